@@ -1,0 +1,145 @@
+"""How wrong a vademecum is, on loads that it has never seen, and what it cost.
+
+The truth is the full finite element solution on the same mesh. Loads are patches centred at face
+centroids, which no part of the build uses, in three directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avatar_core.loads import patch_loads
+from avatar_core.shepard import weights_at
+
+if TYPE_CHECKING:
+    from avatar_core.elasticity import Elasticity
+    from avatar_core.vademecum import Vademecum
+
+_BATCH = 40  # load positions solved at once
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Relative errors (fractions) on unseen loads, mean and worst, and the cost.
+
+    l2 : |u - u_FE| / |u_FE| over all vertices, mass-weighted, each load and direction
+    contact : |C - C_FE|_F / |C_FE|_F of the 3 x 3 compliance of the loaded patch
+    force : |F / F_FE - 1| of the normal force for an imposed normal indentation
+    vertex_contact_worst : contact error at load positions of the build, on fresh solves
+    n_loads : unseen load positions; ``seed`` draws them
+    build_cpu_seconds : user + system time of everything, meshing and this certificate included
+    mesh_l2, mesh_contact : change of the reference when the mesh is refined once (NaN: not asked)
+    """
+
+    l2_mean: float
+    l2_worst: float
+    contact_mean: float
+    contact_worst: float
+    force_mean: float
+    force_worst: float
+    vertex_contact_worst: float
+    n_loads: int
+    seed: int
+    modes: int
+    build_cpu_seconds: float = float("nan")
+    mesh_l2: float = float("nan")
+    mesh_contact: float = float("nan")
+
+    @classmethod
+    def unknown(cls) -> Certificate:
+        """A certificate that promises nothing."""
+        nan = float("nan")
+        return cls(nan, nan, nan, nan, nan, nan, nan, 0, 0, 0)
+
+
+def certify(
+    vademecum: Vademecum,
+    elasticity: Elasticity,
+    n_loads: int = 200,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> Certificate:
+    """Measure a vademecum against full finite elements on unseen loads.
+
+    Parameters
+    ----------
+    vademecum : Vademecum
+    elasticity : Elasticity, the problem it was built from
+    n_loads : unseen positions (all face centroids where the organ has fewer)
+    seed : of the random choice
+    progress : called with the number of positions done so far
+    """
+    surface = vademecum.surface
+    rng = np.random.default_rng(seed)
+    chosen = rng.permutation(len(surface.corners))[:n_loads]
+    l2, contact, force = [], [], []
+    for batch in np.array_split(chosen, max(1, len(chosen) // _BATCH)):
+        truth, compliance = _reference(
+            elasticity, surface.centroids[batch], surface.centroid_normals[batch], vademecum
+        )
+        for k, triangle in enumerate(batch):
+            normal = surface.centroid_normals[triangle]
+            here = weights_at(surface.interpolation, surface.centroids[triangle], normal)
+            l2.append(_l2(vademecum, vademecum.displacement(*here), truth[k]))
+            estimate = vademecum.compliance(*here)
+            contact.append(_frobenius(estimate, compliance[k]))
+            force.append(abs(normal @ compliance[k] @ normal / (normal @ estimate @ normal) - 1))
+        if progress is not None:
+            progress(len(contact))
+    return Certificate(
+        l2_mean=float(np.mean(l2)),
+        l2_worst=float(np.max(l2)),
+        contact_mean=float(np.mean(contact)),
+        contact_worst=float(np.max(contact)),
+        force_mean=float(np.mean(force)),
+        force_worst=float(np.max(force)),
+        vertex_contact_worst=_vertex_contact(vademecum, elasticity, rng),
+        n_loads=len(chosen),
+        seed=seed,
+        modes=vademecum.far.rank,
+    )
+
+
+def _reference(
+    elasticity: Elasticity, centers: np.ndarray, normals: np.ndarray, vademecum: Vademecum
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertex displacements (n, 3 n_vertices, 3) and patch compliances (n, 3, 3)."""
+    loads = patch_loads(elasticity, centers, normals, vademecum.surface.patch_radius)
+    solution = elasticity.solve(loads)
+    vertex = elasticity.at_vertices(solution).reshape(-1, len(centers), 3).transpose(1, 0, 2)
+    average = (loads.T @ solution).reshape(len(centers), 3, len(centers), 3)
+    own = np.arange(len(centers))
+    return vertex, average[own, :, own, :]
+
+
+def _l2(vademecum: Vademecum, estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Relative mass-weighted error of each direction, shape (3,)."""
+    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)[:, None]
+    return np.sqrt((mass * (estimate - truth) ** 2).sum(axis=0) / (mass * truth**2).sum(axis=0))
+
+
+def _frobenius(estimate: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
+
+
+def _vertex_contact(
+    vademecum: Vademecum, elasticity: Elasticity, rng: np.random.Generator
+) -> float:
+    surface = vademecum.surface
+    some = rng.permutation(len(surface.vertices))[:_BATCH]
+    _, compliance = _reference(
+        elasticity, surface.centers[some], surface.normals[some], vademecum
+    )
+    return max(
+        _frobenius(
+            vademecum.compliance(
+                *weights_at(surface.interpolation, surface.centers[i], surface.normals[i])
+            ),
+            compliance[k],
+        )
+        for k, i in enumerate(some)
+    )

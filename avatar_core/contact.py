@@ -1,0 +1,248 @@
+"""Contact between spherical tool tips and an organ at 1 kHz: offline ``prepare``, online ``step``.
+
+``prepare`` allocates, compiles and may fail; ``step`` does none of it and returns a status.
+The compiled code is in :mod:`avatar_core.contact_kernels`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from avatar_core import contact_kernels as kernels
+from avatar_core.contact_kernels import ModelArrays, Out, State
+from avatar_core.errors import ContactError
+from avatar_core.near_field import LocalBlocks
+from avatar_core.vademecum import Vademecum
+from avatar_core.shepard import MAX_STENCIL
+
+Cloud = Literal["surface", "volume", "off"]
+
+TIP_RADIUS_RANGE = (2e-3, 20e-3)  # [m]
+
+
+class Status(IntEnum):
+    """What a step came to; the numbers of avatar_ros/msg/ContactState."""
+
+    OK = kernels.OK
+    NO_MODEL = kernels.NO_MODEL
+    NO_POSE = kernels.NO_POSE
+    STALE_POSE = kernels.STALE_POSE
+    INVALID_POSE = kernels.INVALID_POSE
+    NOT_CONVERGED = kernels.NOT_CONVERGED
+    TOO_MANY_CONTACTS = kernels.TOO_MANY
+    OUT_OF_RANGE = kernels.OUT_OF_RANGE
+
+
+@dataclass(frozen=True)
+class ContactModel:
+    """Everything a step reads and writes.
+
+    arrays : ModelArrays, constant
+        distance, access, origin, spacing: the tip field; position, normal, tangent, reach,
+        neighbor, fit: interpolation over the load positions; load (n_positions, 3, rank) and
+        the contact_* blocks: compliance [m/N]; softness (1,), added where access fades [m/N];
+        space (n_points, 3, rank) and the near_* blocks: displacement of the cloud [m/N];
+        rest (n_points, 3) [m]; tip_radius (n_tools,) [m]
+    state : State, forces kept for the next period, and scratch
+    out : Out
+        force, torque (n_tools, 3) [N, N m], of the organ on each tool about its tip (a
+        frictionless sphere has no torque about its centre);
+        cloud (n_points, 6) float32, deformed position and displacement [m];
+        n_contacts (1,), then contact_tool, contact_position, contact_normal (organ to tool),
+        contact_force (on the tool), contact_penetration of the active contacts
+    """
+
+    arrays: Any
+    state: Any
+    out: Any
+
+    @property
+    def n_tools(self) -> int:
+        """Number of tools."""
+        return len(self.arrays.tip_radius)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the constant arrays [bytes]."""
+        return int(sum(array.nbytes for array in self.arrays))
+
+    def reset(self) -> None:
+        """Forget all contacts: the organ is at rest."""
+        self.state.engaged[:] = False
+        self.state.force[:] = 0.0
+
+
+def prepare(
+    vademecum: Vademecum,
+    tip_radii: tuple[float, ...] = (5e-3,),
+    modes: int | None = None,
+    cloud: Cloud = "surface",
+) -> ContactModel:
+    """Lay out a vademecum for the step, and compile the step.
+
+    Parameters
+    ----------
+    vademecum : Vademecum
+    tip_radii : radius of each tool's spherical tip, 2 to 20 mm [m]
+    modes : far-field modes of the *displacement*; None for all. Fewer modes leave the force
+        exact, since the contact compliance keeps all of them.
+    cloud : "surface" or "volume" vertices, or "off"
+
+    Raises
+    ------
+    ContactError
+        For radii, modes or clouds out of range.
+    """
+    return make_model(model_arrays(vademecum, tip_radii, modes, cloud))
+
+
+def model_arrays(
+    vademecum: Vademecum,
+    tip_radii: tuple[float, ...] = (5e-3,),
+    modes: int | None = None,
+    cloud: Cloud = "surface",
+) -> ModelArrays:
+    """The constant arrays of a contact model; see :func:`prepare`."""
+    _check(vademecum, tip_radii, modes, cloud)
+    surface, mesh = vademecum.surface, vademecum.mesh
+    points = {
+        "surface": mesh.surface_vertices,
+        "volume": np.arange(len(mesh.vertices)),
+        "off": np.empty(0, np.int64),
+    }[cloud]
+    rank = vademecum.far.rank if modes is None else modes
+    near = _near_at(vademecum.near, points, len(mesh.vertices))
+    space = vademecum.far.space.reshape(len(mesh.vertices), 3, -1)[points, :, :rank]
+    contact = vademecum.contact_near
+    load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
+    return ModelArrays(
+        *vademecum.tip_field,
+        *surface.interpolation,
+        load=np.ascontiguousarray(load),
+        contact_start=contact.start,
+        contact_target=contact.target,
+        contact_block=contact.block,
+        softness=np.array([float((load**2).sum(axis=(1, 2)).mean() / 3.0)]),
+        space=np.ascontiguousarray(space),
+        near_start=near.start,
+        near_target=near.target,
+        near_block=near.block,
+        rest=mesh.vertices[points].astype(np.float32),
+        tip_radius=np.array(tip_radii, float),
+    )
+
+
+def make_model(arrays: ModelArrays) -> ContactModel:
+    """Allocate state and outputs around the constant arrays, and run the step once."""
+    n_tools, n_modes = len(arrays.tip_radius), arrays.load.shape[2]
+    n_stencil = MAX_STENCIL * n_tools
+    state = State(
+        engaged=np.zeros(n_tools, np.bool_),
+        force=np.zeros(n_tools),
+        gap=np.zeros(n_tools),
+        access=np.zeros(n_tools),
+        access_gradient=np.zeros((n_tools, 3)),
+        direction=np.zeros((n_tools, 3)),
+        point=np.zeros((n_tools, 3)),
+        candidates=np.zeros((n_tools, MAX_STENCIL), np.int64),
+        n_candidates=np.zeros(n_tools, np.int64),
+        local=np.full(len(arrays.position), -1, np.int64),
+        nodes=np.zeros(n_stencil, np.int64),
+        n_local=np.zeros(1, np.int64),
+        weight=np.zeros((n_tools, n_stencil)),
+        mode=np.zeros((n_tools, n_modes), np.float32),
+        column=np.zeros((n_tools, n_stencil, 3)),
+        displacement=np.zeros((n_stencil, 3)),
+        compliance=np.zeros((n_tools, n_tools)),
+        trial=np.zeros(n_stencil),
+        amplitude=np.zeros(n_modes, np.float32),
+    )
+    out = Out(
+        force=np.zeros((n_tools, 3)),
+        torque=np.zeros((n_tools, 3)),
+        cloud=np.zeros((len(arrays.rest), 6), np.float32),
+        n_contacts=np.zeros(1, np.int64),
+        contact_tool=np.zeros(n_tools, np.int64),
+        contact_position=np.zeros((n_tools, 3)),
+        contact_normal=np.zeros((n_tools, 3)),
+        contact_force=np.zeros((n_tools, 3)),
+        contact_penetration=np.zeros(n_tools),
+    )
+    model = ContactModel(arrays, state, out)
+    far_away = np.full((n_tools, 3), 1e3)
+    step(model, far_away)
+    model.reset()
+    return model
+
+
+def step(model: ContactModel, tips: np.ndarray) -> int:
+    """Advance one period; real-time safe: allocates no array of size, never raises or logs.
+
+    Parameters
+    ----------
+    model : ContactModel, whose ``out`` is filled
+    tips : ndarray of float64, C-contiguous, shape (n_tools, 3), sphere centres [m]
+
+    Returns
+    -------
+    int
+        A :class:`Status`. INVALID_POSE: some pose was not finite; OUT_OF_RANGE: some tip is
+        off the accessible surface, too deep, or did not come in through the surface. The tools
+        concerned have zero force, the others are served.
+    """
+    return int(kernels.contact_step(model.arrays, model.state, model.out, tips))
+
+
+def save_arrays(arrays: ModelArrays, folder: Path) -> None:
+    """Write the constant arrays as one ``.npy`` each, to be mapped by another process."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, array in arrays._asdict().items():
+        np.save(folder / f"{name}.npy", array)
+
+
+def load_arrays(folder: Path) -> ModelArrays:
+    """Map what :func:`save_arrays` wrote, without reading it."""
+    mapped = {
+        name: np.load(folder / f"{name}.npy", mmap_mode="r")
+        for name in ModelArrays._fields
+    }
+    return ModelArrays(**mapped)
+
+
+def stored_energy(model: ContactModel) -> float:
+    """Elastic energy lambda . C lambda / 2 of the present contacts [J]."""
+    force = model.state.force
+    return float(0.5 * force @ model.state.compliance @ force)
+
+
+def _near_at(near: LocalBlocks, points: np.ndarray, n_vertices: int) -> LocalBlocks:
+    """The near field at some vertices, renumbered to their order."""
+    number = np.full(n_vertices, -1, np.int32)
+    number[points] = np.arange(len(points), dtype=np.int32)
+    target = number[near.target]
+    kept = target >= 0
+    count = np.bincount(near.position[kept], minlength=len(near.start) - 1)
+    start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+    return LocalBlocks(
+        start, np.ascontiguousarray(target[kept]), np.ascontiguousarray(near.block[kept])
+    )
+
+
+def _check(
+    vademecum: Vademecum, tip_radii: tuple[float, ...], modes: int | None, cloud: str
+) -> None:
+    low, high = TIP_RADIUS_RANGE
+    if not 1 <= len(tip_radii) <= kernels.MAX_TOOLS:
+        raise ContactError(f"{len(tip_radii)} tools; give 1 to {kernels.MAX_TOOLS} tip radii")
+    for radius in tip_radii:
+        if not low <= radius <= high:
+            raise ContactError(f"tip radius {radius:g} m; it must lie in {low:g} to {high:g} m")
+    if modes is not None and not 1 <= modes <= vademecum.far.rank:
+        raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {vademecum.far.rank}")
+    if cloud not in ("surface", "volume", "off"):
+        raise ContactError(f"cloud '{cloud}' is unknown; choose surface, volume or off")

@@ -1,0 +1,243 @@
+"""Small-strain elasticity on tetrahedra, solved on an element that does not lock.
+
+The weak form (paper Eq. 4 without the load coordinate): find u in H1_0 with
+
+    int_Omega 2 mu eps(u):eps(v) + lambda div(u) div(v) dx = int_Gamma t . v da   for all v.
+
+Quadratic tetrahedra (P2) serve up to nu = 0.49. Above, the Taylor-Hood pair (P2 displacement, P1
+pressure) replaces lambda div(u) by a pressure p with int (div u - p / lambda) q dx = 0.
+Linear tetrahedra (P1) lock at the nu of liver (compliance 0.72 of the true one at 0.48): they
+are there for timing very large meshes, never as a default.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import rslab
+import scipy.sparse as sp
+from skfem import (
+    Basis,
+    BilinearForm,
+    ElementTetP1,
+    ElementTetP2,
+    ElementVector,
+    MeshTet,
+)
+from skfem.helpers import ddot, div, sym_grad
+
+from avatar_core.errors import ConvergenceError, MaterialError
+from avatar_core.mesh import TetMesh
+
+Element = Literal["P1", "P2", "Taylor-Hood"]
+
+# P2 stays within 2 % of Taylor-Hood up to here and locks beyond.
+POISSON_RATIO_P2 = 0.49
+
+
+@dataclass(frozen=True)
+class Material:
+    """Isotropic linear elastic material; the defaults are the liver of the paper, Sec. 3.1.
+
+    young_modulus : E > 0 [Pa]
+    poisson_ratio : 0 <= nu < 0.5
+    """
+
+    young_modulus: float = 0.17e6
+    poisson_ratio: float = 0.48
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.young_modulus) and self.young_modulus > 0):
+            raise MaterialError(
+                f"Young's modulus is {self.young_modulus} Pa; it must be positive (liver: 0.17e6)"
+            )
+        if not 0 <= self.poisson_ratio < 0.5:
+            raise MaterialError(
+                f"Poisson's ratio is {self.poisson_ratio}; it must lie in [0, 0.5): an "
+                "incompressible organ is approached by 0.4999"
+            )
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        """Lame parameters (lambda, mu) [Pa]."""
+        young, nu = self.young_modulus, self.poisson_ratio
+        return young * nu / ((1 + nu) * (1 - 2 * nu)), young / (2 * (1 + nu))
+
+    @property
+    def element(self) -> Element:
+        """The element that does not lock at this Poisson's ratio."""
+        return "P2" if self.poisson_ratio <= POISSON_RATIO_P2 else "Taylor-Hood"
+
+
+@BilinearForm
+def strain_energy(u, v, w):  # type: ignore[no-untyped-def]
+    """2 eps(u):eps(v), the shear part for mu = 1."""
+    return 2.0 * ddot(sym_grad(u), sym_grad(v))
+
+
+@BilinearForm
+def volume_change(u, v, w):  # type: ignore[no-untyped-def]
+    """div(u) div(v), the volumetric part for lambda = 1."""
+    return div(u) * div(v)
+
+
+@BilinearForm
+def divergence(u, q, w):  # type: ignore[no-untyped-def]
+    """q div(u), the coupling of displacement and pressure."""
+    return q * div(u)
+
+
+@BilinearForm
+def pressure_mass(p, q, w):  # type: ignore[no-untyped-def]
+    """p q."""
+    return p * q
+
+
+class Elasticity:
+    """The discrete elastic problem of one mesh, material and clamp.
+
+    Displacements are vectors of ``3 n_nodes`` values, ``3 node + component``; nodes are the mesh
+    vertices in their order, then (P2, Taylor-Hood) the edge midpoints.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    material : Material
+    clamped : ndarray of bool, shape (n_faces,), over ``mesh.boundary_faces``; all False leaves
+        the organ free: then only :attr:`stiffness` can be used.
+    element : "P1", "P2", "Taylor-Hood" or None for ``material.element``
+    """
+
+    def __init__(
+        self,
+        mesh: TetMesh,
+        material: Material,
+        clamped: np.ndarray,
+        element: Element | None = None,
+    ) -> None:
+        self.mesh, self.material = mesh, material
+        self.element: Element = element or material.element
+        self._skfem_mesh = MeshTet(
+            np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
+        )
+        shape = ElementTetP1() if self.element == "P1" else ElementTetP2()
+        self._basis = Basis(self._skfem_mesh, ElementVector(shape), intorder=2)
+        self._dofs = self._node_dofs()
+        self.clamped_nodes = np.unique(self.face_nodes[clamped])
+
+    def _node_dofs(self) -> np.ndarray:
+        """scikit-fem's number of each degree of freedom, in our order."""
+        dofs = self._basis.nodal_dofs.T
+        if self.element != "P1":
+            dofs = np.concatenate([dofs, self._basis.edge_dofs.T])
+        return np.ascontiguousarray(dofs).ravel()
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of displacement nodes."""
+        return len(self._dofs) // 3
+
+    @cached_property
+    def face_nodes(self) -> np.ndarray:
+        """Nodes of each boundary face: 3 (P1) or 6 (corners, then edges 01, 12, 20) columns."""
+        faces = self.mesh.boundary_faces
+        if self.element == "P1":
+            return faces
+        n_vertices = len(self.mesh.vertices)
+        edges = np.sort(self._skfem_mesh.edges, axis=0).astype(np.int64)
+        key = edges[0] * n_vertices + edges[1]
+        order = np.argsort(key)
+        pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
+        found = np.searchsorted(key[order], pairs[..., 0] * n_vertices + pairs[..., 1])
+        return np.concatenate([faces, n_vertices + order[found]], axis=1)
+
+    def _form(self, form: BilinearForm) -> sp.csr_matrix:
+        matrix = form.assemble(self._basis).tocsr()
+        return matrix[self._dofs][:, self._dofs]
+
+    @cached_property
+    def _mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
+        """Shear stiffness, divergence and pressure mass of the Taylor-Hood pair."""
+        _, mu = self.material.lame
+        pressure = Basis(self._skfem_mesh, ElementTetP1(), intorder=2)
+        coupling = divergence.assemble(self._basis, pressure).tocsr()[:, self._dofs]
+        return mu * self._form(strain_energy), coupling, pressure_mass.assemble(pressure).tocsr()
+
+    @cached_property
+    def stiffness(self) -> sp.csr_matrix:
+        """K without boundary conditions, shape (3 n_nodes, 3 n_nodes) [N/m] (P1 and P2)."""
+        lam, mu = self.material.lame
+        return (mu * self._form(strain_energy) + lam * self._form(volume_change)).tocsr()
+
+    @cached_property
+    def _free(self) -> np.ndarray:
+        free = np.ones((self.n_nodes, 3), bool)
+        free[self.clamped_nodes] = False
+        return np.flatnonzero(free)
+
+    @cached_property
+    def _factor(self) -> rslab.Ldlt:
+        if len(self.clamped_nodes) == 0:
+            raise MaterialError("an organ without a clamp has no equilibrium; clamp some faces")
+        free = self._free
+        if self.element == "Taylor-Hood":
+            shear, coupling, mass = self._mixed
+            coupling = coupling[:, free]
+            lam, _ = self.material.lame
+            system = sp.bmat([[shear[free][:, free], -coupling.T], [-coupling, -mass / lam]])
+        else:
+            system = self.stiffness[free][:, free]
+        return rslab.ldlt(sp.csc_matrix(system))
+
+    def solve(self, loads: np.ndarray | sp.spmatrix) -> np.ndarray:
+        """Displacements u = K^-1 f under nodal forces, zero at the clamp.
+
+        Parameters
+        ----------
+        loads : ndarray or sparse, shape (3 n_nodes, n) [N]
+
+        Returns
+        -------
+        ndarray, shape (3 n_nodes, n) [m]
+
+        Raises
+        ------
+        ConvergenceError
+            If the factorization failed and the solution does not balance the load.
+        """
+        loads = loads.toarray() if sp.issparse(loads) else np.asarray(loads, float)
+        free = self._free
+        right = np.zeros((self._factor.n, loads.shape[1]), order="F")
+        right[: len(free)] = loads[free]
+        solution = self._factor.solve_many(right)
+        displacement = np.zeros(loads.shape)
+        displacement[free] = solution[: len(free)]
+        imbalance = np.abs(self.apply(displacement[:, :1])[free] - loads[free, :1]).max()
+        if not imbalance <= 1e-6 * np.abs(loads[:, :1]).max():
+            raise ConvergenceError(
+                f"the linear solution leaves {imbalance:.1e} N out of balance; "
+                "check the mesh for slivers"
+            )
+        return displacement
+
+    @cached_property
+    def _pressure_factor(self) -> rslab.Ldlt:
+        return rslab.ldlt(sp.csc_matrix(self._mixed[2]))
+
+    def apply(self, displacement: np.ndarray) -> np.ndarray:
+        """Internal forces K u, shape (3 n_nodes, n) [N]; reactions appear at the clamp."""
+        if self.element != "Taylor-Hood":
+            return self.stiffness @ displacement
+        shear, coupling, _ = self._mixed
+        lam, _ = self.material.lame
+        change = np.asfortranarray(coupling @ displacement)
+        return shear @ displacement + lam * (
+            coupling.T @ self._pressure_factor.solve_many(change)
+        )
+
+    def at_vertices(self, displacement: np.ndarray) -> np.ndarray:
+        """The vertex part of nodal displacements, shape (3 n_vertices, n)."""
+        return displacement[: 3 * len(self.mesh.vertices)]

@@ -1,0 +1,35 @@
+"""Typed errors of the offline part; each message names cause and remedy in one line."""
+
+from __future__ import annotations
+
+
+class AvatarError(Exception):
+    """Base of every error that a user can cause and cure."""
+
+
+class SurfaceError(AvatarError):
+    """The organ surface cannot be read or does not bound one organ of plausible size."""
+
+
+class MeshError(AvatarError):
+    """The volume mesh is missing, degenerate or inverted, or a region of it is empty."""
+
+
+class MaterialError(AvatarError):
+    """A material parameter lies outside the range in which the model is well posed."""
+
+
+class LoadError(AvatarError):
+    """A load patch or load direction does not fit the surface it acts on."""
+
+
+class StorageError(AvatarError):
+    """A file is truncated, altered, from a future schema, or cannot be written."""
+
+
+class ContactError(AvatarError):
+    """A contact model cannot be prepared from what was asked."""
+
+
+class ConvergenceError(AvatarError):
+    """An iteration reached its limit before its tolerance."""

@@ -1,0 +1,206 @@
+"""Where a tool may press: load positions, patch tractions and their conjugate displacements.
+
+A tool tip presses through a *patch*: a traction of unit total force, spread over the surface
+around its centre s by the compact profile
+
+    psi_s(x) = c (1 - |x - s|^2 / R^2)^2 max(0, n(x) . n_s),   |x - s| < R,   int psi_s da = 1,
+
+R being a physical length, so that refining the mesh does not change the load. The displacement
+conjugate to it is the average u_bar(s) = int psi_s u da: force times u_bar is work.
+
+Positions s are the vertices and edge midpoints of the accessible faces; between them everything
+that depends on s is interpolated (:mod:`avatar_core.shepard`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+from skfem.quadrature import get_quadrature
+from skfem.refdom import RefTri
+
+from avatar_core.elasticity import Elasticity
+from avatar_core.errors import MeshError
+from avatar_core.mesh import Regions, TetMesh
+from avatar_core.shepard import Interpolation, make_interpolation
+
+LEAST_PATCH_RADIUS = 12e-3  # [m]
+
+
+@dataclass(frozen=True)
+class LoadSurface:
+    """The load positions of the accessible surface.
+
+    centers : ndarray, shape (n_positions, 3) [m], patch centres
+    normals : ndarray, shape (n_positions, 3), unit outward normals
+    corners : ndarray of int, shape (n_triangles, 3), positions at the corners of each face
+    vertices : ndarray of int, shape (n_corners,), mesh vertex of the first positions; the others
+        are edge midpoints
+    patch_radius : R [m]
+    """
+
+    centers: np.ndarray
+    normals: np.ndarray
+    corners: np.ndarray
+    vertices: np.ndarray
+    patch_radius: float
+
+    @property
+    def n_positions(self) -> int:
+        """Number of load positions."""
+        return len(self.centers)
+
+    @property
+    def centroids(self) -> np.ndarray:
+        """Centroids of the accessible faces, shape (n_triangles, 3) [m]."""
+        return self.centers[self.corners].mean(axis=1)
+
+    @property
+    def centroid_normals(self) -> np.ndarray:
+        """Unit normals for patches at the centroids, shape (n_triangles, 3)."""
+        return _unit(self.normals[self.corners].sum(axis=1))
+
+    @cached_property
+    def interpolation(self) -> Interpolation:
+        """Smooth interpolation between the positions."""
+        return make_interpolation(self.centers, self.normals)
+
+
+def triangle_shape(barycentric: np.ndarray) -> np.ndarray:
+    """Shape functions of the six-node triangle, the trace of a P2 element.
+
+    Parameters
+    ----------
+    barycentric : ndarray, shape (..., 3), coordinates (l0, l1, l2) that sum to one
+
+    Returns
+    -------
+    ndarray, shape (..., 6): l(2l - 1) at the corners, 4 l l' at edges 01, 12, 20
+    """
+    corner = barycentric * (2.0 * barycentric - 1.0)
+    return np.concatenate(
+        [corner, 4.0 * barycentric * np.roll(barycentric, -1, axis=-1)], axis=-1
+    )
+
+
+def default_patch_radius(mesh: TetMesh, regions: Regions) -> float:
+    """R = max(12 mm, 1.2 x mean edge of the accessible surface) [m]."""
+    corners = mesh.vertices[mesh.boundary_faces[regions.accessible]]
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
+    return max(LEAST_PATCH_RADIUS, 1.2 * float(edge))
+
+
+def load_surface(
+    mesh: TetMesh, regions: Regions, patch_radius: float | None = None
+) -> LoadSurface:
+    """Load positions of the accessible region.
+
+    Raises
+    ------
+    MeshError
+        If the patch radius is not a length that the surface can resolve.
+    """
+    if patch_radius is None:
+        patch_radius = default_patch_radius(mesh, regions)
+    if not 0.2 * mesh.mean_surface_edge <= patch_radius < np.inf:
+        raise MeshError(
+            f"a patch of radius {patch_radius:g} m cannot be resolved by surface edges of "
+            f"{mesh.mean_surface_edge:.2g} m; refine the mesh or take a radius above 12 mm"
+        )
+    faces = mesh.boundary_faces[regions.accessible]
+    vertices, corner = np.unique(faces, return_inverse=True)
+    corner = corner.reshape(-1, 3)
+    a, b = np.unique(np.sort(corner[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0).T
+    point, normal = mesh.vertices[vertices], mesh.vertex_normals[vertices]
+    return LoadSurface(
+        centers=np.concatenate([point, (point[a] + point[b]) / 2.0]),
+        normals=np.concatenate([normal, _unit(normal[a] + normal[b])]),
+        corners=corner,
+        vertices=vertices,
+        patch_radius=float(patch_radius),
+    )
+
+
+def patch_loads(
+    elasticity: Elasticity, centers: np.ndarray, normals: np.ndarray, radius: float
+) -> sp.csr_matrix:
+    """Nodal forces of unit patch tractions in the three coordinate directions.
+
+    Column ``3 i + d`` integrates psi_{s_i} e_d against the element's shape functions; its
+    transpose averages: ``loads.T @ u`` is u_bar. The profile is normalized by its own quadrature,
+    so the total force of a column is one to rounding.
+
+    Parameters
+    ----------
+    elasticity : Elasticity
+    centers, normals : ndarray, shape (n, 3) [m], unit outward normals
+    radius : R [m]
+
+    Returns
+    -------
+    sparse, shape (3 n_nodes, 3 n) [N per N]
+
+    Raises
+    ------
+    MeshError
+        If a patch meets no quadrature point of the surface.
+    """
+    points, weights, point_normals, trace = _surface_quadrature(elasticity, radius)
+    near = cKDTree(points).query_ball_point(centers, radius)
+    size = np.array([len(hit) for hit in near])
+    center = np.repeat(np.arange(len(centers)), size)
+    point = np.concatenate([np.asarray(hit, np.int64) for hit in near])
+    squared = ((points[point] - centers[center]) ** 2).sum(axis=1) / radius**2
+    facing = np.einsum("ij,ij->i", point_normals[point], normals[center])
+    value = weights[point] * (1.0 - squared) ** 2 * np.maximum(facing, 0.0)
+    profile = sp.csr_matrix((value, (center, point)), shape=(len(centers), len(points)))
+    total = np.asarray(profile.sum(axis=1)).ravel()
+    if not (total > 0).all():
+        raise MeshError(f"a patch of radius {radius:g} m holds no surface; enlarge it")
+    scalar = sp.diags(1.0 / total) @ profile @ trace
+    return sp.kron(scalar, sp.identity(3), format="csr").T.tocsr()
+
+
+def _surface_quadrature(
+    elasticity: Elasticity, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, sp.csr_matrix]:
+    """Points, weights and normals on the boundary, and the trace of the nodal shape functions."""
+    mesh = elasticity.mesh
+    pieces = max(1, int(np.ceil(1.5 * mesh.mean_surface_edge / radius)))
+    barycentric, weight = _subdivided_rule(pieces)
+    corners = mesh.vertices[mesh.boundary_faces]
+    points = np.einsum("qk,fkd->fqd", barycentric, corners).reshape(-1, 3)
+    weights = np.outer(mesh.face_areas, weight).ravel()
+    unit = mesh.face_area_normals / mesh.face_areas[:, None]
+    shape = barycentric if elasticity.element == "P1" else triangle_shape(barycentric)
+    nodes = np.repeat(elasticity.face_nodes, len(weight), axis=0)
+    rows = np.repeat(np.arange(len(points)), nodes.shape[1])
+    trace = sp.csr_matrix(
+        (np.tile(shape, (len(corners), 1)).ravel(), (rows, nodes.ravel())),
+        shape=(len(points), elasticity.n_nodes),
+    )
+    return points, weights, np.repeat(unit, len(weight), axis=0), trace
+
+
+def _subdivided_rule(pieces: int) -> tuple[np.ndarray, np.ndarray]:
+    """A rule of degree 5 on each of pieces^2 equal sub-triangles; weights sum to one."""
+    local, weight = get_quadrature(RefTri, 5)
+    bary = np.stack([1.0 - local[0] - local[1], local[0], local[1]], axis=1)
+    corners = []
+    for i in range(pieces):
+        for j in range(pieces - i):
+            corners.append([(i, j), (i + 1, j), (i, j + 1)])
+            if i + j < pieces - 1:
+                corners.append([(i + 1, j + 1), (i, j + 1), (i + 1, j)])
+    tri = np.array(corners, float) / pieces
+    tri = np.concatenate([1.0 - tri.sum(axis=2, keepdims=True), tri], axis=2)
+    points = np.einsum("qk,tkd->tqd", bary, tri).reshape(-1, 3)
+    return points, np.tile(weight / weight.sum() / len(tri), len(tri))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)

@@ -1,0 +1,485 @@
+"""The contact node: poses of tools in; force on each tool and deformation of the organ out.
+
+Three threads of control, each in its place:
+
+- the loop (``ContactLoop``, a thread): waits for a pose, steps, publishes; nothing else.
+- the node (``ContactNode``, the main thread): parameters, transitions, statistics.
+- the handover (a process, and a thread that maps what it sends): brings a vademecum in.
+
+They share two references, which are exchanged whole: the model in use and the record of times.
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import CallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
+
+from avatar_core import contact
+from avatar_ros import node_runner, parameters, qos, realtime
+from avatar_ros.conversions import (
+    NO_STAMP,
+    CloudTemplate,
+    PoseReader,
+    StateTemplate,
+    WrenchTemplate,
+    stamp_nanoseconds,
+)
+from avatar_ros.handover import Handover, Order, Prepared
+from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_ros.parameters import ContactSettings, ParameterError
+
+OK = int(ContactState.STATUS_OK)
+NO_MODEL = int(ContactState.STATUS_NO_MODEL)
+NO_POSE = int(ContactState.STATUS_NO_POSE)
+STALE_POSE = int(ContactState.STATUS_STALE_POSE)
+
+LATE = 1.5  # a period this many times the nominal one counts as missed
+_PATIENCE = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own
+_SHORTEST = 0.5  # periods between two answers to poses, however fast they come
+_FAR_AWAY = 1e3  # where a tool without a pose is, for the step [m]
+_STATISTICS_PERIOD = 1.0  # [s]
+_GRACE = 0.1  # a replaced model is kept until no step can use it [s]
+
+
+# --- What the loop works with ----------------------------------------------------------------
+
+
+class OwnThread(CallbackGroup):
+    """For subscriptions that the loop takes from itself: no executor ever touches them."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+class Tool:
+    """One tool's subscription, publisher and last pose.
+
+    status : OK with a usable pose, otherwise why not
+    stamp : of the last valid pose, eight bytes; zero before the first
+    """
+
+    def __init__(self, subscription: Any, publisher: Any, frame_id: str) -> None:
+        self.subscription = subscription
+        self.publisher = publisher
+        self.wrench = WrenchTemplate(frame_id)
+        self.status = NO_POSE
+        self.stamp = NO_STAMP
+        self._reader = PoseReader(frame_id)
+        self._received = 0  # [ns]
+
+    def take(self, now: int, timeout: int, tip: np.ndarray) -> bool:
+        """Take the newest pose, if any, and place ``tip``; true if a valid one came."""
+        taken = self.subscription.handle.take_message(PoseStamped, True)
+        if taken is None:
+            if self.status == OK and now - self._received > timeout:
+                self.status = STALE_POSE
+                tip[:] = _FAR_AWAY
+            return False
+        self.status = self._reader.read(taken[0])
+        if self.status != OK:
+            tip[:] = _FAR_AWAY
+            return False
+        tip[:] = self._reader.position
+        self.stamp = self._reader.stamp
+        self._received = now
+        return True
+
+
+class Online:
+    """A contact model and the messages that have its size: exchanged as one."""
+
+    def __init__(self, vademecum_id: str, model: Any, settings: ContactSettings) -> None:
+        self.model = model
+        self.cloud: CloudTemplate | None = None
+        if model is not None and settings.cloud != "off":
+            self.cloud = CloudTemplate(settings.frame_id, len(model.out.cloud))
+        capacity = 1 if model is None else len(model.out.contact_tool)
+        self.states = [
+            StateTemplate(settings.frame_id, tool, vademecum_id, capacity)
+            for tool in settings.tools
+        ]
+
+
+class Record:
+    """Times of the steps since the record was begun [ns]; writing allocates nothing."""
+
+    CAPACITY = 4096
+
+    def __init__(self, begin: int) -> None:
+        self.begin = begin
+        self.n_periods = 0
+        self.n_steps = 0
+        self.n_ages = 0
+        self.periods = np.zeros(self.CAPACITY, np.int64)
+        self.computes = np.zeros(self.CAPACITY, np.int64)
+        self.ages = np.zeros(self.CAPACITY, np.int64)
+
+    def note_period(self, period: int) -> None:
+        if self.n_periods < self.CAPACITY:
+            self.periods[self.n_periods] = period
+            self.n_periods += 1
+
+    def note_step(self, compute: int) -> None:
+        if self.n_steps < self.CAPACITY:
+            self.computes[self.n_steps] = compute
+            self.n_steps += 1
+
+    def note_age(self, age: int) -> None:
+        if self.n_ages < self.CAPACITY:
+            self.ages[self.n_ages] = age
+            self.n_ages += 1
+
+
+@dataclass
+class Outlets:
+    """Publishers of what concerns all tools."""
+
+    state: Any
+    deformation: Any
+
+
+# --- The loop --------------------------------------------------------------------------------
+
+
+class ContactLoop:
+    """Answers every pose at once, and keeps its period when none comes.
+
+    online : what is simulated; exchange it at any time
+    record : where times go; exchange it at any time
+    failure : what ended the loop before ``stop``, else empty
+    """
+
+    def __init__(
+        self,
+        settings: ContactSettings,
+        tools: list[Tool],
+        outlets: Outlets,
+        context: Any,
+    ) -> None:
+        self.settings = settings
+        self.online = Online("", None, settings)
+        self.record = Record(time.monotonic_ns())
+        self.failure = ""
+        self._tools = tools
+        self._outlets = outlets
+        self._tips = np.full((len(tools), 3), _FAR_AWAY)
+        self._wait_set = _rclpy.WaitSet(len(tools), 0, 0, 0, 0, 0, context.handle)
+        self._period = round(1e9 / settings.rate)
+        self._running = False
+        self._thread: threading.Thread | None = None
+        self._step_start = 0  # of the last step [ns]
+        self._answered = 0  # start of the last step that had a new pose [ns]
+        self._cycle = 0
+
+    def start(self, cpu: int = -1) -> None:
+        self._running = True
+        self._thread = threading.Thread(target=self._run, args=(cpu,), name="contact loop")
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Returns when the last step is over, within two periods."""
+        self._running = False
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _run(self, cpu: int) -> None:
+        try:
+            with ExitStack() as in_use:
+                for entity in (*self._tools, self._outlets):
+                    _hold(in_use, entity)
+                in_use.enter_context(self._wait_set)
+                realtime.bind_thread(cpu)
+                self._step_start = time.monotonic_ns()
+                while self._running:
+                    self._wait()
+                    self._step()
+        except Exception as error:
+            self.failure = f"the contact loop ended: {type(error).__name__}: {error}"
+
+    def _wait(self) -> None:
+        """Until a pose came, or until this period must not wait any longer."""
+        period = self._period
+        expecting = any(tool.status == OK for tool in self._tools)
+        patience = round(_PATIENCE * period) if expecting else period
+        deadline = self._step_start + patience
+        realtime.sleep_until(self._answered + round(_SHORTEST * period))
+        wait_set = self._wait_set
+        wait_set.clear_entities()
+        for tool in self._tools:
+            wait_set.add_subscription(tool.subscription.handle)
+        wait_set.wait(max(0, deadline - time.monotonic_ns()))
+
+    def _step(self) -> None:
+        start = time.monotonic_ns()
+        settings, online, record = self.settings, self.online, self.record
+        timeout = round(settings.pose_timeout * 1e9)
+        fresh = False
+        for tool, tip in zip(self._tools, self._tips, strict=True):
+            fresh |= tool.take(start, timeout, tip)
+        record.note_period(start - self._step_start)
+        self._step_start = start
+        if fresh:
+            self._answered = start
+            record.note_age(time.time_ns() - stamp_nanoseconds(self._tools[0].stamp))
+        model = online.model
+        code = NO_MODEL if model is None else contact.step(model, self._tips)
+        for i, tool in enumerate(self._tools):
+            self._publish_wrench(i, tool, model)
+        record.note_step(time.monotonic_ns() - start)
+        for i, tool in enumerate(self._tools):
+            self._publish_state(i, tool, online, code)
+        self._cycle += 1
+        if online.cloud is not None and self._cycle % settings.cloud_divisor == 0:
+            online.cloud.points[:] = model.out.cloud
+            stamp = self._tools[0].stamp
+            self._outlets.deformation.handle.publish_raw(online.cloud.serialise(stamp))
+
+    def _publish_wrench(self, i: int, tool: Tool, model: Any) -> None:
+        wrench = tool.wrench
+        if model is None or tool.status != OK:
+            wrench.force[:] = 0.0
+            wrench.torque[:] = 0.0
+        else:
+            wrench.force[:] = model.out.force[i]
+            wrench.torque[:] = model.out.torque[i]
+        tool.publisher.handle.publish_raw(wrench.serialise(tool.stamp))
+
+    def _publish_state(self, i: int, tool: Tool, online: Online, code: int) -> None:
+        template = online.states[i]
+        status = tool.status if tool.status != OK else code
+        n = 0 if online.model is None else _write_contacts(template, online.model.out, i)
+        self._outlets.state.handle.publish_raw(template.serialise(tool.stamp, status, n))
+
+
+def _hold(in_use: ExitStack, entity: Tool | Outlets) -> None:
+    """Keep the middleware's side of an entity alive while the loop runs."""
+    for port in vars(entity).values():
+        handle = getattr(port, "handle", None)
+        if handle is not None:
+            in_use.enter_context(handle)
+
+
+def _write_contacts(template: StateTemplate, out: Any, tool: int) -> int:
+    """Copy a tool's contacts into its message; returns their number."""
+    total = int(out.n_contacts[0])
+    if total == 0:
+        return 0
+    mine = np.flatnonzero(out.contact_tool[:total] == tool)
+    rows = template.contacts[: len(mine)]
+    rows[:, 0:3] = out.contact_position[mine]
+    rows[:, 3:6] = out.contact_normal[mine]
+    rows[:, 6:9] = out.contact_force[mine]
+    rows[:, 9] = out.contact_penetration[mine]
+    return len(mine)
+
+
+# --- The node --------------------------------------------------------------------------------
+
+
+class ContactNode(LifecycleNode):
+    """Parameters, transitions, statistics; the work is done by ``ContactLoop``.
+
+    refusal : why the last transition failed
+    failure : why the node cannot go on, else empty
+    """
+
+    def __init__(self) -> None:
+        super().__init__("contact")
+        self.refusal = ""
+        self._loop: ContactLoop | None = None
+        self._handover: Handover | None = None
+        self._statistics: Any = None
+        self._timer: Any = None
+        parameters.declare(self, parameters.CONTACT)
+        self.add_on_set_parameters_callback(self._change_parameters)
+
+    @property
+    def failure(self) -> str:
+        return "" if self._loop is None else self._loop.failure
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self._activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self._deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self._clean_up)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._deactivate()
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _attempt(self, transition: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            transition()
+        except ParameterError as error:
+            self.refusal = str(error)
+            self.get_logger().error(self.refusal)
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def _configure(self) -> None:
+        settings = parameters.read_contact(self)
+        contact.warm_up(len(settings.tools))
+        own = OwnThread()
+        tools = [
+            Tool(
+                self.create_subscription(
+                    PoseStamped,
+                    f"{name}/measured_cp",
+                    _never_called,
+                    qos.NEWEST,
+                    callback_group=own,
+                    raw=True,
+                ),
+                self.create_publisher(WrenchStamped, f"{name}/spatial/servo_cf", qos.COMMAND),
+                settings.frame_id,
+            )
+            for name in settings.tools
+        ]
+        outlets = Outlets(
+            self.create_publisher(ContactState, "contact_state", qos.state(len(tools))),
+            self.create_publisher(PointCloud2, "deformation", qos.NEWEST),
+        )
+        self._statistics = self.create_publisher(LoopStatistics, "statistics", qos.STATISTICS)
+        self._loop = ContactLoop(settings, tools, outlets, self.context)
+        order = Order(
+            topic=self.resolve_topic_name("vademecum"),
+            node_name=f"_{self.get_name()}_handover",
+            namespace=self.get_namespace(),
+            tip_radii=settings.tip_radii,
+            modes=settings.modes,
+            cloud=settings.cloud,
+        )
+        self._handover = Handover(order, self._take_model, self.get_logger().error)
+
+    def _activate(self) -> None:
+        assert self._loop is not None
+        settings = self._loop.settings
+        granted = realtime.claim(settings.priority, settings.cpu, settings.lock_memory)
+        for refusal in granted.refusals:
+            self.get_logger().warning(refusal)
+        realtime.calm_interpreter()
+        self._loop.record = Record(time.monotonic_ns())
+        self._loop.start(granted.cpu)
+        self._timer = self.create_timer(_STATISTICS_PERIOD, self._publish_statistics)
+
+    def _deactivate(self) -> None:
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+            self._timer = None
+        if self._loop is not None:
+            self._loop.stop()
+
+    def _clean_up(self) -> None:
+        if self._handover is not None:
+            self._handover.stop()
+            self._handover = None
+        self._loop = None
+        for subscription in [s for s in self.subscriptions if s.raw]:
+            self.destroy_subscription(subscription)
+        for publisher in [p for p in self.publishers if p.topic_name.startswith("/")]:
+            if publisher.msg_type in (WrenchStamped, ContactState, PointCloud2, LoopStatistics):
+                self.destroy_publisher(publisher)
+
+    def _take_model(self, prepared: Prepared) -> None:
+        """In the handover's thread: put a vademecum into use between two steps."""
+        loop = self._loop
+        if loop is None:
+            return
+        model = contact.make_model(contact.ModelArrays(**prepared.arrays))
+        replaced = loop.online
+        loop.online = Online(prepared.id, model, loop.settings)
+        self.get_logger().info(f"vademecum {prepared.name!r} ({prepared.id[:12]}) in use")
+        time.sleep(_GRACE)
+        del replaced  # frees its memory here, not in the loop
+
+    def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        """Type and range were checked; those that may change take effect with the next step."""
+        loop = self._loop
+        if loop is not None:
+            changed = {p.name: p.value for p in changes if hasattr(loop.settings, p.name)}
+            loop.settings = replace(loop.settings, **changed)
+        return SetParametersResult(successful=True)
+
+    def _publish_statistics(self) -> None:
+        loop = self._loop
+        if loop is None:
+            return
+        end = time.monotonic_ns()
+        record, loop.record = loop.record, Record(end)
+        message = statistics(record, end, loop.settings.rate)
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._statistics.publish(message)
+        gc.collect()
+
+
+def statistics(record: Record, end: int, rate: float) -> LoopStatistics:
+    """Summary of a record that ended at ``end`` [ns] of a loop with a nominal rate [Hz]."""
+    periods = record.periods[: record.n_periods] * 1e-9
+    computes = record.computes[: record.n_steps] * 1e-9
+    ages = record.ages[: record.n_ages] * 1e-9
+    window = (end - record.begin) * 1e-9
+    period_p50, period_p99, period_max = _percentiles(periods)
+    compute_p50, compute_p99, compute_max = _percentiles(computes)
+    age_p50, age_p99, _ = _percentiles(ages)
+    return LoopStatistics(
+        window=window,
+        rate=len(periods) / window,
+        periods=len(periods),
+        missed=int(np.count_nonzero(periods > LATE / rate)),
+        period_p50=period_p50,
+        period_p99=period_p99,
+        period_max=period_max,
+        compute_p50=compute_p50,
+        compute_p99=compute_p99,
+        compute_max=compute_max,
+        pose_age_p50=age_p50,
+        pose_age_p99=age_p99,
+    )
+
+
+def _percentiles(values: np.ndarray) -> tuple[float, float, float]:
+    """Median, 99th percentile and maximum; NaN of nothing."""
+    if len(values) == 0:
+        return (np.nan, np.nan, np.nan)
+    p50, p99, largest = np.percentile(values, (50, 99, 100))
+    return float(p50), float(p99), float(largest)
+
+
+def _never_called(message: bytes) -> None:
+    """The loop takes poses itself."""
+
+
+def main() -> int:
+    return node_runner.run(ContactNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

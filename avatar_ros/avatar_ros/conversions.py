@@ -1,0 +1,246 @@
+"""Between the core's arrays and ROS messages.
+
+In the loop no message object is built: a message serialised once is a template, in which only
+numbers are written over. Where they lie is not computed but looked for, by serialising messages
+with marks in these places, so the templates hold for whatever serialisation the middleware uses.
+Functions below "In the loop" neither allocate anything large nor raise.
+"""
+
+from __future__ import annotations
+
+import array
+import dataclasses
+import math
+import struct
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Point, PoseStamped, WrenchStamped
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import PointCloud2, PointField
+from shape_msgs.msg import Mesh, MeshTriangle
+from std_msgs.msg import Header
+
+from avatar_ros.msg import Contact, ContactState, VademecumFile, VademecumInfo
+
+POINT_BYTES = 24  # x y z dx dy dz, float32
+_CONTACT_NUMBERS = 10  # position, normal, force, penetration
+_STAMP_BYTES = 8
+_UNIT_NORM_TOLERANCE = 1e-3  # of a quaternion; float32 poses keep 1e-7
+_MARK = 0x5A3C_96E1_1EAD_BEEF
+NO_STAMP = bytes(_STAMP_BYTES)
+
+
+class LayoutError(RuntimeError):
+    """The middleware's serialisation is not what a template needs."""
+
+
+def _find(mark: bytes, serialised: bytes) -> int:
+    start = serialised.find(mark)
+    if start < 0 or serialised.find(mark, start + 1) >= 0:
+        raise LayoutError("a field is not stored once and in full: use rmw_fastrtps_cpp")
+    return start
+
+
+def _find_number(message: Any, set_number: Callable[[float], None]) -> int:
+    """Byte offset of the float64 that ``set_number`` sets in ``message``."""
+    mark: float = struct.unpack("=d", struct.pack("=Q", _MARK))[0]
+    set_number(mark)
+    start = _find(struct.pack("=d", mark), serialize_message(message))
+    set_number(0.0)
+    return start
+
+
+def _find_stamp(message: Any) -> int:
+    message.header.stamp.sec, message.header.stamp.nanosec = 0x5A3C96E1, 0x1EADBEEF
+    start = _find(struct.pack("=iI", 0x5A3C96E1, 0x1EADBEEF), serialize_message(message))
+    message.header.stamp.sec = message.header.stamp.nanosec = 0
+    return start
+
+
+# --- In the loop -----------------------------------------------------------------------------
+
+
+class PoseReader:
+    """Reads serialised PoseStamped of one frame.
+
+    ``read`` returns a status of ContactState; after STATUS_OK ``position`` holds the tip
+    [m] and ``stamp`` the eight bytes of the time stamp.
+    """
+
+    def __init__(self, frame_id: str) -> None:
+        message = PoseStamped(header=Header(frame_id=frame_id))
+        pose = message.pose
+        self._stamp = _find_stamp(message)
+        self._numbers = _find_number(message, lambda x: setattr(pose.position, "x", x))
+        last = _find_number(message, lambda x: setattr(pose.orientation, "w", x))
+        if last != self._numbers + 48:
+            raise LayoutError("a pose is not seven float64 in a row: use rmw_fastrtps_cpp")
+        serialised = serialize_message(message)
+        self._length = last + 8
+        self._encoding = serialised[:2]
+        self._frame_start = self._stamp + _STAMP_BYTES
+        mark = frame_id.encode() + b"\0"
+        self._frame_end = serialised.index(mark, self._frame_start) + len(mark)
+        self._frame = serialised[self._frame_start : self._frame_end]
+        self._unpack = struct.Struct("=7d").unpack_from
+        self.position = (0.0, 0.0, 0.0)
+        self.stamp = NO_STAMP
+
+    def read(self, raw: bytes) -> int:
+        if raw[self._frame_start : self._frame_end] != self._frame:
+            return int(ContactState.STATUS_UNKNOWN_FRAME)
+        stamp = raw[self._stamp : self._frame_start]
+        if len(raw) < self._length or raw[:2] != self._encoding or stamp == NO_STAMP:
+            return int(ContactState.STATUS_INVALID_POSE)
+        x, y, z, i, j, k, w = self._unpack(raw, self._numbers)
+        norm = i * i + j * j + k * k + w * w
+        if not math.isfinite(x + y + z) or not abs(norm - 1.0) < 2.0 * _UNIT_NORM_TOLERANCE:
+            return int(ContactState.STATUS_INVALID_POSE)
+        self.position = (x, y, z)
+        self.stamp = stamp
+        return int(ContactState.STATUS_OK)
+
+
+def stamp_nanoseconds(stamp: bytes) -> int:
+    """Time of a stamp since the epoch of its clock [ns]."""
+    seconds, nanoseconds = struct.unpack("=iI", stamp)
+    return int(seconds * 1_000_000_000 + nanoseconds)
+
+
+class WrenchTemplate:
+    """A serialised WrenchStamped; ``force`` and ``torque`` are views of its numbers."""
+
+    def __init__(self, frame_id: str) -> None:
+        message = WrenchStamped(header=Header(frame_id=frame_id))
+        wrench = message.wrench
+        start = _find_number(message, lambda x: setattr(wrench.force, "x", x))
+        last = _find_number(message, lambda x: setattr(wrench.torque, "z", x))
+        if last != start + 40:
+            raise LayoutError("a wrench is not six float64 in a row: use rmw_fastrtps_cpp")
+        self._stamp = _find_stamp(message)
+        self._buffer = bytearray(serialize_message(message))
+        numbers = np.frombuffer(self._buffer, dtype=np.float64, count=6, offset=start)
+        self.force, self.torque = numbers[:3], numbers[3:]
+
+    def serialise(self, stamp: bytes) -> bytes:
+        self._buffer[self._stamp : self._stamp + _STAMP_BYTES] = stamp
+        return bytes(self._buffer)
+
+
+class CloudTemplate:
+    """A serialised PointCloud2; ``points`` is a view of its numbers, shape (n_points, 6)."""
+
+    def __init__(self, frame_id: str, n_points: int) -> None:
+        names = ("x", "y", "z", "dx", "dy", "dz")
+        message = PointCloud2(
+            header=Header(frame_id=frame_id),
+            height=1,
+            width=n_points,
+            fields=[
+                PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
+                for i, name in enumerate(names)
+            ],
+            point_step=POINT_BYTES,
+            row_step=POINT_BYTES * n_points,
+            is_dense=True,
+        )
+        self._stamp = _find_stamp(message)
+        mark = struct.pack("=QQQ", _MARK, _MARK ^ 1, _MARK ^ 2)
+        data = array.array("B", bytes(POINT_BYTES * n_points))
+        data[:POINT_BYTES] = array.array("B", mark)
+        message.data = data
+        self._buffer = bytearray(serialize_message(message))
+        start = _find(mark, bytes(self._buffer))
+        self.points = np.frombuffer(
+            self._buffer, dtype=np.float32, count=6 * n_points, offset=start
+        ).reshape(n_points, 6)
+        self.points[:] = 0.0
+
+    def serialise(self, stamp: bytes) -> bytes:
+        self._buffer[self._stamp : self._stamp + _STAMP_BYTES] = stamp
+        return bytes(self._buffer)
+
+
+class StateTemplate:
+    """A serialised ContactState with room for ``capacity`` contacts.
+
+    ``contacts`` is a view of their numbers, shape (capacity, 10): position, normal, force,
+    penetration.
+    """
+
+    def __init__(self, frame_id: str, tool: str, vademecum_id: str, capacity: int) -> None:
+        message = ContactState(
+            header=Header(frame_id=frame_id),
+            tool=tool,
+            vademecum_id=vademecum_id,
+            contacts=[Contact() for _ in range(capacity)],
+            force_error=math.nan,
+        )
+        contact = message.contacts[0]
+        self._stamp = _find_stamp(message)
+        self._status = _status_offset(message)
+        start = _find_number(message, lambda x: setattr(contact.position, "x", x))
+        last = _find_number(message, lambda x: setattr(contact, "penetration", x))
+        serialised = serialize_message(message)
+        self._head = bytearray(serialised[:start])
+        self._tail = serialised[start + 8 * _CONTACT_NUMBERS * capacity :]
+        self._block = bytearray(8 * _CONTACT_NUMBERS * capacity)
+        self.contacts = np.frombuffer(self._block, dtype=np.float64).reshape(capacity, -1)
+        self._count = serialised.rindex(struct.pack("=I", capacity), 0, start)
+        self._capacity = capacity
+        if last != start + 72 or not self._agrees_with(message, 0):
+            raise LayoutError("contacts are not ten float64 each in a row: use rmw_fastrtps_cpp")
+        if not self._agrees_with(message, min(2, capacity)):
+            raise LayoutError("contacts are not stored one after another: use rmw_fastrtps_cpp")
+
+    def serialise(self, stamp: bytes, status: int, n_contacts: int) -> bytes:
+        head = self._head
+        head[self._stamp : self._stamp + _STAMP_BYTES] = stamp
+        head[self._status] = status
+        head[self._count : self._count + 4] = n_contacts.to_bytes(4, sys.byteorder)
+        used = 8 * _CONTACT_NUMBERS * n_contacts
+        return bytes(head) + bytes(memoryview(self._block)[:used]) + self._tail
+
+    def _agrees_with(self, message: ContactState, n_contacts: int) -> bool:
+        message.contacts = message.contacts[:0] + [Contact() for _ in range(n_contacts)]
+        return serialize_message(message) == self.serialise(NO_STAMP, 0, n_contacts)
+
+
+def _status_offset(message: ContactState) -> int:
+    """Byte offset of the status: the only byte that changes with it."""
+    before = serialize_message(message)
+    message.status = 0xA5
+    after = serialize_message(message)
+    message.status = 0
+    changed = [i for i, (a, b) in enumerate(zip(before, after, strict=True)) if a != b]
+    if len(changed) != 1:
+        raise LayoutError("the status is not stored in one byte: use rmw_fastrtps_cpp")
+    return changed[0]
+
+
+# --- Outside the loop ------------------------------------------------------------------------
+
+
+def vademecum_info(info: Any, header: Header) -> VademecumInfo:
+    """The message of ``avatar_core.vademecum.VademecumInfo``, field by field."""
+    return VademecumInfo(header=header, **dataclasses.asdict(info))
+
+
+def vademecum_file(identity: str, name: str, data: bytes) -> VademecumFile:
+    message = VademecumFile(id=identity, name=name)
+    message.data = array.array("B", data)  # assigning bytes would check each one: 100 times slower
+    return message
+
+
+def surface_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Triangles in the organ frame; ``vertices`` (n, 3) [m], ``faces`` (m, 3)."""
+    return Mesh(
+        vertices=[Point(x=x, y=y, z=z) for x, y, z in vertices.astype(np.float64).tolist()],
+        triangles=[
+            MeshTriangle(vertex_indices=np.asarray(face, dtype=np.uint32)) for face in faces
+        ],
+    )
+

@@ -1,0 +1,267 @@
+"""A vademecum on its way into the loop's process, without the loop noticing.
+
+Deserialising 40 MB, verifying them and preparing the contact model would each hold Python's
+global lock for tens of milliseconds. A process of its own does all three: it subscribes to
+`vademecum`, and puts the prepared arrays into a sealed piece of shared memory, whose handle it
+sends through a socket. The loop's process only maps that memory; nothing lies in a file system.
+
+Run as ``python -m avatar_ros.handover JSON`` by ``Handover``, never by hand.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import mmap
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from avatar_ros import realtime
+
+_ALIGNMENT = 64
+_PACKET = 1 << 16
+_RESTART_DELAY = 1.0  # [s]
+_STOP_TIMEOUT = 1.0  # [s]
+_SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the receiving process prepares, and where it gets it."""
+
+    topic: str
+    node_name: str
+    namespace: str
+    tip_radii: tuple[float, ...]
+    modes: int | None
+    cloud: str
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A verified vademecum's contact model as arrays in shared memory."""
+
+    id: str
+    name: str
+    arrays: dict[str, np.ndarray]
+
+
+class Handover:
+    """Keeps the receiving process running and calls back with what it prepared.
+
+    Both callbacks run in a thread of this object, one at a time.
+
+    on_model : called with each vademecum that was verified and prepared
+    on_refusal : called with one line when one was refused or the process ended
+    """
+
+    def __init__(
+        self,
+        order: Order,
+        on_model: Callable[[Prepared], None],
+        on_refusal: Callable[[str], None],
+    ) -> None:
+        self._order = order
+        self._on_model = on_model
+        self._on_refusal = on_refusal
+        self._stop = threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._thread = threading.Thread(target=self._supervise, name="handover", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the receiving process; returns when it has ended."""
+        self._stop.set()
+        process = self._process
+        if process is not None:
+            _end(process)
+        self._thread.join(_STOP_TIMEOUT)
+
+    def _supervise(self) -> None:
+        while not self._stop.is_set():
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            with ours:
+                with theirs:
+                    self._process = _start(self._order, theirs)
+                self._receive(ours)
+            _end(self._process)
+            if not self._stop.is_set():
+                self._on_refusal("the process that receives vademecums ended; starting another")
+                self._stop.wait(_RESTART_DELAY)
+
+    def _receive(self, ours: socket.socket) -> None:
+        while True:
+            packet, handles, _, _ = socket.recv_fds(ours, _PACKET, 1)
+            if not packet:
+                return
+            note = json.loads(packet)
+            if handles:
+                self._on_model(Prepared(note["id"], note["name"], _map(handles[0], note["arrays"])))
+            else:
+                self._on_refusal(note["refusal"])
+
+
+def _start(order: Order, theirs: socket.socket) -> subprocess.Popen[bytes]:
+    environment = realtime.single_threaded_libraries(dict(os.environ))
+    return subprocess.Popen(
+        [sys.executable, "-m", "avatar_ros.handover", json.dumps(asdict(order))],
+        stdin=theirs,
+        pass_fds=(),
+        env=environment,
+        start_new_session=True,  # Ctrl-C is for the node, which then ends this one
+    )
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_STOP_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+# --- Arrays in shared memory -----------------------------------------------------------------
+
+
+def share(arrays: dict[str, np.ndarray]) -> tuple[int, list[dict[str, Any]]]:
+    """Copy arrays into sealed anonymous shared memory; returns its handle and a table of contents.
+
+    Sealed: neither side can change or shorten it afterwards, so a fault in one cannot reach the
+    other through it.
+    """
+    contents = []
+    end = 0
+    for name, values in arrays.items():
+        start = -(-end // _ALIGNMENT) * _ALIGNMENT
+        end = start + values.nbytes
+        contents.append(
+            {"name": name, "start": start, "shape": values.shape, "dtype": values.dtype.str}
+        )
+    handle = os.memfd_create("avatar-model", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    os.ftruncate(handle, max(end, 1))
+    with mmap.mmap(handle, max(end, 1)) as memory:
+        for entry, values in zip(contents, arrays.values(), strict=True):
+            _view(memory, entry)[...] = values
+    fcntl.fcntl(handle, fcntl.F_ADD_SEALS, _SEALS)
+    return handle, contents
+
+
+def _map(handle: int, contents: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Map shared arrays, private to this process, with all pages present; closes the handle."""
+    try:
+        # Writable, but a private copy: jitted code compiled for ordinary arrays accepts it.
+        memory = mmap.mmap(handle, 0, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE)
+    finally:
+        os.close(handle)
+    realtime.bring_into_memory(np.frombuffer(memory, dtype=np.uint8))
+    return {entry["name"]: _view(memory, entry) for entry in contents}
+
+
+def _view(memory: mmap.mmap, entry: dict[str, Any]) -> np.ndarray:
+    return np.ndarray(tuple(entry["shape"]), entry["dtype"], memory, entry["start"])
+
+
+# --- The receiving process -------------------------------------------------------------------
+
+
+class Receiver:
+    """Verifies and prepares what comes in, and reports through a socket."""
+
+    def __init__(self, order: Order, report: socket.socket) -> None:
+        self._order = order
+        self._report = report
+        self._current = ""
+
+    def receive(self, identity: str, name: str, data: memoryview) -> None:
+        if identity == self._current:
+            return  # a loader that was started again
+        try:
+            arrays = self._prepare(identity, data)
+        except Exception as error:  # whatever a file from elsewhere provokes, the loop goes on
+            reason = " ".join(str(error).split()) or type(error).__name__
+            self._send({"refusal": f"vademecum {name!r} refused: {reason}"})
+            return
+        handle, contents = share(arrays)
+        try:
+            self._send({"id": identity, "name": name, "arrays": contents}, handle)
+        finally:
+            os.close(handle)
+        self._current = identity
+
+    def _prepare(self, identity: str, data: memoryview) -> dict[str, np.ndarray]:
+        from avatar_core import contact, storage
+
+        if hashlib.sha256(data).hexdigest() != identity:
+            raise ValueError("altered on the way, its checksum differs: load it again")
+        handle = os.memfd_create("avatar-vademecum", os.MFD_CLOEXEC)
+        try:
+            with open(handle, "wb", closefd=False) as file:
+                file.write(data)
+            vademecum = storage.load_vademecum(f"/proc/self/fd/{handle}")
+        finally:
+            os.close(handle)
+        order = self._order
+        arrays = contact.model_arrays(
+            vademecum, tuple(order.tip_radii), order.modes, order.cloud
+        )
+        return dict(arrays._asdict())
+
+    def _send(self, note: dict[str, Any], *handles: int) -> None:
+        socket.send_fds(self._report, [json.dumps(note).encode()], handles)
+
+
+def main() -> int:
+    realtime.die_with_parent(signal.SIGTERM)
+    realtime.release()
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    from avatar_ros import qos
+    from avatar_ros.msg import VademecumFile
+    from avatar_ros.node_runner import StopSignal
+
+    stop = StopSignal()
+    order = Order(**json.loads(sys.argv[1]))
+    report = socket.socket(fileno=os.dup(sys.stdin.fileno()))
+    receiver = Receiver(order, report)
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node(
+        order.node_name,
+        namespace=order.namespace,
+        start_parameter_services=False,
+        enable_rosout=False,
+    )
+    node.create_subscription(
+        VademecumFile,
+        order.topic,
+        lambda message: receiver.receive(message.id, message.name, memoryview(message.data)),
+        qos.LATCHED,
+    )
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stop:
+            executor.spin_once(timeout_sec=0.1)
+    except BrokenPipeError:
+        pass  # the node is gone
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,210 @@
+"""The parameters of the nodes: each declared once, with type, default, range and meaning."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+
+CLOUDS = ("surface", "volume", "off")
+_TOOL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
+_TIP_RADIUS_RANGE = (0.002, 0.020)
+
+
+class ParameterError(ValueError):
+    """A parameter has a value that the node cannot work with; the message says what it takes."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a node.
+
+    range : smallest and largest value of a number
+    any_type : the type may differ from the default's; checked where it is read
+    """
+
+    name: str
+    default: Any
+    description: str
+    range: tuple[float, float] | None = None
+    read_only: bool = True
+    any_type: bool = False
+
+    def descriptor(self) -> ParameterDescriptor:
+        descriptor = ParameterDescriptor(
+            description=self.description, read_only=self.read_only, dynamic_typing=self.any_type
+        )
+        if self.range is not None and isinstance(self.default, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=self.range[0], to_value=self.range[1])
+            ]
+        elif self.range is not None:
+            low, high = (int(bound) for bound in self.range)
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+        return descriptor
+
+    def wanted(self) -> str:
+        kind = "a number with a decimal point" if isinstance(self.default, float) else "a value"
+        bounds = f" from {self.range[0]:g} to {self.range[1]:g}" if self.range else ""
+        return f"{kind}{bounds} like {self.default!r}"
+
+
+AUTOSTART = Parameter(
+    "autostart", True, "configure and activate at start; false: wait for lifecycle transitions"
+)
+FRAME_ID = Parameter("frame_id", "organ", "frame of the organ; poses in other frames are refused")
+
+VADEMECUM_LOADER = (
+    AUTOSTART,
+    FRAME_ID,
+    Parameter("library_dir", ".", "directory of the vademecums; nothing outside it is read"),
+    Parameter("vademecum", "", "file in library_dir to load at start; empty: none"),
+    Parameter("max_megabytes", 1024, "largest file that is read [MB]", range=(1, 65536)),
+)
+
+CONTACT = (
+    AUTOSTART,
+    FRAME_ID,
+    Parameter("tools", ["tool"], "names of the tools; each has its topics below NAME/"),
+    Parameter(
+        "tip_radius",
+        0.005,
+        "radius of the spherical tool tips [m], 0.002 to 0.020; one number or one per tool",
+        any_type=True,
+    ),
+    Parameter("rate", 1000.0, "steps per second [Hz]", range=(100.0, 2000.0)),
+    Parameter("cloud", "surface", "vertices in deformation: surface, volume or off"),
+    Parameter(
+        "cloud_divisor",
+        1,
+        "deformation is published every so many steps",
+        range=(1, 1000),
+        read_only=False,
+    ),
+    Parameter("modes", 0, "modes of the far field in use; 0: all", range=(0, 100_000)),
+    Parameter(
+        "pose_timeout",
+        0.02,
+        "age of the last pose, by the time it came in, from which force is zero [s]",
+        range=(0.002, 1.0),
+        read_only=False,
+    ),
+    Parameter(
+        "realtime.priority", 0, "SCHED_FIFO priority asked for; 0: ordinary", range=(0, 98)
+    ),
+    Parameter("realtime.cpu", -1, "core the loop is bound to; -1: any", range=(-1, 1023)),
+    Parameter("realtime.lock_memory", True, "keep the process in memory; needs a priority"),
+)
+
+
+@dataclass(frozen=True)
+class LoaderSettings:
+    library_dir: str
+    vademecum: str
+    frame_id: str
+    max_bytes: int
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """Parameters of the contact node; rates [Hz], times [s], radii [m]."""
+
+    tools: tuple[str, ...]
+    tip_radii: tuple[float, ...]
+    rate: float
+    cloud: str
+    cloud_divisor: int
+    modes: int | None
+    frame_id: str
+    pose_timeout: float
+    priority: int
+    cpu: int
+    lock_memory: bool
+
+
+def declare(node: Node, parameters: tuple[Parameter, ...]) -> None:
+    """Declare all, with the values given by files and command line.
+
+    Raises
+    ------
+    ParameterError : a given value has the wrong type or lies out of range
+    """
+    for parameter in parameters:
+        try:
+            node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            raise ParameterError(
+                f"parameter {parameter.name}: give {parameter.wanted()} ({parameter.description})"
+            ) from error
+
+
+def read_loader(node: Node) -> LoaderSettings:
+    value = _values(node, VADEMECUM_LOADER)
+    return LoaderSettings(
+        library_dir=os.path.expanduser(value["library_dir"]),
+        vademecum=value["vademecum"],
+        frame_id=_frame(value["frame_id"]),
+        max_bytes=value["max_megabytes"] * 1_000_000,
+    )
+
+
+def read_contact(node: Node) -> ContactSettings:
+    """The contact node's parameters, checked against one another.
+
+    Raises
+    ------
+    ParameterError : naming the parameter and what it takes
+    """
+    value = _values(node, CONTACT)
+    tools = tuple(value["tools"])
+    if not tools or len(set(tools)) != len(tools):
+        raise ParameterError("parameter tools: give at least one name, each once")
+    for tool in tools:
+        if not _TOOL_NAME.fullmatch(tool):
+            raise ParameterError(f"parameter tools: {tool!r} cannot be part of a topic's name")
+    if value["cloud"] not in CLOUDS:
+        raise ParameterError(f"parameter cloud: give one of {', '.join(CLOUDS)}")
+    return ContactSettings(
+        tools=tools,
+        tip_radii=_tip_radii(value["tip_radius"], len(tools)),
+        rate=value["rate"],
+        cloud=value["cloud"],
+        cloud_divisor=value["cloud_divisor"],
+        modes=value["modes"] or None,
+        frame_id=_frame(value["frame_id"]),
+        pose_timeout=value["pose_timeout"],
+        priority=value["realtime.priority"],
+        cpu=value["realtime.cpu"],
+        lock_memory=value["realtime.lock_memory"],
+    )
+
+
+def _values(node: Node, parameters: tuple[Parameter, ...]) -> dict[str, Any]:
+    return {p.name: node.get_parameter(p.name).value for p in parameters}
+
+
+def _frame(name: str) -> str:
+    if not name:
+        raise ParameterError("parameter frame_id: give the name of the organ's frame")
+    return name
+
+
+def _tip_radii(value: Any, n_tools: int) -> tuple[float, ...]:
+    numbers = [value] if isinstance(value, int | float) else value
+    low, high = _TIP_RADIUS_RANGE
+    try:
+        radii = [float(number) for number in numbers]
+    except (TypeError, ValueError):
+        radii = []
+    if len(radii) == 1:
+        radii *= n_tools
+    if len(radii) != n_tools or not all(low <= radius <= high for radius in radii):
+        raise ParameterError(
+            f"parameter tip_radius: give one number or {n_tools}, from {low:g} to {high:g} m"
+        )
+    return tuple(radii)

@@ -1,0 +1,179 @@
+"""The loader: verifies a vademecum file and announces it, whole, to whoever needs it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rclpy.lifecycle
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from shape_msgs.msg import Mesh
+from std_msgs.msg import Header
+
+from avatar_core import storage
+from avatar_core.errors import AvatarError
+from avatar_ros import conversions, node_runner, parameters, qos
+from avatar_ros.msg import VademecumFile, VademecumInfo
+from avatar_ros.parameters import LoaderSettings, ParameterError
+from avatar_ros.srv import LoadVademecum
+
+
+class RefusedError(AvatarError):
+    """A file that is not offered by this loader."""
+
+
+def find_in_library(name: str, library_dir: str, max_bytes: int) -> Path:
+    """The file ``name`` of the library.
+
+    Raises
+    ------
+    RefusedError : it lies outside, is no regular file, is missing or too large
+    """
+    if not name or "\0" in name:
+        raise RefusedError("no file name: give one in library_dir")
+    wanted = Path(name)
+    if wanted.is_absolute() or ".." in wanted.parts:
+        raise RefusedError(f"{name}: give a path inside library_dir, not absolute and without ..")
+    library = Path(library_dir).resolve()
+    try:
+        path = (library / wanted).resolve(strict=True)
+        status = path.stat()
+    except (OSError, RuntimeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "links to itself"
+        raise RefusedError(f"{name}: {reason}; the library is {library}") from error
+    if not path.is_relative_to(library):
+        raise RefusedError(f"{name}: a link out of library_dir; copy the file into {library}")
+    if not stat.S_ISREG(status.st_mode):
+        raise RefusedError(f"{name}: not a file")
+    if status.st_size > max_bytes:
+        raise RefusedError(
+            f"{name}: {status.st_size / 1e6:.0f} MB; raise max_megabytes to read it"
+        )
+    return path
+
+
+class LoaderNode(rclpy.lifecycle.LifecycleNode):
+    """Announces one vademecum at a time; a refused file leaves the one before in place.
+
+    refusal : why the last transition failed
+    failure : always empty, nothing in this node can end it
+    """
+
+    def __init__(self) -> None:
+        super().__init__("vademecum_loader")
+        self.refusal = ""
+        self.failure = ""
+        self._settings: LoaderSettings | None = None
+        self._outlets: dict[type, Any] = {}
+        self._service: Any = None
+        parameters.declare(self, parameters.VADEMECUM_LOADER)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self._activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._deactivate()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._deactivate()
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _attempt(self, transition: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            transition()
+        except (ParameterError, AvatarError, OSError, MemoryError) as error:
+            self.refusal = str(error)
+            self.get_logger().error(self.refusal)
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def _configure(self) -> None:
+        self._settings = parameters.read_loader(self)
+        if not os.path.isdir(self._settings.library_dir):
+            raise ParameterError(
+                f"parameter library_dir: {self._settings.library_dir} is not a directory"
+            )
+        self._outlets = {
+            kind: self.create_publisher(kind, topic, qos.LATCHED)
+            for kind, topic in (
+                (VademecumInfo, "vademecum_info"),
+                (Mesh, "rest_surface"),
+                (VademecumFile, "vademecum"),
+            )
+        }
+
+    def _activate(self) -> None:
+        assert self._settings is not None
+        if self._settings.vademecum:
+            self.load(self._settings.vademecum)
+        self._service = self.create_service(LoadVademecum, "load_vademecum", self._answer)
+
+    def _deactivate(self) -> None:
+        if self._service is not None:
+            self.destroy_service(self._service)
+            self._service = None
+
+    def _clean_up(self) -> None:
+        for publisher in self._outlets.values():
+            self.destroy_publisher(publisher)
+        self._outlets = {}
+
+    def load(self, name: str) -> VademecumInfo:
+        """Verify a file of the library and announce it.
+
+        Raises
+        ------
+        AvatarError, OSError : the file is refused; nothing was announced
+        """
+        assert self._settings is not None
+        path = find_in_library(name, self._settings.library_dir, self._settings.max_bytes)
+        vademecum = storage.load_vademecum(path)
+        data = path.read_bytes()
+        if hashlib.sha256(data).hexdigest() != vademecum.id:
+            raise RefusedError(f"{name}: changed while it was read; load it again")
+        header = Header(
+            frame_id=self._settings.frame_id, stamp=self.get_clock().now().to_msg()
+        )
+        info = conversions.vademecum_info(vademecum.info(), header)
+        surface = conversions.surface_mesh(vademecum.surface_vertices, vademecum.surface_faces)
+        self._outlets[VademecumInfo].publish(info)
+        self._outlets[Mesh].publish(surface)
+        self._outlets[VademecumFile].publish(
+            conversions.vademecum_file(vademecum.id, vademecum.name, data)
+        )
+        self.get_logger().info(
+            f"announced {vademecum.name!r} ({vademecum.id[:12]}), {len(data) / 1e6:.1f} MB"
+        )
+        return info
+
+    def _answer(
+        self, request: LoadVademecum.Request, response: LoadVademecum.Response
+    ) -> LoadVademecum.Response:
+        try:
+            response.info = self.load(request.name)
+            response.success = True
+        except Exception as error:  # a service always answers; the file decides what is raised
+            response.message = " ".join(str(error).split()) or type(error).__name__
+            self.get_logger().error(f"load_vademecum: {response.message}")
+        return response
+
+
+def main() -> int:
+    return node_runner.run(LoaderNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
