@@ -25,6 +25,10 @@ from avatar_core.vademecum import Convergence, Provenance, RankError, Vademecum
 
 Progress = Callable[[str, float], None]
 
+
+def _silent(stage: str, fraction: float) -> None:
+    """Report nothing."""
+
 _BATCH = 40  # load positions solved at once
 _WORST_OVER_MEAN = 2.5  # the worst load may be this much worse than the mean asked for
 
@@ -48,7 +52,7 @@ class BuildRule:
     oversampling: float = 1.2
     near_inner: float = 1.6
     near_outer: float = 3.0
-    contact_support: float = 3.5
+    contact_support: float = 4.0
     max_sample_bytes: int = 400_000_000
 
 
@@ -59,7 +63,7 @@ def build_vademecum(
     surface: LoadSurface,
     rule: BuildRule,
     provenance: Provenance,
-    progress: Progress = lambda stage, fraction: None,
+    progress: Progress = _silent,
 ) -> Vademecum:
     """Compute the vademecum of one organ; see the module docstring for the stages.
 

@@ -143,3 +143,26 @@ def _vertex_contact(
         )
         for k, i in enumerate(some)
     )
+
+
+def mesh_error(
+    vademecum: Vademecum, elasticity: Elasticity, n_loads: int = 8
+) -> tuple[float, float]:
+    """Mean change of the reference itself when every tetrahedron is split into eight.
+
+    Returns
+    -------
+    l2, contact : relative changes of displacement at the vertices and of the patch compliance
+    """
+    refined = elasticity.refined()
+    surface = vademecum.surface
+    chosen = np.random.default_rng(0).permutation(len(surface.corners))[:n_loads]
+    where = surface.centroids[chosen], surface.centroid_normals[chosen]
+    coarse, coarse_compliance = _reference(elasticity, *where, vademecum)
+    fine, fine_compliance = _reference(refined, *where, vademecum)
+    fine = fine[:, : coarse.shape[1]]  # refinement appends its vertices
+    l2 = [_l2(vademecum, coarse[k], fine[k]) for k in range(len(chosen))]
+    contact = [
+        _frobenius(coarse_compliance[k], fine_compliance[k]) for k in range(len(chosen))
+    ]
+    return float(np.mean(l2)), float(np.mean(contact))

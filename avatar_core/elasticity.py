@@ -19,6 +19,7 @@ from typing import Literal
 import numpy as np
 import rslab
 import scipy.sparse as sp
+from scipy.spatial import cKDTree
 from skfem import (
     Basis,
     BilinearForm,
@@ -30,7 +31,7 @@ from skfem import (
 from skfem.helpers import ddot, div, sym_grad
 
 from avatar_core.errors import ConvergenceError, MaterialError
-from avatar_core.mesh import TetMesh
+from avatar_core.mesh import TetMesh, make_mesh
 
 Element = Literal["P1", "P2", "Taylor-Hood"]
 
@@ -119,6 +120,7 @@ class Elasticity:
         element: Element | None = None,
     ) -> None:
         self.mesh, self.material = mesh, material
+        self._clamped_faces = clamped
         self.element: Element = element or material.element
         self._skfem_mesh = MeshTet(
             np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
@@ -139,6 +141,27 @@ class Elasticity:
     def n_nodes(self) -> int:
         """Number of displacement nodes."""
         return len(self._dofs) // 3
+
+    def refined(self) -> Elasticity:
+        """The same problem with every tetrahedron split into eight; vertices keep their numbers."""
+        fine = self._skfem_mesh.refined(1)
+        tets = fine.t.T.copy()
+        turned = TetMesh(fine.p.T, tets).tet_volumes < 0
+        tets[turned] = tets[turned][:, [0, 2, 1, 3]]
+        mesh = make_mesh(fine.p.T, tets)
+        clamped_at = self.mesh.vertices[self.mesh.boundary_faces]
+        parent = cKDTree(clamped_at.mean(axis=1))
+        center = mesh.vertices[mesh.boundary_faces].mean(axis=1)
+        # a quarter's centroid lies nearest to its own parent's or in the parent's plane
+        candidates = parent.query(center, k=4)[1]
+        inside = np.array(
+            [
+                [_contains(clamped_at[face], point) for face in row]
+                for row, point in zip(candidates, center, strict=True)
+            ]
+        )
+        owner = candidates[np.arange(len(center)), inside.argmax(axis=1)]
+        return Elasticity(mesh, self.material, self._clamped_faces[owner], self.element)
 
     @cached_property
     def face_nodes(self) -> np.ndarray:
@@ -192,6 +215,11 @@ class Elasticity:
             system = self.stiffness[free][:, free]
         return rslab.ldlt(sp.csc_matrix(system))
 
+    @property
+    def factor_bytes(self) -> int:
+        """Memory of the factorization [bytes]."""
+        return 12 * int(self._factor.factor_nnz)  # a value and its share of an index
+
     def solve(self, loads: np.ndarray | sp.spmatrix) -> np.ndarray:
         """Displacements u = K^-1 f under nodal forces, zero at the clamp.
 
@@ -241,3 +269,12 @@ class Elasticity:
     def at_vertices(self, displacement: np.ndarray) -> np.ndarray:
         """The vertex part of nodal displacements, shape (3 n_vertices, n)."""
         return displacement[: 3 * len(self.mesh.vertices)]
+
+
+def _contains(triangle: np.ndarray, point: np.ndarray) -> bool:
+    """Whether a point of the triangle's plane lies in it, with a little slack."""
+    edges = (triangle[1] - triangle[0], triangle[2] - triangle[0])
+    weight = np.linalg.lstsq(np.stack(edges, axis=1), point - triangle[0], rcond=None)[0]
+    gap = point - triangle[0] - weight @ np.stack(edges)
+    on_plane = np.linalg.norm(gap) < 1e-6 * np.linalg.norm(edges[0])
+    return bool(on_plane and weight.min() > -1e-6 and weight.sum() < 1 + 1e-6)

@@ -158,9 +158,7 @@ def candidate_rotations() -> FloatArray:
     """The 24 rotations that permute the axes, each alone and under six tilts; (168, 3, 3)."""
     tilts = np.vstack([np.zeros(3), np.eye(3), -np.eye(3)]) * np.radians(TILT)
     turned = Rotation.create_group("O").as_matrix()
-    return np.array(
-        [t @ r for t, r in product(Rotation.from_rotvec(tilts).as_matrix(), turned)]
-    )
+    return np.array([t @ r for t, r in product(Rotation.from_rotvec(tilts).as_matrix(), turned)])
 
 
 def _compared(surface: SurfaceMesh) -> DistanceGrid:
@@ -174,6 +172,4 @@ def _compared(surface: SurfaceMesh) -> DistanceGrid:
     n = 2 * round(COMPARED_HALF_WIDTH / COMPARED_SPACING) + 1
     origin = np.full(3, -COMPARED_HALF_WIDTH)
     values = signed_distance(grid_points(origin, COMPARED_SPACING, (n, n, n)), moved)
-    return DistanceGrid(
-        origin, COMPARED_SPACING, np.clip(values, *COMPARED_RANGE).reshape(n, n, n)
-    )
+    return DistanceGrid(origin, COMPARED_SPACING, np.clip(values, *COMPARED_RANGE).reshape(n, n, n))

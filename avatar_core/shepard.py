@@ -16,8 +16,8 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-N_FIT = 15  # neighbours of each quadratic
-N_BLEND = 9  # positions that reach a point, about
+N_FIT = 10  # neighbours of each quadratic
+N_BLEND = 8  # positions that reach a point, about
 MAX_STENCIL = 160
 _AT_NODE = 1e-7  # [m] closer than this, a point is the position itself
 

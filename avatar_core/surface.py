@@ -10,6 +10,7 @@ import hashlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 PLAUSIBLE_EXTENT = (0.05, 0.5)  # largest extent of an organ [m]
 STRAY_FRACTION = 0.02  # components below this part of the volume are dropped
 AMBIGUOUS_FRACTION = 0.05  # whole organs measure 0, organs cut in half 0.17 and more
-MAX_LABEL_BYTES = 2**31  # of a decompressed label map
+MAX_LABEL_BYTES = 2**30  # of a decompressed label map
 LABEL_SPACING = 2.0  # label maps finer than this are averaged to it [mm]
 
 _DIRECTIONS = {
@@ -255,9 +256,7 @@ def winding_number(surface: SurfaceMesh, points: FloatArray) -> FloatArray:
 def _clear_winding(surface: SurfaceMesh, n: int = 24, band: float = 0.02) -> FloatArray:
     """Winding number on an n^3 grid in the bounding box, off the surface by band x diagonal."""
     points = _box_points(*surface.bounding_box, (n, n, n))
-    squared, _, _ = igl.point_mesh_squared_distance(
-        points, surface.vertices, _int64(surface.faces)
-    )
+    squared, _, _ = igl.point_mesh_squared_distance(points, surface.vertices, _int64(surface.faces))
     clear = squared > (band * np.linalg.norm(surface.extent)) ** 2
     return winding_number(surface, points[clear])
 
@@ -390,16 +389,16 @@ def _winding_volume(surface: SurfaceMesh, n: int = 48) -> float:
     low = surface.bounding_box[0] - h
     cells = np.ceil(surface.extent / h).astype(int) + 2
     points = _box_points(low, low + h * cells, cells.tolist())
-    squared, _, _ = igl.point_mesh_squared_distance(
-        points, surface.vertices, _int64(surface.faces)
-    )
+    squared, _, _ = igl.point_mesh_squared_distance(points, surface.vertices, _int64(surface.faces))
     sign = np.where(np.abs(winding_number(surface, points)) > 0.5, -1.0, 1.0)
     return float(h**3 * np.clip(0.5 - sign * np.sqrt(squared) / h, 0.0, 1.0).sum())
 
 
 def _box_points(low: FloatArray, high: FloatArray, shape: Iterable[int]) -> FloatArray:
     """Centres of the cells of a box divided into shape cells, shape (product, 3)."""
-    axes = [a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, shape, strict=True)]
+    axes = [
+        a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, shape, strict=True)
+    ]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -510,9 +509,7 @@ def _read_obj(path: Path) -> Soup:
 def _fan(polygons: Iterable[Iterable[int]]) -> IntArray:
     """Split polygons into triangles that share their first corner, shape (m, 3)."""
     triangles = [
-        (corners[0], b, c)
-        for corners in map(list, polygons)
-        for b, c in zip(corners[1:-1], corners[2:], strict=True)
+        (corners[0], b, c) for corners in map(list, polygons) for b, c in pairwise(corners[1:])
     ]
     return np.array(triangles, dtype=np.int64).reshape(-1, 3)
 
@@ -523,7 +520,8 @@ def _by_meshio(reader: str) -> Callable[[Path], Soup]:
     def read(path: Path) -> Soup:
         import meshio
 
-        mesh = getattr(meshio, reader).read(str(path))
+        with np.errstate(over="ignore"):  # its test for binary STL overflows on text
+            mesh = getattr(meshio, reader).read(str(path))
         blocks = [c.data for c in mesh.cells if c.type in ("triangle", "quad", "polygon")]
         faces = [_fan(block.tolist()) for block in blocks]
         points = np.asarray(mesh.points, dtype=np.float64)
@@ -533,7 +531,7 @@ def _by_meshio(reader: str) -> Callable[[Path], Soup]:
 
 
 def _read_vtk(path: Path) -> Soup:
-    """Legacy VTK: polygonal data by VTK itself (meshio has no reader for it), the rest by meshio."""
+    """Legacy VTK: polygonal data by VTK itself, which meshio cannot read, the rest by meshio."""
     header = path.read_bytes()[:1024].upper()
     return _read_polydata(path) if b"POLYDATA" in header else _by_meshio("vtk")(path)
 
@@ -541,6 +539,7 @@ def _read_vtk(path: Path) -> Soup:
 def _read_polydata(path: Path) -> Soup:
     try:
         from vtkmodules.util.numpy_support import vtk_to_numpy
+        from vtkmodules.vtkCommonCore import vtkObject
         from vtkmodules.vtkFiltersCore import vtkTriangleFilter
         from vtkmodules.vtkIOLegacy import vtkPolyDataReader
     except ImportError as error:
@@ -553,7 +552,9 @@ def _read_polydata(path: Path) -> Soup:
     triangles.PassLinesOff()
     triangles.PassVertsOff()
     triangles.SetInputConnection(reader.GetOutputPort())
+    vtkObject.GlobalWarningDisplayOff()  # VTK reports in many lines on stderr; ours is one
     triangles.Update()
+    vtkObject.GlobalWarningDisplayOn()
     data = triangles.GetOutput()
     if data.GetNumberOfPolys() == 0:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
@@ -565,7 +566,7 @@ def _read_label_map(path: Path, label: int | None) -> Soup:
     """Surface of one label of a NIfTI volume, in its world coordinates (RAS by definition)."""
     import nibabel
 
-    image = nibabel.load(path)
+    image: Any = nibabel.load(path)
     _require_loadable(path, image)
     values = np.squeeze(np.asanyarray(image.dataobj))
     if values.ndim != 3:
@@ -576,7 +577,9 @@ def _read_label_map(path: Path, label: int | None) -> Soup:
 
 def _require_loadable(path: Path, image: Any) -> None:
     """Bound the decompressed size before anything is loaded."""
-    n_bytes = int(np.prod(image.shape, dtype=np.int64)) * max(image.get_data_dtype().itemsize, 2)
+    scaled = (image.dataobj.slope, image.dataobj.inter) != (1.0, 0.0)
+    item = 8 if scaled else image.get_data_dtype().itemsize
+    n_bytes = item * int(np.prod(image.shape, dtype=np.int64))
     if n_bytes > MAX_LABEL_BYTES:
         raise SurfaceError(
             f"{path.name}: label map of {n_bytes / 1e9:.1f} GB; crop it to the organ "

@@ -1,0 +1,214 @@
+"""Does this machine hold 1 kHz? Step times beside the honest rivals, in one run.
+
+Rivals: the dense table (all columns stored, same contact solve) and a prefactored direct solve.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from avatar_core import contact_kernels as kernels
+from avatar_core.contact import ContactModel, prepare, step
+from avatar_core.elasticity import Elasticity
+from avatar_core.loads import patch_loads
+from avatar_core.near_field import LocalBlocks
+from avatar_core.tool_path import access, slide
+from avatar_core.vademecum import Vademecum
+
+SPHERE, DEPTH = 10e-3, 5e-3  # [m] the benchmark's tip and how deep it slides
+MAX_TABLE_BYTES = 2_000_000_000
+
+
+@dataclass(frozen=True)
+class StepRow:
+    """Step times of one method.
+
+    p50_us, p99_us : of the whole step, contact and full field [us]; NaN if it does not fit
+    contacts_mean, contacts_min : active contacts in the steps that were timed
+    """
+
+    method: str
+    vertices: int
+    modes: int
+    tools: int
+    contacts_mean: float
+    contacts_min: int
+    p50_us: float
+    p99_us: float
+    bytes: int
+
+
+def time_steps(vademecum: Vademecum, n_tools: int, modes: int | None) -> StepRow:
+    """Slide ``n_tools`` spheres of 10 mm, 5 mm deep, with the field at all vertices."""
+    model = prepare(vademecum, (SPHERE,) * n_tools, modes, cloud="volume")
+    rank = model.arrays.space.shape[2]
+    return _timed("vademecum", vademecum, model, rank, n_tools, lambda tips: step(model, tips))
+
+
+def time_dense_table(vademecum: Vademecum, n_tools: int) -> StepRow:
+    """The same contacts and field from stored columns."""
+    n_v, n_s = len(vademecum.mesh.vertices), vademecum.surface.n_positions
+    size = 4 * 9 * n_s * (n_v + n_s)
+    if size > MAX_TABLE_BYTES:
+        nan = float("nan")
+        return StepRow("dense table", n_v, 0, n_tools, nan, 0, nan, nan, size)
+    model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume")
+    load = vademecum.far.load.reshape(n_s, 3, -1)
+    columns = _dense(vademecum.far.space, load, vademecum.near, n_v)
+    compliance = _dense(vademecum.far.load, load, vademecum.contact_near, n_s)
+
+    def dense(tips: np.ndarray) -> None:
+        _dense_step(model.arrays, model.state, model.out, tips, columns, compliance)
+
+    row = _timed("dense table", vademecum, model, 0, n_tools, dense)
+    return StepRow(**{**row.__dict__, "bytes": columns.nbytes + compliance.nbytes})
+
+
+def time_direct(elasticity: Elasticity, vademecum: Vademecum, n: int = 40) -> StepRow:
+    """One back-substitution with the stored factor per step, one contact."""
+    surface = vademecum.surface
+    loads = patch_loads(
+        elasticity, surface.centers[:n], surface.normals[:n], surface.patch_radius
+    ).toarray()
+    elasticity.solve(loads[:, :1])
+    times = []
+    for k in range(n):
+        start = time.perf_counter()
+        elasticity.solve(loads[:, 3 * k : 3 * k + 1])
+        times.append(time.perf_counter() - start)
+    micro = np.array(times) * 1e6
+    return StepRow(
+        f"direct solve ({elasticity.element})",
+        len(vademecum.mesh.vertices),
+        0,
+        1,
+        1.0,
+        1,
+        float(np.median(micro)),
+        float(np.quantile(micro, 0.99)),
+        elasticity.factor_bytes,
+    )
+
+
+def load_average() -> float:
+    """Processes that compete for the machine, one-minute mean."""
+    return os.getloadavg()[0]
+
+
+def _timed(
+    method: str,
+    vademecum: Vademecum,
+    model: ContactModel,
+    modes: int,
+    n_tools: int,
+    call: Callable[[np.ndarray], object],
+) -> StepRow:
+    tips = _tool_paths(vademecum, n_tools)
+    times = np.empty(len(tips))
+    contacts = np.empty(len(tips), int)
+    for k in range(len(tips)):
+        start = time.perf_counter()
+        call(tips[k])
+        times[k] = time.perf_counter() - start
+        contacts[k] = model.out.n_contacts[0]
+    kept = np.arange(len(tips)) >= 200  # warm caches
+    kept &= contacts >= n_tools
+    micro = times[kept] * 1e6
+    return StepRow(
+        method,
+        len(vademecum.mesh.vertices),
+        modes,
+        n_tools,
+        float(contacts[kept].mean()),
+        int(contacts[kept].min()),
+        float(np.median(micro)),
+        float(np.quantile(micro, 0.99)),
+        model.nbytes,
+    )
+
+
+def _tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000) -> np.ndarray:
+    """Slides that start far apart, shape (n, n_tools, 3)."""
+    centers = vademecum.surface.centers
+    starts = [int(np.argmin(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))]
+    inner = _away_from_rim(vademecum)
+    while len(starts) < n_tools:
+        distance = np.min(
+            [np.linalg.norm(centers[inner] - centers[s], axis=1) for s in starts], axis=0
+        )
+        starts.append(int(inner[np.argmax(distance)]))
+    paths = [
+        slide(vademecum, SPHERE, DEPTH, n * 1e-4, position=start) for start in starts
+    ]
+    return np.ascontiguousarray(np.stack(paths, axis=1))
+
+
+def _away_from_rim(vademecum: Vademecum) -> np.ndarray:
+    """Load positions with full access a centimetre around."""
+    from avatar_core.tool_path import _access
+
+    surface, field = vademecum.surface, vademecum.tip_field
+    kept = []
+    for j in range(0, surface.n_positions, 3):
+        p = surface.centers[j] + surface.normals[j] * (SPHERE - DEPTH)
+        around = np.eye(3) * 1e-2
+        if min(access(field, p + s * e) for e in around for s in (-1, 1)) > 0.99:
+            kept.append(j)
+    return np.array(kept)
+
+
+def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: int) -> np.ndarray:
+    """All columns, shape (n_positions, 3, n_targets, 3): direction, target, component."""
+    n, _, rank = load.shape
+    dense = (load.reshape(-1, rank) @ space.T).reshape(n, 3, n_targets, 3)
+    for j in range(n):
+        row = slice(near.start[j], near.start[j + 1])
+        dense[j][:, near.target[row]] += near.block[row].transpose(2, 0, 1)
+    return np.ascontiguousarray(dense, dtype=np.float32)
+
+
+@njit(cache=True, fastmath=True)
+def _dense_step(model, state, out, tips, columns, compliance):  # type: ignore[no-untyped-def]
+    """:func:`contact_kernels.contact_step` with stored columns instead of modes."""
+    kernels._locate(model, state, tips)
+    kernels._number(model, state)
+    for t in range(tips.shape[0]):
+        for q in range(state.n_local[0]):
+            for d in range(3):
+                state.column[t, q, d] = 0.0
+        for p in range(state.n_local[0]):
+            w = state.weight[t, p]
+            if w != 0.0:
+                for c in range(3):
+                    row = compliance[state.nodes[p], c]
+                    f = w * state.direction[t, c]
+                    for q in range(state.n_local[0]):
+                        for d in range(3):
+                            state.column[t, q, d] += f * row[state.nodes[q], d]
+    kernels._assemble(model, state)
+    kernels._solve(state)
+    kernels._displace_stencil(state)
+    kernels._write_forces(model, state, out, tips)
+    cloud = out.cloud
+    for v in range(cloud.shape[0]):
+        cloud[v, 3] = cloud[v, 4] = cloud[v, 5] = np.float32(0.0)
+    for p in range(state.n_local[0]):
+        for c in range(3):
+            f = 0.0
+            for t in range(tips.shape[0]):
+                f -= state.weight[t, p] * state.force[t] * state.direction[t, c]
+            if f != 0.0:
+                row, g = columns[state.nodes[p], c], np.float32(f)
+                for v in range(cloud.shape[0]):
+                    cloud[v, 3] += g * row[v, 0]
+                    cloud[v, 4] += g * row[v, 1]
+                    cloud[v, 5] += g * row[v, 2]
+    for v in range(cloud.shape[0]):
+        for d in range(3):
+            cloud[v, d] = model.rest[v, d] + cloud[v, 3 + d]

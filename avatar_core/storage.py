@@ -1,0 +1,308 @@
+"""Vademecums on disk: HDF5 with schema version and checksum. The only module that imports h5py.
+
+Layout (schema 1.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
+in sorted order and over the JSON attributes), and the JSON attributes ``material``,
+``provenance``, ``convergence``, ``certificate``. Datasets:
+
+    mesh/vertices (n_v, 3) [m]          mesh/tets (n_t, 4)
+    regions/clamped, regions/accessible over the boundary faces
+    surface/centers, surface/normals (n_s, 3) [m]   surface/corners (n_f, 3)
+    surface/vertices                     surface/patch_radius [m]
+    far/space (3 n_v, k) [m]             far/load (3 n_s, k)
+    near/start, near/target, near/block [m/N]
+    contact_near/start, contact_near/target, contact_near/block [m/N]
+    tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from avatar_core.certificate import Certificate
+from avatar_core.elasticity import Material
+from avatar_core.errors import AvatarError, StorageError
+from avatar_core.loads import LoadSurface
+from avatar_core.mesh import Regions, TetMesh
+from avatar_core.near_field import LocalBlocks
+from avatar_core.pgd import EnrichmentReport, EnrichmentStatus
+from avatar_core.separated import SeparatedField
+from avatar_core.tip_field import TipField
+from avatar_core.vademecum import (
+    SCHEMA_VERSION,
+    Convergence,
+    Provenance,
+    RankError,
+    Vademecum,
+)
+
+FORMAT = "avatar vademecum"
+MAX_FILE_BYTES = 4 << 30
+MAX_ARRAY_BYTES = 2 << 30
+
+_JSON = ("material", "provenance", "convergence", "certificate")
+
+
+def save_vademecum(vademecum: Vademecum, path: str | Path) -> None:
+    """Write a vademecum; the file appears complete or not at all.
+
+    Raises
+    ------
+    StorageError
+        If the folder does not exist or the disk is full; nothing is left behind.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise StorageError(f"folder {path.parent} does not exist; create it first")
+    arrays, attributes = _arrays(vademecum), _attributes(vademecum)
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        os.close(handle)
+        try:
+            _write(Path(temporary), arrays, attributes)
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+    except (OSError, RuntimeError) as error:  # h5py reports a full disk as RuntimeError
+        raise StorageError(
+            f"cannot write {path} ({_reason(error)}); free disk space or choose another folder"
+        ) from error
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> None:
+    with h5py.File(path, "w") as file:
+        for key, value in attributes.items():
+            file.attrs[key] = value
+        for key, array in arrays.items():
+            file.create_dataset(key, data=array)
+        file.attrs["checksum"] = _checksum(arrays, attributes)
+        file.flush()
+    with path.open("rb+") as written:
+        os.fsync(written.fileno())
+
+
+def load_vademecum(path: str | Path) -> Vademecum:
+    """Read and verify a vademecum.
+
+    Sizes are checked before anything is allocated, the checksum before anything is used.
+
+    Raises
+    ------
+    StorageError
+        For a missing, truncated, altered, foreign or newer file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise StorageError(f"no vademecum at {path}; build one with 'avatar vademecum'")
+    size = path.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise StorageError(f"{path} has {size >> 20} MiB, more than a vademecum may have")
+    try:
+        with h5py.File(path, "r") as file:
+            attributes = _read_attributes(file, path)
+            arrays = _read_arrays(file, path, size)
+            stated = str(file.attrs["checksum"])
+        if stated != _checksum(arrays, attributes):
+            raise StorageError(f"{path} was altered or damaged (checksum); build it again")
+        vademecum = _assemble(arrays, attributes)
+    except AvatarError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError) as error:
+        raise StorageError(
+            f"{path} is no readable vademecum ({_reason(error)}); it may be truncated: "
+            "build or copy it again"
+        ) from error
+    return replace(vademecum, id=file_id(path), nbytes=size)
+
+
+def file_id(path: str | Path) -> str:
+    """SHA-256 of the file, the id under which a vademecum is announced."""
+    digest = hashlib.sha256()
+    with Path(path).open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _read_attributes(file: h5py.File, path: Path) -> dict[str, str]:
+    if str(file.attrs.get("format", "")) != FORMAT:
+        raise StorageError(f"{path} is HDF5 but no vademecum; build one with 'avatar vademecum'")
+    schema = str(file.attrs["schema"])
+    if int(schema.split(".")[0]) > int(SCHEMA_VERSION.split(".")[0]):
+        raise StorageError(
+            f"{path} has schema {schema}, this version reads up to {SCHEMA_VERSION}; "
+            "upgrade avatar"
+        )
+    keys = ("format", "schema", "name", "element", *_JSON)
+    return {key: str(file.attrs[key]) for key in keys}
+
+
+def _read_arrays(file: h5py.File, path: Path, size: int) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {}
+    total = 0
+    for key in _KEYS:
+        dataset = file[key]
+        if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiub":
+            raise StorageError(f"{path}: '{key}' is no array of numbers; build the file again")
+        if dataset.is_virtual or dataset.external:
+            raise StorageError(f"{path}: '{key}' points outside the file; build it again")
+        total += dataset.nbytes
+        if dataset.nbytes > MAX_ARRAY_BYTES or total > size:
+            raise StorageError(f"{path}: '{key}' claims more data than the file holds")
+        arrays[key] = dataset[...]
+    return arrays
+
+
+_KEYS = (
+    "mesh/vertices",
+    "mesh/tets",
+    "regions/clamped",
+    "regions/accessible",
+    "surface/centers",
+    "surface/normals",
+    "surface/corners",
+    "surface/vertices",
+    "surface/patch_radius",
+    "far/space",
+    "far/load",
+    "near/start",
+    "near/target",
+    "near/block",
+    "contact_near/start",
+    "contact_near/target",
+    "contact_near/block",
+    "tip_field/distance",
+    "tip_field/access",
+    "tip_field/origin",
+    "tip_field/spacing",
+)
+
+
+def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
+    """Every dataset; the keys are attribute paths of the vademecum."""
+    arrays = {}
+    for key in _KEYS:
+        value: Any = v
+        for attribute in key.split("/"):
+            value = getattr(value, attribute)
+        arrays[key] = np.asarray(value)
+    return arrays
+
+
+def _attributes(v: Vademecum) -> dict[str, str]:
+    convergence = asdict(v.convergence)
+    for report in convergence["enrichments"]:
+        report["status"] = report["status"].value
+    return {
+        "format": FORMAT,
+        "schema": SCHEMA_VERSION,
+        "name": v.name,
+        "element": v.element,
+        "material": json.dumps(asdict(v.material)),
+        "provenance": json.dumps(asdict(v.provenance)),
+        "convergence": json.dumps(convergence),
+        "certificate": json.dumps(asdict(v.certificate) if v.certificate else None),
+    }
+
+
+def _checksum(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
+    digest = hashlib.sha256()
+    for key in sorted(attributes):
+        digest.update(f"{key}={attributes[key]};".encode())
+    for key in sorted(arrays):
+        array = np.ascontiguousarray(arrays[key])
+        digest.update(f"{key}:{array.dtype.str}:{array.shape};".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vademecum:
+    _check_shapes(arrays)
+    material, provenance, convergence, certificate = (json.loads(attributes[k]) for k in _JSON)
+
+    def blocks(name: str) -> LocalBlocks:
+        return LocalBlocks(*(arrays[f"{name}/{k}"] for k in ("start", "target", "block")))
+
+    return Vademecum(
+        name=attributes["name"],
+        mesh=TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"]),
+        regions=Regions(arrays["regions/clamped"], arrays["regions/accessible"]),
+        material=Material(**material),
+        element=attributes["element"],  # type: ignore[arg-type]
+        surface=LoadSurface(
+            arrays["surface/centers"],
+            arrays["surface/normals"],
+            arrays["surface/corners"],
+            arrays["surface/vertices"],
+            float(arrays["surface/patch_radius"]),
+        ),
+        far=SeparatedField(arrays["far/space"], arrays["far/load"]),
+        near=blocks("near"),
+        contact_near=blocks("contact_near"),
+        tip_field=TipField(*(arrays[f"tip_field/{name}"] for name in TipField._fields)),
+        convergence=_convergence(convergence),
+        provenance=Provenance(
+            **{k: tuple(v) if isinstance(v, list) else v for k, v in provenance.items()}
+        ),
+        certificate=Certificate(**certificate) if certificate else None,
+    )
+
+
+def _convergence(stored: dict[str, Any]) -> Convergence:
+    return Convergence(
+        stored["converged"],
+        stored["tolerance"],
+        tuple(
+            EnrichmentReport(**{**report, "status": EnrichmentStatus(report["status"])})
+            for report in stored["enrichments"]
+        ),
+        tuple(RankError(**error) for error in stored["rank_errors"]),
+    )
+
+
+def _check_shapes(a: dict[str, np.ndarray]) -> None:
+    """Indices within bounds and sizes that agree, so that compiled code cannot go astray."""
+    n_vertices, n_positions = len(a["mesh/vertices"]), len(a["surface/centers"])
+    rank = a["far/space"].shape[1]
+    agree = (
+        a["far/space"].shape == (3 * n_vertices, rank)
+        and a["far/load"].shape == (3 * n_positions, rank)
+        and a["surface/normals"].shape == (n_positions, 3)
+        and a["tip_field/distance"].shape == a["tip_field/access"].shape
+        and a["tip_field/origin"].shape == (3,)
+        and all(np.isfinite(v).all() for v in a.values() if v.dtype.kind == "f")
+    )
+    for name, target in (("near", n_vertices), ("contact_near", n_positions)):
+        start, index = a[f"{name}/start"], a[f"{name}/target"]
+        agree = agree and (
+            len(start) == n_positions + 1
+            and start[0] == 0
+            and bool((np.diff(start) >= 0).all())
+            and start[-1] == len(index)
+            and a[f"{name}/block"].shape == (len(index), 3, 3)
+            and _within(index, target)
+        )
+    agree = agree and _within(a["mesh/tets"], n_vertices)
+    agree = agree and _within(a["surface/corners"], n_positions)
+    agree = agree and _within(a["surface/vertices"], n_vertices)
+    if not agree:
+        raise StorageError("the arrays of the file do not fit together; build it again")
+
+
+def _within(index: np.ndarray, limit: int) -> bool:
+    return index.size == 0 or (0 <= int(index.min()) and int(index.max()) < limit)
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__

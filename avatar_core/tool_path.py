@@ -1,0 +1,81 @@
+"""Scripted tool motions over an organ: what the benchmarks, the demo and the tests replay."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avatar_core.tip_field import FAR, TipField, evaluate
+from avatar_core.vademecum import Vademecum
+
+
+def middle_ofaccess(vademecum: Vademecum) -> int:
+    """The load position in the middle of the accessible surface."""
+    centers = vademecum.surface.centers
+    return int(np.argmin(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))
+
+
+def palpation(
+    vademecum: Vademecum, radius: float, depth: float, n: int, position: int | None = None
+) -> np.ndarray:
+    """A push along the inward normal and back out, shape (n, 3) [m]; starts 2 mm above."""
+    surface = vademecum.surface
+    j = middle_ofaccess(vademecum) if position is None else position
+    t = np.linspace(0.0, 1.0, n)
+    travel = -2e-3 + (depth + 2e-3) * np.sin(np.pi * t) ** 2
+    return surface.centers[j] + (radius - travel)[:, None] * surface.normals[j]
+
+
+def slide(
+    vademecum: Vademecum,
+    radius: float,
+    depth: float,
+    length: float,
+    step: float = 1e-4,
+    heading: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    position: int | None = None,
+) -> np.ndarray:
+    """A slide at constant depth over the accessible surface, shape (n, 3) [m].
+
+    The centre keeps phi = radius - depth and heads along ``heading``; it turns back where the
+    access fades, so that any length can be travelled.
+
+    Parameters
+    ----------
+    radius, depth : of the tip and of its penetration of the surface at rest [m]
+    length, step : travelled and between periods [m]
+    """
+    field = vademecum.tip_field
+    j = middle_ofaccess(vademecum) if position is None else position
+    p = vademecum.surface.centers[j] + vademecum.surface.normals[j] * (radius - depth)
+    direction = np.asarray(heading, float)
+    path = np.empty((int(round(length / step)), 3))
+    for k in range(len(path)):
+        p = _at_level(field, p, radius - depth)
+        if access(field, p) < 0.999 and k > 0:
+            p, direction = path[k - 1].copy(), -direction
+        path[k] = p
+        normal = _gradient(field, p)
+        along = direction - (direction @ normal) * normal
+        p = p + step * along / np.linalg.norm(along)
+    return path
+
+
+def _gradient(field: TipField, p: np.ndarray) -> np.ndarray:
+    gradient = np.zeros(3)
+    evaluate(field.distance, field.origin, field.spacing[0], p, gradient, FAR)
+    return gradient / np.linalg.norm(gradient)
+
+
+def _at_level(field: TipField, p: np.ndarray, level: float) -> np.ndarray:
+    gradient = np.zeros(3)
+    for _ in range(3):
+        phi = evaluate(field.distance, field.origin, field.spacing[0], p, gradient, FAR)
+        p = p - (phi - level) * gradient / (gradient @ gradient)
+    return p
+
+
+def access(field: TipField, p: np.ndarray) -> float:
+    """chi at p: one where a tip may touch."""
+    return float(
+        evaluate(field.access, field.origin, field.spacing[0], p, np.zeros(3), 0.0)
+    )
