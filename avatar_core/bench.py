@@ -18,7 +18,7 @@ from avatar_core.contact import ContactModel, prepare, step
 from avatar_core.elasticity import Elasticity
 from avatar_core.loads import patch_loads
 from avatar_core.near_field import LocalBlocks
-from avatar_core.tool_path import access, slide
+from avatar_core.tool_path import inner_positions, middle_of_access, slide
 from avatar_core.vademecum import Vademecum
 
 SPHERE, DEPTH = 10e-3, 5e-3  # [m] the benchmark's tip and how deep it slides
@@ -135,32 +135,15 @@ def _timed(
 
 def _tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000) -> np.ndarray:
     """Slides that start far apart, shape (n, n_tools, 3)."""
-    centers = vademecum.surface.centers
-    starts = [int(np.argmin(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))]
-    inner = _away_from_rim(vademecum)
+    centers, inner = vademecum.surface.centers, inner_positions(vademecum)
+    starts = [middle_of_access(vademecum)]
     while len(starts) < n_tools:
         distance = np.min(
             [np.linalg.norm(centers[inner] - centers[s], axis=1) for s in starts], axis=0
         )
         starts.append(int(inner[np.argmax(distance)]))
-    paths = [
-        slide(vademecum, SPHERE, DEPTH, n * 1e-4, position=start) for start in starts
-    ]
+    paths = [slide(vademecum, SPHERE, DEPTH, n * 1e-4, position=start) for start in starts]
     return np.ascontiguousarray(np.stack(paths, axis=1))
-
-
-def _away_from_rim(vademecum: Vademecum) -> np.ndarray:
-    """Load positions with full access a centimetre around."""
-    from avatar_core.tool_path import _access
-
-    surface, field = vademecum.surface, vademecum.tip_field
-    kept = []
-    for j in range(0, surface.n_positions, 3):
-        p = surface.centers[j] + surface.normals[j] * (SPHERE - DEPTH)
-        around = np.eye(3) * 1e-2
-        if min(access(field, p + s * e) for e in around for s in (-1, 1)) > 0.99:
-            kept.append(j)
-    return np.array(kept)
 
 
 def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: int) -> np.ndarray:

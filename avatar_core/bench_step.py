@@ -61,6 +61,4 @@ def _built(
 
 
 def _row(rows: list[StepRow], method: str, tools: int, modes: int) -> StepRow:
-    return next(
-        row for row in rows if (row.method, row.tools, row.modes) == (method, tools, modes)
-    )
+    return next(row for row in rows if (row.method, row.tools, row.modes) == (method, tools, modes))

@@ -29,6 +29,7 @@ Progress = Callable[[str, float], None]
 def _silent(stage: str, fraction: float) -> None:
     """Report nothing."""
 
+
 _BATCH = 40  # load positions solved at once
 _WORST_OVER_MEAN = 2.5  # the worst load may be this much worse than the mean asked for
 

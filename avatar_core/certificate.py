@@ -131,9 +131,7 @@ def _vertex_contact(
 ) -> float:
     surface = vademecum.surface
     some = rng.permutation(len(surface.vertices))[:_BATCH]
-    _, compliance = _reference(
-        elasticity, surface.centers[some], surface.normals[some], vademecum
-    )
+    _, compliance = _reference(elasticity, surface.centers[some], surface.normals[some], vademecum)
     return max(
         _frobenius(
             vademecum.compliance(
@@ -162,7 +160,5 @@ def mesh_error(
     fine, fine_compliance = _reference(refined, *where, vademecum)
     fine = fine[:, : coarse.shape[1]]  # refinement appends its vertices
     l2 = [_l2(vademecum, coarse[k], fine[k]) for k in range(len(chosen))]
-    contact = [
-        _frobenius(coarse_compliance[k], fine_compliance[k]) for k in range(len(chosen))
-    ]
+    contact = [_frobenius(coarse_compliance[k], fine_compliance[k]) for k in range(len(chosen))]
     return float(np.mean(l2)), float(np.mean(contact))

@@ -226,7 +226,9 @@ def bench_step(
     organ = _read(surface, unit, axes, label)
     with _Bar() as progress:
         rows, summary = run_step_bench(organ, small, large, progress)
-    print(f"load average {load_average():.2f}; 10 mm spheres sliding 5 mm deep, field at all vertices")
+    print(
+        f"load average {load_average():.2f}; 10 mm spheres sliding 5 mm deep, field at all vertices"
+    )
     print(_step_table(rows))
     for key, value in summary.items():
         print(f"{key:22s} {value:10.1f}")

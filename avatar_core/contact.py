@@ -17,8 +17,8 @@ from avatar_core import contact_kernels as kernels
 from avatar_core.contact_kernels import ModelArrays, Out, State
 from avatar_core.errors import ContactError
 from avatar_core.near_field import LocalBlocks
-from avatar_core.vademecum import Vademecum
 from avatar_core.shepard import MAX_STENCIL
+from avatar_core.vademecum import Vademecum
 
 Cloud = Literal["surface", "volume", "off"]
 
@@ -206,11 +206,11 @@ def save_arrays(arrays: ModelArrays, folder: Path) -> None:
 
 
 def load_arrays(folder: Path) -> ModelArrays:
-    """Map what :func:`save_arrays` wrote, without reading it."""
-    mapped = {
-        name: np.load(folder / f"{name}.npy", mmap_mode="r")
-        for name in ModelArrays._fields
-    }
+    """Map what :func:`save_arrays` wrote, without reading it.
+
+    Pages are copy-on-write: to the compiled step a read-only array would be another type.
+    """
+    mapped = {name: np.load(folder / f"{name}.npy", mmap_mode="c") for name in ModelArrays._fields}
     return ModelArrays(**mapped)
 
 

@@ -22,7 +22,7 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
-from avatar_core.shepard import MAX_STENCIL, add_weights, find_candidates, number_stencil
+from avatar_core.shepard import add_weights, find_candidates, number_stencil
 from avatar_core.tip_field import FAR, evaluate
 
 MAX_TOOLS = 8
@@ -151,9 +151,7 @@ def _locate(model, state, tips):  # type: ignore[no-untyped-def]
         state.engaged[t] = True
         if state.access[t] < FULL_ACCESS:
             status = max(status, OUT_OF_RANGE)
-        state.n_candidates[t] = find_candidates(
-            model, state.point[t], _MARGIN, state.candidates[t]
-        )
+        state.n_candidates[t] = find_candidates(model, state.point[t], _MARGIN, state.candidates[t])
     return status
 
 

@@ -262,9 +262,7 @@ class Elasticity:
         shear, coupling, _ = self._mixed
         lam, _ = self.material.lame
         change = np.asfortranarray(coupling @ displacement)
-        return shear @ displacement + lam * (
-            coupling.T @ self._pressure_factor.solve_many(change)
-        )
+        return shear @ displacement + lam * (coupling.T @ self._pressure_factor.solve_many(change))
 
     def at_vertices(self, displacement: np.ndarray) -> np.ndarray:
         """The vertex part of nodal displacements, shape (3 n_vertices, n)."""

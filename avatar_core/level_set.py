@@ -24,8 +24,8 @@ COMPARED_SPACING = 0.01  # [m]
 COMPARED_HALF_WIDTH = 0.14  # [m]
 COMPARED_RANGE = (-0.03, 0.01)  # distances are cut to this [m]
 
-TURNED_ANGLE = 45.0  # beyond this a surface counts as turned [degrees] ...
-TURNED_GAIN = 1.15  # ... if turning it back fits this much better
+TURNED_ANGLE = 45.0  # a surface counts as turned if a rotation beyond this [degrees] ...
+TURNED_GAIN = 1.15  # ... fits this much better than any below it
 TILT = 10.0  # rotations tried: 24 turns of the axes, each tilted by this about x, y, z [degrees]
 
 
@@ -68,7 +68,7 @@ class OrientationOffset:
 
     rotation : ndarray, shape (3, 3), turns the surface onto the reference
     angle : of that rotation [degrees]
-    gain : misfit of the surface as it stands (tilts allowed) over the misfit once turned, >= 1
+    gain : least misfit of turns below 45 degrees over the least misfit of all, >= 1
     """
 
     rotation: FloatArray
@@ -78,7 +78,7 @@ class OrientationOffset:
     @property
     def is_turned(self) -> bool:
         """Whether the turn exceeds 45 degrees and fits clearly better than no turn."""
-        return self.angle > TURNED_ANGLE and self.gain > TURNED_GAIN
+        return self.gain > TURNED_GAIN
 
     @property
     def warning(self) -> str | None:
@@ -149,7 +149,7 @@ def orientation_offset(surface: SurfaceMesh, reference: SurfaceMesh) -> Orientat
     misfits = np.array([np.linalg.norm(grid.sample(points @ R) - wanted) for R in rotations])
     angles = np.degrees(Rotation.from_matrix(rotations).magnitude())
     best = int(np.argmin(misfits))
-    standing = misfits[angles <= TILT + 1e-3].min()
+    standing = misfits[angles <= TURNED_ANGLE].min()
     gain = standing / max(misfits[best], 1e-12) if misfits[best] < standing else 1.0
     return OrientationOffset(rotations[best], float(angles[best]), float(gain))
 

@@ -82,9 +82,7 @@ def triangle_shape(barycentric: np.ndarray) -> np.ndarray:
     ndarray, shape (..., 6): l(2l - 1) at the corners, 4 l l' at edges 01, 12, 20
     """
     corner = barycentric * (2.0 * barycentric - 1.0)
-    return np.concatenate(
-        [corner, 4.0 * barycentric * np.roll(barycentric, -1, axis=-1)], axis=-1
-    )
+    return np.concatenate([corner, 4.0 * barycentric * np.roll(barycentric, -1, axis=-1)], axis=-1)
 
 
 def default_patch_radius(mesh: TetMesh, regions: Regions) -> float:
@@ -94,9 +92,7 @@ def default_patch_radius(mesh: TetMesh, regions: Regions) -> float:
     return max(LEAST_PATCH_RADIUS, 1.2 * float(edge))
 
 
-def load_surface(
-    mesh: TetMesh, regions: Regions, patch_radius: float | None = None
-) -> LoadSurface:
+def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = None) -> LoadSurface:
     """Load positions of the accessible region.
 
     Raises

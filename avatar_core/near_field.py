@@ -37,9 +37,7 @@ class LocalBlocks:
         """Row of every block, shape (n_blocks,)."""
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
 
-    def combined(
-        self, positions: np.ndarray, weights: np.ndarray, n_targets: int
-    ) -> np.ndarray:
+    def combined(self, positions: np.ndarray, weights: np.ndarray, n_targets: int) -> np.ndarray:
         """Weighted sum of some rows, dense, shape (3 n_targets, 3)."""
         out = np.zeros((n_targets, 3, 3))
         for j, weight in zip(positions, weights, strict=True):

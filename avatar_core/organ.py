@@ -59,9 +59,7 @@ def vademecum_of(
     progress("mesh", 0.0)
     mesh = tetrahedralize(surface, options.n_vertices)
     progress("mesh", 1.0)
-    regions = (
-        regions_from_groups(mesh, options.groups) if options.groups else regions_by_rule(mesh)
-    )
+    regions = regions_from_groups(mesh, options.groups) if options.groups else regions_by_rule(mesh)
     elasticity = Elasticity(mesh, options.material, regions.clamped, options.element)
     loads = load_surface(mesh, regions, options.patch_radius)
     vademecum = build_vademecum(

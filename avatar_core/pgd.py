@@ -27,6 +27,10 @@ from avatar_core.elasticity import Elasticity
 from avatar_core.errors import ConvergenceError
 
 
+# An enrichment that captures less of the total energy than this is made of rounding errors.
+_ROUNDING = 1e-13
+
+
 class EnrichmentStatus(Enum):
     """How an enrichment ended."""
 
@@ -119,7 +123,7 @@ class _Expansion:
             dual = self.problem.elasticity.apply(space)
             space = space - self.space @ (self.space.T @ dual)
         value, vector = np.linalg.eigh(space.T @ self.problem.elasticity.apply(space))
-        new = value > 1e-18 * max(value.max(), 1e-300)
+        new = value > 1e-18 * value.max()
         space = space @ (vector[:, new] / np.sqrt(value[new]))
         load = self.problem.loads.T @ space
         columns = slice(self.rank, self.rank + space.shape[1])
@@ -185,20 +189,23 @@ def solve_pgd(
 
 def _enrich(expansion: _Expansion, rule: PGDRule) -> EnrichmentReport:
     """One enrichment: start at random loads with energy left, alternate, keep the result."""
-    block = min(rule.block, rule.max_modes - expansion.rank)
-    load = _start(expansion, block)
-    status, change, captured, sweep = EnrichmentStatus.SWEEP_LIMIT, np.inf, 0.0, 0
-    for sweep in range(1, rule.max_sweeps + 1):
+    problem = expansion.problem
+    rounding = _ROUNDING * float(problem.weights @ problem.energy)
+    load = _start(expansion, min(rule.block, rule.max_modes - expansion.rank))
+    status, change, captured, sweeps = EnrichmentStatus.SWEEP_LIMIT, np.inf, 0.0, 0
+    while sweeps < rule.max_sweeps and status is EnrichmentStatus.SWEEP_LIMIT:
         space, load = _sweep(expansion, load)
-        before, captured = captured, float(expansion.problem.weights @ (load**2).sum(axis=1))
-        change = abs(captured - before) / captured if captured > 0 else 0.0
+        sweeps += 1
+        before, captured = captured, float(problem.weights @ (load**2).sum(axis=1))
+        if captured <= rounding:
+            return EnrichmentReport(
+                EnrichmentStatus.EXHAUSTED, 0, sweeps, 0.0, expansion.error
+            )
+        change = abs(captured - before) / captured
         if change <= rule.sweep_tolerance:
             status = EnrichmentStatus.CONVERGED
-            break
     modes = expansion.append(space)
-    if modes == 0 or captured <= 1e-24 * (expansion.problem.weights @ expansion.problem.energy):
-        status = EnrichmentStatus.EXHAUSTED
-    return EnrichmentReport(status, modes, sweep, change, expansion.error)
+    return EnrichmentReport(status, modes, sweeps, change, expansion.error)
 
 
 def _start(expansion: _Expansion, block: int) -> np.ndarray:
@@ -216,11 +223,11 @@ def _sweep(expansion: _Expansion, load: np.ndarray) -> tuple[np.ndarray, np.ndar
     """
     problem = expansion.problem
     weighted = problem.weights[:, None] * load
-    weighted /= np.linalg.norm(weighted, axis=0)
+    weighted /= np.linalg.norm(weighted, axis=0) + 1e-300
     space = problem.elasticity.solve(problem.loads @ weighted)
     space -= expansion.space @ (expansion.load.T @ weighted)
     work = problem.loads.T @ space
     value, vector = np.linalg.eigh((work.T @ weighted + weighted.T @ work) / 2.0)
-    new = value > 1e-14 * max(value.max(), 1e-300)
+    new = value > 1e-14 * value.max()
     scale = vector[:, new] / np.sqrt(value[new])
     return space @ scale, work @ scale

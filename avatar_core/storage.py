@@ -18,6 +18,7 @@ in sorted order and over the JSON attributes), and the JSON attributes ``materia
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import tempfile
@@ -63,33 +64,35 @@ def save_vademecum(vademecum: Vademecum, path: str | Path) -> None:
     path = Path(path)
     if not path.parent.is_dir():
         raise StorageError(f"folder {path.parent} does not exist; create it first")
-    arrays, attributes = _arrays(vademecum), _attributes(vademecum)
+    content = _encoded(_arrays(vademecum), _attributes(vademecum))
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        os.close(handle)
         try:
-            _write(Path(temporary), arrays, attributes)
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
             os.chmod(temporary, 0o644)
             os.replace(temporary, path)
         except BaseException:
             Path(temporary).unlink(missing_ok=True)
             raise
-    except (OSError, RuntimeError) as error:  # h5py reports a full disk as RuntimeError
+    except OSError as error:
         raise StorageError(
             f"cannot write {path} ({_reason(error)}); free disk space or choose another folder"
         ) from error
 
 
-def _write(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> None:
-    with h5py.File(path, "w") as file:
+def _encoded(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> memoryview:
+    """The HDF5 file in memory: on a full disk, HDF5 itself would crash."""
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
         for key, value in attributes.items():
             file.attrs[key] = value
         for key, array in arrays.items():
             file.create_dataset(key, data=array)
         file.attrs["checksum"] = _checksum(arrays, attributes)
-        file.flush()
-    with path.open("rb+") as written:
-        os.fsync(written.fileno())
+    return content.getbuffer()
 
 
 def load_vademecum(path: str | Path) -> Vademecum:
@@ -141,8 +144,7 @@ def _read_attributes(file: h5py.File, path: Path) -> dict[str, str]:
     schema = str(file.attrs["schema"])
     if int(schema.split(".")[0]) > int(SCHEMA_VERSION.split(".")[0]):
         raise StorageError(
-            f"{path} has schema {schema}, this version reads up to {SCHEMA_VERSION}; "
-            "upgrade avatar"
+            f"{path} has schema {schema}, this version reads up to {SCHEMA_VERSION}; upgrade avatar"
         )
     keys = ("format", "schema", "name", "element", *_JSON)
     return {key: str(file.attrs[key]) for key in keys}
@@ -301,7 +303,7 @@ def _check_shapes(a: dict[str, np.ndarray]) -> None:
 
 
 def _within(index: np.ndarray, limit: int) -> bool:
-    return index.size == 0 or (0 <= int(index.min()) and int(index.max()) < limit)
+    return index.size == 0 or (int(index.min()) >= 0 and int(index.max()) < limit)
 
 
 def _reason(error: BaseException) -> str:

@@ -30,7 +30,7 @@ Soup = tuple[FloatArray, IntArray]
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 PLAUSIBLE_EXTENT = (0.05, 0.5)  # largest extent of an organ [m]
 STRAY_FRACTION = 0.02  # components below this part of the volume are dropped
-AMBIGUOUS_FRACTION = 0.05  # whole organs measure 0, organs cut in half 0.17 and more
+AMBIGUOUS_FRACTION = 0.05  # whole livers measure 0, livers cut in half 0.12 and more
 MAX_LABEL_BYTES = 2**30  # of a decompressed label map
 LABEL_SPACING = 2.0  # label maps finer than this are averaged to it [mm]
 
@@ -234,7 +234,7 @@ def require_plausible_size(surface: SurfaceMesh) -> None:
 def ambiguous_fraction(surface: SurfaceMesh) -> float:
     """Points with 0.25 < |w| < 0.75 over points with |w| > 0.5, away from the surface.
 
-    0 for a closed surface, cracked or not; above 0.17 for livers cut in half; inf if nothing is
+    0 for a closed surface, cracked or not; above 0.12 for livers cut in half; inf if nothing is
     inside.
     """
     winding = np.abs(surface.clear_winding)

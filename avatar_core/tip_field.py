@@ -63,9 +63,7 @@ def make_tip_field(
     )
 
 
-def _closest(
-    mesh: TetMesh, faces: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _closest(mesh: TetMesh, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance to some faces and the closest points on them."""
     squared, _, closest = igl.point_mesh_squared_distance(points, mesh.vertices, faces)
     return np.sqrt(squared), closest

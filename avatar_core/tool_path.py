@@ -8,10 +8,21 @@ from avatar_core.tip_field import FAR, TipField, evaluate
 from avatar_core.vademecum import Vademecum
 
 
-def middle_ofaccess(vademecum: Vademecum) -> int:
-    """The load position in the middle of the accessible surface."""
-    centers = vademecum.surface.centers
-    return int(np.argmin(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))
+def inner_positions(vademecum: Vademecum, margin: float = 12e-3) -> np.ndarray:
+    """Load positions with full access ``margin`` [m] around them (all, if there are none)."""
+    surface, field = vademecum.surface, vademecum.tip_field
+    around = margin * np.concatenate([np.eye(3), -np.eye(3)])
+    raised = surface.centers + 5e-3 * surface.normals
+    inner = [
+        j for j, p in enumerate(raised) if min(access(field, p + step) for step in around) > 0.99
+    ]
+    return np.array(inner) if inner else np.arange(surface.n_positions)
+
+
+def middle_of_access(vademecum: Vademecum) -> int:
+    """The load position nearest to the middle of the accessible surface, away from its rim."""
+    centers, inner = vademecum.surface.centers, inner_positions(vademecum)
+    return int(inner[np.argmin(np.linalg.norm(centers[inner] - centers.mean(axis=0), axis=1))])
 
 
 def palpation(
@@ -19,7 +30,7 @@ def palpation(
 ) -> np.ndarray:
     """A push along the inward normal and back out, shape (n, 3) [m]; starts 2 mm above."""
     surface = vademecum.surface
-    j = middle_ofaccess(vademecum) if position is None else position
+    j = middle_of_access(vademecum) if position is None else position
     t = np.linspace(0.0, 1.0, n)
     travel = -2e-3 + (depth + 2e-3) * np.sin(np.pi * t) ** 2
     return surface.centers[j] + (radius - travel)[:, None] * surface.normals[j]
@@ -45,10 +56,10 @@ def slide(
     length, step : travelled and between periods [m]
     """
     field = vademecum.tip_field
-    j = middle_ofaccess(vademecum) if position is None else position
+    j = middle_of_access(vademecum) if position is None else position
     p = vademecum.surface.centers[j] + vademecum.surface.normals[j] * (radius - depth)
     direction = np.asarray(heading, float)
-    path = np.empty((int(round(length / step)), 3))
+    path = np.empty((round(length / step), 3))
     for k in range(len(path)):
         p = _at_level(field, p, radius - depth)
         if access(field, p) < 0.999 and k > 0:
@@ -76,6 +87,4 @@ def _at_level(field: TipField, p: np.ndarray, level: float) -> np.ndarray:
 
 def access(field: TipField, p: np.ndarray) -> float:
     """chi at p: one where a tip may touch."""
-    return float(
-        evaluate(field.access, field.origin, field.spacing[0], p, np.zeros(3), 0.0)
-    )
+    return float(evaluate(field.access, field.origin, field.spacing[0], p, np.zeros(3), 0.0))

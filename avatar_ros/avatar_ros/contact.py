@@ -14,7 +14,6 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,12 +23,11 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
 from avatar_core import contact
-from avatar_ros import node_runner, parameters, qos, realtime
+from avatar_ros import parameters, qos, realtime
 from avatar_ros.conversions import (
     NO_STAMP,
     CloudTemplate,
@@ -39,8 +37,9 @@ from avatar_ros.conversions import (
     stamp_nanoseconds,
 )
 from avatar_ros.handover import Handover, Order, Prepared
+from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.msg import ContactState, LoopStatistics
-from avatar_ros.parameters import ContactSettings, ParameterError
+from avatar_ros.parameters import ContactSettings
 
 OK = int(ContactState.STATUS_OK)
 NO_MODEL = int(ContactState.STATUS_NO_MODEL)
@@ -156,6 +155,7 @@ class Outlets:
 
     state: Any
     deformation: Any
+    statistics: Any
 
 
 # --- The loop --------------------------------------------------------------------------------
@@ -188,6 +188,7 @@ class ContactLoop:
         self._running = False
         self._thread: threading.Thread | None = None
         self._step_start = 0  # of the last step [ns]
+        self._due = 0  # the next step, if no pose comes before [ns]
         self._answered = 0  # start of the last step that had a new pose [ns]
         self._cycle = 0
 
@@ -206,29 +207,29 @@ class ContactLoop:
     def _run(self, cpu: int) -> None:
         try:
             with ExitStack() as in_use:
-                for entity in (*self._tools, self._outlets):
-                    _hold(in_use, entity)
+                for port in self._ports():
+                    in_use.enter_context(port.handle)  # not destroyed under the loop
                 in_use.enter_context(self._wait_set)
                 realtime.bind_thread(cpu)
-                self._step_start = time.monotonic_ns()
+                self._step_start = self._due = time.monotonic_ns()
                 while self._running:
                     self._wait()
                     self._step()
         except Exception as error:
             self.failure = f"the contact loop ended: {type(error).__name__}: {error}"
 
+    def _ports(self) -> list[Any]:
+        of_tools = [port for tool in self._tools for port in (tool.subscription, tool.publisher)]
+        return [*of_tools, self._outlets.state, self._outlets.deformation]
+
     def _wait(self) -> None:
         """Until a pose came, or until this period must not wait any longer."""
-        period = self._period
-        expecting = any(tool.status == OK for tool in self._tools)
-        patience = round(_PATIENCE * period) if expecting else period
-        deadline = self._step_start + patience
-        realtime.sleep_until(self._answered + round(_SHORTEST * period))
+        realtime.sleep_until(self._answered + round(_SHORTEST * self._period))
         wait_set = self._wait_set
         wait_set.clear_entities()
         for tool in self._tools:
             wait_set.add_subscription(tool.subscription.handle)
-        wait_set.wait(max(0, deadline - time.monotonic_ns()))
+        wait_set.wait(max(0, self._due - time.monotonic_ns()))
 
     def _step(self) -> None:
         start = time.monotonic_ns()
@@ -239,6 +240,7 @@ class ContactLoop:
             fresh |= tool.take(start, timeout, tip)
         record.note_period(start - self._step_start)
         self._step_start = start
+        self._due = self._next_due(start, fresh)
         if fresh:
             self._answered = start
             record.note_age(time.time_ns() - stamp_nanoseconds(self._tools[0].stamp))
@@ -255,6 +257,13 @@ class ContactLoop:
             stamp = self._tools[0].stamp
             self._outlets.deformation.handle.publish_raw(online.cloud.serialise(stamp))
 
+    def _next_due(self, start: int, fresh: bool) -> int:
+        """When to step even without a pose: later if one is expected, else in a fixed rhythm."""
+        if fresh:
+            return start + round(_PATIENCE * self._period)
+        due = self._due + self._period
+        return due if due > start else start + self._period
+
     def _publish_wrench(self, i: int, tool: Tool, model: Any) -> None:
         wrench = tool.wrench
         if model is None or tool.status != OK:
@@ -267,17 +276,9 @@ class ContactLoop:
 
     def _publish_state(self, i: int, tool: Tool, online: Online, code: int) -> None:
         template = online.states[i]
-        status = tool.status if tool.status != OK else code
+        status = code if code == NO_MODEL or tool.status == OK else tool.status
         n = 0 if online.model is None else _write_contacts(template, online.model.out, i)
         self._outlets.state.handle.publish_raw(template.serialise(tool.stamp, status, n))
-
-
-def _hold(in_use: ExitStack, entity: Tool | Outlets) -> None:
-    """Keep the middleware's side of an entity alive while the loop runs."""
-    for port in vars(entity).values():
-        handle = getattr(port, "handle", None)
-        if handle is not None:
-            in_use.enter_context(handle)
 
 
 def _write_contacts(template: StateTemplate, out: Any, tool: int) -> int:
@@ -297,58 +298,27 @@ def _write_contacts(template: StateTemplate, out: Any, tool: int) -> int:
 # --- The node --------------------------------------------------------------------------------
 
 
-class ContactNode(LifecycleNode):
-    """Parameters, transitions, statistics; the work is done by ``ContactLoop``.
-
-    refusal : why the last transition failed
-    failure : why the node cannot go on, else empty
-    """
+class ContactNode(ManagedNode):
+    """Parameters, transitions, statistics; the work is done by ``ContactLoop``."""
 
     def __init__(self) -> None:
-        super().__init__("contact")
-        self.refusal = ""
         self._loop: ContactLoop | None = None
         self._handover: Handover | None = None
-        self._statistics: Any = None
+        self._tools: list[Tool] = []
+        self._outlets: Outlets | None = None
         self._timer: Any = None
-        parameters.declare(self, parameters.CONTACT)
+        super().__init__("contact", parameters.CONTACT)
         self.add_on_set_parameters_callback(self._change_parameters)
 
     @property
     def failure(self) -> str:
         return "" if self._loop is None else self._loop.failure
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._attempt(self._configure)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._attempt(self._activate)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._attempt(self._deactivate)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._attempt(self._clean_up)
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._deactivate()
-        self._clean_up()
-        return TransitionCallbackReturn.SUCCESS
-
-    def _attempt(self, transition: Callable[[], None]) -> TransitionCallbackReturn:
-        try:
-            transition()
-        except ParameterError as error:
-            self.refusal = str(error)
-            self.get_logger().error(self.refusal)
-            return TransitionCallbackReturn.FAILURE
-        return TransitionCallbackReturn.SUCCESS
-
-    def _configure(self) -> None:
+    def configure(self) -> None:
         settings = parameters.read_contact(self)
         contact.warm_up(len(settings.tools))
         own = OwnThread()
-        tools = [
+        self._tools = [
             Tool(
                 self.create_subscription(
                     PoseStamped,
@@ -363,12 +333,12 @@ class ContactNode(LifecycleNode):
             )
             for name in settings.tools
         ]
-        outlets = Outlets(
-            self.create_publisher(ContactState, "contact_state", qos.state(len(tools))),
+        self._outlets = Outlets(
+            self.create_publisher(ContactState, "contact_state", qos.state(len(self._tools))),
             self.create_publisher(PointCloud2, "deformation", qos.NEWEST),
+            self.create_publisher(LoopStatistics, "statistics", qos.STATISTICS),
         )
-        self._statistics = self.create_publisher(LoopStatistics, "statistics", qos.STATISTICS)
-        self._loop = ContactLoop(settings, tools, outlets, self.context)
+        self._loop = ContactLoop(settings, self._tools, self._outlets, self.context)
         order = Order(
             topic=self.resolve_topic_name("vademecum"),
             node_name=f"_{self.get_name()}_handover",
@@ -379,7 +349,7 @@ class ContactNode(LifecycleNode):
         )
         self._handover = Handover(order, self._take_model, self.get_logger().error)
 
-    def _activate(self) -> None:
+    def activate(self) -> None:
         assert self._loop is not None
         settings = self._loop.settings
         granted = realtime.claim(settings.priority, settings.cpu, settings.lock_memory)
@@ -390,23 +360,24 @@ class ContactNode(LifecycleNode):
         self._loop.start(granted.cpu)
         self._timer = self.create_timer(_STATISTICS_PERIOD, self._publish_statistics)
 
-    def _deactivate(self) -> None:
+    def deactivate(self) -> None:
         if self._timer is not None:
             self.destroy_timer(self._timer)
             self._timer = None
         if self._loop is not None:
             self._loop.stop()
 
-    def _clean_up(self) -> None:
+    def clean_up(self) -> None:
         if self._handover is not None:
             self._handover.stop()
             self._handover = None
         self._loop = None
-        for subscription in [s for s in self.subscriptions if s.raw]:
-            self.destroy_subscription(subscription)
-        for publisher in [p for p in self.publishers if p.topic_name.startswith("/")]:
-            if publisher.msg_type in (WrenchStamped, ContactState, PointCloud2, LoopStatistics):
-                self.destroy_publisher(publisher)
+        for tool in self._tools:
+            self.destroy_subscription(tool.subscription)
+            self.destroy_publisher(tool.publisher)
+        for publisher in vars(self._outlets).values() if self._outlets else ():
+            self.destroy_publisher(publisher)
+        self._tools, self._outlets = [], None
 
     def _take_model(self, prepared: Prepared) -> None:
         """In the handover's thread: put a vademecum into use between two steps."""
@@ -429,14 +400,14 @@ class ContactNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _publish_statistics(self) -> None:
-        loop = self._loop
-        if loop is None:
+        loop, outlets = self._loop, self._outlets
+        if loop is None or outlets is None:
             return
         end = time.monotonic_ns()
         record, loop.record = loop.record, Record(end)
         message = statistics(record, end, loop.settings.rate)
         message.header.stamp = self.get_clock().now().to_msg()
-        self._statistics.publish(message)
+        outlets.statistics.publish(message)
         gc.collect()
 
 
@@ -478,7 +449,7 @@ def _never_called(message: bytes) -> None:
 
 
 def main() -> int:
-    return node_runner.run(ContactNode)
+    return run(ContactNode)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PoseStamped, WrenchStamped
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 from shape_msgs.msg import Mesh, MeshTriangle
 from std_msgs.msg import Header
@@ -110,6 +110,10 @@ def stamp_nanoseconds(stamp: bytes) -> int:
     return int(seconds * 1_000_000_000 + nanoseconds)
 
 
+def stamp_bytes(nanoseconds: int) -> bytes:
+    return struct.pack("=iI", nanoseconds // 1_000_000_000, nanoseconds % 1_000_000_000)
+
+
 class WrenchTemplate:
     """A serialised WrenchStamped; ``force`` and ``torque`` are views of its numbers."""
 
@@ -128,6 +132,38 @@ class WrenchTemplate:
     def serialise(self, stamp: bytes) -> bytes:
         self._buffer[self._stamp : self._stamp + _STAMP_BYTES] = stamp
         return bytes(self._buffer)
+
+
+class PoseTemplate:
+    """A serialised PoseStamped without rotation; ``position`` is a view of its numbers."""
+
+    def __init__(self, frame_id: str) -> None:
+        message = PoseStamped(header=Header(frame_id=frame_id))
+        position = message.pose.position
+        start = _find_number(message, lambda x: setattr(position, "x", x))
+        self._stamp = _find_stamp(message)
+        message.pose.orientation.w = 1.0
+        self._buffer = bytearray(serialize_message(message))
+        self.position = np.frombuffer(self._buffer, dtype=np.float64, count=3, offset=start)
+
+    def serialise(self, stamp: bytes) -> bytes:
+        self._buffer[self._stamp : self._stamp + _STAMP_BYTES] = stamp
+        return bytes(self._buffer)
+
+
+class WrenchReader:
+    """Reads serialised WrenchStamped of one frame: stamp [ns] and force [N]."""
+
+    def __init__(self, frame_id: str) -> None:
+        message = WrenchStamped(header=Header(frame_id=frame_id))
+        force = message.wrench.force
+        self._stamp = _find_stamp(message)
+        self._start = _find_number(message, lambda x: setattr(force, "x", x))
+        self._unpack = struct.Struct("=3d").unpack_from
+
+    def read(self, raw: bytes) -> tuple[int, tuple[float, ...]]:
+        stamp = stamp_nanoseconds(raw[self._stamp : self._stamp + _STAMP_BYTES])
+        return stamp, self._unpack(raw, self._start)
 
 
 class CloudTemplate:
@@ -191,10 +227,8 @@ class StateTemplate:
         self.contacts = np.frombuffer(self._block, dtype=np.float64).reshape(capacity, -1)
         self._count = serialised.rindex(struct.pack("=I", capacity), 0, start)
         self._capacity = capacity
-        if last != start + 72 or not self._agrees_with(message, 0):
+        if last != start + 72 or not all(self._reads_back(n) for n in {0, 1, capacity}):
             raise LayoutError("contacts are not ten float64 each in a row: use rmw_fastrtps_cpp")
-        if not self._agrees_with(message, min(2, capacity)):
-            raise LayoutError("contacts are not stored one after another: use rmw_fastrtps_cpp")
 
     def serialise(self, stamp: bytes, status: int, n_contacts: int) -> bytes:
         head = self._head
@@ -204,21 +238,38 @@ class StateTemplate:
         used = 8 * _CONTACT_NUMBERS * n_contacts
         return bytes(head) + bytes(memoryview(self._block)[:used]) + self._tail
 
-    def _agrees_with(self, message: ContactState, n_contacts: int) -> bool:
-        message.contacts = message.contacts[:0] + [Contact() for _ in range(n_contacts)]
-        return serialize_message(message) == self.serialise(NO_STAMP, 0, n_contacts)
+    def _reads_back(self, n_contacts: int) -> bool:
+        """A message of so many contacts means what was written; its padding may be anything."""
+        self.contacts[:] = np.arange(self.contacts.size).reshape(self.contacts.shape)
+        sent = self.serialise(struct.pack("=iI", 3, 4), 5, n_contacts)
+        read = deserialize_message(sent, ContactState)
+        numbers = [_contact_numbers(contact) for contact in read.contacts]
+        written = self.contacts[:n_contacts].tolist()
+        self.contacts[:] = 0.0
+        stamp = read.header.stamp
+        return (
+            numbers == written
+            and (stamp.sec, stamp.nanosec, read.status) == (3, 4, 5)
+            and math.isnan(read.force_error)
+        )
+
+
+def _contact_numbers(contact: Contact) -> list[float]:
+    p, n, f = contact.position, contact.normal, contact.force
+    return [p.x, p.y, p.z, n.x, n.y, n.z, f.x, f.y, f.z, contact.penetration]
 
 
 def _status_offset(message: ContactState) -> int:
-    """Byte offset of the status: the only byte that changes with it."""
-    before = serialize_message(message)
-    message.status = 0xA5
-    after = serialize_message(message)
-    message.status = 0
-    changed = [i for i, (a, b) in enumerate(zip(before, after, strict=True)) if a != b]
-    if len(changed) != 1:
+    """Byte offset of the status: the only byte that follows it; padding may hold anything."""
+    values = (0xA5, 0x3C, 0x00)
+    serialised = []
+    for value in values:
+        message.status = value
+        serialised.append(serialize_message(message))
+    follows = [i for i, held in enumerate(zip(*serialised, strict=True)) if held == values]
+    if len(follows) != 1:
         raise LayoutError("the status is not stored in one byte: use rmw_fastrtps_cpp")
-    return changed[0]
+    return follows[0]
 
 
 # --- Outside the loop ------------------------------------------------------------------------
@@ -243,4 +294,3 @@ def surface_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
             MeshTriangle(vertex_indices=np.asarray(face, dtype=np.uint32)) for face in faces
         ],
     )
-

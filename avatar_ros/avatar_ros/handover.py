@@ -22,7 +22,7 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -44,7 +44,7 @@ class Order:
     namespace: str
     tip_radii: tuple[float, ...]
     modes: int | None
-    cloud: str
+    cloud: Literal["surface", "volume", "off"]
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,7 @@ def _start(order: Order, theirs: socket.socket) -> subprocess.Popen[bytes]:
     environment = realtime.single_threaded_libraries(dict(os.environ))
     return subprocess.Popen(
         [sys.executable, "-m", "avatar_ros.handover", json.dumps(asdict(order))],
-        stdin=theirs,
-        pass_fds=(),
+        stdin=theirs.fileno(),
         env=environment,
         start_new_session=True,  # Ctrl-C is for the node, which then ends this one
     )
@@ -183,7 +182,9 @@ class Receiver:
         self._report = report
         self._current = ""
 
-    def receive(self, identity: str, name: str, data: memoryview) -> None:
+    def receive(self, message: Any) -> None:
+        """Take a VademecumFile."""
+        identity, name, data = message.id, message.name, memoryview(message.data)
         if identity == self._current:
             return  # a loader that was started again
         try:
@@ -212,9 +213,7 @@ class Receiver:
         finally:
             os.close(handle)
         order = self._order
-        arrays = contact.model_arrays(
-            vademecum, tuple(order.tip_radii), order.modes, order.cloud
-        )
+        arrays = contact.model_arrays(vademecum, tuple(order.tip_radii), order.modes, order.cloud)
         return dict(arrays._asdict())
 
     def _send(self, note: dict[str, Any], *handles: int) -> None:
@@ -229,8 +228,8 @@ def main() -> int:
     from rclpy.signals import SignalHandlerOptions
 
     from avatar_ros import qos
+    from avatar_ros.managed_node import StopSignal
     from avatar_ros.msg import VademecumFile
-    from avatar_ros.node_runner import StopSignal
 
     stop = StopSignal()
     order = Order(**json.loads(sys.argv[1]))
@@ -246,7 +245,7 @@ def main() -> int:
     node.create_subscription(
         VademecumFile,
         order.topic,
-        lambda message: receiver.receive(message.id, message.name, memoryview(message.data)),
+        receiver.receive,
         qos.LATCHED,
     )
     executor = SingleThreadedExecutor()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -94,9 +94,7 @@ CONTACT = (
         range=(0.002, 1.0),
         read_only=False,
     ),
-    Parameter(
-        "realtime.priority", 0, "SCHED_FIFO priority asked for; 0: ordinary", range=(0, 98)
-    ),
+    Parameter("realtime.priority", 0, "SCHED_FIFO priority asked for; 0: ordinary", range=(0, 98)),
     Parameter("realtime.cpu", -1, "core the loop is bound to; -1: any", range=(-1, 1023)),
     Parameter("realtime.lock_memory", True, "keep the process in memory; needs a priority"),
 )
@@ -117,7 +115,7 @@ class ContactSettings:
     tools: tuple[str, ...]
     tip_radii: tuple[float, ...]
     rate: float
-    cloud: str
+    cloud: Literal["surface", "volume", "off"]
     cloud_divisor: int
     modes: int | None
     frame_id: str

@@ -1,10 +1,11 @@
-"""What the operating system can do for a loop that must keep time: priority, core, memory, clock."""
+"""What the operating system does for a loop that must keep time: priority, core, memory, clock."""
 
 from __future__ import annotations
 
 import ctypes
 import ctypes.util
 import gc
+import json
 import os
 import sys
 import time
@@ -146,3 +147,18 @@ def die_with_parent(signal_number: int) -> None:
 
 def _threads() -> list[int]:
     return [int(task.name) for task in Path("/proc/self/task").iterdir()]
+
+
+def main() -> int:
+    """``python -m avatar_ros.realtime SECONDS PRIORITY``: this machine's wake-up periods, JSON."""
+    seconds, priority = float(sys.argv[1]), int(sys.argv[2])
+    granted = claim(priority)
+    bind_thread(-1)
+    calm_interpreter()
+    periods = wake_up_periods(seconds)
+    print(json.dumps({"priority": granted.priority, "periods": periods.tolist()}))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

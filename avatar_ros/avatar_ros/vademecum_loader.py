@@ -5,18 +5,16 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import rclpy.lifecycle
-from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from shape_msgs.msg import Mesh
 from std_msgs.msg import Header
 
 from avatar_core import storage
 from avatar_core.errors import AvatarError
-from avatar_ros import conversions, node_runner, parameters, qos
+from avatar_ros import conversions, parameters, qos
+from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.msg import VademecumFile, VademecumInfo
 from avatar_ros.parameters import LoaderSettings, ParameterError
 from avatar_ros.srv import LoadVademecum
@@ -50,57 +48,20 @@ def find_in_library(name: str, library_dir: str, max_bytes: int) -> Path:
     if not stat.S_ISREG(status.st_mode):
         raise RefusedError(f"{name}: not a file")
     if status.st_size > max_bytes:
-        raise RefusedError(
-            f"{name}: {status.st_size / 1e6:.0f} MB; raise max_megabytes to read it"
-        )
+        raise RefusedError(f"{name}: {status.st_size / 1e6:.0f} MB; raise max_megabytes to read it")
     return path
 
 
-class LoaderNode(rclpy.lifecycle.LifecycleNode):
-    """Announces one vademecum at a time; a refused file leaves the one before in place.
-
-    refusal : why the last transition failed
-    failure : always empty, nothing in this node can end it
-    """
+class LoaderNode(ManagedNode):
+    """Announces one vademecum at a time; a refused file leaves the one before in place."""
 
     def __init__(self) -> None:
-        super().__init__("vademecum_loader")
-        self.refusal = ""
-        self.failure = ""
         self._settings: LoaderSettings | None = None
         self._outlets: dict[type, Any] = {}
         self._service: Any = None
-        parameters.declare(self, parameters.VADEMECUM_LOADER)
+        super().__init__("vademecum_loader", parameters.VADEMECUM_LOADER)
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._attempt(self._configure)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._attempt(self._activate)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._deactivate()
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._clean_up()
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._deactivate()
-        self._clean_up()
-        return TransitionCallbackReturn.SUCCESS
-
-    def _attempt(self, transition: Callable[[], None]) -> TransitionCallbackReturn:
-        try:
-            transition()
-        except (ParameterError, AvatarError, OSError, MemoryError) as error:
-            self.refusal = str(error)
-            self.get_logger().error(self.refusal)
-            return TransitionCallbackReturn.FAILURE
-        return TransitionCallbackReturn.SUCCESS
-
-    def _configure(self) -> None:
+    def configure(self) -> None:
         self._settings = parameters.read_loader(self)
         if not os.path.isdir(self._settings.library_dir):
             raise ParameterError(
@@ -115,18 +76,18 @@ class LoaderNode(rclpy.lifecycle.LifecycleNode):
             )
         }
 
-    def _activate(self) -> None:
+    def activate(self) -> None:
         assert self._settings is not None
         if self._settings.vademecum:
             self.load(self._settings.vademecum)
         self._service = self.create_service(LoadVademecum, "load_vademecum", self._answer)
 
-    def _deactivate(self) -> None:
+    def deactivate(self) -> None:
         if self._service is not None:
             self.destroy_service(self._service)
             self._service = None
 
-    def _clean_up(self) -> None:
+    def clean_up(self) -> None:
         for publisher in self._outlets.values():
             self.destroy_publisher(publisher)
         self._outlets = {}
@@ -144,9 +105,7 @@ class LoaderNode(rclpy.lifecycle.LifecycleNode):
         data = path.read_bytes()
         if hashlib.sha256(data).hexdigest() != vademecum.id:
             raise RefusedError(f"{name}: changed while it was read; load it again")
-        header = Header(
-            frame_id=self._settings.frame_id, stamp=self.get_clock().now().to_msg()
-        )
+        header = Header(frame_id=self._settings.frame_id, stamp=self.get_clock().now().to_msg())
         info = conversions.vademecum_info(vademecum.info(), header)
         surface = conversions.surface_mesh(vademecum.surface_vertices, vademecum.surface_faces)
         self._outlets[VademecumInfo].publish(info)
@@ -172,7 +131,7 @@ class LoaderNode(rclpy.lifecycle.LifecycleNode):
 
 
 def main() -> int:
-    return node_runner.run(LoaderNode)
+    return run(LoaderNode)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,9 @@ def generate_launch_description() -> LaunchDescription:
     params = LaunchConfiguration("params")
     return LaunchDescription(
         [
-            DeclareLaunchArgument("params", default_value=default, description="YAML for both nodes"),
+            DeclareLaunchArgument(
+                "params", default_value=default, description="YAML for both nodes"
+            ),
             Node(package="avatar_ros", executable="vademecum_loader", parameters=[params]),
             Node(package="avatar_ros", executable="contact", parameters=[params]),
         ]

@@ -1,0 +1,323 @@
+"""Does this machine hold 1 kHz? Measures a whole cell of real processes over real DDS.
+
+Loader, contact node, a palpating tool, a cloud viewer, and beside them a loop that only sleeps:
+what it misses, the machine misses. Run by ``avatar bench cell``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar_core.errors import AvatarError
+from avatar_ros import realtime
+from avatar_ros.scripted_tool import READY, Felt
+
+PERIOD = 1e-3  # [s]
+ON_TIME = 1.5e-3  # longest period that is on time [s]
+PRIORITY = 80  # of contact node, tool and sleeping loop in the real-time mode
+_START_TIMEOUT = 120.0  # compilation included [s]
+_STOP_TIMEOUT = 2.0  # a node ends within [s]
+_DOMAINS = range(1, 102)  # of DDS, those that work on every platform
+
+
+class CellError(AvatarError):
+    """A process of the measured cell did not do its part."""
+
+
+@dataclass(frozen=True)
+class Times:
+    """Of periods or latencies [ms]."""
+
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+
+    @staticmethod
+    def of(seconds: np.ndarray) -> Times:
+        if len(seconds) == 0:
+            return Times(np.nan, np.nan, np.nan)
+        return Times(*(float(x) for x in 1e3 * np.percentile(seconds, (50, 99, 100))))
+
+
+@dataclass(frozen=True)
+class CellMeasurement:
+    """One run of the cell.
+
+    priority : SCHED_FIFO priority that the tool was granted, 0 without
+    load_average : of the last minute, before the run; processes of others disturb
+    rate_hz, on_time_fraction : periods of the contact loop, by its own clock; on time: <= 1.5 ms
+    rate_at_tool_hz, on_time_at_tool_fraction : periods between wrenches that reached the tool
+    latency : from publishing a pose to its wrench in hand, in the tool
+    answered_fraction : poses that got a wrench of their own
+    compute_p99_ms : worst second of the contact node, from pose in hand to wrench published
+    floor : periods of the sleeping loop in the same seconds
+    cloud_hz, cloud_bytes : what the viewer got
+    force_max_n : largest force felt
+    felt : every pose and its answer; not in the data file
+    """
+
+    priority: int
+    load_average: float
+    seconds: float
+    rate_hz: float
+    on_time_fraction: float
+    period_max_ms: float
+    rate_at_tool_hz: float
+    on_time_at_tool_fraction: float
+    latency: Times
+    answered_fraction: float
+    compute_p99_ms: float
+    floor: Times
+    floor_on_time_fraction: float
+    cloud_hz: float
+    cloud_bytes: int
+    force_max_n: float
+    felt: Felt
+
+
+@dataclass(frozen=True)
+class CellReport:
+    """What ``avatar bench cell`` prints; ``real_time`` is None where priority is refused."""
+
+    machine: str
+    cores: int
+    vademecum: str
+    real_time: CellMeasurement | None
+    ordinary: CellMeasurement | None
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """The figures of the better mode that was run, under the names of the data file."""
+        best = self.real_time or self.ordinary
+        if best is None:
+            return {}
+        return {
+            "rate_hz": best.rate_hz,
+            "on_time_fraction": best.on_time_fraction,
+            "latency_p50_ms": best.latency.p50_ms,
+            "latency_p99_ms": best.latency.p99_ms,
+        }
+
+    def save(self, path: Path) -> None:
+        """Write all figures as JSON; those that could not be measured are null."""
+        document = {"name": "cell", "summary": self.summary, **asdict(self)}
+        path.write_text(json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+
+    def table(self) -> str:
+        """Both modes side by side, one figure a line."""
+        runs = [run for run in (self.real_time, self.ordinary) if run is not None]
+        names = [f"SCHED_FIFO {run.priority}" if run.priority else "ordinary" for run in runs]
+        lines = [f"{'':34}" + "".join(f"{name:>16}" for name in names)]
+        for label, value in _ROWS:
+            lines.append(f"{label:34}" + "".join(f"{value(run):>16}" for run in runs))
+        return "\n".join(lines)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(held) for name, held in value.items() if name != "felt"}
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _times(times: Times) -> str:
+    return f"{times.p50_ms:.2f} {times.p99_ms:.2f} {times.max_ms:.1f}"
+
+
+_ROWS = (
+    ("load average before", lambda run: f"{run.load_average:.2f}"),
+    ("contact loop rate [Hz]", lambda run: f"{run.rate_hz:.1f}"),
+    ("  periods <= 1.5 ms", lambda run: f"{run.on_time_fraction:.3%}"),
+    ("  longest period [ms]", lambda run: f"{run.period_max_ms:.1f}"),
+    ("wrenches at the tool [Hz]", lambda run: f"{run.rate_at_tool_hz:.1f}"),
+    ("  periods <= 1.5 ms", lambda run: f"{run.on_time_at_tool_fraction:.3%}"),
+    ("pose to wrench p50 p99 max [ms]", lambda run: _times(run.latency)),
+    ("  poses answered", lambda run: f"{run.answered_fraction:.3%}"),
+    ("  computing, worst p99 [ms]", lambda run: f"{run.compute_p99_ms:.3f}"),
+    ("bare sleep p50 p99 max [ms]", lambda run: _times(run.floor)),
+    ("  periods <= 1.5 ms", lambda run: f"{run.floor_on_time_fraction:.3%}"),
+    ("clouds at the viewer [Hz]", lambda run: f"{run.cloud_hz:.1f}"),
+    ("  bytes each", lambda run: f"{run.cloud_bytes}"),
+    ("largest force [N]", lambda run: f"{run.force_max_n:.2f}"),
+)
+
+
+def run_cell(
+    vademecum_path: str | Path,
+    seconds: float = 60.0,
+    output_json: str | Path | None = None,
+    real_time: bool = True,
+    ordinary: bool = True,
+    tip_radius: float = 0.005,
+) -> CellReport:
+    """Measure a cell with real-time priority and without, ``seconds`` each.
+
+    Raises
+    ------
+    CellError : a process failed; the message holds its last line
+    """
+    path = Path(vademecum_path).resolve()
+    if not path.is_file():
+        raise CellError(f"{path}: no such file; build one with 'avatar vademecum'")
+    granted = real_time and _priority_is_granted()
+    report = CellReport(
+        machine=f"{platform.machine()} {platform.release()}",
+        cores=len(os.sched_getaffinity(0)),
+        vademecum=path.name,
+        real_time=_measure(path, seconds, PRIORITY, tip_radius) if granted else None,
+        ordinary=_measure(path, seconds, 0, tip_radius) if ordinary else None,
+    )
+    if output_json is not None:
+        report.save(Path(output_json))
+    return report
+
+
+def _priority_is_granted() -> bool:
+    question = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({PRIORITY}))"
+    return (
+        subprocess.run([sys.executable, "-c", question], stderr=subprocess.DEVNULL).returncode == 0
+    )
+
+
+def _measure(path: Path, seconds: float, priority: int, tip_radius: float) -> CellMeasurement:
+    load = os.getloadavg()[0]
+    with (
+        tempfile.TemporaryDirectory(prefix="avatar-bench-") as folder,
+        cell(path, tip_radius, priority) as environment,
+    ):
+        felt_file, view_file = Path(folder, "felt.npz"), Path(folder, "view.json")
+        viewer = Module("cloud_viewer", [str(view_file)], environment)
+        arguments = [str(path), "--tip-radius", str(tip_radius), "--output", str(felt_file)]
+        arguments += ["--seconds", str(seconds), "--priority", str(priority)]
+        tool = Module("scripted_tool", arguments, environment)
+        try:
+            assert tool.stdout is not None
+            if tool.stdout.readline().strip() != READY:
+                tool.wait(_STOP_TIMEOUT)
+                raise CellError(f"the tool did not start: {tool.last_words()}")
+            floor = Module("realtime", [str(seconds), str(priority)], environment)
+            bare, _ = floor.communicate(timeout=seconds + _START_TIMEOUT)
+            if tool.wait(timeout=seconds + _START_TIMEOUT) != 0:
+                raise CellError(f"the tool failed: {tool.last_words()}")
+        finally:
+            tool.finish()
+            viewer.finish()
+        felt = Felt.load(felt_file)
+        return _evaluate(felt, json.loads(view_file.read_text()), json.loads(bare), load)
+
+
+def _evaluate(
+    felt: Felt, view: dict[str, Any], bare: dict[str, Any], load: float
+) -> CellMeasurement:
+    windows = [
+        w
+        for w in view["statistics"]
+        if felt.begin <= w["received"] - w["window"] and w["received"] <= felt.end
+    ]
+    if not windows:
+        raise CellError("no statistics from the contact node: measure for 3 s or longer")
+    periods = sum(w["periods"] for w in windows)
+    duration = float(felt.end - felt.begin)
+    clouds = np.array(view["clouds"])
+    floor = np.array(bare["periods"])
+    at_tool = np.diff(felt.arrivals)
+    answered = felt.latencies[np.isfinite(felt.latencies)]
+    return CellMeasurement(
+        priority=int(felt.priority),
+        load_average=load,
+        seconds=duration,
+        rate_hz=periods / sum(w["window"] for w in windows),
+        on_time_fraction=1.0 - sum(w["missed"] for w in windows) / periods,
+        period_max_ms=1e3 * max(w["period_max"] for w in windows),
+        rate_at_tool_hz=len(felt.arrivals) / duration,
+        on_time_at_tool_fraction=float(np.mean(at_tool <= ON_TIME)),
+        latency=Times.of(answered),
+        answered_fraction=len(answered) / len(felt.latencies),
+        compute_p99_ms=1e3 * max(w["compute_p99"] for w in windows),
+        floor=Times.of(floor),
+        floor_on_time_fraction=float(np.mean(floor <= ON_TIME)),
+        cloud_hz=np.count_nonzero((clouds > felt.begin) & (clouds < felt.end)) / duration,
+        cloud_bytes=view["cloud_bytes"],
+        force_max_n=float(np.nanmax(np.linalg.norm(felt.forces, axis=1))),
+        felt=felt,
+    )
+
+
+# --- Processes -------------------------------------------------------------------------------
+
+
+def isolated_environment() -> dict[str, str]:
+    """An environment with a DDS domain of its own, on this machine only."""
+    environment = realtime.single_threaded_libraries(dict(os.environ))
+    return environment | {
+        "ROS_DOMAIN_ID": str(_DOMAINS[(os.getpid() * 37 + time.monotonic_ns()) % len(_DOMAINS)]),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+@contextmanager
+def cell(vademecum: Path, tip_radius: float = 0.005, priority: int = 0) -> Iterator[dict[str, str]]:
+    """Loader and contact node as processes; gives the environment to join them.
+
+    Raises
+    ------
+    CellError : one of them failed, or did not end in time
+    """
+    environment = isolated_environment()
+    files = ["-p", f"library_dir:={vademecum.parent}", "-p", f"vademecum:={vademecum.name}"]
+    loader = Module("vademecum_loader", ["--ros-args", *files], environment)
+    numbers = ["-p", f"tip_radius:={float(tip_radius)}", "-p", f"realtime.priority:={priority}"]
+    contact = Module("contact", ["--ros-args", *numbers], environment)
+    try:
+        yield environment
+        for name, process in (("vademecum_loader", loader), ("contact", contact)):
+            if process.poll() is not None:
+                raise CellError(f"{name} ended by itself: {process.last_words()}")
+    finally:
+        codes = [process.finish() for process in (contact, loader)]
+    if any(codes):
+        raise CellError(f"contact and loader ended with codes {codes} instead of 0")
+
+
+class Module(subprocess.Popen[str]):
+    """A Python module as a process; what it says on standard error is kept."""
+
+    def __init__(self, name: str, arguments: list[str], environment: dict[str, str]) -> None:
+        self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115, closed with the object
+        super().__init__(
+            [sys.executable, "-m", f"avatar_ros.{name}", *arguments],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=self._said,
+            text=True,
+        )
+
+    def last_words(self) -> str:
+        """The last line of standard error."""
+        self._said.seek(0)
+        lines = [line.strip() for line in self._said if line.strip()]
+        return lines[-1] if lines else f"it said nothing, exit code {self.poll()}"
+
+    def finish(self) -> int:
+        """End it as Ctrl-C would; returns its exit code."""
+        if self.poll() is None:
+            self.send_signal(signal.SIGINT)
+        try:
+            return self.wait(_STOP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return self.wait()

@@ -1,0 +1,59 @@
+"""The third process of a measured cell: takes every cloud, and keeps the loop's statistics.
+
+Run as ``python -m avatar_ros.cloud_viewer FILE.json``; the file is written at SIGINT or SIGTERM.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import PointCloud2
+
+from avatar_ros import qos, realtime
+from avatar_ros.managed_node import StopSignal
+from avatar_ros.msg import LoopStatistics
+
+
+def main() -> int:
+    output = Path(sys.argv[1])
+    stop = StopSignal()
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("cloud_viewer", enable_rosout=False, start_parameter_services=False)
+    clouds: list[float] = []
+    n_bytes = [0]
+    statistics: list[dict[str, Any]] = []
+
+    def view(cloud: bytes) -> None:
+        clouds.append(time.monotonic())
+        n_bytes[0] = len(cloud)
+
+    def note(message: LoopStatistics) -> None:
+        numbers = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
+        del numbers["header"]
+        statistics.append({"received": time.monotonic(), **numbers})
+
+    node.create_subscription(PointCloud2, "deformation", view, qos.NEWEST, raw=True)
+    node.create_subscription(LoopStatistics, "statistics", note, qos.STATISTICS)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    realtime.calm_interpreter()
+    while not stop:
+        executor.spin_once(timeout_sec=0.1)
+    output.write_text(
+        json.dumps({"clouds": clouds, "cloud_bytes": n_bytes[0], "statistics": statistics})
+    )
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

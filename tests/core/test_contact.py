@@ -1,0 +1,278 @@
+"""Contact: action and reaction, energy, smoothness, exact constraints, every status."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar_core.contact import (
+    ContactModel,
+    Status,
+    load_arrays,
+    make_model,
+    prepare,
+    save_arrays,
+    step,
+    stored_energy,
+)
+from avatar_core.errors import ContactError
+from avatar_core.shepard import weights_at
+from avatar_core.tool_path import inner_positions, middle_of_access, palpation, slide
+from avatar_core.vademecum import Vademecum
+
+RADIUS = 5e-3
+
+
+@pytest.fixture()
+def model(phantom_vademecum: Vademecum) -> ContactModel:
+    return prepare(phantom_vademecum, (RADIUS,), cloud="volume")
+
+
+def push(v: Vademecum, depth: float, position: int | None = None) -> np.ndarray:
+    j = middle_of_access(v) if position is None else position
+    return (v.surface.centers[j] + (RADIUS - depth) * v.surface.normals[j])[None].copy()
+
+
+def test_no_force_without_contact(phantom_vademecum: Vademecum, model: ContactModel) -> None:
+    assert step(model, push(phantom_vademecum, -1e-3)) == Status.OK
+    assert not model.out.force.any()
+    assert model.out.n_contacts[0] == 0
+    np.testing.assert_array_equal(model.out.cloud[:, 3:], 0.0)
+
+
+def test_force_equals_full_finite_elements(
+    phantom_vademecum: Vademecum, model: ContactModel
+) -> None:
+    """Pressed at a load position: lambda = indentation / (n . C n), C from a fresh solve."""
+    from avatar_core.elasticity import Elasticity
+    from avatar_core.loads import patch_loads
+
+    v = phantom_vademecum
+    assert step(model, push(v, 3e-3)) == Status.OK
+    problem = Elasticity(v.mesh, v.material, v.regions.clamped)
+    n, s = model.state.direction[0], model.state.point[0]
+    load = patch_loads(problem, s[None], n[None], v.surface.patch_radius)
+    compliance = n @ (load.T @ problem.solve(load)) @ n
+    assert model.state.force[0] == pytest.approx(-model.state.gap[0] / compliance, rel=0.03)
+
+
+def test_patch_does_not_penetrate(phantom_vademecum: Vademecum, model: ContactModel) -> None:
+    for tip in slide(phantom_vademecum, RADIUS, 4e-3, 0.02):
+        assert step(model, tip[None].copy()) == Status.OK
+        assert model.out.contact_penetration[0] < 1e-5
+
+
+def test_action_is_reaction(phantom_vademecum: Vademecum, model: ContactModel) -> None:
+    """The pressed displacement field is the one of the opposite of the normal tool force."""
+    v = phantom_vademecum
+    step(model, push(v, 5e-3))
+    n, force = model.state.direction[0], model.out.force[0]
+    assert force @ n == pytest.approx(model.state.force[0], rel=5e-3)
+    where = weights_at(v.surface.interpolation, model.state.point[0], n)
+    field = v.displacement(*where) @ (-n * model.state.force[0])
+    np.testing.assert_allclose(
+        model.out.cloud[:, 3:].ravel(), field, atol=2e-5 * np.abs(field).max()
+    )
+
+
+def test_displacement_moves_the_cloud(phantom_vademecum: Vademecum, model: ContactModel) -> None:
+    step(model, push(phantom_vademecum, 5e-3))
+    moved = phantom_vademecum.mesh.vertices + model.out.cloud[:, 3:]
+    np.testing.assert_allclose(model.out.cloud[:, :3], moved, atol=1e-7)
+
+
+def test_force_is_the_derivative_of_the_energy(
+    phantom_vademecum: Vademecum, model: ContactModel
+) -> None:
+    v = phantom_vademecum
+    rng = np.random.default_rng(2)
+    for j in rng.choice(inner_positions(v), 5):
+        tip = push(v, 4e-3, j) + rng.uniform(-2e-3, 2e-3, 3)
+        step(model, tip)
+        force, h = model.out.force[0].copy(), 1e-5
+        slope = np.empty(3)
+        for d in range(3):
+            energies = []
+            for sign in (1, -1):
+                moved = tip.copy()
+                moved[0, d] += sign * h
+                step(model, moved)
+                energies.append(stored_energy(model))
+            slope[d] = (energies[0] - energies[1]) / (2 * h)
+        np.testing.assert_allclose(force, -slope, atol=1e-3 * np.linalg.norm(force))
+
+
+def test_closed_paths_do_no_work(phantom_vademecum: Vademecum, model: ContactModel) -> None:
+    worst = closed_path_work(phantom_vademecum, model, 100, seed=0)
+    assert worst < 0.01
+
+
+@pytest.mark.long
+def test_a_thousand_closed_paths_do_no_work(
+    phantom_vademecum: Vademecum, model: ContactModel
+) -> None:
+    worst = closed_path_work(phantom_vademecum, model, 1000, seed=1)
+    print(f"work round 1,000 closed paths: at most {worst:.2%} of the peak stored energy")
+    assert worst < 0.01
+
+
+def closed_path_work(v: Vademecum, model: ContactModel, n_paths: int, seed: int) -> float:
+    """Largest |work| / peak energy over loops that start and end 3 mm above the organ."""
+    rng = np.random.default_rng(seed)
+    inner = inner_positions(v, 20e-3)
+    worst = 0.0
+    for _ in range(n_paths):
+        j = rng.choice(inner)
+        n = v.surface.normals[j]
+        corners = v.surface.centers[j] + RADIUS * n + rng.uniform(-12e-3, 12e-3, (4, 3))
+        corners += np.outer(-((corners - v.surface.centers[j]) @ n) + RADIUS, n)
+        corners -= np.outer(rng.uniform(0, 6e-3, 4), n)
+        start = corners[0] + n * 15e-3
+        path = np.concatenate(
+            [
+                np.linspace(a, b, 150, endpoint=False)
+                for a, b in zip([start, *corners], [*corners, start], strict=True)
+            ]
+            + [start[None]]
+        )
+        model.reset()
+        force = np.zeros_like(path)
+        peak = 0.0
+        for k, tip in enumerate(path):
+            step(model, tip[None].copy())
+            force[k] = model.out.force[0]
+            peak = max(peak, stored_energy(model))
+        work = 0.5 * ((force[1:] + force[:-1]) * np.diff(path, axis=0)).sum()
+        if peak > 1e-5:
+            worst = max(worst, abs(work) / peak)
+    return worst
+
+
+@pytest.mark.parametrize("depth", [1e-3, 3e-3])
+def test_sliding_force_has_no_steps(
+    phantom_vademecum: Vademecum, model: ContactModel, depth: float
+) -> None:
+    """200 mm at constant depth in steps of 0.1 mm: no step above 2 % of the peak force."""
+    forces = []
+    for tip in slide(phantom_vademecum, RADIUS, depth, 0.2):
+        assert step(model, tip[None].copy()) == Status.OK
+        forces.append(model.out.force[0].copy())
+    size = np.linalg.norm(forces, axis=1)
+    jump = np.linalg.norm(np.diff(forces, axis=0), axis=1).max() / size.max()
+    print(f"largest force step {jump:.2%} of the peak {size.max():.1f} N")
+    assert jump < 0.02
+
+
+def test_small_tip_is_felt_between_vertices(phantom_vademecum: Vademecum) -> None:
+    """A 2 mm tip over face centroids: as much force as over the vertices around."""
+    v = phantom_vademecum
+    small = prepare(v, (2e-3,))
+    inner = set(inner_positions(v).tolist())
+    for corners in v.surface.corners[::15]:
+        if not inner.issuperset(corners.tolist()):
+            continue
+        centroid = v.surface.centers[corners].mean(axis=0)
+        normal = v.surface.normals[corners].mean(axis=0)
+        step(small, (centroid + normal * 0.5e-3)[None].copy())
+        assert np.linalg.norm(small.out.force[0]) > 0.1
+
+
+def test_two_tools_share_the_organ(phantom_vademecum: Vademecum) -> None:
+    """With a second tool pressing beside, the organ has sunk and the first force is smaller."""
+    v = phantom_vademecum
+    two = prepare(v, (RADIUS, RADIUS))
+    a = middle_of_access(v)
+    b = int(
+        np.argmin(abs(np.linalg.norm(v.surface.centers - v.surface.centers[a], axis=1) - 25e-3))
+    )
+    tips = np.concatenate([push(v, 4e-3, a), push(v, 4e-3, b)])
+    lifted = np.concatenate([push(v, 4e-3, a), push(v, -4e-3, b)])
+    step(two, lifted)
+    alone = np.linalg.norm(two.out.force[0])
+    step(two, tips)
+    assert two.out.n_contacts[0] == 2
+    assert 0.3 * alone < np.linalg.norm(two.out.force[0]) < 0.98 * alone
+    assert (two.out.contact_penetration[:2] < 1e-5).all()
+
+
+def test_force_is_proportional_to_indentation(
+    phantom_vademecum: Vademecum, model: ContactModel
+) -> None:
+    """Linear elasticity: lambda / (-gap) does not depend on depth at one surface point."""
+    v = phantom_vademecum
+    ratio = []
+    for depth in (0.5e-3, 1e-3, 2e-3):
+        step(model, push(v, depth))
+        ratio.append(model.state.force[0] / -model.state.gap[0])
+    np.testing.assert_allclose(ratio, ratio[0], rtol=5e-3)  # s moves with the tip by < 0.1 mm
+
+
+def test_return_to_rest_is_exact(phantom_vademecum: Vademecum, model: ContactModel) -> None:
+    v = phantom_vademecum
+    for tip in palpation(v, RADIUS, 8e-3, 200):
+        step(model, tip[None].copy())
+    assert not model.out.force.any()
+    np.testing.assert_array_equal(model.out.cloud[:, 3:], 0.0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_invalid_pose_has_no_force(
+    phantom_vademecum: Vademecum, model: ContactModel, bad: float
+) -> None:
+    step(model, push(phantom_vademecum, 3e-3))
+    assert step(model, np.array([[bad, 0.0, 0.0]])) == Status.INVALID_POSE
+    assert not model.out.force.any()
+    assert step(model, push(phantom_vademecum, -3e-3)) == Status.OK
+
+
+def test_tip_that_starts_inside_is_out_of_range_until_withdrawn(
+    phantom_vademecum: Vademecum, model: ContactModel
+) -> None:
+    deep = push(phantom_vademecum, RADIUS + 12e-3)
+    assert step(model, deep) == Status.OUT_OF_RANGE
+    assert not model.out.force.any()
+    step(model, push(phantom_vademecum, -1e-3))
+    for depth in np.arange(0.0, RADIUS + 12e-3, 1e-3):
+        step(model, push(phantom_vademecum, depth))
+    assert step(model, deep) == Status.OK
+    assert model.out.force.any()
+
+
+def test_clamped_side_is_out_of_range(phantom_vademecum: Vademecum, model: ContactModel) -> None:
+    v = phantom_vademecum
+    away = v.mesh.vertices[v.mesh.surface_vertices]
+    back = away[np.argmin(away[:, 1])] + np.array([0.0, -1e-3, 0.0])
+    assert step(model, back[None].copy()) in (Status.OK, Status.OUT_OF_RANGE)
+    assert not model.out.force.any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tip_radii": ()}, "tools"),
+        ({"tip_radii": (1e-3,)}, "tip radius"),
+        ({"tip_radii": (float("nan"),)}, "tip radius"),
+        ({"modes": 0}, "modes"),
+        ({"modes": 10**6}, "modes"),
+        ({"cloud": "fog"}, "cloud"),
+    ],
+)
+def test_impossible_model_is_refused(
+    phantom_vademecum: Vademecum, options: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ContactError, match=message):
+        prepare(phantom_vademecum, **options)  # type: ignore[arg-type]
+
+
+def test_mapped_arrays_give_the_same_force(
+    phantom_vademecum: Vademecum, model: ContactModel, tmp_path: Path
+) -> None:
+    save_arrays(model.arrays, tmp_path / "model")
+    mapped = make_model(load_arrays(tmp_path / "model"))
+    tip = push(phantom_vademecum, 4e-3)
+    step(model, tip)
+    step(mapped, tip)
+    np.testing.assert_array_equal(mapped.out.force, model.out.force)
+    np.testing.assert_array_equal(mapped.out.cloud, model.out.cloud)

@@ -1,0 +1,191 @@
+"""The vademecum: its promise on unseen loads, positivity, symmetry, storage."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from avatar_core.build import BuildRule
+from avatar_core.certificate import certify
+from avatar_core.elasticity import Elasticity
+from avatar_core.errors import StorageError
+from avatar_core.shepard import weights_at
+from avatar_core.storage import load_vademecum, save_vademecum
+from avatar_core.vademecum import Vademecum
+
+
+def test_certificate_meets_the_promise_on_the_phantom(phantom_vademecum: Vademecum) -> None:
+    c = phantom_vademecum.certificate
+    assert c is not None
+    assert phantom_vademecum.convergence.converged
+    assert c.l2_mean <= 0.05 and c.l2_worst <= 0.12
+    assert c.contact_mean <= 0.03 and c.contact_worst <= 0.10
+    assert c.vertex_contact_worst <= 1e-3
+
+
+def test_certificate_sees_a_damaged_vademecum(phantom_vademecum: Vademecum) -> None:
+    """A certificate that cannot tell a good from a bad file would certify anything."""
+    v = phantom_vademecum
+    problem = Elasticity(v.mesh, v.material, v.regions.clamped)
+    damaged = replace(v, near=replace(v.near, block=0.0 * v.near.block))
+    good, bad = certify(v, problem, 20), certify(damaged, problem, 20)
+    assert good.l2_mean < 0.6 * bad.l2_mean
+    assert bad.contact_mean == pytest.approx(good.contact_mean)
+
+
+def test_near_field_makes_the_loaded_positions_exact(phantom_vademecum: Vademecum) -> None:
+    """Within the plateau around a load position, the displacement is the full solution."""
+    from avatar_core.loads import patch_loads
+
+    v = phantom_vademecum
+    problem = Elasticity(v.mesh, v.material, v.regions.clamped)
+    for j in (0, 50, 200):
+        load = patch_loads(
+            problem, v.surface.centers[[j]], v.surface.normals[[j]], v.surface.patch_radius
+        )
+        exact = problem.at_vertices(problem.solve(load))
+        near = np.linalg.norm(v.mesh.vertices - v.surface.centers[j], axis=1)
+        near = np.repeat(near < 1.6 * v.surface.patch_radius, 3)
+        estimate = v.displacement(np.array([j]), np.ones(1))
+        assert np.abs(estimate - exact)[near].max() < 1e-5 * np.abs(exact).max()
+
+
+def test_contact_compliance_is_symmetric_positive_definite(phantom_vademecum: Vademecum) -> None:
+    """On random active sets, interpolated in s, with their normals."""
+    smallest, asymmetry = active_set_spectrum(phantom_vademecum, 200, seed=0)
+    assert smallest > 0
+    assert asymmetry < 1e-6
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["LiTS-4", "LiTS-10", "LiTS-60", "Amos-007", "LiTS-23"])
+def test_contact_compliance_of_real_livers(name: str, livers_dir: Path) -> None:
+    from avatar_core.organ import OrganOptions, vademecum_of
+    from avatar_core.surface import read_surface
+
+    options = OrganOptions(n_vertices=1500, rule=BuildRule(max_modes=40), n_certified=3)
+    v = vademecum_of(read_surface(livers_dir / f"{name}.obj"), options)
+    smallest, asymmetry = active_set_spectrum(v, 1000, seed=1)
+    print(f"{name}: smallest eigenvalue {smallest:.2e} of the mean diagonal, asymmetry {asymmetry:.1e}")
+    assert smallest > 0
+    assert asymmetry < 1e-6
+
+
+def active_set_spectrum(v: Vademecum, n_sets: int, seed: int) -> tuple[float, float]:
+    """Smallest eigenvalue over the mean diagonal, and largest asymmetry, over random sets."""
+    rng = np.random.default_rng(seed)
+    surface = v.surface
+    smallest, asymmetry = np.inf, 0.0
+    for _ in range(n_sets):
+        faces = rng.choice(len(surface.corners), rng.integers(2, 7), replace=False)
+        bary = rng.dirichlet(np.ones(3), len(faces))
+        corners = surface.corners[faces]
+        points = np.einsum("ck,ckd->cd", bary, surface.centers[corners])
+        normals = np.einsum("ck,ckd->cd", bary, surface.normals[corners])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        where = [
+            weights_at(surface.interpolation, p, n) for p, n in zip(points, normals, strict=True)
+        ]
+        c = np.array(
+            [
+                [
+                    normals[a] @ v.compliance(*where[a], *where[b]) @ normals[b]
+                    for b in range(len(where))
+                ]
+                for a in range(len(where))
+            ]
+        )
+        scale = np.diag(c).mean()
+        smallest = min(smallest, np.linalg.eigvalsh((c + c.T) / 2).min() / scale)
+        asymmetry = max(asymmetry, np.abs(c - c.T).max() / scale)
+    return smallest, asymmetry
+
+
+def test_file_gives_back_the_same_vademecum(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
+    save_vademecum(phantom_vademecum, tmp_path / "a.h5")
+    v = load_vademecum(tmp_path / "a.h5")
+    assert repr(v.certificate) == repr(phantom_vademecum.certificate)  # NaN differs from NaN
+    assert v.convergence == phantom_vademecum.convergence
+    assert v.provenance == phantom_vademecum.provenance
+    for name in ("far", "near", "contact_near"):
+        a, b = getattr(v, name), getattr(phantom_vademecum, name)
+        for field in a.__dataclass_fields__:
+            np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+    assert v.nbytes == (tmp_path / "a.h5").stat().st_size
+    assert len(v.id) == 64
+
+
+@pytest.mark.parametrize("at", [0.02, 0.3, 0.7, 0.99])
+def test_flipped_bit_is_refused(phantom_vademecum: Vademecum, tmp_path: Path, at: float) -> None:
+    file = tmp_path / "a.h5"
+    save_vademecum(phantom_vademecum, file)
+    content = bytearray(file.read_bytes())
+    content[int(at * len(content))] ^= 0x10
+    file.write_bytes(content)
+    with pytest.raises(StorageError) as refusal:
+        load_vademecum(file)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.01, 0.5, 0.999])
+def test_truncated_file_is_refused(
+    phantom_vademecum: Vademecum, tmp_path: Path, keep: float
+) -> None:
+    file = tmp_path / "a.h5"
+    save_vademecum(phantom_vademecum, file)
+    content = file.read_bytes()
+    file.write_bytes(content[: int(keep * len(content))])
+    with pytest.raises(StorageError, match="again"):
+        load_vademecum(file)
+
+
+def test_schema_from_the_future_is_refused(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
+    file = tmp_path / "a.h5"
+    save_vademecum(phantom_vademecum, file)
+    with h5py.File(file, "r+") as stored:
+        stored.attrs["schema"] = "99.0"
+    with pytest.raises(StorageError, match=r"99\.0.*upgrade"):
+        load_vademecum(file)
+
+
+def test_foreign_hdf5_and_missing_file_are_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "b.h5", "w") as stored:
+        stored["x"] = 1
+    with pytest.raises(StorageError, match="no vademecum"):
+        load_vademecum(tmp_path / "b.h5")
+    with pytest.raises(StorageError, match="no vademecum at"):
+        load_vademecum(tmp_path / "c.h5")
+
+
+def test_full_disk_leaves_the_old_file(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
+    """A write that fails half way (file size limit) keeps what was there, and no scraps."""
+    file = tmp_path / "a.h5"
+    save_vademecum(phantom_vademecum, file)
+    before = file.read_bytes()
+    script = (
+        "import resource, signal, sys\n"
+        "from avatar_core.storage import load_vademecum, save_vademecum\n"
+        "from avatar_core.errors import StorageError\n"
+        "v = load_vademecum(sys.argv[1])\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
+        "try:\n    save_vademecum(v, sys.argv[1])\n"
+        "except StorageError as error:\n    print(error); raise SystemExit(7)\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", script, str(file)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert run.returncode == 7, run.stderr
+    assert "free disk space" in run.stdout
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
