@@ -1,4 +1,7 @@
-"""The loader and the contact node: `ros2 launch avatar_ros contact.launch.py params:=FILE`."""
+"""The loader and the contact node: `ros2 launch avatar_ros contact.launch.py vademecum:=FILE.h5`.
+
+``library_dir`` and ``vademecum`` override what the YAML file ``params`` says.
+"""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
@@ -10,12 +13,17 @@ from launch_ros.substitutions import FindPackageShare
 def generate_launch_description() -> LaunchDescription:
     default = PathJoinSubstitution([FindPackageShare("avatar_ros"), "params", "contact.yaml"])
     params = LaunchConfiguration("params")
+    library = {name: LaunchConfiguration(name) for name in ("library_dir", "vademecum")}
     return LaunchDescription(
         [
             DeclareLaunchArgument(
                 "params", default_value=default, description="YAML for both nodes"
             ),
-            Node(package="avatar_ros", executable="vademecum_loader", parameters=[params]),
+            DeclareLaunchArgument("library_dir", default_value=".", description="vademecums"),
+            DeclareLaunchArgument("vademecum", default_value="", description="file to load"),
+            Node(
+                package="avatar_ros", executable="vademecum_loader", parameters=[params, library]
+            ),
             Node(package="avatar_ros", executable="contact", parameters=[params]),
         ]
     )
