@@ -7,7 +7,7 @@ import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
@@ -141,7 +141,8 @@ def vademecum(
         best = built.convergence.rank_errors[-1]
         print(
             f"avatar: not converged: {best.rank} modes leave {best.mean:.1%} mean, "
-            f"{best.worst:.1%} worst; the file is complete and marked; raise --modes or --tolerance",
+            f"{best.worst:.1%} worst; the file is complete and marked; raise --modes or "
+            "--tolerance",
             file=sys.stderr,
         )
         raise typer.Exit(EXIT_NOT_CONVERGED)
@@ -184,7 +185,7 @@ def demo(
     seconds: Annotated[float, typer.Option(help="of palpation over ROS 2 [s]")] = 10.0,
     vertices: Vertices = 1200,
 ) -> None:
-    """Phantom liver -> vademecum -> ROS 2 nodes at 1 kHz under a scripted tool -> table, picture."""
+    """Phantom -> vademecum -> ROS 2 nodes at 1 kHz under a scripted tool -> table, picture."""
     import tempfile
 
     from avatar_core.organ import OrganOptions, vademecum_of
@@ -334,11 +335,11 @@ def _step_table(rows: list[StepRow]) -> str:
         f"{'method':22s} {'vertices':>8s} {'modes':>5s} {'tools':>5s} {'contacts':>8s} "
         f"{'p50 us':>8s} {'p99 us':>8s} {'MB':>8s}"
     ]
-    for r in rows:
-        lines.append(
-            f"{r.method:22s} {r.vertices:8d} {r.modes or '-':>5} {r.tools:5d} "
-            f"{r.contacts_mean:8.1f} {r.p50_us:8.1f} {r.p99_us:8.1f} {r.bytes / 1e6:8.1f}"
-        )
+    lines += [
+        f"{r.method:22s} {r.vertices:8d} {r.modes or '-':>5} {r.tools:5d} "
+        f"{r.contacts_mean:8.1f} {r.p50_us:8.1f} {r.p99_us:8.1f} {r.bytes / 1e6:8.1f}"
+        for r in rows
+    ]
     return "\n".join(lines)
 
 
@@ -356,7 +357,7 @@ def _finite(value: Any) -> Any:
 class _Bar:
     """One progress bar over the stages of a build."""
 
-    _SHARE = {"mesh": 0.1, "solve": 0.4, "modes": 0.35, "certify": 0.15}
+    _SHARE: ClassVar = {"mesh": 0.1, "solve": 0.4, "modes": 0.35, "certify": 0.15}
 
     def __enter__(self) -> _Bar:
         from tqdm import tqdm

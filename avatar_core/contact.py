@@ -17,7 +17,7 @@ from avatar_core import contact_kernels as kernels
 from avatar_core.contact_kernels import ModelArrays, Out, State
 from avatar_core.errors import ContactError
 from avatar_core.near_field import LocalBlocks
-from avatar_core.shepard import MAX_STENCIL
+from avatar_core.shepard import MAX_STENCIL, N_FIT
 from avatar_core.vademecum import Vademecum
 
 Cloud = Literal["surface", "volume", "off"]
@@ -196,6 +196,34 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
         concerned have zero force, the others are served.
     """
     return int(kernels.contact_step(model.arrays, model.state, model.out, tips))
+
+
+def warm_up(n_tools: int = 1) -> None:
+    """Compile the step (or read it from numba's cache) before any vademecum is at hand."""
+    single, double = np.float32, np.float64
+    n, rank, points = 1, 1, 1
+    blocks = (np.zeros(n + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, 3, 3), single))
+    make_model(
+        ModelArrays(
+            np.full((8, 8, 8), 1.0, single),
+            np.zeros((8, 8, 8), single),
+            np.zeros(3, double),
+            np.ones(1, double),
+            np.zeros((n, 3), double),
+            np.zeros((n, 3), double),
+            np.zeros((n, 2, 3), double),
+            np.zeros(n, double),
+            np.zeros((n, N_FIT), np.int64),
+            np.zeros((n, 5, N_FIT), double),
+            np.zeros((n, 3, rank), single),
+            *blocks,
+            np.ones(1, double),
+            np.zeros((points, 3, rank), single),
+            *blocks,
+            np.zeros((points, 3), single),
+            np.full(n_tools, 5e-3, double),
+        )
+    )
 
 
 def save_arrays(arrays: ModelArrays, folder: Path) -> None:

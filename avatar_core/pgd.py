@@ -26,7 +26,6 @@ import scipy.sparse as sp
 from avatar_core.elasticity import Elasticity
 from avatar_core.errors import ConvergenceError
 
-
 # An enrichment that captures less of the total energy than this is made of rounding errors.
 _ROUNDING = 1e-13
 
@@ -198,9 +197,7 @@ def _enrich(expansion: _Expansion, rule: PGDRule) -> EnrichmentReport:
         sweeps += 1
         before, captured = captured, float(problem.weights @ (load**2).sum(axis=1))
         if captured <= rounding:
-            return EnrichmentReport(
-                EnrichmentStatus.EXHAUSTED, 0, sweeps, 0.0, expansion.error
-            )
+            return EnrichmentReport(EnrichmentStatus.EXHAUSTED, 0, sweeps, 0.0, expansion.error)
         change = abs(captured - before) / captured
         if change <= rule.sweep_tolerance:
             status = EnrichmentStatus.CONVERGED

@@ -276,3 +276,14 @@ def test_mapped_arrays_give_the_same_force(
     step(mapped, tip)
     np.testing.assert_array_equal(mapped.out.force, model.out.force)
     np.testing.assert_array_equal(mapped.out.cloud, model.out.cloud)
+
+
+def test_warm_up_compiles_what_a_vademecum_needs(phantom_vademecum: Vademecum) -> None:
+    """After warm_up, preparing a real model compiles nothing more."""
+    from avatar_core import contact_kernels
+    from avatar_core.contact import warm_up
+
+    warm_up(1)
+    before = len(contact_kernels.contact_step.signatures)
+    prepare(phantom_vademecum, (RADIUS,), cloud="volume")
+    assert len(contact_kernels.contact_step.signatures) == before

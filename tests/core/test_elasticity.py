@@ -36,7 +36,7 @@ def test_force_balance_and_energy(element: str) -> None:
     internal = problem.apply(solution)
     clamped = internal.reshape(-1, 3, 3)[problem.clamped_nodes]
     np.testing.assert_allclose(clamped.sum(axis=0), -np.eye(3), atol=1e-9)
-    work = np.diag((load.T @ solution))
+    work = np.diag(load.T @ solution)
     np.testing.assert_allclose(work, np.einsum("ij,ij->j", solution, internal), rtol=1e-9)
 
 
@@ -122,7 +122,9 @@ def _manufactured_error(n: int) -> float:
     lam, mu = problem.material.lame
     k = np.pi / size
     basis = Basis(
-        MeshTet(mesh.vertices.T.copy(), mesh.tets.T.copy()), ElementVector(ElementTetP2()), intorder=6
+        MeshTet(mesh.vertices.T.copy(), mesh.tets.T.copy()),
+        ElementVector(ElementTetP2()),
+        intorder=6,
     )
 
     @LinearForm

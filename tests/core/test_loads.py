@@ -14,9 +14,7 @@ from avatar_core.shepard import make_interpolation, weights_at
 
 def test_total_force_is_exact(phantom_elasticity: Elasticity, phantom_mesh: TetMesh) -> None:
     surface = load_surface(phantom_mesh, regions_by_rule(phantom_mesh))
-    loads = patch_loads(
-        phantom_elasticity, surface.centers, surface.normals, surface.patch_radius
-    )
+    loads = patch_loads(phantom_elasticity, surface.centers, surface.normals, surface.patch_radius)
     total = loads.T.reshape((-1, loads.shape[0])).dot(np.tile(np.eye(3), (loads.shape[0] // 3, 1)))
     expected = np.tile(np.eye(3), (surface.n_positions, 1))
     np.testing.assert_allclose(total, expected, atol=1e-12)
@@ -96,7 +94,8 @@ def test_interpolation_is_continuously_differentiable() -> None:
     mesh = tetrahedralize(phantom_liver(), 700)
     surface = load_surface(mesh, regions_by_rule(mesh))
     values = np.sin(40 * surface.centers @ np.array([1.0, 0.5, 0.7]))
-    a = surface.centers[np.argmin(np.linalg.norm(surface.centers - surface.centers.mean(0), axis=1))]
+    middle = surface.centers.mean(axis=0)
+    a = surface.centers[np.argmin(np.linalg.norm(surface.centers - middle, axis=1))]
     line = a + np.linspace(-0.01, 0.01, 2001)[:, None] * np.array([1.0, 0.0, 0.3])
     f = []
     for point in line:

@@ -28,7 +28,8 @@ def problem_of_rank(
 @pytest.mark.parametrize("block", [1, 4])
 def test_field_of_rank_four_is_recovered_exactly(box_elasticity: Elasticity, block: int) -> None:
     problem, exact = problem_of_rank(box_elasticity, 4)
-    solution = solve_pgd(problem, PGDRule(10, 1e-9, block=block, max_sweeps=200, sweep_tolerance=1e-13))
+    rule = PGDRule(10, 1e-9, block=block, max_sweeps=200, sweep_tolerance=1e-13)
+    solution = solve_pgd(problem, rule)
     field = SeparatedField(solution.space, solution.load)
     assert field.rank == 4
     assert np.abs(field.evaluate() - exact).max() < 1e-7 * np.abs(exact).max()
@@ -77,9 +78,7 @@ def test_enrichment_beyond_rounding_stops(box_elasticity: Elasticity) -> None:
 
 def test_zero_load_is_refused(box_elasticity: Elasticity) -> None:
     problem, _ = problem_of_rank(box_elasticity, 2, n_loads=3)
-    zero = ParametricProblem(
-        box_elasticity, problem.loads * 0.0, problem.weights, np.zeros(3)
-    )
+    zero = ParametricProblem(box_elasticity, problem.loads * 0.0, problem.weights, np.zeros(3))
     with pytest.raises(ConvergenceError, match="zero"):
         solve_pgd(zero, PGDRule(5, 1e-3))
 

@@ -73,7 +73,7 @@ def test_contact_compliance_of_real_livers(name: str, livers_dir: Path) -> None:
     options = OrganOptions(n_vertices=1500, rule=BuildRule(max_modes=40), n_certified=3)
     v = vademecum_of(read_surface(livers_dir / f"{name}.obj"), options)
     smallest, asymmetry = active_set_spectrum(v, 1000, seed=1)
-    print(f"{name}: smallest eigenvalue {smallest:.2e} of the mean diagonal, asymmetry {asymmetry:.1e}")
+    print(f"{name}: smallest eigenvalue {smallest:.2e} of the mean diagonal")
     assert smallest > 0
     assert asymmetry < 1e-6
 

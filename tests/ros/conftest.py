@@ -1,0 +1,152 @@
+"""A cell of real processes over real DDS, in a domain of its own, on this machine only."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+TIP_RADIUS = 0.005  # [m]
+START_TIMEOUT = 120.0  # of a process, its compilation included, on a busy machine [s]
+TOUCH_DEPTH = 0.004  # [m]
+
+
+class Probe:
+    """A node in the test's own process that listens and asks."""
+
+    def __init__(self) -> None:
+        import rclpy
+
+        self._context = rclpy.Context()
+        self._context.init()
+        self.node = rclpy.create_node("probe", context=self._context)
+        self._executor = rclpy.executors.SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    def spin(self, seconds: float) -> None:
+        self.until(lambda: False, seconds, fail=False)
+
+    def until(self, reached: Callable[[], bool], timeout: float, fail: bool = True) -> None:
+        deadline = time.monotonic() + timeout
+        while not reached():
+            if time.monotonic() > deadline:
+                assert not fail, f"not reached within {timeout:g} s"
+                return
+            self._executor.spin_once(timeout_sec=0.01)
+
+    def next(
+        self,
+        kind: type,
+        topic: str,
+        qos: Any,
+        wanted: Callable[[Any], bool] = lambda message: True,
+        timeout: float = START_TIMEOUT,
+        meanwhile: Callable[[], None] = lambda: None,
+    ) -> Any:
+        """The next message that is ``wanted``; ``meanwhile`` is called while waiting."""
+        found: list[Any] = []
+        subscription = self.node.create_subscription(
+            kind, topic, lambda message: found.append(message) if wanted(message) else None, qos
+        )
+        deadline = time.monotonic() + timeout
+        try:
+            while not found:
+                assert time.monotonic() < deadline, f"no such {topic} within {timeout:g} s"
+                meanwhile()
+                self._executor.spin_once(timeout_sec=0.002)
+        finally:
+            self.node.destroy_subscription(subscription)
+        return found[0]
+
+    def call(self, kind: type, name: str, request: Any) -> Any:
+        client = self.node.create_client(kind, name)
+        try:
+            self.until(client.service_is_ready, START_TIMEOUT)
+            answer = client.call_async(request)
+            self.until(answer.done, START_TIMEOUT)
+            return answer.result()
+        finally:
+            self.node.destroy_client(client)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_domain() -> dict[str, str]:
+    """No other cell on this machine or network hears these tests, nor they it."""
+    from avatar_ros.bench_cell import isolated_environment
+
+    environment = isolated_environment()
+    os.environ.update(environment)
+    return environment
+
+
+@pytest.fixture(scope="session")
+def organ() -> Any:
+    """A coarse phantom's vademecum: what matters here is not how exact it is."""
+    from avatar_core.build import BuildRule
+    from avatar_core.organ import OrganOptions, vademecum_of
+    from avatar_core.phantom import phantom_liver
+
+    rule = BuildRule(max_modes=30)
+    return vademecum_of(phantom_liver(), OrganOptions(n_vertices=500, rule=rule, n_certified=10))
+
+
+@pytest.fixture(scope="session")
+def library(organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Good and bad files, and a way out."""
+    from avatar_core.storage import save_vademecum
+
+    folder = tmp_path_factory.mktemp("library")
+    outside = tmp_path_factory.mktemp("outside")
+    save_vademecum(organ, folder / "liver.h5")
+    content = (folder / "liver.h5").read_bytes()
+    (outside / "liver.h5").write_bytes(content)
+    (folder / "link.h5").symlink_to(outside / "liver.h5")
+    (folder / "short.h5").write_bytes(content[: len(content) // 2])
+    middle = len(content) // 2
+    flipped = bytes([content[middle] ^ 0x10])
+    (folder / "flipped.h5").write_bytes(content[:middle] + flipped + content[middle + 1 :])
+    (folder / "text.h5").write_text("not an HDF5 file")
+    (folder / "folder.h5").mkdir()
+    return folder
+
+
+@pytest.fixture
+def probe(own_domain: dict[str, str]) -> Iterator[Probe]:
+    probe = Probe()
+    yield probe
+    probe.close()
+
+
+@pytest.fixture(scope="module")
+def cell(own_domain: dict[str, str], library: Path) -> Iterator[dict[str, Any]]:
+    """Loader and contact node, as a user starts them, for one module of tests."""
+    from avatar_ros.bench_cell import Module
+
+    files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
+    processes = {
+        "vademecum_loader": Module("vademecum_loader", ["--ros-args", *files], own_domain),
+        "contact": Module("contact", [], own_domain),
+    }
+    yield processes
+    codes = {name: process.finish() for name, process in processes.items()}
+    assert codes == {"vademecum_loader": 0, "contact": 0}
+
+
+@pytest.fixture(scope="session")
+def touch(organ: Any) -> tuple[np.ndarray, np.ndarray]:
+    """A tip 4 mm deep in the middle of the accessible surface, and the outward normal there."""
+    from avatar_core.tool_path import middle_of_access
+
+    j = middle_of_access(organ)
+    normal = organ.surface.normals[j]
+    return organ.surface.centers[j] + (TIP_RADIUS - TOUCH_DEPTH) * normal, normal

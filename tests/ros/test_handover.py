@@ -1,0 +1,46 @@
+"""Arrays handed from one process to another by shared memory."""
+
+from __future__ import annotations
+
+import mmap
+import os
+
+import numpy as np
+import pytest
+
+pytest.importorskip("avatar_ros.handover", reason="avatar_ros is not installed")
+
+from avatar_ros.handover import _map, share
+
+pytestmark = pytest.mark.ros
+
+
+def _arrays() -> dict[str, np.ndarray]:
+    random = np.random.default_rng(0)
+    return {
+        "space": random.random((7, 3, 5)).astype(np.float32),
+        "start": np.arange(11),
+        "none": np.empty((0, 3)),
+        "load": random.random((4, 3)),
+    }
+
+
+def test_arrays_arrive_as_they_were() -> None:
+    sent = _arrays()
+    received = _map(*share(sent))
+    for name, values in sent.items():
+        np.testing.assert_array_equal(received[name], values)
+        assert received[name].dtype == values.dtype
+        assert type(received[name]) is np.ndarray  # compiled code is compiled for these
+        assert received[name].flags.aligned and received[name].flags.writeable
+
+
+def test_neither_side_can_alter_what_was_handed_over() -> None:
+    handle, _ = share(_arrays())
+    with pytest.raises(PermissionError):
+        os.ftruncate(handle, 1)
+    with pytest.raises(PermissionError):
+        os.pwrite(handle, b"x", 0)
+    with pytest.raises(PermissionError):
+        mmap.mmap(handle, 0)
+    os.close(handle)

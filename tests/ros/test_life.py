@@ -1,0 +1,136 @@
+"""Start, transitions and end of the nodes' processes."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from geometry_msgs.msg import WrenchStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+
+from avatar_ros import qos
+from avatar_ros.bench_cell import Module
+from avatar_ros.msg import ContactState
+
+pytestmark = pytest.mark.ros
+
+NODES = ("vademecum_loader", "contact")
+
+
+def _state(probe: Any, node: str) -> str:
+    return str(probe.call(GetState, f"{node}/get_state", GetState.Request()).current_state.label)
+
+
+def _change(probe: Any, node: str, transition: int) -> bool:
+    request = ChangeState.Request(transition=Transition(id=transition))
+    return bool(probe.call(ChangeState, f"{node}/change_state", request).success)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("node", NODES)
+def test_a_signal_ends_a_node_cleanly(
+    own_domain: dict[str, str], probe: Any, node: str, number: int
+) -> None:
+    process = Module(node, [], own_domain)
+    probe.until(lambda: False, 1.0, fail=False)
+    assert _state(probe, node) == "active"
+    process.send_signal(number)
+    begin = time.monotonic()
+    assert process.wait(10.0) == 0
+    assert time.monotonic() - begin < 2.0
+    assert process.last_words().startswith("it said nothing") or "rror" not in process.last_words()
+
+
+def test_without_vademecum_the_wrench_is_zero(own_domain: dict[str, str], probe: Any) -> None:
+    process = Module("contact", [], own_domain)
+    try:
+        state = probe.next(ContactState, "contact_state", qos.state(1))
+        assert state.status == ContactState.STATUS_NO_MODEL
+        assert (state.vademecum_id, list(state.contacts)) == ("", [])
+        wrench = probe.next(WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND)
+        assert wrench == WrenchStamped(header=wrench.header)
+        assert wrench.header.frame_id == "organ"
+        assert (wrench.header.stamp.sec, wrench.header.stamp.nanosec) == (0, 0)
+    finally:
+        assert process.finish() == 0
+
+
+def test_two_tools_have_topics_of_their_own(own_domain: dict[str, str], probe: Any) -> None:
+    arguments = ["-p", "tools:=[left,right]", "-p", "tip_radius:=[0.004,0.008]"]
+    process = Module("contact", ["--ros-args", *arguments], own_domain)
+    try:
+        for tool in ("left", "right"):
+            probe.next(WrenchStamped, f"{tool}/spatial/servo_cf", qos.COMMAND)
+            probe.next(ContactState, "contact_state", qos.state(2), lambda s, t=tool: s.tool == t)
+    finally:
+        assert process.finish() == 0
+
+
+def test_the_contact_node_is_managed(own_domain: dict[str, str], probe: Any) -> None:
+    process = Module("contact", ["--ros-args", "-p", "autostart:=false"], own_domain)
+    topic = "tool/spatial/servo_cf"
+    try:
+        assert _state(probe, "contact") == "unconfigured"
+        for _ in range(2):  # once more after cleaning up
+            assert _change(probe, "contact", Transition.TRANSITION_CONFIGURE)
+            assert _change(probe, "contact", Transition.TRANSITION_ACTIVATE)
+            probe.next(WrenchStamped, topic, qos.COMMAND)
+            assert _change(probe, "contact", Transition.TRANSITION_DEACTIVATE)
+            with pytest.raises(AssertionError, match="no such"):
+                probe.next(WrenchStamped, topic, qos.COMMAND, timeout=0.5)
+            assert _change(probe, "contact", Transition.TRANSITION_CLEANUP)
+            assert _state(probe, "contact") == "unconfigured"
+            probe.until(lambda: probe.node.count_publishers(topic) == 0, 5.0)
+    finally:
+        assert process.finish() == 0
+
+
+@pytest.mark.parametrize(
+    ("node", "arguments", "reason"),
+    [
+        ("contact", ["rate:=5.0"], "from 100 to 2000"),
+        ("contact", ["rate:=fast"], "rate"),
+        ("contact", ["tip_radius:=0.5"], "0.002 to 0.02"),
+        ("contact", ["tip_radius:=[0.005,0.005]"], "tip_radius"),
+        ("contact", ["tools:=[a b]"], "topic's name"),
+        ("contact", ["cloud:=fog"], "surface, volume, off"),
+        ("contact", ["frame_id:=''"], "frame_id"),
+        ("vademecum_loader", ["library_dir:=/nowhere"], "not a directory"),
+        ("vademecum_loader", ["vademecum:=missing.h5"], "No such file"),
+        ("vademecum_loader", ["max_megabytes:=0"], "from 1 to 65536"),
+    ],
+)
+def test_a_wrong_parameter_ends_the_node(
+    own_domain: dict[str, str], tmp_path: Path, node: str, arguments: list[str], reason: str
+) -> None:
+    options = [word for argument in arguments for word in ("-p", argument)]
+    process = Module(node, ["--ros-args", *options], own_domain)
+    assert process.wait(60.0) == 1
+    assert reason in process.last_words()
+
+
+def test_a_broken_vademecum_from_elsewhere_is_refused(
+    own_domain: dict[str, str], probe: Any
+) -> None:
+    from avatar_ros.conversions import vademecum_file
+    from avatar_ros.msg import VademecumFile
+
+    process = Module("contact", [], own_domain)
+    try:
+        probe.next(ContactState, "contact_state", qos.state(1))
+        publisher = probe.node.create_publisher(VademecumFile, "vademecum", qos.LATCHED)
+        publisher.publish(vademecum_file("0" * 64, "forged", b"x" * 1000))
+        probe.until(lambda: "refused" in process.last_words(), 30.0)
+        assert "checksum" in process.last_words()
+        state = probe.next(ContactState, "contact_state", qos.state(1))
+        assert state.status == ContactState.STATUS_NO_MODEL
+    finally:
+        assert process.finish() == 0
