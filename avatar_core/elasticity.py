@@ -236,7 +236,7 @@ class Elasticity:
         ConvergenceError
             If the factorization failed and the solution does not balance the load.
         """
-        loads = loads.toarray() if sp.issparse(loads) else np.asarray(loads, float)
+        loads = np.asarray(loads.toarray() if isinstance(loads, sp.spmatrix) else loads, float)
         free = self._free
         right = np.zeros((self._factor.n, loads.shape[1]), order="F")
         right[: len(free)] = loads[free]

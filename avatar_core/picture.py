@@ -60,7 +60,9 @@ def _draw_organ(figure, vademecum: Vademecum, cloud: np.ndarray, tip: np.ndarray
     color[:, :3] *= (0.55 + 0.45 * np.clip(light @ np.array([-0.4, 0.75, 0.5]), 0, 1))[:, None]
     # radiological view: the patient's right is on the viewer's left
     flat = np.stack([-corner[front, :, 0], corner[front, :, 2]], axis=2) * 1e3
-    axes.add_collection(PolyCollection(flat, facecolors=color, edgecolors="face", linewidths=0.2))
+    axes.add_collection(
+        PolyCollection(list(flat), facecolors=color, edgecolors="face", linewidths=0.2)
+    )
     axes.plot(-tip[0] * 1e3, tip[2] * 1e3, "o", ms=9, mfc="none", mec="crimson", mew=2)
     axes.autoscale_view()
     axes.set_aspect("equal")

@@ -77,4 +77,4 @@ def optimal_rotation(
 
 def _gram_root(factor: np.ndarray, mass: np.ndarray) -> np.ndarray:
     """A with A^T A = factor^T M factor, also where the factor is rank deficient."""
-    return np.linalg.qr(np.sqrt(mass)[:, None] * factor, mode="r")
+    return np.asarray(np.linalg.qr(np.sqrt(mass)[:, None] * factor, mode="r"))

@@ -254,11 +254,13 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         contact_near=blocks("contact_near"),
         tip_field=TipField(*(arrays[f"tip_field/{name}"] for name in TipField._fields)),
         convergence=_convergence(convergence),
-        provenance=Provenance(
-            **{k: tuple(v) if isinstance(v, list) else v for k, v in provenance.items()}
-        ),
+        provenance=_provenance(provenance),
         certificate=Certificate(**certificate) if certificate else None,
     )
+
+
+def _provenance(stored: dict[str, Any]) -> Provenance:
+    return Provenance(**{k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()})
 
 
 def _convergence(stored: dict[str, Any]) -> Convergence:

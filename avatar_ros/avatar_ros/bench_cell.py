@@ -300,6 +300,7 @@ class Module(subprocess.Popen[str]):
         self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115, closed with the object
         super().__init__(
             [sys.executable, "-m", f"avatar_ros.{name}", *arguments],
+            cwd="/",  # -m would let a checkout there stand before what is installed
             env=environment,
             stdout=subprocess.PIPE,
             stderr=self._said,

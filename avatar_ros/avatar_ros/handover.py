@@ -117,6 +117,7 @@ def _start(order: Order, theirs: socket.socket) -> subprocess.Popen[bytes]:
         [sys.executable, "-m", "avatar_ros.handover", json.dumps(asdict(order))],
         stdin=theirs.fileno(),
         env=environment,
+        cwd="/",  # -m would let whatever lies where the node was started stand first
         start_new_session=True,  # Ctrl-C is for the node, which then ends this one
     )
 
