@@ -236,7 +236,8 @@ class Elasticity:
         ConvergenceError
             If the factorization failed and the solution does not balance the load.
         """
-        loads = np.asarray(loads.toarray() if isinstance(loads, sp.spmatrix) else loads, float)
+        dense = loads.toarray() if sp.issparse(loads) else loads  # type: ignore[union-attr]
+        loads = np.asarray(dense, float)
         free = self._free
         right = np.zeros((self._factor.n, loads.shape[1]), order="F")
         right[: len(free)] = loads[free]

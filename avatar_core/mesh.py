@@ -6,6 +6,10 @@ clamp and the accessible surface, found by a geometric rule or read from a file 
 
 from __future__ import annotations
 
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -187,14 +191,15 @@ def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
     import pytetwild
 
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    vertices, tets = pytetwild.tetrahedralize(
-        surface.vertices * 1e3,  # millimetres, for which fTetWild's thresholds are made
-        surface.faces.astype(np.int32),
-        edge_length_fac=edge / diagonal,
-        epsilon=4e-3,  # a smaller envelope forbids coarse meshes
-        num_threads=1,  # the same surface gives the same mesh
-        quiet=True,
-    )[:2]
+    with _scratch_folder():
+        vertices, tets = pytetwild.tetrahedralize(
+            surface.vertices * 1e3,  # millimetres, for which fTetWild's thresholds are made
+            surface.faces.astype(np.int32),
+            edge_length_fac=edge / diagonal,
+            epsilon=4e-3,  # a smaller envelope forbids coarse meshes
+            num_threads=1,
+            quiet=True,
+        )[:2]
     if len(tets) == 0:
         raise MeshError("no tetrahedra fit into the surface; check that it encloses a volume")
     volumes = TetMesh(vertices, tets).tet_volumes
@@ -202,6 +207,18 @@ def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
         tets, volumes = tets[:, [0, 2, 1, 3]], -volumes
     solid = tets[volumes > 1e-9 * np.abs(volumes).mean()]
     return make_mesh(vertices * 1e-3, _largest_component(solid))
+
+
+@contextmanager
+def _scratch_folder() -> Iterator[None]:
+    """Work in a temporary folder: fTetWild leaves a file where it runs."""
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            yield
+        finally:
+            os.chdir(before)
 
 
 def _largest_component(tets: np.ndarray) -> np.ndarray:

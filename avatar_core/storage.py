@@ -260,7 +260,8 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
 
 
 def _provenance(stored: dict[str, Any]) -> Provenance:
-    return Provenance(**{k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()})
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()}
+    return Provenance(**values)
 
 
 def _convergence(stored: dict[str, Any]) -> Convergence:
