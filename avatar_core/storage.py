@@ -108,25 +108,40 @@ def load_vademecum(path: str | Path) -> Vademecum:
     path = Path(path)
     if not path.is_file():
         raise StorageError(f"no vademecum at {path}; build one with 'avatar vademecum'")
-    size = path.stat().st_size
+    return _read(path, path.stat().st_size, str(path), file_id(path))
+
+
+def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
+    """Read and verify a vademecum in memory; see :func:`load_vademecum`.
+
+    Parameters
+    ----------
+    content : the bytes of a vademecum file
+    origin : what messages call it
+    """
+    digest = hashlib.sha256(content).hexdigest()
+    return _read(io.BytesIO(content), len(content), origin, digest)
+
+
+def _read(source: Path | io.BytesIO, size: int, origin: str, identity: str) -> Vademecum:
     if size > MAX_FILE_BYTES:
-        raise StorageError(f"{path} has {size >> 20} MiB, more than a vademecum may have")
+        raise StorageError(f"{origin} has {size >> 20} MiB, more than a vademecum may have")
     try:
-        with h5py.File(path, "r") as file:
-            attributes = _read_attributes(file, path)
-            arrays = _read_arrays(file, path, size)
+        with h5py.File(source, "r") as file:
+            attributes = _read_attributes(file, origin)
+            arrays = _read_arrays(file, origin, size)
             stated = str(file.attrs["checksum"])
         if stated != _checksum(arrays, attributes):
-            raise StorageError(f"{path} was altered or damaged (checksum); build it again")
+            raise StorageError(f"{origin} was altered or damaged (checksum); build it again")
         vademecum = _assemble(arrays, attributes)
     except AvatarError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError) as error:
         raise StorageError(
-            f"{path} is no readable vademecum ({_reason(error)}); it may be truncated: "
+            f"{origin} is no readable vademecum ({_reason(error)}); it may be truncated: "
             "build or copy it again"
         ) from error
-    return replace(vademecum, id=file_id(path), nbytes=size)
+    return replace(vademecum, id=identity, nbytes=size)
 
 
 def file_id(path: str | Path) -> str:
@@ -138,7 +153,7 @@ def file_id(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-def _read_attributes(file: h5py.File, path: Path) -> dict[str, str]:
+def _read_attributes(file: h5py.File, path: str) -> dict[str, str]:
     if str(file.attrs.get("format", "")) != FORMAT:
         raise StorageError(f"{path} is HDF5 but no vademecum; build one with 'avatar vademecum'")
     schema = str(file.attrs["schema"])
@@ -150,7 +165,7 @@ def _read_attributes(file: h5py.File, path: Path) -> dict[str, str]:
     return {key: str(file.attrs[key]) for key in keys}
 
 
-def _read_arrays(file: h5py.File, path: Path, size: int) -> dict[str, np.ndarray]:
+def _read_arrays(file: h5py.File, path: str, size: int) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
     total = 0
     for key in _KEYS:
