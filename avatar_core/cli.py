@@ -48,18 +48,16 @@ Json = Annotated[Path | None, typer.Option("-o", "--output", help="write the tab
 def main() -> int:
     """Entry point: errors of the user become one line and exit code 1."""
     try:
-        app(standalone_mode=False)
+        code = app(standalone_mode=False)
     except AvatarError as error:
         print(f"avatar: {error}", file=sys.stderr)
         return 1
-    except typer.Exit as stop:
-        return stop.exit_code
     except typer.Abort:
         print("avatar: stopped", file=sys.stderr)
         return 130
     except Exception as error:
         return _usage(error)
-    return 0
+    return code if isinstance(code, int) else 0
 
 
 def _usage(error: Exception) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,8 @@ from avatar_core.mesh import Regions, TetMesh, make_mesh, regions_by_rule, tetra
 from avatar_core.organ import OrganOptions, vademecum_of
 from avatar_core.phantom import phantom_liver
 from avatar_core.vademecum import Vademecum
+
+Box = Callable[[int], tuple[TetMesh, Regions]]
 
 
 def box_mesh(n: int, size: tuple[float, float, float] = (0.1, 0.1, 0.1)) -> TetMesh:
@@ -41,6 +45,17 @@ def box_regions(mesh: TetMesh) -> Regions:
     """Clamped at y = 0, accessible at the opposite side."""
     y = mesh.vertices[mesh.boundary_faces][:, :, 1]
     return Regions((y < 1e-9).all(axis=1), (y > y.max() - 1e-9).all(axis=1))
+
+
+@pytest.fixture(scope="session")
+def box() -> Box:
+    """Builds a box of n^3 cubes and its regions."""
+
+    def build(n: int) -> tuple[TetMesh, Regions]:
+        mesh = box_mesh(n)
+        return mesh, box_regions(mesh)
+
+    return build
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from skfem import Basis, ElementTetP2, ElementVector, LinearForm, MeshTet
@@ -9,11 +11,13 @@ from skfem import Basis, ElementTetP2, ElementVector, LinearForm, MeshTet
 from avatar_core.elasticity import Elasticity, Material
 from avatar_core.errors import MaterialError
 from avatar_core.loads import patch_loads
-from tests.core.conftest import box_mesh, box_regions
+from avatar_core.mesh import Regions, TetMesh
+
+Box = Callable[[int], tuple[TetMesh, Regions]]
 
 
-def test_rigid_modes_carry_no_energy() -> None:
-    mesh = box_mesh(2)
+def test_rigid_modes_carry_no_energy(box: Box) -> None:
+    mesh, _ = box(2)
     free = Elasticity(mesh, Material(), np.zeros(len(mesh.boundary_faces), bool))
     nodes = _nodes(free)
     modes = [np.tile(axis, len(nodes)) for axis in np.eye(3)]
@@ -26,10 +30,9 @@ def test_rigid_modes_carry_no_energy() -> None:
 
 
 @pytest.mark.parametrize("element", ["P2", "Taylor-Hood"])
-def test_force_balance_and_energy(element: str) -> None:
+def test_force_balance_and_energy(box: Box, element: str) -> None:
     """Reactions at the clamp cancel the applied force; the work of the load is u . K u."""
-    mesh = box_mesh(3)
-    regions = box_regions(mesh)
+    mesh, regions = box(3)
     problem = Elasticity(mesh, Material(poisson_ratio=0.48), regions.clamped, element)  # type: ignore[arg-type]
     load = patch_loads(problem, np.array([[0.05, 0.1, 0.05]]), np.array([[0.0, 1.0, 0.0]]), 0.03)
     solution = problem.solve(load)
@@ -40,18 +43,17 @@ def test_force_balance_and_energy(element: str) -> None:
     np.testing.assert_allclose(work, np.einsum("ij,ij->j", solution, internal), rtol=1e-9)
 
 
-def test_manufactured_solution_converges_with_third_order() -> None:
+def test_manufactured_solution_converges_with_third_order(box: Box) -> None:
     """P2: the L2 error of u = sin(kx) sin(ky) sin(kz) e_x falls by 2^3 when h is halved."""
-    errors = [_manufactured_error(n) for n in (3, 6)]
+    errors = [_manufactured_error(box, n) for n in (3, 6)]
     assert np.log2(errors[0] / errors[1]) > 2.7  # 3, less what coarse meshes lose
 
 
-def test_p2_and_taylor_hood_converge_to_each_other() -> None:
+def test_p2_and_taylor_hood_converge_to_each_other(box: Box) -> None:
     """The two elements close in on the same compliance as the mesh is refined."""
 
     def gap(n: int) -> float:
-        mesh = box_mesh(n)
-        regions = box_regions(mesh)
+        mesh, regions = box(n)
         compliance = []
         for element in ("P2", "Taylor-Hood"):
             problem = Elasticity(mesh, Material(poisson_ratio=0.45), regions.clamped, element)  # type: ignore[arg-type]
@@ -64,10 +66,9 @@ def test_p2_and_taylor_hood_converge_to_each_other() -> None:
     assert gap(6) < 0.5 * gap(3)
 
 
-def test_nearly_incompressible_organ_does_not_lock() -> None:
+def test_nearly_incompressible_organ_does_not_lock(box: Box) -> None:
     """At nu 0.499 linear tetrahedra are far too stiff; the chosen element is not."""
-    mesh = box_mesh(4)
-    regions = box_regions(mesh)
+    mesh, regions = box(4)
 
     def compliance(nu: float, element: str | None = None) -> float:
         problem = Elasticity(mesh, Material(poisson_ratio=nu), regions.clamped, element)  # type: ignore[arg-type]
@@ -81,8 +82,8 @@ def test_nearly_incompressible_organ_does_not_lock() -> None:
     assert compliance(0.499, "P1") < 0.7 * compliance(0.499)
 
 
-def test_unclamped_organ_is_refused() -> None:
-    mesh = box_mesh(2)
+def test_unclamped_organ_is_refused(box: Box) -> None:
+    mesh, _ = box(2)
     free = Elasticity(mesh, Material(), np.zeros(len(mesh.boundary_faces), bool))
     with pytest.raises(MaterialError, match="clamp"):
         free.solve(np.zeros((3 * free.n_nodes, 1)))
@@ -94,9 +95,8 @@ def test_impossible_material_is_refused(values: tuple[float, float]) -> None:
         Material(*values)
 
 
-def test_refined_problem_keeps_vertices_clamp_and_solution() -> None:
-    mesh = box_mesh(2)
-    regions = box_regions(mesh)
+def test_refined_problem_keeps_vertices_clamp_and_solution(box: Box) -> None:
+    mesh, regions = box(2)
     coarse = Elasticity(mesh, Material(poisson_ratio=0.3), regions.clamped)
     fine = coarse.refined()
     np.testing.assert_allclose(fine.mesh.vertices[: len(mesh.vertices)], mesh.vertices)
@@ -114,9 +114,9 @@ def _nodes(problem: Elasticity) -> np.ndarray:
     return np.concatenate([vertices, vertices[edges].mean(axis=1)])
 
 
-def _manufactured_error(n: int) -> float:
+def _manufactured_error(box: Box, n: int) -> float:
     size, nu = 0.1, 0.3
-    mesh = box_mesh(n)
+    mesh, _ = box(n)
     boundary = np.ones(len(mesh.boundary_faces), bool)
     problem = Elasticity(mesh, Material(1.0, nu), boundary)
     lam, mu = problem.material.lame

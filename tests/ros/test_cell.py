@@ -12,12 +12,12 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
+from avatar_ros.conversions import stamp_nanoseconds
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 
 from avatar_ros import qos
-from avatar_ros.conversions import stamp_nanoseconds
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumInfo
 from avatar_ros.srv import LoadVademecum
 

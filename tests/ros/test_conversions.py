@@ -10,11 +10,6 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
-from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
-
 from avatar_ros.conversions import (
     CloudTemplate,
     PoseReader,
@@ -25,6 +20,11 @@ from avatar_ros.conversions import (
     stamp_bytes,
     stamp_nanoseconds,
 )
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+
 from avatar_ros.msg import ContactState
 
 pytestmark = pytest.mark.ros

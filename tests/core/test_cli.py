@@ -1,0 +1,164 @@
+"""The command: bad input is one clear line and exit code 1, and leaves no file behind."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar_core import cli
+from avatar_core.phantom import phantom_liver
+
+TRIANGLE = "v 0 0 0\nv 100 0 0\nv 0 100 0\n"
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["avatar", *map(str, arguments)])
+    return cli.main()
+
+
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+    lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(faces) + 1]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def phantom_file(folder: Path, scale: float = 1e3) -> Path:
+    liver = phantom_liver()
+    return write_obj(folder / "liver.obj", liver.vertices * scale, liver.faces)
+
+
+@pytest.mark.parametrize(
+    ("content", "remedy"),
+    [
+        (None, "check the path"),
+        ("", "surface"),
+        (TRIANGLE + "f 1 2 3\nf 1 3 2\n", "clos"),
+        (TRIANGLE.replace("100 0 0", "nan 0 0") + "f 1 2 3\n", "finite"),
+    ],
+    ids=["missing", "empty", "two triangles", "NaN"],
+)
+def test_bad_surface(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    content: str | None,
+    remedy: str,
+) -> None:
+    source = tmp_path / "organ.obj"
+    if content is not None:
+        source.write_text(content)
+    refused(monkeypatch, capsys, tmp_path, [source], remedy)
+
+
+def test_open_surface(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    liver = phantom_liver()
+    middle = liver.vertices[liver.faces].mean(axis=1)[:, 0]
+    half = liver.faces[middle > np.median(middle)]
+    source = write_obj(tmp_path / "half.obj", liver.vertices * 1e3, half)
+    refused(monkeypatch, capsys, tmp_path, [source], "open")
+
+
+@pytest.mark.parametrize("scale", [1e4, 10.0], ids=["too large", "too small"])
+def test_wrong_unit(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    scale: float,
+) -> None:
+    refused(monkeypatch, capsys, tmp_path, [phantom_file(tmp_path, scale)], "unit")
+
+
+@pytest.mark.parametrize(
+    ("options", "remedy"),
+    [
+        (["--poisson", "0.5"], "0.4999"),
+        (["--young", "-1"], "positive"),
+        (["--patch-radius", "1e-12"], "radius"),
+        (["--vertices", "3"], "at least"),
+        (["--modes", "0"], "at least 1"),
+        (["--tolerance", "0"], "between"),
+        (["--element", "Q8"], "P2"),
+        (["--axes", "XYZ"], "axes"),
+        (["--unit", "inch"], "mm"),
+        (["--groups", "nothing.npz"], "node groups"),
+    ],
+)
+def test_bad_option(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    options: list[str],
+    remedy: str,
+) -> None:
+    source = phantom_file(tmp_path)
+    small = [] if "--vertices" in options else ["--vertices", "400"]
+    refused(monkeypatch, capsys, tmp_path, [source, *small, *options], remedy)
+
+
+def test_missing_output_folder(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert run(monkeypatch, "vademecum", "phantom", "-o", tmp_path / "no" / "v.h5") == 1
+    assert "create it first" in capsys.readouterr().err
+
+
+def test_tolerance_out_of_reach_is_written_and_marked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "v.h5"
+    options = ["--vertices", "300", "--modes", "6", "--tolerance", "0.001", "--certify", "5"]
+    assert run(monkeypatch, "vademecum", "phantom", "-o", file, *options) == 3
+    assert "not converged" in capsys.readouterr().err
+    assert run(monkeypatch, "show", file, "--json") == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["converged"] is False
+    wanted = {"l2_mean", "l2_worst", "contact_mean", "contact_worst"}
+    assert wanted | {"modes", "build_cpu_seconds", "bytes"} <= set(shown["certificate"])
+    assert shown["certificate"]["build_cpu_seconds"] > 0
+
+
+def test_show_refuses_what_is_no_vademecum(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "x.h5").write_bytes(b"nothing")
+    assert run(monkeypatch, "show", tmp_path / "x.h5") == 1
+    assert run(monkeypatch, "show", tmp_path / "y.h5") == 1
+    assert len(capsys.readouterr().err.strip().splitlines()) == 2
+
+
+def test_unknown_option_is_a_usage_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "show", "--colour") == 2
+    assert "--colour" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [[], ["vademecum"], ["show"], ["demo"], ["bench", "step"]])
+def test_help(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: list[str]
+) -> None:
+    assert run(monkeypatch, *command, "--help") == 0
+    assert "Usage" in capsys.readouterr().out
+
+
+def refused(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    folder: Path,
+    arguments: list[object],
+    remedy: str,
+) -> None:
+    before = set(folder.iterdir())
+    code = run(monkeypatch, "vademecum", *arguments, "-o", folder / "v.h5")
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("avatar:")]
+    assert code == 1
+    assert len(lines) == 1
+    assert remedy in lines[0]
+    assert set(folder.iterdir()) == before
