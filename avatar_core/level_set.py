@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from avatar_core.surface import SurfaceMesh, march, winding_number
+from avatar_core.surface import SurfaceMesh, winding_number
+from avatar_core.surface_files import march
 
 FloatArray = NDArray[np.float64]
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from avatar_core.errors import SurfaceError
 from avatar_core.level_set import grid_points
-from avatar_core.surface import SurfaceMesh, march
+from avatar_core.surface import SurfaceMesh
+from avatar_core.surface_files import march
 
 FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]

@@ -11,10 +11,10 @@ from avatar_core.vademecum import Vademecum
 def inner_positions(vademecum: Vademecum, margin: float = 12e-3) -> np.ndarray:
     """Load positions with full access ``margin`` [m] around them (all, if there are none)."""
     surface, field = vademecum.surface, vademecum.tip_field
-    around = margin * np.concatenate([np.eye(3), -np.eye(3)])
+    around = margin * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     raised = surface.centers + 5e-3 * surface.normals
     inner = [
-        j for j, p in enumerate(raised) if min(access(field, p + step) for step in around) > 0.99
+        j for j, p in enumerate(raised) if min(access(field, p + step) for step in around) > 0.999
     ]
     return np.array(inner) if inner else np.arange(surface.n_positions)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from avatar_core.elasticity import Elasticity, Material
 from avatar_core.mesh import Regions, TetMesh, make_mesh, regions_by_rule, tetrahedralize
 from avatar_core.organ import OrganOptions, vademecum_of
 from avatar_core.phantom import phantom_liver
+from avatar_core.surface import read_surface
 from avatar_core.vademecum import Vademecum
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
@@ -78,3 +80,12 @@ def phantom_elasticity(phantom_mesh: TetMesh) -> Elasticity:
 def phantom_vademecum() -> Vademecum:
     options = OrganOptions(n_vertices=900, rule=BuildRule(max_modes=60), n_certified=60)
     return vademecum_of(phantom_liver(), options)
+
+
+REAL = ("LiTS-4", "LiTS-10", "LiTS-60", "Amos-007", "LiTS-23")  # five patients, one cracked
+
+
+@pytest.fixture(scope="session", params=REAL)
+def real_vademecum(request: pytest.FixtureRequest, livers_dir: Path) -> Vademecum:
+    options = OrganOptions(n_vertices=1500, rule=BuildRule(max_modes=60), n_certified=3)
+    return vademecum_of(read_surface(livers_dir / f"{request.param}.obj"), options)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from avatar_core import surface as door
+from avatar_core import surface_files
 from avatar_core.errors import SurfaceError
 from avatar_core.surface import SurfaceMesh, ambiguous_fraction, axes_matrix, read_surface
 
@@ -135,7 +136,7 @@ def test_label_map_asks_which_label(tmp_path):
 
 def test_label_map_is_bounded_before_it_is_loaded(tmp_path, monkeypatch):
     path = label_map(tmp_path / "organ.nii.gz", np.diag([4.0, 4.0, 4.0, 1.0]))
-    monkeypatch.setattr(door, "MAX_LABEL_BYTES", 1000)
+    monkeypatch.setattr(surface_files, "MAX_LABEL_BYTES", 1000)
     refused(path, "crop it")
 
 
