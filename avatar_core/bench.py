@@ -44,10 +44,10 @@ class StepRow:
     bytes: int
 
 
-def time_steps(vademecum: Vademecum, n_tools: int, modes: int | None) -> StepRow:
+def time_steps(vademecum: Vademecum, n_tools: int) -> StepRow:
     """Slide ``n_tools`` spheres of 10 mm, 5 mm deep, with the field at all vertices."""
-    model = prepare(vademecum, (SPHERE,) * n_tools, modes, cloud="volume")
-    rank = model.arrays.space.shape[2]
+    model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume")
+    rank = vademecum.far.rank
     return _timed("vademecum", vademecum, model, rank, n_tools, lambda tips: step(model, tips))
 
 

@@ -94,6 +94,38 @@ def build_vademecum(
     )
 
 
+def with_rank(vademecum: Vademecum, rank: int, rule: BuildRule) -> Vademecum:
+    """The vademecum that a build with fewer modes would have given.
+
+    What the dropped modes held of the near fields moves into these, so that the response at the
+    load positions stays exact.
+    """
+    surface, far = vademecum.surface, vademecum.far
+    dropped = SeparatedField(far.space[:, rank:], far.load[:, rank:])
+    radius = surface.patch_radius
+    inner, outer = rule.near_inner * radius, rule.near_outer * radius
+
+    def grown(
+        near: LocalBlocks, factor: np.ndarray, points: np.ndarray, contact: bool
+    ) -> LocalBlocks:
+        distance = np.linalg.norm(surface.centers[near.position] - points[near.target], axis=1)
+        fade = (
+            wendland(distance, rule.contact_support * radius)
+            if contact
+            else plateau(distance, inner, outer)
+        )
+        zero = replace(near, block=np.zeros_like(near.block))
+        tail = _remainder(zero, -factor, dropped.load, fade)
+        return replace(near, block=near.block + tail.block)
+
+    return replace(
+        vademecum,
+        far=far.truncate(rank),
+        near=grown(vademecum.near, dropped.space, vademecum.mesh.vertices, False),
+        contact_near=grown(vademecum.contact_near, dropped.load, surface.centers, True),
+    )
+
+
 @dataclass(frozen=True)
 class ExactResponse:
     """What is kept of the full solutions, each computed once and dropped.

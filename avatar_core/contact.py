@@ -45,7 +45,8 @@ class ContactModel:
     arrays : ModelArrays, constant
         distance, access, origin, spacing: the tip field; position, normal, tangent, reach,
         neighbor, fit: interpolation over the load positions; load (n_positions, 3, rank) and
-        the contact_* blocks: compliance [m/N]; softness (1,), added where access fades [m/N];
+        the contact_* blocks, nearest first: compliance [m/N]; softness (1,), added where access
+        fades [m/N];
         space (n_points, 3, rank) and the near_* blocks: displacement of the cloud [m/N];
         rest (n_points, 3) [m]; tip_radius (n_tools,) [m]
     state : State, forces kept for the next period, and scratch
@@ -118,7 +119,7 @@ def model_arrays(
     rank = vademecum.far.rank if modes is None else modes
     near = _near_at(vademecum.near, points, len(mesh.vertices))
     space = vademecum.far.space.reshape(len(mesh.vertices), 3, -1)[points, :, :rank]
-    contact = vademecum.contact_near
+    contact, distance = _by_distance(vademecum.contact_near, surface.centers)
     load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
     return ModelArrays(
         *vademecum.tip_field,
@@ -127,6 +128,8 @@ def model_arrays(
         contact_start=contact.start,
         contact_target=contact.target,
         contact_block=contact.block,
+        contact_distance=distance,
+        contact_reach=np.array([float(distance.max(initial=0.0))]),
         softness=np.array([float((load**2).sum(axis=(1, 2)).mean() / 3.0)]),
         space=np.ascontiguousarray(space),
         near_start=near.start,
@@ -160,6 +163,7 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         displacement=np.zeros((n_stencil, 3)),
         compliance=np.zeros((n_tools, n_tools)),
         trial=np.zeros(n_stencil),
+        shifted=np.zeros((3, 3)),
         amplitude=np.zeros(n_modes, np.float32),
     )
     out = Out(
@@ -217,6 +221,8 @@ def warm_up(n_tools: int = 1) -> None:
             np.zeros((n, 5, N_FIT), double),
             np.zeros((n, 3, rank), single),
             *blocks,
+            np.zeros(0, single),
+            np.ones(1, double),
             np.ones(1, double),
             np.zeros((points, 3, rank), single),
             *blocks,
@@ -246,6 +252,14 @@ def stored_energy(model: ContactModel) -> float:
     """Elastic energy lambda . C lambda / 2 of the present contacts [J]."""
     force = model.state.force
     return float(0.5 * force @ model.state.compliance @ force)
+
+
+def _by_distance(near: LocalBlocks, centers: np.ndarray) -> tuple[LocalBlocks, np.ndarray]:
+    """The blocks of each position sorted by distance, and those distances (float32) [m]."""
+    distance = np.linalg.norm(centers[near.position] - centers[near.target], axis=1)
+    order = np.lexsort((distance, near.position))
+    blocks = LocalBlocks(near.start, near.target[order], near.block[order])
+    return blocks, distance[order].astype(np.float32)
 
 
 def _near_at(near: LocalBlocks, points: np.ndarray, n_vertices: int) -> LocalBlocks:

@@ -56,6 +56,8 @@ ModelArrays = namedtuple(
         "contact_start",
         "contact_target",
         "contact_block",
+        "contact_distance",
+        "contact_reach",
         "softness",
         "space",
         "near_start",
@@ -88,6 +90,7 @@ State = namedtuple(
         "displacement",  # (T S, 3) of the stencil
         "compliance",  # (T, T)
         "trial",  # (T S,) weights at a shifted tip
+        "shifted",  # (3, 3) that tip, its direction and surface point
         "amplitude",  # (k,)
     ],
 )
@@ -221,18 +224,55 @@ def _column(model, state, t):  # type: ignore[no-untyped-def]
             u2 += model.load[j, 2, k] * mode[k]
         column = state.column[t, q]
         column[0], column[1], column[2] = u0, u1, u2
+    radius, together = _stencil_extent(model, state, t)
     for p in range(state.n_local[0]):
         w = state.weight[t, p]
         if w == 0.0:
             continue
         j = state.nodes[p]
-        w0, w1, w2 = w * n[0], w * n[1], w * n[2]
+        w0, w1, w2 = np.float32(w * n[0]), np.float32(w * n[1]), np.float32(w * n[2])
+        limit = np.float32(np.inf if together else radius + _from_point(model, state, t, j))
         for e in range(model.contact_start[j], model.contact_start[j + 1]):
+            if model.contact_distance[e] > limit:
+                break
             q = state.local[model.contact_target[e]]
             if q >= 0:
-                block = model.contact_block[e]
                 for d in range(3):
-                    state.column[t, q, d] += block[d, 0] * w0 + block[d, 1] * w1 + block[d, 2] * w2
+                    state.column[t, q, d] += (
+                        model.contact_block[e, d, 0] * w0
+                        + model.contact_block[e, d, 1] * w1
+                        + model.contact_block[e, d, 2] * w2
+                    )
+
+
+@njit(cache=True, fastmath=True)
+def _from_point(model, state, t, j):  # type: ignore[no-untyped-def]
+    """Distance of load position j from the surface point under tip t [m]."""
+    squared = 0.0
+    for d in range(3):
+        squared += (model.position[j, d] - state.point[t, d]) ** 2
+    return np.sqrt(squared)
+
+
+@njit(cache=True, fastmath=True)
+def _stencil_extent(model, state, t):  # type: ignore[no-untyped-def]
+    """Radius of the stencil of tip t [m], and whether another tip may share its near field.
+
+    Blocks are sorted by distance, so that the search for a lone stencil can stop early.
+    """
+    radius = 0.0
+    for q in range(state.n_local[0]):
+        if state.weight[t, q] != 0.0:
+            radius = max(radius, _from_point(model, state, t, state.nodes[q]))
+    together = False
+    for s in range(state.engaged.shape[0]):
+        if s != t and state.n_candidates[s] > 0:
+            squared = 0.0
+            for d in range(3):
+                squared += (state.point[s, d] - state.point[t, d]) ** 2
+            if np.sqrt(squared) < model.contact_reach[0] + 2.0 * radius:
+                together = True
+    return radius + 1e-6, together
 
 
 @njit(cache=True)
@@ -309,7 +349,7 @@ def _frozen_gap(model, state, t, p, direction, point):  # type: ignore[no-untype
 @njit(cache=True)
 def _write_forces(model, state, out, tips):  # type: ignore[no-untyped-def]
     """Forces on the tools and the contacts that make them."""
-    p, direction, point = np.empty(3), np.empty(3), np.empty(3)
+    p, direction, point = state.shifted[0], state.shifted[1], state.shifted[2]
     n = 0
     for t in range(tips.shape[0]):
         for d in range(3):
@@ -382,9 +422,12 @@ def _write_cloud(model, state, out):  # type: ignore[no-untyped-def]
         j = state.nodes[q]
         for e in range(model.near_start[j], model.near_start[j + 1]):
             v = model.near_target[e]
-            block = model.near_block[e]
             for d in range(3):
-                cloud[v, 3 + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2
+                cloud[v, 3 + d] += (
+                    model.near_block[e, d, 0] * f0
+                    + model.near_block[e, d, 1] * f1
+                    + model.near_block[e, d, 2] * f2
+                )
     for v in range(cloud.shape[0]):
         for d in range(3):
             cloud[v, d] = model.rest[v, d] + cloud[v, 3 + d]

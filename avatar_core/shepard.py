@@ -117,13 +117,18 @@ def add_weights(data, candidates, n_candidates, x, normal, local, weight):  # ty
         if distance >= reach or facing <= 0.0:
             continue
         blend = (facing * (reach - distance) / (reach * distance)) ** 2
-        t = data.tangent[j]
-        a = (t[0, 0] * dx + t[0, 1] * dy + t[0, 2] * dz) / reach
-        b = (t[1, 0] * dx + t[1, 1] * dy + t[1, 2] * dz) / reach
+        t = data.tangent
+        a = (t[j, 0, 0] * dx + t[j, 0, 1] * dy + t[j, 0, 2] * dz) / reach
+        b = (t[j, 1, 0] * dx + t[j, 1, 1] * dy + t[j, 1, 2] * dz) / reach
         own = 1.0
         for i in range(N_FIT):
-            f = data.fit[j]
-            share = f[0, i] * a + f[1, i] * b + f[2, i] * a * a + f[3, i] * a * b + f[4, i] * b * b
+            share = (
+                data.fit[j, 0, i] * a
+                + data.fit[j, 1, i] * b
+                + data.fit[j, 2, i] * a * a
+                + data.fit[j, 3, i] * a * b
+                + data.fit[j, 4, i] * b * b
+            )
             weight[local[data.neighbor[j, i]]] += blend * share
             own -= share
         weight[local[j]] += blend * own

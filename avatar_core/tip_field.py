@@ -70,42 +70,55 @@ def _closest(mesh: TetMesh, faces: np.ndarray, points: np.ndarray) -> tuple[np.n
 
 
 @njit(cache=True)
-def _bspline(t, w, dw):  # type: ignore[no-untyped-def]
-    """The four uniform cubic B-spline weights at t in [0, 1), and their derivatives."""
+def _bspline(t):  # type: ignore[no-untyped-def]
+    """The four uniform cubic B-spline weights at t in [0, 1)."""
     s = 1.0 - t
-    w[0], w[3] = s * s * s / 6.0, t * t * t / 6.0
-    w[1] = (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0
-    w[2] = (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0
-    dw[0], dw[3] = -0.5 * s * s, 0.5 * t * t
-    dw[1] = -2.0 * t + 1.5 * t * t
-    dw[2] = 2.0 * s - 1.5 * s * s
+    return (
+        s * s * s / 6.0,
+        (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0,
+        (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0,
+        t * t * t / 6.0,
+    )
+
+
+@njit(cache=True)
+def _bspline_slope(t):  # type: ignore[no-untyped-def]
+    """Their derivatives."""
+    s = 1.0 - t
+    return (-0.5 * s * s, -2.0 * t + 1.5 * t * t, 2.0 * s - 1.5 * s * s, 0.5 * t * t)
 
 
 @njit(cache=True)
 def evaluate(values, origin, spacing, p, gradient, outside):  # type: ignore[no-untyped-def]
     """Value of a sampled field at p, its gradient into ``gradient``; ``outside`` off the grid."""
-    w, dw = np.empty((3, 4)), np.empty((3, 4))
-    first = np.empty(3, np.int64)
-    for d in range(3):
-        x = (p[d] - origin[d]) / spacing
-        cell = np.floor(x)
-        if not (cell >= 1.0 and cell < values.shape[d] - 2.0):
-            gradient[0] = gradient[1] = gradient[2] = 0.0
-            return outside
-        first[d] = np.int64(cell) - 1
-        _bspline(x - cell, w[d], dw[d])
+    x = (p[0] - origin[0]) / spacing
+    y = (p[1] - origin[1]) / spacing
+    z = (p[2] - origin[2]) / spacing
+    cx, cy, cz = np.floor(x), np.floor(y), np.floor(z)
+    if not (
+        cx >= 1.0
+        and cx < values.shape[0] - 2.0
+        and cy >= 1.0
+        and cy < values.shape[1] - 2.0
+        and cz >= 1.0
+        and cz < values.shape[2] - 2.0
+    ):
+        gradient[0] = gradient[1] = gradient[2] = 0.0
+        return outside
+    wx, wy, wz = _bspline(x - cx), _bspline(y - cy), _bspline(z - cz)
+    dx, dy, dz = _bspline_slope(x - cx), _bspline_slope(y - cy), _bspline_slope(z - cz)
+    nx, ny, nz = int(cx) - 1, int(cy) - 1, int(cz) - 1
     value = g0 = g1 = g2 = 0.0
     for i in range(4):
         for j in range(4):
             line = slope = 0.0
             for k in range(4):
-                v = values[first[0] + i, first[1] + j, first[2] + k]
-                line += w[2, k] * v
-                slope += dw[2, k] * v
-            wij = w[0, i] * w[1, j]
-            value += wij * line
-            g0 += dw[0, i] * w[1, j] * line
-            g1 += w[0, i] * dw[1, j] * line
-            g2 += wij * slope
+                v = values[nx + i, ny + j, nz + k]
+                line += wz[k] * v
+                slope += dz[k] * v
+            value += wx[i] * wy[j] * line
+            g0 += dx[i] * wy[j] * line
+            g1 += wx[i] * dy[j] * line
+            g2 += wx[i] * wy[j] * slope
     gradient[0], gradient[1], gradient[2] = g0 / spacing, g1 / spacing, g2 / spacing
     return value

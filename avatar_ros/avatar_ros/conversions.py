@@ -212,12 +212,18 @@ class StateTemplate:
             header=Header(frame_id=frame_id),
             tool=tool,
             vademecum_id=vademecum_id,
-            contacts=[Contact() for _ in range(capacity)],
             force_error=math.nan,
         )
+
+        def set_count(n_contacts: int) -> None:
+            message.contacts = [Contact() for _ in range(n_contacts)]
+
+        self._status = _find_byte(message, lambda status: setattr(message, "status", status))
+        least = _find_byte(message, set_count)  # byte of the number of contacts
+        self._count = least if sys.byteorder == "little" else least - 3
+        set_count(capacity)
         contact = message.contacts[0]
         self._stamp = _find_stamp(message)
-        self._status = _status_offset(message)
         start = _find_number(message, lambda x: setattr(contact.position, "x", x))
         last = _find_number(message, lambda x: setattr(contact, "penetration", x))
         serialised = serialize_message(message)
@@ -225,8 +231,6 @@ class StateTemplate:
         self._tail = serialised[start + 8 * _CONTACT_NUMBERS * capacity :]
         self._block = bytearray(8 * _CONTACT_NUMBERS * capacity)
         self.contacts = np.frombuffer(self._block, dtype=np.float64).reshape(capacity, -1)
-        self._count = serialised.rindex(struct.pack("=I", capacity), 0, start)
-        self._capacity = capacity
         if last != start + 72 or not all(self._reads_back(n) for n in {0, 1, capacity}):
             raise LayoutError("contacts are not ten float64 each in a row: use rmw_fastrtps_cpp")
 
@@ -259,16 +263,20 @@ def _contact_numbers(contact: Contact) -> list[float]:
     return [p.x, p.y, p.z, n.x, n.y, n.z, f.x, f.y, f.z, contact.penetration]
 
 
-def _status_offset(message: ContactState) -> int:
-    """Byte offset of the status: the only byte that follows it; padding may hold anything."""
-    values = (0xA5, 0x3C, 0x00)
+def _find_byte(message: ContactState, set_byte: Callable[[int], None]) -> int:
+    """Byte offset of what ``set_byte`` sets: the only byte that follows it.
+
+    Marks will not do for a small number, and one comparison neither: padding may hold anything.
+    """
+    values = (5, 3, 7, 2)
     serialised = []
     for value in values:
-        message.status = value
+        set_byte(value)
         serialised.append(serialize_message(message))
-    follows = [i for i, held in enumerate(zip(*serialised, strict=True)) if held == values]
+    follows = [i for i, held in enumerate(zip(*serialised, strict=False)) if held == values]
+    set_byte(0)
     if len(follows) != 1:
-        raise LayoutError("the status is not stored in one byte: use rmw_fastrtps_cpp")
+        raise LayoutError("a number is not stored in one place: use rmw_fastrtps_cpp")
     return follows[0]
 
 

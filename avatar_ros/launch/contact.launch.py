@@ -21,9 +21,7 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument("library_dir", default_value=".", description="vademecums"),
             DeclareLaunchArgument("vademecum", default_value="", description="file to load"),
-            Node(
-                package="avatar_ros", executable="vademecum_loader", parameters=[params, library]
-            ),
+            Node(package="avatar_ros", executable="vademecum_loader", parameters=[params, library]),
             Node(package="avatar_ros", executable="contact", parameters=[params]),
         ]
     )

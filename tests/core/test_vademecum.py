@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
+from avatar_core.build import BuildRule, with_rank
 from avatar_core.certificate import certify
 from avatar_core.elasticity import Elasticity
 from avatar_core.errors import StorageError
@@ -182,3 +183,18 @@ def test_full_disk_leaves_the_old_file(phantom_vademecum: Vademecum, tmp_path: P
     assert "free disk space" in run.stdout
     assert file.read_bytes() == before
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_fewer_modes_leave_the_loaded_positions_exact(phantom_vademecum: Vademecum) -> None:
+    v = phantom_vademecum
+    short = with_rank(v, 10, BuildRule())
+    j = v.surface.n_positions // 2
+    where = np.array([j]), np.ones(1)
+    np.testing.assert_allclose(
+        short.compliance(*where), v.compliance(*where), atol=1e-5 * v.compliance(*where).max()
+    )
+    near = np.linalg.norm(v.mesh.vertices - v.surface.centers[j], axis=1)
+    near = np.repeat(near < 1.5 * v.surface.patch_radius, 3)
+    change = np.abs(short.displacement(*where) - v.displacement(*where)).max(axis=1)
+    assert change[near].max() < 1e-4 * change.max()
+    assert active_set_spectrum(short, 50, seed=2)[0] > 0

@@ -12,7 +12,6 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.conversions import stamp_nanoseconds
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
@@ -160,7 +159,7 @@ def test_a_bad_pose_gives_no_force(
     else:
         part, name = field.split(".")
         setattr(getattr(hand.pose.pose, part), name, value)
-    assert not _status(probe, status, hand).contacts or True
+    assert not _status(probe, status, hand).contacts
     wrench = probe.next(WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND, meanwhile=hand)
     assert not _force(wrench).any()
 
@@ -205,13 +204,10 @@ def test_the_loop_keeps_its_rate_without_poses(cell: Any, probe: Any) -> None:
         ("short.h5", "build"),
         ("flipped.h5", "build"),
         ("text.h5", "build"),
-        ("liver.h5\0", "no file name"),
     ],
 )
 def test_a_bad_file_is_refused(cell: Any, probe: Any, name: str, reason: str) -> None:
     before = probe.next(VademecumInfo, "vademecum_info", qos.LATCHED)
-    if "\0" in name:
-        pytest.skip("a string with a zero byte cannot be sent by rclpy")
     answer = probe.call(LoadVademecum, "load_vademecum", LoadVademecum.Request(name=name))
     assert not answer.success
     assert reason in answer.message
@@ -230,4 +226,3 @@ def test_a_good_file_is_loaded(cell: Any, probe: Any, organ: Any, library: Path)
     assert answer.info.n_modes == expected.n_modes
     assert answer.info.contact_worst == expected.contact_worst
     assert answer.info.header.frame_id == "organ"
-    assert stamp_nanoseconds is not None

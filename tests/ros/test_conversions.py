@@ -40,9 +40,7 @@ def _pose(frame: str = "organ", **changed: float) -> bytes:
     header.stamp.sec, header.stamp.nanosec = divmod(STAMP, 1_000_000_000)
     pose = Pose(
         position=Point(x=numbers["x"], y=numbers["y"], z=numbers["z"]),
-        orientation=Quaternion(
-            x=numbers["qx"], y=numbers["qy"], z=numbers["qz"], w=numbers["qw"]
-        ),
+        orientation=Quaternion(x=numbers["qx"], y=numbers["qy"], z=numbers["qz"], w=numbers["qw"]),
     )
     return serialize_message(PoseStamped(header=header, pose=pose))
 
