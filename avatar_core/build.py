@@ -48,11 +48,11 @@ class BuildRule:
     max_sample_bytes : memory for the columns kept in full, all if they fit, to measure errors on
     """
 
-    tolerance: float = 0.04
+    tolerance: float = 0.045
     max_modes: int = 100
     oversampling: float = 1.2
-    near_inner: float = 1.6
-    near_outer: float = 3.0
+    near_inner: float = 1.8
+    near_outer: float = 3.3
     contact_support: float = 4.0
     max_sample_bytes: int = 400_000_000
 

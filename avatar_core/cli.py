@@ -86,7 +86,7 @@ def vademecum(
     modes: Annotated[int, typer.Option(help="far-field modes at most")] = 100,
     tolerance: Annotated[
         float, typer.Option(help="mean relative displacement error over the build's loads [-]")
-    ] = 0.04,
+    ] = 0.045,
     groups: Annotated[
         Path | None,
         typer.Option(help=".npz with points 'clamped' and 'accessible' [m], instead of the rule"),

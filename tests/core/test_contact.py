@@ -196,9 +196,9 @@ def test_two_tools_share_the_organ(phantom_vademecum: Vademecum) -> None:
     v = phantom_vademecum
     two = prepare(v, (RADIUS, RADIUS))
     a = middle_of_access(v)
-    b = int(
-        np.argmin(abs(np.linalg.norm(v.surface.centers - v.surface.centers[a], axis=1) - 25e-3))
-    )
+    inner = inner_positions(v)
+    distance = np.linalg.norm(v.surface.centers[inner] - v.surface.centers[a], axis=1)
+    b = int(inner[np.argmin(abs(distance - 25e-3))])
     tips = np.concatenate([push(v, 4e-3, a), push(v, 4e-3, b)])
     lifted = np.concatenate([push(v, 4e-3, a), push(v, -4e-3, b)])
     step(two, lifted)
