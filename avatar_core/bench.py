@@ -159,7 +159,7 @@ def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: in
 @njit(cache=True, fastmath=True)
 def _dense_step(model, state, out, tips, columns, compliance):  # type: ignore[no-untyped-def]
     """:func:`contact_kernels.contact_step` with stored columns instead of modes."""
-    kernels._locate(model, state, tips)
+    kernels._locate(model, state, out, tips)
     kernels._number(model, state)
     for t in range(tips.shape[0]):
         for q in range(state.n_local[0]):

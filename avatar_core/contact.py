@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -18,7 +17,9 @@ from avatar_core.contact_kernels import ModelArrays, Out, State
 from avatar_core.errors import ContactError
 from avatar_core.near_field import LocalBlocks
 from avatar_core.shepard import MAX_STENCIL, N_FIT
-from avatar_core.vademecum import Vademecum
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum import Vademecum
 
 Cloud = Literal["surface", "volume", "off"]
 
@@ -36,6 +37,7 @@ class Status(IntEnum):
     NOT_CONVERGED = kernels.NOT_CONVERGED
     TOO_MANY_CONTACTS = kernels.TOO_MANY
     OUT_OF_RANGE = kernels.OUT_OF_RANGE
+    UNKNOWN_FRAME = kernels.UNKNOWN_FRAME
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class ContactModel:
     state : State, forces kept for the next period, and scratch
     out : Out
         force, torque (n_tools, 3) [N, N m], of the organ on each tool about its tip (a
-        frictionless sphere has no torque about its centre);
+        frictionless sphere has no torque about its centre); status (n_tools,), of each;
         cloud (n_points, 6) float32, deformed position and displacement [m];
         n_contacts (1,), then contact_tool, contact_position, contact_normal (organ to tool),
         contact_force (on the tool), contact_penetration of the active contacts
@@ -169,6 +171,7 @@ def make_model(arrays: ModelArrays) -> ContactModel:
     out = Out(
         force=np.zeros((n_tools, 3)),
         torque=np.zeros((n_tools, 3)),
+        status=np.zeros(n_tools, np.int64),
         cloud=np.zeros((len(arrays.rest), 6), np.float32),
         n_contacts=np.zeros(1, np.int64),
         contact_tool=np.zeros(n_tools, np.int64),
@@ -180,6 +183,8 @@ def make_model(arrays: ModelArrays) -> ContactModel:
     model = ContactModel(arrays, state, out)
     far_away = np.full((n_tools, 3), 1e3)
     step(model, far_away)
+    solve(model, far_away)
+    deform(model)
     model.reset()
     return model
 
@@ -195,11 +200,21 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
     Returns
     -------
     int
-        A :class:`Status`. INVALID_POSE: some pose was not finite; OUT_OF_RANGE: some tip is
-        off the accessible surface, too deep, or did not come in through the surface. The tools
-        concerned have zero force, the others are served.
+        The worst :class:`Status` of the tools; ``out.status`` has each. INVALID_POSE: not
+        finite; OUT_OF_RANGE: off the accessible surface, too deep, or not come in through the
+        surface. The tools concerned have no force or a fading one, the others are served.
     """
     return int(kernels.contact_step(model.arrays, model.state, model.out, tips))
+
+
+def solve(model: ContactModel, tips: np.ndarray) -> int:
+    """The first half of :func:`step`: forces and contacts, so that they can leave at once."""
+    return int(kernels.contact_solve(model.arrays, model.state, model.out, tips))
+
+
+def deform(model: ContactModel) -> None:
+    """The second half of :func:`step`: the cloud under the forces of :func:`solve`."""
+    kernels.contact_deform(model.arrays, model.state, model.out)
 
 
 def warm_up(n_tools: int = 1) -> None:
@@ -230,22 +245,6 @@ def warm_up(n_tools: int = 1) -> None:
             np.full(n_tools, 5e-3, double),
         )
     )
-
-
-def save_arrays(arrays: ModelArrays, folder: Path) -> None:
-    """Write the constant arrays as one ``.npy`` each, to be mapped by another process."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, array in arrays._asdict().items():
-        np.save(folder / f"{name}.npy", array)
-
-
-def load_arrays(folder: Path) -> ModelArrays:
-    """Map what :func:`save_arrays` wrote, without reading it.
-
-    Pages are copy-on-write: to the compiled step a read-only array would be another type.
-    """
-    mapped = {name: np.load(folder / f"{name}.npy", mmap_mode="c") for name in ModelArrays._fields}
-    return ModelArrays(**mapped)
 
 
 def stored_energy(model: ContactModel) -> float:

@@ -29,6 +29,7 @@ MAX_TOOLS = 8
 MAX_SWEEPS = 1000
 
 OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
+UNKNOWN_FRAME = 8
 
 GAP_TOLERANCE = 1e-9  # [m] of gap change that ends Gauss-Seidel
 ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not come in through the surface
@@ -100,6 +101,7 @@ Out = namedtuple(
     [
         "force",
         "torque",
+        "status",
         "cloud",
         "n_contacts",
         "contact_tool",
@@ -112,50 +114,62 @@ Out = namedtuple(
 
 
 @njit(cache=True)
-def contact_step(model, state, out, tips):  # type: ignore[no-untyped-def]
-    """One period: locate, assemble, solve, differentiate, deform. Returns a status."""
-    status = _locate(model, state, tips)
+def contact_solve(model, state, out, tips):  # type: ignore[no-untyped-def]
+    """First half of a period: locate, assemble, solve, differentiate. Returns the worst status."""
+    status = _locate(model, state, out, tips)
     _number(model, state)
     for t in range(tips.shape[0]):
         _column(model, state, t)
     _assemble(model, state)
-    if not _solve(state) and status == OK:
-        status = NOT_CONVERGED
+    if not _solve(state):
+        for t in range(tips.shape[0]):
+            if state.n_candidates[t] > 0:
+                out.status[t] = NOT_CONVERGED
+        status = max(status, NOT_CONVERGED)
     _displace_stencil(state)
     _write_forces(model, state, out, tips)
-    _write_cloud(model, state, out)
     return status
 
 
 @njit(cache=True)
-def _locate(model, state, tips):  # type: ignore[no-untyped-def]
-    """Gap, direction and surface point of every tip; which tips may touch."""
-    status = OK
-    for t in range(tips.shape[0]):
-        state.n_candidates[t] = 0
-        state.access[t] = 1.0
-        if not np.isfinite(tips[t, 0] + tips[t, 1] + tips[t, 2]):
-            state.engaged[t] = False
-            status = INVALID_POSE
-            continue
-        phi = _below(model, tips[t], state.direction[t], state.point[t])
-        state.gap[t] = phi - model.tip_radius[t]
-        if state.gap[t] >= 0.0:
-            state.engaged[t] = False
-            continue
-        state.access[t] = evaluate(
-            model.access, model.origin, model.spacing[0], tips[t], state.access_gradient[t], 0.0
-        )
-        entered = state.engaged[t] or phi > -ENTRY_DEPTH
-        if not entered or phi < -MAX_DEPTH or state.access[t] < MIN_ACCESS:
-            state.engaged[t] = False
-            status = max(status, OUT_OF_RANGE)
-            continue
-        state.engaged[t] = True
-        if state.access[t] < FULL_ACCESS:
-            status = max(status, OUT_OF_RANGE)
-        state.n_candidates[t] = find_candidates(model, state.point[t], _MARGIN, state.candidates[t])
+def contact_step(model, state, out, tips):  # type: ignore[no-untyped-def]
+    """One period: forces, then the deformed cloud. Returns the worst status."""
+    status = contact_solve(model, state, out, tips)
+    contact_deform(model, state, out)
     return status
+
+
+@njit(cache=True)
+def _locate(model, state, out, tips):  # type: ignore[no-untyped-def]
+    """Gap, direction and surface point of every tip; which tips may touch."""
+    worst = OK
+    for t in range(tips.shape[0]):
+        out.status[t] = _locate_one(model, state, t, tips[t])
+        worst = max(worst, out.status[t])
+    return worst
+
+
+@njit(cache=True)
+def _locate_one(model, state, t, tip):  # type: ignore[no-untyped-def]
+    state.n_candidates[t] = 0
+    state.access[t] = 1.0
+    engaged = state.engaged[t]
+    state.engaged[t] = False
+    if not np.isfinite(tip[0] + tip[1] + tip[2]):
+        return INVALID_POSE
+    phi = _below(model, tip, state.direction[t], state.point[t])
+    state.gap[t] = phi - model.tip_radius[t]
+    if state.gap[t] >= 0.0:
+        return OK
+    state.access[t] = evaluate(
+        model.access, model.origin, model.spacing[0], tip, state.access_gradient[t], 0.0
+    )
+    entered = engaged or phi > -ENTRY_DEPTH
+    if not entered or phi < -MAX_DEPTH or state.access[t] < MIN_ACCESS:
+        return OUT_OF_RANGE
+    state.engaged[t] = True
+    state.n_candidates[t] = find_candidates(model, state.point[t], _MARGIN, state.candidates[t])
+    return OK if state.access[t] >= FULL_ACCESS else OUT_OF_RANGE
 
 
 @njit(cache=True)
@@ -383,8 +397,8 @@ def _write_forces(model, state, out, tips):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True)
-def _write_cloud(model, state, out):  # type: ignore[no-untyped-def]
-    """Displacement of every cloud point: far field by modes, near field by blocks."""
+def contact_deform(model, state, out):  # type: ignore[no-untyped-def]
+    """Second half of a period: the cloud, far field by modes and near field by blocks."""
     cloud, amplitude = out.cloud, state.amplitude
     n_modes = model.space.shape[2]
     for k in range(n_modes):

@@ -245,14 +245,16 @@ class ContactLoop:
             self._answered = start
             record.note_age(time.time_ns() - stamp_nanoseconds(self._tools[0].stamp))
         model = online.model
-        code = NO_MODEL if model is None else contact.step(model, self._tips)
+        if model is not None:
+            contact.solve(model, self._tips)
         for i, tool in enumerate(self._tools):
             self._publish_wrench(i, tool, model)
         record.note_step(time.monotonic_ns() - start)
         for i, tool in enumerate(self._tools):
-            self._publish_state(i, tool, online, code)
+            self._publish_state(i, tool, online)
         self._cycle += 1
         if online.cloud is not None and self._cycle % settings.cloud_divisor == 0:
+            contact.deform(model)
             online.cloud.points[:] = model.out.cloud
             stamp = self._tools[0].stamp
             self._outlets.deformation.handle.publish_raw(online.cloud.serialise(stamp))
@@ -274,9 +276,13 @@ class ContactLoop:
             wrench.torque[:] = model.out.torque[i]
         tool.publisher.handle.publish_raw(wrench.serialise(tool.stamp))
 
-    def _publish_state(self, i: int, tool: Tool, online: Online, code: int) -> None:
+    def _publish_state(self, i: int, tool: Tool, online: Online) -> None:
         template = online.states[i]
-        status = code if code == NO_MODEL or tool.status == OK else tool.status
+        status = tool.status
+        if online.model is None:
+            status = NO_MODEL
+        elif status == OK:
+            status = int(online.model.out.status[i])
         n = 0 if online.model is None else _write_contacts(template, online.model.out, i)
         self._outlets.state.handle.publish_raw(template.serialise(tool.stamp, status, n))
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from avatar_core.contact import (
     ContactModel,
     Status,
-    load_arrays,
-    make_model,
+    deform,
     prepare,
-    save_arrays,
+    solve,
     step,
     stored_energy,
 )
@@ -278,16 +275,25 @@ def test_impossible_model_is_refused(
         prepare(phantom_vademecum, **options)  # type: ignore[arg-type]
 
 
-def test_mapped_arrays_give_the_same_force(
-    phantom_vademecum: Vademecum, model: ContactModel, tmp_path: Path
-) -> None:
-    save_arrays(model.arrays, tmp_path / "model")
-    mapped = make_model(load_arrays(tmp_path / "model"))
+def test_each_tool_has_its_own_status(phantom_vademecum: Vademecum) -> None:
+    two = prepare(phantom_vademecum, (RADIUS, RADIUS))
+    tips = np.concatenate([push(phantom_vademecum, 3e-3), [[np.nan, 0.0, 0.0]]])
+    assert step(two, tips) == Status.INVALID_POSE
+    assert two.out.status.tolist() == [Status.OK, Status.INVALID_POSE]
+    assert two.out.force[0].any() and not two.out.force[1].any()
+
+
+def test_solve_then_deform_is_a_step(phantom_vademecum: Vademecum, model: ContactModel) -> None:
     tip = push(phantom_vademecum, 4e-3)
     step(model, tip)
-    step(mapped, tip)
-    np.testing.assert_array_equal(mapped.out.force, model.out.force)
-    np.testing.assert_array_equal(mapped.out.cloud, model.out.cloud)
+    force, cloud = model.out.force.copy(), model.out.cloud.copy()
+    model.reset()
+    model.out.cloud[:] = 0.0
+    assert solve(model, tip) == Status.OK
+    np.testing.assert_array_equal(model.out.force, force)
+    assert not model.out.cloud.any()
+    deform(model)
+    np.testing.assert_array_equal(model.out.cloud, cloud)
 
 
 def test_warm_up_compiles_what_a_vademecum_needs(phantom_vademecum: Vademecum) -> None:
