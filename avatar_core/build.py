@@ -101,6 +101,8 @@ def with_rank(vademecum: Vademecum, rank: int, rule: BuildRule) -> Vademecum:
     load positions stays exact.
     """
     surface, far = vademecum.surface, vademecum.far
+    if rank >= far.rank:
+        return vademecum
     dropped = SeparatedField(far.space[:, rank:], far.load[:, rank:])
     radius = surface.patch_radius
     inner, outer = rule.near_inner * radius, rule.near_outer * radius
