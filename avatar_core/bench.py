@@ -18,6 +18,7 @@ from avatar_core.contact import ContactModel, prepare, step
 from avatar_core.elasticity import Elasticity
 from avatar_core.loads import patch_loads
 from avatar_core.near_field import LocalBlocks
+from avatar_core.tip_response import gather
 from avatar_core.tool_path import inner_positions, middle_of_access, slide
 from avatar_core.vademecum import Vademecum
 
@@ -60,7 +61,7 @@ def time_dense_table(vademecum: Vademecum, n_tools: int) -> StepRow:
         return StepRow("dense table", n_v, 0, n_tools, nan, 0, nan, nan, size)
     model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume")
     load = vademecum.far.load.reshape(n_s, 3, -1)
-    columns = _dense(vademecum.far.space, load, vademecum.near, n_v)
+    columns = _dense(vademecum.far.space, load, vademecum.near, n_v).reshape(n_s, 3, 3 * n_v)
     compliance = _dense(vademecum.far.load, load, vademecum.contact_near, n_s)
 
     def dense(tips: np.ndarray) -> None:
@@ -159,39 +160,39 @@ def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: in
 @njit(cache=True, fastmath=True)
 def _dense_step(model, state, out, tips, columns, compliance):  # type: ignore[no-untyped-def]
     """:func:`contact_kernels.contact_step` with stored columns instead of modes."""
-    kernels._locate(model, state, out, tips)
-    kernels._number(model, state)
+    kernels._forget_stencil(state)
+    n_active = 0
     for t in range(tips.shape[0]):
-        for q in range(state.n_local[0]):
-            for d in range(3):
-                state.column[t, q, d] = 0.0
-        for p in range(state.n_local[0]):
-            w = state.weight[t, p]
-            if w != 0.0:
+        kernels._locate(model, state, t, tips[t])
+        state.mode[t] = np.float32(0.0)
+        if state.active[t]:
+            n_active += 1
+            gather(model, state, t, tips[t])
+    for t in range(tips.shape[0]):
+        if state.active[t]:
+            for i in range(state.n_own[t]):
+                p = state.own[t, i]
                 for c in range(3):
                     row = compliance[state.nodes[p], c]
-                    f = w * state.direction[t, c]
+                    f = state.weight[t, p, 0] * state.normal[t, c]
                     for q in range(state.n_local[0]):
                         for d in range(3):
                             state.column[t, q, d] += f * row[state.nodes[q], d]
     kernels._assemble(model, state)
     kernels._solve(state)
-    kernels._displace_stencil(state)
-    kernels._write_forces(model, state, out, tips)
-    cloud = out.cloud
-    for v in range(cloud.shape[0]):
-        cloud[v, 3] = cloud[v, 4] = cloud[v, 5] = np.float32(0.0)
+    kernels._write_forces(model, state, out, tips, n_active > 1)
+    u = state.field[: 3 * out.cloud.shape[0]]
+    u[:] = np.float32(0.0)
     for p in range(state.n_local[0]):
         for c in range(3):
             f = 0.0
             for t in range(tips.shape[0]):
-                f -= state.weight[t, p] * state.force[t] * state.direction[t, c]
+                f -= state.weight[t, p, 0] * state.scale[t] * state.force[t] * state.normal[t, c]
             if f != 0.0:
                 row, g = columns[state.nodes[p], c], np.float32(f)
-                for v in range(cloud.shape[0]):
-                    cloud[v, 3] += g * row[v, 0]
-                    cloud[v, 4] += g * row[v, 1]
-                    cloud[v, 5] += g * row[v, 2]
-    for v in range(cloud.shape[0]):
+                for i in range(u.shape[0]):
+                    u[i] += g * row[i]
+    for v in range(out.cloud.shape[0]):
         for d in range(3):
-            cloud[v, d] = model.rest[v, d] + cloud[v, 3 + d]
+            out.cloud[v, d] = model.rest[v, d] + u[3 * v + d]
+            out.cloud[v, 3 + d] = u[3 * v + d]

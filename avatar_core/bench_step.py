@@ -12,7 +12,9 @@ from avatar_core.vademecum import Provenance, Vademecum
 
 MODES = (11, 50, 200)
 # no tolerance to meet: all 200 modes are wanted
-RULE = BuildRule(tolerance=1e-9, max_modes=max(MODES), oversampling=1.0)
+RULE = BuildRule(
+    tolerance=1e-9, max_modes=max(MODES), oversampling=1.0, most_oversampling=1.0, near_growth=1.0
+)
 N_TOOLS = 3  # a sphere has one contact; three of them are at least three
 
 

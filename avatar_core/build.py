@@ -31,7 +31,8 @@ def _silent(stage: str, fraction: float) -> None:
 
 
 _BATCH = 40  # load positions solved at once
-_WORST_OVER_MEAN = 2.5  # the worst load may be this much worse than the mean asked for
+_WORST_OVER_MEAN = 8 / 3  # the worst load may be this much worse than the mean asked for
+_ENOUGH = 1.25  # the modes found must leave so much less than asked, as not all are kept
 
 
 @dataclass(frozen=True)
@@ -39,11 +40,13 @@ class BuildRule:
     """What the offline stage aims at.
 
     tolerance : mean relative L2 error over the build's own loads; the worst load may have
-        2.5 times it
+        8/3 times it
     max_modes : far-field modes at most
-    oversampling : PGD finds this many times ``max_modes``, of which the best are kept
+    oversampling : PGD finds this many times ``max_modes``, of which the best are kept; where
+        these leave too much, up to ``most_oversampling`` times
     near_inner, near_outer : the displacement near field is exact within, absent beyond, in
         patch radii
+    near_growth : both grow by this factor where ``max_modes`` do not meet the tolerance
     contact_support : reach of the contact near field, in patch radii
     max_sample_bytes : memory for the columns kept in full, all if they fit, to measure errors on
     """
@@ -51,10 +54,21 @@ class BuildRule:
     tolerance: float = 0.045
     max_modes: int = 100
     oversampling: float = 1.2
+    most_oversampling: float = 1.7
     near_inner: float = 1.8
     near_outer: float = 3.3
+    near_growth: float = 1.3
     contact_support: float = 4.0
     max_sample_bytes: int = 400_000_000
+
+    def with_wider_near_field(self) -> BuildRule:
+        """The rule with its near field grown, once."""
+        return replace(
+            self,
+            near_inner=self.near_growth * self.near_inner,
+            near_outer=self.near_growth * self.near_outer,
+            near_growth=1.0,
+        )
 
 
 def build_vademecum(
@@ -77,6 +91,10 @@ def build_vademecum(
     modes = _modes(elasticity, loads, response, missing, rule, progress)
     errors = _rank_errors(modes.field, missing, rule)
     rank, converged = _choose_rank(errors, rule)
+    if not converged and rule.near_growth > 1.0:
+        rule = rule.with_wider_near_field()
+        errors = _rank_errors(modes.field, _Missing(elasticity, surface, response, rule), rule)
+        rank, converged = _choose_rank(errors, rule)
     far = modes.field.truncate(rank)
     return Vademecum(
         name=name,
@@ -88,7 +106,7 @@ def build_vademecum(
         far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
         near=_displacement_near(far, response, surface, rule),
         contact_near=_contact_near(far, response, surface, rule),
-        tip_field=make_tip_field(elasticity.mesh, regions, 0.5 * surface.patch_radius),
+        tip_field=make_tip_field(elasticity.mesh, regions, surface.patch_radius),
         convergence=Convergence(converged, rule.tolerance, modes.solution.history, errors),
         provenance=provenance,
     )
@@ -160,7 +178,8 @@ def _exact_response(
     """Solve for every load position and keep what the vademecum needs."""
     radius, n = surface.patch_radius, surface.n_positions
     vertices = elasticity.mesh.vertices
-    vertex_pairs = near_pairs(surface.centers, vertices, rule.near_outer * radius)
+    widest = rule.near_growth * rule.near_outer * radius
+    vertex_pairs = near_pairs(surface.centers, vertices, widest)
     contact_pairs = near_pairs(surface.centers, surface.centers, rule.contact_support * radius)
     vertex = np.empty((len(vertex_pairs.target), 3, 3), np.float32)
     contact = np.empty((len(contact_pairs.target), 3, 3))
@@ -256,12 +275,19 @@ def _modes(
     base = 1.0 / response.norm**2
     weights = base.copy()
 
-    def follow_error(space: np.ndarray, load: np.ndarray) -> np.ndarray:
+    least = int(np.ceil(rule.oversampling * rule.max_modes))
+    limit = int(np.ceil(max(rule.oversampling, rule.most_oversampling) * rule.max_modes))
+    found = 0
+
+    def follow_error(space: np.ndarray, load: np.ndarray) -> np.ndarray | None:
+        nonlocal found
+        found += load.shape[1]
         error = missing.remove(elasticity.at_vertices(space), load)
+        if found >= least and _is_met(_ENOUGH * error.mean(), _ENOUGH * error.max(), rule):
+            return None
         weights[missing.loads] = base[missing.loads] * (error / error.mean()) ** 2
         return weights.copy()
 
-    limit = int(np.ceil(rule.oversampling * rule.max_modes))
     solution = solve_pgd(
         ParametricProblem(elasticity, loads.tocsr(), base, response.energy),
         PGDRule(limit, tolerance=1e-6),
@@ -290,9 +316,13 @@ def _rank_errors(
 
 def _choose_rank(errors: tuple[RankError, ...], rule: BuildRule) -> tuple[int, bool]:
     for error in errors:
-        if error.mean <= rule.tolerance and error.worst <= _WORST_OVER_MEAN * rule.tolerance:
+        if _is_met(error.mean, error.worst, rule):
             return error.rank, True
     return errors[-1].rank, False
+
+
+def _is_met(mean: float, worst: float, rule: BuildRule) -> bool:
+    return mean <= rule.tolerance and worst <= _WORST_OVER_MEAN * rule.tolerance
 
 
 def _displacement_near(
@@ -303,7 +333,8 @@ def _displacement_near(
     fade = plateau(
         response.vertex_pairs.distance, rule.near_inner * radius, rule.near_outer * radius
     )
-    return _remainder(response.vertex, far.space, far.load, fade)
+    blocks = _remainder(response.vertex, far.space, far.load, fade)
+    return blocks.kept(response.vertex_pairs.distance < rule.near_outer * radius)
 
 
 def _contact_near(

@@ -13,13 +13,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.loads import patch_loads
-from avatar_core.shepard import weights_at
+from avatar_core.tip_field import FAR, evaluate
+from avatar_core.tip_response import make_tip_response
 
 if TYPE_CHECKING:
     from avatar_core.elasticity import Elasticity
+    from avatar_core.loads import LoadSurface
     from avatar_core.vademecum import Vademecum
 
 _BATCH = 40  # load positions solved at once
+_TIP_RADIUS = 5e-3  # [m]
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,8 @@ class Certificate:
     l2 : |u - u_FE| / |u_FE| over all vertices, mass-weighted, each load and direction
     contact : |C - C_FE|_F / |C_FE|_F of the 3 x 3 compliance of the loaded patch
     force : |F / F_FE - 1| of the normal force for an imposed normal indentation
+    felt : the same as a 5 mm tip feels it at its first touch, through the compliance and normal
+        that the contact step smooths so that no edge of the mesh is felt
     vertex_contact_worst : contact error at load positions of the build, on fresh solves
     n_loads : unseen load positions; ``seed`` draws them
     build_cpu_seconds : user + system time of everything, meshing and this certificate included
@@ -41,6 +46,8 @@ class Certificate:
     contact_worst: float
     force_mean: float
     force_worst: float
+    felt_mean: float
+    felt_worst: float
     vertex_contact_worst: float
     n_loads: int
     seed: int
@@ -53,7 +60,7 @@ class Certificate:
     def unknown(cls) -> Certificate:
         """A certificate that promises nothing."""
         nan = float("nan")
-        return cls(nan, nan, nan, nan, nan, nan, nan, 0, 0, 0)
+        return cls(nan, nan, nan, nan, nan, nan, nan, nan, nan, 0, 0, 0)
 
 
 def certify(
@@ -76,18 +83,21 @@ def certify(
     surface = vademecum.surface
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(len(surface.corners))[:n_loads]
-    l2, contact, force = [], [], []
+    felt_compliance = _FeltCompliance(vademecum)
+    l2, contact, force, felt = [], [], [], []
     for batch in np.array_split(chosen, max(1, len(chosen) // _BATCH)):
         truth, compliance = _reference(
             elasticity, surface.centroids[batch], surface.centroid_normals[batch], vademecum
         )
         for k, triangle in enumerate(batch):
-            normal = surface.centroid_normals[triangle]
-            here = weights_at(surface.interpolation, surface.centroids[triangle], normal)
+            point, normal = surface.centroids[triangle], surface.centroid_normals[triangle]
+            here = _at_centroid(surface, triangle)
             l2.append(_l2(vademecum, vademecum.displacement(*here), truth[k]))
             estimate = vademecum.compliance(*here)
             contact.append(_frobenius(estimate, compliance[k]))
             force.append(abs(normal @ compliance[k] @ normal / (normal @ estimate @ normal) - 1))
+            value, n = felt_compliance(point, normal)
+            felt.append(abs(n @ compliance[k] @ n / value - 1))
         if progress is not None:
             progress(len(contact))
     return Certificate(
@@ -97,11 +107,38 @@ def certify(
         contact_worst=float(np.max(contact)),
         force_mean=float(np.mean(force)),
         force_worst=float(np.max(force)),
+        felt_mean=float(np.mean(felt)),
+        felt_worst=float(np.max(felt)),
         vertex_contact_worst=_vertex_contact(vademecum, elasticity, rng),
         n_loads=len(chosen),
         seed=seed,
         modes=vademecum.far.rank,
     )
+
+
+def _at_centroid(surface: LoadSurface, triangle: int) -> tuple[np.ndarray, np.ndarray]:
+    """Load positions and weights at the centroid of an accessible face."""
+    positions, weights = surface.weights(np.array([triangle]), np.full((1, 3), 1.0 / 3.0))
+    return positions[0], weights[0]
+
+
+class _FeltCompliance:
+    """The normal compliance and the normal that a tip feels as it touches."""
+
+    def __init__(self, vademecum: Vademecum) -> None:
+        self._field = vademecum.tip_field
+        surface = vademecum.surface
+        load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
+        self._response = make_tip_response(
+            surface, self._field, load, vademecum.contact_near, _TIP_RADIUS, _TIP_RADIUS
+        )
+
+    def __call__(self, point: np.ndarray, normal: np.ndarray) -> tuple[float, np.ndarray]:
+        grid = self._field.origin, self._field.spacing[0], point + _TIP_RADIUS * normal
+        slope = np.zeros(3)
+        value = evaluate(self._response.self_compliance, *grid, slope, 1.0)
+        evaluate(self._field.distance, *grid, slope, FAR)
+        return value, slope / np.linalg.norm(slope)
 
 
 def _reference(
@@ -133,12 +170,7 @@ def _vertex_contact(
     some = rng.permutation(len(surface.vertices))[:_BATCH]
     _, compliance = _reference(elasticity, surface.centers[some], surface.normals[some], vademecum)
     return max(
-        _frobenius(
-            vademecum.compliance(
-                *weights_at(surface.interpolation, surface.centers[i], surface.normals[i])
-            ),
-            compliance[k],
-        )
+        _frobenius(vademecum.compliance(np.array([i]), np.ones(1)), compliance[k])
         for k, i in enumerate(some)
     )
 

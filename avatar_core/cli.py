@@ -319,6 +319,7 @@ def _show_text(v: Vademecum) -> None:
         ("displacement, L2", c.l2_mean, c.l2_worst),
         ("contact compliance", c.contact_mean, c.contact_worst),
         ("force of an indentation", c.force_mean, c.force_worst),
+        ("the same, felt by a sliding tip", c.felt_mean, c.felt_worst),
     ):
         print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
     print(f"  built in {c.build_cpu_seconds:.0f} s of CPU time", end="")

@@ -6,7 +6,7 @@ The compiled code is in :mod:`avatar_core.contact_kernels`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,8 +15,8 @@ import numpy as np
 from avatar_core import contact_kernels as kernels
 from avatar_core.contact_kernels import ModelArrays, Out, State
 from avatar_core.errors import ContactError
-from avatar_core.near_field import LocalBlocks
-from avatar_core.shepard import MAX_STENCIL, N_FIT
+from avatar_core.near_field import LocalBlocks, hash_rows
+from avatar_core.tip_response import MAX_STENCIL, make_tip_response
 
 if TYPE_CHECKING:
     from avatar_core.vademecum import Vademecum
@@ -45,12 +45,13 @@ class ContactModel:
     """Everything a step reads and writes.
 
     arrays : ModelArrays, constant
-        distance, access, origin, spacing: the tip field; position, normal, tangent, reach,
-        neighbor, fit: interpolation over the load positions; load (n_positions, 3, rank) and
-        the contact_* blocks, nearest first: compliance [m/N]; softness (1,), added where access
-        fades [m/N];
-        space (n_points, 3, rank) and the near_* blocks: displacement of the cloud [m/N];
-        rest (n_points, 3) [m]; tip_radius (n_tools,) [m]
+        distance, access, origin, spacing: the tip field; row, carrier, share,
+        self_compliance: the tip response on its grid; position (n_positions, 3) [m];
+        load (n_positions, 3, rank) and the contact_* blocks, found by their hash tables:
+        compliance [m/N]; softness (1,), added where access fades [m/N];
+        space (n_blocks, rank, BLOCK) int16, modes of the displacement of the cloud, in parts of
+        space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 3) [m];
+        tip_radius (n_tools,) [m]
     state : State, forces kept for the next period, and scratch
     out : Out
         force, torque (n_tools, 3) [N, N m], of the organ on each tool about its tip (a
@@ -121,19 +122,25 @@ def model_arrays(
     rank = vademecum.far.rank if modes is None else modes
     near = _near_at(vademecum.near, points, len(mesh.vertices))
     space = vademecum.far.space.reshape(len(mesh.vertices), 3, -1)[points, :, :rank]
-    contact, distance = _by_distance(vademecum.contact_near, surface.centers)
+    contact = vademecum.contact_near
+    contact_start, contact_slot = hash_rows(contact)
     load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
+    response = make_tip_response(
+        surface, vademecum.tip_field, load, contact, kernels.MAX_DEPTH, max(tip_radii)
+    )
+    modes_in_blocks, scale = _in_blocks(space)
     return ModelArrays(
         *vademecum.tip_field,
-        *surface.interpolation,
+        *response,
+        position=np.ascontiguousarray(surface.centers),
         load=np.ascontiguousarray(load),
-        contact_start=contact.start,
-        contact_target=contact.target,
+        contact_start=contact_start,
+        contact_slot=contact_slot,
         contact_block=contact.block,
-        contact_distance=distance,
-        contact_reach=np.array([float(distance.max(initial=0.0))]),
+        contact_reach=np.array([_reach(contact, surface.centers)]),
         softness=np.array([float((load**2).sum(axis=(1, 2)).mean() / 3.0)]),
-        space=np.ascontiguousarray(space),
+        space=modes_in_blocks,
+        space_scale=scale,
         near_start=near.start,
         near_target=near.target,
         near_block=near.block,
@@ -146,27 +153,37 @@ def make_model(arrays: ModelArrays) -> ContactModel:
     """Allocate state and outputs around the constant arrays, and run the step once."""
     n_tools, n_modes = len(arrays.tip_radius), arrays.load.shape[2]
     n_stencil = MAX_STENCIL * n_tools
+    single = np.float32
     state = State(
         engaged=np.zeros(n_tools, np.bool_),
         force=np.zeros(n_tools),
+        active=np.zeros(n_tools, np.bool_),
         gap=np.zeros(n_tools),
+        slope=np.zeros((n_tools, 3)),
+        normal=np.zeros((n_tools, 3)),
+        turning=np.zeros((n_tools, 3, 3)),
+        hessian=np.zeros((3, 3)),
         access=np.zeros(n_tools),
-        access_gradient=np.zeros((n_tools, 3)),
-        direction=np.zeros((n_tools, 3)),
+        access_slope=np.zeros((n_tools, 3)),
         point=np.zeros((n_tools, 3)),
-        candidates=np.zeros((n_tools, MAX_STENCIL), np.int64),
-        n_candidates=np.zeros(n_tools, np.int64),
         local=np.full(len(arrays.position), -1, np.int64),
         nodes=np.zeros(n_stencil, np.int64),
+        mark=np.full(n_stencil, -1, np.int64),
         n_local=np.zeros(1, np.int64),
-        weight=np.zeros((n_tools, n_stencil)),
-        mode=np.zeros((n_tools, n_modes), np.float32),
+        own=np.zeros((n_tools, MAX_STENCIL), np.int64),
+        n_own=np.zeros(n_tools, np.int64),
+        weight=np.zeros((n_tools, n_stencil, 4)),
+        mode=np.zeros((n_tools, n_modes), single),
+        mode_slope=np.zeros((n_tools, 3, n_modes), single),
         column=np.zeros((n_tools, n_stencil, 3)),
-        displacement=np.zeros((n_stencil, 3)),
+        self_compliance=np.ones(n_tools),
+        self_slope=np.zeros((n_tools, 3)),
+        gram=np.ones((n_tools, n_tools)),
+        scale=np.ones(n_tools),
         compliance=np.zeros((n_tools, n_tools)),
-        trial=np.zeros(n_stencil),
-        shifted=np.zeros((3, 3)),
-        amplitude=np.zeros(n_modes, np.float32),
+        gram_slope=np.zeros(3),
+        amplitude=np.zeros(n_modes, single),
+        field=np.zeros(arrays.space.shape[0] * kernels.BLOCK, single),
     )
     out = Out(
         force=np.zeros((n_tools, 3)),
@@ -228,18 +245,19 @@ def warm_up(n_tools: int = 1) -> None:
             np.zeros((8, 8, 8), single),
             np.zeros(3, double),
             np.ones(1, double),
+            np.full((8, 8, 8), -1, np.int32),
+            np.zeros((0, 6), np.int32),
+            np.zeros((0, 6), single),
+            np.full((8, 8, 8), 1.0, single),
             np.zeros((n, 3), double),
-            np.zeros((n, 3), double),
-            np.zeros((n, 2, 3), double),
-            np.zeros(n, double),
-            np.zeros((n, N_FIT), np.int64),
-            np.zeros((n, 5, N_FIT), double),
             np.zeros((n, 3, rank), single),
-            *blocks,
-            np.zeros(0, single),
+            np.array([0, 2], np.int64),
+            np.full((2, 2), -1, np.int32),
+            np.zeros((0, 3, 3), single),
             np.ones(1, double),
             np.ones(1, double),
-            np.zeros((points, 3, rank), single),
+            np.zeros((1, rank, kernels.BLOCK), np.int16),
+            np.zeros(rank, single),
             *blocks,
             np.zeros((points, 3), single),
             np.full(n_tools, 5e-3, double),
@@ -253,25 +271,33 @@ def stored_energy(model: ContactModel) -> float:
     return float(0.5 * force @ model.state.compliance @ force)
 
 
-def _by_distance(near: LocalBlocks, centers: np.ndarray) -> tuple[LocalBlocks, np.ndarray]:
-    """The blocks of each position sorted by distance, and those distances (float32) [m]."""
+def _reach(near: LocalBlocks, centers: np.ndarray) -> float:
+    """Longest distance between the two positions of a block [m]."""
     distance = np.linalg.norm(centers[near.position] - centers[near.target], axis=1)
-    order = np.lexsort((distance, near.position))
-    blocks = LocalBlocks(near.start, near.target[order], near.block[order])
-    return blocks, distance[order].astype(np.float32)
+    return float(distance.max(initial=0.0)) * (1.0 + 1e-9)
+
+
+def _in_blocks(space: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Modes (n_points, 3, rank) as int16 (n_blocks, rank, BLOCK), and what one step is worth.
+
+    Half the memory of single precision, which is what the cloud waits for; rounding costs
+    1 / 65536 of each mode's peak.
+    """
+    flat = space.reshape(-1, space.shape[2])
+    scale = (np.abs(flat).max(axis=0, initial=1e-30) / 32767.0).astype(np.float32)
+    n_blocks = -(-len(flat) // kernels.BLOCK)
+    padded = np.zeros((n_blocks * kernels.BLOCK, len(scale)), np.int16)
+    padded[: len(flat)] = np.rint(flat / scale)
+    blocks = padded.reshape(n_blocks, kernels.BLOCK, len(scale)).transpose(0, 2, 1)
+    return np.ascontiguousarray(blocks), scale
 
 
 def _near_at(near: LocalBlocks, points: np.ndarray, n_vertices: int) -> LocalBlocks:
     """The near field at some vertices, renumbered to their order."""
     number = np.full(n_vertices, -1, np.int32)
     number[points] = np.arange(len(points), dtype=np.int32)
-    target = number[near.target]
-    kept = target >= 0
-    count = np.bincount(near.position[kept], minlength=len(near.start) - 1)
-    start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-    return LocalBlocks(
-        start, np.ascontiguousarray(target[kept]), np.ascontiguousarray(near.block[kept])
-    )
+    kept = near.kept(number[near.target] >= 0)
+    return replace(kept, target=number[kept.target])
 
 
 def _check(

@@ -3,13 +3,14 @@
 Each tool tip (sphere, centre p, radius r) presses through one patch, at the surface point below
 it, along the normal n = grad phi / |grad phi|. Forces lambda solve the Signorini conditions
 
-    gap = phi(p) - r + sum_t' C_tt' lambda_t' >= 0,   lambda >= 0,   lambda gap = 0,
-    C_tt' = n_t . C(s_t, s_t') n_t'                              (projected Gauss-Seidel)
+    gap_t = phi(p_t) - r_t,   gap_t + sum_t' C_tt' lambda_t' >= 0,   lambda >= 0,  complementary,
 
-The stored energy W(p) = lambda . C lambda / 2 is a function of the tip positions alone, and the
-force on a tip is its exact derivative,
+by projected Gauss-Seidel, C as in :mod:`avatar_core.tip_response`. The stored energy
+W(p) = lambda . C lambda / 2 is a function of the tip positions alone, and the force on a tip is
+its exact derivative,
 
-    F_t = - dW/dp_t = lambda_t d/dp_t [ phi(p_t) - n(p_t) . u_bar(s(p_t)) ]    (u_bar held fixed):
+    F_t = - dW/dp_t
+        = lambda_t [ grad phi + lambda_t grad gamma / 2 + sum_t'!=t lambda_t' dC_tt'/dp_t ]:
 
 the normal force, and the small tangential one by which a frictionless tip slides towards softer
 tissue. Without it a closed path would gain or lose energy.
@@ -22,11 +23,13 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
-from avatar_core.shepard import add_weights, find_candidates, number_stencil
-from avatar_core.tip_field import FAR, evaluate
+from avatar_core.near_field import find_block
+from avatar_core.tip_field import FAR, evaluate, second_derivatives
+from avatar_core.tip_response import gather
 
 MAX_TOOLS = 8
 MAX_SWEEPS = 1000
+BLOCK = 256  # displacements that are summed together while they lie in the fastest cache
 
 OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
 UNKNOWN_FRAME = 8
@@ -36,8 +39,7 @@ ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not come in through the 
 MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
 MIN_ACCESS = 1e-2  # below, the tip is off the accessible surface
 FULL_ACCESS = 0.99  # below, the force fades
-_EPSILON = 2e-6  # [m] of the central difference of the frozen gap
-_MARGIN = 1e-4  # [m] by which stencils are searched wider
+LEAST_WEIGHT = 5e-3  # load positions that carry less move no near field in the cloud
 
 # What the step reads; `prepare` fills it once. Shapes in avatar_core.contact.ContactModel.
 ModelArrays = namedtuple(
@@ -47,20 +49,19 @@ ModelArrays = namedtuple(
         "access",
         "origin",
         "spacing",
+        "row",
+        "carrier",
+        "share",
+        "self_compliance",
         "position",
-        "normal",
-        "tangent",
-        "reach",
-        "neighbor",
-        "fit",
         "load",
         "contact_start",
-        "contact_target",
+        "contact_slot",
         "contact_block",
-        "contact_distance",
         "contact_reach",
         "softness",
         "space",
+        "space_scale",
         "near_start",
         "near_target",
         "near_block",
@@ -75,24 +76,33 @@ State = namedtuple(
     [
         "engaged",  # (T,) the tip came in through the surface
         "force",  # (T,) lambda
+        "active",  # (T,) the tip is closer than its radius, where it may touch
         "gap",  # (T,) phi - r
+        "slope",  # (T, 3) grad phi
+        "normal",  # (T, 3) n
+        "turning",  # (T, 3, 3) dn_i / dp_d
+        "hessian",  # (3, 3) of phi
         "access",  # (T,) chi
-        "access_gradient",  # (T, 3)
-        "direction",  # (T, 3) n
+        "access_slope",  # (T, 3)
         "point",  # (T, 3) s
-        "candidates",  # (T, S)
-        "n_candidates",  # (T,)
         "local",  # (n_positions,) number in the joint stencil, or -1
-        "nodes",  # (T S,) joint stencil
+        "nodes",  # (S,) joint stencil
+        "mark",  # (S,) last tip that uses it
         "n_local",  # (1,)
-        "weight",  # (T, T S)
-        "mode",  # (T, k) Y^T w n
-        "column",  # (T, T S, 3) displacement of the stencil per unit lambda
-        "displacement",  # (T S, 3) of the stencil
+        "own",  # (T, MAX_STENCIL) the part of each tip
+        "n_own",  # (T,)
+        "weight",  # (T, S, 4) w and its gradient
+        "mode",  # (T, k) Y^T f
+        "mode_slope",  # (T, 3, k) its gradient
+        "column",  # (T, S, 3) near displacement of the stencil per unit lambda
+        "self_compliance",  # (T,) gamma
+        "self_slope",  # (T, 3) grad gamma
+        "gram",  # (T, T) f_t . C f_t'
+        "scale",  # (T,) a_t
         "compliance",  # (T, T)
-        "trial",  # (T S,) weights at a shifted tip
-        "shifted",  # (3, 3) that tip, its direction and surface point
-        "amplitude",  # (k,)
+        "gram_slope",  # (3,) d(f_t . C f_t')/dp_t
+        "amplitude",  # (k,) of the far field
+        "field",  # (n_blocks BLOCK,) displacement of the cloud, component after component
     ],
 )
 
@@ -115,19 +125,28 @@ Out = namedtuple(
 
 @njit(cache=True)
 def contact_solve(model, state, out, tips):  # type: ignore[no-untyped-def]
-    """First half of a period: locate, assemble, solve, differentiate. Returns the worst status."""
-    status = _locate(model, state, out, tips)
-    _number(model, state)
-    for t in range(tips.shape[0]):
-        _column(model, state, t)
+    """First half of a period: locate, gather, assemble, solve, differentiate."""
+    n_tools = tips.shape[0]
+    _forget_stencil(state)
+    status = OK
+    n_active = 0
+    for t in range(n_tools):
+        out.status[t] = _locate(model, state, t, tips[t])
+        status = max(status, out.status[t])
+        if state.active[t]:
+            n_active += 1
+            gather(model, state, t, tips[t])
+            _mode(model, state, t)
+    for t in range(n_tools):
+        if state.active[t]:
+            _near_column(model, state, t)
     _assemble(model, state)
     if not _solve(state):
-        for t in range(tips.shape[0]):
-            if state.n_candidates[t] > 0:
+        for t in range(n_tools):
+            if state.active[t]:
                 out.status[t] = NOT_CONVERGED
         status = max(status, NOT_CONVERGED)
-    _displace_stencil(state)
-    _write_forces(model, state, out, tips)
+    _write_forces(model, state, out, tips, n_active > 1)
     return status
 
 
@@ -140,174 +159,142 @@ def contact_step(model, state, out, tips):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _locate(model, state, out, tips):  # type: ignore[no-untyped-def]
-    """Gap, direction and surface point of every tip; which tips may touch."""
-    worst = OK
-    for t in range(tips.shape[0]):
-        out.status[t] = _locate_one(model, state, t, tips[t])
-        worst = max(worst, out.status[t])
-    return worst
+def _forget_stencil(state):  # type: ignore[no-untyped-def]
+    n = state.n_local[0]
+    for q in range(n):
+        state.local[state.nodes[q]] = -1
+        state.mark[q] = -1
+    for t in range(state.engaged.shape[0]):
+        state.weight[t, :n] = 0.0
+        state.column[t, :n] = 0.0
+        state.n_own[t] = 0
+    state.n_local[0] = 0
 
 
 @njit(cache=True)
-def _locate_one(model, state, t, tip):  # type: ignore[no-untyped-def]
-    state.n_candidates[t] = 0
+def _locate(model, state, t, tip):  # type: ignore[no-untyped-def]
+    """Gap, normal, access, compliance and surface point of a tip; whether it may touch."""
+    state.active[t] = False
     state.access[t] = 1.0
     engaged = state.engaged[t]
     state.engaged[t] = False
     if not np.isfinite(tip[0] + tip[1] + tip[2]):
         return INVALID_POSE
-    phi = _below(model, tip, state.direction[t], state.point[t])
+    grid, h = model.origin, model.spacing[0]
+    phi = evaluate(model.distance, grid, h, tip, state.slope[t], FAR)
     state.gap[t] = phi - model.tip_radius[t]
     if state.gap[t] >= 0.0:
         return OK
-    state.access[t] = evaluate(
-        model.access, model.origin, model.spacing[0], tip, state.access_gradient[t], 0.0
-    )
+    access = evaluate(model.access, grid, h, tip, state.access_slope[t], 0.0)
+    state.access[t] = min(access, 1.0)
     entered = engaged or phi > -ENTRY_DEPTH
-    if not entered or phi < -MAX_DEPTH or state.access[t] < MIN_ACCESS:
+    if not entered or phi < -MAX_DEPTH or access < MIN_ACCESS:
         return OUT_OF_RANGE
     state.engaged[t] = True
-    state.n_candidates[t] = find_candidates(model, state.point[t], _MARGIN, state.candidates[t])
-    return OK if state.access[t] >= FULL_ACCESS else OUT_OF_RANGE
+    state.active[t] = True
+    _direct(model, state, t, tip, phi)
+    state.self_compliance[t] = evaluate(
+        model.self_compliance, grid, h, tip, state.self_slope[t], 1.0
+    )
+    return OK if access >= FULL_ACCESS else OUT_OF_RANGE
 
 
 @njit(cache=True)
-def _below(model, p, direction, point):  # type: ignore[no-untyped-def]
-    """phi(p), the unit normal there, and the surface point p - phi n."""
-    phi = evaluate(model.distance, model.origin, model.spacing[0], p, direction, FAR)
-    length = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
-    scale = 1.0 / length if length > 1e-6 else 0.0
+def _direct(model, state, t, p, phi):  # type: ignore[no-untyped-def]
+    """n = g / |g| with g = grad phi, dn/dp = (I - n n^T) grad g / |g|, and s = p - phi n."""
+    n, hessian = state.normal[t], state.hessian
+    g = state.slope[t]
+    scale = 1.0 / max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
     for d in range(3):
-        direction[d] *= scale
-        point[d] = p[d] - phi * direction[d]
-    return phi
-
-
-@njit(cache=True)
-def _number(model, state):  # type: ignore[no-untyped-def]
-    """Number the joint stencil of all tips, and weigh it for each."""
-    for q in range(state.n_local[0]):
-        state.local[state.nodes[q]] = -1
-    n = 0
-    for t in range(state.engaged.shape[0]):
-        n = number_stencil(
-            model, state.candidates[t], state.n_candidates[t], state.local, state.nodes, n
-        )
-    state.n_local[0] = n
-    for t in range(state.engaged.shape[0]):
-        if state.n_candidates[t] > 0:
-            reached = add_weights(
-                model,
-                state.candidates[t],
-                state.n_candidates[t],
-                state.point[t],
-                state.direction[t],
-                state.local,
-                state.weight[t, :n],
-            )
-            if not reached:
-                state.n_candidates[t] = 0
+        n[d] = g[d] * scale
+        state.point[t, d] = p[d] - phi * n[d]
+    second_derivatives(model.distance, model.origin, model.spacing[0], p, hessian)
+    for d in range(3):
+        along = n[0] * hessian[0, d] + n[1] * hessian[1, d] + n[2] * hessian[2, d]
+        for i in range(3):
+            state.turning[t, i, d] = (hessian[i, d] - n[i] * along) * scale
 
 
 @njit(cache=True, fastmath=True)
-def _column(model, state, t):  # type: ignore[no-untyped-def]
-    """Displacement of the joint stencil under a unit normal force of tip t: C w n."""
-    if state.n_candidates[t] == 0:
-        return
-    n_modes = model.load.shape[2]
-    n = state.direction[t]
-    mode = state.mode[t]
-    for k in range(n_modes):
-        mode[k] = 0.0
-    for q in range(state.n_local[0]):
-        w = state.weight[t, q]
-        if w != 0.0:
-            j = state.nodes[q]
-            w0, w1, w2 = np.float32(w * n[0]), np.float32(w * n[1]), np.float32(w * n[2])
-            for k in range(n_modes):
-                mode[k] += (
-                    model.load[j, 0, k] * w0 + model.load[j, 1, k] * w1 + model.load[j, 2, k] * w2
-                )
-    for q in range(state.n_local[0]):
-        j = state.nodes[q]
-        u0 = u1 = u2 = np.float32(0.0)
-        for k in range(n_modes):
-            u0 += model.load[j, 0, k] * mode[k]
-            u1 += model.load[j, 1, k] * mode[k]
-            u2 += model.load[j, 2, k] * mode[k]
-        column = state.column[t, q]
-        column[0], column[1], column[2] = u0, u1, u2
-    radius, together = _stencil_extent(model, state, t)
-    for p in range(state.n_local[0]):
-        w = state.weight[t, p]
-        if w == 0.0:
-            continue
-        j = state.nodes[p]
+def _mode(model, state, t):  # type: ignore[no-untyped-def]
+    """Y^T f: how a unit normal force of tip t drives the modes."""
+    mode, n = state.mode[t], state.normal[t]
+    mode[:] = np.float32(0.0)
+    for i in range(state.n_own[t]):
+        q = state.own[t, i]
+        w, load = state.weight[t, q, 0], model.load[state.nodes[q]]
         w0, w1, w2 = np.float32(w * n[0]), np.float32(w * n[1]), np.float32(w * n[2])
-        limit = np.float32(np.inf if together else radius + _from_point(model, state, t, j))
-        for e in range(model.contact_start[j], model.contact_start[j + 1]):
-            if model.contact_distance[e] > limit:
-                break
-            q = state.local[model.contact_target[e]]
-            if q >= 0:
+        for k in range(mode.shape[0]):
+            mode[k] += w0 * load[0, k] + w1 * load[1, k] + w2 * load[2, k]
+
+
+@njit(cache=True, fastmath=True)
+def _mode_slope(model, state, t):  # type: ignore[no-untyped-def]
+    """d(Y^T f)/dp with df/dp_d = dw/dp_d n + w dn/dp_d."""
+    slope, n, turning = state.mode_slope[t], state.normal[t], state.turning[t]
+    slope[:] = np.float32(0.0)
+    for i in range(state.n_own[t]):
+        q = state.own[t, i]
+        weight, load = state.weight[t, q], model.load[state.nodes[q]]
+        for d in range(3):
+            f0 = np.float32(weight[1 + d] * n[0] + weight[0] * turning[0, d])
+            f1 = np.float32(weight[1 + d] * n[1] + weight[0] * turning[1, d])
+            f2 = np.float32(weight[1 + d] * n[2] + weight[0] * turning[2, d])
+            for k in range(slope.shape[1]):
+                slope[d, k] += f0 * load[0, k] + f1 * load[1, k] + f2 * load[2, k]
+
+
+@njit(cache=True, fastmath=True)
+def _near_column(model, state, t):  # type: ignore[no-untyped-def]
+    """Near displacement of the joint stencil under a unit normal force of tip t."""
+    n, column, position = state.normal[t], state.column[t], model.position
+    reach = model.contact_reach[0] ** 2
+    for i in range(state.n_own[t]):
+        p = state.own[t, i]
+        w, j = state.weight[t, p, 0], state.nodes[p]
+        w0, w1, w2 = np.float32(w * n[0]), np.float32(w * n[1]), np.float32(w * n[2])
+        for q in range(state.n_local[0]):
+            m = state.nodes[q]
+            distance = (position[j, 0] - position[m, 0]) ** 2
+            distance += (position[j, 1] - position[m, 1]) ** 2
+            distance += (position[j, 2] - position[m, 2]) ** 2
+            if distance > reach:
+                continue
+            e = find_block(model.contact_start, model.contact_slot, j, m)
+            if e >= 0:
+                block = model.contact_block[e]
                 for d in range(3):
-                    state.column[t, q, d] += (
-                        model.contact_block[e, d, 0] * w0
-                        + model.contact_block[e, d, 1] * w1
-                        + model.contact_block[e, d, 2] * w2
-                    )
+                    column[q, d] += block[d, 0] * w0 + block[d, 1] * w1 + block[d, 2] * w2
 
 
 @njit(cache=True, fastmath=True)
-def _from_point(model, state, t, j):  # type: ignore[no-untyped-def]
-    """Distance of load position j from the surface point under tip t [m]."""
-    squared = 0.0
-    for d in range(3):
-        squared += (model.position[j, d] - state.point[t, d]) ** 2
-    return np.sqrt(squared)
-
-
-@njit(cache=True, fastmath=True)
-def _stencil_extent(model, state, t):  # type: ignore[no-untyped-def]
-    """Radius of the stencil of tip t [m], and whether another tip may share its near field.
-
-    Blocks are sorted by distance, so that the search for a lone stencil can stop early.
-    """
-    radius = 0.0
-    for q in range(state.n_local[0]):
-        if state.weight[t, q] != 0.0:
-            radius = max(radius, _from_point(model, state, t, state.nodes[q]))
-    together = False
-    for s in range(state.engaged.shape[0]):
-        if s != t and state.n_candidates[s] > 0:
-            squared = 0.0
-            for d in range(3):
-                squared += (state.point[s, d] - state.point[t, d]) ** 2
-            if np.sqrt(squared) < model.contact_reach[0] + 2.0 * radius:
-                together = True
-    return radius + 1e-6, together
-
-
-@njit(cache=True)
 def _assemble(model, state):  # type: ignore[no-untyped-def]
     """Compliance between the tips; softer where access fades."""
     n_tools = state.engaged.shape[0]
     for t in range(n_tools):
-        for s in range(n_tools):
-            value = 0.0
-            if state.n_candidates[t] > 0 and state.n_candidates[s] > 0:
-                for q in range(state.n_local[0]):
-                    w = state.weight[t, q]
-                    if w != 0.0:
-                        for d in range(3):
-                            value += w * state.direction[t, d] * state.column[s, q, d]
-            state.compliance[t, s] = value
-        if state.n_candidates[t] > 0:
-            chi = min(state.access[t], 1.0)
-            state.compliance[t, t] += model.softness[0] * (1.0 / chi - 1.0)
-        else:
+        if not state.active[t]:
             state.force[t] = 0.0
+            continue
+        n = state.normal[t]
+        for s in range(n_tools):
+            if not state.active[s]:
+                continue
+            far = np.float32(0.0)
+            for k in range(state.mode.shape[1]):
+                far += state.mode[t, k] * state.mode[s, k]
+            near = 0.0
+            for i in range(state.n_own[t]):
+                q = state.own[t, i]
+                u = state.column[s, q]
+                near += state.weight[t, q, 0] * (n[0] * u[0] + n[1] * u[1] + n[2] * u[2])
+            state.gram[t, s] = far + near
+        state.scale[t] = np.sqrt(state.self_compliance[t] / state.gram[t, t])
+    for t in range(n_tools):
+        for s in range(n_tools):
+            if state.active[t] and state.active[s]:
+                state.compliance[t, s] = state.scale[t] * state.scale[s] * state.gram[t, s]
+        if state.active[t]:
+            state.compliance[t, t] += model.softness[0] * (1.0 / state.access[t] - 1.0)
 
 
 @njit(cache=True)
@@ -317,11 +304,12 @@ def _solve(state):  # type: ignore[no-untyped-def]
     for _ in range(MAX_SWEEPS):
         worst = 0.0
         for t in range(n_tools):
-            if state.n_candidates[t] == 0:
+            if not state.active[t]:
                 continue
             gap = state.gap[t]
             for s in range(n_tools):
-                gap += state.compliance[t, s] * state.force[s]
+                if state.active[s]:
+                    gap += state.compliance[t, s] * state.force[s]
             new = max(0.0, state.force[t] - gap / state.compliance[t, t])
             worst = max(worst, abs(new - state.force[t]) * state.compliance[t, t])
             state.force[t] = new
@@ -330,118 +318,142 @@ def _solve(state):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True)
-def _displace_stencil(state):  # type: ignore[no-untyped-def]
-    for q in range(state.n_local[0]):
-        for d in range(3):
-            state.displacement[q, d] = 0.0
-    for t in range(state.engaged.shape[0]):
-        if state.force[t] > 0.0:
-            for q in range(state.n_local[0]):
-                for d in range(3):
-                    state.displacement[q, d] -= state.force[t] * state.column[t, q, d]
-
-
-@njit(cache=True)
-def _frozen_gap(model, state, t, p, direction, point):  # type: ignore[no-untyped-def]
-    """phi(p) - n(p) . u_bar(s(p)) with the displacement of the stencil held fixed."""
-    phi = _below(model, p, direction, point)
-    n = state.n_local[0]
-    trial = state.trial[:n]
-    add_weights(
-        model, state.candidates[t], state.n_candidates[t], point, direction, state.local, trial
-    )
-    gap = phi
-    for q in range(n):
-        w = trial[q]
-        if w != 0.0:
-            for d in range(3):
-                gap -= w * direction[d] * state.displacement[q, d]
-    return gap
-
-
-@njit(cache=True)
-def _write_forces(model, state, out, tips):  # type: ignore[no-untyped-def]
+@njit(cache=True, fastmath=True)
+def _write_forces(model, state, out, tips, several):  # type: ignore[no-untyped-def]
     """Forces on the tools and the contacts that make them."""
-    p, direction, point = state.shifted[0], state.shifted[1], state.shifted[2]
     n = 0
-    for t in range(tips.shape[0]):
-        for d in range(3):
-            out.force[t, d] = out.torque[t, d] = 0.0
-        force = state.force[t]
+    for t in range(state.engaged.shape[0]):
+        out.force[t] = 0.0
+        out.torque[t] = 0.0
+        force, chi = state.force[t], state.access[t]
         if force <= 0.0:
             continue
-        chi = min(state.access[t], 1.0)
-        gap = state.gap[t] - model.softness[0] * (1.0 / chi - 1.0) * force
-        for s in range(tips.shape[0]):
-            gap += state.compliance[t, s] * state.force[s]
-        out.contact_penetration[n] = max(0.0, -gap)
-        out.contact_tool[n] = t
-        fade = 0.5 * force * force * model.softness[0] / (chi * chi) if chi < 1.0 else 0.0
         for d in range(3):
-            p[0], p[1], p[2] = tips[t, 0], tips[t, 1], tips[t, 2]
-            p[d] += _EPSILON
-            up = _frozen_gap(model, state, t, p, direction, point)
-            p[d] -= 2.0 * _EPSILON
-            down = _frozen_gap(model, state, t, p, direction, point)
-            slope = (up - down) / (2.0 * _EPSILON)
-            out.force[t, d] = force * slope - fade * state.access_gradient[t, d]
+            out.force[t, d] = force * (state.slope[t, d] + 0.5 * force * state.self_slope[t, d])
+            if chi < 1.0:
+                fading = -model.softness[0] / (chi * chi) * state.access_slope[t, d]
+                out.force[t, d] += 0.5 * force * force * fading
+        if several:
+            _add_coupling(model, state, out, t)
+        gap = state.gap[t] - model.softness[0] * (1.0 / chi - 1.0) * force
+        for s in range(state.engaged.shape[0]):
+            if state.active[s]:
+                gap += state.compliance[t, s] * state.force[s]
+        out.contact_tool[n] = t
+        out.contact_penetration[n] = max(0.0, -gap)
+        for d in range(3):
             out.contact_force[n, d] = out.force[t, d]
-            out.contact_normal[n, d] = state.direction[t, d]
-            moved = state.point[t, d]
-            for q in range(state.n_local[0]):
-                moved += state.weight[t, q] * state.displacement[q, d]
-            out.contact_position[n, d] = moved
+            out.contact_normal[n, d] = state.normal[t, d]
+            out.contact_position[n, d] = tips[t, d] - model.tip_radius[t] * state.normal[t, d]
         n += 1
     out.n_contacts[0] = n
 
 
 @njit(cache=True, fastmath=True)
+def _add_coupling(model, state, out, t):  # type: ignore[no-untyped-def]
+    """lambda_t sum_t' lambda_t' dC_tt'/dp_t, with C_tt' = a_t a_t' f_t . C f_t'."""
+    _mode_slope(model, state, t)
+    slope, force = state.gram_slope, state.force[t]
+    _gram_slope(state, t, t)
+    change0 = 0.5 * state.self_slope[t, 0] / state.self_compliance[t] - slope[0] / state.gram[t, t]
+    change1 = 0.5 * state.self_slope[t, 1] / state.self_compliance[t] - slope[1] / state.gram[t, t]
+    change2 = 0.5 * state.self_slope[t, 2] / state.self_compliance[t] - slope[2] / state.gram[t, t]
+    for s in range(state.engaged.shape[0]):
+        if s == t or state.force[s] <= 0.0:
+            continue
+        _gram_slope(state, t, s)
+        product, scale = force * state.force[s], state.scale[t] * state.scale[s]
+        out.force[t, 0] += product * (state.compliance[t, s] * change0 + scale * slope[0])
+        out.force[t, 1] += product * (state.compliance[t, s] * change1 + scale * slope[1])
+        out.force[t, 2] += product * (state.compliance[t, s] * change2 + scale * slope[2])
+
+
+@njit(cache=True, fastmath=True)
+def _gram_slope(state, t, s):  # type: ignore[no-untyped-def]
+    """(df_t/dp_t) . C f_s."""
+    n, turning, slope = state.normal[t], state.turning[t], state.gram_slope
+    for d in range(3):
+        far = np.float32(0.0)
+        for k in range(state.mode.shape[1]):
+            far += state.mode_slope[t, d, k] * state.mode[s, k]
+        near = 0.0
+        for i in range(state.n_own[t]):
+            q = state.own[t, i]
+            w, dw = state.weight[t, q, 0], state.weight[t, q, 1 + d]
+            for c in range(3):
+                near += (dw * n[c] + w * turning[c, d]) * state.column[s, q, c]
+        slope[d] = far + near
+
+
+@njit(cache=True, fastmath=True)
 def contact_deform(model, state, out):  # type: ignore[no-untyped-def]
     """Second half of a period: the cloud, far field by modes and near field by blocks."""
-    cloud, amplitude = out.cloud, state.amplitude
-    n_modes = model.space.shape[2]
-    for k in range(n_modes):
-        amplitude[k] = 0.0
-    touched = False
+    cloud, field = out.cloud, state.field
+    if out.n_contacts[0] == 0:
+        field[:] = np.float32(0.0)
+    else:
+        _amplitudes(state)
+        _far_field(model, state)
+        _near_field(model, state)
+    for v in range(cloud.shape[0]):
+        for d in range(3):
+            cloud[v, d] = model.rest[v, d] + field[3 * v + d]
+            cloud[v, 3 + d] = field[3 * v + d]
+
+
+@njit(cache=True, fastmath=True)
+def _amplitudes(state):  # type: ignore[no-untyped-def]
+    """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards."""
+    amplitude = state.amplitude
+    amplitude[:] = np.float32(0.0)
     for t in range(state.engaged.shape[0]):
         if state.force[t] > 0.0:
-            touched = True
-            force = np.float32(state.force[t])
-            for k in range(n_modes):
+            force = np.float32(state.force[t] * state.scale[t])
+            for k in range(amplitude.shape[0]):
                 amplitude[k] -= force * state.mode[t, k]
-    if not touched:
-        for v in range(cloud.shape[0]):
-            for d in range(3):
-                cloud[v, d] = model.rest[v, d]
-                cloud[v, 3 + d] = 0.0
-        return
-    for v in range(cloud.shape[0]):
-        u0 = u1 = u2 = np.float32(0.0)
-        for k in range(n_modes):
-            u0 += model.space[v, 0, k] * amplitude[k]
-            u1 += model.space[v, 1, k] * amplitude[k]
-            u2 += model.space[v, 2, k] * amplitude[k]
-        cloud[v, 3], cloud[v, 4], cloud[v, 5] = u0, u1, u2
+
+
+@njit(cache=True, fastmath=True)
+def _far_field(model, state):  # type: ignore[no-untyped-def]
+    """sum_k X_k a_k, four modes at a time; modes are stored as 16-bit fractions of their peak."""
+    amplitude, scale = state.amplitude, model.space_scale
+    n_modes = scale.shape[0]
+    for b in range(model.space.shape[0]):
+        u = state.field[b * BLOCK : (b + 1) * BLOCK]
+        x = model.space[b]
+        for i in range(BLOCK):
+            u[i] = np.float32(0.0)
+        for k in range(0, n_modes - 3, 4):
+            a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
+            a2, a3 = amplitude[k + 2] * scale[k + 2], amplitude[k + 3] * scale[k + 3]
+            for i in range(BLOCK):
+                u[i] += x[k, i] * a0 + x[k + 1, i] * a1 + x[k + 2, i] * a2 + x[k + 3, i] * a3
+        for k in range(n_modes - n_modes % 4, n_modes):
+            a = amplitude[k] * scale[k]
+            for i in range(BLOCK):
+                u[i] += x[k, i] * a
+
+
+@njit(cache=True, fastmath=True)
+def _near_field(model, state):  # type: ignore[no-untyped-def]
+    """The exact remainder around the load positions that carry the forces."""
+    u = state.field
     for q in range(state.n_local[0]):
         f0 = f1 = f2 = np.float32(0.0)
+        largest = 0.0
         for t in range(state.engaged.shape[0]):
             if state.force[t] > 0.0:
-                w = -state.weight[t, q] * state.force[t]
-                f0 += np.float32(w * state.direction[t, 0])
-                f1 += np.float32(w * state.direction[t, 1])
-                f2 += np.float32(w * state.direction[t, 2])
-        if f0 == 0.0 and f1 == 0.0 and f2 == 0.0:
+                w = state.weight[t, q, 0]
+                largest = max(largest, abs(w))
+                f = -w * state.scale[t] * state.force[t]
+                f0 += np.float32(f * state.normal[t, 0])
+                f1 += np.float32(f * state.normal[t, 1])
+                f2 += np.float32(f * state.normal[t, 2])
+        if largest < LEAST_WEIGHT:
             continue
         j = state.nodes[q]
         for e in range(model.near_start[j], model.near_start[j + 1]):
-            v = model.near_target[e]
+            v = 3 * model.near_target[e]
+            block = model.near_block[e]
             for d in range(3):
-                cloud[v, 3 + d] += (
-                    model.near_block[e, d, 0] * f0
-                    + model.near_block[e, d, 1] * f1
-                    + model.near_block[e, d, 2] * f2
-                )
-    for v in range(cloud.shape[0]):
-        for d in range(3):
-            cloud[v, d] = model.rest[v, d] + cloud[v, 3 + d]
+                u[v + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2

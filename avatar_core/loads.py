@@ -8,8 +8,8 @@ around its centre s by the compact profile
 R being a physical length, so that refining the mesh does not change the load. The displacement
 conjugate to it is the average u_bar(s) = int psi_s u da: force times u_bar is work.
 
-Positions s are the vertices and edge midpoints of the accessible faces; between them everything
-that depends on s is interpolated (:mod:`avatar_core.shepard`).
+Positions s are the vertices of the accessible faces and, where these are coarse against R, their
+edge midpoints; between them everything that depends on s is interpolated.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from skfem.refdom import RefTri
 from avatar_core.elasticity import Elasticity
 from avatar_core.errors import MeshError
 from avatar_core.mesh import Regions, TetMesh
-from avatar_core.shepard import Interpolation, make_interpolation
 
 LEAST_PATCH_RADIUS = 12e-3  # [m]
+MIDPOINTS_FROM = 0.6  # mean edge, in patch radii, from which edges get a midpoint
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,28 @@ class LoadSurface:
         return _unit(self.normals[self.corners].sum(axis=1))
 
     @cached_property
-    def interpolation(self) -> Interpolation:
-        """Smooth interpolation between the positions."""
-        return make_interpolation(self.centers, self.normals)
+    def face_positions(self) -> np.ndarray:
+        """Positions that carry each face: corners, then midpoints of edges 01, 12, 20, if any."""
+        n_corners = len(self.vertices)
+        if self.n_positions == n_corners:
+            return self.corners
+        edges = np.sort(self.corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        _, number = np.unique(edges, axis=0, return_inverse=True)
+        return np.concatenate([self.corners, n_corners + number.reshape(-1, 3)], axis=1)
+
+    def weights(self, faces: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Load positions and interpolation weights at points of some faces, each (n, 3 or 6).
+
+        Quadratic where the edges have midpoints, linear where they do not; one at a position
+        itself, zero at the others.
+
+        Parameters
+        ----------
+        faces : ndarray of int, shape (n,)
+        barycentric : ndarray, shape (n, 3)
+        """
+        positions = self.face_positions[faces]
+        return positions, barycentric if positions.shape[1] == 3 else triangle_shape(barycentric)
 
 
 def triangle_shape(barycentric: np.ndarray) -> np.ndarray:
@@ -112,6 +131,8 @@ def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = N
     corner = corner.reshape(-1, 3)
     a, b = np.unique(np.sort(corner[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0).T
     point, normal = mesh.vertices[vertices], mesh.vertex_normals[vertices]
+    if np.linalg.norm(point[a] - point[b], axis=1).mean() < MIDPOINTS_FROM * patch_radius:
+        a = b = np.empty(0, np.int64)
     return LoadSurface(
         centers=np.concatenate([point, (point[a] + point[b]) / 2.0]),
         normals=np.concatenate([normal, _unit(normal[a] + normal[b])]),

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 
 
@@ -36,6 +37,14 @@ class LocalBlocks:
     def position(self) -> np.ndarray:
         """Row of every block, shape (n_blocks,)."""
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
+
+    def kept(self, mask: np.ndarray) -> LocalBlocks:
+        """The blocks for which a mask holds, shape (n_blocks,)."""
+        count = np.bincount(self.position[mask], minlength=len(self.start) - 1)
+        start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+        return LocalBlocks(
+            start, np.ascontiguousarray(self.target[mask]), np.ascontiguousarray(self.block[mask])
+        )
 
     def combined(self, positions: np.ndarray, weights: np.ndarray, n_targets: int) -> np.ndarray:
         """Weighted sum of some rows, dense, shape (3 n_targets, 3)."""
@@ -80,3 +89,48 @@ def wendland(distance: np.ndarray, support: float) -> np.ndarray:
     """
     r = np.minimum(distance / support, 1.0)
     return (1.0 - r) ** 4 * (4.0 * r + 1.0)
+
+
+_HASH = 2654435761  # Knuth's multiplicative hashing, The Art of Computer Programming 3, Sec. 6.4
+
+
+def hash_rows(near: LocalBlocks) -> tuple[np.ndarray, np.ndarray]:
+    """Open-addressing tables by which a compiled loop finds one block of a row at once.
+
+    Returns
+    -------
+    start : ndarray of int64, shape (n_rows + 1,), slots of each row, a power of two
+    slot : ndarray of int32, shape (n_slots, 2), target (-1: empty) and index of its block
+    """
+    length = np.diff(near.start)
+    size = 2 ** np.ceil(np.log2(np.maximum(2 * length, 2))).astype(np.int64)
+    start = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
+    slot = np.full((start[-1], 2), -1, np.int32)
+    _fill_slots(near.start, near.target, start, slot)
+    return start, slot
+
+
+@njit(cache=True)
+def _fill_slots(row_start, target, start, slot):  # type: ignore[no-untyped-def]
+    for j in range(len(row_start) - 1):
+        mask = start[j + 1] - start[j] - 1
+        for e in range(row_start[j], row_start[j + 1]):
+            k = (np.int64(target[e]) * _HASH >> 16) & mask
+            while slot[start[j] + k, 0] >= 0:
+                k = (k + 1) & mask
+            slot[start[j] + k, 0] = target[e]
+            slot[start[j] + k, 1] = e
+
+
+@njit(cache=True)
+def find_block(start, slot, row, target):  # type: ignore[no-untyped-def]
+    """Index of the block of a row and target in the tables of :func:`hash_rows`, or -1."""
+    mask = start[row + 1] - start[row] - 1
+    k = (np.int64(target) * _HASH >> 16) & mask
+    while True:
+        found = slot[start[row] + k, 0]
+        if found == target:
+            return slot[start[row] + k, 1]
+        if found < 0:
+            return -1
+        k = (k + 1) & mask

@@ -152,7 +152,7 @@ def solve_pgd(
     problem: ParametricProblem,
     rule: PGDRule,
     progress: Callable[[int], None] = lambda rank: None,
-    reweigh: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    reweigh: Callable[[np.ndarray, np.ndarray], np.ndarray | None] | None = None,
 ) -> PGDSolution:
     """Greedy enrichment with alternating directions until the rule stops it.
 
@@ -162,7 +162,8 @@ def solve_pgd(
     rule : PGDRule
     progress : called with the rank after every enrichment
     reweigh : called with the new space and load functions; returns the weights of the loads for
-        the next enrichment, so that the norm can follow the error that matters
+        the next enrichment, so that the norm can follow the error that matters, or None to stop
+        because that error is small enough
 
     Raises
     ------
@@ -180,6 +181,8 @@ def solve_pgd(
         if reweigh is not None:
             new = slice(expansion.rank - report.modes, expansion.rank)
             weights = reweigh(expansion.space[:, new], expansion.load[:, new])
+            if weights is None:
+                break
             expansion.problem = replace(expansion.problem, weights=weights)
         if report.status is EnrichmentStatus.EXHAUSTED:
             break

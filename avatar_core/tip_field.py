@@ -2,8 +2,13 @@
 
 phi(p) is the signed distance from p to the closest point of the organ's faces (negative inside),
 chi(p) is one where that point is accessible and fades to zero beyond. Both are sampled on a grid
-and evaluated with cubic B-splines whose coefficients are the samples (a quasi-interpolant): twice
-continuously differentiable, local, exact for planes; it rounds edges over about the spacing.
+and evaluated by quadratic B-splines, whose second derivatives are bounded: a force made of them
+never jumps.
+
+A tip presses through a patch of radius R, so that shape much finer than R is not felt, and the
+corners of a coarse mesh should not be: phi is smoothed with the kernel 2 G - G * G, G a Gaussian
+of standard deviation R/3, which keeps planes and curved sides where they are (its error is of
+fourth order) and rounds edges over about R/3.
 """
 
 from __future__ import annotations
@@ -13,37 +18,37 @@ from collections import namedtuple
 import igl
 import numpy as np
 from numba import njit
+from scipy.ndimage import gaussian_filter
 
 from avatar_core.mesh import Regions, TetMesh
 
 SPACING = 3e-3  # [m]
 MARGIN = 30e-3  # [m] around the accessible surface
 FAR = 10.0  # [m] value outside the grid
+SMOOTHING = 1 / 3  # standard deviation, in patch radii
+FADING = 0.5  # distance beyond the accessible surface over which access fades, in patch radii
 
 # distance, access (nx, ny, nz) float32; origin (3,) [m]; spacing (1,) [m]
 TipField = namedtuple("TipField", ["distance", "access", "origin", "spacing"])
 
 
-def make_tip_field(
-    mesh: TetMesh, regions: Regions, fade: float, spacing: float = SPACING
-) -> TipField:
+def make_tip_field(mesh: TetMesh, regions: Regions, patch_radius: float) -> TipField:
     """Sample phi and chi around the accessible surface.
 
-    Inside the organ, the distance is taken to the accessible faces and those within ``fade`` of
-    them, so that a push into a thin lobe does not come out at its back.
+    Inside the organ, the distance is taken to the accessible faces and those within the fading
+    distance of them, so that a push into a thin lobe does not come out at its back.
 
     Parameters
     ----------
     mesh, regions : the organ
-    fade : distance beyond the accessible surface over which access fades [m]
-    spacing : of the grid [m]
+    patch_radius : R [m]
     """
-    faces = mesh.boundary_faces
+    faces, fade = mesh.boundary_faces, FADING * patch_radius
     open_faces = faces[regions.accessible]
     corners = mesh.vertices[open_faces].reshape(-1, 3)
     origin = corners.min(axis=0) - MARGIN
-    shape = np.ceil((np.ptp(corners, axis=0) + 2 * MARGIN) / spacing).astype(int) + 1
-    axes = [origin[d] + spacing * np.arange(shape[d]) for d in range(3)]
+    shape = np.ceil((np.ptp(corners, axis=0) + 2 * MARGIN) / SPACING).astype(int) + 1
+    axes = [origin[d] + SPACING * np.arange(shape[d]) for d in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = igl.fast_winding_number(mesh.vertices, faces, points) > 0.5
     center = mesh.vertices[faces].mean(axis=1)
@@ -56,11 +61,31 @@ def make_tip_field(
     beyond = np.clip(_closest(mesh, open_faces, closest)[0] / fade, 0.0, 1.0)
     access = 1.0 - beyond**2 * (3.0 - 2.0 * beyond)
     return TipField(
-        distance.reshape(shape).astype(np.float32),
+        smoothed(distance.reshape(shape), SMOOTHING * patch_radius / SPACING).astype(np.float32),
         access.reshape(shape).astype(np.float32),
         origin,
-        np.array([spacing]),
+        np.array([SPACING]),
     )
+
+
+def smoothed(values: np.ndarray, deviation: float, known: np.ndarray | None = None) -> np.ndarray:
+    """2 G f - G G f on a grid, G a Gaussian of some standard deviation [grid spacings].
+
+    Parameters
+    ----------
+    known : mask of the grid points that have a value; the others receive one from them, the mean
+        where none is near
+    """
+    if known is None:
+        known = np.ones(values.shape, bool)
+    mean = values[known].mean()
+    share = np.maximum(gaussian_filter(known.astype(float), deviation), 1e-6)
+
+    def once(f: np.ndarray) -> np.ndarray:
+        return mean + gaussian_filter(np.where(known, f - mean, 0.0), deviation) / share
+
+    first = once(values)
+    return 2.0 * first - once(first)
 
 
 def _closest(mesh: TetMesh, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -70,50 +95,45 @@ def _closest(mesh: TetMesh, faces: np.ndarray, points: np.ndarray) -> tuple[np.n
 
 
 @njit(cache=True)
-def _bspline(t):  # type: ignore[no-untyped-def]
-    """The four uniform cubic B-spline weights at t in [0, 1)."""
-    s = 1.0 - t
-    return (
-        s * s * s / 6.0,
-        (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0,
-        (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0,
-        t * t * t / 6.0,
-    )
+def bspline(t):  # type: ignore[no-untyped-def]
+    """The three uniform quadratic B-spline weights at t in [-1/2, 1/2) from the middle sample."""
+    return (0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2)
 
 
 @njit(cache=True)
-def _bspline_slope(t):  # type: ignore[no-untyped-def]
+def bspline_slope(t):  # type: ignore[no-untyped-def]
     """Their derivatives."""
-    s = 1.0 - t
-    return (-0.5 * s * s, -2.0 * t + 1.5 * t * t, 2.0 * s - 1.5 * s * s, 0.5 * t * t)
+    return (t - 0.5, -2.0 * t, t + 0.5)
+
+
+@njit(cache=True)
+def on_grid(values, origin, spacing, p):  # type: ignore[no-untyped-def]
+    """Whether all 27 samples around p exist (never for a p that is not finite)."""
+    for d in range(3):
+        middle = np.floor((p[d] - origin[d]) / spacing + 0.5)
+        if not 1.0 <= middle < values.shape[d] - 1.0:
+            return False
+    return True
 
 
 @njit(cache=True)
 def evaluate(values, origin, spacing, p, gradient, outside):  # type: ignore[no-untyped-def]
-    """Value of a sampled field at p, its gradient into ``gradient``; ``outside`` off the grid."""
+    """Value of a sampled field at p, its gradient into ``gradient``; off the grid ``outside``."""
+    if not on_grid(values, origin, spacing, p):
+        gradient[0] = gradient[1] = gradient[2] = 0.0
+        return outside
     x = (p[0] - origin[0]) / spacing
     y = (p[1] - origin[1]) / spacing
     z = (p[2] - origin[2]) / spacing
-    cx, cy, cz = np.floor(x), np.floor(y), np.floor(z)
-    if not (
-        cx >= 1.0
-        and cx < values.shape[0] - 2.0
-        and cy >= 1.0
-        and cy < values.shape[1] - 2.0
-        and cz >= 1.0
-        and cz < values.shape[2] - 2.0
-    ):
-        gradient[0] = gradient[1] = gradient[2] = 0.0
-        return outside
-    wx, wy, wz = _bspline(x - cx), _bspline(y - cy), _bspline(z - cz)
-    dx, dy, dz = _bspline_slope(x - cx), _bspline_slope(y - cy), _bspline_slope(z - cz)
-    nx, ny, nz = int(cx) - 1, int(cy) - 1, int(cz) - 1
+    nx, ny, nz = int(x + 0.5), int(y + 0.5), int(z + 0.5)
+    wx, wy, wz = bspline(x - nx), bspline(y - ny), bspline(z - nz)
+    dx, dy, dz = bspline_slope(x - nx), bspline_slope(y - ny), bspline_slope(z - nz)
     value = g0 = g1 = g2 = 0.0
-    for i in range(4):
-        for j in range(4):
+    for i in range(3):
+        for j in range(3):
             line = slope = 0.0
-            for k in range(4):
-                v = values[nx + i, ny + j, nz + k]
+            for k in range(3):
+                v = values[nx + i - 1, ny + j - 1, nz + k - 1]
                 line += wz[k] * v
                 slope += dz[k] * v
             value += wx[i] * wy[j] * line
@@ -122,3 +142,31 @@ def evaluate(values, origin, spacing, p, gradient, outside):  # type: ignore[no-
             g2 += wx[i] * wy[j] * slope
     gradient[0], gradient[1], gradient[2] = g0 / spacing, g1 / spacing, g2 / spacing
     return value
+
+
+@njit(cache=True)
+def second_derivatives(values, origin, spacing, p, hessian):  # type: ignore[no-untyped-def]
+    """Second derivatives of a sampled field at a p that is :func:`on_grid`, into (3, 3)."""
+    x = (p[0] - origin[0]) / spacing
+    y = (p[1] - origin[1]) / spacing
+    z = (p[2] - origin[2]) / spacing
+    nx, ny, nz = int(x + 0.5), int(y + 0.5), int(z + 0.5)
+    wx, wy, wz = bspline(x - nx), bspline(y - ny), bspline(z - nz)
+    dx, dy, dz = bspline_slope(x - nx), bspline_slope(y - ny), bspline_slope(z - nz)
+    curve = (1.0, -2.0, 1.0)
+    h00 = h11 = h22 = h01 = h02 = h12 = 0.0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                v = values[nx + i - 1, ny + j - 1, nz + k - 1]
+                h00 += curve[i] * wy[j] * wz[k] * v
+                h11 += wx[i] * curve[j] * wz[k] * v
+                h22 += wx[i] * wy[j] * curve[k] * v
+                h01 += dx[i] * dy[j] * wz[k] * v
+                h02 += dx[i] * wy[j] * dz[k] * v
+                h12 += wx[i] * dy[j] * dz[k] * v
+    scale = 1.0 / (spacing * spacing)
+    hessian[0, 0], hessian[1, 1], hessian[2, 2] = h00 * scale, h11 * scale, h22 * scale
+    hessian[0, 1] = hessian[1, 0] = h01 * scale
+    hessian[0, 2] = hessian[2, 0] = h02 * scale
+    hessian[1, 2] = hessian[2, 1] = h12 * scale

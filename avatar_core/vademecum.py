@@ -134,7 +134,7 @@ class Vademecum:
         Parameters
         ----------
         positions, weights : ndarray, shape (n,), a point of the surface as interpolated by
-            :func:`avatar_core.shepard.weights_at`
+            :meth:`avatar_core.loads.LoadSurface.weights`
         rank : int or None, modes to use; the near field belongs to all of them
         """
         far = self.far if rank is None else self.far.truncate(rank)

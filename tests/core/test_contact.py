@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from avatar_core.build import BuildRule, with_rank
 from avatar_core.contact import (
     ContactModel,
     Status,
@@ -15,7 +16,7 @@ from avatar_core.contact import (
     stored_energy,
 )
 from avatar_core.errors import ContactError
-from avatar_core.shepard import weights_at
+from avatar_core.tip_response import closest_weights
 from avatar_core.tool_path import inner_positions, middle_of_access, palpation, slide
 from avatar_core.vademecum import Vademecum
 
@@ -42,14 +43,14 @@ def test_no_force_without_contact(phantom_vademecum: Vademecum, model: ContactMo
 def test_force_equals_full_finite_elements(
     phantom_vademecum: Vademecum, model: ContactModel
 ) -> None:
-    """Pressed at a load position: lambda = indentation / (n . C n), C from a fresh solve."""
+    """lambda = indentation / (n . C n) with C from a fresh solve, to the 3 % of the certificate."""
     from avatar_core.elasticity import Elasticity
     from avatar_core.loads import patch_loads
 
     v = phantom_vademecum
     assert step(model, push(v, 3e-3)) == Status.OK
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
-    n, s = model.state.direction[0], model.state.point[0]
+    n, s = model.state.normal[0], model.state.point[0]
     load = patch_loads(problem, s[None], n[None], v.surface.patch_radius)
     compliance = n @ (load.T @ problem.solve(load)) @ n
     assert model.state.force[0] == pytest.approx(-model.state.gap[0] / compliance, rel=0.03)
@@ -62,16 +63,23 @@ def test_patch_does_not_penetrate(phantom_vademecum: Vademecum, model: ContactMo
 
 
 def test_action_is_reaction(phantom_vademecum: Vademecum, model: ContactModel) -> None:
-    """The pressed displacement field is the one of the opposite of the normal tool force."""
+    """The organ is displaced by the opposite of the normal force on the tool."""
     v = phantom_vademecum
     step(model, push(v, 5e-3))
-    n, force = model.state.direction[0], model.out.force[0]
-    assert force @ n == pytest.approx(model.state.force[0], rel=5e-3)
-    where = weights_at(v.surface.interpolation, model.state.point[0], n)
-    field = v.displacement(*where) @ (-n * model.state.force[0])
+    n, force = model.state.normal[0], model.out.force[0]
+    # the rest is tangential: towards softer tissue
+    assert force @ n == pytest.approx(model.state.force[0], rel=0.02)
+    field = v.displacement(*at_closest_point(v, model)) @ (-n * model.state.force[0])
+    # the tip's weights are blurred over 1.5 mm, the patch is 12 mm or wider
     np.testing.assert_allclose(
-        model.out.cloud[:, 3:].ravel(), field, atol=2e-5 * np.abs(field).max()
+        model.out.cloud[:, 3:].ravel(), field, atol=0.03 * np.abs(field).max()
     )
+
+
+def at_closest_point(v: Vademecum, model: ContactModel) -> tuple[np.ndarray, np.ndarray]:
+    """Load positions and weights at the surface point below the first tip."""
+    positions, weights = closest_weights(v.surface, model.state.point[:1])
+    return positions[0], weights[0]
 
 
 def test_displacement_moves_the_cloud(phantom_vademecum: Vademecum, model: ContactModel) -> None:
@@ -106,13 +114,7 @@ def test_closed_paths_do_no_work(phantom_vademecum: Vademecum, model: ContactMod
     assert worst < 0.01
 
 
-# Across a fold narrower than the patch, direction and compliance change within a millimetre: the
-# step of the force reaches 12 % at 5 mm depth, the work 2 % where the path is integrated coarsely.
-_FOLDS = pytest.mark.xfail(reason="narrow folds of some real livers", strict=False)
-
-
 @pytest.mark.long
-@_FOLDS
 def test_closed_paths_on_real_livers_do_no_work(real_vademecum: Vademecum) -> None:
     worst = closed_path_work(real_vademecum, prepare(real_vademecum, (RADIUS,)), 1000, seed=1)
     print(f"{real_vademecum.name}: work at most {worst:.2%} of the peak stored energy")
@@ -120,7 +122,6 @@ def test_closed_paths_on_real_livers_do_no_work(real_vademecum: Vademecum) -> No
 
 
 @pytest.mark.long
-@_FOLDS
 @pytest.mark.parametrize("depth", [2e-3, 5e-3])
 def test_sliding_force_on_real_livers_has_no_steps(real_vademecum: Vademecum, depth: float) -> None:
     jump, peak = largest_force_step(real_vademecum, prepare(real_vademecum, (RADIUS,)), depth)
@@ -211,6 +212,78 @@ def test_two_tools_share_the_organ(phantom_vademecum: Vademecum) -> None:
     assert two.out.n_contacts[0] == 2
     assert 0.3 * alone < np.linalg.norm(two.out.force[0]) < 0.98 * alone
     assert (two.out.contact_penetration[:2] < 1e-5).all()
+
+
+@pytest.mark.parametrize("distance", [16e-3, 30e-3, 60e-3])
+def test_coupled_forces_are_the_derivative_of_the_energy(
+    phantom_vademecum: Vademecum, distance: float
+) -> None:
+    v = phantom_vademecum
+    two = prepare(v, (RADIUS, RADIUS))
+    a, inner = middle_of_access(v), inner_positions(v)
+    apart = np.linalg.norm(v.surface.centers[inner] - v.surface.centers[a], axis=1)
+    b = int(inner[np.argmin(abs(apart - distance))])
+    tips = np.concatenate([push(v, 4e-3, a), push(v, 4e-3, b)]) + 1e-4
+    step(two, tips)
+    assert two.out.n_contacts[0] == 2
+    force, slope, h = two.out.force.copy(), np.empty((2, 3)), 1e-5
+    for t, d in np.ndindex(2, 3):
+        energies = []
+        for sign in (1, -1):
+            moved = tips.copy()
+            moved[t, d] += sign * h
+            step(two, moved)
+            energies.append(stored_energy(two))
+        slope[t, d] = (energies[0] - energies[1]) / (2 * h)
+    np.testing.assert_allclose(force, -slope, atol=1e-3 * np.abs(force).max())
+
+
+def test_compliance_between_tips_is_symmetric_positive_definite(
+    phantom_vademecum: Vademecum,
+) -> None:
+    smallest, asymmetry = active_set_spectrum(phantom_vademecum, 200, seed=0)
+    assert smallest > 0
+    assert asymmetry < 1e-6
+
+
+def test_fewer_modes_keep_the_compliance_positive_definite(phantom_vademecum: Vademecum) -> None:
+    smallest, _ = active_set_spectrum(with_rank(phantom_vademecum, 10, BuildRule()), 50, seed=2)
+    assert smallest > 0
+
+
+@pytest.mark.long
+def test_compliance_between_tips_on_real_livers(real_vademecum: Vademecum) -> None:
+    smallest, asymmetry = active_set_spectrum(real_vademecum, 1000, seed=1)
+    print(f"{real_vademecum.name}: smallest eigenvalue {smallest:.2e} of the mean diagonal")
+    assert smallest > 0
+    assert asymmetry < 1e-6
+
+
+def active_set_spectrum(v: Vademecum, n_sets: int, seed: int) -> tuple[float, float]:
+    """Of 2 to 8 tips at random: least eigenvalue and largest asymmetry over the mean diagonal."""
+    rng = np.random.default_rng(seed)
+    model = prepare(v, (RADIUS,) * 8, cloud="off")
+    faces = v.surface.corners
+    smallest, asymmetry, seen = np.inf, 0.0, 0
+    for _ in range(n_sets):
+        chosen = faces[rng.choice(len(faces), 8, replace=False)]
+        share = rng.dirichlet(np.ones(3), 8)
+        points = np.einsum("ck,ckd->cd", share, v.surface.centers[chosen])
+        normals = np.einsum("ck,ckd->cd", share, v.surface.normals[chosen])
+        tips = points + (RADIUS - 2e-3) * normals
+        tips[rng.integers(2, 9) :] += 1.0  # the others are out of contact
+        model.reset()
+        step(model, tips)
+        pressed = np.flatnonzero(model.state.active)
+        if len(pressed) < 2:
+            continue
+        seen += 1
+        c = model.state.compliance[np.ix_(pressed, pressed)]
+        scale = np.diag(c).mean()
+        smallest = min(smallest, np.linalg.eigvalsh((c + c.T) / 2).min() / scale)
+        asymmetry = max(asymmetry, np.abs(c - c.T).max() / scale)
+    assert seen > 0.9 * n_sets
+    return smallest, asymmetry
 
 
 def test_force_is_proportional_to_indentation(

@@ -9,7 +9,6 @@ from avatar_core.elasticity import Elasticity
 from avatar_core.errors import MeshError
 from avatar_core.loads import load_surface, patch_loads
 from avatar_core.mesh import TetMesh, regions_by_rule
-from avatar_core.shepard import make_interpolation, weights_at
 
 
 def test_total_force_is_exact(phantom_elasticity: Elasticity, phantom_mesh: TetMesh) -> None:
@@ -66,41 +65,35 @@ def test_unresolvable_patch_is_refused(phantom_mesh: TetMesh, radius: float) -> 
         load_surface(phantom_mesh, regions_by_rule(phantom_mesh), radius)
 
 
-def test_interpolation_reproduces_quadratics_and_its_own_positions() -> None:
-    rng = np.random.default_rng(3)
-    plane = np.concatenate([rng.uniform(0, 0.1, (400, 2)), np.zeros((400, 1))], axis=1)
-    up = np.tile([0.0, 0.0, 1.0], (400, 1))
-    data = make_interpolation(plane, up)
+def test_interpolation_is_exact_at_positions_and_continuous(phantom_mesh: TetMesh) -> None:
+    surface = load_surface(phantom_mesh, regions_by_rule(phantom_mesh))
+    corner = np.eye(3)
+    for points in (corner, (corner + np.roll(corner, 1, axis=1)) / 2):
+        positions, weights = surface.weights(np.zeros(3, int), points)
+        assert ((np.abs(weights) > 1e-12).sum(axis=1) == 1).all()
+        here = np.einsum("ij,ijd->id", weights, surface.centers[positions])
+        expected = points @ surface.centers[surface.corners[0]]
+        np.testing.assert_allclose(here, expected, atol=1e-15)
+    # the two faces of an edge agree along it: weights at a quarter of the way, from both
+    a, b = surface.corners[0, :2]
+    other = next(
+        f for f in range(1, len(surface.corners)) if {a, b} <= set(surface.corners[f].tolist())
+    )
+    dense = np.zeros((2, surface.n_positions))
+    for row, face in enumerate((0, other)):
+        bary = 0.75 * (surface.corners[face] == a) + 0.25 * (surface.corners[face] == b)
+        positions, weights = surface.weights(np.array([face]), bary[None].astype(float))
+        np.add.at(dense[row], positions[0], weights[0])
+    np.testing.assert_allclose(dense[0], dense[1], atol=1e-12)
 
-    def quadratic(p: np.ndarray) -> np.ndarray:
-        x, y = 50 * p[..., 0], 50 * p[..., 1]
-        return 1 + x - 2 * y + x * x - x * y + 0.5 * y * y
 
-    inside = rng.uniform(0.02, 0.08, (50, 2))
-    for x, y in inside:
-        point = np.array([x, y, 0.0])
-        j, w = weights_at(data, point, up[0])
-        assert w.sum() == pytest.approx(1.0, abs=1e-12)
-        assert w @ quadratic(plane[j]) == pytest.approx(quadratic(point), abs=1e-9)
-    j, w = weights_at(data, plane[7], up[0])
-    assert w[j == 7][0] == pytest.approx(1.0, abs=1e-6)
-
-
-def test_interpolation_is_continuously_differentiable() -> None:
-    """Weights along a line over the phantom have no jump in value or slope."""
-    from avatar_core.mesh import tetrahedralize
-    from avatar_core.phantom import phantom_liver
-
-    mesh = tetrahedralize(phantom_liver(), 700)
-    surface = load_surface(mesh, regions_by_rule(mesh))
-    values = np.sin(40 * surface.centers @ np.array([1.0, 0.5, 0.7]))
-    middle = surface.centers.mean(axis=0)
-    a = surface.centers[np.argmin(np.linalg.norm(surface.centers - middle, axis=1))]
-    line = a + np.linspace(-0.01, 0.01, 2001)[:, None] * np.array([1.0, 0.0, 0.3])
-    f = []
-    for point in line:
-        j, w = weights_at(surface.interpolation, point, np.array([0.0, 1.0, 0.0]))
-        f.append(w @ values[j])
-    slope = np.diff(f) / 1e-5
-    assert np.abs(np.diff(f)).max() < 20e-5 * 5
-    assert np.abs(np.diff(slope)).max() < 0.1 * np.abs(slope).max()
+def test_fine_surface_needs_no_midpoints(phantom_mesh: TetMesh) -> None:
+    """Where edges are short against the patch, vertices alone carry it, linearly."""
+    regions = regions_by_rule(phantom_mesh)
+    coarse = load_surface(phantom_mesh, regions)
+    fine = load_surface(phantom_mesh, regions, 4.0 * phantom_mesh.mean_surface_edge)
+    assert coarse.n_positions > 3 * len(coarse.vertices)
+    assert fine.n_positions == len(fine.vertices)
+    positions, weights = fine.weights(np.array([5]), np.array([[0.2, 0.3, 0.5]]))
+    np.testing.assert_array_equal(positions[0], fine.corners[5])
+    np.testing.assert_allclose(weights[0], [0.2, 0.3, 0.5])
