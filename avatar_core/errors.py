@@ -33,3 +33,11 @@ class ContactError(AvatarError):
 
 class ConvergenceError(AvatarError):
     """An iteration reached its limit before its tolerance."""
+
+
+class LLEError(AvatarError):
+    """A base of shapes, or what is asked of it, does not allow barycentric weights."""
+
+
+class RegistrationError(AvatarError):
+    """A template cannot be laid on a surface without leaving it or crushing elements."""

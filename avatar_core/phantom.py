@@ -1,4 +1,5 @@
-"""The built-in liver: a smooth level set of two lobes, a notch and a flat visceral face.
+"""The built-in liver, a smooth level set of two lobes, a notch and a flat visceral face, and the
+maps that turn one organ into a population.
 
 Axes RAS, metres: the right lobe lies at +x, the left lobe tapers to -x, the dome is superior (+z)
 and the visceral face looks down, back and to the left.
@@ -7,7 +8,7 @@ and the visceral face looks down, back and to the left.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,11 @@ from avatar_core.surface_files import march
 FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 LevelSet = Callable[[FloatArray], FloatArray]
+
+VOLUME_GAIN = 0.3  # of a population, det A between 1 / 1.3 and 1.3
+DISTORTION = 0.1  # largest shear
+BEND_LENGTH = 0.3  # wavelength of a bend [m]
+BENT = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))  # moved along one axis, wave along another
 
 BOX = ((-0.16, -0.13, -0.13), (0.12, 0.12, 0.11))  # holds the organ and a margin [m]
 
@@ -110,3 +116,63 @@ def project(points: FloatArray, level_set: LevelSet, step: float = 1e-5) -> Floa
         squared = np.maximum(np.sum(gradient**2, axis=1), 1e-6)
         points = points - (level_set(points) / squared)[:, None] * gradient
     return points
+
+
+# --- populations ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeMap:
+    """Map of an organ onto a member of its population, x' = A (x + b(x)).
+
+    stretch : ndarray, shape (3,), diagonal of A (Eq. 17)
+    shear : ndarray, shape (3,), entries xy, xz, yz of A above the diagonal; below it are zeros
+    bend : ndarray, shape (6,), amplitudes [m] of b_i(x) = a (1 - cos(2 pi x_j / L)) for the
+        pairs (i, j) of axes: smooth, not affine, one-to-one if the two of each i
+        together stay below L / (2 pi)
+    """
+
+    stretch: FloatArray
+    shear: FloatArray
+    bend: FloatArray
+
+    @property
+    def matrix(self) -> FloatArray:
+        """A, upper triangular, shape (3, 3)."""
+        matrix = np.diag(self.stretch)
+        matrix[np.triu_indices(3, 1)] = self.shear
+        return matrix
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Images of points, shape (k, 3) [m]."""
+        bent = np.array(points, dtype=np.float64)
+        for (i, j), amplitude in zip(BENT, self.bend, strict=True):
+            bent[:, i] += amplitude * (1.0 - np.cos(2 * np.pi / BEND_LENGTH * points[:, j]))
+        return bent @ self.matrix.T
+
+    def moved(self, surface: SurfaceMesh) -> SurfaceMesh:
+        """Image of a surface, triangle by triangle."""
+        return replace(surface, vertices=self(surface.vertices))
+
+
+def population(n: int, seed: int, bend: float = 0.0) -> list[ShapeMap]:
+    """Random maps of Eq. 17 (six parameters, if bend > 0 twelve); longer lists begin alike.
+
+    Stretches 1.3^(u / 3) and shears 0.1 u, u uniform in [-1, 1]: the volume changes by det A,
+    always under 30 %, the distortion is always under 10 %. (The paper prints the sum of the
+    stretches for the volume gain; it is their product.)
+
+    bend : largest amplitude of each bend [m]
+
+    Raises SurfaceError if the bends could fold the organ.
+    """
+    if not 0.0 <= bend < BEND_LENGTH / (4 * np.pi):
+        raise SurfaceError(
+            f"population: bend {bend:.3g} m may fold the organ; choose below "
+            f"{BEND_LENGTH / (4 * np.pi):.3f} m"
+        )
+    draws = np.random.default_rng(seed).uniform(-1.0, 1.0, (n, 12))
+    return [
+        ShapeMap((1.0 + VOLUME_GAIN) ** (u[:3] / 3), DISTORTION * u[3:6], bend * u[6:])
+        for u in draws
+    ]
