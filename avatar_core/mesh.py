@@ -251,7 +251,7 @@ def regions_by_rule(
         clamped[order[0]] = True
     touches_clamp = np.isin(faces, faces[clamped]).any(axis=1)
     anterior = mesh.face_area_normals @ ANTERIOR > anterior_cosine * area
-    accessible = _without_islands(faces, area, anterior & ~touches_clamp, least=0.05)
+    accessible = without_islands(faces, area, anterior & ~touches_clamp, least=0.05)
     return _checked(mesh, Regions(clamped, accessible))
 
 
@@ -280,7 +280,7 @@ def regions_from_groups(mesh: TetMesh, path: str | Path) -> Regions:
     return _checked(mesh, Regions(inside["clamped"], inside["accessible"] & ~touches))
 
 
-def _without_islands(
+def without_islands(
     faces: np.ndarray, area: np.ndarray, chosen: np.ndarray, least: float
 ) -> np.ndarray:
     """Drop edge-connected islands that hold less than ``least`` of the chosen area."""
