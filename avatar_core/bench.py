@@ -74,9 +74,7 @@ def time_dense_table(vademecum: Vademecum, n_tools: int) -> StepRow:
 def time_direct(elasticity: Elasticity, vademecum: Vademecum, n: int = 40) -> StepRow:
     """One back-substitution with the stored factor per step, one contact."""
     surface = vademecum.surface
-    loads = patch_loads(
-        elasticity, surface.centers[:n], surface.normals[:n], surface.patch_radius
-    ).toarray()
+    loads = patch_loads(elasticity, surface.centers[:n], surface.patch_radius).toarray()
     elasticity.solve(loads[:, :1])
     times = []
     for k in range(n):

@@ -85,7 +85,7 @@ def build_vademecum(
     A tolerance that is not met within ``max_modes`` still gives a complete vademecum, whose
     ``convergence.converged`` is False.
     """
-    loads = patch_loads(elasticity, surface.centers, surface.normals, surface.patch_radius)
+    loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     response = _exact_response(elasticity, surface, loads, rule, progress)
     missing = _Missing(elasticity, surface, response, rule)
     modes = _modes(elasticity, loads, response, missing, rule, progress)

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from avatar_core.errors import RegistrationError
 from avatar_core.loads import LoadSurface
-from avatar_core.mesh import Regions, TetMesh, _without_islands
+from avatar_core.mesh import Regions, TetMesh, without_islands
 from avatar_core.registration import Registration
 from avatar_core.springs import barycentric_centroids
 
@@ -72,7 +72,7 @@ def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
     clamped = regions.clamped[owner].mean(axis=1) > 0.5
     accessible = regions.accessible[owner].mean(axis=1) > 0.5
     accessible &= ~np.isin(faces, faces[clamped]).any(axis=1)
-    accessible = _without_islands(faces, patient.face_areas, accessible, least=0.05)
+    accessible = without_islands(faces, patient.face_areas, accessible, least=0.05)
     if not (clamped.any() and accessible.any()):
         raise RegistrationError(
             "no face of the patient's mesh falls into the template's clamp or accessible region; "

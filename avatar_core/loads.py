@@ -5,8 +5,9 @@ around its centre s by the compact profile
 
     psi_s(x) = c (1 - |x - s|^2 / R^2)^2 max(0, n(x) . n_s),   |x - s| < R,   int psi_s da = 1,
 
-R being a physical length, so that refining the mesh does not change the load. The displacement
-conjugate to it is the average u_bar(s) = int psi_s u da: force times u_bar is work.
+n_s being the mean normal of the surface within R, and R a physical length, so that refining the
+mesh does not change the load. The displacement conjugate to it is the average
+u_bar(s) = int psi_s u da: force times u_bar is work.
 
 Positions s are the vertices of the accessible faces and, where these are coarse against R, their
 edge midpoints; between them everything that depends on s is interpolated.
@@ -36,7 +37,7 @@ class LoadSurface:
     """The load positions of the accessible surface.
 
     centers : ndarray, shape (n_positions, 3) [m], patch centres
-    normals : ndarray, shape (n_positions, 3), unit outward normals
+    normals : ndarray, shape (n_positions, 3), of the patches, :func:`patch_normals`
     corners : ndarray of int, shape (n_triangles, 3), positions at the corners of each face
     vertices : ndarray of int, shape (n_corners,), mesh vertex of the first positions; the others
         are edge midpoints
@@ -60,9 +61,10 @@ class LoadSurface:
         return self.centers[self.corners].mean(axis=1)
 
     @property
-    def centroid_normals(self) -> np.ndarray:
-        """Unit normals for patches at the centroids, shape (n_triangles, 3)."""
-        return _unit(self.normals[self.corners].sum(axis=1))
+    def face_normals(self) -> np.ndarray:
+        """Unit outward normals of the accessible faces, shape (n_triangles, 3)."""
+        a, b, c = (self.centers[self.corners[:, i]] for i in range(3))
+        return _unit(np.cross(b - a, c - a))
 
     @cached_property
     def face_positions(self) -> np.ndarray:
@@ -130,21 +132,38 @@ def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = N
     vertices, corner = np.unique(faces, return_inverse=True)
     corner = corner.reshape(-1, 3)
     a, b = np.unique(np.sort(corner[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0).T
-    point, normal = mesh.vertices[vertices], mesh.vertex_normals[vertices]
+    point = mesh.vertices[vertices]
     if np.linalg.norm(point[a] - point[b], axis=1).mean() < MIDPOINTS_FROM * patch_radius:
         a = b = np.empty(0, np.int64)
+    centers = np.concatenate([point, (point[a] + point[b]) / 2.0])
     return LoadSurface(
-        centers=np.concatenate([point, (point[a] + point[b]) / 2.0]),
-        normals=np.concatenate([normal, _unit(normal[a] + normal[b])]),
+        centers=centers,
+        normals=patch_normals(mesh, centers, patch_radius),
         corners=corner,
         vertices=vertices,
         patch_radius=float(patch_radius),
     )
 
 
-def patch_loads(
-    elasticity: Elasticity, centers: np.ndarray, normals: np.ndarray, radius: float
-) -> sp.csr_matrix:
+def patch_normals(mesh: TetMesh, centers: np.ndarray, radius: float) -> np.ndarray:
+    """Normals of patches: the mean surface normal within R, weighted like the traction.
+
+    n_s ~ int (1 - |x - s|^2 / R^2)^2 n da. It turns smoothly with s where the faces do not, which
+    makes everything that depends on s smooth enough to be interpolated.
+
+    Parameters
+    ----------
+    centers : ndarray, shape (n, 3) [m]
+
+    Returns
+    -------
+    ndarray, shape (n, 3), unit vectors
+    """
+    points = _surface_points(mesh, radius)
+    return _unit(_bump(points, centers, radius) @ points.normals)
+
+
+def patch_loads(elasticity: Elasticity, centers: np.ndarray, radius: float) -> sp.csr_matrix:
     """Nodal forces of unit patch tractions in the three coordinate directions.
 
     Column ``3 i + d`` integrates psi_{s_i} e_d against the element's shape functions; its
@@ -154,7 +173,7 @@ def patch_loads(
     Parameters
     ----------
     elasticity : Elasticity
-    centers, normals : ndarray, shape (n, 3) [m], unit outward normals
+    centers : ndarray, shape (n, 3) [m]
     radius : R [m]
 
     Returns
@@ -166,41 +185,65 @@ def patch_loads(
     MeshError
         If a patch meets no quadrature point of the surface.
     """
-    points, weights, point_normals, trace = _surface_quadrature(elasticity, radius)
-    near = cKDTree(points).query_ball_point(centers, radius)
-    size = np.array([len(hit) for hit in near])
-    center = np.repeat(np.arange(len(centers)), size)
-    point = np.concatenate([np.asarray(hit, np.int64) for hit in near])
-    squared = ((points[point] - centers[center]) ** 2).sum(axis=1) / radius**2
-    facing = np.einsum("ij,ij->i", point_normals[point], normals[center])
-    value = weights[point] * (1.0 - squared) ** 2 * np.maximum(facing, 0.0)
-    profile = sp.csr_matrix((value, (center, point)), shape=(len(centers), len(points)))
+    points = _surface_points(elasticity.mesh, radius)
+    profile = _bump(points, centers, radius).tocoo()
+    normals = _unit(profile @ points.normals)
+    facing = np.einsum("ij,ij->i", points.normals[profile.col], normals[profile.row])
+    profile.data = profile.data * np.maximum(facing, 0.0)
     total = np.asarray(profile.sum(axis=1)).ravel()
     if not (total > 0).all():
         raise MeshError(f"a patch of radius {radius:g} m holds no surface; enlarge it")
-    scalar = sp.diags(1.0 / total) @ profile @ trace
+    scalar = sp.diags(1.0 / total) @ profile @ _trace(elasticity, points)
     return sp.kron(scalar, sp.identity(3), format="csr").T.tocsr()
 
 
-def _surface_quadrature(
-    elasticity: Elasticity, radius: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, sp.csr_matrix]:
-    """Points, weights and normals on the boundary, and the trace of the nodal shape functions."""
-    mesh = elasticity.mesh
+@dataclass(frozen=True)
+class _SurfacePoints:
+    """Quadrature on the boundary, face by face.
+
+    barycentric (n_per_face, 3), points (n, 3) [m], weights (n,) [m2], normals (n, 3)
+    """
+
+    barycentric: np.ndarray
+    points: np.ndarray
+    weights: np.ndarray
+    normals: np.ndarray
+
+
+def _surface_points(mesh: TetMesh, radius: float) -> _SurfacePoints:
     pieces = max(1, int(np.ceil(1.5 * mesh.mean_surface_edge / radius)))
     barycentric, weight = _subdivided_rule(pieces)
     corners = mesh.vertices[mesh.boundary_faces]
-    points = np.einsum("qk,fkd->fqd", barycentric, corners).reshape(-1, 3)
-    weights = np.outer(mesh.face_areas, weight).ravel()
     unit = mesh.face_area_normals / mesh.face_areas[:, None]
-    shape = barycentric if elasticity.element == "P1" else triangle_shape(barycentric)
-    nodes = np.repeat(elasticity.face_nodes, len(weight), axis=0)
-    rows = np.repeat(np.arange(len(points)), nodes.shape[1])
-    trace = sp.csr_matrix(
-        (np.tile(shape, (len(corners), 1)).ravel(), (rows, nodes.ravel())),
-        shape=(len(points), elasticity.n_nodes),
+    return _SurfacePoints(
+        barycentric,
+        np.einsum("qk,fkd->fqd", barycentric, corners).reshape(-1, 3),
+        np.outer(mesh.face_areas, weight).ravel(),
+        np.repeat(unit, len(weight), axis=0),
     )
-    return points, weights, np.repeat(unit, len(weight), axis=0), trace
+
+
+def _bump(points: _SurfacePoints, centers: np.ndarray, radius: float) -> sp.csr_matrix:
+    """Quadrature weights times (1 - |x - s|^2 / R^2)^2, sparse, shape (n_centers, n_points)."""
+    near = cKDTree(points.points).query_ball_point(centers, radius)
+    size = np.array([len(hit) for hit in near])
+    center = np.repeat(np.arange(len(centers)), size)
+    point = np.concatenate([np.asarray(hit, np.int64) for hit in near])
+    squared = ((points.points[point] - centers[center]) ** 2).sum(axis=1) / radius**2
+    value = points.weights[point] * (1.0 - squared) ** 2
+    return sp.csr_matrix((value, (center, point)), shape=(len(centers), len(points.points)))
+
+
+def _trace(elasticity: Elasticity, points: _SurfacePoints) -> sp.csr_matrix:
+    """Shape functions of the boundary's nodes at the quadrature points."""
+    barycentric, n_faces = points.barycentric, len(elasticity.face_nodes)
+    shape = barycentric if elasticity.element == "P1" else triangle_shape(barycentric)
+    nodes = np.repeat(elasticity.face_nodes, len(barycentric), axis=0)
+    rows = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+    return sp.csr_matrix(
+        (np.tile(shape, (n_faces, 1)).ravel(), (rows, nodes.ravel())),
+        shape=(len(nodes), elasticity.n_nodes),
+    )
 
 
 def _subdivided_rule(pieces: int) -> tuple[np.ndarray, np.ndarray]:

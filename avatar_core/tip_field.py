@@ -61,31 +61,17 @@ def make_tip_field(mesh: TetMesh, regions: Regions, patch_radius: float) -> TipF
     beyond = np.clip(_closest(mesh, open_faces, closest)[0] / fade, 0.0, 1.0)
     access = 1.0 - beyond**2 * (3.0 - 2.0 * beyond)
     return TipField(
-        smoothed(distance.reshape(shape), SMOOTHING * patch_radius / SPACING).astype(np.float32),
+        _smoothed(distance.reshape(shape), SMOOTHING * patch_radius / SPACING).astype(np.float32),
         access.reshape(shape).astype(np.float32),
         origin,
         np.array([SPACING]),
     )
 
 
-def smoothed(values: np.ndarray, deviation: float, known: np.ndarray | None = None) -> np.ndarray:
-    """2 G f - G G f on a grid, G a Gaussian of some standard deviation [grid spacings].
-
-    Parameters
-    ----------
-    known : mask of the grid points that have a value; the others receive one from them, the mean
-        where none is near
-    """
-    if known is None:
-        known = np.ones(values.shape, bool)
-    mean = values[known].mean()
-    share = np.maximum(gaussian_filter(known.astype(float), deviation), 1e-6)
-
-    def once(f: np.ndarray) -> np.ndarray:
-        return mean + gaussian_filter(np.where(known, f - mean, 0.0), deviation) / share
-
-    first = once(values)
-    return 2.0 * first - once(first)
+def _smoothed(values: np.ndarray, deviation: float) -> np.ndarray:
+    """2 G f - G G f on a grid, G a Gaussian of some standard deviation [grid spacings]."""
+    once = gaussian_filter(values, deviation, mode="nearest")
+    return 2.0 * once - gaussian_filter(once, deviation, mode="nearest")
 
 
 def _closest(mesh: TetMesh, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,10 +6,10 @@ folds would be felt as jumps. What a moving tip needs is therefore sampled on th
 field and evaluated by the same B-splines B_q(p), twice differentiable almost everywhere:
 
     w_j(p)   = sum_q B_q(p) w_j(s(x_q))         share of load position j, sum_j w_j = 1
-    gamma(p) = sum_q B_q(p) [K gamma_0](x_q)    gamma_0 = n . C(s, s) n
+    gamma(p) = sum_q B_q(p) n_s . C(s, s) n_s   at s = s(x_q)
 
-with n = grad phi / |grad phi| and K a smoothing kernel over a fifth of the patch radius. gamma is
-the compliance that one tip feels; between tips t and t' it is
+with n_s the normal of the patch. gamma is the compliance that one tip feels; between tips t and
+t', whose normals are n = grad phi / |grad phi|, it is
 
     C_tt' = a_t a_t' f_t . C f_t',    f_t = w(p_t) n(p_t),    a_t^2 = gamma(p_t) / (f_t . C f_t),
 
@@ -26,9 +26,8 @@ from numba import njit
 
 from avatar_core.loads import LoadSurface
 from avatar_core.near_field import LocalBlocks
-from avatar_core.tip_field import TipField, bspline, bspline_slope, smoothed
+from avatar_core.tip_field import TipField, bspline, bspline_slope
 
-SMOOTHING = 0.2  # standard deviation of K, in patch radii
 MAX_STENCIL = 128  # load positions that carry one tip, at most
 
 # row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
@@ -60,20 +59,14 @@ def make_tip_response(
     shell &= _dilated(field.access > 0.0)
     points = field.origin + spacing * np.argwhere(shell)
     carrier, share = closest_weights(surface, points)
-    normal = np.stack(np.gradient(field.distance.astype(float), spacing), axis=-1)[shell]
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    compliance = np.zeros(shell.shape)
-    compliance[shell] = _self_compliance(
-        carrier, share, normal, load, near.start, near.target, near.block
-    )
+    normal = np.einsum("qi,qid->qd", share, surface.normals[carrier])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    felt = _self_compliance(carrier, share, normal, load, near.start, near.target, near.block)
+    compliance = np.full(shell.shape, felt.mean(), np.float32)
+    compliance[shell] = felt
     row = np.full(shell.shape, -1, np.int32)
     row[shell] = np.arange(len(points), dtype=np.int32)
-    return TipResponse(
-        row,
-        carrier.astype(np.int32),
-        share.astype(np.float32),
-        smoothed(compliance, SMOOTHING * surface.patch_radius / spacing, shell).astype(np.float32),
-    )
+    return TipResponse(row, carrier.astype(np.int32), share.astype(np.float32), compliance)
 
 
 def closest_weights(surface: LoadSurface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -98,7 +91,7 @@ def _dilated(mask: np.ndarray, steps: int = 3) -> np.ndarray:
 
 @njit(cache=True, fastmath=True)
 def _self_compliance(carrier, share, normal, load, start, target, block):  # type: ignore[no-untyped-def]
-    """n . C(s, s) n at every sample, C interpolated from both sides."""
+    """n_s . C(s, s) n_s at every sample, C interpolated from both sides."""
     out = np.zeros(len(carrier))
     rank, n_carriers = load.shape[2], carrier.shape[1]
     mode = np.empty(rank)

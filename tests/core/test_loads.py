@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from avatar_core.elasticity import Elasticity
 from avatar_core.errors import MeshError
-from avatar_core.loads import load_surface, patch_loads
-from avatar_core.mesh import TetMesh, regions_by_rule
+from avatar_core.loads import load_surface, patch_loads, patch_normals
+from avatar_core.mesh import Regions, TetMesh, regions_by_rule
+
+Box = Callable[[int], tuple[TetMesh, Regions]]
 
 
 def test_total_force_is_exact(phantom_elasticity: Elasticity, phantom_mesh: TetMesh) -> None:
     surface = load_surface(phantom_mesh, regions_by_rule(phantom_mesh))
-    loads = patch_loads(phantom_elasticity, surface.centers, surface.normals, surface.patch_radius)
+    loads = patch_loads(phantom_elasticity, surface.centers, surface.patch_radius)
     total = loads.T.reshape((-1, loads.shape[0])).dot(np.tile(np.eye(3), (loads.shape[0] // 3, 1)))
     expected = np.tile(np.eye(3), (surface.n_positions, 1))
     np.testing.assert_allclose(total, expected, atol=1e-12)
@@ -23,9 +27,7 @@ def test_compliance_is_symmetric(phantom_elasticity: Elasticity, phantom_mesh: T
     """Maxwell-Betti: the displacement at a due to a force at b is that at b due to a."""
     surface = load_surface(phantom_mesh, regions_by_rule(phantom_mesh))
     some = np.random.default_rng(0).permutation(surface.n_positions)[:12]
-    loads = patch_loads(
-        phantom_elasticity, surface.centers[some], surface.normals[some], surface.patch_radius
-    )
+    loads = patch_loads(phantom_elasticity, surface.centers[some], surface.patch_radius)
     compliance = loads.T @ phantom_elasticity.solve(loads)
     assert np.abs(compliance - compliance.T).max() < 1e-10 * np.abs(compliance).max()
     assert np.linalg.eigvalsh(compliance).min() > 0
@@ -44,9 +46,7 @@ def test_patch_is_local_and_faces_its_side(phantom_elasticity: Elasticity) -> No
     """No force beyond the radius (plus an element), none on faces that look away."""
     mesh = phantom_elasticity.mesh
     surface = load_surface(mesh, regions_by_rule(mesh))
-    loads = patch_loads(
-        phantom_elasticity, surface.centers, surface.normals, surface.patch_radius
-    ).tocsc()
+    loads = patch_loads(phantom_elasticity, surface.centers, surface.patch_radius).tocsc()
     longest = np.linalg.norm(
         mesh.vertices[mesh.boundary_faces] - mesh.vertices[np.roll(mesh.boundary_faces, 1, 1)],
         axis=2,
@@ -97,3 +97,16 @@ def test_fine_surface_needs_no_midpoints(phantom_mesh: TetMesh) -> None:
     positions, weights = fine.weights(np.array([5]), np.array([[0.2, 0.3, 0.5]]))
     np.testing.assert_array_equal(positions[0], fine.corners[5])
     np.testing.assert_allclose(weights[0], [0.2, 0.3, 0.5])
+
+
+def test_patch_normals_turn_smoothly_over_an_edge(box: Box) -> None:
+    """Along a line across the edge of a box, normals turn by 90 degrees, never at once."""
+    mesh, _ = box(6)
+    x = np.linspace(0.06, 0.1, 81)
+    top = np.stack([x, np.full_like(x, 0.1), np.full_like(x, 0.05)], axis=1)
+    side = np.stack([np.full_like(x, 0.1), x[::-1], np.full_like(x, 0.05)], axis=1)
+    normals = patch_normals(mesh, np.concatenate([top, side[1:]]), 0.03)
+    np.testing.assert_allclose(normals[[0, -1]], np.eye(3)[[1, 0]], atol=1e-2)
+    np.testing.assert_allclose(normals[80], [0.5**0.5, 0.5**0.5, 0.0], atol=1e-2)
+    turn = np.degrees(np.arccos(np.clip((normals[1:] * normals[:-1]).sum(axis=1), -1, 1)))
+    assert turn.max() < 3.0  # 0.5 mm steps over a patch of 30 mm

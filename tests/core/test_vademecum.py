@@ -46,9 +46,7 @@ def test_near_field_makes_the_loaded_positions_exact(phantom_vademecum: Vademecu
     v = phantom_vademecum
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
     for j in (0, 50, 200):
-        load = patch_loads(
-            problem, v.surface.centers[[j]], v.surface.normals[[j]], v.surface.patch_radius
-        )
+        load = patch_loads(problem, v.surface.centers[[j]], v.surface.patch_radius)
         exact = problem.at_vertices(problem.solve(load))
         near = np.linalg.norm(v.mesh.vertices - v.surface.centers[j], axis=1)
         near = np.repeat(near < 1.8 * v.surface.patch_radius, 3)
