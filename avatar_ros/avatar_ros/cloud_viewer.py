@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
 from avatar_ros import qos, realtime
-from avatar_ros.managed_node import StopSignal
+from avatar_ros.managed_node import StopSignal, spin_until
 from avatar_ros.msg import LoopStatistics
 
 
@@ -41,17 +40,11 @@ def main() -> int:
 
     node.create_subscription(PointCloud2, "deformation", view, qos.NEWEST, raw=True)
     node.create_subscription(LoopStatistics, "statistics", note, qos.STATISTICS)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
     realtime.calm_interpreter()
-    while not stop:
-        executor.spin_once(timeout_sec=0.1)
+    spin_until(stop, node)
     output.write_text(
         json.dumps({"clouds": clouds, "cloud_bytes": n_bytes[0], "statistics": statistics})
     )
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown()
     return 0
 
 

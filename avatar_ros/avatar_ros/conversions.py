@@ -114,7 +114,22 @@ def stamp_bytes(nanoseconds: int) -> bytes:
     return struct.pack("=iI", nanoseconds // 1_000_000_000, nanoseconds % 1_000_000_000)
 
 
-class WrenchTemplate:
+class _StampedTemplate:
+    """A message serialised once; each time only its stamp and its numbers are written anew."""
+
+    def __init__(self, message: Any) -> None:
+        self._stamp = _find_stamp(message)
+        self._buffer = bytearray(serialize_message(message))
+
+    def serialise(self, stamp: bytes) -> bytes:
+        self._buffer[self._stamp : self._stamp + _STAMP_BYTES] = stamp
+        return bytes(self._buffer)
+
+    def _numbers(self, start: int, count: int) -> np.ndarray:
+        return np.frombuffer(self._buffer, dtype=np.float64, count=count, offset=start)
+
+
+class WrenchTemplate(_StampedTemplate):
     """A serialised WrenchStamped; ``force`` and ``torque`` are views of its numbers."""
 
     def __init__(self, frame_id: str) -> None:
@@ -124,31 +139,21 @@ class WrenchTemplate:
         last = _find_number(message, lambda x: setattr(wrench.torque, "z", x))
         if last != start + 40:
             raise LayoutError("a wrench is not six float64 in a row: use rmw_fastrtps_cpp")
-        self._stamp = _find_stamp(message)
-        self._buffer = bytearray(serialize_message(message))
-        numbers = np.frombuffer(self._buffer, dtype=np.float64, count=6, offset=start)
+        super().__init__(message)
+        numbers = self._numbers(start, 6)
         self.force, self.torque = numbers[:3], numbers[3:]
 
-    def serialise(self, stamp: bytes) -> bytes:
-        self._buffer[self._stamp : self._stamp + _STAMP_BYTES] = stamp
-        return bytes(self._buffer)
 
-
-class PoseTemplate:
+class PoseTemplate(_StampedTemplate):
     """A serialised PoseStamped without rotation; ``position`` is a view of its numbers."""
 
     def __init__(self, frame_id: str) -> None:
         message = PoseStamped(header=Header(frame_id=frame_id))
         position = message.pose.position
         start = _find_number(message, lambda x: setattr(position, "x", x))
-        self._stamp = _find_stamp(message)
         message.pose.orientation.w = 1.0
-        self._buffer = bytearray(serialize_message(message))
-        self.position = np.frombuffer(self._buffer, dtype=np.float64, count=3, offset=start)
-
-    def serialise(self, stamp: bytes) -> bytes:
-        self._buffer[self._stamp : self._stamp + _STAMP_BYTES] = stamp
-        return bytes(self._buffer)
+        super().__init__(message)
+        self.position = self._numbers(start, 3)
 
 
 class WrenchReader:

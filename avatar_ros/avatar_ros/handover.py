@@ -10,6 +10,7 @@ Run as ``python -m avatar_ros.handover JSON`` by ``Handover``, never by hand.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import mmap
@@ -218,11 +219,10 @@ def main() -> int:
     realtime.die_with_parent(signal.SIGTERM)
     realtime.release()
     import rclpy
-    from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
     from avatar_ros import qos
-    from avatar_ros.managed_node import StopSignal
+    from avatar_ros.managed_node import StopSignal, spin_until
     from avatar_ros.msg import VademecumFile
 
     stop = StopSignal()
@@ -242,17 +242,8 @@ def main() -> int:
         receiver.receive,
         qos.LATCHED,
     )
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    try:
-        while not stop:
-            executor.spin_once(timeout_sec=0.1)
-    except BrokenPipeError:
-        pass  # the node is gone
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
+    with contextlib.suppress(BrokenPipeError):  # the contact node is gone
+        spin_until(stop, node)
     return 0
 
 

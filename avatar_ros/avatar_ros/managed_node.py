@@ -5,11 +5,13 @@ from __future__ import annotations
 import signal
 import sys
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from avatar_core.errors import AvatarError
@@ -19,7 +21,7 @@ from avatar_ros.parameters import Parameter, ParameterError
 _SIGNAL_LATENCY = 0.1  # longest until a signal is noticed [s]
 
 
-class ManagedNode(LifecycleNode):
+class ManagedNode(LifecycleNode, ABC):
     """A lifecycle node whose transitions may raise, and that says why it refused one.
 
     A subclass gives ``configure``, ``activate``, ``deactivate``, ``clean_up``; the last two may
@@ -34,17 +36,21 @@ class ManagedNode(LifecycleNode):
         self.refusal = ""
         parameters.declare(self, declared)
 
+    @abstractmethod
     def configure(self) -> None:
-        raise NotImplementedError
+        """Do all that may fail."""
 
+    @abstractmethod
     def activate(self) -> None:
-        raise NotImplementedError
+        """Start to serve."""
 
+    @abstractmethod
     def deactivate(self) -> None:
-        raise NotImplementedError
+        """Stop serving."""
 
+    @abstractmethod
     def clean_up(self) -> None:
-        raise NotImplementedError
+        """Give back what ``configure`` took."""
 
     @property
     def failure(self) -> str:
@@ -104,6 +110,19 @@ class StopSignal:
 
     def __bool__(self) -> bool:
         return self._came
+
+
+def spin_until(stop: StopSignal, node: Node) -> None:
+    """Serve a plain node until the signal came, then take it and rclpy down."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stop:
+            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
 
 
 def run(make_node: Callable[[], ManagedNode]) -> int:
