@@ -46,6 +46,20 @@ class LocalBlocks:
             start, np.ascontiguousarray(self.target[mask]), np.ascontiguousarray(self.block[mask])
         )
 
+    def with_whole_rows(self, rows: dict[int, np.ndarray]) -> LocalBlocks:
+        """The same with some rows replaced by blocks for all targets, each (n_targets, 3, 3)."""
+        if not rows:
+            return self
+        targets, blocks = [], []
+        for j in range(len(self.start) - 1):
+            row = slice(self.start[j], self.start[j + 1])
+            whole = rows.get(j)
+            targets.append(self.target[row] if whole is None else np.arange(len(whole)))
+            blocks.append(self.block[row] if whole is None else whole)
+        start = np.concatenate([[0], np.cumsum([len(t) for t in targets])]).astype(np.int64)
+        target = np.concatenate(targets).astype(np.int32)
+        return LocalBlocks(start, target, np.concatenate(blocks).astype(self.block.dtype))
+
     def combined(self, positions: np.ndarray, weights: np.ndarray, n_targets: int) -> np.ndarray:
         """Weighted sum of some rows, dense, shape (3 n_targets, 3)."""
         out = np.zeros((n_targets, 3, 3))

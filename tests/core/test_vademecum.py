@@ -149,3 +149,19 @@ def test_fewer_modes_leave_the_loaded_positions_exact(phantom_vademecum: Vademec
     near = np.repeat(near < 1.5 * v.surface.patch_radius, 3)
     change = np.abs(short.displacement(*where) - v.displacement(*where)).max(axis=1)
     assert change[near].max() < 1e-4 * change.max()
+
+
+def test_whole_rows_replace_near_ones(phantom_vademecum: Vademecum) -> None:
+    """A position stored whole answers with its own blocks at every vertex, the others as before."""
+    near = phantom_vademecum.near
+    n = len(phantom_vademecum.mesh.vertices)
+    whole = np.random.default_rng(0).standard_normal((n, 3, 3))
+    changed = near.with_whole_rows({5: whole})
+    one = np.ones(1)
+    np.testing.assert_allclose(
+        changed.combined(np.array([5]), one, n), whole.reshape(-1, 3), rtol=1e-6
+    )
+    for j in (4, 6, len(near.start) - 2):
+        np.testing.assert_array_equal(
+            changed.combined(np.array([j]), one, n), near.combined(np.array([j]), one, n)
+        )
