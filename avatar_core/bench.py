@@ -158,39 +158,44 @@ def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: in
 @njit(cache=True, fastmath=True)
 def _dense_step(model, state, out, tips, columns, compliance):  # type: ignore[no-untyped-def]
     """:func:`contact_kernels.contact_step` with stored columns instead of modes."""
-    kernels._forget_stencil(state)
-    n_active = 0
-    for t in range(tips.shape[0]):
+    n_active, n_tools = 0, tips.shape[0]
+    for t in range(n_tools):
         kernels._locate(model, state, t, tips[t])
         state.mode[t] = np.float32(0.0)
         if state.active[t]:
             n_active += 1
             gather(model, state, t, tips[t])
-    for t in range(tips.shape[0]):
-        if state.active[t]:
-            for i in range(state.n_own[t]):
-                p = state.own[t, i]
-                for c in range(3):
-                    row = compliance[state.nodes[p], c]
-                    f = state.weight[t, p, 0] * state.normal[t, c]
-                    for q in range(state.n_local[0]):
-                        for d in range(3):
-                            state.column[t, q, d] += f * row[state.nodes[q], d]
+    for t in range(n_tools):
+        for s in range(n_tools):
+            state.near[t, s] = True
+            if state.active[t] and state.active[s]:
+                _dense_column(state, t, s, compliance)
     kernels._assemble(model, state)
     kernels._solve(state)
     kernels._write_forces(model, state, out, tips, n_active > 1)
     u = state.field[: 3 * out.cloud.shape[0]]
     u[:] = np.float32(0.0)
-    for p in range(state.n_local[0]):
-        for c in range(3):
-            f = 0.0
-            for t in range(tips.shape[0]):
-                f -= state.weight[t, p, 0] * state.scale[t] * state.force[t] * state.normal[t, c]
-            if f != 0.0:
-                row, g = columns[state.nodes[p], c], np.float32(f)
-                for i in range(u.shape[0]):
-                    u[i] += g * row[i]
+    for t in range(n_tools):
+        for i in range(state.n_nodes[t] if state.force[t] > 0.0 else 0):
+            force = -state.weight[t, i, 0] * state.scale[t] * state.force[t]
+            for c in range(3):
+                row, f = columns[state.nodes[t, i], c], np.float32(force * state.normal[t, c])
+                for k in range(u.shape[0]):
+                    u[k] += f * row[k]
     for v in range(out.cloud.shape[0]):
         for d in range(3):
             out.cloud[v, d] = model.rest[v, d] + u[3 * v + d]
             out.cloud[v, 3 + d] = u[3 * v + d]
+
+
+@njit(cache=True, fastmath=True)
+def _dense_column(state, t, s, compliance):  # type: ignore[no-untyped-def]
+    column = state.column[t, s]
+    column[: state.n_nodes[s]] = 0.0
+    for i in range(state.n_nodes[t]):
+        for c in range(3):
+            row = compliance[state.nodes[t, i], c]
+            f = state.weight[t, i, 0] * state.normal[t, c]
+            for q in range(state.n_nodes[s]):
+                for d in range(3):
+                    column[q, d] += f * row[state.nodes[s, q], d]

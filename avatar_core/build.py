@@ -56,10 +56,10 @@ class BuildRule:
     tolerance: float = 0.045
     max_modes: int = 100
     oversampling: float = 1.2
-    most_oversampling: float = 1.7
+    most_oversampling: float = 2.2
     near_inner: float = 1.8
     near_outer: float = 3.3
-    near_growth: float = 1.3
+    near_growth: float = 1.4
     contact_support: float = 4.0
     max_sample_bytes: int = 400_000_000
 

@@ -152,7 +152,6 @@ def model_arrays(
 def make_model(arrays: ModelArrays) -> ContactModel:
     """Allocate state and outputs around the constant arrays, and run the step once."""
     n_tools, n_modes = len(arrays.tip_radius), arrays.load.shape[2]
-    n_stencil = MAX_STENCIL * n_tools
     single = np.float32
     state = State(
         engaged=np.zeros(n_tools, np.bool_),
@@ -167,15 +166,14 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         access_slope=np.zeros((n_tools, 3)),
         point=np.zeros((n_tools, 3)),
         local=np.full(len(arrays.position), -1, np.int64),
-        nodes=np.zeros(n_stencil, np.int64),
-        mark=np.full(n_stencil, -1, np.int64),
-        n_local=np.zeros(1, np.int64),
-        own=np.zeros((n_tools, MAX_STENCIL), np.int64),
-        n_own=np.zeros(n_tools, np.int64),
-        weight=np.zeros((n_tools, n_stencil, 4)),
+        nodes=np.zeros((n_tools, MAX_STENCIL), np.int64),
+        n_nodes=np.zeros(n_tools, np.int64),
+        weight=np.zeros((n_tools, MAX_STENCIL, 4)),
+        extent=np.zeros(n_tools),
         mode=np.zeros((n_tools, n_modes), single),
         mode_slope=np.zeros((n_tools, 3, n_modes), single),
-        column=np.zeros((n_tools, n_stencil, 3)),
+        column=np.zeros((n_tools, n_tools, MAX_STENCIL, 3)),
+        near=np.zeros((n_tools, n_tools), np.bool_),
         self_compliance=np.ones(n_tools),
         self_slope=np.zeros((n_tools, 3)),
         gram=np.ones((n_tools, n_tools)),

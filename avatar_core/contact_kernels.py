@@ -39,7 +39,7 @@ ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not come in through the 
 MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
 MIN_ACCESS = 1e-2  # below, the tip is off the accessible surface
 FULL_ACCESS = 0.99  # below, the force fades
-LEAST_WEIGHT = 5e-3  # load positions that carry less move no near field in the cloud
+LEAST_WEIGHT = 0.01  # load positions that carry less leave their near field to the others
 
 # What the step reads; `prepare` fills it once. Shapes in avatar_core.contact.ContactModel.
 ModelArrays = namedtuple(
@@ -85,16 +85,15 @@ State = namedtuple(
         "access",  # (T,) chi
         "access_slope",  # (T, 3)
         "point",  # (T, 3) s
-        "local",  # (n_positions,) number in the joint stencil, or -1
-        "nodes",  # (S,) joint stencil
-        "mark",  # (S,) last tip that uses it
-        "n_local",  # (1,)
-        "own",  # (T, MAX_STENCIL) the part of each tip
-        "n_own",  # (T,)
-        "weight",  # (T, S, 4) w and its gradient
+        "local",  # (n_positions,) scratch of gather, all -1
+        "nodes",  # (T, MAX_STENCIL) load positions that carry the tip
+        "n_nodes",  # (T,)
+        "weight",  # (T, MAX_STENCIL, 4) w and its gradient
+        "extent",  # (T,) radius of these positions about s
         "mode",  # (T, k) Y^T f
         "mode_slope",  # (T, 3, k) its gradient
-        "column",  # (T, S, 3) near displacement of the stencil per unit lambda
+        "column",  # (T, T, MAX_STENCIL, 3) near displacement at the second's nodes by the first
+        "near",  # (T, T) whether the near fields of two tips meet
         "self_compliance",  # (T,) gamma
         "self_slope",  # (T, 3) grad gamma
         "gram",  # (T, T) f_t . C f_t'
@@ -127,7 +126,6 @@ Out = namedtuple(
 def contact_solve(model, state, out, tips):  # type: ignore[no-untyped-def]
     """First half of a period: locate, gather, assemble, solve, differentiate."""
     n_tools = tips.shape[0]
-    _forget_stencil(state)
     status = OK
     n_active = 0
     for t in range(n_tools):
@@ -137,9 +135,11 @@ def contact_solve(model, state, out, tips):  # type: ignore[no-untyped-def]
             n_active += 1
             gather(model, state, t, tips[t])
             _mode(model, state, t)
+            _measure_extent(model, state, t)
     for t in range(n_tools):
-        if state.active[t]:
-            _near_column(model, state, t)
+        for s in range(n_tools):
+            if state.active[t] and state.active[s]:
+                _near_column(model, state, t, s)
     _assemble(model, state)
     if not _solve(state):
         for t in range(n_tools):
@@ -156,19 +156,6 @@ def contact_step(model, state, out, tips):  # type: ignore[no-untyped-def]
     status = contact_solve(model, state, out, tips)
     contact_deform(model, state, out)
     return status
-
-
-@njit(cache=True)
-def _forget_stencil(state):  # type: ignore[no-untyped-def]
-    n = state.n_local[0]
-    for q in range(n):
-        state.local[state.nodes[q]] = -1
-        state.mark[q] = -1
-    for t in range(state.engaged.shape[0]):
-        state.weight[t, :n] = 0.0
-        state.column[t, :n] = 0.0
-        state.n_own[t] = 0
-    state.n_local[0] = 0
 
 
 @njit(cache=True)
@@ -220,9 +207,8 @@ def _mode(model, state, t):  # type: ignore[no-untyped-def]
     """Y^T f: how a unit normal force of tip t drives the modes."""
     mode, n = state.mode[t], state.normal[t]
     mode[:] = np.float32(0.0)
-    for i in range(state.n_own[t]):
-        q = state.own[t, i]
-        w, load = state.weight[t, q, 0], model.load[state.nodes[q]]
+    for i in range(state.n_nodes[t]):
+        w, load = state.weight[t, i, 0], model.load[state.nodes[t, i]]
         w0, w1, w2 = np.float32(w * n[0]), np.float32(w * n[1]), np.float32(w * n[2])
         for k in range(mode.shape[0]):
             mode[k] += w0 * load[0, k] + w1 * load[1, k] + w2 * load[2, k]
@@ -233,9 +219,8 @@ def _mode_slope(model, state, t):  # type: ignore[no-untyped-def]
     """d(Y^T f)/dp with df/dp_d = dw/dp_d n + w dn/dp_d."""
     slope, n, turning = state.mode_slope[t], state.normal[t], state.turning[t]
     slope[:] = np.float32(0.0)
-    for i in range(state.n_own[t]):
-        q = state.own[t, i]
-        weight, load = state.weight[t, q], model.load[state.nodes[q]]
+    for i in range(state.n_nodes[t]):
+        weight, load = state.weight[t, i], model.load[state.nodes[t, i]]
         for d in range(3):
             f0 = np.float32(weight[1 + d] * n[0] + weight[0] * turning[0, d])
             f1 = np.float32(weight[1 + d] * n[1] + weight[0] * turning[1, d])
@@ -245,20 +230,36 @@ def _mode_slope(model, state, t):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True)
-def _near_column(model, state, t):  # type: ignore[no-untyped-def]
-    """Near displacement of the joint stencil under a unit normal force of tip t."""
-    n, column, position = state.normal[t], state.column[t], model.position
-    reach = model.contact_reach[0] ** 2
-    for i in range(state.n_own[t]):
-        p = state.own[t, i]
-        w, j = state.weight[t, p, 0], state.nodes[p]
+def _measure_extent(model, state, t):  # type: ignore[no-untyped-def]
+    farthest = 0.0
+    for i in range(state.n_nodes[t]):
+        j, squared = state.nodes[t, i], 0.0
+        for d in range(3):
+            squared += (model.position[j, d] - state.point[t, d]) ** 2
+        farthest = max(farthest, squared)
+    state.extent[t] = np.sqrt(farthest)
+
+
+@njit(cache=True, fastmath=True)
+def _near_column(model, state, t, s):  # type: ignore[no-untyped-def]
+    """Near displacement at the nodes of tip s under a unit normal force of tip t."""
+    reach, apart = model.contact_reach[0], 0.0
+    for d in range(3):
+        apart += (state.point[s, d] - state.point[t, d]) ** 2
+    state.near[t, s] = np.sqrt(apart) < reach + state.extent[t] + state.extent[s]
+    if not state.near[t, s]:
+        return
+    n, column, position = state.normal[t], state.column[t, s], model.position
+    column[: state.n_nodes[s]] = 0.0
+    for i in range(state.n_nodes[t]):
+        w, j = state.weight[t, i, 0], state.nodes[t, i]
         w0, w1, w2 = np.float32(w * n[0]), np.float32(w * n[1]), np.float32(w * n[2])
-        for q in range(state.n_local[0]):
-            m = state.nodes[q]
+        for q in range(state.n_nodes[s]):
+            m = state.nodes[s, q]
             distance = (position[j, 0] - position[m, 0]) ** 2
             distance += (position[j, 1] - position[m, 1]) ** 2
             distance += (position[j, 2] - position[m, 2]) ** 2
-            if distance > reach:
+            if distance > reach * reach:
                 continue
             e = find_block(model.contact_start, model.contact_slot, j, m)
             if e >= 0:
@@ -275,19 +276,9 @@ def _assemble(model, state):  # type: ignore[no-untyped-def]
         if not state.active[t]:
             state.force[t] = 0.0
             continue
-        n = state.normal[t]
-        for s in range(n_tools):
-            if not state.active[s]:
-                continue
-            far = np.float32(0.0)
-            for k in range(state.mode.shape[1]):
-                far += state.mode[t, k] * state.mode[s, k]
-            near = 0.0
-            for i in range(state.n_own[t]):
-                q = state.own[t, i]
-                u = state.column[s, q]
-                near += state.weight[t, q, 0] * (n[0] * u[0] + n[1] * u[1] + n[2] * u[2])
-            state.gram[t, s] = far + near
+        for s in range(t + 1):
+            if state.active[s]:
+                state.gram[t, s] = state.gram[s, t] = _gram(state, t, s)
         state.scale[t] = np.sqrt(state.self_compliance[t] / state.gram[t, t])
     for t in range(n_tools):
         for s in range(n_tools):
@@ -295,6 +286,19 @@ def _assemble(model, state):  # type: ignore[no-untyped-def]
                 state.compliance[t, s] = state.scale[t] * state.scale[s] * state.gram[t, s]
         if state.active[t]:
             state.compliance[t, t] += model.softness[0] * (1.0 / state.access[t] - 1.0)
+
+
+@njit(cache=True, fastmath=True)
+def _gram(state, t, s):  # type: ignore[no-untyped-def]
+    """f_t . C f_s."""
+    n, far, near = state.normal[t], np.float32(0.0), 0.0
+    for k in range(state.mode.shape[1]):
+        far += state.mode[t, k] * state.mode[s, k]
+    if state.near[s, t]:
+        for i in range(state.n_nodes[t]):
+            u = state.column[s, t, i]
+            near += state.weight[t, i, 0] * (n[0] * u[0] + n[1] * u[1] + n[2] * u[2])
+    return far + near
 
 
 @njit(cache=True)
@@ -377,11 +381,11 @@ def _gram_slope(state, t, s):  # type: ignore[no-untyped-def]
         for k in range(state.mode.shape[1]):
             far += state.mode_slope[t, d, k] * state.mode[s, k]
         near = 0.0
-        for i in range(state.n_own[t]):
-            q = state.own[t, i]
-            w, dw = state.weight[t, q, 0], state.weight[t, q, 1 + d]
-            for c in range(3):
-                near += (dw * n[c] + w * turning[c, d]) * state.column[s, q, c]
+        if state.near[s, t]:
+            for i in range(state.n_nodes[t]):
+                w, dw, u = state.weight[t, i, 0], state.weight[t, i, 1 + d], state.column[s, t, i]
+                for c in range(3):
+                    near += (dw * n[c] + w * turning[c, d]) * u[c]
         slope[d] = far + near
 
 
@@ -437,23 +441,26 @@ def _far_field(model, state):  # type: ignore[no-untyped-def]
 @njit(cache=True, fastmath=True)
 def _near_field(model, state):  # type: ignore[no-untyped-def]
     """The exact remainder around the load positions that carry the forces."""
-    u = state.field
-    for q in range(state.n_local[0]):
-        f0 = f1 = f2 = np.float32(0.0)
-        largest = 0.0
-        for t in range(state.engaged.shape[0]):
-            if state.force[t] > 0.0:
-                w = state.weight[t, q, 0]
-                largest = max(largest, abs(w))
-                f = -w * state.scale[t] * state.force[t]
-                f0 += np.float32(f * state.normal[t, 0])
-                f1 += np.float32(f * state.normal[t, 1])
-                f2 += np.float32(f * state.normal[t, 2])
-        if largest < LEAST_WEIGHT:
+    for t in range(state.engaged.shape[0]):
+        if state.force[t] <= 0.0:
             continue
-        j = state.nodes[q]
-        for e in range(model.near_start[j], model.near_start[j + 1]):
-            v = 3 * model.near_target[e]
-            block = model.near_block[e]
-            for d in range(3):
-                u[v + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2
+        kept = 0.0
+        for i in range(state.n_nodes[t]):
+            if abs(state.weight[t, i, 0]) >= LEAST_WEIGHT:
+                kept += state.weight[t, i, 0]
+        force = -state.force[t] * state.scale[t] / kept
+        for i in range(state.n_nodes[t]):
+            w = state.weight[t, i, 0]
+            if abs(w) >= LEAST_WEIGHT:
+                _add_row(model, state, state.nodes[t, i], w * force, state.normal[t])
+
+
+@njit(cache=True, fastmath=True)
+def _add_row(model, state, j, force, n):  # type: ignore[no-untyped-def]
+    u = state.field
+    f0, f1, f2 = np.float32(force * n[0]), np.float32(force * n[1]), np.float32(force * n[2])
+    for e in range(model.near_start[j], model.near_start[j + 1]):
+        v = 3 * model.near_target[e]
+        block = model.near_block[e]
+        for d in range(3):
+            u[v + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2

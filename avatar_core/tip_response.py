@@ -123,12 +123,10 @@ def _self_compliance(carrier, share, normal, load, start, target, block):  # typ
 
 @njit(cache=True)
 def gather(model, state, t, p):  # type: ignore[no-untyped-def]
-    """Weights of tip t at p and their gradient, over the joint stencil of all tips.
+    """Weights of tip t at p and their gradient.
 
-    Of ``state`` it extends ``local`` (number of a load position in the joint stencil, or -1),
-    ``nodes`` and ``n_local``, and fills ``weight[t]`` (w, dw/dx, dw/dy, dw/dz by local number),
-    ``own[t]`` and ``n_own[t]`` (the local numbers that t uses). ``mark`` tells which tip used a
-    number last.
+    Of ``state`` it fills ``nodes[t]``, the load positions that carry the tip, their number
+    ``n_nodes[t]`` and ``weight[t]``: w, dw/dx, dw/dy, dw/dz of each. ``local`` is scratch.
     """
     spacing = model.spacing[0]
     x = (p[0] - model.origin[0]) / spacing
@@ -137,8 +135,7 @@ def gather(model, state, t, p):  # type: ignore[no-untyped-def]
     nx, ny, nz = int(x + 0.5), int(y + 0.5), int(z + 0.5)
     wx, wy, wz = bspline(x - nx), bspline(y - ny), bspline(z - nz)
     dx, dy, dz = bspline_slope(x - nx), bspline_slope(y - ny), bspline_slope(z - nz)
-    weight, own = state.weight[t], state.own[t]
-    n_local, n_own = state.n_local[0], 0
+    nodes, weight, n = state.nodes[t], state.weight[t], 0
     for i in range(3):
         for j in range(3):
             for k in range(3):
@@ -156,20 +153,16 @@ def gather(model, state, t, p):  # type: ignore[no-untyped-def]
                     carrier = model.carrier[row, e]
                     q = state.local[carrier]
                     if q < 0:
-                        if n_local == state.nodes.shape[0]:
+                        if n == nodes.shape[0]:
                             continue
-                        q = n_local
-                        state.local[carrier], state.nodes[q] = q, carrier
-                        n_local += 1
-                    if state.mark[q] != t:
-                        if n_own == own.shape[0]:
-                            continue
-                        state.mark[q] = t
-                        own[n_own] = q
-                        n_own += 1
+                        q = n
+                        state.local[carrier], nodes[q] = q, carrier
+                        weight[q] = 0.0
+                        n += 1
                     weight[q, 0] += b * share
                     weight[q, 1] += b0 * share
                     weight[q, 2] += b1 * share
                     weight[q, 3] += b2 * share
-    state.n_local[0] = n_local
-    state.n_own[t] = n_own
+    for q in range(n):
+        state.local[nodes[q]] = -1
+    state.n_nodes[t] = n

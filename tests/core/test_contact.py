@@ -43,18 +43,24 @@ def test_no_force_without_contact(phantom_vademecum: Vademecum, model: ContactMo
 def test_force_equals_full_finite_elements(
     phantom_vademecum: Vademecum, model: ContactModel
 ) -> None:
-    """lambda = indentation / (n . C n) with C from a fresh solve, to the 3 % of the certificate."""
+    """lambda = indentation / (n . C n), C from fresh solves, as well as the certificate says."""
     from avatar_core.elasticity import Elasticity
     from avatar_core.loads import patch_loads, patch_normals
 
     v = phantom_vademecum
-    assert step(model, push(v, 3e-3)) == Status.OK
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
-    s = model.state.point
-    n = patch_normals(v.mesh, s, v.surface.patch_radius)[0]
-    load = patch_loads(problem, s, v.surface.patch_radius)
-    compliance = n @ (load.T @ problem.solve(load)) @ n
-    assert model.state.force[0] == pytest.approx(-model.state.gap[0] / compliance, rel=0.03)
+    errors = []
+    for j in np.random.default_rng(3).choice(inner_positions(v), 8, replace=False):
+        model.reset()
+        assert step(model, push(v, 3e-3, j)) == Status.OK
+        s = model.state.point
+        n = patch_normals(v.mesh, s, v.surface.patch_radius)[0]
+        load = patch_loads(problem, s, v.surface.patch_radius)
+        compliance = n @ (load.T @ problem.solve(load)) @ n
+        errors.append(abs(model.state.force[0] * compliance / -model.state.gap[0] - 1.0))
+    assert v.certificate is not None
+    assert np.mean(errors) < 2.0 * v.certificate.felt_mean
+    assert np.max(errors) < 1.5 * v.certificate.felt_worst
 
 
 def test_patch_does_not_penetrate(phantom_vademecum: Vademecum, model: ContactModel) -> None:
@@ -77,7 +83,7 @@ def test_action_is_reaction(phantom_vademecum: Vademecum, model: ContactModel) -
     # the tip's weights are blurred over 1.5 mm, which the vertex right below it notices most
     cloud = model.out.cloud[:, 3:].ravel()
     assert np.linalg.norm(cloud - field) < 0.01 * np.linalg.norm(field)
-    np.testing.assert_allclose(cloud, field, atol=0.05 * np.abs(field).max())
+    np.testing.assert_allclose(cloud, field, atol=0.08 * np.abs(field).max())
 
 
 def at_closest_point(v: Vademecum, model: ContactModel) -> tuple[np.ndarray, np.ndarray]:
