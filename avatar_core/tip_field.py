@@ -7,8 +7,8 @@ never jumps.
 
 A tip presses through a patch of radius R, so that shape much finer than R is not felt, and the
 corners of a coarse mesh should not be: phi is smoothed with the kernel 2 G - G * G, G a Gaussian
-of standard deviation R/3, which keeps planes and curved sides where they are (its error is of
-fourth order) and rounds edges over about R/3.
+of standard deviation 0.4 R, which keeps planes and curved sides where they are (its error is of
+fourth order) and rounds edges over about that.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from avatar_core.mesh import Regions, TetMesh
 SPACING = 3e-3  # [m]
 MARGIN = 30e-3  # [m] around the accessible surface
 FAR = 10.0  # [m] value outside the grid
-SMOOTHING = 1 / 3  # standard deviation, in patch radii
+SMOOTHING = 0.4  # standard deviation, in patch radii
 FADING = 0.5  # distance beyond the accessible surface over which access fades, in patch radii
 
 # distance, access (nx, ny, nz) float32; origin (3,) [m]; spacing (1,) [m]
@@ -61,17 +61,29 @@ def make_tip_field(mesh: TetMesh, regions: Regions, patch_radius: float) -> TipF
     beyond = np.clip(_closest(mesh, open_faces, closest)[0] / fade, 0.0, 1.0)
     access = 1.0 - beyond**2 * (3.0 - 2.0 * beyond)
     return TipField(
-        _smoothed(distance.reshape(shape), SMOOTHING * patch_radius / SPACING).astype(np.float32),
+        smoothed(distance.reshape(shape), SMOOTHING * patch_radius / SPACING).astype(np.float32),
         access.reshape(shape).astype(np.float32),
         origin,
         np.array([SPACING]),
     )
 
 
-def _smoothed(values: np.ndarray, deviation: float) -> np.ndarray:
-    """2 G f - G G f on a grid, G a Gaussian of some standard deviation [grid spacings]."""
-    once = gaussian_filter(values, deviation, mode="nearest")
-    return 2.0 * once - gaussian_filter(once, deviation, mode="nearest")
+def smoothed(values: np.ndarray, deviation: float, known: np.ndarray | None = None) -> np.ndarray:
+    """2 G f - G G f on a grid, G a Gaussian of some standard deviation [grid spacings].
+
+    Where not all grid points are ``known``, their mean stands in for the others.
+    """
+    if known is None:
+        once = gaussian_filter(values, deviation, mode="nearest")
+        return 2.0 * once - gaussian_filter(once, deviation, mode="nearest")
+    mean = values[known].mean()
+    share = np.maximum(gaussian_filter(known.astype(float), deviation), 1e-6)
+
+    def average(f: np.ndarray) -> np.ndarray:
+        return gaussian_filter(np.where(known, f, 0.0), deviation) / share
+
+    once = average(values - mean)
+    return mean + np.where(known, 2.0 * once - average(once), 0.0)
 
 
 def _closest(mesh: TetMesh, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

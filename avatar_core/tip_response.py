@@ -6,10 +6,11 @@ folds would be felt as jumps. What a moving tip needs is therefore sampled on th
 field and evaluated by the same B-splines B_q(p), twice differentiable almost everywhere:
 
     w_j(p)   = sum_q B_q(p) w_j(s(x_q))         share of load position j, sum_j w_j = 1
-    gamma(p) = sum_q B_q(p) n_s . C(s, s) n_s   at s = s(x_q)
+    gamma(p) = sum_q B_q(p) [K gamma_0](x_q)    gamma_0 = n_s . C(s, s) n_s at s = s(x_q)
 
-with n_s the normal of the patch. gamma is the compliance that one tip feels; between tips t and
-t', whose normals are n = grad phi / |grad phi|, it is
+with n_s the normal of the patch and K the kernel of the tip field, over a fifth of the patch
+radius. gamma is the compliance that one tip feels; between tips t and t', whose normals are
+n = grad phi / |grad phi|, it is
 
     C_tt' = a_t a_t' f_t . C f_t',    f_t = w(p_t) n(p_t),    a_t^2 = gamma(p_t) / (f_t . C f_t),
 
@@ -26,8 +27,9 @@ from numba import njit
 
 from avatar_core.loads import LoadSurface
 from avatar_core.near_field import LocalBlocks
-from avatar_core.tip_field import TipField, bspline, bspline_slope
+from avatar_core.tip_field import TipField, bspline, bspline_slope, smoothed
 
+SMOOTHING = 0.2  # standard deviation of K, in patch radii
 MAX_STENCIL = 128  # load positions that carry one tip, at most
 
 # row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
@@ -61,12 +63,16 @@ def make_tip_response(
     carrier, share = closest_weights(surface, points)
     normal = np.einsum("qi,qid->qd", share, surface.normals[carrier])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    felt = _self_compliance(carrier, share, normal, load, near.start, near.target, near.block)
-    compliance = np.full(shell.shape, felt.mean(), np.float32)
-    compliance[shell] = felt
+    compliance = np.zeros(shell.shape)
+    compliance[shell] = _self_compliance(
+        carrier, share, normal, load, near.start, near.target, near.block
+    )
+    compliance = smoothed(compliance, SMOOTHING * surface.patch_radius / spacing, shell)
     row = np.full(shell.shape, -1, np.int32)
     row[shell] = np.arange(len(points), dtype=np.int32)
-    return TipResponse(row, carrier.astype(np.int32), share.astype(np.float32), compliance)
+    return TipResponse(
+        row, carrier.astype(np.int32), share.astype(np.float32), compliance.astype(np.float32)
+    )
 
 
 def closest_weights(surface: LoadSurface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

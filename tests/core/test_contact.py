@@ -164,7 +164,7 @@ def closed_path_work(v: Vademecum, model: ContactModel, n_paths: int, seed: int)
         start = corners[0] + n * 15e-3
         path = np.concatenate(
             [
-                np.linspace(a, b, 150, endpoint=False)
+                np.linspace(a, b, 400, endpoint=False)
                 for a, b in zip([start, *corners], [*corners, start], strict=True)
             ]
             + [start[None]]
