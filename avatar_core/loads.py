@@ -29,6 +29,7 @@ from avatar_core.errors import MeshError
 from avatar_core.mesh import Regions, TetMesh
 
 LEAST_PATCH_RADIUS = 12e-3  # [m]
+LEAST_OPENNESS = 0.2  # length of the mean unit normal within R, below which a face carries no load
 MIDPOINTS_FROM = 0.6  # mean edge, in patch radii, from which edges get a midpoint
 
 
@@ -128,7 +129,7 @@ def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = N
             f"a patch of radius {patch_radius:g} m cannot be resolved by surface edges of "
             f"{mesh.mean_surface_edge:.2g} m; refine the mesh or take a radius above 12 mm"
         )
-    faces = mesh.boundary_faces[regions.accessible]
+    faces = _open_faces(mesh, mesh.boundary_faces[regions.accessible], patch_radius)
     vertices, corner = np.unique(faces, return_inverse=True)
     corner = corner.reshape(-1, 3)
     a, b = np.unique(np.sort(corner[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0).T
@@ -143,6 +144,17 @@ def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = N
         vertices=vertices,
         patch_radius=float(patch_radius),
     )
+
+
+def _open_faces(mesh: TetMesh, faces: np.ndarray, radius: float) -> np.ndarray:
+    """The faces where a patch has room: not the walls of fissures and flaps much thinner than R.
+
+    There the surface looks every way within R, so that no patch has a normal.
+    """
+    points = _surface_points(mesh, radius)
+    around = _bump(points, mesh.vertices[faces].mean(axis=1), radius)
+    mean = (around @ points.normals) / np.asarray(around.sum(axis=1)).reshape(-1, 1)
+    return faces[np.linalg.norm(mean, axis=1) > LEAST_OPENNESS]
 
 
 def patch_normals(mesh: TetMesh, centers: np.ndarray, radius: float) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from avatar_core.elasticity import Elasticity
 from avatar_core.errors import MeshError
 from avatar_core.loads import load_surface, patch_loads, patch_normals
-from avatar_core.mesh import Regions, TetMesh, regions_by_rule
+from avatar_core.mesh import Regions, TetMesh, make_mesh, regions_by_rule
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 
@@ -110,3 +110,19 @@ def test_patch_normals_turn_smoothly_over_an_edge(box: Box) -> None:
     np.testing.assert_allclose(normals[80], [0.5**0.5, 0.5**0.5, 0.0], atol=1e-2)
     turn = np.degrees(np.arccos(np.clip((normals[1:] * normals[:-1]).sum(axis=1), -1, 1)))
     assert turn.max() < 3.0  # 0.5 mm steps over a patch of 30 mm
+
+
+def test_walls_of_a_narrow_fissure_carry_no_load(box: Box) -> None:
+    """A slot 5 mm wide in a box: a patch of 30 mm has no room on its walls, and has beside it."""
+    mesh, _ = box(20)
+    center = mesh.vertices[mesh.tets].mean(axis=1)
+    slot = (abs(center[:, 0] - 0.0525) < 2.5e-3) & (center[:, 1] > 0.02)
+    slotted = make_mesh(mesh.vertices, mesh.tets[~slot])
+    faces = slotted.boundary_faces
+    middle = slotted.vertices[faces].mean(axis=1)
+    everywhere = Regions((middle[:, 1] < 1e-9), (middle[:, 1] > 1e-9))
+    surface = load_surface(slotted, everywhere, 0.03)
+    inside = (abs(surface.centroids[:, 0] - 0.0525) < 4e-3) & (surface.centroids[:, 1] < 0.07)
+    inside &= (surface.centroids[:, 1] > 0.04) & (abs(surface.centroids[:, 2] - 0.05) < 0.02)
+    assert not inside.any()
+    assert (surface.centroids[:, 1] > 0.0999).sum() > 100
