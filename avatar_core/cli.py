@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
+from avatar_core.cli_atlas import atlas
 from avatar_core.errors import AvatarError
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ app = typer.Typer(
 )
 bench = typer.Typer(help="Does this machine hold 1 kHz?", no_args_is_help=True)
 app.add_typer(bench, name="bench")
+app.add_typer(atlas, name="atlas")
 
 Surface = Annotated[
     str,
