@@ -15,8 +15,6 @@ Layout (schema 1.0), attributes at the root: ``format`` = "avatar atlas", ``sche
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -29,6 +27,7 @@ from avatar_core.atlas import Atlas
 from avatar_core.atlas_anatomy import Anatomy, Response
 from avatar_core.elasticity import Material
 from avatar_core.errors import AvatarError, StorageError
+from avatar_core.hdf5 import checksum, reason, replace_file, within
 from avatar_core.level_set import GridBox
 from avatar_core.lle import Gram
 from avatar_core.mesh import MeshQuality, Regions, TetMesh
@@ -38,7 +37,6 @@ from avatar_core.registration import (
     SimilarityTransform,
     Template,
 )
-from avatar_core.storage import _checksum, _encoded, _reason, _within
 from avatar_core.surface import SurfaceMesh
 
 ATLAS_SCHEMA = "1.0"
@@ -70,7 +68,7 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
         group = f"anatomies/{number:06d}"
         arrays |= {f"{group}/{key}": value for key, value in _anatomy_arrays(anatomy).items()}
     about = {"template": template.name, "box": asdict(atlas.box), "rule": asdict(atlas.rule)}
-    _replace(Path(path), arrays, _attributes(ATLAS_FORMAT, about))
+    replace_file(Path(path), arrays, _attributes(ATLAS_FORMAT, about))
 
 
 def load_atlas(path: str | Path) -> Atlas:
@@ -89,7 +87,7 @@ def load_atlas(path: str | Path) -> Atlas:
 
 def save_anatomy(anatomy: Anatomy, path: Path) -> None:
     """Write one anatomy on its own, complete or not at all; StorageError if it cannot be."""
-    _replace(path, _anatomy_arrays(anatomy), _attributes(ANATOMY_FORMAT, {}))
+    replace_file(path, _anatomy_arrays(anatomy), _attributes(ANATOMY_FORMAT, {}))
 
 
 def load_anatomy(path: Path) -> Anatomy:
@@ -194,7 +192,7 @@ def _template(arrays: Arrays, name: str) -> Template:
     _require_finite({"gram": arrays["gram/products"], **part})
     mesh = TetMesh(part["vertices"], part["tets"])
     fits = part["vertices"].shape[1:] == (3,) and part["tets"].shape[1:] == (4,)
-    fits = fits and _within(part["tets"], len(part["vertices"]))
+    fits = fits and within(part["tets"], len(part["vertices"]))
     n_faces = len(mesh.boundary_faces) if fits else 0
     if not fits or not part["clamped"].shape == part["accessible"].shape == (n_faces,):
         raise StorageError("the template's arrays do not fit together; build the atlas again")
@@ -220,29 +218,6 @@ def _require_finite(arrays: Arrays) -> None:
 # --- files ------------------------------------------------------------------------------------
 
 
-def _replace(path: Path, arrays: Arrays, attributes: dict[str, str]) -> None:
-    """Put the encoded file in the place of the old one, in one step."""
-    if not path.parent.is_dir():
-        raise StorageError(f"folder {path.parent} does not exist; create it first")
-    content = _encoded(arrays, attributes)
-    try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise StorageError(
-            f"cannot write {path} ({_reason(error)}); free disk space or choose another folder"
-        ) from error
-
-
 def _read(path: Path, kind: str, assemble: Any) -> Any:
     """What `assemble` makes of the arrays and the JSON, once both are verified."""
     size = path.stat().st_size
@@ -253,14 +228,14 @@ def _read(path: Path, kind: str, assemble: Any) -> Any:
             attributes = _read_attributes(file, kind, path)
             arrays = _read_arrays(file, path, size)
             stated = str(file.attrs["checksum"])
-        if stated != _checksum(arrays, attributes):
+        if stated != checksum(arrays, attributes):
             raise StorageError(f"{path} was altered or damaged (checksum); build it again")
         return assemble(arrays, json.loads(attributes["about"]))
     except AvatarError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError) as error:
         raise StorageError(
-            f"{path} is no readable {kind.removeprefix('avatar ')} ({_reason(error)}); it may be "
+            f"{path} is no readable {kind.removeprefix('avatar ')} ({reason(error)}); it may be "
             "truncated: build or copy it again"
         ) from error
 

@@ -1,4 +1,4 @@
-"""Vademecums on disk: HDF5 with schema version and checksum. The only module that imports h5py.
+"""Vademecums on disk: HDF5 with schema version and checksum.
 
 Layout (schema 1.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
@@ -20,8 +20,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
-import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +30,7 @@ import numpy as np
 from avatar_core.certificate import Certificate
 from avatar_core.elasticity import Material
 from avatar_core.errors import AvatarError, StorageError
+from avatar_core.hdf5 import checksum, reason, replace_file, within
 from avatar_core.loads import LoadSurface
 from avatar_core.mesh import Regions, TetMesh
 from avatar_core.near_field import LocalBlocks
@@ -61,38 +60,7 @@ def save_vademecum(vademecum: Vademecum, path: str | Path) -> None:
     StorageError
         If the folder does not exist or the disk is full; nothing is left behind.
     """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise StorageError(f"folder {path.parent} does not exist; create it first")
-    content = _encoded(_arrays(vademecum), _attributes(vademecum))
-    try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise StorageError(
-            f"cannot write {path} ({_reason(error)}); free disk space or choose another folder"
-        ) from error
-
-
-def _encoded(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> memoryview:
-    """The HDF5 file in memory: on a full disk, HDF5 itself would crash."""
-    content = io.BytesIO()
-    with h5py.File(content, "w") as file:
-        for key, value in attributes.items():
-            file.attrs[key] = value
-        for key, array in arrays.items():
-            file.create_dataset(key, data=array)
-        file.attrs["checksum"] = _checksum(arrays, attributes)
-    return content.getbuffer()
+    replace_file(Path(path), _arrays(vademecum), _attributes(vademecum))
 
 
 def load_vademecum(path: str | Path) -> Vademecum:
@@ -131,14 +99,14 @@ def _read(source: Path | io.BytesIO, size: int, origin: str, identity: str) -> V
             attributes = _read_attributes(file, origin)
             arrays = _read_arrays(file, origin, size)
             stated = str(file.attrs["checksum"])
-        if stated != _checksum(arrays, attributes):
+        if stated != checksum(arrays, attributes):
             raise StorageError(f"{origin} was altered or damaged (checksum); build it again")
         vademecum = _assemble(arrays, attributes)
     except AvatarError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError) as error:
         raise StorageError(
-            f"{origin} is no readable vademecum ({_reason(error)}); it may be truncated: "
+            f"{origin} is no readable vademecum ({reason(error)}); it may be truncated: "
             "build or copy it again"
         ) from error
     return replace(vademecum, id=identity, nbytes=size)
@@ -233,17 +201,6 @@ def _attributes(v: Vademecum) -> dict[str, str]:
     }
 
 
-def _checksum(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
-    digest = hashlib.sha256()
-    for key in sorted(attributes):
-        digest.update(f"{key}={attributes[key]};".encode())
-    for key in sorted(arrays):
-        array = np.ascontiguousarray(arrays[key])
-        digest.update(f"{key}:{array.dtype.str}:{array.shape};".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
-
-
 def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vademecum:
     _check_shapes(arrays)
     material, provenance, convergence, certificate = (json.loads(attributes[k]) for k in _JSON)
@@ -311,18 +268,10 @@ def _check_shapes(a: dict[str, np.ndarray]) -> None:
             and bool((np.diff(start) >= 0).all())
             and start[-1] == len(index)
             and a[f"{name}/block"].shape == (len(index), 3, 3)
-            and _within(index, target)
+            and within(index, target)
         )
-    agree = agree and _within(a["mesh/tets"], n_vertices)
-    agree = agree and _within(a["surface/corners"], n_positions)
-    agree = agree and _within(a["surface/vertices"], n_vertices)
+    agree = agree and within(a["mesh/tets"], n_vertices)
+    agree = agree and within(a["surface/corners"], n_positions)
+    agree = agree and within(a["surface/vertices"], n_vertices)
     if not agree:
         raise StorageError("the arrays of the file do not fit together; build it again")
-
-
-def _within(index: np.ndarray, limit: int) -> bool:
-    return index.size == 0 or (int(index.min()) >= 0 and int(index.max()) < limit)
-
-
-def _reason(error: BaseException) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -528,14 +528,14 @@ def test_arrays_that_do_not_fit_are_refused(
     key: str,
     spoil: Callable[[np.ndarray], np.ndarray],
 ) -> None:
-    from avatar_core import atlas_storage
+    from avatar_core import hdf5
 
-    encoded = atlas_storage._encoded
+    encoded = hdf5.encoded
 
     def spoiled(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> memoryview:
         return encoded({**arrays, key: spoil(arrays[key])}, attributes)
 
-    monkeypatch.setattr(atlas_storage, "_encoded", spoiled)  # with a checksum that is right
+    monkeypatch.setattr(hdf5, "encoded", spoiled)  # with a checksum that is right
     save_atlas(atlas, tmp_path / "a.h5")
     with pytest.raises(AvatarError, match=r"again|atlas|surface"):
         load_atlas(tmp_path / "a.h5")
