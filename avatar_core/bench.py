@@ -14,11 +14,11 @@ import numpy as np
 from numba import njit
 
 from avatar_core import contact_kernels as kernels
+from avatar_core.cloud_kernels import write_cloud
 from avatar_core.contact import ContactModel, prepare, step
 from avatar_core.elasticity import Elasticity
 from avatar_core.loads import patch_loads
 from avatar_core.near_field import LocalBlocks
-from avatar_core.tip_response import gather
 from avatar_core.tool_path import inner_positions, middle_of_access, slide
 from avatar_core.vademecum import Vademecum
 
@@ -164,7 +164,6 @@ def _dense_step(model, state, out, tips, columns, compliance):  # type: ignore[n
         state.mode[t] = np.float32(0.0)
         if state.active[t]:
             n_active += 1
-            gather(model, state, t, tips[t])
     for t in range(n_tools):
         for s in range(n_tools):
             state.near[t, s] = True
@@ -182,10 +181,7 @@ def _dense_step(model, state, out, tips, columns, compliance):  # type: ignore[n
                 row, f = columns[state.nodes[t, i], c], np.float32(force * state.normal[t, c])
                 for k in range(u.shape[0]):
                     u[k] += f * row[k]
-    for v in range(out.cloud.shape[0]):
-        for d in range(3):
-            out.cloud[v, d] = model.rest[v, d] + u[3 * v + d]
-            out.cloud[v, 3 + d] = u[3 * v + d]
+    write_cloud(model.rest, u, out.cloud)
 
 
 @njit(cache=True, fastmath=True)

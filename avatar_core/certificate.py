@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.loads import patch_loads, patch_normals
-from avatar_core.tip_field import evaluate
+from avatar_core.splines import evaluate
 from avatar_core.tip_response import make_tip_response
 
 if TYPE_CHECKING:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from avatar_core import contact_kernels as kernels
+from avatar_core.cloud_kernels import BLOCK
 from avatar_core.contact_kernels import ModelArrays, Out, State
 from avatar_core.errors import ContactError
 from avatar_core.near_field import LocalBlocks, hash_rows
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 Cloud = Literal["surface", "volume", "off"]
 
+LANES = 32  # single numbers that a vectorised loop takes at once
 TIP_RADIUS_RANGE = (2e-3, 20e-3)  # [m]
 
 
@@ -47,11 +49,11 @@ class ContactModel:
     arrays : ModelArrays, constant
         distance, access, origin, spacing: the tip field; row, carrier, share,
         self_compliance: the tip response on its grid; position (n_positions, 3) [m];
-        load (n_positions, 3, rank) and the contact_* blocks, found by their hash tables:
+        load (n_positions, 3, rank and zeros) and the contact_* blocks, found by their hash tables:
         compliance [m/N]; softness (1,), added where access fades [m/N];
         space (n_blocks, rank, BLOCK) int16, modes of the displacement of the cloud, in parts of
-        space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 3) [m];
-        tip_radius (n_tools,) [m]
+        space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 6), the cloud without
+        displacement [m]; tip_radius (n_tools,) [m]
     state : State, forces kept for the next period, and scratch
     out : Out
         force, torque (n_tools, 3) [N, N m], of the organ on each tool about its tip (a
@@ -133,7 +135,7 @@ def model_arrays(
         *vademecum.tip_field,
         *response,
         position=np.ascontiguousarray(surface.centers),
-        load=np.ascontiguousarray(load),
+        load=_padded(load),
         contact_start=contact_start,
         contact_slot=contact_slot,
         contact_block=contact.block,
@@ -144,7 +146,7 @@ def model_arrays(
         near_start=near.start,
         near_target=near.target,
         near_block=near.block,
-        rest=mesh.vertices[points].astype(np.float32),
+        rest=np.pad(mesh.vertices[points], ((0, 0), (0, 3))).astype(np.float32),
         tip_radius=np.array(tip_radii, float),
     )
 
@@ -159,6 +161,7 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         active=np.zeros(n_tools, np.bool_),
         gap=np.zeros(n_tools),
         slope=np.zeros((n_tools, 3)),
+        steepness=np.ones(n_tools),
         normal=np.zeros((n_tools, 3)),
         turning=np.zeros((n_tools, 3, 3)),
         hessian=np.zeros((3, 3)),
@@ -172,7 +175,7 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         extent=np.zeros(n_tools),
         mode=np.zeros((n_tools, n_modes), single),
         mode_slope=np.zeros((n_tools, 3, n_modes), single),
-        column=np.zeros((n_tools, n_tools, MAX_STENCIL, 3)),
+        column=np.zeros((n_tools, n_tools, MAX_STENCIL, 3), single),
         near=np.zeros((n_tools, n_tools), np.bool_),
         self_compliance=np.ones(n_tools),
         self_slope=np.zeros((n_tools, 3)),
@@ -181,7 +184,7 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         compliance=np.zeros((n_tools, n_tools)),
         gram_slope=np.zeros(3),
         amplitude=np.zeros(n_modes, single),
-        field=np.zeros(arrays.space.shape[0] * kernels.BLOCK, single),
+        field=np.zeros(arrays.space.shape[0] * BLOCK, single),
     )
     out = Out(
         force=np.zeros((n_tools, 3)),
@@ -254,10 +257,10 @@ def warm_up(n_tools: int = 1) -> None:
             np.zeros((0, 3, 3), single),
             np.ones(1, double),
             np.ones(1, double),
-            np.zeros((1, rank, kernels.BLOCK), np.int16),
+            np.zeros((1, rank, BLOCK), np.int16),
             np.zeros(rank, single),
             *blocks,
-            np.zeros((points, 3), single),
+            np.zeros((points, 6), single),
             np.full(n_tools, 5e-3, double),
         )
     )
@@ -275,6 +278,11 @@ def _reach(near: LocalBlocks, centers: np.ndarray) -> float:
     return float(distance.max(initial=0.0)) * (1.0 + 1e-9)
 
 
+def _padded(load: np.ndarray) -> np.ndarray:
+    """Zeros up to a multiple of the modes that a compiled loop takes at once."""
+    return np.pad(load, ((0, 0), (0, 0), (0, -load.shape[2] % LANES)))
+
+
 def _in_blocks(space: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Modes (n_points, 3, rank) as int16 (n_blocks, rank, BLOCK), and what one step is worth.
 
@@ -283,10 +291,10 @@ def _in_blocks(space: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     flat = space.reshape(-1, space.shape[2])
     scale = (np.abs(flat).max(axis=0, initial=1e-30) / 32767.0).astype(np.float32)
-    n_blocks = -(-len(flat) // kernels.BLOCK)
-    padded = np.zeros((n_blocks * kernels.BLOCK, len(scale)), np.int16)
+    n_blocks = -(-len(flat) // BLOCK)
+    padded = np.zeros((n_blocks * BLOCK, len(scale)), np.int16)
     padded[: len(flat)] = np.rint(flat / scale)
-    blocks = padded.reshape(n_blocks, kernels.BLOCK, len(scale)).transpose(0, 2, 1)
+    blocks = padded.reshape(n_blocks, BLOCK, len(scale)).transpose(0, 2, 1)
     return np.ascontiguousarray(blocks), scale
 
 

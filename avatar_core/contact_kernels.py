@@ -23,13 +23,13 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
+from avatar_core.cloud_kernels import contact_deform
 from avatar_core.near_field import find_block
-from avatar_core.tip_field import FAR, evaluate, second_derivatives
+from avatar_core.splines import cell_at, in_cell, on_grid, second_derivatives
 from avatar_core.tip_response import gather
 
 MAX_TOOLS = 8
 MAX_SWEEPS = 1000
-BLOCK = 256  # displacements that are summed together while they lie in the fastest cache
 
 OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
 UNKNOWN_FRAME = 8
@@ -39,7 +39,6 @@ ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not come in through the 
 MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
 MIN_ACCESS = 1e-2  # below, the tip is off the accessible surface
 FULL_ACCESS = 0.99  # below, the force fades
-LEAST_WEIGHT = 0.01  # load positions that carry less leave their near field to the others
 
 # What the step reads; `prepare` fills it once. Shapes in avatar_core.contact.ContactModel.
 ModelArrays = namedtuple(
@@ -79,6 +78,7 @@ State = namedtuple(
         "active",  # (T,) the tip is closer than its radius, where it may touch
         "gap",  # (T,) phi - r
         "slope",  # (T, 3) grad phi
+        "steepness",  # (T,) |grad phi|
         "normal",  # (T, 3) n
         "turning",  # (T, 3, 3) dn_i / dp_d
         "hessian",  # (3, 3) of phi
@@ -133,13 +133,12 @@ def contact_solve(model, state, out, tips):  # type: ignore[no-untyped-def]
         status = max(status, out.status[t])
         if state.active[t]:
             n_active += 1
-            gather(model, state, t, tips[t])
             _mode(model, state, t)
             _measure_extent(model, state, t)
     for t in range(n_tools):
-        for s in range(n_tools):
+        for s in range(t + 1):
             if state.active[t] and state.active[s]:
-                _near_column(model, state, t, s)
+                _near_columns(model, state, t, s)
     _assemble(model, state)
     if not _solve(state):
         for t in range(n_tools):
@@ -158,51 +157,58 @@ def contact_step(model, state, out, tips):  # type: ignore[no-untyped-def]
     return status
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _locate(model, state, t, tip):  # type: ignore[no-untyped-def]
-    """Gap, normal, access, compliance and surface point of a tip; whether it may touch."""
+    """Gap, normal, access, compliance, surface point and load positions of a tip, if it touches."""
     state.active[t] = False
     state.access[t] = 1.0
     engaged = state.engaged[t]
     state.engaged[t] = False
     if not np.isfinite(tip[0] + tip[1] + tip[2]):
         return INVALID_POSE
-    grid, h = model.origin, model.spacing[0]
-    phi = evaluate(model.distance, grid, h, tip, state.slope[t], FAR)
+    if not on_grid(model.distance.shape, model.origin, model.spacing[0], tip):
+        return OK
+    cell = cell_at(model.origin, model.spacing[0], tip)
+    phi = in_cell(model.distance, cell, state.slope[t])
     state.gap[t] = phi - model.tip_radius[t]
     if state.gap[t] >= 0.0:
         return OK
-    access = evaluate(model.access, grid, h, tip, state.access_slope[t], 0.0)
+    access = in_cell(model.access, cell, state.access_slope[t])
     state.access[t] = min(access, 1.0)
     entered = engaged or phi > -ENTRY_DEPTH
     if not entered or phi < -MAX_DEPTH or access < MIN_ACCESS:
         return OUT_OF_RANGE
     state.engaged[t] = True
     state.active[t] = True
-    _direct(model, state, t, tip, phi)
-    state.self_compliance[t] = evaluate(
-        model.self_compliance, grid, h, tip, state.self_slope[t], 1.0
-    )
+    _direct(state, t, tip, phi)
+    state.self_compliance[t] = in_cell(model.self_compliance, cell, state.self_slope[t])
+    gather(model, state, t, cell)
     return OK if access >= FULL_ACCESS else OUT_OF_RANGE
 
 
-@njit(cache=True)
-def _direct(model, state, t, p, phi):  # type: ignore[no-untyped-def]
-    """n = g / |g| with g = grad phi, dn/dp = (I - n n^T) grad g / |g|, and s = p - phi n."""
-    n, hessian = state.normal[t], state.hessian
+@njit(cache=True, forceinline=True)
+def _direct(state, t, p, phi):  # type: ignore[no-untyped-def]
+    """n = g / |g| with g = grad phi, and s = p - phi n."""
     g = state.slope[t]
-    scale = 1.0 / max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
+    state.steepness[t] = max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
     for d in range(3):
-        n[d] = g[d] * scale
-        state.point[t, d] = p[d] - phi * n[d]
-    second_derivatives(model.distance, model.origin, model.spacing[0], p, hessian)
+        state.normal[t, d] = g[d] / state.steepness[t]
+        state.point[t, d] = p[d] - phi * state.normal[t, d]
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def _turn(model, state, t, p):  # type: ignore[no-untyped-def]
+    """dn/dp = (I - n n^T) grad g / |g|."""
+    n, hessian = state.normal[t], state.hessian
+    cell = cell_at(model.origin, model.spacing[0], p)
+    second_derivatives(model.distance, cell, model.spacing[0], hessian)
     for d in range(3):
         along = n[0] * hessian[0, d] + n[1] * hessian[1, d] + n[2] * hessian[2, d]
         for i in range(3):
-            state.turning[t, i, d] = (hessian[i, d] - n[i] * along) * scale
+            state.turning[t, i, d] = (hessian[i, d] - n[i] * along) / state.steepness[t]
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, forceinline=True)
 def _mode(model, state, t):  # type: ignore[no-untyped-def]
     """Y^T f: how a unit normal force of tip t drives the modes."""
     mode, n = state.mode[t], state.normal[t]
@@ -214,7 +220,7 @@ def _mode(model, state, t):  # type: ignore[no-untyped-def]
             mode[k] += w0 * load[0, k] + w1 * load[1, k] + w2 * load[2, k]
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, forceinline=True)
 def _mode_slope(model, state, t):  # type: ignore[no-untyped-def]
     """d(Y^T f)/dp with df/dp_d = dw/dp_d n + w dn/dp_d."""
     slope, n, turning = state.mode_slope[t], state.normal[t], state.turning[t]
@@ -229,7 +235,7 @@ def _mode_slope(model, state, t):  # type: ignore[no-untyped-def]
                 slope[d, k] += f0 * load[0, k] + f1 * load[1, k] + f2 * load[2, k]
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, forceinline=True)
 def _measure_extent(model, state, t):  # type: ignore[no-untyped-def]
     farthest = 0.0
     for i in range(state.n_nodes[t]):
@@ -240,35 +246,46 @@ def _measure_extent(model, state, t):  # type: ignore[no-untyped-def]
     state.extent[t] = np.sqrt(farthest)
 
 
-@njit(cache=True, fastmath=True)
-def _near_column(model, state, t, s):  # type: ignore[no-untyped-def]
-    """Near displacement at the nodes of tip s under a unit normal force of tip t."""
+@njit(cache=True, fastmath=True, forceinline=True)
+def _near_columns(model, state, t, s):  # type: ignore[no-untyped-def]
+    """Near displacement at the nodes of tip s under a unit normal force of tip t, and back.
+
+    By Maxwell and Betti the block from m to j is that from j to m transposed: each is read once.
+    """
     reach, apart = model.contact_reach[0], 0.0
     for d in range(3):
         apart += (state.point[s, d] - state.point[t, d]) ** 2
-    state.near[t, s] = np.sqrt(apart) < reach + state.extent[t] + state.extent[s]
-    if not state.near[t, s]:
+    near = np.sqrt(apart) < reach + state.extent[t] + state.extent[s]
+    state.near[t, s] = state.near[s, t] = near
+    if not near:
         return
-    n, column, position = state.normal[t], state.column[t, s], model.position
-    column[: state.n_nodes[s]] = 0.0
+    there, back = state.column[t, s], state.column[s, t]
+    there[: state.n_nodes[s]] = np.float32(0.0)
+    back[: state.n_nodes[t]] = np.float32(0.0)
+    n, m, zero = state.normal[t], state.normal[s], np.float32(0.0)
     for i in range(state.n_nodes[t]):
-        w, j = state.weight[t, i, 0], state.nodes[t, i]
+        j, w = state.nodes[t, i], state.weight[t, i, 0]
         w0, w1, w2 = np.float32(w * n[0]), np.float32(w * n[1]), np.float32(w * n[2])
-        for q in range(state.n_nodes[s]):
-            m = state.nodes[s, q]
-            distance = (position[j, 0] - position[m, 0]) ** 2
-            distance += (position[j, 1] - position[m, 1]) ** 2
-            distance += (position[j, 2] - position[m, 2]) ** 2
-            if distance > reach * reach:
+        u0 = u1 = u2 = zero
+        for q in range(i + 1 if s == t else state.n_nodes[s]):
+            e = find_block(model.contact_start, model.contact_slot, j, state.nodes[s, q])
+            if e < 0:
                 continue
-            e = find_block(model.contact_start, model.contact_slot, j, m)
-            if e >= 0:
-                block = model.contact_block[e]
-                for d in range(3):
-                    column[q, d] += block[d, 0] * w0 + block[d, 1] * w1 + block[d, 2] * w2
+            b = model.contact_block[e]
+            there[q, 0] += b[0, 0] * w0 + b[0, 1] * w1 + b[0, 2] * w2
+            there[q, 1] += b[1, 0] * w0 + b[1, 1] * w1 + b[1, 2] * w2
+            there[q, 2] += b[2, 0] * w0 + b[2, 1] * w1 + b[2, 2] * w2
+            w = state.weight[s, q, 0] if s != t or q != i else 0.0
+            v0, v1, v2 = np.float32(w * m[0]), np.float32(w * m[1]), np.float32(w * m[2])
+            u0 += b[0, 0] * v0 + b[1, 0] * v1 + b[2, 0] * v2
+            u1 += b[0, 1] * v0 + b[1, 1] * v1 + b[2, 1] * v2
+            u2 += b[0, 2] * v0 + b[1, 2] * v1 + b[2, 2] * v2
+        back[i, 0] += u0
+        back[i, 1] += u1
+        back[i, 2] += u2
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, forceinline=True)
 def _assemble(model, state):  # type: ignore[no-untyped-def]
     """Compliance between the tips; softer where access fades."""
     n_tools = state.engaged.shape[0]
@@ -288,7 +305,7 @@ def _assemble(model, state):  # type: ignore[no-untyped-def]
             state.compliance[t, t] += model.softness[0] * (1.0 / state.access[t] - 1.0)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, forceinline=True)
 def _gram(state, t, s):  # type: ignore[no-untyped-def]
     """f_t . C f_s."""
     n, far, near = state.normal[t], np.float32(0.0), 0.0
@@ -301,7 +318,7 @@ def _gram(state, t, s):  # type: ignore[no-untyped-def]
     return far + near
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _solve(state):  # type: ignore[no-untyped-def]
     """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda >= 0, from the last forces."""
     n_tools = state.engaged.shape[0]
@@ -322,7 +339,7 @@ def _solve(state):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, forceinline=True)
 def _write_forces(model, state, out, tips, several):  # type: ignore[no-untyped-def]
     """Forces on the tools and the contacts that make them."""
     n = 0
@@ -338,6 +355,7 @@ def _write_forces(model, state, out, tips, several):  # type: ignore[no-untyped-
                 fading = -model.softness[0] / (chi * chi) * state.access_slope[t, d]
                 out.force[t, d] += 0.5 * force * force * fading
         if several:
+            _turn(model, state, t, tips[t])
             _add_coupling(model, state, out, t)
         gap = state.gap[t] - model.softness[0] * (1.0 / chi - 1.0) * force
         for s in range(state.engaged.shape[0]):
@@ -353,7 +371,7 @@ def _write_forces(model, state, out, tips, several):  # type: ignore[no-untyped-
     out.n_contacts[0] = n
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, forceinline=True)
 def _add_coupling(model, state, out, t):  # type: ignore[no-untyped-def]
     """lambda_t sum_t' lambda_t' dC_tt'/dp_t, with C_tt' = a_t a_t' f_t . C f_t'."""
     _mode_slope(model, state, t)
@@ -372,7 +390,7 @@ def _add_coupling(model, state, out, t):  # type: ignore[no-untyped-def]
         out.force[t, 2] += product * (state.compliance[t, s] * change2 + scale * slope[2])
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, forceinline=True)
 def _gram_slope(state, t, s):  # type: ignore[no-untyped-def]
     """(df_t/dp_t) . C f_s."""
     n, turning, slope = state.normal[t], state.turning[t], state.gram_slope
@@ -387,80 +405,3 @@ def _gram_slope(state, t, s):  # type: ignore[no-untyped-def]
                 for c in range(3):
                     near += (dw * n[c] + w * turning[c, d]) * u[c]
         slope[d] = far + near
-
-
-@njit(cache=True, fastmath=True)
-def contact_deform(model, state, out):  # type: ignore[no-untyped-def]
-    """Second half of a period: the cloud, far field by modes and near field by blocks."""
-    cloud, field = out.cloud, state.field
-    if out.n_contacts[0] == 0:
-        field[:] = np.float32(0.0)
-    else:
-        _amplitudes(state)
-        _far_field(model, state)
-        _near_field(model, state)
-    for v in range(cloud.shape[0]):
-        for d in range(3):
-            cloud[v, d] = model.rest[v, d] + field[3 * v + d]
-            cloud[v, 3 + d] = field[3 * v + d]
-
-
-@njit(cache=True, fastmath=True)
-def _amplitudes(state):  # type: ignore[no-untyped-def]
-    """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards."""
-    amplitude = state.amplitude
-    amplitude[:] = np.float32(0.0)
-    for t in range(state.engaged.shape[0]):
-        if state.force[t] > 0.0:
-            force = np.float32(state.force[t] * state.scale[t])
-            for k in range(amplitude.shape[0]):
-                amplitude[k] -= force * state.mode[t, k]
-
-
-@njit(cache=True, fastmath=True)
-def _far_field(model, state):  # type: ignore[no-untyped-def]
-    """sum_k X_k a_k, four modes at a time; modes are stored as 16-bit fractions of their peak."""
-    amplitude, scale = state.amplitude, model.space_scale
-    n_modes = scale.shape[0]
-    for b in range(model.space.shape[0]):
-        u = state.field[b * BLOCK : (b + 1) * BLOCK]
-        x = model.space[b]
-        for i in range(BLOCK):
-            u[i] = np.float32(0.0)
-        for k in range(0, n_modes - 3, 4):
-            a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
-            a2, a3 = amplitude[k + 2] * scale[k + 2], amplitude[k + 3] * scale[k + 3]
-            for i in range(BLOCK):
-                u[i] += x[k, i] * a0 + x[k + 1, i] * a1 + x[k + 2, i] * a2 + x[k + 3, i] * a3
-        for k in range(n_modes - n_modes % 4, n_modes):
-            a = amplitude[k] * scale[k]
-            for i in range(BLOCK):
-                u[i] += x[k, i] * a
-
-
-@njit(cache=True, fastmath=True)
-def _near_field(model, state):  # type: ignore[no-untyped-def]
-    """The exact remainder around the load positions that carry the forces."""
-    for t in range(state.engaged.shape[0]):
-        if state.force[t] <= 0.0:
-            continue
-        kept = 0.0
-        for i in range(state.n_nodes[t]):
-            if abs(state.weight[t, i, 0]) >= LEAST_WEIGHT:
-                kept += state.weight[t, i, 0]
-        force = -state.force[t] * state.scale[t] / kept
-        for i in range(state.n_nodes[t]):
-            w = state.weight[t, i, 0]
-            if abs(w) >= LEAST_WEIGHT:
-                _add_row(model, state, state.nodes[t, i], w * force, state.normal[t])
-
-
-@njit(cache=True, fastmath=True)
-def _add_row(model, state, j, force, n):  # type: ignore[no-untyped-def]
-    u = state.field
-    f0, f1, f2 = np.float32(force * n[0]), np.float32(force * n[1]), np.float32(force * n[2])
-    for e in range(model.near_start[j], model.near_start[j + 1]):
-        v = 3 * model.near_target[e]
-        block = model.near_block[e]
-        for d in range(3):
-            u[v + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2

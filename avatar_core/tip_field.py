@@ -17,7 +17,6 @@ from collections import namedtuple
 
 import igl
 import numpy as np
-from numba import njit
 from scipy.ndimage import gaussian_filter
 
 from avatar_core.mesh import Regions, TetMesh
@@ -90,81 +89,3 @@ def _closest(mesh: TetMesh, faces: np.ndarray, points: np.ndarray) -> tuple[np.n
     """Distance to some faces and the closest points on them."""
     squared, _, closest = igl.point_mesh_squared_distance(points, mesh.vertices, faces)
     return np.sqrt(squared), closest
-
-
-@njit(cache=True)
-def bspline(t):  # type: ignore[no-untyped-def]
-    """The three uniform quadratic B-spline weights at t in [-1/2, 1/2) from the middle sample."""
-    return (0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2)
-
-
-@njit(cache=True)
-def bspline_slope(t):  # type: ignore[no-untyped-def]
-    """Their derivatives."""
-    return (t - 0.5, -2.0 * t, t + 0.5)
-
-
-@njit(cache=True)
-def on_grid(values, origin, spacing, p):  # type: ignore[no-untyped-def]
-    """Whether all 27 samples around p exist (never for a p that is not finite)."""
-    for d in range(3):
-        middle = np.floor((p[d] - origin[d]) / spacing + 0.5)
-        if not 1.0 <= middle < values.shape[d] - 1.0:
-            return False
-    return True
-
-
-@njit(cache=True)
-def evaluate(values, origin, spacing, p, gradient, outside):  # type: ignore[no-untyped-def]
-    """Value of a sampled field at p, its gradient into ``gradient``; off the grid ``outside``."""
-    if not on_grid(values, origin, spacing, p):
-        gradient[0] = gradient[1] = gradient[2] = 0.0
-        return outside
-    x = (p[0] - origin[0]) / spacing
-    y = (p[1] - origin[1]) / spacing
-    z = (p[2] - origin[2]) / spacing
-    nx, ny, nz = int(x + 0.5), int(y + 0.5), int(z + 0.5)
-    wx, wy, wz = bspline(x - nx), bspline(y - ny), bspline(z - nz)
-    dx, dy, dz = bspline_slope(x - nx), bspline_slope(y - ny), bspline_slope(z - nz)
-    value = g0 = g1 = g2 = 0.0
-    for i in range(3):
-        for j in range(3):
-            line = slope = 0.0
-            for k in range(3):
-                v = values[nx + i - 1, ny + j - 1, nz + k - 1]
-                line += wz[k] * v
-                slope += dz[k] * v
-            value += wx[i] * wy[j] * line
-            g0 += dx[i] * wy[j] * line
-            g1 += wx[i] * dy[j] * line
-            g2 += wx[i] * wy[j] * slope
-    gradient[0], gradient[1], gradient[2] = g0 / spacing, g1 / spacing, g2 / spacing
-    return value
-
-
-@njit(cache=True)
-def second_derivatives(values, origin, spacing, p, hessian):  # type: ignore[no-untyped-def]
-    """Second derivatives of a sampled field at a p that is :func:`on_grid`, into (3, 3)."""
-    x = (p[0] - origin[0]) / spacing
-    y = (p[1] - origin[1]) / spacing
-    z = (p[2] - origin[2]) / spacing
-    nx, ny, nz = int(x + 0.5), int(y + 0.5), int(z + 0.5)
-    wx, wy, wz = bspline(x - nx), bspline(y - ny), bspline(z - nz)
-    dx, dy, dz = bspline_slope(x - nx), bspline_slope(y - ny), bspline_slope(z - nz)
-    curve = (1.0, -2.0, 1.0)
-    h00 = h11 = h22 = h01 = h02 = h12 = 0.0
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                v = values[nx + i - 1, ny + j - 1, nz + k - 1]
-                h00 += curve[i] * wy[j] * wz[k] * v
-                h11 += wx[i] * curve[j] * wz[k] * v
-                h22 += wx[i] * wy[j] * curve[k] * v
-                h01 += dx[i] * dy[j] * wz[k] * v
-                h02 += dx[i] * wy[j] * dz[k] * v
-                h12 += wx[i] * dy[j] * dz[k] * v
-    scale = 1.0 / (spacing * spacing)
-    hessian[0, 0], hessian[1, 1], hessian[2, 2] = h00 * scale, h11 * scale, h22 * scale
-    hessian[0, 1] = hessian[1, 0] = h01 * scale
-    hessian[0, 2] = hessian[2, 0] = h02 * scale
-    hessian[1, 2] = hessian[2, 1] = h12 * scale

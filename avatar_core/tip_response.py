@@ -27,7 +27,7 @@ from numba import njit
 
 from avatar_core.loads import LoadSurface
 from avatar_core.near_field import LocalBlocks
-from avatar_core.tip_field import TipField, bspline, bspline_slope, smoothed
+from avatar_core.tip_field import TipField, smoothed
 
 SMOOTHING = 0.2  # standard deviation of K, in patch radii
 MAX_STENCIL = 128  # load positions that carry one tip, at most
@@ -127,31 +127,23 @@ def _self_compliance(carrier, share, normal, load, start, target, block):  # typ
     return out
 
 
-@njit(cache=True)
-def gather(model, state, t, p):  # type: ignore[no-untyped-def]
-    """Weights of tip t at p and their gradient.
+@njit(cache=True, fastmath=True, forceinline=True)
+def gather(model, state, t, cell):  # type: ignore[no-untyped-def]
+    """Weights of tip t in a cell of the grid, and their gradient.
 
     Of ``state`` it fills ``nodes[t]``, the load positions that carry the tip, their number
     ``n_nodes[t]`` and ``weight[t]``: w, dw/dx, dw/dy, dw/dz of each. ``local`` is scratch.
     """
-    spacing = model.spacing[0]
-    x = (p[0] - model.origin[0]) / spacing
-    y = (p[1] - model.origin[1]) / spacing
-    z = (p[2] - model.origin[2]) / spacing
-    nx, ny, nz = int(x + 0.5), int(y + 0.5), int(z + 0.5)
-    wx, wy, wz = bspline(x - nx), bspline(y - ny), bspline(z - nz)
-    dx, dy, dz = bspline_slope(x - nx), bspline_slope(y - ny), bspline_slope(z - nz)
+    (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
     nodes, weight, n = state.nodes[t], state.weight[t], 0
     for i in range(3):
         for j in range(3):
             for k in range(3):
-                row = model.row[nx + i - 1, ny + j - 1, nz + k - 1]
+                row = model.row[nx + i, ny + j, nz + k]
                 if row < 0:
                     continue
                 b = wx[i] * wy[j] * wz[k]
-                b0 = dx[i] * wy[j] * wz[k] / spacing
-                b1 = wx[i] * dy[j] * wz[k] / spacing
-                b2 = wx[i] * wy[j] * dz[k] / spacing
+                b0, b1, b2 = dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k], wx[i] * wy[j] * dz[k]
                 for e in range(model.carrier.shape[1]):
                     share = model.share[row, e]
                     if share == 0.0:

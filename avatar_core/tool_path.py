@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from avatar_core.tip_field import FAR, TipField, evaluate
+from avatar_core.splines import evaluate
+from avatar_core.tip_field import FAR, TipField
 from avatar_core.vademecum import Vademecum
 
 

@@ -75,16 +75,24 @@ def test_interpolation_is_exact_at_positions_and_continuous(phantom_mesh: TetMes
         expected = points @ surface.centers[surface.corners[0]]
         np.testing.assert_allclose(here, expected, atol=1e-15)
     # the two faces of an edge agree along it: weights at a quarter of the way, from both
-    a, b = surface.corners[0, :2]
-    other = next(
-        f for f in range(1, len(surface.corners)) if {a, b} <= set(surface.corners[f].tolist())
-    )
+    a, b, faces = _inner_edge(surface.corners)
     dense = np.zeros((2, surface.n_positions))
-    for row, face in enumerate((0, other)):
+    for row, face in enumerate(faces):
         bary = 0.75 * (surface.corners[face] == a) + 0.25 * (surface.corners[face] == b)
         positions, weights = surface.weights(np.array([face]), bary[None].astype(float))
         np.add.at(dense[row], positions[0], weights[0])
     np.testing.assert_allclose(dense[0], dense[1], atol=1e-12)
+
+
+def _inner_edge(corners: np.ndarray) -> tuple[int, int, tuple[int, int]]:
+    """An edge and the two faces that share it; edges at the rim have only one."""
+    seen: dict[tuple[int, ...], int] = {}
+    for face, triangle in enumerate(corners):
+        for edge in ((triangle[k], triangle[k - 1]) for k in range(3)):
+            first = seen.setdefault(tuple(sorted(edge)), face)
+            if first != face:
+                return int(edge[0]), int(edge[1]), (first, face)
+    raise AssertionError("no two faces share an edge")
 
 
 def test_fine_surface_needs_no_midpoints(phantom_mesh: TetMesh) -> None:

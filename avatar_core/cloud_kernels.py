@@ -1,0 +1,98 @@
+"""The compiled part of the contact step that deforms the cloud: far field by modes, near by blocks.
+
+    u(x) = - sum_t lambda_t a_t [ sum_k X_k(x) Y_k . f_t  +  sum_j w_j N_j(x) n_t ]
+
+with f_t = w(p_t) n_t as in :mod:`avatar_core.contact_kernels`, N_j the exact near field of load
+position j.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+BLOCK = 256  # displacements that are summed together while they lie in the fastest cache
+LEAST_WEIGHT = 0.01  # load positions that carry less leave their near field to the others
+
+
+@njit(cache=True, fastmath=True)
+def contact_deform(model, state, out):  # type: ignore[no-untyped-def]
+    """Second half of a period: the cloud under the forces of the first."""
+    if out.n_contacts[0] == 0:
+        state.field[:] = np.float32(0.0)
+    else:
+        _amplitudes(state)
+        _far_field(model, state)
+        _near_field(model, state)
+    write_cloud(model.rest, state.field, out.cloud)
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def write_cloud(rest, field, cloud):  # type: ignore[no-untyped-def]
+    """Deformed position and displacement of every point (n_points, 6)."""
+    n_points = cloud.shape[0]
+    flat_rest, flat_cloud = rest.reshape(6 * n_points), cloud.reshape(6 * n_points)
+    for v in range(n_points):
+        for d in range(6):
+            flat_cloud[6 * v + d] = flat_rest[6 * v + d] + field[3 * v + d % 3]
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def _amplitudes(state):  # type: ignore[no-untyped-def]
+    """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards."""
+    amplitude = state.amplitude
+    amplitude[:] = np.float32(0.0)
+    for t in range(state.engaged.shape[0]):
+        if state.force[t] > 0.0:
+            force = np.float32(state.force[t] * state.scale[t])
+            for k in range(amplitude.shape[0]):
+                amplitude[k] -= force * state.mode[t, k]
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def _far_field(model, state):  # type: ignore[no-untyped-def]
+    """sum_k X_k a_k, four modes at a time; modes are stored as 16-bit fractions of their peak."""
+    amplitude, scale = state.amplitude, model.space_scale
+    n_modes = scale.shape[0]
+    for b in range(model.space.shape[0]):
+        u = state.field[b * BLOCK : (b + 1) * BLOCK]
+        x = model.space[b]
+        for i in range(BLOCK):
+            u[i] = np.float32(0.0)
+        for k in range(0, n_modes - 3, 4):
+            a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
+            a2, a3 = amplitude[k + 2] * scale[k + 2], amplitude[k + 3] * scale[k + 3]
+            for i in range(BLOCK):
+                u[i] += x[k, i] * a0 + x[k + 1, i] * a1 + x[k + 2, i] * a2 + x[k + 3, i] * a3
+        for k in range(n_modes - n_modes % 4, n_modes):
+            a = amplitude[k] * scale[k]
+            for i in range(BLOCK):
+                u[i] += x[k, i] * a
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def _near_field(model, state):  # type: ignore[no-untyped-def]
+    """The exact remainder around the load positions that carry the forces."""
+    for t in range(state.engaged.shape[0]):
+        if state.force[t] <= 0.0:
+            continue
+        kept = 0.0
+        for i in range(state.n_nodes[t]):
+            if abs(state.weight[t, i, 0]) >= LEAST_WEIGHT:
+                kept += state.weight[t, i, 0]
+        force = -state.force[t] * state.scale[t] / kept
+        for i in range(state.n_nodes[t]):
+            w = state.weight[t, i, 0]
+            if abs(w) >= LEAST_WEIGHT:
+                _add_row(model, state, state.nodes[t, i], w * force, state.normal[t])
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def _add_row(model, state, j, force, n):  # type: ignore[no-untyped-def]
+    u = state.field
+    f0, f1, f2 = np.float32(force * n[0]), np.float32(force * n[1]), np.float32(force * n[2])
+    for e in range(model.near_start[j], model.near_start[j + 1]):
+        v = 3 * model.near_target[e]
+        block = model.near_block[e]
+        for d in range(3):
+            u[v + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2
