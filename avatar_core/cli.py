@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from avatar_core.vademecum import Vademecum
 
 EXIT_NOT_CONVERGED = 3
+EXIT_STOPPED = 130  # by Ctrl-C, as shells count it
 
 app = typer.Typer(
     help="Computational patient avatars: an organ's mechanical response, computed once, "
@@ -54,11 +55,10 @@ def main() -> int:
     except AvatarError as error:
         print(f"avatar: {error}", file=sys.stderr)
         return 1
-    except typer.Abort:
-        print("avatar: stopped", file=sys.stderr)
-        return 130
     except Exception as error:
         return _usage(error)
+    if code == EXIT_STOPPED:
+        print("avatar: stopped; nothing was left half written", file=sys.stderr)
     return code if isinstance(code, int) else 0
 
 

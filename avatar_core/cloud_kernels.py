@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 BLOCK = 256  # displacements that are summed together while they lie in the fastest cache
-LEAST_WEIGHT = 0.01  # load positions that carry less leave their near field to the others
+LEAST_WEIGHT = 0.02  # what each load position leaves of its near field to the others
 
 
 @njit(cache=True, fastmath=True)
@@ -78,13 +78,20 @@ def _near_field(model, state):  # type: ignore[no-untyped-def]
             continue
         kept = 0.0
         for i in range(state.n_nodes[t]):
-            if abs(state.weight[t, i, 0]) >= LEAST_WEIGHT:
-                kept += state.weight[t, i, 0]
+            kept += _shrunk(state.weight[t, i, 0])
         force = -state.force[t] * state.scale[t] / kept
         for i in range(state.n_nodes[t]):
-            w = state.weight[t, i, 0]
-            if abs(w) >= LEAST_WEIGHT:
+            w = _shrunk(state.weight[t, i, 0])
+            if w != 0.0:
                 _add_row(model, state, state.nodes[t, i], w * force, state.normal[t])
+
+
+@njit(cache=True, forceinline=True)
+def _shrunk(w):  # type: ignore[no-untyped-def]
+    """A weight moved towards zero, so that a load position that leaves does so without a jump."""
+    if w > 0.0:
+        return max(w - LEAST_WEIGHT, 0.0)
+    return min(w + LEAST_WEIGHT, 0.0)
 
 
 @njit(cache=True, fastmath=True, forceinline=True)

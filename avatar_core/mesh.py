@@ -7,7 +7,9 @@ clamp and the accessible surface, found by a geometric rule or read from a file 
 from __future__ import annotations
 
 import os
+import signal
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -191,7 +193,7 @@ def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
     import pytetwild
 
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    with _scratch_folder():
+    with _scratch_folder(), _own_interrupt():
         vertices, tets = pytetwild.tetrahedralize(
             surface.vertices * 1e3,  # millimetres, for which fTetWild's thresholds are made
             surface.faces.astype(np.int32),
@@ -219,6 +221,17 @@ def _scratch_folder() -> Iterator[None]:
             yield
         finally:
             os.chdir(before)
+
+
+@contextmanager
+def _own_interrupt() -> Iterator[None]:
+    """Take Ctrl-C back: fTetWild's geometry library leaves the handler of the C runtime."""
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, handler)
 
 
 def _largest_component(tets: np.ndarray) -> np.ndarray:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from avatar_core import cli
+from avatar_core.mesh import tetrahedralize
 from avatar_core.phantom import phantom_liver
 
 TRIANGLE = "v 0 0 0\nv 100 0 0\nv 0 100 0\n"
@@ -162,3 +166,17 @@ def refused(
     assert len(lines) == 1
     assert remedy in lines[0]
     assert set(folder.iterdir()) == before
+
+
+def test_ctrl_c_is_said_and_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def meshed_then_stopped(*_: object) -> None:
+        tetrahedralize(phantom_liver(), 100)  # a library in there takes the signal for itself
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(10.0)
+
+    monkeypatch.setattr("avatar_core.organ.vademecum_of", meshed_then_stopped)
+    assert run(monkeypatch, "vademecum", "phantom", "-o", tmp_path / "liver.h5") == 130
+    assert capsys.readouterr().err.splitlines()[-1].startswith("avatar: stopped")
+    assert not list(tmp_path.iterdir())

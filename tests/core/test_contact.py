@@ -383,7 +383,7 @@ def test_solve_then_deform_is_a_step(phantom_vademecum: Vademecum, model: Contac
     np.testing.assert_array_equal(model.out.force, force)
     assert not model.out.cloud.any()
     deform(model)
-    np.testing.assert_array_equal(model.out.cloud, cloud)
+    np.testing.assert_allclose(model.out.cloud, cloud, rtol=0, atol=2e-8)  # one bit at 0.2 m
 
 
 def test_warm_up_compiles_what_a_vademecum_needs(phantom_vademecum: Vademecum) -> None:
