@@ -23,6 +23,7 @@ from avatar_core.tool_path import inner_positions, middle_of_access, slide
 from avatar_core.vademecum import Vademecum
 
 SPHERE, DEPTH = 10e-3, 5e-3  # [m] the benchmark's tip and how deep it slides
+PASSES = 5  # slides that are timed; other processes disturb some of them
 MAX_TABLE_BYTES = 2_000_000_000
 
 
@@ -30,7 +31,8 @@ MAX_TABLE_BYTES = 2_000_000_000
 class StepRow:
     """Step times of one method.
 
-    p50_us, p99_us : of the whole step, contact and full field [us]; NaN if it does not fit
+    p50_us, p99_us : of the whole step, contact and full field, medians over five slides [us]; NaN
+        if it does not fit
     contacts_mean, contacts_min : active contacts in the steps that were timed
     """
 
@@ -109,6 +111,25 @@ def _timed(
     call: Callable[[np.ndarray], object],
 ) -> StepRow:
     tips = _tool_paths(vademecum, n_tools)
+    passes = [_pass(model, tips, n_tools, call) for _ in range(PASSES)]
+    contacts = np.concatenate([contacts for _, contacts in passes])
+    return StepRow(
+        method,
+        len(vademecum.mesh.vertices),
+        modes,
+        n_tools,
+        float(contacts.mean()),
+        int(contacts.min()),
+        float(np.median([np.median(micro) for micro, _ in passes])),
+        float(np.median([np.quantile(micro, 0.99) for micro, _ in passes])),
+        model.nbytes,
+    )
+
+
+def _pass(
+    model: ContactModel, tips: np.ndarray, n_tools: int, call: Callable[[np.ndarray], object]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times [us] and contacts of the steps of one slide in which all tools touch."""
     times = np.empty(len(tips))
     contacts = np.empty(len(tips), int)
     for k in range(len(tips)):
@@ -116,20 +137,8 @@ def _timed(
         call(tips[k])
         times[k] = time.perf_counter() - start
         contacts[k] = model.out.n_contacts[0]
-    kept = np.arange(len(tips)) >= 200  # warm caches
-    kept &= contacts >= n_tools
-    micro = times[kept] * 1e6
-    return StepRow(
-        method,
-        len(vademecum.mesh.vertices),
-        modes,
-        n_tools,
-        float(contacts[kept].mean()),
-        int(contacts[kept].min()),
-        float(np.median(micro)),
-        float(np.quantile(micro, 0.99)),
-        model.nbytes,
-    )
+    kept = (np.arange(len(tips)) >= 200) & (contacts >= n_tools)  # caches are warm by then
+    return times[kept] * 1e6, contacts[kept]
 
 
 def _tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000) -> np.ndarray:

@@ -6,10 +6,12 @@ The compiled code is in :mod:`avatar_core.contact_kernels`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import numba
 import numpy as np
 
 from avatar_core import contact_kernels as kernels
@@ -42,6 +44,17 @@ class Status(IntEnum):
     UNKNOWN_FRAME = kernels.UNKNOWN_FRAME
 
 
+class Compiled(NamedTuple):
+    """The halves of a step and the whole, compiled for the types of one model.
+
+    Called without numba's look-up of the types, which takes 4 us for as many arrays.
+    """
+
+    solve: Callable[..., int]
+    deform: Callable[..., None]
+    step: Callable[..., int]
+
+
 @dataclass(frozen=True)
 class ContactModel:
     """Everything a step reads and writes.
@@ -61,11 +74,15 @@ class ContactModel:
         cloud (n_points, 6) float32, deformed position and displacement [m];
         n_contacts (1,), then contact_tool, contact_position, contact_normal (organ to tool),
         contact_force (on the tool), contact_penetration of the active contacts
+    tips : ndarray, shape (n_tools, 3), sphere centres of the present step [m]
+    compiled : Compiled
     """
 
     arrays: Any
     state: Any
     out: Any
+    tips: np.ndarray
+    compiled: Compiled
 
     @property
     def n_tools(self) -> int:
@@ -198,13 +215,19 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         contact_force=np.zeros((n_tools, 3)),
         contact_penetration=np.zeros(n_tools),
     )
-    model = ContactModel(arrays, state, out)
     far_away = np.full((n_tools, 3), 1e3)
-    step(model, far_away)
-    solve(model, far_away)
-    deform(model)
-    model.reset()
-    return model
+    compiled = Compiled(
+        _compiled(kernels.contact_solve, arrays, state, out, far_away),
+        _compiled(kernels.contact_deform, arrays, state, out),
+        _compiled(kernels.contact_step, arrays, state, out, far_away),
+    )
+    return ContactModel(arrays, state, out, far_away, compiled)
+
+
+def _compiled(kernel: Any, *arguments: Any) -> Any:
+    """A kernel compiled for the types of some arguments, with which it runs once."""
+    kernel(*arguments)
+    return kernel.get_overload(tuple(numba.typeof(argument) for argument in arguments))
 
 
 def step(model: ContactModel, tips: np.ndarray) -> int:
@@ -213,7 +236,7 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
     Parameters
     ----------
     model : ContactModel, whose ``out`` is filled
-    tips : ndarray of float64, C-contiguous, shape (n_tools, 3), sphere centres [m]
+    tips : ndarray, shape (n_tools, 3), sphere centres [m]
 
     Returns
     -------
@@ -222,17 +245,19 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
         finite; OUT_OF_RANGE: off the accessible surface, too deep, or not come in through the
         surface. The tools concerned have no force or a fading one, the others are served.
     """
-    return int(kernels.contact_step(model.arrays, model.state, model.out, tips))
+    model.tips[:] = tips
+    return model.compiled.step(model.arrays, model.state, model.out, model.tips)
 
 
 def solve(model: ContactModel, tips: np.ndarray) -> int:
     """The first half of :func:`step`: forces and contacts, so that they can leave at once."""
-    return int(kernels.contact_solve(model.arrays, model.state, model.out, tips))
+    model.tips[:] = tips
+    return model.compiled.solve(model.arrays, model.state, model.out, model.tips)
 
 
 def deform(model: ContactModel) -> None:
     """The second half of :func:`step`: the cloud under the forces of :func:`solve`."""
-    kernels.contact_deform(model.arrays, model.state, model.out)
+    model.compiled.deform(model.arrays, model.state, model.out)
 
 
 def warm_up(n_tools: int = 1) -> None:
