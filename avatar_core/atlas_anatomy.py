@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from avatar_core.compact import CompactResponse
 from avatar_core.elasticity import Element, Material
 from avatar_core.errors import AvatarError
 from avatar_core.registration import RegistrationQuality, SimilarityTransform
-from avatar_core.separated import SeparatedField
 from avatar_core.surface import SurfaceMesh
 
 FloatArray = NDArray[np.float64]
@@ -22,25 +22,15 @@ class AtlasError(AvatarError):
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
-    """Displacement of one anatomy under unit loads, u(x, s) = sum_k X_k(x) Y_k(s).
+class Response(CompactResponse):
+    """The response of one anatomy on the registered template, in the anatomy's own RAS axes.
 
-    space : ndarray of float32, shape (3 n_template_vertices, rank) [m/N], at the vertices of the
-        registered template, components in the anatomy's own RAS axes
-    load : ndarray of float32, shape (3 n_positions, rank), over the template's load positions
     material, element, patch_radius [m] : what it was computed with
     """
 
-    space: NDArray[np.float32]
-    load: NDArray[np.float32]
     material: Material
     element: Element
     patch_radius: float
-
-    @property
-    def field(self) -> SeparatedField:
-        """The two factors as a field."""
-        return SeparatedField(self.space, self.load)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +93,7 @@ def require_shapes(anatomy: Anatomy, n_points: int, n_vertices: int) -> None:
         rank = response.space.shape[-1]
         fits = fits and response.space.shape == (3 * n_vertices, rank)
         fits = fits and response.load.ndim == 2 and response.load.shape[1] == rank
+        fits = fits and response.missing.shape == (len(response.load) // 3, 3, 3)
     if not fits:
         raise AtlasError(
             f"{anatomy.name}: its arrays do not fit the atlas's box and template; build it with "

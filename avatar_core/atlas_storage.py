@@ -42,6 +42,7 @@ from avatar_core.surface import SurfaceMesh
 ATLAS_SCHEMA = "1.0"
 ATLAS_FORMAT = "avatar atlas"
 ANATOMY_FORMAT = "avatar anatomy"
+RESPONSE_KEYS = ("space", "load", "missing")
 MAX_FILE_BYTES = 64 << 30
 
 Arrays = dict[str, np.ndarray]
@@ -129,7 +130,7 @@ def _anatomy_arrays(anatomy: Anatomy) -> Arrays:
         "registered": anatomy.registered,
     }
     if response is not None:
-        arrays |= {"space": response.space, "load": response.load}
+        arrays |= {key: getattr(response, key) for key in RESPONSE_KEYS}
         about["response"] = {
             "material": asdict(response.material),
             "element": response.element,
@@ -170,9 +171,13 @@ def _anatomy(arrays: Arrays) -> Anatomy:
 def _response(arrays: Arrays, about: dict[str, Any] | None) -> Response | None:
     if about is None:
         return None
-    material = Material(**about["material"])
     return Response(
-        arrays["space"], arrays["load"], material, about["element"], about["patch_radius"]
+        space=arrays["space"],
+        load=arrays["load"],
+        missing=arrays["missing"],
+        material=Material(**about["material"]),
+        element=about["element"],
+        patch_radius=about["patch_radius"],
     )
 
 

@@ -37,6 +37,9 @@ Axes = Annotated[
 ]
 Label = Annotated[int | None, typer.Option(help="label of the organ in label maps")]
 Jobs = Annotated[int | None, typer.Option(help="processes on this machine; default one a CPU")]
+ShapesOnly = Annotated[
+    bool, typer.Option("--shapes-only", help="leave out the mechanical responses")
+]
 Scheduler = Annotated[
     str | None, typer.Option(help="address of a Dask scheduler to use instead, tcp://HOST:PORT")
 ]
@@ -57,6 +60,7 @@ def create(
         tuple[float, float, float],
         typer.Option(help="largest organ the atlas shall hold, along x, y, z [m]"),
     ] = (0.33, 0.26, 0.26),
+    shapes_only: ShapesOnly = False,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
@@ -65,13 +69,19 @@ def create(
     Exit code 1 if no surface can be used, and then nothing is written.
     """
     from avatar_core.atlas_build import AtlasOptions, create_atlas
+    from avatar_core.atlas_response import Responder
     from avatar_core.atlas_workers import Workers
 
     sources = _sources(surfaces, unit, axes, label)
     options = AtlasOptions(template_vertices, box, spacing)
     with _bar(len(sources)) as progress:
         growth = create_atlas(
-            file, sources, options, workers=Workers(jobs, scheduler), progress=progress
+            file,
+            sources,
+            options,
+            workers=Workers(jobs, scheduler),
+            respond=None if shapes_only else Responder(),
+            progress=progress,
         )
     _report(file, growth)
 
@@ -83,6 +93,7 @@ def add(
     unit: Unit = "mm",
     axes: Axes = "RAS",
     label: Label = None,
+    shapes_only: ShapesOnly = False,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
@@ -91,11 +102,18 @@ def add(
     The old file stays until the new one is complete. Exit code 1 if no surface can be used.
     """
     from avatar_core.atlas_build import extend_atlas
+    from avatar_core.atlas_response import Responder
     from avatar_core.atlas_workers import Workers
 
     sources = _sources(surfaces, unit, axes, label)
     with _bar(len(sources)) as progress:
-        growth = extend_atlas(file, sources, workers=Workers(jobs, scheduler), progress=progress)
+        growth = extend_atlas(
+            file,
+            sources,
+            workers=Workers(jobs, scheduler),
+            respond=None if shapes_only else Responder(),
+            progress=progress,
+        )
     _report(file, growth)
 
 
@@ -196,11 +214,11 @@ def _report(file: Path, growth: Growth) -> None:
 def _sources(surfaces: Sequence[str], unit: str, axes: str, label: int | None) -> list[Source]:
     """The surfaces named, those of a folder in the order of their names."""
     from avatar_core.atlas_build import SurfaceFile
-    from avatar_core.cli import _parsed_axes
+    from avatar_core.cli_vademecum import parsed_axes
     from avatar_core.phantom import phantom_liver
     from avatar_core.surface import METRES, axes_matrix
 
-    parsed = _parsed_axes(axes)
+    parsed = parsed_axes(axes)
     axes_matrix(parsed)  # what is wrong for all is no reason to skip each
     if unit not in METRES:
         raise AvatarError(f"--unit is '{unit}'; use one of {', '.join(METRES)}")
@@ -243,8 +261,5 @@ def _bar(total: int) -> Iterator[Callable[[int, int, str], None]]:
             yield advance
         except KeyboardInterrupt:
             bar.close()
-            print(
-                "avatar: stopped; the same command goes on from the surfaces that are done",
-                file=sys.stderr,
-            )
+            print("avatar: the same command goes on with what is done", file=sys.stderr)
             raise typer.Exit(EXIT_STOPPED) from None

@@ -1,0 +1,240 @@
+"""``avatar vademecum`` and ``avatar show``, and what commands that build share."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import typer
+
+from avatar_core.errors import AvatarError
+
+if TYPE_CHECKING:
+    from avatar_core.surface import SurfaceMesh
+    from avatar_core.vademecum import Vademecum
+
+EXIT_NOT_CONVERGED = 3
+
+Surface = Annotated[
+    str,
+    typer.Argument(
+        help="OBJ, STL, PLY, VTK, OFF or label map (.nii, .nii.gz); 'phantom' is the built-in liver"
+    ),
+]
+Unit = Annotated[str, typer.Option(help="unit of the file: mm, cm or m")]
+Axes = Annotated[
+    str, typer.Option(help="axes of the file: RAS, LPS, or 16 numbers of a 4x4 matrix to RAS")
+]
+Label = Annotated[int | None, typer.Option(help="label of the organ in a label map")]
+Vertices = Annotated[int, typer.Option(help="number of mesh vertices, about")]
+
+
+def vademecum(
+    surface: Surface,
+    output: Annotated[Path, typer.Option("-o", "--output", help="vademecum to write (.h5)")],
+    unit: Unit = "mm",
+    axes: Axes = "RAS",
+    label: Label = None,
+    vertices: Vertices = 2850,
+    young: Annotated[float, typer.Option(help="Young's modulus [Pa]")] = 0.17e6,
+    poisson: Annotated[float, typer.Option(help="Poisson's ratio, 0 to below 0.5 [-]")] = 0.48,
+    patch_radius: Annotated[
+        float | None,
+        typer.Option(help="radius of a tool's load patch [m]; default max(12 mm, 1.2 edges)"),
+    ] = None,
+    modes: Annotated[int, typer.Option(help="far-field modes at most")] = 100,
+    tolerance: Annotated[
+        float, typer.Option(help="mean relative displacement error over the build's loads [-]")
+    ] = 0.045,
+    groups: Annotated[
+        Path | None,
+        typer.Option(help=".npz with points 'clamped' and 'accessible' [m], instead of the rule"),
+    ] = None,
+    element: Annotated[
+        str | None, typer.Option(help="P1, P2 or Taylor-Hood; default by Poisson's ratio")
+    ] = None,
+    certify: Annotated[int, typer.Option(help="unseen loads of the certificate")] = 200,
+    seed: Annotated[int, typer.Option(help="of the unseen loads")] = 0,
+    mesh_error: Annotated[
+        bool, typer.Option("--mesh-error", help="also measure the mesh's own error (slow)")
+    ] = False,
+) -> None:
+    """Build the certified vademecum of an organ. Exit code 3: complete, but not converged."""
+    from avatar_core.build import BuildRule
+    from avatar_core.elasticity import Material
+    from avatar_core.organ import OrganOptions, orientation_warning, vademecum_of
+    from avatar_core.storage import load_vademecum, save_vademecum
+
+    require(modes >= 1, f"--modes is {modes}; ask for at least 1")
+    require(0 < tolerance < 1, f"--tolerance is {tolerance}; it must lie between 0 and 1")
+    require(certify >= 1, f"--certify is {certify}; ask for at least 1 load")
+    require(
+        element in (None, "P1", "P2", "Taylor-Hood"),
+        f"--element is {element}; choose P1, P2 or Taylor-Hood",
+    )
+    require(output.parent.is_dir(), f"folder {output.parent} does not exist; create it first")
+    options = OrganOptions(
+        n_vertices=vertices,
+        material=Material(young, poisson),
+        element=element,  # type: ignore[arg-type]
+        patch_radius=patch_radius,
+        groups=groups,
+        rule=BuildRule(tolerance=tolerance, max_modes=modes),
+        n_certified=certify,
+        seed=seed,
+        with_mesh_error=mesh_error,
+    )
+    organ = read_organ(surface, unit, axes, label)
+    for notice in organ.notices:
+        print(f"notice: {notice}", file=sys.stderr)
+    warning = orientation_warning(organ)
+    if warning:
+        print(f"warning: {warning}", file=sys.stderr)
+    with BuildBar() as progress:
+        built = vademecum_of(organ, options, progress)
+    save_vademecum(built, output)
+    show_text(load_vademecum(output))
+    if not built.convergence.converged:
+        best = built.convergence.rank_errors[-1]
+        print(
+            f"avatar: not converged: {best.rank} modes leave {best.mean:.1%} mean, "
+            f"{best.worst:.1%} worst; the file is complete and marked; raise --modes or "
+            "--tolerance",
+            file=sys.stderr,
+        )
+        raise typer.Exit(EXIT_NOT_CONVERGED)
+
+
+def show(
+    file: Annotated[Path, typer.Argument(help="a vademecum (.h5)")],
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+) -> None:
+    """Say what a vademecum is, how wrong it may be, and what it cost."""
+    from avatar_core.storage import load_vademecum
+
+    v = load_vademecum(file)
+    if not as_json:
+        show_text(v)
+        return
+    certificate = {**(asdict(v.certificate) if v.certificate else {}), "bytes": v.nbytes}
+    print(
+        json.dumps(
+            finite(
+                {
+                    **asdict(v.info()),
+                    "element": v.element,
+                    "certificate": certificate,
+                    "provenance": asdict(v.provenance),
+                    "rank_errors": [asdict(error) for error in v.convergence.rank_errors],
+                }
+            ),
+            indent=2,
+        )
+    )
+
+
+def read_organ(surface: str, unit: str, axes: str, label: int | None) -> SurfaceMesh:
+    """A surface from a file, or the built-in liver."""
+    from avatar_core.phantom import phantom_liver
+    from avatar_core.surface import read_surface
+
+    if surface == "phantom":
+        return phantom_liver()
+    return read_surface(surface, unit, parsed_axes(axes), label)
+
+
+def parsed_axes(axes: str) -> Any:
+    """A name of axes, or the 4x4 matrix that 16 numbers are."""
+    numbers = axes.replace(",", " ").split()
+    if len(numbers) != 16:
+        return axes
+    try:
+        values = [float(number) for number in numbers]
+    except ValueError as error:
+        raise AvatarError(f"--axes holds no 4x4 matrix ({error}); give 16 numbers") from error
+    return [values[4 * row : 4 * row + 4] for row in range(4)]
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise AvatarError with the message unless the condition holds."""
+    if not condition:
+        raise AvatarError(message)
+
+
+def show_text(v: Vademecum) -> None:
+    """What ``avatar show`` prints."""
+    info, c = v.info(), v.certificate
+    print(f"{info.name}  (from {info.source}, {v.provenance.unit}, axes {info.axes})")
+    print(
+        f"  {info.n_vertices} vertices ({info.n_surface_vertices} on the surface), "
+        f"{info.volume * 1e6:.0f} ml, {v.element}, E {info.young_modulus:g} Pa, "
+        f"nu {info.poisson_ratio:g}"
+    )
+    print(
+        f"  {info.n_load_positions} load positions, patch radius {info.patch_radius * 1e3:.1f} mm, "
+        f"{info.n_modes} modes, {info.bytes / 1e6:.1f} MB"
+    )
+    if c is None:
+        print("  no certificate")
+        return
+    print(f"  errors on {c.n_loads} unseen loads x 3 directions    mean     worst")
+    for name, mean, worst in (
+        ("displacement, L2", c.l2_mean, c.l2_worst),
+        ("contact compliance", c.contact_mean, c.contact_worst),
+        ("force of an indentation", c.force_mean, c.force_worst),
+        ("the same, felt by a sliding tip", c.felt_mean, c.felt_worst),
+    ):
+        print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
+    print(f"  built in {c.build_cpu_seconds:.0f} s of CPU time", end="")
+    tolerance = v.convergence.tolerance
+    state = "converged" if info.converged else "NOT CONVERGED"
+    print(", interpolated" if math.isnan(tolerance) else f", {state} (tolerance {tolerance:.1%})")
+    if not math.isnan(c.mesh_l2):
+        print(f"  mesh refined once: displacement {c.mesh_l2:.1%}, contact {c.mesh_contact:.1%}")
+
+
+def finite(value: Any) -> Any:
+    """JSON has no NaN: null instead."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+class BuildBar:
+    """One progress bar over the stages of a build."""
+
+    _SHARE: ClassVar = {"mesh": 0.1, "solve": 0.4, "modes": 0.35, "certify": 0.15}
+
+    def __enter__(self) -> BuildBar:
+        from tqdm import tqdm
+
+        self._bar = tqdm(
+            total=1.0,
+            bar_format="{desc:12s} {percentage:3.0f}% |{bar}| {elapsed}",
+            file=sys.stderr,
+            disable=None,
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Stage ``stage`` is done to ``fraction``."""
+        before = 0.0
+        for name, share in self._SHARE.items():
+            if name == stage:
+                break
+            before += share
+        share = self._SHARE.get(stage, 0.0)
+        self._bar.set_description_str(stage, refresh=False)
+        self._bar.n = min(1.0, before + share * min(fraction, 1.0))
+        self._bar.refresh()
