@@ -17,6 +17,7 @@ from avatar_core.errors import LLEError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+Vectors = Sequence[FloatArray] | FloatArray  # one row, or one array, a shape
 
 DEFAULT_REGULARIZATION = 1e-6  # real livers: leave-one-out Dice .94, with the usual 1e-3 less
 SAME = 1e-6  # vectors closer than this part of their length are one: 0.1 um between livers
@@ -49,7 +50,7 @@ class Barycenter:
         """sum |w|: 1 if convex; errors of the neighbours are amplified by up to this."""
         return float(np.abs(self.weights).sum())
 
-    def combine(self, values: Sequence[ArrayLike]) -> FloatArray:
+    def combine(self, values: Sequence[ArrayLike] | FloatArray) -> FloatArray:
         """Eq. 18, sum_j w_j values[j]; a member of the base gets its own value bit for bit.
 
         values : one array per member of the base, all of one shape
@@ -63,7 +64,7 @@ class Barycenter:
 # --- weights ----------------------------------------------------------------------------------
 
 
-def local_gram(point: FloatArray, neighbors: Sequence[FloatArray]) -> FloatArray:
+def local_gram(point: FloatArray, neighbors: Vectors) -> FloatArray:
     """C_jk = (X_j - x) . (X_k - x), from differences, shape (k, k)."""
     difference = np.empty((len(neighbors), len(point)))
     for row, neighbor in zip(difference, neighbors, strict=True):
@@ -105,7 +106,7 @@ def convex_weights(gram: FloatArray) -> FloatArray:
 
 
 def barycenter(
-    vectors: Sequence[FloatArray],
+    vectors: Vectors,
     point: ArrayLike,
     n_neighbors: int,
     *,
@@ -164,7 +165,7 @@ def _condition(gram: FloatArray) -> float:
 # --- checks -----------------------------------------------------------------------------------
 
 
-def checked_vector(point: ArrayLike, vectors: Sequence[FloatArray]) -> FloatArray:
+def checked_vector(point: ArrayLike, vectors: Vectors) -> FloatArray:
     """The point as array, if it is finite and as long as the vectors of a base."""
     x = np.asarray(point, dtype=np.float64)
     if len(vectors) == 0:

@@ -12,6 +12,7 @@ import typer
 
 from avatar_core.cli_atlas import atlas
 from avatar_core.cli_patient import patient
+from avatar_core.cli_study import study
 from avatar_core.cli_vademecum import (
     Axes,
     BuildBar,
@@ -45,6 +46,7 @@ app.add_typer(atlas, name="atlas")
 app.command()(vademecum)
 app.command()(show)
 app.command()(patient)
+app.command()(study)
 
 Json = Annotated[Path | None, typer.Option("-o", "--output", help="write the table as JSON")]
 

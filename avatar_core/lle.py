@@ -18,6 +18,7 @@ from avatar_core.barycenter import (
     DEFAULT_REGULARIZATION,
     SAME,
     Barycenter,
+    Vectors,
     barycenter,
     barycenter_weights,
     checked_vector,
@@ -50,7 +51,7 @@ class Gram:
     products: FloatArray
 
     @classmethod
-    def of(cls, vectors: Sequence[FloatArray]) -> Gram:
+    def of(cls, vectors: Vectors) -> Gram:
         """All products of n vectors of shape (D,), summed over blocks of values."""
         n, length = len(vectors), len(vectors[0])
         origin, products = np.empty(length), np.zeros((n, n))
@@ -72,7 +73,7 @@ class Gram:
         lengths = self.squared_lengths
         return np.maximum(lengths[rows, None] + lengths - 2 * self.products[rows], 0.0)
 
-    def grown(self, vectors: Sequence[FloatArray], point: FloatArray) -> Gram:
+    def grown(self, vectors: Vectors, point: FloatArray) -> Gram:
         """With one more row, of a point that follows the vectors."""
         shifted = point - self.origin
         row = np.array([(vector - self.origin) @ shifted for vector in vectors])
@@ -161,7 +162,7 @@ class LLE:
 
 
 def fit(
-    vectors: Sequence[ArrayLike],
+    vectors: Sequence[ArrayLike] | FloatArray,
     n_neighbors: int,
     *,
     regularization: float = DEFAULT_REGULARIZATION,

@@ -20,8 +20,10 @@ from avatar_core.mesh import TetMesh, regions_by_rule
 from avatar_core.patient import PatientOptions, patient_vademecum
 from avatar_core.patient_base import PatientError, base_of, numbers_of
 from avatar_core.phantom import phantom_liver, population
+from avatar_core.reduced import ReductionRule
 from avatar_core.registration import RegistrationRule, Template
 from avatar_core.storage import load_vademecum
+from avatar_core.study_transport import transport
 from avatar_core.surface import SurfaceMesh, read_surface
 
 # rough and coarse, 1 s an anatomy; the atlas's own tests use the same rule
@@ -135,6 +137,21 @@ def test_a_build_can_be_stopped_in_every_stage(
         patient_vademecum(surface, base_of(atlas), "reduced", QUICK, stop)
 
 
+@pytest.mark.long
+def test_the_study_measures_each_fidelity_against_all_solutions(
+    atlas: Atlas, livers: list[Path]
+) -> None:
+    options = replace(QUICK, reduction=ReductionRule(largest_share=0.6))
+    found = transport([read_surface(livers[1])], base_of(atlas), options=options)
+    (row,) = found.rows
+    assert row.name == "liver1" and row.solved_solutions == 3 * row.n_positions
+    assert row.reduced < min(row.interpolated)
+    assert row.reduced_solutions < row.solved_solutions
+    assert row.clamp_rule > 0.0
+    assert found.summary["interpolated_kriging_mean"] == row.interpolated[2]
+    assert all(np.isfinite(value) for value in found.summary.values())
+
+
 @pytest.fixture
 def run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -148,7 +165,9 @@ def run(
     return command
 
 
-@pytest.mark.parametrize("fidelity", ["interpolated", "reduced", "solved"])
+@pytest.mark.parametrize(
+    "fidelity", ["interpolated", "reduced", pytest.param("solved", marks=pytest.mark.long)]
+)
 def test_the_command_writes_a_certified_vademecum(
     run: Callable[..., tuple[int, str, str]],
     file: Path,

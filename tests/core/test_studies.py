@@ -1,0 +1,263 @@
+"""Studies: tiny forms on phantoms, against what is known exactly, and what they write."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar_core import (
+    cli,
+    cli_study,
+    study_grid,
+    study_in_silico,
+    study_leave_one_out,
+    study_samples,
+)
+from avatar_core.barycenter import barycenter
+from avatar_core.errors import SurfaceError
+from avatar_core.lle import Gram
+from avatar_core.mesh import TetMesh
+from avatar_core.phantom import phantom_liver
+from avatar_core.study import Study, mean_and_worst, write_study
+from avatar_core.study_response import carried, field_at, relative_errors, trilinear
+from avatar_core.study_shapes import paper_box, read_livers, subject_numbers
+
+COARSE = (16, 13, 14)
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["avatar", *map(str, arguments)])
+    return cli.main()
+
+
+def checked_files(study: Study, folder: Path) -> dict[str, object]:
+    """The JSON a study writes, after a look at its keys and at the picture's first bytes."""
+    record, picture = write_study(study, folder, seconds=1.0)
+    document = json.loads(record.read_text())
+    assert {"name", "summary", "rows", "paper", "machine", "seconds"} <= set(document)
+    assert document["name"] == study.name == record.stem == picture.stem
+    assert all(isinstance(v, int | float | None) for v in document["summary"].values())
+    flat = str | int | float | bool | None
+    assert document["rows"]
+    assert all(isinstance(v, flat) for row in document["rows"] for v in row.values())
+    assert document["machine"]["cores"] >= 1
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    return document["summary"]
+
+
+@pytest.fixture
+def no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Run where there is no default folder of livers: phantoms stand in."""
+    monkeypatch.chdir(tmp_path)
+
+
+def write_phantoms(folder: Path, n: int) -> Path:
+    organ = phantom_liver(0.012)
+    faces = "".join(f"f {a} {b} {c}\n" for a, b, c in organ.faces + 1)
+    for i in range(n):
+        points = 1e3 * organ.vertices * (1.0 + 0.02 * i)
+        vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in points)
+        (folder / f"LiTS-{5 + i}.obj").write_text(vertices + faces)
+    return folder
+
+
+# --- the four studies -------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_folder")
+@pytest.mark.long
+def test_grid(tmp_path: Path) -> None:
+    plan = study_grid.Plan(
+        n_fine=1, n_displaced=1, n_vertices=300, n_loads=2, n_points=400, spacings=(10e-3, 5e-3)
+    )
+    summary = checked_files(study_grid.study(None, plan), tmp_path)
+    # marching and quadrature are of second order; single organs scatter
+    assert summary["volume_order"] > 1.0
+    assert summary["volume_error_5mm"] < 0.005
+    assert summary["distance_error_5mm"] < summary["distance_error_10mm"]
+    # a P1 field read trilinearly: better on the finer grid
+    assert 0 < summary["displacement_error_5mm"] < summary["displacement_error_10mm"] < 0.2
+    assert 0 < summary["remeshed_error_same_surface"] < 1.0
+
+
+@pytest.mark.long
+def test_in_silico(tmp_path: Path) -> None:
+    plan = study_in_silico.Plan(
+        n_base=24, n_held_out=2, n_vertices=150, n_loads=1, shape=COARSE, phantom_spacing=12e-3
+    )
+    study = study_in_silico.study(plan)
+    summary = checked_files(study, tmp_path)
+    assert summary["volume_error"] < 0.02
+    # the grid adds its own error to that of the weights
+    assert 0 < summary["displacement_nodewise"] < summary["displacement_grid"] < 0.5
+    assert summary["from_gap_k12"] == 6  # 12 neighbours span the six parameters of Eq. 17
+    assert len(study.notices) == len(study_in_silico.SPECTRA)
+    assert all("stand out" in notice for notice in study.notices)
+
+
+@pytest.mark.long
+def test_samples(tmp_path: Path) -> None:
+    plan = study_samples.Plan(
+        sizes=(12, 40, 120), n_targets=4, shape=COARSE, phantom_spacing=12e-3, repeats=1
+    )
+    summary = checked_files(study_samples.study(plan), tmp_path)
+    assert summary["error_120"] < summary["error_12"] / 2
+    assert summary["rate"] > 0.2
+    assert summary["lle_seconds_120"] > 0
+    assert summary["sklearn_ratio"] > 0
+    assert summary["weights_difference"] < 1e-8
+
+
+def test_samples_without_scikit_learn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sklearn.manifold", None)
+    vectors = np.random.default_rng(0).standard_normal((30, 40))
+    timing = study_samples.time_lle(vectors, repeats=1)
+    assert timing.seconds > 0
+    assert math.isnan(timing.sklearn_seconds)
+
+
+@pytest.mark.usefixtures("no_folder")
+@pytest.mark.long
+def test_leave_one_out(tmp_path: Path) -> None:
+    plan = study_leave_one_out.Plan(
+        neighbors=(5, 10, 0), components=(5, 10), shape=COARSE, phantoms=16
+    )
+    study = study_leave_one_out.study(None, plan)
+    summary = checked_files(study, tmp_path)
+    assert "stand in" in study.notices[0]
+    assert summary["dice_nearest_neighbour"] < summary["dice_k10"] <= summary["dice_best"] < 1
+    assert summary["dice_convex_lle"] < summary["dice_best"]
+    rows = {(r["alignment"], r["method"], r["k"], r["regularization"]): r for r in study.rows}
+    assert math.isclose(rows["similarity", "convex LLE", 15, None]["absolute_sum"], 1.0)
+
+
+# --- the parts --------------------------------------------------------------------------------
+
+
+def test_leave_one_out_weights_are_those_of_the_library() -> None:
+    vectors = np.random.default_rng(1).standard_normal((20, 60))
+    gram, others = Gram.of(list(vectors)), np.arange(1, 20)
+    mine = study_leave_one_out.lle_weights(gram, 8, 1e-3, 0, others)
+    point = barycenter(list(vectors), vectors[0], 8, regularization=1e-3, leave_out={0})
+    wanted = np.zeros(20)
+    wanted[point.neighbors] = point.weights
+    # both solve the same 8 x 8 system of condition below 1e3
+    np.testing.assert_allclose(mine, wanted[1:], atol=1e-11)
+
+
+def test_principal_weights_project_orthogonally() -> None:
+    vectors = np.random.default_rng(2).standard_normal((12, 50))
+    gram, others = Gram.of(list(vectors)), np.arange(1, 12)
+    weights = study_leave_one_out.principal_weights(gram, 4, 0, others)
+    rest = vectors[1:] - vectors[1:].mean(axis=0)
+    axes = np.linalg.svd(rest, full_matrices=False)[2][:4]
+    mean = vectors[1:].mean(axis=0)
+    assert math.isclose(weights.sum(), 1.0)
+    np.testing.assert_allclose(
+        weights @ vectors[1:], mean + axes.T @ (axes @ (vectors[0] - mean)), atol=1e-10
+    )
+
+
+def test_one_person_is_one_subject(tmp_path: Path) -> None:
+    numbers = subject_numbers(["LiTS-10", "LiTS-14", "LiTS-15", "LiTS-16", "LiTS-6"])
+    assert numbers[0] == numbers[4]
+    assert numbers[1] == numbers[2]
+    assert len(set(numbers)) == 3
+    livers = read_livers(write_phantoms(tmp_path, 4), None, 0)  # LiTS-5 to LiTS-8
+    assert len(set(livers.subjects)) == 2
+
+
+def test_a_bad_surface_is_skipped_and_reported(tmp_path: Path) -> None:
+    write_phantoms(tmp_path, 3)
+    (tmp_path / "broken.obj").write_text("v 0 0 0\n")
+    livers = read_livers(tmp_path, None, 0)
+    assert len(livers.surfaces) == 3
+    assert "skipped" in livers.notices[0]
+    (tmp_path / "LiTS-5.obj").unlink()
+    with pytest.raises(SurfaceError, match="at least 3"):
+        read_livers(tmp_path, None, 0)
+
+
+def test_paper_box_holds_all_surfaces(phantom: object) -> None:
+    organ = phantom_liver(0.012)
+    larger = replace(organ, vertices=1.3 * organ.vertices)
+    box = paper_box([organ, larger], COARSE)
+    assert box.shape == COARSE
+    assert min(box.margin(organ), box.margin(larger)) >= 0.02 - 1e-12
+
+
+def test_fields_pass_the_grid_unchanged_if_they_are_affine(phantom_mesh: TetMesh) -> None:
+    """Within the organ both interpolations keep affine fields; the rows always sum to one."""
+    points = phantom_mesh.vertices[phantom_mesh.tets].mean(axis=1)[::7]
+    corners, back = trilinear(points, np.array([-0.2, -0.2, -0.2]), 0.003)
+    np.testing.assert_allclose(back @ corners, points, atol=1e-12)
+    there = field_at(phantom_mesh, points)
+    np.testing.assert_allclose(there @ phantom_mesh.vertices, points, atol=1e-12)
+    outside = field_at(phantom_mesh, np.array([[1.0, 1.0, 1.0]]))
+    assert math.isclose(outside.sum(), 1.0)
+    field = np.ones((len(phantom_mesh.vertices), 3, 2))
+    np.testing.assert_allclose(carried((back @ field_at(phantom_mesh, corners)), field), 1.0)
+
+
+def test_relative_errors_per_load(phantom_mesh: TetMesh) -> None:
+    wanted = np.random.default_rng(3).standard_normal((len(phantom_mesh.vertices), 3, 2))
+    found = wanted * np.array([1.1, 0.8])
+    np.testing.assert_allclose(relative_errors(found, wanted, phantom_mesh), [0.1, 0.2])
+
+
+def test_mean_and_worst() -> None:
+    assert mean_and_worst("e", [1.0, 3.0]) == {"e": 2.0, "e_worst": 3.0}
+    assert math.isnan(mean_and_worst("e", [])["e"])
+
+
+def test_json_has_no_nan(tmp_path: Path) -> None:
+    study = Study("x", "Nothing.", {"a": math.nan}, ({"b": np.float64(2.0)},), {}, lambda f: None)
+    record, _ = write_study(study, tmp_path, 0.0)
+    document = json.loads(record.read_text())
+    assert document["summary"]["a"] is None
+    assert document["rows"][0]["b"] == 2.0
+
+
+# --- the command ------------------------------------------------------------------------------
+
+
+def test_unknown_study(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert run(monkeypatch, "study", "gird", "-o", tmp_path / "out") == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "gird" in line
+    assert "leave-one-out" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_folders_are_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    missing = ["--surfaces", tmp_path / "no"]
+    assert run(monkeypatch, "study", "leave-one-out", "-o", tmp_path, *missing) == 1
+    (tmp_path / "file").touch()
+    assert run(monkeypatch, "study", "grid", "-o", tmp_path / "file") == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 2
+    assert "surfaces" in lines[0]
+    assert "another folder" in lines[1]
+
+
+def test_the_command_prints_and_writes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    found = Study("samples", "So.", {"rate": 0.5}, ({"n": 1},), {"rate": 1.0}, lambda f: None)
+    monkeypatch.setattr(study_samples, "run", lambda surfaces, quick, folder: found)
+    assert run(monkeypatch, "study", "samples", "-o", tmp_path / "new", "--quick") == 0
+    shown = capsys.readouterr().out
+    assert "paper" in shown.splitlines()[0]
+    assert shown.splitlines()[1].split() == ["rate", "1", "0.5"]
+    assert {file.name for file in (tmp_path / "new").iterdir()} == {"samples.json", "samples.png"}
+    assert set(cli_study.STUDIES) >= {"grid", "in-silico", "samples", "leave-one-out", "transport"}
