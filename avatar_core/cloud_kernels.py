@@ -42,7 +42,7 @@ def _amplitudes(state):  # type: ignore[no-untyped-def]
     """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards."""
     amplitude = state.amplitude
     amplitude[:] = np.float32(0.0)
-    for t in range(state.engaged.shape[0]):
+    for t in range(state.passage.shape[0]):
         if state.force[t] > 0.0:
             force = np.float32(state.force[t] * state.scale[t])
             for k in range(amplitude.shape[0]):
@@ -73,7 +73,7 @@ def _far_field(model, state):  # type: ignore[no-untyped-def]
 @njit(cache=True, fastmath=True, forceinline=True)
 def _near_field(model, state):  # type: ignore[no-untyped-def]
     """The exact remainder around the load positions that carry the forces."""
-    for t in range(state.engaged.shape[0]):
+    for t in range(state.passage.shape[0]):
         if state.force[t] <= 0.0:
             continue
         kept = 0.0

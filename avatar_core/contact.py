@@ -96,7 +96,7 @@ class ContactModel:
 
     def reset(self) -> None:
         """Forget all contacts: the organ is at rest."""
-        self.state.engaged[:] = False
+        self.state.passage[:] = kernels.OUTSIDE
         self.state.force[:] = 0.0
 
 
@@ -173,7 +173,7 @@ def make_model(arrays: ModelArrays) -> ContactModel:
     n_tools, n_modes = len(arrays.tip_radius), arrays.load.shape[2]
     single = np.float32
     state = State(
-        engaged=np.zeros(n_tools, np.bool_),
+        passage=np.zeros(n_tools, np.int64),
         force=np.zeros(n_tools),
         active=np.zeros(n_tools, np.bool_),
         gap=np.zeros(n_tools),

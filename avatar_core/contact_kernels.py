@@ -34,6 +34,10 @@ MAX_SWEEPS = 1000
 OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
 UNKNOWN_FRAME = 8
 
+# A tip that did not come in through the surface is barred until it is outside again: a contact
+# that began at depth would give back energy that nobody put in.
+OUTSIDE, ENTERED, BARRED = range(3)
+
 GAP_TOLERANCE = 1e-9  # [m] of gap change that ends Gauss-Seidel
 ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not come in through the surface
 MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
@@ -69,11 +73,11 @@ ModelArrays = namedtuple(
     ],
 )
 
-# What the step keeps between calls (engaged, force) and its scratch.
+# What the step keeps between calls (passage, force) and its scratch.
 State = namedtuple(
     "State",
     [
-        "engaged",  # (T,) the tip came in through the surface
+        "passage",  # (T,) whether the tip came in through the surface: OUTSIDE, ENTERED, BARRED
         "force",  # (T,) lambda
         "active",  # (T,) the tip is closer than its radius, where it may touch
         "gap",  # (T,) phi - r
@@ -162,8 +166,8 @@ def _locate(model, state, t, tip):  # type: ignore[no-untyped-def]
     """Gap, normal, access, compliance, surface point and load positions of a tip, if it touches."""
     state.active[t] = False
     state.access[t] = 1.0
-    engaged = state.engaged[t]
-    state.engaged[t] = False
+    before = state.passage[t]
+    state.passage[t] = OUTSIDE
     if not np.isfinite(tip[0] + tip[1] + tip[2]):
         return INVALID_POSE
     if not on_grid(model.distance.shape, model.origin, model.spacing[0], tip):
@@ -175,10 +179,13 @@ def _locate(model, state, t, tip):  # type: ignore[no-untyped-def]
         return OK
     access = in_cell(model.access, cell, state.access_slope[t])
     state.access[t] = min(access, 1.0)
-    entered = engaged or phi > -ENTRY_DEPTH
-    if not entered or phi < -MAX_DEPTH or access < MIN_ACCESS:
+    if access < MIN_ACCESS:
         return OUT_OF_RANGE
-    state.engaged[t] = True
+    deepest = MAX_DEPTH if before == ENTERED else ENTRY_DEPTH
+    if before == BARRED or phi < -deepest:
+        state.passage[t] = BARRED
+        return OUT_OF_RANGE
+    state.passage[t] = ENTERED
     state.active[t] = True
     _direct(state, t, tip, phi)
     state.self_compliance[t] = in_cell(model.self_compliance, cell, state.self_slope[t])
@@ -288,7 +295,7 @@ def _near_columns(model, state, t, s):  # type: ignore[no-untyped-def]
 @njit(cache=True, fastmath=True, forceinline=True)
 def _assemble(model, state):  # type: ignore[no-untyped-def]
     """Compliance between the tips; softer where access fades."""
-    n_tools = state.engaged.shape[0]
+    n_tools = state.passage.shape[0]
     for t in range(n_tools):
         if not state.active[t]:
             state.force[t] = 0.0
@@ -321,7 +328,7 @@ def _gram(state, t, s):  # type: ignore[no-untyped-def]
 @njit(cache=True, forceinline=True)
 def _solve(state):  # type: ignore[no-untyped-def]
     """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda >= 0, from the last forces."""
-    n_tools = state.engaged.shape[0]
+    n_tools = state.passage.shape[0]
     for _ in range(MAX_SWEEPS):
         worst = 0.0
         for t in range(n_tools):
@@ -343,7 +350,7 @@ def _solve(state):  # type: ignore[no-untyped-def]
 def _write_forces(model, state, out, tips, several):  # type: ignore[no-untyped-def]
     """Forces on the tools and the contacts that make them."""
     n = 0
-    for t in range(state.engaged.shape[0]):
+    for t in range(state.passage.shape[0]):
         out.force[t] = 0.0
         out.torque[t] = 0.0
         force, chi = state.force[t], state.access[t]
@@ -358,7 +365,7 @@ def _write_forces(model, state, out, tips, several):  # type: ignore[no-untyped-
             _turn(model, state, t, tips[t])
             _add_coupling(model, state, out, t)
         gap = state.gap[t] - model.softness[0] * (1.0 / chi - 1.0) * force
-        for s in range(state.engaged.shape[0]):
+        for s in range(state.passage.shape[0]):
             if state.active[s]:
                 gap += state.compliance[t, s] * state.force[s]
         out.contact_tool[n] = t
@@ -380,7 +387,7 @@ def _add_coupling(model, state, out, t):  # type: ignore[no-untyped-def]
     change0 = 0.5 * state.self_slope[t, 0] / state.self_compliance[t] - slope[0] / state.gram[t, t]
     change1 = 0.5 * state.self_slope[t, 1] / state.self_compliance[t] - slope[1] / state.gram[t, t]
     change2 = 0.5 * state.self_slope[t, 2] / state.self_compliance[t] - slope[2] / state.gram[t, t]
-    for s in range(state.engaged.shape[0]):
+    for s in range(state.passage.shape[0]):
         if s == t or state.force[s] <= 0.0:
             continue
         _gram_slope(state, t, s)

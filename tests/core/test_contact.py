@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -151,35 +153,50 @@ def largest_force_step(v: Vademecum, model: ContactModel, depth: float) -> tuple
 
 
 def closed_path_work(v: Vademecum, model: ContactModel, n_paths: int, seed: int) -> float:
-    """Largest |work| / peak energy over loops that start and end 3 mm above the organ."""
+    """Largest |work| / peak energy over loops that start and end 15 mm above the organ.
+
+    A loop that only grazes the organ leaves it within a step or two, which the trapezoidal rule
+    does not resolve; a loop that stands out is integrated again, twenty times finer.
+    """
     rng = np.random.default_rng(seed)
     inner = inner_positions(v, 20e-3)
     worst = 0.0
     for _ in range(n_paths):
-        j = rng.choice(inner)
-        n = v.surface.normals[j]
-        corners = v.surface.centers[j] + RADIUS * n + rng.uniform(-12e-3, 12e-3, (4, 3))
-        corners += np.outer(-((corners - v.surface.centers[j]) @ n) + RADIUS, n)
-        corners -= np.outer(rng.uniform(0, 6e-3, 4), n)
-        start = corners[0] + n * 15e-3
-        path = np.concatenate(
-            [
-                np.linspace(a, b, 400, endpoint=False)
-                for a, b in zip([start, *corners], [*corners, start], strict=True)
-            ]
-            + [start[None]]
-        )
-        model.reset()
-        force = np.zeros_like(path)
-        peak = 0.0
-        for k, tip in enumerate(path):
-            step(model, tip[None].copy())
-            force[k] = model.out.force[0]
-            peak = max(peak, stored_energy(model))
-        work = 0.5 * ((force[1:] + force[:-1]) * np.diff(path, axis=0)).sum()
+        path = closed_path(v, rng.choice(inner), rng)
+        work, peak = work_along(model, path)
+        if peak > 1e-5 and work > max(worst, 2e-3) * peak:
+            work, peak = work_along(model, refined(path, 20))
         if peak > 1e-5:
-            worst = max(worst, abs(work) / peak)
+            worst = max(worst, work / peak)
     return worst
+
+
+def closed_path(v: Vademecum, position: int, rng: np.random.Generator) -> np.ndarray:
+    """Down from above a load position, along four random corners around it, and back up."""
+    center, n = v.surface.centers[position], v.surface.normals[position]
+    corners = center + RADIUS * n + rng.uniform(-12e-3, 12e-3, (4, 3))
+    corners += np.outer(-((corners - center) @ n) + RADIUS, n)
+    corners -= np.outer(rng.uniform(0, 6e-3, 4), n)
+    start = corners[0] + n * 15e-3
+    return refined(np.array([start, *corners, start]), 400)
+
+
+def refined(path: np.ndarray, n: int) -> np.ndarray:
+    """Every leg of a path in n steps."""
+    legs = [np.linspace(a, b, n, endpoint=False) for a, b in pairwise(path)]
+    return np.concatenate([*legs, path[-1:]])
+
+
+def work_along(model: ContactModel, path: np.ndarray) -> tuple[float, float]:
+    """|Work| of the force along a path, by the trapezoidal rule, and peak stored energy [J]."""
+    model.reset()
+    force, peak = np.zeros_like(path), 0.0
+    for k, tip in enumerate(path):
+        step(model, tip[None].copy())
+        force[k] = model.out.force[0]
+        peak = max(peak, stored_energy(model))
+    work = 0.5 * ((force[1:] + force[:-1]) * np.diff(path, axis=0)).sum()
+    return abs(float(work)), peak
 
 
 @pytest.mark.parametrize("depth", [1e-3, 5e-3])
@@ -331,7 +348,9 @@ def test_tip_that_starts_inside_is_out_of_range_until_withdrawn(
 ) -> None:
     deep = push(phantom_vademecum, RADIUS + 12e-3)
     assert step(model, deep) == Status.OUT_OF_RANGE
-    assert not model.out.force.any()
+    for depth in np.arange(RADIUS + 12e-3, 0.0, -1e-3):  # it gives no energy back on its way out
+        assert step(model, push(phantom_vademecum, depth)) == Status.OUT_OF_RANGE
+        assert not model.out.force.any()
     step(model, push(phantom_vademecum, -1e-3))
     for depth in np.arange(0.0, RADIUS + 12e-3, 1e-3):
         step(model, push(phantom_vademecum, depth))
