@@ -269,8 +269,8 @@ def _unit_hint(largest: float, unit: str) -> str:
     raw = largest / METRES[unit]
     fitting = [other for other in METRES if _is_plausible(raw * METRES[other])]
     if fitting:
-        return f"is the unit {fitting[0]} instead of {unit}? use --unit {fitting[0]}"
-    return f"no unit of {', '.join(METRES)} fits: rescale the file to one whole organ in --unit"
+        return f"is the unit {fitting[0]} instead of {unit}? give it (--unit {fitting[0]})"
+    return f"no unit of {', '.join(METRES)} fits: rescale the file to one whole organ in that unit"
 
 
 def _check_arrays(vertices: FloatArray, faces: NDArray[Any], name: str) -> None:

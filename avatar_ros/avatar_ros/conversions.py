@@ -307,3 +307,10 @@ def surface_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
             MeshTriangle(vertex_indices=np.asarray(face, dtype=np.uint32)) for face in faces
         ],
     )
+
+
+def mesh_arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) and faces (m, 3) of a message, whatever they hold."""
+    vertices = np.array([(p.x, p.y, p.z) for p in mesh.vertices], dtype=np.float64)
+    faces = np.array([t.vertex_indices for t in mesh.triangles], dtype=np.int64)
+    return vertices.reshape(-1, 3), faces.reshape(-1, 3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from avatar_ros import parameters
 from avatar_ros.parameters import Parameter, ParameterError
 
 _SIGNAL_LATENCY = 0.1  # longest until a signal is noticed [s]
+_LAST_ANSWERS = 1.0  # for what is still to be answered when the node ends [s]
 
 
 class ManagedNode(LifecycleNode, ABC):
@@ -56,6 +58,11 @@ class ManagedNode(LifecycleNode, ABC):
     def failure(self) -> str:
         """Why the node cannot go on, else empty."""
         return ""
+
+    @property
+    def owes_answers(self) -> bool:
+        """Whether a request is still to be answered, for which the node is kept a moment."""
+        return False
 
     def bring_up(self) -> bool:
         """Configure and activate; false if the node refused."""
@@ -155,5 +162,8 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
         return 1 if node.failure else 0
     finally:
         node.trigger_shutdown()
-        executor.shutdown()
+        end = time.monotonic() + _LAST_ANSWERS
+        while node.owes_answers and time.monotonic() < end:
+            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+        executor.shutdown(timeout_sec=_LAST_ANSWERS)  # without, it waits for ever for what is open
         node.destroy_node()

@@ -11,7 +11,10 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
+from avatar_ros.patient_builder import Rules
+
 CLOUDS = ("surface", "volume", "off")
+WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
 _TOOL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 _TIP_RADIUS_RANGE = (0.002, 0.020)
 
@@ -67,6 +70,20 @@ VADEMECUM_LOADER = (
     Parameter("max_megabytes", 1024, "largest file that is read [MB]", range=(1, 65536)),
 )
 
+PATIENT_INTERPOLATION = (
+    AUTOSTART,
+    Parameter("atlas", "", "base of anatomies with responses (.h5), of 'avatar atlas create'"),
+    Parameter("library_dir", ".", "directory of surfaces and results; nothing outside is touched"),
+    Parameter("max_megabytes", 256, "largest surface file or mesh that is read [MB]", (1, 1999)),
+    Parameter("vertices", 2850, "of a patient's own mesh, about", range=(100, 50_000)),
+    Parameter("modes", 100, "far-field modes at most", range=(1, 1000)),
+    Parameter("weighting", "kriging", "of the neighbours: kriging, lle-template or lle-grid"),
+    Parameter(
+        "certify", -1, "unseen loads of the certificate; -1: by fidelity", range=(-1, 10_000)
+    ),
+    Parameter("threads", 1, "of the numerical libraries", range=(1, 64)),
+)
+
 CONTACT = (
     AUTOSTART,
     FRAME_ID,
@@ -109,6 +126,16 @@ class LoaderSettings:
 
 
 @dataclass(frozen=True)
+class InterpolationSettings:
+    """Parameters of the patient_interpolation node."""
+
+    rules: Rules
+    library_dir: str
+    max_bytes: int
+    threads: int
+
+
+@dataclass(frozen=True)
 class ContactSettings:
     """Parameters of the contact node; rates [Hz], times [s], radii [m]."""
 
@@ -148,6 +175,32 @@ def read_loader(node: Node) -> LoaderSettings:
         vademecum=value["vademecum"],
         frame_id=_frame(value["frame_id"]),
         max_bytes=value["max_megabytes"] * 1_000_000,
+    )
+
+
+def read_interpolation(node: Node) -> InterpolationSettings:
+    """The patient_interpolation node's parameters.
+
+    Raises
+    ------
+    ParameterError : naming the parameter and what it takes
+    """
+    value = _values(node, PATIENT_INTERPOLATION)
+    if not value["atlas"]:
+        raise ParameterError("parameter atlas: give the file of an atlas, of 'avatar atlas create'")
+    if value["weighting"] not in WEIGHTINGS:
+        raise ParameterError(f"parameter weighting: give one of {', '.join(WEIGHTINGS)}")
+    return InterpolationSettings(
+        rules=Rules(
+            atlas=os.path.abspath(os.path.expanduser(value["atlas"])),
+            n_vertices=value["vertices"],
+            max_modes=value["modes"],
+            weighting=value["weighting"],
+            n_certified=value["certify"],
+        ),
+        library_dir=os.path.expanduser(value["library_dir"]),
+        max_bytes=value["max_megabytes"] * 1_000_000,
+        threads=value["threads"],
     )
 
 

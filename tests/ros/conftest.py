@@ -128,6 +128,14 @@ def probe(own_domain: dict[str, str]) -> Iterator[Probe]:
 
 
 @pytest.fixture(scope="module")
+def lasting_probe(own_domain: dict[str, str]) -> Iterator[Probe]:
+    """For many short questions: a new node takes a second or more to find the others."""
+    probe = Probe()
+    yield probe
+    probe.close()
+
+
+@pytest.fixture(scope="module")
 def cell(own_domain: dict[str, str], library: Path) -> Iterator[dict[str, Any]]:
     """Loader and contact node, as a user starts them, for one module of tests."""
     from avatar_ros.bench_cell import Module

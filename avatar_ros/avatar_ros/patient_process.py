@@ -1,0 +1,200 @@
+"""The process that keeps the atlas and builds patients.
+
+Run as ``python -m avatar_ros.patient_process JSON`` by ``PatientBuilder``, never by hand.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from avatar_core import storage
+from avatar_core.atlas_storage import load_atlas
+from avatar_core.patient import (
+    Fidelity,
+    Patient,
+    PatientOptions,
+    patient_vademecum,
+    require_fidelity,
+)
+from avatar_core.patient_base import PatientBase, base_of, numbers_of
+from avatar_core.surface import (
+    SurfaceMesh,
+    keep_organ,
+    orient_outward,
+    read_surface,
+    require_closed,
+    require_plausible_size,
+)
+from avatar_ros import realtime
+from avatar_ros.patient_builder import BuildError, Built, Order, Ready, Refused, Rules, Stage
+
+_NICENESS = 10  # a contact loop on the same machine goes first
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """The atlas as patients need it; ``volumes`` [m3] by name of the anatomy."""
+
+    base: PatientBase
+    volumes: dict[str, float]
+
+    @classmethod
+    def load(cls, path: str) -> Source:
+        """Raises AvatarError if the atlas cannot be read or has no responses."""
+        atlas = load_atlas(path)
+        return cls(base_of(atlas), {one.name: one.volume for one in atlas.anatomies})
+
+
+def build(order: Order, source: Source, rules: Rules, notes: Connection) -> Built:
+    """Build one patient and write it.
+
+    Raises
+    ------
+    AvatarError, OSError : nothing was written
+    """
+
+    def report(stage: str, fraction: float, error: float) -> None:
+        notes.send(Stage(stage, min(float(fraction), 1.0), float(error)))
+
+    require_fidelity(order.fidelity)
+    options = _options(order, source.base, rules)
+    require_replaceable(Path(order.output))
+    report("surface", 0.0, math.nan)
+    surface = surface_of(order)
+    fidelity: Fidelity = order.fidelity  # type: ignore[assignment]
+    patient = patient_vademecum(surface, source.base, fidelity, options, report)
+    report("save", 0.0, math.nan)
+    with _uninterrupted():
+        require_replaceable(Path(order.output))
+        storage.save_vademecum(patient.vademecum, order.output)
+        built = _account(patient, surface, source, order)
+        notes.send(built)
+    return built
+
+
+def surface_of(order: Order) -> SurfaceMesh:
+    """The surface of the order's file or arrays, checked alike.
+
+    Raises SurfaceError as ``read_surface`` does.
+    """
+    if order.vertices is None or order.faces is None:
+        return read_surface(order.surface, order.unit, order.axes)
+    surface = SurfaceMesh(order.vertices, order.faces, order.name)
+    surface = orient_outward(require_closed(keep_organ(surface)))
+    require_plausible_size(surface)
+    return surface
+
+
+def require_replaceable(path: Path) -> None:
+    """Raise BuildError unless there is nothing at the path, or a vademecum: an atlas must stay."""
+    if not path.exists():
+        return
+    if path.is_file() and h5py.is_hdf5(path):
+        with h5py.File(path, "r") as file:
+            if str(file.attrs.get("format", "")) == storage.FORMAT:
+                return
+    raise BuildError(f"{path.name} exists and is no vademecum; choose another name")
+
+
+def volume_error(patient: Patient, volume: float, volumes: dict[str, float]) -> float:
+    """|sum w_j V_j / V - 1|: how well the weights that combine responses combine volumes [-]."""
+    combined = sum(
+        w * volumes[name] for name, w in zip(patient.neighbours, patient.weights, strict=True)
+    )
+    return abs(float(combined) / volume - 1.0)
+
+
+def displacement_error(patient: Patient) -> float:
+    """Measured by the certificate, else estimated, else NaN [-]."""
+    if patient.vademecum.certificate is not None:
+        return float(patient.vademecum.certificate.l2_mean)
+    return float(patient.estimates[-1].mean) if patient.estimates else math.nan
+
+
+def _options(order: Order, base: PatientBase, rules: Rules) -> PatientOptions:
+    default = PatientOptions()
+    left_out = numbers_of(base, order.leave_out)
+    if len({*left_out, *base.copies}) == len(base.names):
+        raise BuildError("no anatomy is left in the atlas; leave out fewer")
+    return PatientOptions(
+        n_vertices=rules.n_vertices,
+        weighting=rules.weighting,  # type: ignore[arg-type]
+        n_neighbors=order.neighbors or None,
+        tolerance=default.tolerance if order.tolerance == 0.0 else order.tolerance,
+        max_modes=rules.max_modes,
+        n_certified=None if rules.n_certified < 0 else rules.n_certified,
+        leave_out=left_out,
+    )
+
+
+def _account(patient: Patient, surface: SurfaceMesh, source: Source, order: Order) -> Built:
+    weights = np.asarray(patient.weights, dtype=float)
+    return Built(
+        vademecum_id=storage.file_id(order.output),
+        file=os.path.basename(order.output),
+        neighbours=list(patient.neighbours),
+        weights=weights.tolist(),
+        weight_abs_sum=patient.barycenter.absolute_sum,
+        hull_distance=float(patient.barycenter.hull_distance),
+        volume_error=volume_error(patient, surface.volume, source.volumes),
+        displacement_error=displacement_error(patient),
+        notices=[*surface.notices, *patient.notices],
+    )
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """SIGTERM has to wait: a file is written as a whole, and then reported."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+
+
+def serve(rules: Rules, notes: Connection) -> None:
+    """Load the atlas, then build what is ordered until the line is closed."""
+    try:
+        source = Source.load(rules.atlas)
+    except Exception as error:  # whatever a file provokes, the node says it in one line
+        notes.send(Refused(_in_one_line(error)))
+        return
+    notes.send(Ready(len(source.base.names)))
+    while True:
+        order = notes.recv()
+        try:
+            build(order, source, rules, notes)
+        except (BrokenPipeError, EOFError):
+            raise
+        except Exception as error:  # as above
+            notes.send(Refused(_in_one_line(error)))
+
+
+def _in_one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def main() -> int:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    realtime.die_with_parent(signal.SIGTERM)
+    os.nice(_NICENESS)
+    notes = Connection(os.dup(sys.stdin.fileno()))
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the node is gone
+        serve(Rules(**json.loads(sys.argv[1])), notes)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
