@@ -25,24 +25,27 @@ def run_step_bench(
 
     The large mesh uses P1 elements, for time only: its forces are too stiff.
     """
+    rows = _rows(*_built(surface, small, None, progress))
+    summary = {
+        "step_p99_us": _row(rows, "vademecum", N_TOOLS, 50).p99_us,
+        "rival_p99_us": _row(rows, "dense table", N_TOOLS, 0).p99_us,
+        "direct_p99_us": rows[-1].p99_us,
+    }
+    if large:
+        big = _rows(*_built(surface, large, "P1", progress))
+        summary["step_20k_p99_us"] = _row(big, "vademecum", N_TOOLS, 50).p99_us
+        summary["step_20k_one_p99_us"] = _row(big, "vademecum", 1, 50).p99_us
+        rows += big
+    return rows, summary
+
+
+def _rows(vademecum: Vademecum, elasticity: Elasticity) -> list[StepRow]:
+    """The methods on one mesh, with one tool and with several."""
     rows: list[StepRow] = []
-    summary: dict[str, float] = {}
-    vademecum, elasticity = _built(surface, small, None, progress)
     for n_tools in (1, N_TOOLS):
         rows += [time_steps(with_rank(vademecum, modes, RULE), n_tools) for modes in MODES]
         rows.append(time_dense_table(vademecum, n_tools))
-    rows.append(time_direct(elasticity, vademecum))
-    summary["step_p99_us"] = _row(rows, "vademecum", N_TOOLS, 50).p99_us
-    summary["rival_p99_us"] = _row(rows, "dense table", N_TOOLS, 0).p99_us
-    summary["direct_p99_us"] = rows[-1].p99_us
-    if large:
-        vademecum, elasticity = _built(surface, large, "P1", progress)
-        big = [time_steps(with_rank(vademecum, modes, RULE), N_TOOLS) for modes in MODES]
-        big.append(time_dense_table(vademecum, N_TOOLS))
-        big.append(time_direct(elasticity, vademecum))
-        summary["step_20k_p99_us"] = _row(big, "vademecum", N_TOOLS, 50).p99_us
-        rows += big
-    return rows, summary
+    return [*rows, time_direct(elasticity, vademecum)]
 
 
 def _built(

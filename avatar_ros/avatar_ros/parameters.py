@@ -79,7 +79,10 @@ PATIENT_INTERPOLATION = (
     Parameter("modes", 100, "far-field modes at most", range=(1, 1000)),
     Parameter("weighting", "kriging", "of the neighbours: kriging, lle-template or lle-grid"),
     Parameter(
-        "certify", -1, "unseen loads of the certificate; -1: by fidelity", range=(-1, 10_000)
+        "certify",
+        -1,
+        "unseen loads of the certificate; -1: 24, or 200 of solved",
+        range=(-1, 10_000),
     ),
     Parameter("threads", 1, "of the numerical libraries", range=(1, 64)),
 )
