@@ -28,6 +28,7 @@ from avatar_core.near_field import LocalBlocks, near_pairs
 from avatar_core.patient_base import PatientBase, PatientError
 from avatar_core.reduced import (
     ErrorEstimate,
+    ReducedResponse,
     ReductionRule,
     missing_blocks,
     reduce,
@@ -287,6 +288,18 @@ def reduced(
     options: PatientOptions,
     progress: Progress = _silent,
 ) -> tuple[Vademecum, tuple[ErrorEstimate, ...]]:
+    """The vademecum of :func:`reduced_response`, and the estimates on the way."""
+    found = reduced_response(problem, base, weights, options, progress)
+    return vademecum_of_reduced(problem, found, options), found.history
+
+
+def reduced_response(
+    problem: PatientProblem,
+    base: PatientBase,
+    weights: Barycenter,
+    options: PatientOptions,
+    progress: Progress = _silent,
+) -> ReducedResponse:
     """Galerkin projection on the patient's own mesh; see :mod:`avatar_core.reduced`."""
     combined = combine(base.responses, weights, options.reduction.n_start)
     positions = load_map(problem.registration, base.loads, problem.loads.centers)
@@ -294,7 +307,7 @@ def reduced(
     loads = patch_loads(
         problem.elasticity, problem.loads.centers, problem.loads.patch_radius
     ).tocsr()
-    found = reduce(
+    return reduce(
         problem.elasticity,
         loads,
         problem.loads,
@@ -303,13 +316,18 @@ def reduced(
         options.reduction,
         lambda fraction, estimate: progress("response", fraction, estimate.mean),
     )
+
+
+def vademecum_of_reduced(
+    problem: PatientProblem, found: ReducedResponse, options: PatientOptions
+) -> Vademecum:
+    """What contact needs around a response: modes by worth, near field, distance and access."""
     convergence = Convergence(
         found.converged,
         options.tolerance,
         rank_errors=tuple(RankError(e.rank, e.mean, e.worst) for e in found.history),
     )
-    vademecum = _assembled(problem, found.response, found.support, convergence, options)
-    return vademecum, found.history
+    return _assembled(problem, found.response, found.support, convergence, options)
 
 
 def solved(

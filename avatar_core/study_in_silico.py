@@ -91,6 +91,7 @@ def study(plan: Plan) -> Study:
         **mean_and_worst("volume_error", [row["volume_error"] for row in rows]),
         **mean_and_worst("displacement_nodewise", [row["nodewise"] for row in rows]),
         **mean_and_worst("displacement_grid", [row["grid"] for row in rows]),
+        "displacement_nodewise_all": float(np.mean([row["nodewise_all"] for row in rows])),
     }
     summary["displacement_passage"] = float(np.mean([row["passage"] for row in rows]))
     for k in (10, 12):
@@ -148,6 +149,7 @@ def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> dict[str
 def held_out_rows(livers: Population, plan: Plan) -> list[dict[str, float]]:
     """Errors of each held-out liver, interpolated among the base."""
     base = fit(livers.vectors[: plan.n_base], NEIGHBORS)
+    everyone = fit(livers.vectors[: plan.n_base], plan.n_base - 1)
     held_out = range(plan.n_base, plan.n_base + plan.n_held_out)
     rows = []
     for i in follow(held_out, "held-out livers"):
@@ -156,6 +158,7 @@ def held_out_rows(livers: Population, plan: Plan) -> list[dict[str, float]]:
         found = reinitialize(blend).volume
         mesh, wanted = livers.meshes[i], livers.responses[i]
         nodewise = relative_errors(point.combine(livers.responses), wanted, mesh)
+        by_all = everyone.barycenter(livers.vectors[i]).combine(livers.responses)
         on_grid = relative_errors(_through_grid(livers, point, mesh), wanted, mesh)
         itself = relative_errors(_passage(livers, i, mesh), wanted, mesh)
         rows.append(
@@ -164,6 +167,7 @@ def held_out_rows(livers: Population, plan: Plan) -> list[dict[str, float]]:
                 "volume_error": abs(found / float(livers.volumes[i]) - 1.0),
                 "nodewise": float(nodewise.mean()),
                 "nodewise_worst_load": float(nodewise.max()),
+                "nodewise_all": float(relative_errors(by_all, wanted, mesh).mean()),
                 "grid": float(on_grid.mean()),
                 "grid_worst_load": float(on_grid.max()),
                 "passage": float(itself.mean()),
@@ -193,11 +197,13 @@ def _passage(livers: Population, i: int, mesh: TetMesh) -> FloatArray:
 def _sentence(summary: dict[str, float], plan: Plan) -> str:
     verdict = "stand out" if summary["six_stand_out_k12"] else "do not stand out"
     other = "stand out" if summary["six_stand_out_k10"] else "do not"
+    volume, grid = summary["volume_error"], summary["displacement_grid"]
+    twelve, every = summary["displacement_nodewise"], summary["displacement_nodewise_all"]
     return (
-        f"{plan.n_base} + {plan.n_held_out} livers by Eq. 17: volume "
-        f"{summary['volume_error']:.2%} wrong (paper < 5 %), displacement "
-        f"{summary['displacement_nodewise']:.2%} nodewise and {summary['displacement_grid']:.2%} "
-        f"on the grid (paper 9.03 %); six eigenvalues {verdict} for k = 12, {other} for k = 10."
+        f"{plan.n_base} + {plan.n_held_out} livers by Eq. 17: volume {volume:.2%} wrong (paper "
+        f"< 5 %), displacement {twelve:.2%} nodewise ({every:.2%} with all neighbours) and "
+        f"{grid:.2%} on the grid (paper 9.03 %); six eigenvalues {verdict} for k = 12, {other} for "
+        "k = 10."
     )
 
 

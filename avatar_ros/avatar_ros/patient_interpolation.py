@@ -208,14 +208,16 @@ class PatientInterpolationNode(ManagedNode):
 
     async def _beside(self, work: Callable[[], Built]) -> Built:
         """Wait for some work in a thread of its own while the executor goes on."""
-        done = Future(executor=self.executor)
+        executor = self.executor
+        assert executor is not None  # which runs this
+        done = Future(executor=executor)
 
         def run() -> None:
             try:
                 done.set_result(work())
             except Exception as error:
                 done.set_exception(error)
-            self.executor.wake()
+            executor.wake()
 
         self._n_awaited += 1
         try:
