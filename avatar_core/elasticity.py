@@ -28,10 +28,11 @@ from skfem import (
     ElementVector,
     MeshTet,
 )
-from skfem.helpers import ddot, div, sym_grad
+from skfem.helpers import div
 
 from avatar_core.errors import ConvergenceError, MaterialError
 from avatar_core.mesh import TetMesh, make_mesh
+from avatar_core.stiffness import unit_stiffness
 
 Element = Literal["P1", "P2", "Taylor-Hood"]
 
@@ -74,18 +75,6 @@ class Material:
 
 
 @BilinearForm
-def strain_energy(u, v, w):  # type: ignore[no-untyped-def]
-    """2 eps(u):eps(v), the shear part for mu = 1."""
-    return 2.0 * ddot(sym_grad(u), sym_grad(v))
-
-
-@BilinearForm
-def volume_change(u, v, w):  # type: ignore[no-untyped-def]
-    """div(u) div(v), the volumetric part for lambda = 1."""
-    return div(u) * div(v)
-
-
-@BilinearForm
 def divergence(u, q, w):  # type: ignore[no-untyped-def]
     """q div(u), the coupling of displacement and pressure."""
     return q * div(u)
@@ -125,22 +114,17 @@ class Elasticity:
         self._skfem_mesh = MeshTet(
             np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
         )
-        shape = ElementTetP1() if self.element == "P1" else ElementTetP2()
-        self._basis = Basis(self._skfem_mesh, ElementVector(shape), intorder=2)
-        self._dofs = self._node_dofs()
+        self._shape = ElementTetP1() if self.element == "P1" else ElementTetP2()
+        self._basis = Basis(self._skfem_mesh, self._shape, intorder=2)
+        self.n_nodes = self._basis.N
         self.clamped_nodes = np.unique(self.face_nodes[clamped])
 
-    def _node_dofs(self) -> np.ndarray:
+    def _nodes_first(self, basis: Basis) -> np.ndarray:
         """scikit-fem's number of each degree of freedom, in our order."""
-        dofs = self._basis.nodal_dofs.T
+        dofs = basis.nodal_dofs.T
         if self.element != "P1":
-            dofs = np.concatenate([dofs, self._basis.edge_dofs.T])
+            dofs = np.concatenate([dofs, basis.edge_dofs.T])
         return np.ascontiguousarray(dofs).ravel()
-
-    @property
-    def n_nodes(self) -> int:
-        """Number of displacement nodes."""
-        return len(self._dofs) // 3
 
     def refined(self) -> Elasticity:
         """The same problem with every tetrahedron split into eight; vertices keep their numbers."""
@@ -177,23 +161,27 @@ class Elasticity:
         found = np.searchsorted(key[order], pairs[..., 0] * n_vertices + pairs[..., 1])
         return np.concatenate([faces, n_vertices + order[found]], axis=1)
 
-    def _form(self, form: BilinearForm) -> sp.csr_matrix:
-        matrix = form.assemble(self._basis).tocsr()
-        return matrix[self._dofs][:, self._dofs]
+    def _unit_stiffness(self) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+        """Shear part for mu = 1 and volumetric part for lambda = 1."""
+        node = np.argsort(self._nodes_first(self._basis))
+        return unit_stiffness(self._basis, node[self._basis.element_dofs.T])
 
     @cached_property
     def _mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
         """Shear stiffness, divergence and pressure mass of the Taylor-Hood pair."""
         _, mu = self.material.lame
         pressure = Basis(self._skfem_mesh, ElementTetP1(), intorder=2)
-        coupling = divergence.assemble(self._basis, pressure).tocsr()[:, self._dofs]
-        return mu * self._form(strain_energy), coupling, pressure_mass.assemble(pressure).tocsr()
+        displacement = Basis(self._skfem_mesh, ElementVector(self._shape), intorder=2)
+        coupling = divergence.assemble(displacement, pressure).tocsr()
+        coupling = coupling[:, self._nodes_first(displacement)]
+        return mu * self._unit_stiffness()[0], coupling, pressure_mass.assemble(pressure).tocsr()
 
     @cached_property
     def stiffness(self) -> sp.csr_matrix:
         """K without boundary conditions, shape (3 n_nodes, 3 n_nodes) [N/m] (P1 and P2)."""
         lam, mu = self.material.lame
-        return (mu * self._form(strain_energy) + lam * self._form(volume_change)).tocsr()
+        shear, volume = self._unit_stiffness()
+        return (mu * shear + lam * volume).tocsr()
 
     @cached_property
     def _free(self) -> np.ndarray:

