@@ -15,19 +15,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from avatar_core.errors import MeshError
-
-if TYPE_CHECKING:
-    from avatar_core.surface import SurfaceMesh
+from avatar_core.surface import SurfaceMesh, winding_number
 
 # Faces of a positively oriented tetrahedron, each with its normal pointing outwards.
 _TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+
+_LOST_VOLUME = 0.03  # of the organ, that a mesh may lack; 64 livers at 2,850 vertices: below 0.8 %
 
 POSTERIOR_SUPERIOR = np.array([0.0, -1.0, 1.0]) / np.sqrt(2.0)
 ANTERIOR = np.array([0.0, 1.0, 0.0])
@@ -161,19 +160,21 @@ def make_mesh(vertices: np.ndarray, tets: np.ndarray) -> TetMesh:
 def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
     """Fill a surface with tetrahedra by fTetWild, to about the number of vertices asked for.
 
-    fTetWild accepts cracked, doubled and self-intersecting faces and keeps the volume that the
-    winding number calls inside (Hu et al., "Fast Tetrahedral Meshing in the Wild", 2020).
+    fTetWild accepts cracked, doubled and self-intersecting faces (Hu et al., "Fast Tetrahedral
+    Meshing in the Wild", 2020). Of the box that it fills, the tetrahedra are kept whose centroids
+    the winding number of the surface calls inside; its own filter loses a lobe of a folded liver
+    now and then.
 
     Parameters
     ----------
     surface : SurfaceMesh
     n_vertices : int
-        Number of mesh vertices aimed at; met to about 10 %.
+        Number of mesh vertices aimed at; met to about 10 %, above some 600 of them.
 
     Raises
     ------
     MeshError
-        If no mesh comes out, or one of the wrong size.
+        If no mesh comes out, or none that fills the surface.
     """
     if n_vertices < 50:
         raise MeshError(f"{n_vertices} vertices are too few for an organ; ask for at least 50")
@@ -186,6 +187,12 @@ def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
         if 0.88 < ratio < 1.12:
             break
         edge *= ratio ** (1.0 / 2.6)
+    lost = 1.0 - mesh.volume / surface.volume
+    if abs(lost) > _LOST_VOLUME:
+        raise MeshError(
+            f"the mesh holds {1.0 - lost:.0%} of the volume of the surface; close its gaps and "
+            "remove faces inside the organ, or ask for more vertices"
+        )
     return mesh
 
 
@@ -201,14 +208,17 @@ def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
             epsilon=4e-3,  # a smaller envelope forbids coarse meshes
             num_threads=1,
             quiet=True,
+            disable_filtering=True,
         )[:2]
-    if len(tets) == 0:
-        raise MeshError("no tetrahedra fit into the surface; check that it encloses a volume")
+    vertices = vertices * 1e-3
     volumes = TetMesh(vertices, tets).tet_volumes
     if np.median(volumes) < 0:
         tets, volumes = tets[:, [0, 2, 1, 3]], -volumes
-    solid = tets[volumes > 1e-9 * np.abs(volumes).mean()]
-    return make_mesh(vertices * 1e-3, _largest_component(solid))
+    inside = np.abs(winding_number(surface, vertices[tets].mean(axis=1))) > 0.5
+    solid = tets[inside & (volumes > 1e-9 * np.abs(volumes).mean())]
+    if len(solid) == 0:
+        raise MeshError("no tetrahedra fit into the surface; check that it encloses a volume")
+    return make_mesh(vertices, _largest_component(solid))
 
 
 @contextmanager
