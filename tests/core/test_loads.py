@@ -101,6 +101,9 @@ def test_fine_surface_needs_no_midpoints(phantom_mesh: TetMesh) -> None:
     coarse = load_surface(phantom_mesh, regions)
     fine = load_surface(phantom_mesh, regions, 4.0 * phantom_mesh.mean_surface_edge)
     assert coarse.n_positions > 3 * len(coarse.vertices)
+    # half a patch radius is not short: linear interpolation would cost 6 % of the compliance
+    medium = load_surface(phantom_mesh, regions, 2.0 * phantom_mesh.mean_surface_edge)
+    assert medium.n_positions > 3 * len(medium.vertices)
     assert fine.n_positions == len(fine.vertices)
     positions, weights = fine.weights(np.array([5]), np.array([[0.2, 0.3, 0.5]]))
     np.testing.assert_array_equal(positions[0], fine.corners[5])
