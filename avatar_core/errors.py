@@ -41,3 +41,11 @@ class LLEError(AvatarError):
 
 class RegistrationError(AvatarError):
     """A template cannot be laid on a surface without leaving it or crushing elements."""
+
+
+class CoordinateError(AvatarError):
+    """A coordinate that a vademecum does not have, or a value outside its range."""
+
+
+class EquilibriumError(AvatarError):
+    """A deformed organ has no stable equilibrium under the load that was asked for."""
