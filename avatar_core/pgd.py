@@ -1,17 +1,27 @@
-"""Proper Generalized Decomposition over load position (paper Sec. 2.1).
+"""Proper Generalized Decomposition with any number of coordinates.
 
-For K u(s) = f(s) with u(x, s) = sum_k X_k(x) Y_k(s), each enrichment R(x) S(s) minimizes the
-weighted energy of what is left (paper Eqs. 7-14, with one scalar S per load instead of the
-entry-wise product, to which it collapses when each load has one direction):
+For an affine problem over places x, loads s and parameters p = (p_1, p_2, ...),
 
-    S known:  K R = sum_s w(s) S(s) r(s) / sum_s w(s) S(s)^2        (Eq. 14)
-    R known:  S(s) = R . r(s) / (R . K R)                           (Eq. 11)
+    sum_q [prod_d theta_q^d(p_d)] K_q u(x, s, p) = sum_j F_j(x, s) prod_d phi_j^d(p_d),
 
-with the residual r = f - K u^m. Space functions are kept K-orthonormal, so that the Galerkin
-update of *all* load functions is Y_k(s) = X_k . f(s), the residual energy is known exactly, and
-alternating directions are a power iteration for the next eigenvector of the residual's energy.
-Eigenvalues lie close together, so a single pair converges slowly: ``block`` pairs are sought at
-once (a subspace iteration, each pair normalized against the others). ``block = 1`` is the paper's.
+greedy enrichment seeks u = sum_k X_k(x) S_k(s) prod_d P_k^d(p_d), one product at a time, by
+alternating directions: the weak form is tested with R S P, where all factors but one are known,
+
+    [sum_q a_q K_q] R = right-hand side,    a_q = (S, S) prod_d (P^d, theta_q^d P^d),
+
+and likewise for S and every P^d, which are scalar equations at each load and each node of a
+parameter. After every product the functions of s and of all parameters are computed anew by a
+Galerkin projection onto the others (Chinesta, Keunings & Leygue, The Proper Generalized
+Decomposition for Advanced Numerical Simulations, 2014, ch. 2-3; Nouy, CMAME 199:1603, 2010).
+
+Vademecums are not built by it: a space basis with small systems
+(:mod:`avatar_core.parametric_build`) needs fewer modes and does not stagnate towards
+incompressibility (``avatar study coordinates``). It is the form to take for many parameters, as
+the basis needs solutions on a grid of all of them.
+
+Operators are symmetric and positive (semi-)definite, coordinates are discretised by nodes with
+quadrature weights, their norm. :func:`minimal_residual` and :func:`projection` turn a problem and a
+field into other problems of the same form.
 """
 
 from __future__ import annotations
@@ -21,213 +31,420 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
-import scipy.sparse as sp
+from scipy.sparse import diags
+from scipy.sparse.linalg import LinearOperator, aslinearoperator, cg
 
-from avatar_core.elasticity import Elasticity
+from avatar_core.affine import AffineProblem, CanonicalField, Samples
+from avatar_core.compact import FloatArray
 from avatar_core.errors import ConvergenceError
 
-# An enrichment that captures less of the total energy than this is made of rounding errors.
-_ROUNDING = 1e-13
 
-
-class EnrichmentStatus(Enum):
-    """How an enrichment ended."""
+class Outcome(Enum):
+    """How an enrichment, or the whole decomposition, ended."""
 
     CONVERGED = "converged"
-    SWEEP_LIMIT = "sweep limit"  # accepted: the mode still lowers the energy, less than it could
-    EXHAUSTED = "exhausted"  # the residual is rounding; nothing was added
+    SWEEP_LIMIT = "sweep limit"  # accepted: the product lowers the error, less than it could
+    STAGNATED = "stagnated"  # the last enrichments hardly lowered the residual
+    MODE_LIMIT = "mode limit"  # the tolerance was not met with the modes allowed
 
 
 @dataclass(frozen=True)
-class EnrichmentReport:
-    """One greedy enrichment: its status, the sweeps it took and what was left after it.
+class Enrichment:
+    """One product: how it ended, its sweeps, the change in the last, and the residual after it.
 
-    modes : pairs added
-    change : relative change of the energy that R S captures, in the last sweep
-    energy_error : sqrt(residual energy / total energy) after the enrichment
+    residual : |r| / |f| in the norm of K_0^-1, over sampled loads and nodes
     """
 
-    status: EnrichmentStatus
-    modes: int
+    outcome: Outcome
     sweeps: int
     change: float
-    energy_error: float
+    residual: float
 
 
 @dataclass(frozen=True)
 class PGDRule:
     """When to stop.
 
-    max_modes : pairs at most
-    tolerance : stop when the relative energy error is below
-    block : pairs sought at once
-    max_sweeps : alternating directions per enrichment at most
-    sweep_tolerance : an enrichment has converged when the energy it captures changes less
+    max_modes : products at most; tolerance : of the relative residual
+    max_sweeps, sweep_tolerance : of alternating directions, by the change of the product
+    solve_tolerance : of the conjugate gradients for X
+    update : compute the functions of all products anew after each
+    stall : stagnation is a residual that fell less than ``least_gain`` over so many products
+    n_samples : points (s, p) at which the residual is measured
     """
 
     max_modes: int
-    tolerance: float
-    block: int = 10
-    max_sweeps: int = 5
-    sweep_tolerance: float = 2e-2
+    tolerance: float = 1e-3
+    max_sweeps: int = 8
+    sweep_tolerance: float = 3e-2
+    solve_tolerance: float = 1e-3
+    update: bool = True
+    stall: int = 8
+    least_gain: float = 0.05
+    n_samples: int = 24
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PGDSolution:
-    """K-orthonormal space functions, their load functions, and the history that led there.
+    """The field, how it ended and how it got there."""
 
-    space : ndarray, shape (3 n_nodes, rank)
-    load : ndarray, shape (n_loads, rank)
-    """
-
-    space: np.ndarray
-    load: np.ndarray
-    history: tuple[EnrichmentReport, ...]
+    field: CanonicalField
+    outcome: Outcome
+    history: tuple[Enrichment, ...]
 
     @property
     def converged(self) -> bool:
-        """Every enrichment that was made reached its own sweep tolerance."""
-        return all(report.status is not EnrichmentStatus.SWEEP_LIMIT for report in self.history)
-
-
-class _Expansion:
-    """The growing K-orthonormal expansion and the energy that it leaves to each load."""
-
-    def __init__(self, problem: ParametricProblem, capacity: int) -> None:
-        self.problem = problem
-        n_dofs, n_loads = problem.loads.shape
-        self._space = np.zeros((n_dofs, capacity), order="F")
-        self._load = np.zeros((n_loads, capacity), order="F")
-        self.rank = 0
-        self.energy = problem.energy.copy()  # of each load, f . K^-1 f - sum_k Y_k^2
-
-    @property
-    def space(self) -> np.ndarray:
-        return self._space[:, : self.rank]
-
-    @property
-    def load(self) -> np.ndarray:
-        return self._load[:, : self.rank]
-
-    @property
-    def error(self) -> float:
-        """Relative weighted energy error."""
-        weights, total = self.problem.weights, self.problem.energy
-        left = weights @ np.maximum(self.energy, 0.0)
-        return float(np.sqrt(left / (weights @ total)))
-
-    def append(self, space: np.ndarray) -> int:
-        """Make space functions K-orthonormal and add them; the number of those that were new."""
-        for _ in range(2):  # once more for rounding
-            dual = self.problem.elasticity.apply(space)
-            space = space - self.space @ (self.space.T @ dual)
-        value, vector = np.linalg.eigh(space.T @ self.problem.elasticity.apply(space))
-        new = value > 1e-18 * value.max()
-        space = space @ (vector[:, new] / np.sqrt(value[new]))
-        load = self.problem.loads.T @ space
-        columns = slice(self.rank, self.rank + space.shape[1])
-        self._space[:, columns], self._load[:, columns] = space, load
-        self.energy -= (load**2).sum(axis=1)
-        self.rank += space.shape[1]
-        return int(space.shape[1])
-
-
-@dataclass(frozen=True)
-class ParametricProblem:
-    """K u(s) = f(s) for all loads s, with the weight of each load in the norm over s.
-
-    elasticity : Elasticity, solves with and applies K
-    loads : sparse, shape (3 n_nodes, n_loads)
-    weights : ndarray, shape (n_loads,), positive
-    energy : ndarray, shape (n_loads,), f(s) . K^-1 f(s) [J], the patch compliance
-    """
-
-    elasticity: Elasticity
-    loads: sp.csr_matrix
-    weights: np.ndarray
-    energy: np.ndarray
+        """The tolerance was met and no enrichment had to be cut short."""
+        cut = any(step.outcome is Outcome.SWEEP_LIMIT for step in self.history)
+        return self.outcome is Outcome.CONVERGED and not cut
 
 
 def solve_pgd(
-    problem: ParametricProblem,
+    problem: AffineProblem,
     rule: PGDRule,
-    progress: Callable[[int], None] = lambda rank: None,
-    reweigh: Callable[[np.ndarray, np.ndarray], np.ndarray | None] | None = None,
+    progress: Callable[[int, float], None] = lambda rank, residual: None,
 ) -> PGDSolution:
     """Greedy enrichment with alternating directions until the rule stops it.
 
     Parameters
     ----------
-    problem : ParametricProblem
-    rule : PGDRule
-    progress : called with the rank after every enrichment
-    reweigh : called with the new space and load functions; returns the weights of the loads for
-        the next enrichment, so that the norm can follow the error that matters, or None to stop
-        because that error is small enough
+    progress : called with rank and residual after every product
 
     Raises
     ------
     ConvergenceError
-        If the right-hand side is zero, so that no relative error exists.
+        If the right-hand side is zero, or a linear system could not be solved.
     """
-    if not problem.weights @ problem.energy > 0:
-        raise ConvergenceError("all loads are zero: there is nothing to separate")
-    expansion = _Expansion(problem, rule.max_modes)
-    history: list[EnrichmentReport] = []
-    while expansion.rank < rule.max_modes and expansion.error > rule.tolerance:
-        report = _enrich(expansion, rule)
-        history.append(report)
-        progress(expansion.rank)
-        if reweigh is not None:
-            new = slice(expansion.rank - report.modes, expansion.rank)
-            weights = reweigh(expansion.space[:, new], expansion.load[:, new])
-            if weights is None:
-                break
-            expansion.problem = replace(expansion.problem, weights=weights)
-        if report.status is EnrichmentStatus.EXHAUSTED:
-            break
-    return PGDSolution(expansion.space.copy(), expansion.load.copy(), tuple(history))
+    expansion = _Expansion(problem)
+    samples = Samples(problem, rule.n_samples)
+    history: list[Enrichment] = []
+    while len(history) < rule.max_modes:
+        product, outcome, sweeps, change = _enrich(expansion, rule)
+        expansion.append(product)
+        if rule.update:
+            expansion.update()
+        history.append(Enrichment(outcome, sweeps, change, samples.residual(expansion.field)))
+        progress(len(history), history[-1].residual)
+        if history[-1].residual <= rule.tolerance:
+            return PGDSolution(expansion.field, Outcome.CONVERGED, tuple(history))
+        if _stagnated(history, rule):
+            return PGDSolution(expansion.field, Outcome.STAGNATED, tuple(history))
+    return PGDSolution(expansion.field, Outcome.MODE_LIMIT, tuple(history))
 
 
-def _enrich(expansion: _Expansion, rule: PGDRule) -> EnrichmentReport:
-    """One enrichment: start at random loads with energy left, alternate, keep the result."""
+def _stagnated(history: list[Enrichment], rule: PGDRule) -> bool:
+    if len(history) <= rule.stall:
+        return False
+    return history[-1].residual > (1.0 - rule.least_gain) * history[-1 - rule.stall].residual
+
+
+# --- one product ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Product:
+    """R S prod_d P^d with unit S and P^d, and the rows R . K_q X_k (last: R . K_q R)."""
+
+    space: FloatArray
+    load: FloatArray
+    parameters: tuple[FloatArray, ...]
+    rows: FloatArray  # (n_terms, rank + 1)
+
+
+def _enrich(expansion: _Expansion, rule: PGDRule) -> tuple[_Product, Outcome, int, float]:
+    """Alternating directions from a random load function and constant parameters."""
     problem = expansion.problem
-    rounding = _ROUNDING * float(problem.weights @ problem.energy)
-    load = _start(expansion, min(rule.block, rule.max_modes - expansion.rank))
-    status, change, captured, sweeps = EnrichmentStatus.SWEEP_LIMIT, np.inf, 0.0, 0
-    while sweeps < rule.max_sweeps and status is EnrichmentStatus.SWEEP_LIMIT:
-        space, load = _sweep(expansion, load)
-        sweeps += 1
-        before, captured = captured, float(problem.weights @ (load**2).sum(axis=1))
-        if captured <= rounding:
-            return EnrichmentReport(EnrichmentStatus.EXHAUSTED, 0, sweeps, 0.0, expansion.error)
-        change = abs(captured - before) / captured
+    rng = np.random.default_rng(expansion.field.rank)
+    load = _unit(rng.standard_normal(len(problem.load_weights)), problem.load_weights)
+    parameters = tuple(_unit(np.ones(len(w)), w) for w in problem.weights)
+    product: _Product | None = None
+    change = np.inf
+    for sweep in range(1, rule.max_sweeps + 1):
+        before = product
+        start = None if before is None else before.space
+        space = expansion.space_step(load, parameters, rule.solve_tolerance, start)
+        rows = expansion.rows(space)
+        amplitudes = expansion.load_step(space, rows, parameters)
+        load = _unit(amplitudes, problem.load_weights)
+        for d in range(len(parameters)):
+            found = expansion.parameter_step(d, space, rows, load, parameters)
+            parameters = (*parameters[:d], _unit(found, problem.weights[d]), *parameters[d + 1 :])
+        size = float(np.sqrt(problem.load_weights @ amplitudes**2))
+        product = _Product(space, size * load, parameters, rows)
+        change = _change(problem, before, product)
         if change <= rule.sweep_tolerance:
-            status = EnrichmentStatus.CONVERGED
-    modes = expansion.append(space)
-    return EnrichmentReport(status, modes, sweeps, change, expansion.error)
+            return product, Outcome.CONVERGED, sweep, change
+    assert product is not None
+    return product, Outcome.SWEEP_LIMIT, rule.max_sweeps, change
 
 
-def _start(expansion: _Expansion, block: int) -> np.ndarray:
-    """Random load functions, larger where more energy is left."""
-    rng = np.random.default_rng(expansion.rank)
-    left = np.sqrt(np.maximum(expansion.energy, 0.0))
-    return left[:, None] * rng.standard_normal((len(left), block))
+def _change(problem: AffineProblem, before: _Product | None, after: _Product) -> float:
+    """|new - old| / |new| of two products, norms of the coordinates."""
+    if before is None:
+        return np.inf
+
+    def inner(a: _Product, b: _Product) -> float:
+        value = float(a.space @ b.space) * float((problem.load_weights * a.load) @ b.load)
+        for w, p, q in zip(problem.weights, a.parameters, b.parameters, strict=True):
+            value *= float((w * p) @ q)
+        return value
+
+    whole = inner(after, after)
+    left = whole - 2.0 * inner(after, before) + inner(before, before)
+    return float(np.sqrt(max(left, 0.0) / whole)) if whole > 0 else 0.0
 
 
-def _sweep(expansion: _Expansion, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Alternating directions: R from S (Eq. 14), K-orthonormal within the block, S from R (11).
+def _unit(function: FloatArray, weight: FloatArray) -> FloatArray:
+    norm = np.sqrt(weight @ function**2)
+    return function / norm if norm > 0 else function
 
-    K R = sum_s w S r(s) is solved as R = K^-1 sum_s w S f(s) - sum_k X_k (Y_k . w S), and its
-    energy R . K R equals (F^T R) . w S, so that no product with K is needed.
+
+class _Expansion:
+    """The growing field, with the products of its space functions that every step needs.
+
+    gram : X^T K_q X, shape (n_terms, rank, rank)
+    projected : X^T F_j, shape (n_sources, rank, n_loads)
     """
-    problem = expansion.problem
-    weighted = problem.weights[:, None] * load
-    weighted /= np.linalg.norm(weighted, axis=0) + 1e-300
-    space = problem.elasticity.solve(problem.loads @ weighted)
-    space -= expansion.space @ (expansion.load.T @ weighted)
-    work = problem.loads.T @ space
-    value, vector = np.linalg.eigh((work.T @ weighted + weighted.T @ work) / 2.0)
-    new = value > 1e-14 * value.max()
-    scale = vector[:, new] / np.sqrt(value[new])
-    return space @ scale, work @ scale
+
+    def __init__(self, problem: AffineProblem) -> None:
+        self.problem = problem
+        n_loads = len(problem.load_weights)
+        self.field = CanonicalField(
+            np.zeros((problem.n, 0)),
+            np.zeros((n_loads, 0)),
+            tuple(np.zeros((len(w), 0)) for w in problem.weights),
+        )
+        self.gram = np.zeros((len(problem.terms), 0, 0))
+        self.projected = np.zeros((len(problem.sources), 0, n_loads))
+
+    def couplings(
+        self, parameters: tuple[FloatArray, ...], skipped: int | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """prod_d over all parameters but one, with the functions P of a product.
+
+        Returns
+        -------
+        own : (P, theta_q P), shape (n_terms,); others : (P, theta_q P_k), shape (n_terms, rank);
+        sources : (P, phi_j), shape (n_sources,)
+        """
+        problem, rank = self.problem, self.field.rank
+        own = np.ones(len(problem.terms))
+        others = np.ones((len(problem.terms), rank))
+        sources = np.ones(len(problem.sources))
+        for d, function in enumerate(parameters):
+            if d == skipped:
+                continue
+            weighted = problem.weights[d] * function
+            own = own * (problem.factors[d] @ (weighted * function))
+            others = others * ((problem.factors[d] * weighted) @ self.field.parameters[d])
+            sources = sources * (problem.source_factors[d] @ weighted)
+        return own, others, sources
+
+    def space_step(
+        self,
+        load: FloatArray,
+        parameters: tuple[FloatArray, ...],
+        tolerance: float,
+        start: FloatArray | None,
+    ) -> FloatArray:
+        """R: [sum_q a_q K_q] R = sum_j b_j F_j wS - sum_q K_q X c_q, by conjugate gradients."""
+        problem = self.problem
+        own, others, sources = self.couplings(parameters)
+        weighted = problem.load_weights * load
+        own = own * float(weighted @ load)
+        others = others * (weighted @ self.field.load)
+        right = sum(b * (f @ weighted) for b, f in zip(sources, problem.sources, strict=True))
+        for term, c in zip(problem.terms, others, strict=True):
+            right = right - term @ (self.field.space @ c)
+
+        def apply(vector: FloatArray) -> FloatArray:
+            terms = zip(own, problem.terms, strict=True)
+            return np.asarray(sum(a * (term @ vector) for a, term in terms))
+
+        operator = LinearOperator((problem.n, problem.n), matvec=apply)
+        space, failed = cg(
+            operator, right, x0=start, rtol=tolerance, maxiter=500, M=problem.precondition
+        )
+        if failed or not np.isfinite(space).all():
+            raise ConvergenceError(
+                "the system for a space function was not solved in 500 iterations; narrow the "
+                "ranges of the coordinates"
+            )
+        return np.asarray(space)
+
+    def rows(self, space: FloatArray) -> FloatArray:
+        """R . K_q X_k, and last R . K_q R, shape (n_terms, rank + 1)."""
+        images = [term @ space for term in self.problem.terms]
+        return np.array([np.append(self.field.space.T @ f, space @ f) for f in images])
+
+    def load_step(
+        self, space: FloatArray, rows: FloatArray, parameters: tuple[FloatArray, ...]
+    ) -> FloatArray:
+        """S(s), a scalar equation at each load; shape (n_loads,)."""
+        own, others, sources = self.couplings(parameters)
+        right = sum(
+            b * f.rmatvec(space) for b, f in zip(sources, self.problem.sources, strict=True)
+        )
+        known = self.field.load @ (rows[:, :-1] * others).sum(axis=0)
+        return np.asarray((right - known) / (rows[:, -1] @ own))
+
+    def parameter_step(
+        self,
+        d: int,
+        space: FloatArray,
+        rows: FloatArray,
+        load: FloatArray,
+        parameters: tuple[FloatArray, ...],
+    ) -> FloatArray:
+        """P^d(p), a scalar equation at each node of the parameter; shape (n_nodes,)."""
+        problem = self.problem
+        own, others, sources = self.couplings(parameters, skipped=d)
+        weighted = problem.load_weights * load
+        stiffness = (rows[:, -1] * own * float(weighted @ load)) @ problem.factors[d]
+        work = np.array([space @ (f @ weighted) for f in problem.sources])
+        right = (sources * work) @ problem.source_factors[d]
+        coupled = rows[:, :-1] * others * (weighted @ self.field.load)
+        known = problem.factors[d].T @ coupled  # (n_nodes, rank)
+        right = right - (known * self.field.parameters[d]).sum(axis=1)
+        return np.asarray(right / stiffness)
+
+    # --- all products -------------------------------------------------------------------------
+
+    def append(self, product: _Product) -> None:
+        """Add a product."""
+        rank, old = self.field.rank, self.gram
+        self.gram = np.zeros((len(old), rank + 1, rank + 1))
+        self.gram[:, :rank, :rank] = old
+        self.gram[:, rank, :] = self.gram[:, :, rank] = product.rows
+        new = np.array([f.rmatvec(product.space) for f in self.problem.sources])
+        self.projected = np.concatenate([self.projected, new[:, None]], axis=1)
+        self.field = CanonicalField(
+            np.column_stack([self.field.space, product.space]),
+            np.column_stack([self.field.load, product.load]),
+            tuple(
+                np.column_stack([known, p])
+                for known, p in zip(self.field.parameters, product.parameters, strict=True)
+            ),
+        )
+
+    def update(self) -> None:
+        """Galerkin projection for all functions of s, then of each parameter, and unit norms."""
+        self._update_loads()
+        for d in range(len(self.field.parameters)):
+            self._update_parameter(d)
+
+    def _grams(self, d: int) -> FloatArray:
+        """(P_k^d, theta_q^d P_l^d), shape (n_terms, rank, rank)."""
+        functions = self.field.parameters[d]
+        weighted = self.problem.factors[d] * self.problem.weights[d]
+        return np.einsum("qp,pk,pl->qkl", weighted, functions, functions, optimize=True)
+
+    def _moments(self, d: int) -> FloatArray:
+        """(P_k^d, phi_j^d), shape (n_sources, rank)."""
+        return (self.problem.source_factors[d] * self.problem.weights[d]) @ self.field.parameters[d]
+
+    def _update_loads(self) -> None:
+        stiffness, right = self.gram, self.projected
+        for d in range(len(self.field.parameters)):
+            stiffness = stiffness * self._grams(d)
+            right = right * self._moments(d)[:, :, None]
+        load = _solve(stiffness.sum(axis=0), right.sum(axis=0)).T
+        self.field = replace(self.field, load=load)
+
+    def _update_parameter(self, d: int) -> None:
+        problem, load = self.problem, self.field.load
+        weighted = problem.load_weights[:, None] * load
+        stiffness = self.gram * (load.T @ weighted)
+        right = np.einsum("jkn,nk->jk", self.projected, weighted)
+        for e in range(len(self.field.parameters)):
+            if e != d:
+                stiffness = stiffness * self._grams(e)
+                right = right * self._moments(e)
+        functions = np.array(
+            [
+                _solve(np.tensordot(theta, stiffness, 1), phi @ right)
+                for theta, phi in zip(
+                    problem.factors[d].T, problem.source_factors[d].T, strict=True
+                )
+            ]
+        )
+        norm = np.sqrt(problem.weights[d] @ functions**2)
+        norm[norm == 0.0] = 1.0
+        parameters = list(self.field.parameters)
+        parameters[d] = functions / norm
+        self.field = CanonicalField(self.field.space, load * norm, tuple(parameters))
+
+
+def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Least squares, as two products may share their other functions."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
+    scaled = scale[:, None] * matrix * scale
+    shape = (len(scale),) + (1,) * (right.ndim - 1)
+    found = np.linalg.lstsq(scaled, scale.reshape(shape) * right, rcond=1e-12)[0]
+    return np.asarray(scale.reshape(shape) * found)
+
+
+# --- other problems of the same form ----------------------------------------------------------
+
+
+def minimal_residual(problem: AffineProblem) -> AffineProblem:
+    """The normal equations: its Galerkin solution minimises the residual in the K_0^-1 norm.
+
+    sum_qq' theta_q theta_q' K_q K_0^-1 K_q' u = sum_qj theta_q phi_j K_q K_0^-1 F_j
+    """
+    inverse, pairs = problem.precondition, []
+    for q, left in enumerate(problem.terms):
+        for r, right in enumerate(problem.terms[: q + 1]):
+            both = left @ inverse @ right
+            pairs.append((q, r, both if q == r else both + right @ inverse @ left))
+    sources = [(q, j) for q in range(len(problem.terms)) for j in range(len(problem.sources))]
+    return replace(
+        problem,
+        terms=tuple(operator for _, _, operator in pairs),
+        factors=tuple(np.array([f[q] * f[r] for q, r, _ in pairs]) for f in problem.factors),
+        sources=tuple(problem.terms[q] @ inverse @ problem.sources[j] for q, j in sources),
+        source_factors=tuple(
+            np.array([f[q] * g[j] for q, j in sources])
+            for f, g in zip(problem.factors, problem.source_factors, strict=True)
+        ),
+    )
+
+
+def projection(
+    known: CanonicalField,
+    space_mass: LinearOperator,
+    inverse_mass: LinearOperator,
+    problem: AffineProblem,
+) -> AffineProblem:
+    """The problem u = known in the norms of a problem: fewer products for the same field.
+
+    space_mass : of the norm in space; inverse_mass : its inverse
+    """
+    sources = tuple(
+        aslinearoperator(space_mass @ known.space[:, [k]]) @ aslinearoperator(known.load[:, [k]].T)
+        for k in range(known.rank)
+    )
+    return replace(
+        problem,
+        terms=(space_mass,),
+        factors=tuple(np.ones((1, len(w))) for w in problem.weights),
+        sources=sources,
+        source_factors=tuple(functions.T for functions in known.parameters),
+        precondition=inverse_mass,
+    )
+
+
+def compress(
+    known: CanonicalField,
+    problem: AffineProblem,
+    space_mass: FloatArray,
+    tolerance: float,
+    max_modes: int | None = None,
+) -> PGDSolution:
+    """A shorter field within ``tolerance`` (relative, in the norms of the coordinates).
+
+    space_mass : ndarray, shape (n,), lumped
+    """
+    mass, inverse = aslinearoperator(diags(space_mass)), aslinearoperator(diags(1.0 / space_mass))
+    rule = PGDRule(max_modes or known.rank, tolerance, max_sweeps=30, sweep_tolerance=1e-3)
+    return solve_pgd(projection(known, mass, inverse, problem), rule)

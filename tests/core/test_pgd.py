@@ -1,100 +1,166 @@
-"""PGD and separated fields: exact recovery, optimality, honest reports."""
+"""PGD in any number of coordinates, on small problems whose solution is known."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-import scipy.sparse as sp
+from scipy.sparse.linalg import aslinearoperator
 
-from avatar_core.elasticity import Elasticity
+from avatar_core.affine import AffineProblem, CanonicalField, Samples
 from avatar_core.errors import ConvergenceError
-from avatar_core.pgd import EnrichmentStatus, ParametricProblem, PGDRule, solve_pgd
-from avatar_core.separated import SeparatedField
+from avatar_core.pgd import (
+    Outcome,
+    PGDRule,
+    compress,
+    minimal_residual,
+    solve_pgd,
+)
+
+N, N_LOADS, N_NODES = 24, 10, (5, 4)
 
 
-def problem_of_rank(
-    elasticity: Elasticity, rank: int, n_loads: int = 30, seed: int = 0
-) -> tuple[ParametricProblem, np.ndarray]:
-    """Loads that are combinations of ``rank`` forces, and their exact solutions."""
+def _stiffnesses(rng: np.random.Generator) -> list[np.ndarray]:
+    roots = [rng.standard_normal((N, N)) for _ in range(2)]
+    return [root @ root.T / N + 0.3 * np.eye(N) for root in roots]
+
+
+def _problem(seed: int = 0, spread: float = 3.0) -> AffineProblem:
+    """[theta_1(p) K_1 + theta_2(p, c) K_2] u = f(s), theta_2 = p c."""
     rng = np.random.default_rng(seed)
-    force = rng.standard_normal((3 * elasticity.n_nodes, rank))
-    force.reshape(-1, 3, rank)[elasticity.clamped_nodes] = 0.0
-    loads = force @ (rng.standard_normal((rank, n_loads)) * 0.5 ** np.arange(rank)[:, None])
-    exact = elasticity.solve(loads)
-    energy = np.einsum("ij,ij->j", loads, exact)
-    return ParametricProblem(elasticity, sp.csr_matrix(loads), 1.0 / energy, energy), exact
-
-
-@pytest.mark.parametrize("block", [1, 4])
-def test_field_of_rank_four_is_recovered_exactly(box_elasticity: Elasticity, block: int) -> None:
-    problem, exact = problem_of_rank(box_elasticity, 4)
-    rule = PGDRule(10, 1e-9, block=block, max_sweeps=200, sweep_tolerance=1e-13)
-    solution = solve_pgd(problem, rule)
-    field = SeparatedField(solution.space, solution.load)
-    assert field.rank == 4
-    assert np.abs(field.evaluate() - exact).max() < 1e-7 * np.abs(exact).max()
-
-
-def test_modes_are_orthonormal_in_energy(box_elasticity: Elasticity) -> None:
-    problem, _ = problem_of_rank(box_elasticity, 12)
-    solution = solve_pgd(problem, PGDRule(8, 1e-9, block=3))
-    gram = solution.space.T @ box_elasticity.apply(solution.space)
-    np.testing.assert_allclose(gram, np.eye(gram.shape[0]), atol=1e-8)
-
-
-def test_greedy_modes_are_near_the_svd_optimum(box_elasticity: Elasticity) -> None:
-    """In (x, s) the best modes are the eigenvectors of the weighted compliance."""
-    problem, exact = problem_of_rank(box_elasticity, 20, n_loads=60)
-    solution = solve_pgd(problem, PGDRule(8, 0.0, block=8, max_sweeps=30, sweep_tolerance=1e-6))
-    scale = np.sqrt(problem.weights)
-    spectrum = np.linalg.eigvalsh(scale[:, None] * (problem.loads.T @ exact) * scale)[::-1]
-    optimum = np.sqrt(spectrum[8:].sum() / spectrum.sum())
-    assert optimum <= solution.history[-1].energy_error * (1 + 1e-9)
-    assert solution.history[-1].energy_error < 1.02 * optimum
-
-
-def test_stated_energy_error_is_the_true_one(box_elasticity: Elasticity) -> None:
-    problem, exact = problem_of_rank(box_elasticity, 12)
-    solution = solve_pgd(problem, PGDRule(5, 0.0, block=2))
-    left = exact - solution.space @ solution.load.T
-    energy = np.einsum("ij,ij->j", left, box_elasticity.apply(left))
-    true = np.sqrt(problem.weights @ energy / (problem.weights @ problem.energy))
-    assert solution.history[-1].energy_error == pytest.approx(true, rel=1e-6)
-
-
-def test_one_sweep_is_reported_not_silent(box_elasticity: Elasticity) -> None:
-    problem, _ = problem_of_rank(box_elasticity, 12)
-    solution = solve_pgd(problem, PGDRule(4, 1e-9, block=1, max_sweeps=1))
-    assert all(r.status is EnrichmentStatus.SWEEP_LIMIT for r in solution.history)
-    assert not solution.converged
-
-
-def test_enrichment_beyond_rounding_stops(box_elasticity: Elasticity) -> None:
-    problem, _ = problem_of_rank(box_elasticity, 2)
-    solution = solve_pgd(problem, PGDRule(20, 0.0, block=2, max_sweeps=30))
-    assert solution.history[-1].status is EnrichmentStatus.EXHAUSTED
-    assert np.isfinite(solution.space).all()
-
-
-def test_zero_load_is_refused(box_elasticity: Elasticity) -> None:
-    problem, _ = problem_of_rank(box_elasticity, 2, n_loads=3)
-    zero = ParametricProblem(box_elasticity, problem.loads * 0.0, problem.weights, np.zeros(3))
-    with pytest.raises(ConvergenceError, match="zero"):
-        solve_pgd(zero, PGDRule(5, 1e-3))
-
-
-def test_norm_and_compression_equal_the_full_matrix() -> None:
-    rng = np.random.default_rng(5)
-    m, w = rng.uniform(0.5, 2.0, 40), rng.uniform(0.5, 2.0, 25)
-    field = SeparatedField(
-        rng.standard_normal((40, 6)), rng.standard_normal((25, 6)) * 10.0 ** -np.arange(6)
+    terms = _stiffnesses(rng)
+    p, c = np.linspace(1.0, spread, N_NODES[0]), np.linspace(0.5, 2.0, N_NODES[1])
+    middle = terms[0] + p[2] * c[1] * terms[1]
+    return AffineProblem(
+        terms=tuple(map(aslinearoperator, terms)),
+        sources=(aslinearoperator(rng.standard_normal((N, N_LOADS))),),
+        factors=(np.array([np.ones_like(p), p]), np.array([np.ones_like(c), c])),
+        source_factors=(np.ones((1, len(p))), np.ones((1, len(c)))),
+        load_weights=rng.uniform(0.5, 2.0, N_LOADS),
+        weights=(np.full(len(p), 1 / len(p)), np.full(len(c), 1 / len(c))),
+        precondition=aslinearoperator(np.linalg.inv(middle)),
     )
-    full = field.evaluate()
-    weighted = np.sqrt(m)[:, None] * full * np.sqrt(w)
-    assert field.norm(m, w) == pytest.approx(np.linalg.norm(weighted), rel=1e-12)
-    short = field.compress(m, w, 1e-2)
-    value = np.linalg.svd(weighted, compute_uv=False)
-    tail = np.sqrt(np.cumsum(value[::-1] ** 2)[::-1] / (value**2).sum())
-    assert short.rank == int(np.argmax(np.append(tail, 0.0) <= 1e-2))
-    error = np.sqrt(m)[:, None] * (short.evaluate() - full) * np.sqrt(w)
-    assert np.linalg.norm(error) <= 1e-2 * np.linalg.norm(weighted)
+
+
+def _dense(operator: object) -> np.ndarray:
+    return np.asarray(operator @ np.eye(operator.shape[1]))  # type: ignore[attr-defined]
+
+
+def _exact(problem: AffineProblem) -> np.ndarray:
+    """u at all nodes, shape (n_p, n_c, n, n_loads)."""
+    terms, force = [_dense(k) for k in problem.terms], _dense(problem.sources[0])
+    out = np.empty((*N_NODES, N, N_LOADS))
+    for a, b in np.ndindex(*N_NODES):
+        theta = problem.factors[0][:, a] * problem.factors[1][:, b]
+        out[a, b] = np.linalg.solve(theta[0] * terms[0] + theta[1] * terms[1], force)
+    return out
+
+
+def _error(field: CanonicalField, exact: np.ndarray) -> float:
+    found = np.array([[field.at((a, b)) for b in range(N_NODES[1])] for a in range(N_NODES[0])])
+    return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+
+
+def test_a_field_of_rank_three_is_recovered_in_as_many_products() -> None:
+    rng = np.random.default_rng(5)
+    problem = _problem()
+    vectors = [np.linalg.qr(rng.standard_normal((n, 3)))[0] for n in (N, N_LOADS, *N_NODES)]
+    known = CanonicalField(vectors[0] * [9.0, 3.0, 1.0], vectors[1], (vectors[2], vectors[3]))
+    flat = replace(
+        problem,
+        load_weights=np.ones(N_LOADS),
+        weights=tuple(np.ones(n) for n in N_NODES),
+    )
+    found = compress(known, flat, np.ones(N), 1e-4)
+    assert found.field.rank == 3
+    exact = np.array([[known.at((a, b)) for b in range(N_NODES[1])] for a in range(N_NODES[0])])
+    assert _error(found.field, exact) < 1e-3  # the sweeps' own tolerance
+
+
+def test_compression_drops_what_is_not_worth_a_product() -> None:
+    rng = np.random.default_rng(6)
+    problem = _problem()
+    vectors = [np.linalg.qr(rng.standard_normal((n, 4)))[0] for n in (N, N_LOADS, *N_NODES)]
+    known = CanonicalField(vectors[0] * [9.0, 3.0, 1e-4, 1e-5], *vectors[1:2], tuple(vectors[2:]))
+    found = compress(known, problem, np.ones(N), 1e-3)
+    exact = np.array([[known.at((a, b)) for b in range(N_NODES[1])] for a in range(N_NODES[0])])
+    assert found.field.rank < known.rank
+    assert _error(found.field, exact) < 5e-3
+
+
+def test_separable_solution_needs_one_product_a_load_pattern() -> None:
+    """K_2 = K_1 makes u = K_1^-1 f / (1 + p c): two terms, as 1/(1 + p c) is not separable."""
+    problem = _problem()
+    same = replace(problem, terms=(problem.terms[0],), factors=(
+        np.array([np.linspace(1.0, 3.0, N_NODES[0])]), np.array([np.linspace(0.5, 2.0, N_NODES[1])])
+    ))  # fmt: skip
+    load = np.random.default_rng(1).standard_normal((N, 1)) @ np.ones((1, N_LOADS))
+    same = replace(same, sources=(aslinearoperator(load),))
+    found = solve_pgd(same, PGDRule(3, 1e-6, sweep_tolerance=1e-4, solve_tolerance=1e-10))
+    assert (found.field.rank, found.outcome) == (1, Outcome.CONVERGED)
+    u = np.linalg.solve(_dense(same.terms[0]), load)
+    np.testing.assert_allclose(found.field.at((4, 0)), u / (3.0 * 0.5), rtol=1e-5)
+
+
+@pytest.mark.parametrize("variant", ["Galerkin", "no update", "minimal residual"])
+def test_every_variant_closes_in_on_the_direct_solution(variant: str) -> None:
+    problem = _problem()
+    exact = _exact(problem)
+    if variant == "minimal residual":
+        problem = minimal_residual(problem)
+    rule = PGDRule(30, 1e-9, sweep_tolerance=1e-2, solve_tolerance=1e-8, stall=30)
+    if variant == "no update":
+        rule = replace(rule, update=False)
+    found = solve_pgd(problem, rule).field
+    errors = [_error(found, exact)]
+    few = solve_pgd(problem, replace(rule, max_modes=6)).field
+    assert errors[0] < 0.5 * _error(few, exact)
+    assert errors[0] < 0.12  # of ten unrelated loads, thirty products
+
+
+def test_an_update_makes_as_many_products_worth_more() -> None:
+    problem = _problem()
+    exact = _exact(problem)
+    rule = PGDRule(12, 1e-9, solve_tolerance=1e-8, stall=30)
+    plain = solve_pgd(problem, replace(rule, update=False)).field
+    updated = solve_pgd(problem, rule).field
+    assert _error(updated, exact) < _error(plain, exact)
+
+
+def test_an_enrichment_that_is_cut_short_is_reported() -> None:
+    found = solve_pgd(_problem(), PGDRule(4, 1e-9, max_sweeps=1))
+    assert {step.outcome for step in found.history} == {Outcome.SWEEP_LIMIT}
+    assert not found.converged
+    assert found.outcome is Outcome.MODE_LIMIT
+
+
+def test_stagnation_ends_the_enrichment_and_is_said() -> None:
+    """Products of the wrong operator do not lower the residual of the right one."""
+    found = solve_pgd(_problem(spread=1e3), PGDRule(40, 1e-9, stall=3, least_gain=0.5))
+    assert found.outcome is Outcome.STAGNATED
+    assert found.field.rank < 40
+
+
+def test_estimates_follow_the_true_error_and_the_bound_holds() -> None:
+    problem = _problem()
+    exact = _exact(problem)
+    field = solve_pgd(problem, PGDRule(15, 1e-9, solve_tolerance=1e-8, stall=30)).field
+    samples = Samples(problem, 40, seed=3)
+    theta = problem.factors[0][:, 2] * problem.factors[1][:, 1]
+    estimate = samples.estimate(field, theta)
+    force = _dense(problem.sources[0])
+    true = []
+    for j, (a, b) in zip(samples.loads, samples.nodes, strict=True):
+        right = force[:, j] @ exact[a, b][:, j]
+        mine = force[:, j] @ field.at((a, b))[:, j]
+        true.append(abs(right - mine) / abs(mine))
+    assert 0.5 < estimate.contact / np.mean(true) < 2.0
+    assert estimate.contact_bound >= np.mean(true)
+
+
+def test_no_load_is_refused() -> None:
+    problem = _problem()
+    nothing = replace(problem, sources=(aslinearoperator(np.zeros((N, N_LOADS))),))
+    with pytest.raises(ConvergenceError, match="zero"):
+        solve_pgd(nothing, PGDRule(3))
