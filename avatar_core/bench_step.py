@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from avatar_core.bench import StepRow, time_dense_table, time_direct, time_steps
-from avatar_core.build import BuildRule, Progress, build_vademecum, with_rank
+from avatar_core.build import build_vademecum, with_rank
+from avatar_core.build_rule import NO_ERROR, BuildRule, Progress
 from avatar_core.elasticity import Elasticity, Element, Material
 from avatar_core.loads import load_surface
 from avatar_core.mesh import regions_by_rule, tetrahedralize
@@ -51,7 +52,7 @@ def _rows(vademecum: Vademecum, elasticity: Elasticity) -> list[StepRow]:
 def _built(
     surface: SurfaceMesh, n_vertices: int, element: Element | None, progress: Progress
 ) -> tuple[Vademecum, Elasticity]:
-    progress("mesh", 0.0)
+    progress("mesh", 0.0, NO_ERROR)
     mesh = tetrahedralize(surface, n_vertices)
     regions = regions_by_rule(mesh)
     elasticity = Elasticity(mesh, Material(), regions.clamped, element)

@@ -6,9 +6,9 @@ centroids, which no part of the build uses, in three directions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _BATCH = 40  # load positions solved at once
 _TIP_RADIUS = 2e-3  # [m]
+_MEANS = ("l2_mean", "contact_mean", "force_mean", "felt_mean")
+_WORST = ("l2_worst", "contact_worst", "force_worst", "felt_worst", "vertex_contact_worst")
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,20 @@ def certify(
         seed=seed,
         modes=vademecum.far.rank,
     )
+
+
+def merged(parts: Sequence[Certificate]) -> Certificate:
+    """One certificate of several equally large ones: means of the means, worst of the worst."""
+
+    def mean(name: str) -> float:
+        return float(np.mean([getattr(part, name) for part in parts]))
+
+    def worst(name: str) -> float:
+        return float(np.max([getattr(part, name) for part in parts]))
+
+    values: dict[str, Any] = {name: mean(name) for name in _MEANS}
+    values |= {name: worst(name) for name in _WORST}
+    return replace(parts[0], **values, n_loads=sum(part.n_loads for part in parts))
 
 
 def _at_centroid(surface: LoadSurface, triangle: int) -> tuple[np.ndarray, np.ndarray]:

@@ -8,11 +8,16 @@ Quadratic tetrahedra (P2) serve up to nu = 0.49. Above, the Taylor-Hood pair (P2
 pressure) replaces lambda div(u) by a pressure p with int (div u - p / lambda) q dx = 0.
 Linear tetrahedra (P1) lock at the nu of liver (compliance 0.72 of the true one at 0.48): they
 are there for timing very large meshes, never as a default.
+
+With an inclusion, a tumour say, Young's modulus is (1 + (c - 1) chi) E, with the contrast c and the
+share chi of each tetrahedron that lies inside. The stiffness is then affine in mu, lambda, c mu
+and c lambda, of which the coordinates of a vademecum make use.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -74,6 +79,31 @@ class Material:
         return "P2" if self.poisson_ratio <= POISSON_RATIO_P2 else "Taylor-Hood"
 
 
+def factors_at(material: Material, contrast: float | None) -> np.ndarray:
+    """theta_q of K = sum_q theta_q K_q: mu, lambda, and c mu, c lambda with an inclusion."""
+    lam, mu = material.lame
+    theta = np.array([mu, lam])
+    return theta if contrast is None else np.concatenate([theta, contrast * theta])
+
+
+@dataclass(frozen=True, eq=False)
+class Inclusion:
+    """A part of the organ with another stiffness and the same Poisson's ratio.
+
+    share : ndarray, shape (n_tets,), volume fraction of each tetrahedron inside, chi
+    contrast : Young's modulus inside over that outside, c > 0
+    """
+
+    share: np.ndarray
+    contrast: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.contrast) and self.contrast > 0):
+            raise MaterialError(
+                f"the contrast is {self.contrast}; it is a ratio of Young's moduli and positive"
+            )
+
+
 @BilinearForm
 def divergence(u, q, w):  # type: ignore[no-untyped-def]
     """q div(u), the coupling of displacement and pressure."""
@@ -99,6 +129,12 @@ class Elasticity:
     clamped : ndarray of bool, shape (n_faces,), over ``mesh.boundary_faces``; all False leaves
         the organ free: then only :attr:`stiffness` can be used.
     element : "P1", "P2", "Taylor-Hood" or None for ``material.element``
+    inclusion : Inclusion or None; not with Taylor-Hood
+
+    Raises
+    ------
+    MaterialError
+        For an inclusion in a nearly incompressible organ.
     """
 
     def __init__(
@@ -107,10 +143,16 @@ class Elasticity:
         material: Material,
         clamped: np.ndarray,
         element: Element | None = None,
+        inclusion: Inclusion | None = None,
     ) -> None:
-        self.mesh, self.material = mesh, material
+        self.mesh, self.material, self.inclusion = mesh, material, inclusion
         self._clamped_faces = clamped
         self.element: Element = element or material.element
+        if inclusion is not None and self.element == "Taylor-Hood":
+            raise MaterialError(
+                f"an inclusion with Poisson's ratio above {POISSON_RATIO_P2} is not supported; "
+                f"take at most {POISSON_RATIO_P2}"
+            )
         self._skfem_mesh = MeshTet(
             np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
         )
@@ -145,7 +187,25 @@ class Elasticity:
             ]
         )
         owner = candidates[np.arange(len(center)), inside.argmax(axis=1)]
-        return Elasticity(mesh, self.material, self._clamped_faces[owner], self.element)
+        inclusion = self.inclusion
+        if inclusion is not None:
+            within = self._skfem_mesh.element_finder()
+            parent_tet = within(*mesh.vertices[mesh.tets].mean(axis=1).T)
+            inclusion = replace(inclusion, share=inclusion.share[parent_tet])
+        return Elasticity(mesh, self.material, self._clamped_faces[owner], self.element, inclusion)
+
+    def at(self, material: Material, contrast: float | None = None) -> Elasticity:
+        """The same problem with other values on the same element; what can be shared is."""
+        _ = (
+            self._mixed if self.element == "Taylor-Hood" else self._unit_stiffness
+        )  # before the copy
+        other = copy(self)
+        other.material = material
+        if self.inclusion is not None and contrast is not None:
+            other.inclusion = replace(self.inclusion, contrast=contrast)
+        for name in ("stiffness", "_factor"):
+            other.__dict__.pop(name, None)
+        return other
 
     @cached_property
     def face_nodes(self) -> np.ndarray:
@@ -161,27 +221,49 @@ class Elasticity:
         found = np.searchsorted(key[order], pairs[..., 0] * n_vertices + pairs[..., 1])
         return np.concatenate([faces, n_vertices + order[found]], axis=1)
 
-    def _unit_stiffness(self) -> tuple[sp.csr_matrix, sp.csr_matrix]:
-        """Shear part for mu = 1 and volumetric part for lambda = 1."""
-        node = np.argsort(self._nodes_first(self._basis))
-        return unit_stiffness(self._basis, node[self._basis.element_dofs.T])
+    @cached_property
+    def _unit_stiffness(self) -> tuple[sp.csr_matrix, ...]:
+        """K_q of :meth:`factors` (P1 and P2; the first for Taylor-Hood too)."""
+        node = np.argsort(self._nodes_first(self._basis))[self._basis.element_dofs.T]
+        if self.inclusion is None:
+            return unit_stiffness(self._basis, node)
+        inside = self.inclusion.share
+        outside = unit_stiffness(self._basis, node, 1.0 - inside)
+        return outside + unit_stiffness(self._basis, node, inside)
 
     @cached_property
     def _mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
-        """Shear stiffness, divergence and pressure mass of the Taylor-Hood pair."""
-        _, mu = self.material.lame
+        """Shear stiffness for mu = 1, divergence and pressure mass of the Taylor-Hood pair."""
         pressure = Basis(self._skfem_mesh, ElementTetP1(), intorder=2)
         displacement = Basis(self._skfem_mesh, ElementVector(self._shape), intorder=2)
         coupling = divergence.assemble(displacement, pressure).tocsr()
         coupling = coupling[:, self._nodes_first(displacement)]
-        return mu * self._unit_stiffness()[0], coupling, pressure_mass.assemble(pressure).tocsr()
+        return self._unit_stiffness[0], coupling, pressure_mass.assemble(pressure).tocsr()
+
+    @property
+    def factors(self) -> np.ndarray:
+        """theta_q at this problem's material, :func:`factors_at`."""
+        return factors_at(self.material, self.inclusion.contrast if self.inclusion else None)
 
     @cached_property
     def stiffness(self) -> sp.csr_matrix:
         """K without boundary conditions, shape (3 n_nodes, 3 n_nodes) [N/m] (P1 and P2)."""
-        lam, mu = self.material.lame
-        shear, volume = self._unit_stiffness()
-        return (mu * shear + lam * volume).tocsr()
+        terms = zip(self.factors, self._unit_stiffness, strict=True)
+        return sum(theta * matrix for theta, matrix in terms).tocsr()
+
+    def apply_terms(self, displacement: np.ndarray) -> tuple[np.ndarray, ...]:
+        """K_q u for each of :attr:`factors`, shape (3 n_nodes, n) [m^2]."""
+        return tuple(self.apply_term(q, displacement) for q in range(len(self.factors)))
+
+    def apply_term(self, q: int, displacement: np.ndarray) -> np.ndarray:
+        """K_q u, shape (3 n_nodes, n) [m^2]."""
+        if self.element != "Taylor-Hood":
+            return np.asarray(self._unit_stiffness[q] @ displacement)
+        shear, coupling, _ = self._mixed
+        if q == 0:
+            return np.asarray(shear @ displacement)
+        change = np.asfortranarray(coupling @ displacement)
+        return np.asarray(coupling.T @ self._pressure_factor.solve_many(change))
 
     @cached_property
     def _free(self) -> np.ndarray:
@@ -197,8 +279,9 @@ class Elasticity:
         if self.element == "Taylor-Hood":
             shear, coupling, mass = self._mixed
             coupling = coupling[:, free]
-            lam, _ = self.material.lame
-            system = sp.bmat([[shear[free][:, free], -coupling.T], [-coupling, -mass / lam]])
+            lam, mu = self.material.lame
+            shear = mu * shear[free][:, free]
+            system = sp.bmat([[shear, -coupling.T], [-coupling, -mass / lam]])
         else:
             system = self.stiffness[free][:, free]
         return rslab.ldlt(sp.csc_matrix(system))
@@ -248,10 +331,8 @@ class Elasticity:
         """Internal forces K u, shape (3 n_nodes, n) [N]; reactions appear at the clamp."""
         if self.element != "Taylor-Hood":
             return self.stiffness @ displacement
-        shear, coupling, _ = self._mixed
-        lam, _ = self.material.lame
-        change = np.asfortranarray(coupling @ displacement)
-        return shear @ displacement + lam * (coupling.T @ self._pressure_factor.solve_many(change))
+        terms = zip(self.factors, self.apply_terms(displacement), strict=True)
+        return np.asarray(sum(theta * force for theta, force in terms))
 
     def at_vertices(self, displacement: np.ndarray) -> np.ndarray:
         """The vertex part of nodal displacements, shape (3 n_vertices, n)."""

@@ -17,7 +17,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from avatar_core.barycenter import Barycenter
-from avatar_core.build import BuildRule, build_vademecum, with_rank
+from avatar_core.build import build_vademecum, with_rank
+from avatar_core.build_rule import BuildRule
 from avatar_core.certificate import certify
 from avatar_core.compact import CompactResponse
 from avatar_core.correspondence import carry_regions, load_map, registered_positions
@@ -34,7 +35,7 @@ from avatar_core.reduced import (
     reduce,
 )
 from avatar_core.registration import Registration, register
-from avatar_core.separated import SeparatedField, optimal_rotation
+from avatar_core.separated import SeparatedField
 from avatar_core.surface import SurfaceMesh
 from avatar_core.tip_field import make_tip_field
 from avatar_core.transfer import (
@@ -341,7 +342,7 @@ def solved(
         problem.loads,
         replace(options.build, max_modes=options.max_modes),
         _provenance(problem),
-        lambda stage, fraction: progress(f"response: {stage}", fraction, np.nan),
+        lambda stage, fraction, error: progress(f"response: {stage}", fraction, error),
     )
 
 
@@ -396,11 +397,8 @@ def _by_worth(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
     """Modes rotated so that the first are worth most in displacement; Y Y^T does not change."""
     field_ = SeparatedField(np.asarray(response.space, float), np.asarray(response.load, float))
     size = np.maximum((field_.load**2).sum(axis=1), 1e-300)
-    _, mixing, _ = optimal_rotation(field_, np.repeat(mesh.vertex_volumes, 3), 1.0 / size)
-    rotation = np.linalg.qr(mixing)[0]
-    return SeparatedField(
-        (field_.space @ rotation).astype(np.float32), (field_.load @ rotation).astype(np.float32)
-    )
+    sorted_ = field_.sorted_by_worth(np.repeat(mesh.vertex_volumes, 3), 1.0 / size)
+    return SeparatedField(sorted_.space.astype(np.float32), sorted_.load.astype(np.float32))
 
 
 def _no_blocks(loads: LoadSurface, mesh: TetMesh, reach: float) -> LocalBlocks:

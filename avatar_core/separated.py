@@ -36,6 +36,29 @@ class SeparatedField:
         """The first ``rank`` modes."""
         return SeparatedField(self.space[:, :rank], self.load[:, :rank])
 
+    def sorted_by_worth(
+        self, space_mass: np.ndarray, load_mass: np.ndarray | None = None
+    ) -> SeparatedField:
+        """The same field with orthogonally mixed modes, of which the first are worth most.
+
+        An orthogonal mixing keeps what orthonormal modes are good for: Y Y^T, and that any
+        leading ones are a Galerkin subspace. It is the Q of B^T R = Q T, with X^T M X = A^T A,
+        Y^T W Y = B^T B and the singular value decomposition A B^T = P S R^T.
+
+        Parameters
+        ----------
+        space_mass : ndarray, shape (n_dofs,), lumped, M
+        load_mass : ndarray, shape (n_loads,), W; by default 1 / |u|^2 of each load in M, so that
+            relative errors count
+        """
+        a = _gram_root(self.space, space_mass)
+        if load_mass is None:
+            load_mass = 1.0 / np.maximum(((self.load @ a.T) ** 2).sum(axis=1), 1e-300)
+        b = _gram_root(self.load, load_mass)
+        _, _, right = np.linalg.svd(a @ b.T)
+        mixing = np.linalg.qr(b.T @ right.T)[0]
+        return SeparatedField(self.space @ mixing, self.load @ mixing)
+
     def norm(self, space_mass: np.ndarray, load_mass: np.ndarray) -> float:
         """sqrt(sum_ij m_i w_j u_ij^2) with lumped masses, never forming u."""
         gram_space = self.space.T @ (space_mass[:, None] * self.space)

@@ -128,6 +128,7 @@ def read_surface(
     label: int | None = None,
     *,
     check_size: bool = True,
+    one_body: bool = True,
 ) -> SurfaceMesh:
     """Read OBJ, STL, PLY, VTK, OFF or a NIfTI label map as one closed organ surface.
 
@@ -135,6 +136,7 @@ def read_surface(
     axes : where the file's +x, +y, +z point ("RAS", "LPS", "RIA", ...), or a rigid (4, 4) matrix
         from the file's coordinates to RAS in the file's unit
     label : which label of a label map; not needed if there is only one
+    one_body : small stray bodies are dropped, others refused; False for tumours
 
     Raises SurfaceError naming cause and remedy: file missing or unreadable, no triangles, points
     not finite, surface open, more than one organ, implausible size.
@@ -156,7 +158,9 @@ def read_surface(
         axes=matrix,
         source_sha256=hashlib.sha256(content).hexdigest(),
     )
-    surface = orient_outward(require_closed(keep_organ(surface)))
+    if one_body:
+        surface = keep_organ(surface)
+    surface = orient_outward(require_closed(surface))
     if check_size:
         require_plausible_size(surface)
     return surface

@@ -108,6 +108,7 @@ class Online:
     """A contact model and the messages that have its size: exchanged as one."""
 
     def __init__(self, vademecum_id: str, model: Any, settings: ContactSettings) -> None:
+        self.id = vademecum_id
         self.model = model
         self.cloud: CloudTemplate | None = None
         if model is not None and settings.cloud != "off":
@@ -313,6 +314,7 @@ class ContactNode(ManagedNode):
         self._tools: list[Tool] = []
         self._outlets: Outlets | None = None
         self._timer: Any = None
+        self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
         super().__init__("contact", parameters.CONTACT)
         self.add_on_set_parameters_callback(self._change_parameters)
 
@@ -352,6 +354,7 @@ class ContactNode(ManagedNode):
             tip_radii=settings.tip_radii,
             modes=settings.modes,
             cloud=settings.cloud,
+            material=settings.material,
         )
         self._handover = Handover(order, self._take_model, self.get_logger().error)
 
@@ -392,18 +395,47 @@ class ContactNode(ManagedNode):
             return
         model = contact.make_model(contact.ModelArrays(**prepared.arrays))
         replaced = loop.online
+        if replaced.model is not None and replaced.id == prepared.id:
+            model.resume(replaced.model)
+        self._ranges = prepared.ranges
         loop.online = Online(prepared.id, model, loop.settings)
         self.get_logger().info(f"vademecum {prepared.name!r} ({prepared.id[:12]}) in use")
         time.sleep(_GRACE)
         del replaced  # frees its memory here, not in the loop
 
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        """Type and range were checked; those that may change take effect with the next step."""
+        """Type and range were checked; those that may change take effect with the next step.
+
+        A change of the material takes some tenths of a second, in the handover's process.
+        """
         loop = self._loop
-        if loop is not None:
-            changed = {p.name: p.value for p in changes if hasattr(loop.settings, p.name)}
-            loop.settings = replace(loop.settings, **changed)
+        if loop is None:
+            return SetParametersResult(successful=True)
+        material = dict(loop.settings.material)
+        for change in changes:
+            name = parameters.MATERIAL.get(change.name)
+            if name is None:
+                continue
+            refusal = self._refusal_of(name, change.value)
+            if refusal:
+                return SetParametersResult(successful=False, reason=refusal)
+            material.pop(name, None)
+            if change.value != 0.0:
+                material[name] = change.value
+        changed = {p.name: p.value for p in changes if hasattr(loop.settings, p.name)}
+        if material != loop.settings.material and self._handover is not None:
+            self._handover.choose(material)
+        loop.settings = replace(loop.settings, **changed, material=material)
         return SetParametersResult(successful=True)
+
+    def _refusal_of(self, name: str, value: float) -> str:
+        """Why the vademecum in use does not have a value of the material; empty if it has."""
+        if value == 0.0 or name == "young" or self._ranges is None:
+            return ""
+        if name not in self._ranges:
+            return f"the vademecum has no coordinate {name}; build it with --coordinate {name}=..."
+        low, high = self._ranges[name]
+        return "" if low <= value <= high else f"the vademecum holds {low:g} to {high:g}"
 
     def _publish_statistics(self) -> None:
         loop, outlets = self._loop, self._outlets

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -45,15 +45,20 @@ class Order:
     tip_radii: tuple[float, ...]
     modes: int | None
     cloud: Literal["surface", "volume", "off"]
+    material: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A verified vademecum's contact model as arrays in shared memory."""
+    """A verified vademecum's contact model as arrays in shared memory.
+
+    ranges : lowest and highest value of each coordinate that the vademecum has
+    """
 
     id: str
     name: str
     arrays: dict[str, np.ndarray]
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 class Handover:
@@ -76,8 +81,16 @@ class Handover:
         self._on_refusal = on_refusal
         self._stop = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
+        self._line: socket.socket | None = None
         self._thread = threading.Thread(target=self._supervise, name="handover", daemon=True)
         self._thread.start()
+
+    def choose(self, material: dict[str, float]) -> None:
+        """Have the vademecum prepared anew at other values of its coordinates; returns at once."""
+        self._order = replace(self._order, material=material)  # for a process that is started anew
+        if self._line is not None:
+            with contextlib.suppress(OSError):
+                self._line.send(json.dumps(material).encode())
 
     def stop(self) -> None:
         """End the receiving process; returns when it has ended."""
@@ -93,7 +106,9 @@ class Handover:
             with ours:
                 with theirs:
                     self._process = _start(self._order, theirs)
+                    self._line = ours
                 self._receive(ours)
+                self._line = None
             _end(self._process)
             if not self._stop.is_set():
                 self._on_refusal("the process that receives vademecums ended; starting another")
@@ -106,7 +121,8 @@ class Handover:
                 return
             note = json.loads(packet)
             if handles:
-                self._on_model(Prepared(note["id"], note["name"], _map(handles[0], note["arrays"])))
+                arrays = _map(handles[0], note["arrays"])
+                self._on_model(Prepared(note["id"], note["name"], arrays, note["ranges"]))
             else:
                 self._on_refusal(note["refusal"])
 
@@ -176,43 +192,80 @@ def _view(memory: mmap.mmap, entry: dict[str, Any]) -> np.ndarray:
 
 
 class Receiver:
-    """Verifies and prepares what comes in, and reports through a socket."""
+    """Verifies and prepares what comes in, and reports through a socket.
+
+    Vademecums come in the thread of the node, values of the material in that of :meth:`listen`.
+    """
 
     def __init__(self, order: Order, report: socket.socket) -> None:
         self._order = order
         self._report = report
-        self._current = ""
+        self._vademecum: Any = None
+        self._lock = threading.Lock()
 
     def receive(self, message: Any) -> None:
         """Take a VademecumFile."""
-        identity, name, data = message.id, message.name, memoryview(message.data)
-        if identity == self._current:
-            return  # a loader that was started again
+        with self._lock:
+            if self._vademecum is not None and message.id == self._vademecum.id:
+                return  # a loader that was started again
+            try:
+                vademecum = _verified(message.id, memoryview(message.data))
+                self._hand_over(vademecum)
+            except Exception as error:  # whatever a file from elsewhere provokes, the loop goes on
+                self._refuse(f"vademecum {message.name!r} refused", error)
+                return
+            self._vademecum = vademecum
+
+    def listen(self) -> None:
+        """Take values of the material until the line is closed."""
+        while packet := self._report.recv(_PACKET):
+            with self._lock:
+                before = self._order
+                self._order = replace(self._order, material=json.loads(packet))
+                if self._vademecum is None:
+                    continue
+                try:
+                    self._hand_over(self._vademecum)
+                except Exception as error:  # as above
+                    self._order = before
+                    self._refuse("material refused", error)
+
+    def _hand_over(self, vademecum: Any) -> None:
+        """Prepare a vademecum at the values in force, and send it."""
+        from avatar_core import contact
+        from avatar_core.parametric import at_values
+
+        order = self._order
+        coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
+        chosen = at_values(vademecum, order.material)
+        arrays = contact.model_arrays(chosen, tuple(order.tip_radii), order.modes, order.cloud)
+        handle, contents = share(dict(arrays._asdict()))
+        note = {
+            "id": vademecum.id,
+            "name": vademecum.name,
+            "arrays": contents,
+            "ranges": {c.name: (c.low, c.high) for c in coordinates},
+        }
         try:
-            arrays = self._prepare(identity, data)
-        except Exception as error:  # whatever a file from elsewhere provokes, the loop goes on
-            reason = " ".join(str(error).split()) or type(error).__name__
-            self._send({"refusal": f"vademecum {name!r} refused: {reason}"})
-            return
-        handle, contents = share(arrays)
-        try:
-            self._send({"id": identity, "name": name, "arrays": contents}, handle)
+            self._send(note, handle)
         finally:
             os.close(handle)
-        self._current = identity
 
-    def _prepare(self, identity: str, data: memoryview) -> dict[str, np.ndarray]:
-        from avatar_core import contact, storage
-
-        vademecum = storage.parse_vademecum(data, "the received vademecum")
-        if vademecum.id != identity:
-            raise ValueError("altered on the way, its checksum differs: load it again")
-        order = self._order
-        arrays = contact.model_arrays(vademecum, tuple(order.tip_radii), order.modes, order.cloud)
-        return dict(arrays._asdict())
+    def _refuse(self, what: str, error: Exception) -> None:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        self._send({"refusal": f"{what}: {reason}"})
 
     def _send(self, note: dict[str, Any], *handles: int) -> None:
         socket.send_fds(self._report, [json.dumps(note).encode()], handles)
+
+
+def _verified(identity: str, data: memoryview) -> Any:
+    from avatar_core import storage
+
+    vademecum = storage.parse_vademecum(data, "the received vademecum")
+    if vademecum.id != identity:
+        raise ValueError("altered on the way, its checksum differs: load it again")
+    return vademecum
 
 
 def main() -> int:
@@ -229,6 +282,7 @@ def main() -> int:
     order = Order(**json.loads(sys.argv[1]))
     report = socket.socket(fileno=os.dup(sys.stdin.fileno()))
     receiver = Receiver(order, report)
+    threading.Thread(target=receiver.listen, name="material", daemon=True).start()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(
         order.node_name,

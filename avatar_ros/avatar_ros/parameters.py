@@ -114,10 +114,40 @@ CONTACT = (
         range=(0.002, 1.0),
         read_only=False,
     ),
+    Parameter(
+        "material.young_modulus",
+        0.0,
+        "Young's modulus of the organ [Pa]; 0: that of the vademecum",
+        range=(0.0, 1e8),
+        read_only=False,
+    ),
+    Parameter(
+        "material.poisson_ratio",
+        0.0,
+        "Poisson's ratio, if it is a coordinate of the vademecum; 0: that of the vademecum",
+        range=(0.0, 0.4999),
+        read_only=False,
+    ),
+    Parameter(
+        "material.contrast",
+        0.0,
+        "Young's modulus of the tumour over that of the organ, if it is a coordinate; 0: that of "
+        "the vademecum",
+        range=(0.0, 100.0),
+        read_only=False,
+    ),
     Parameter("realtime.priority", 0, "SCHED_FIFO priority asked for; 0: ordinary", range=(0, 98)),
     Parameter("realtime.cpu", -1, "core the loop is bound to; -1: any", range=(-1, 1023)),
     Parameter("realtime.lock_memory", True, "keep the process in memory; needs a priority"),
 )
+
+
+# Names that the core gives to what these parameters choose.
+MATERIAL = {
+    "material.young_modulus": "young",
+    "material.poisson_ratio": "poisson",
+    "material.contrast": "contrast",
+}
 
 
 @dataclass(frozen=True)
@@ -140,7 +170,10 @@ class InterpolationSettings:
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """Parameters of the contact node; rates [Hz], times [s], radii [m]."""
+    """Parameters of the contact node; rates [Hz], times [s], radii [m].
+
+    material : values chosen, by name of the coordinate; the others are those of the vademecum
+    """
 
     tools: tuple[str, ...]
     tip_radii: tuple[float, ...]
@@ -150,6 +183,7 @@ class ContactSettings:
     modes: int | None
     frame_id: str
     pose_timeout: float
+    material: dict[str, float]
     priority: int
     cpu: int
     lock_memory: bool
@@ -232,10 +266,16 @@ def read_contact(node: Node) -> ContactSettings:
         modes=value["modes"] or None,
         frame_id=_frame(value["frame_id"]),
         pose_timeout=value["pose_timeout"],
+        material=chosen_material(value),
         priority=value["realtime.priority"],
         cpu=value["realtime.cpu"],
         lock_memory=value["realtime.lock_memory"],
     )
+
+
+def chosen_material(value: dict[str, Any]) -> dict[str, float]:
+    """The values of the material that are not left to the vademecum."""
+    return {name: value[key] for key, name in MATERIAL.items() if value[key] != 0.0}
 
 
 def _values(node: Node, parameters: tuple[Parameter, ...]) -> dict[str, Any]:

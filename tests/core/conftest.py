@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core.build import BuildRule
+from avatar_core.build_rule import BuildRule
 from avatar_core.elasticity import Elasticity, Material
 from avatar_core.mesh import Regions, TetMesh, make_mesh, regions_by_rule, tetrahedralize
 from avatar_core.organ import OrganOptions, vademecum_of

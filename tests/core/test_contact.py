@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from avatar_core.build import BuildRule, with_rank
+from avatar_core.build import with_rank
+from avatar_core.build_rule import BuildRule
 from avatar_core.contact import (
     ContactModel,
     Status,

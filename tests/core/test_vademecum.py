@@ -12,7 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
-from avatar_core.build import BuildRule, with_rank
+from avatar_core.build import with_rank
+from avatar_core.build_rule import BuildRule
 from avatar_core.certificate import certify
 from avatar_core.elasticity import Elasticity
 from avatar_core.errors import StorageError

@@ -92,7 +92,7 @@ def own_domain() -> dict[str, str]:
 @pytest.fixture(scope="session")
 def organ() -> Any:
     """A coarse phantom's vademecum: what matters here is not how exact it is."""
-    from avatar_core.build import BuildRule
+    from avatar_core.build_rule import BuildRule
     from avatar_core.organ import OrganOptions, vademecum_of
     from avatar_core.phantom import phantom_liver
 

@@ -1,0 +1,135 @@
+"""A vademecum over more than place and load: u(x, s, p), p the material's coordinates.
+
+Offline, one space basis V serves the whole range. Online, values p give the Galerkin response
+
+    A(p) = V^T K(p) V = sum_q theta_q(p) A_q = L L^T,     X = V L^-T,   Y(s) = L^-1 V^T f(s)
+
+which is K(p)-orthonormal as any far field of this project is, so that what remains of the contact
+compliance, C(p) - Y Y^T, is positive semi-definite. It is kept at the nodes of the range
+(:mod:`avatar_core.coordinates`) and combined with weights that are not negative: positive
+semi-definite again. The modes are sorted by what they are worth in displacement at p, and the
+first of them are used. The result is an ordinary Vademecum, so that a step costs what it costs
+without coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+
+from avatar_core.coordinates import Coordinate, node_weights, require_known
+from avatar_core.elasticity import Material, factors_at
+from avatar_core.near_field import LocalBlocks
+from avatar_core.separated import SeparatedField
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum import Vademecum
+
+
+@dataclass(frozen=True, eq=False)
+class ParametricResponse:
+    """What the coordinates of a vademecum need beside its own fields.
+
+    coordinates : at least one
+    basis : SeparatedField, V at the vertices (3 n_vertices, n) and V^T f (3 n_positions, n)
+    operators : ndarray, shape (n_terms, n, n), A_q of :attr:`Elasticity.factors`
+    near, contact_near : ndarray, shape (n_nodes, n_blocks, 3, 3), blocks at the nodes in the
+        pattern of the vademecum's own near fields
+    rank : modes of a vademecum at given values
+    young_modulus : that the blocks are computed for [Pa]
+    """
+
+    coordinates: tuple[Coordinate, ...]
+    basis: SeparatedField
+    operators: np.ndarray
+    near: np.ndarray
+    contact_near: np.ndarray
+    rank: int
+    young_modulus: float
+
+
+def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
+    """The vademecum at chosen values of its coordinates; takes some tenths of a second.
+
+    Parameters
+    ----------
+    vademecum : Vademecum
+    values : by name of a coordinate; what is not given keeps its value. "young" [Pa] is a
+        coordinate of every vademecum: displacements are proportional to 1 / E.
+
+    Raises
+    ------
+    CoordinateError, MaterialError
+        For a coordinate that is not there, or a value out of range.
+    """
+    given = dict(values)
+    material = replace(
+        vademecum.material, young_modulus=given.pop("young", vademecum.material.young_modulus)
+    )
+    parametric = vademecum.parametric
+    require_known(parametric.coordinates if parametric else (), given)
+    if parametric is None or not given:
+        return _with_young_modulus(vademecum, material)
+    here = {"poisson": material.poisson_ratio, "contrast": vademecum.contrast or 1.0, **given}
+    point = {c.name: float(here[c.name]) for c in parametric.coordinates}
+    weights = node_weights(parametric.coordinates, point)  # first, as it refuses
+    material = replace(material, poisson_ratio=point.get("poisson", material.poisson_ratio))
+    contrast = point.get("contrast", vademecum.contrast)
+    reference = replace(material, young_modulus=parametric.young_modulus)
+    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)
+    factors = factors_at(reference, contrast)
+    far = galerkin_field(parametric.basis, parametric.operators, factors, mass)
+    far = far.truncate(parametric.rank)
+    at_reference = replace(
+        vademecum,
+        material=reference,
+        contrast=contrast,
+        far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
+        near=combined(vademecum.near, parametric.near, weights),
+        contact_near=combined(vademecum.contact_near, parametric.contact_near, weights),
+    )
+    return _with_young_modulus(at_reference, material)
+
+
+def _with_young_modulus(vademecum: Vademecum, material: Material) -> Vademecum:
+    """Everything that is a compliance, times E / E'."""
+    softer = vademecum.material.young_modulus / material.young_modulus
+    if softer == 1.0:
+        return replace(vademecum, material=material)
+    root = np.float32(np.sqrt(softer))
+    far, near, contact = vademecum.far, vademecum.near, vademecum.contact_near
+    return replace(
+        vademecum,
+        material=material,
+        far=SeparatedField(root * far.space, root * far.load),
+        near=replace(near, block=np.float32(softer) * near.block),
+        contact_near=replace(contact, block=np.float32(softer) * contact.block),
+    )
+
+
+def galerkin_field(
+    basis: SeparatedField, operators: np.ndarray, factors: np.ndarray, mass: np.ndarray
+) -> SeparatedField:
+    """The K(p)-orthonormal response in a space, modes sorted by their worth in displacement.
+
+    Parameters
+    ----------
+    basis : V and V^T f
+    operators, factors : A_q and theta_q(p)
+    mass : ndarray, shape (3 n_vertices,), lumped
+    """
+    stiffness = np.tensordot(factors, operators, axes=1)
+    root = np.linalg.cholesky((stiffness + stiffness.T) / 2.0)
+    load = scipy.linalg.solve_triangular(root, basis.load.T, lower=True).T
+    space = scipy.linalg.solve_triangular(root, basis.space.T, lower=True).T
+    return SeparatedField(space, load).sorted_by_worth(mass)
+
+
+def combined(near: LocalBlocks, at_nodes: np.ndarray, weights: np.ndarray) -> LocalBlocks:
+    """Blocks between the nodes."""
+    used = np.flatnonzero(weights)
+    return replace(near, block=np.tensordot(weights[used].astype(np.float32), at_nodes[used], 1))

@@ -1,0 +1,146 @@
+"""The material as parameters of the contact node: felt while the tool presses, refused in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.bench_cell import Module
+from geometry_msgs.msg import WrenchStamped
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+
+from avatar_core.build_rule import BuildRule
+from avatar_core.coordinates import Coordinate
+from avatar_core.organ import OrganOptions, vademecum_of
+from avatar_core.phantom import phantom_liver
+from avatar_core.storage import save_vademecum
+from avatar_core.tool_path import middle_of_access
+from avatar_ros import qos
+from avatar_ros.msg import ContactState, LoopStatistics
+from tests.ros.test_cell import Hand, _force
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture(scope="module")
+def soft_organ() -> Any:
+    """A coarse phantom over Poisson's ratio."""
+    options = OrganOptions(
+        n_vertices=400,
+        rule=BuildRule(max_modes=30),
+        coordinates=(Coordinate("poisson", 0.30, 0.49),),
+        n_certified=8,
+    )
+    return vademecum_of(phantom_liver(), options)
+
+
+@pytest.fixture(scope="module")
+def nodes(
+    own_domain: dict[str, str], soft_organ: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[dict[str, Module]]:
+    folder: Path = tmp_path_factory.mktemp("material")
+    save_vademecum(soft_organ, folder / "soft.h5")
+    options = ["--ros-args", "-p", f"library_dir:={folder}", "-p", "vademecum:=soft.h5"]
+    processes = {
+        "vademecum_loader": Module("vademecum_loader", options, own_domain),
+        "contact": Module("contact", [], own_domain),
+    }
+    yield processes
+    assert [process.finish() for process in processes.values()] == [0, 0]
+
+
+@pytest.fixture
+def hand(nodes: dict[str, Module], probe: Any, soft_organ: Any) -> Hand:
+    """A tool that presses the organ by 1 mm."""
+    probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
+    surface = soft_organ.surface
+    j = middle_of_access(soft_organ)
+    hand = Hand(probe, surface.centers[j] + 4e-3 * surface.normals[j])
+    _settled(probe, hand)
+    return hand
+
+
+def _settled(probe: Any, hand: Hand) -> np.ndarray:
+    """The force after a while."""
+    for _ in range(200):
+        hand()
+        probe.spin(0.002)
+    wrench = probe.next(
+        WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND, lambda w: _force(w).any(), 10.0, hand
+    )
+    return _force(wrench)
+
+
+def _set(probe: Any, **values: float) -> Any:
+    """Set parameters below ``material``; the first answer."""
+    named = [
+        Parameter(
+            name=f"material.{name}",
+            value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value),
+        )
+        for name, value in values.items()
+    ]
+    request = SetParameters.Request(parameters=named)
+    return probe.call(SetParameters, "/contact/set_parameters", request).results[0]
+
+
+def _until(probe: Any, hand: Hand, wanted: Any) -> np.ndarray:
+    wrench = probe.next(
+        WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND, lambda w: wanted(_force(w)), 20.0, hand
+    )
+    return _force(wrench)
+
+
+def test_a_stiffer_organ_is_felt_at_once_and_in_proportion(probe: Any, hand: Hand) -> None:
+    before = np.linalg.norm(_settled(probe, hand))
+    assert _set(probe, young_modulus=0.34e6).successful
+    after = _until(probe, hand, lambda f: np.linalg.norm(f) > 1.5 * before)
+    assert np.linalg.norm(after) == pytest.approx(2.0 * before, rel=1e-3)
+    assert _set(probe, young_modulus=0.0).successful  # as in the vademecum
+    again = _until(probe, hand, lambda f: np.linalg.norm(f) < 1.5 * before)
+    assert np.linalg.norm(again) == pytest.approx(before, rel=1e-3)
+
+
+def test_poisson_ratio_changes_the_force(probe: Any, hand: Hand) -> None:
+    before = np.linalg.norm(_settled(probe, hand))
+    assert _set(probe, poisson_ratio=0.31).successful
+    softer = _until(probe, hand, lambda f: f.any() and abs(np.linalg.norm(f) / before - 1) > 0.02)
+    assert softer.any()
+    assert _set(probe, poisson_ratio=0.0).successful
+    _until(probe, hand, lambda f: abs(np.linalg.norm(f) / before - 1.0) < 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"poisson_ratio": 0.2}, "holds 0.3 to 0.49"),
+        ({"contrast": 3.0}, "no coordinate contrast"),
+        ({"poisson_ratio": 0.6}, "range"),
+        ({"young_modulus": -1.0}, "range"),
+    ],
+)
+def test_a_value_that_the_vademecum_does_not_have_is_refused(
+    probe: Any, hand: Hand, values: dict[str, float], reason: str
+) -> None:
+    before = _settled(probe, hand)
+    answer = _set(probe, **values)
+    assert not answer.successful
+    assert reason in answer.reason
+    np.testing.assert_allclose(_settled(probe, hand), before, rtol=1e-3)
+
+
+def test_the_loop_goes_on_while_the_material_changes(probe: Any, hand: Hand) -> None:
+    for k in range(5):
+        assert _set(probe, young_modulus=0.2e6 + 1e4 * k).successful
+    statistics = probe.next(LoopStatistics, "statistics", qos.STATISTICS, meanwhile=hand)
+    # tells a working loop from a broken one; `avatar bench cell` measures it
+    assert statistics.missed < 0.5 * statistics.periods
+    assert _set(probe, young_modulus=0.0).successful
