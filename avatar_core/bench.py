@@ -179,7 +179,7 @@ def _dense_step(model, state, out, tips, columns, compliance):  # type: ignore[n
             if state.active[t] and state.active[s]:
                 _dense_column(state, t, s, compliance)
     kernels._assemble(model, state)
-    kernels._solve(state)
+    kernels._solve(state, False)
     kernels._write_forces(model, state, out, tips, n_active > 1)
     u = state.field[: 3 * out.cloud.shape[0]]
     u[:] = np.float32(0.0)

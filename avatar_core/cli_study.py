@@ -18,6 +18,8 @@ STUDIES = {
     "samples": "avatar_core.study_samples",
     "leave-one-out": "avatar_core.study_leave_one_out",
     "transport": "avatar_core.study_transport",
+    "pgd": "avatar_core.study_pgd",
+    "coordinates": "avatar_core.study_coordinates",
 }
 USAGE = 2
 

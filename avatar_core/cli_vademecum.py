@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -46,10 +46,16 @@ def vademecum(
         float | None,
         typer.Option(help="radius of a tool's load patch [m]; default max(12 mm, 1.2 edges)"),
     ] = None,
-    modes: Annotated[int, typer.Option(help="far-field modes at most")] = 100,
+    modes: Annotated[
+        int | None, typer.Option(help="far-field modes at most; default 100, 200 for large pushes")
+    ] = None,
     tolerance: Annotated[
-        float, typer.Option(help="mean relative displacement error over the build's loads [-]")
-    ] = 0.045,
+        float | None,
+        typer.Option(
+            help="mean relative displacement error over the build's loads [-]; default 0.045, 0.02 "
+            "for large pushes"
+        ),
+    ] = None,
     groups: Annotated[
         Path | None,
         typer.Option(help=".npz with points 'clamped' and 'accessible' [m], instead of the rule"),
@@ -57,6 +63,30 @@ def vademecum(
     element: Annotated[
         str | None, typer.Option(help="P1, P2 or Taylor-Hood; default by Poisson's ratio")
     ] = None,
+    coordinate: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="keep a property of the material free, as poisson=0.40:0.49 or contrast=0.5:20 "
+            "(of the tumour); may be repeated"
+        ),
+    ] = None,
+    tumour: Annotated[
+        Path | None, typer.Option(help="surface of the tumour, in unit and axes of the organ")
+    ] = None,
+    contrast: Annotated[
+        float, typer.Option(help="Young's modulus inside the tumour over that outside [-]")
+    ] = 1.0,
+    material: Annotated[
+        str,
+        typer.Option(
+            help="linear, neo-hookean or st-venant-kirchhoff; the last two keep the force's "
+            "magnitude as a coordinate, for large pushes"
+        ),
+    ] = "linear",
+    max_push: Annotated[float, typer.Option(help="depth of a large push aimed at [m]")] = 20e-3,
+    pushed: Annotated[
+        int, typer.Option(help="unseen sites to certify large pushes at, some 15 s each")
+    ] = 12,
     certify: Annotated[int, typer.Option(help="unseen loads of the certificate")] = 200,
     seed: Annotated[int, typer.Option(help="of the unseen loads")] = 0,
     mesh_error: Annotated[
@@ -64,26 +94,47 @@ def vademecum(
     ] = False,
 ) -> None:
     """Build the certified vademecum of an organ. Exit code 3: complete, but not converged."""
-    from avatar_core.build import BuildRule
+    from avatar_core.build_rule import BuildRule
+    from avatar_core.coordinates import Coordinate
     from avatar_core.elasticity import Material
+    from avatar_core.large_build import LINEAR_RULE, LargeRule
     from avatar_core.organ import OrganOptions, orientation_warning, vademecum_of
     from avatar_core.storage import load_vademecum, save_vademecum
+    from avatar_core.tumour import read_tumour
 
-    require(modes >= 1, f"--modes is {modes}; ask for at least 1")
-    require(0 < tolerance < 1, f"--tolerance is {tolerance}; it must lie between 0 and 1")
+    rule = BuildRule() if material == "linear" else LINEAR_RULE
+    rule = replace(rule, max_modes=modes or rule.max_modes, tolerance=tolerance or rule.tolerance)
+    require(modes is None or modes >= 1, f"--modes is {modes}; ask for at least 1")
+    require(
+        tolerance is None or 0 < tolerance < 1,
+        f"--tolerance is {tolerance}; it must lie between 0 and 1",
+    )
     require(certify >= 1, f"--certify is {certify}; ask for at least 1 load")
     require(
         element in (None, "P1", "P2", "Taylor-Hood"),
         f"--element is {element}; choose P1, P2 or Taylor-Hood",
     )
+    require(
+        material in ("linear", "neo-hookean", "st-venant-kirchhoff"),
+        f"--material is {material}; choose linear, neo-hookean or st-venant-kirchhoff",
+    )
+    require(0 < max_push <= 0.05, f"--max-push is {max_push} m; choose up to 0.05 (20e-3: 20 mm)")
+    require(pushed >= 0, f"--pushed is {pushed}; ask for 0 or more sites")
     require(output.parent.is_dir(), f"folder {output.parent} does not exist; create it first")
+    coordinates = tuple(Coordinate.parse(text) for text in coordinate or ())
     options = OrganOptions(
         n_vertices=vertices,
         material=Material(young, poisson),
+        coordinates=coordinates,
+        tumour=None if tumour is None else read_tumour(tumour, unit, parsed_axes(axes)),
+        contrast=contrast,
+        large=None if material == "linear" else material,  # type: ignore[arg-type]
+        large_rule=LargeRule(max_push=max_push),
+        n_pushed=pushed,
         element=element,  # type: ignore[arg-type]
         patch_radius=patch_radius,
         groups=groups,
-        rule=BuildRule(tolerance=tolerance, max_modes=modes),
+        rule=rule,
         n_certified=certify,
         seed=seed,
         with_mesh_error=mesh_error,
@@ -94,7 +145,7 @@ def vademecum(
     warning = orientation_warning(organ)
     if warning:
         print(f"warning: {warning}", file=sys.stderr)
-    with BuildBar() as progress:
+    with BuildBar(material != "linear") as progress:
         built = vademecum_of(organ, options, progress)
     save_vademecum(built, output)
     show_text(load_vademecum(output))
@@ -127,7 +178,12 @@ def show(
                 {
                     **asdict(v.info()),
                     "element": v.element,
+                    "contrast": v.contrast,
+                    "coordinates": [
+                        asdict(one) for one in (v.parametric.coordinates if v.parametric else ())
+                    ],
                     "certificate": certificate,
+                    "large": _large_summary(v),
                     "provenance": asdict(v.provenance),
                     "rank_errors": [asdict(error) for error in v.convergence.rank_errors],
                 }
@@ -135,6 +191,14 @@ def show(
             indent=2,
         )
     )
+
+
+def _large_summary(v: Vademecum) -> dict[str, Any] | None:
+    """What ``avatar show --json`` says of large deformation."""
+    if v.large is None:
+        return None
+    certificate = asdict(v.large.certificate) if v.large.certificate else None
+    return {"material": v.large.material, "bytes": v.large.nbytes, "certificate": certificate}
 
 
 def read_organ(surface: str, unit: str, axes: str, label: int | None) -> SurfaceMesh:
@@ -178,10 +242,15 @@ def show_text(v: Vademecum) -> None:
         f"  {info.n_load_positions} load positions, patch radius {info.patch_radius * 1e3:.1f} mm, "
         f"{info.n_modes} modes, {info.bytes / 1e6:.1f} MB"
     )
+    if v.contrast is not None:
+        print(f"  tumour: Young's modulus {v.contrast:g} times that of the organ")
+    for one in v.parametric.coordinates if v.parametric else ():
+        print(f"  coordinate {one.name}: {one.low:g} to {one.high:g} ({one.n_nodes} nodes)")
     if c is None:
         print("  no certificate")
         return
-    print(f"  errors on {c.n_loads} unseen loads x 3 directions    mean     worst")
+    where = " and values" if v.parametric else ""
+    print(f"  errors on {c.n_loads} unseen loads{where} x 3 directions    mean     worst")
     for name, mean, worst in (
         ("displacement, L2", c.l2_mean, c.l2_worst),
         ("contact compliance", c.contact_mean, c.contact_worst),
@@ -189,12 +258,34 @@ def show_text(v: Vademecum) -> None:
         ("the same, felt by a sliding tip", c.felt_mean, c.felt_worst),
     ):
         print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
+    _show_large(v)
     print(f"  built in {c.build_cpu_seconds:.0f} s of CPU time", end="")
     tolerance = v.convergence.tolerance
     state = "converged" if info.converged else "NOT CONVERGED"
     print(", interpolated" if math.isnan(tolerance) else f", {state} (tolerance {tolerance:.1%})")
     if not math.isnan(c.mesh_l2):
         print(f"  mesh refined once: displacement {c.mesh_l2:.1%}, contact {c.mesh_contact:.1%}")
+
+
+def _show_large(v: Vademecum) -> None:
+    if v.large is None:
+        return
+    reach = v.large.reach * 1e3
+    print(
+        f"  large deformation, {v.large.material}: {v.large.space.shape[1]} modes, linear depth up "
+        f"to {reach.max():.0f} mm (half of the positions {sorted(reach)[len(reach) // 2]:.0f}, the "
+        f"least {reach.min():.0f})"
+    )
+    c = v.large.certificate
+    if c is None:
+        return
+    print(f"  errors on {c.n_pushes} unseen pushes to {c.depth * 1e3:.0f} mm      mean     worst")
+    for name, mean, worst in (
+        ("displacement, L2", c.l2_mean, c.l2_worst),
+        ("force at equal depth", c.contact_mean, c.contact_worst),
+    ):
+        print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
+    print(f"    the linear vademecum: {c.linear_l2_mean:.1%}, {c.linear_contact_mean:.1%}")
 
 
 def finite(value: Any) -> Any:
@@ -211,14 +302,25 @@ def finite(value: Any) -> Any:
 class BuildBar:
     """One progress bar over the stages of a build."""
 
-    _SHARE: ClassVar = {"mesh": 0.1, "solve": 0.4, "modes": 0.35, "certify": 0.15}
+    _LINEAR: ClassVar = {"mesh": 0.1, "solve": 0.4, "modes": 0.35, "certify": 0.15}
+    _LARGE: ClassVar = {
+        "mesh": 0.02,
+        "solve": 0.07,
+        "modes": 0.07,
+        "certify": 0.04,
+        "large": 0.4,
+        "push": 0.4,
+    }
+
+    def __init__(self, large: bool = False) -> None:
+        self._share = self._LARGE if large else self._LINEAR
 
     def __enter__(self) -> BuildBar:
         from tqdm import tqdm
 
         self._bar = tqdm(
             total=1.0,
-            bar_format="{desc:12s} {percentage:3.0f}% |{bar}| {elapsed}",
+            bar_format="{desc:22s} {percentage:3.0f}% |{bar}| {elapsed}",
             file=sys.stderr,
             disable=None,
         )
@@ -227,14 +329,15 @@ class BuildBar:
     def __exit__(self, *_: object) -> None:
         self._bar.close()
 
-    def __call__(self, stage: str, fraction: float) -> None:
-        """Stage ``stage`` is done to ``fraction``."""
+    def __call__(self, stage: str, fraction: float, error: float) -> None:
+        """Stage ``stage`` is done to ``fraction``; NaN: no error is known."""
         before = 0.0
-        for name, share in self._SHARE.items():
+        for name, share in self._share.items():
             if name == stage:
                 break
             before += share
-        share = self._SHARE.get(stage, 0.0)
-        self._bar.set_description_str(stage, refresh=False)
+        share = self._share.get(stage, 0.0)
+        text = stage if math.isnan(error) else f"{stage}, error {error:.1%}"
+        self._bar.set_description_str(text, refresh=False)
         self._bar.n = min(1.0, before + share * min(fraction, 1.0))
         self._bar.refresh()

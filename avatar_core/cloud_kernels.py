@@ -3,7 +3,7 @@
     u(x) = - sum_t lambda_t a_t [ sum_k X_k(x) Y_k . f_t  +  sum_j w_j N_j(x) n_t ]
 
 with f_t = w(p_t) n_t as in :mod:`avatar_core.contact_kernels`, N_j the exact near field of load
-position j.
+position j, and for large deformation the terms of :mod:`avatar_core.large_deformation`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def contact_deform(model, state, out):  # type: ignore[no-untyped-def]
     if out.n_contacts[0] == 0:
         state.field[:] = np.float32(0.0)
     else:
-        _amplitudes(state)
+        _amplitudes(model, state)
         _far_field(model, state)
         _near_field(model, state)
     write_cloud(model.rest, state.field, out.cloud)
@@ -38,15 +38,34 @@ def write_cloud(rest, field, cloud):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, forceinline=True)
-def _amplitudes(state):  # type: ignore[no-untyped-def]
-    """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards."""
-    amplitude = state.amplitude
+def _amplitudes(model, state):  # type: ignore[no-untyped-def]
+    """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards. Then the bent ones."""
+    amplitude, bent = state.amplitude, model.bend_load.shape[2]
+    n_modes = amplitude.shape[0] - bent
     amplitude[:] = np.float32(0.0)
     for t in range(state.passage.shape[0]):
-        if state.force[t] > 0.0:
-            force = np.float32(state.force[t] * state.scale[t])
-            for k in range(amplitude.shape[0]):
-                amplitude[k] -= force * state.mode[t, k]
+        if state.force[t] <= 0.0:
+            continue
+        force = np.float32(state.force[t] * state.scale[t])
+        for k in range(n_modes):
+            amplitude[k] -= force * state.mode[t, k]
+        if bent > 0:
+            second, third = _powers(state, t)
+            for i in range(state.n_nodes[t]):
+                w, j = state.weight[t, i, 0], state.nodes[t, i]
+                w2, w3 = np.float32(w * second), np.float32(w * third)
+                y2, y3 = model.bend_load[0, j], model.bend_load[1, j]
+                for k in range(bent):
+                    amplitude[n_modes + k] += w2 * y2[k] + w3 * y3[k]
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def _powers(state, t):  # type: ignore[no-untyped-def]
+    """a^2 and a^3 of a tip's linear depth, tangential beyond the reach."""
+    a = state.self_compliance[t] * state.force[t]
+    inside = min(a, state.bend[t, 2])
+    over = a - inside
+    return inside * (inside + 2.0 * over), inside * inside * (inside + 3.0 * over)
 
 
 @njit(cache=True, fastmath=True, forceinline=True)
@@ -73,6 +92,7 @@ def _far_field(model, state):  # type: ignore[no-untyped-def]
 @njit(cache=True, fastmath=True, forceinline=True)
 def _near_field(model, state):  # type: ignore[no-untyped-def]
     """The exact remainder around the load positions that carry the forces."""
+    bends = model.bend_near.shape[1] > 0
     for t in range(state.passage.shape[0]):
         if state.force[t] <= 0.0:
             continue
@@ -80,10 +100,13 @@ def _near_field(model, state):  # type: ignore[no-untyped-def]
         for i in range(state.n_nodes[t]):
             kept += _shrunk(state.weight[t, i, 0])
         force = -state.force[t] * state.scale[t] / kept
+        second, third = _powers(state, t)
         for i in range(state.n_nodes[t]):
             w = _shrunk(state.weight[t, i, 0])
             if w != 0.0:
                 _add_row(model, state, state.nodes[t, i], w * force, state.normal[t])
+                if bends:
+                    _add_bent_row(model, state, state.nodes[t, i], w / kept, second, third)
 
 
 @njit(cache=True, forceinline=True)
@@ -103,3 +126,13 @@ def _add_row(model, state, j, force, n):  # type: ignore[no-untyped-def]
         block = model.near_block[e]
         for d in range(3):
             u[v + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def _add_bent_row(model, state, j, w, second, third):  # type: ignore[no-untyped-def]
+    u = state.field
+    w2, w3 = np.float32(w * second), np.float32(w * third)
+    for e in range(model.near_start[j], model.near_start[j + 1]):
+        v = 3 * model.near_target[e]
+        for d in range(3):
+            u[v + d] += w2 * model.bend_near[0, e, d] + w3 * model.bend_near[1, e, d]

@@ -19,7 +19,7 @@ from avatar_core.cloud_kernels import BLOCK
 from avatar_core.contact_kernels import ModelArrays, Out, State
 from avatar_core.errors import ContactError
 from avatar_core.near_field import LocalBlocks, hash_rows
-from avatar_core.tip_response import MAX_STENCIL, make_tip_response
+from avatar_core.tip_response import MAX_STENCIL, make_tip_response, sampled_at_tip
 
 if TYPE_CHECKING:
     from avatar_core.vademecum import Vademecum
@@ -42,6 +42,7 @@ class Status(IntEnum):
     TOO_MANY_CONTACTS = kernels.TOO_MANY
     OUT_OF_RANGE = kernels.OUT_OF_RANGE
     UNKNOWN_FRAME = kernels.UNKNOWN_FRAME
+    EXTRAPOLATED = kernels.EXTRAPOLATED
 
 
 class Compiled(NamedTuple):
@@ -61,11 +62,13 @@ class ContactModel:
 
     arrays : ModelArrays, constant
         distance, access, origin, spacing: the tip field; row, carrier, share,
-        self_compliance: the tip response on its grid; position (n_positions, 3) [m];
+        self_compliance: the tip response on its grid; bend (3 or 0, nx, ny, nz): beta_2, beta_3
+        and the reach there; position (n_positions, 3) [m];
         load (n_positions, 3, rank and zeros) and the contact_* blocks, found by their hash tables:
         compliance [m/N]; softness (1,), added where access fades [m/N];
         space (n_blocks, rank, BLOCK) int16, modes of the displacement of the cloud, in parts of
-        space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 6), the cloud without
+        space_scale (rank,), and the near_* blocks [m/N]; bend_load and bend_near, what large
+        deformation adds by powers of the depth; rest (n_points, 6), the cloud without
         displacement [m]; tip_radius (n_tools,) [m]
     state : State, forces kept for the next period, and scratch
     out : Out
@@ -93,6 +96,11 @@ class ContactModel:
     def nbytes(self) -> int:
         """Memory of the constant arrays [bytes]."""
         return int(sum(array.nbytes for array in self.arrays))
+
+    def resume(self, before: ContactModel) -> None:
+        """Go on where another model of the same organ and tools is: tips in contact stay so."""
+        self.state.passage[:] = before.state.passage
+        self.state.force[:] = before.state.force
 
     def reset(self) -> None:
         """Forget all contacts: the organ is at rest."""
@@ -139,18 +147,28 @@ def model_arrays(
         "off": np.empty(0, np.int64),
     }[cloud]
     rank = vademecum.far.rank if modes is None else modes
-    near = _near_at(vademecum.near, points, len(mesh.vertices))
+    near, kept = _near_at(vademecum.near, points, len(mesh.vertices))
     space = vademecum.far.space.reshape(len(mesh.vertices), 3, -1)[points, :, :rank]
+    large = vademecum.large
+    if large is not None:
+        bent = large.space.reshape(len(mesh.vertices), 3, -1)[points]
+        space = np.concatenate([space, bent], axis=2)
     contact = vademecum.contact_near
     contact_start, contact_slot = hash_rows(contact)
     load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
     response = make_tip_response(
         surface, vademecum.tip_field, load, contact, kernels.MAX_DEPTH, max(tip_radii)
     )
+    bend = np.zeros((0, 1, 1, 1), np.float32)
+    if large is not None:
+        bend = sampled_at_tip(
+            surface, vademecum.tip_field, response, np.vstack([large.depth, large.reach])
+        )
     modes_in_blocks, scale = _in_blocks(space)
     return ModelArrays(
         *vademecum.tip_field,
         *response,
+        bend=bend,
         position=np.ascontiguousarray(surface.centers),
         load=_padded(load),
         contact_start=contact_start,
@@ -163,6 +181,8 @@ def model_arrays(
         near_start=near.start,
         near_target=near.target,
         near_block=near.block,
+        bend_load=large.load if large else np.zeros((2, 0, 0), np.float32),
+        bend_near=large.near[:, kept] if large else np.zeros((2, 0, 3), np.float32),
         rest=np.pad(mesh.vertices[points], ((0, 0), (0, 3))).astype(np.float32),
         tip_radius=np.array(tip_radii, float),
     )
@@ -196,11 +216,14 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         near=np.zeros((n_tools, n_tools), np.bool_),
         self_compliance=np.ones(n_tools),
         self_slope=np.zeros((n_tools, 3)),
+        bend=np.zeros((n_tools, 3)),
+        bend_slope=np.zeros((n_tools, 3, 3)),
+        bent=np.zeros((n_tools, 4)),
         gram=np.ones((n_tools, n_tools)),
         scale=np.ones(n_tools),
         compliance=np.zeros((n_tools, n_tools)),
         gram_slope=np.zeros(3),
-        amplitude=np.zeros(n_modes, single),
+        amplitude=np.zeros(len(arrays.space_scale), single),
         field=np.zeros(arrays.space.shape[0] * BLOCK, single),
     )
     out = Out(
@@ -275,6 +298,7 @@ def warm_up(n_tools: int = 1) -> None:
             np.zeros((0, 6), np.int32),
             np.zeros((0, 6), single),
             np.full((8, 8, 8), 1.0, single),
+            np.zeros((0, 1, 1, 1), single),
             np.zeros((n, 3), double),
             np.zeros((n, 3, rank), single),
             np.array([0, 2], np.int64),
@@ -285,6 +309,8 @@ def warm_up(n_tools: int = 1) -> None:
             np.zeros((1, rank, BLOCK), np.int16),
             np.zeros(rank, single),
             *blocks,
+            np.zeros((2, 0, 0), single),
+            np.zeros((2, 0, 3), single),
             np.zeros((points, 6), single),
             np.full(n_tools, 5e-3, double),
         )
@@ -292,9 +318,13 @@ def warm_up(n_tools: int = 1) -> None:
 
 
 def stored_energy(model: ContactModel) -> float:
-    """Elastic energy lambda . C lambda / 2 of the present contacts [J]."""
-    force = model.state.force
-    return float(0.5 * force @ model.state.compliance @ force)
+    """Elastic energy lambda . C lambda / 2 of the present contacts, and of bending [J]."""
+    state, force = model.state, model.state.force
+    energy = 0.5 * force @ state.compliance @ force
+    for t in np.flatnonzero(force) if len(model.arrays.bend) else ():
+        h, _, whole, _ = state.bent[t]
+        energy += h * force[t] - whole / state.self_compliance[t]
+    return float(energy)
 
 
 def _reach(near: LocalBlocks, centers: np.ndarray) -> float:
@@ -323,12 +353,15 @@ def _in_blocks(space: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(blocks), scale
 
 
-def _near_at(near: LocalBlocks, points: np.ndarray, n_vertices: int) -> LocalBlocks:
-    """The near field at some vertices, renumbered to their order."""
+def _near_at(
+    near: LocalBlocks, points: np.ndarray, n_vertices: int
+) -> tuple[LocalBlocks, np.ndarray]:
+    """The near field at some vertices, renumbered to their order, and which blocks these are."""
     number = np.full(n_vertices, -1, np.int32)
     number[points] = np.arange(len(points), dtype=np.int32)
-    kept = near.kept(number[near.target] >= 0)
-    return replace(kept, target=number[kept.target])
+    mask = number[near.target] >= 0
+    kept = near.kept(mask)
+    return replace(kept, target=number[kept.target]), mask
 
 
 def _check(

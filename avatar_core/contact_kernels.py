@@ -14,6 +14,10 @@ its exact derivative,
 
 the normal force, and the small tangential one by which a frictionless tip slides towards softer
 tissue. Without it a closed path would gain or lose energy.
+
+With large deformation (:mod:`avatar_core.large_deformation`) the depth of a tip is bent: to
+C_tt lambda_t comes h(a_t), a_t = gamma lambda_t, to the energy what belongs to it, and to the force
+its derivative. h ends as its tangent beyond the reach that was computed.
 """
 
 from __future__ import annotations
@@ -32,7 +36,7 @@ MAX_TOOLS = 8
 MAX_SWEEPS = 1000
 
 OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
-UNKNOWN_FRAME = 8
+UNKNOWN_FRAME, EXTRAPOLATED = 8, 9
 
 # A tip that did not come in through the surface is barred until it is outside again: a contact
 # that began at depth would give back energy that nobody put in.
@@ -56,6 +60,7 @@ ModelArrays = namedtuple(
         "carrier",
         "share",
         "self_compliance",
+        "bend",
         "position",
         "load",
         "contact_start",
@@ -68,6 +73,8 @@ ModelArrays = namedtuple(
         "near_start",
         "near_target",
         "near_block",
+        "bend_load",
+        "bend_near",
         "rest",
         "tip_radius",
     ],
@@ -100,11 +107,14 @@ State = namedtuple(
         "near",  # (T, T) whether the near fields of two tips meet
         "self_compliance",  # (T,) gamma
         "self_slope",  # (T, 3) grad gamma
+        "bend",  # (T, 3) beta_2, beta_3 and the reach
+        "bend_slope",  # (T, 3, 3) their gradients
+        "bent",  # (T, 4) h, dh/da, its integral, d2h/da2 at the reach
         "gram",  # (T, T) f_t . C f_t'
         "scale",  # (T,) a_t
         "compliance",  # (T, T)
         "gram_slope",  # (3,) d(f_t . C f_t')/dp_t
-        "amplitude",  # (k,) of the far field
+        "amplitude",  # (rank,) of the far field, and last of what large deformation adds
         "field",  # (n_blocks BLOCK,) displacement of the cloud, component after component
     ],
 )
@@ -144,12 +154,14 @@ def contact_solve(model, state, out, tips):  # type: ignore[no-untyped-def]
             if state.active[t] and state.active[s]:
                 _near_columns(model, state, t, s)
     _assemble(model, state)
-    if not _solve(state):
+    if not _solve(state, model.bend.shape[0] > 0):
         for t in range(n_tools):
             if state.active[t]:
                 out.status[t] = NOT_CONVERGED
         status = max(status, NOT_CONVERGED)
     _write_forces(model, state, out, tips, n_active > 1)
+    for t in range(n_tools):
+        status = max(status, out.status[t])
     return status
 
 
@@ -189,6 +201,8 @@ def _locate(model, state, t, tip):  # type: ignore[no-untyped-def]
     state.active[t] = True
     _direct(state, t, tip, phi)
     state.self_compliance[t] = in_cell(model.self_compliance, cell, state.self_slope[t])
+    for k in range(model.bend.shape[0]):
+        state.bend[t, k] = in_cell(model.bend[k], cell, state.bend_slope[t, k])
     gather(model, state, t, cell)
     return OK if access >= FULL_ACCESS else OUT_OF_RANGE
 
@@ -325,9 +339,46 @@ def _gram(state, t, s):  # type: ignore[no-untyped-def]
     return far + near
 
 
+@njit(cache=True, fastmath=True, forceinline=True)
+def _bend(state, t):  # type: ignore[no-untyped-def]
+    """h(a) = beta_2 a^2 + beta_3 a^3 at the present force, its slope and integral."""
+    a = state.self_compliance[t] * state.force[t]
+    b2, b3, reach = state.bend[t, 0], state.bend[t, 1], state.bend[t, 2]
+    inside = min(a, reach)
+    over = a - inside
+    h = inside * inside * (b2 + b3 * inside)
+    slope = inside * (2.0 * b2 + 3.0 * b3 * inside)
+    whole = inside**3 * (b2 / 3.0 + b3 * inside / 4.0)
+    state.bent[t, 0] = h + slope * over
+    state.bent[t, 1] = slope
+    state.bent[t, 2] = whole + over * (h + 0.5 * slope * over)
+    state.bent[t, 3] = 2.0 * b2 + 6.0 * b3 * reach
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def _add_bending(state, out, t):  # type: ignore[no-untyped-def]
+    """d/dp of the energy H = 1/gamma int_0^a h, at fixed force."""
+    gamma, reach = state.self_compliance[t], state.bend[t, 2]
+    a = gamma * state.force[t]
+    inside = min(a, reach)
+    over = a - inside
+    # derivatives of int h by beta_2, beta_3 and the reach, and of H by gamma
+    by2 = inside**3 / 3.0 + over * (inside**2 + inside * over)
+    by3 = inside**4 / 4.0 + over * (inside**3 + 1.5 * inside**2 * over)
+    by_reach = 0.5 * state.bent[t, 3] * over * over
+    by_gamma = (state.bent[t, 0] * a - state.bent[t, 2]) / gamma
+    for d in range(3):
+        change = by2 * state.bend_slope[t, 0, d] + by3 * state.bend_slope[t, 1, d]
+        change += by_reach * state.bend_slope[t, 2, d] + by_gamma * state.self_slope[t, d]
+        out.force[t, d] += change / gamma
+
+
 @njit(cache=True, forceinline=True)
-def _solve(state):  # type: ignore[no-untyped-def]
-    """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda >= 0, from the last forces."""
+def _solve(state, bends):  # type: ignore[no-untyped-def]
+    """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda + h >= 0, from the last forces.
+
+    Where the depth is bent each update is one of Newton's.
+    """
     n_tools = state.passage.shape[0]
     for _ in range(MAX_SWEEPS):
         worst = 0.0
@@ -338,8 +389,13 @@ def _solve(state):  # type: ignore[no-untyped-def]
             for s in range(n_tools):
                 if state.active[s]:
                     gap += state.compliance[t, s] * state.force[s]
-            new = max(0.0, state.force[t] - gap / state.compliance[t, t])
-            worst = max(worst, abs(new - state.force[t]) * state.compliance[t, t])
+            stiff = state.compliance[t, t]
+            if bends:
+                _bend(state, t)
+                gap += state.bent[t, 0]
+                stiff += state.bent[t, 1] * state.self_compliance[t]
+            new = max(0.0, state.force[t] - gap / stiff)
+            worst = max(worst, abs(new - state.force[t]) * stiff)
             state.force[t] = new
         if worst < GAP_TOLERANCE:
             return True
@@ -365,6 +421,12 @@ def _write_forces(model, state, out, tips, several):  # type: ignore[no-untyped-
             _turn(model, state, t, tips[t])
             _add_coupling(model, state, out, t)
         gap = state.gap[t] - model.softness[0] * (1.0 / chi - 1.0) * force
+        if model.bend.shape[0] > 0:
+            _bend(state, t)
+            _add_bending(state, out, t)
+            gap += state.bent[t, 0]
+            if state.self_compliance[t] * force > state.bend[t, 2] and out.status[t] == OK:
+                out.status[t] = EXTRAPOLATED
         for s in range(state.passage.shape[0]):
             if state.active[s]:
                 gap += state.compliance[t, s] * state.force[s]

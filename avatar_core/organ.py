@@ -7,14 +7,28 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from avatar_core.build import BuildRule, Progress, _silent, build_vademecum
+from avatar_core.build import build_vademecum
+from avatar_core.build_rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.certificate import certify, mesh_error
-from avatar_core.elasticity import Elasticity, Element, Material
+from avatar_core.coordinates import Coordinate
+from avatar_core.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
+from avatar_core.errors import CoordinateError, MaterialError
+from avatar_core.large_build import LargeRule, hyperelastic_problem, with_large_deformation
+from avatar_core.large_certificate import certify_large
+from avatar_core.large_deformation import LargeMaterial
 from avatar_core.level_set import orientation_offset
 from avatar_core.loads import load_surface
-from avatar_core.mesh import regions_by_rule, regions_from_groups, tetrahedralize
+from avatar_core.mesh import (
+    Regions,
+    TetMesh,
+    regions_by_rule,
+    regions_from_groups,
+    tetrahedralize,
+)
+from avatar_core.parametric_build import build_parametric_vademecum, certify_range
 from avatar_core.phantom import phantom_liver
 from avatar_core.surface import SurfaceMesh
+from avatar_core.tumour import share_inside
 from avatar_core.vademecum import Provenance, Vademecum
 
 _RECORDED = ("avatar", "numpy", "scipy", "scikit-fem", "libigl", "pytetwild", "rslab", "h5py")
@@ -30,6 +44,11 @@ class OrganOptions:
     patch_radius : of the tool's traction [m]; None for max(12 mm, 1.2 x surface edge)
     groups : file of node groups for clamp and accessible region; None for the anatomical rule
     rule : BuildRule
+    coordinates : of the material, that stay free in the vademecum; :mod:`avatar_core.coordinates`
+    tumour : surface inside the organ, with another stiffness; ``contrast`` of Young's moduli
+    large : material of large strains, with which the load's magnitude becomes a coordinate up to
+        the depth ``large_rule.max_push``; None for small strains
+    n_pushed : unseen sites at which large deformation is certified, a nonlinear solution each
     n_certified : unseen load positions of the certificate; ``seed`` draws them
     with_mesh_error : also solve on the same mesh refined once (slow)
     """
@@ -40,13 +59,19 @@ class OrganOptions:
     patch_radius: float | None = None
     groups: Path | None = None
     rule: BuildRule = field(default_factory=BuildRule)
+    coordinates: tuple[Coordinate, ...] = ()
+    tumour: SurfaceMesh | None = None
+    contrast: float = 1.0
+    large: LargeMaterial | None = None
+    large_rule: LargeRule = field(default_factory=LargeRule)
+    n_pushed: int = 12
     n_certified: int = 200
     seed: int = 0
     with_mesh_error: bool = False
 
 
 def vademecum_of(
-    surface: SurfaceMesh, options: OrganOptions | None = None, progress: Progress = _silent
+    surface: SurfaceMesh, options: OrganOptions | None = None, progress: Progress = silent
 ) -> Vademecum:
     """Mesh, solve, separate and certify one organ.
 
@@ -56,34 +81,82 @@ def vademecum_of(
         Of the stage that refused, with the remedy.
     """
     options = options or OrganOptions()
-    progress("mesh", 0.0)
+    progress("mesh", 0.0, NO_ERROR)
     mesh = tetrahedralize(surface, options.n_vertices)
-    progress("mesh", 1.0)
+    progress("mesh", 1.0, NO_ERROR)
     regions = regions_from_groups(mesh, options.groups) if options.groups else regions_by_rule(mesh)
-    elasticity = Elasticity(mesh, options.material, regions.clamped, options.element)
+    elasticity = _elasticity(mesh, regions, options)
     loads = load_surface(mesh, regions, options.patch_radius)
-    vademecum = build_vademecum(
-        surface.name,
-        elasticity,
-        regions,
-        loads,
-        options.rule,
-        _provenance(surface, options),
-        progress,
-    )
-    certificate = certify(
-        vademecum,
-        elasticity,
-        options.n_certified,
-        options.seed,
-        lambda done: progress("certify", done / options.n_certified),
-    )
+    common = (surface.name, elasticity, regions, loads)
+    provenance = _provenance(surface, options)
+
+    def count(done: int) -> None:
+        progress("certify", done / options.n_certified, NO_ERROR)
+
+    if options.coordinates:
+        vademecum = build_parametric_vademecum(
+            *common, options.coordinates, options.rule, provenance, progress
+        )
+        certificate = certify_range(vademecum, elasticity, options.n_certified, options.seed, count)
+    else:
+        vademecum = build_vademecum(*common, options.rule, provenance, progress)
+        certificate = certify(vademecum, elasticity, options.n_certified, options.seed, count)
+    if options.large:
+        vademecum = _with_large(vademecum, options, progress)
     if options.with_mesh_error:
-        progress("mesh error", 0.0)
+        progress("mesh error", 0.0, NO_ERROR)
         l2, contact = mesh_error(vademecum, elasticity)
         certificate = replace(certificate, mesh_l2=l2, mesh_contact=contact)
-    progress("certify", 1.0)
+    progress("certify", 1.0, certificate.l2_mean)
     return vademecum.with_certificate(replace(certificate, build_cpu_seconds=cpu_seconds()))
+
+
+def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress) -> Vademecum:
+    """The vademecum with the load's magnitude as a coordinate, certified."""
+    assert options.large is not None
+    problem = hyperelastic_problem(vademecum, options.large)
+    vademecum = with_large_deformation(
+        vademecum, problem, options.large, options.large_rule, options.rule, progress
+    )
+    if options.n_pushed == 0:
+        return vademecum
+    certificate, _ = certify_large(
+        vademecum,
+        problem,
+        options.n_pushed,
+        options.large_rule.max_push,
+        options.seed,
+        lambda done, error: progress("push", done / options.n_pushed, error),
+    )
+    return vademecum.with_large_certificate(certificate)
+
+
+def _elasticity(mesh: TetMesh, regions: Regions, options: OrganOptions) -> Elasticity:
+    """The elastic problem, on one element that serves the whole range of Poisson's ratio."""
+    contrasts = [c for c in options.coordinates if c.name == "contrast"]
+    if contrasts and options.tumour is None:
+        raise CoordinateError("the contrast is that of a tumour; give its surface with --tumour")
+    if options.large and (options.coordinates or options.tumour):
+        raise CoordinateError(
+            "large deformation is not combined with a tumour or coordinates of the material; build "
+            "two vademecums"
+        )
+    if options.large and (options.element or options.material.element) != "P2":
+        raise MaterialError(
+            f"large deformation is solved on the element P2 up to Poisson's ratio "
+            f"{POISSON_RATIO_P2}; take at most that, and no other --element"
+        )
+    names = [c.name for c in options.coordinates]
+    if len(set(names)) < len(names):
+        raise CoordinateError(f"a coordinate is given twice: {', '.join(names)}")
+    ratios = [c.high for c in options.coordinates if c.name == "poisson"]
+    stiffest = replace(options.material, poisson_ratio=max(ratios)) if ratios else options.material
+    inclusion = None
+    if options.tumour is not None:
+        inclusion = Inclusion(share_inside(mesh, options.tumour), options.contrast)
+    return Elasticity(
+        mesh, options.material, regions.clamped, options.element or stiffest.element, inclusion
+    )
 
 
 def orientation_warning(surface: SurfaceMesh) -> str | None:
@@ -97,15 +170,19 @@ def cpu_seconds() -> float:
 
 
 def _provenance(surface: SurfaceMesh, options: OrganOptions) -> Provenance:
-    parameters = {**asdict(options), **asdict(options.rule), **asdict(options.material)}
-    flat = {k: v for k, v in parameters.items() if not isinstance(v, dict)}
+    parameters = {**vars(options), **asdict(options.rule), **asdict(options.material)}
+    parameters |= asdict(options.large_rule) if options.large else {}
+    for name in ("rule", "material", "large_rule"):
+        del parameters[name]
+    parameters["coordinates"] = " ".join(map(str, options.coordinates)) or None
+    parameters["tumour"] = options.tumour and options.tumour.name
     return Provenance(
         source=surface.name,
         source_sha256=surface.source_sha256,
         unit=surface.unit,
         axes=surface.axes_name,
         versions=tuple(f"{name} {_version(name)}" for name in _RECORDED),
-        parameters=tuple(f"{name}={value}" for name, value in sorted(flat.items())),
+        parameters=tuple(f"{name}={value}" for name, value in sorted(parameters.items())),
         notices=surface.notices,
     )
 

@@ -1,6 +1,6 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 1.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 2.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
 ``provenance``, ``convergence``, ``certificate``. Datasets:
@@ -13,6 +13,20 @@ in sorted order and over the JSON attributes), and the JSON attributes ``materia
     near/start, near/target, near/block [m/N]
     contact_near/start, contact_near/target, contact_near/block [m/N]
     tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
+
+A vademecum with coordinates of the material (from schema 2.0) has
+the JSON attributes ``coordinates``, ``contrast``, and
+
+    parametric/basis/space (3 n_v, n)    parametric/basis/load (3 n_s, n)
+    parametric/operators (n_terms, n, n) parametric/rank, parametric/young_modulus [Pa]
+    parametric/near, parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N]
+
+and one with large deformation the JSON attribute ``large`` (material, certificate) and, for
+k = 2, 3,
+
+    large/space (3 n_v, n)               large/load (2, n_s, n) [m^(1-k)]
+    large/near (2, n_blocks, 3) [m^(1-k)], in the pattern of near/
+    large/depth (2, n_s) [m^(1-k)]       large/reach (n_s,) [m]
 """
 
 from __future__ import annotations
@@ -28,13 +42,16 @@ import h5py
 import numpy as np
 
 from avatar_core.certificate import Certificate
+from avatar_core.coordinates import Coordinate
 from avatar_core.elasticity import Material
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.hdf5 import checksum, reason, replace_file, within
+from avatar_core.large_deformation import POWERS, LargeCertificate, LargeDeformation
 from avatar_core.loads import LoadSurface
 from avatar_core.mesh import Regions, TetMesh
 from avatar_core.near_field import LocalBlocks
-from avatar_core.pgd import EnrichmentReport, EnrichmentStatus
+from avatar_core.parametric import ParametricResponse
+from avatar_core.pgd_load import EnrichmentReport, EnrichmentStatus
 from avatar_core.separated import SeparatedField
 from avatar_core.tip_field import TipField
 from avatar_core.vademecum import (
@@ -50,6 +67,7 @@ MAX_FILE_BYTES = 4 << 30
 MAX_ARRAY_BYTES = 2 << 30
 
 _JSON = ("material", "provenance", "convergence", "certificate")
+_JSON_LATER = ("coordinates", "contrast", "large")  # from schema 2.0
 
 
 def save_vademecum(vademecum: Vademecum, path: str | Path) -> None:
@@ -130,13 +148,16 @@ def _read_attributes(file: h5py.File, path: str) -> dict[str, str]:
             f"{path} has schema {schema}, this version reads up to {SCHEMA_VERSION}; upgrade avatar"
         )
     keys = ("format", "schema", "name", "element", *_JSON)
-    return {key: str(file.attrs[key]) for key in keys}
+    optional = tuple(key for key in _JSON_LATER if key in file.attrs)
+    return {key: str(file.attrs[key]) for key in keys + optional}
 
 
 def _read_arrays(file: h5py.File, path: str, size: int) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
     total = 0
-    for key in _KEYS:
+    keys = _KEYS + (_PARAMETRIC_KEYS if "parametric" in file else ())
+    keys += _LARGE_KEYS if "large" in file else ()
+    for key in keys:
         dataset = file[key]
         if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiub":
             raise StorageError(f"{path}: '{key}' is no array of numbers; build the file again")
@@ -172,12 +193,23 @@ _KEYS = (
     "tip_field/origin",
     "tip_field/spacing",
 )
+_PARAMETRIC_KEYS = (
+    "parametric/basis/space",
+    "parametric/basis/load",
+    "parametric/operators",
+    "parametric/rank",
+    "parametric/young_modulus",
+    "parametric/near",
+    "parametric/contact_near",
+)
+_LARGE_KEYS = ("large/space", "large/load", "large/near", "large/depth", "large/reach")
 
 
 def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
     """Every dataset; the keys are attribute paths of the vademecum."""
     arrays = {}
-    for key in _KEYS:
+    keys = _KEYS + (_PARAMETRIC_KEYS if v.parametric else ()) + (_LARGE_KEYS if v.large else ())
+    for key in keys:
         value: Any = v
         for attribute in key.split("/"):
             value = getattr(value, attribute)
@@ -189,6 +221,7 @@ def _attributes(v: Vademecum) -> dict[str, str]:
     convergence = asdict(v.convergence)
     for report in convergence["enrichments"]:
         report["status"] = report["status"].value
+    coordinates = [asdict(c) for c in v.parametric.coordinates] if v.parametric else []
     return {
         "format": FORMAT,
         "schema": SCHEMA_VERSION,
@@ -198,6 +231,9 @@ def _attributes(v: Vademecum) -> dict[str, str]:
         "provenance": json.dumps(asdict(v.provenance)),
         "convergence": json.dumps(convergence),
         "certificate": json.dumps(asdict(v.certificate) if v.certificate else None),
+        "coordinates": json.dumps(coordinates),
+        "contrast": json.dumps(v.contrast),
+        "large": json.dumps(_large_attribute(v.large)),
     }
 
 
@@ -228,6 +264,42 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         convergence=_convergence(convergence),
         provenance=_provenance(provenance),
         certificate=Certificate(**certificate) if certificate else None,
+        parametric=_parametric(arrays, attributes),
+        contrast=json.loads(attributes.get("contrast", "null")),
+        large=_large(arrays, attributes),
+    )
+
+
+def _large_attribute(large: LargeDeformation | None) -> dict[str, Any] | None:
+    if large is None:
+        return None
+    certificate = asdict(large.certificate) if large.certificate else None
+    return {"material": large.material, "certificate": certificate}
+
+
+def _large(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> LargeDeformation | None:
+    if "large/space" not in arrays:
+        return None
+    stored = json.loads(attributes["large"])
+    certificate = LargeCertificate(**stored["certificate"]) if stored["certificate"] else None
+    space, load, near, depth, reach = (arrays[key] for key in _LARGE_KEYS)
+    return LargeDeformation(stored["material"], space, load, near, depth, reach, certificate)
+
+
+def _parametric(
+    arrays: dict[str, np.ndarray], attributes: dict[str, str]
+) -> ParametricResponse | None:
+    if "parametric/basis/space" not in arrays:
+        return None
+    part = {key.removeprefix("parametric/"): arrays[key] for key in _PARAMETRIC_KEYS}
+    return ParametricResponse(
+        coordinates=tuple(Coordinate(**c) for c in json.loads(attributes["coordinates"])),
+        basis=SeparatedField(part["basis/space"], part["basis/load"]),
+        operators=part["operators"],
+        near=part["near"],
+        contact_near=part["contact_near"],
+        rank=int(part["rank"]),
+        young_modulus=float(part["young_modulus"]),
     )
 
 
@@ -271,6 +343,25 @@ def _check_shapes(a: dict[str, np.ndarray]) -> None:
             and within(index, target)
         )
     agree = agree and within(a["mesh/tets"], n_vertices)
+    if "parametric/basis/space" in a:
+        n, n_nodes = a["parametric/basis/space"].shape[1], len(a["parametric/near"])
+        agree = agree and (
+            a["parametric/basis/space"].shape == (3 * n_vertices, n)
+            and a["parametric/basis/load"].shape == (3 * n_positions, n)
+            and a["parametric/operators"].shape[1:] == (n, n)
+            and a["parametric/near"].shape == (n_nodes, *a["near/block"].shape)
+            and a["parametric/contact_near"].shape == (n_nodes, *a["contact_near/block"].shape)
+            and 1 <= int(a["parametric/rank"]) <= n
+        )
+    if "large/space" in a:
+        n, n_powers = a["large/space"].shape[1], len(POWERS)
+        agree = agree and (
+            a["large/space"].shape == (3 * n_vertices, n)
+            and a["large/load"].shape == (n_powers, n_positions, n)
+            and a["large/near"].shape == (n_powers, len(a["near/target"]), 3)
+            and a["large/depth"].shape == (n_powers, n_positions)
+            and a["large/reach"].shape == (n_positions,)
+        )
     agree = agree and within(a["surface/corners"], n_positions)
     agree = agree and within(a["surface/vertices"], n_vertices)
     if not agree:

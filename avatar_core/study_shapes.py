@@ -82,6 +82,19 @@ def read_livers(folder: Path | None, n: int | None, phantoms: int) -> Livers:
     return Livers(tuple(surfaces), subject_numbers(names), tuple(notices))
 
 
+def read_liver(folder: Path | None, name: str) -> SurfaceMesh:
+    """One liver of a folder, its first if it has none of that name; the phantom without a folder.
+
+    folder : None for ../shared/data/livers
+    """
+    if folder is None and not DEFAULT_FOLDER.is_dir():
+        return phantom_liver()
+    livers = sorted((folder or DEFAULT_FOLDER).glob("*.obj"))
+    if not livers:
+        raise SurfaceError(f"no .obj files in {folder}; give a folder of liver surfaces")
+    return read_surface(next((path for path in livers if path.stem == name), livers[0]))
+
+
 def subject_numbers(names: Sequence[str]) -> IntArray:
     """One number a person, shape (n,): known scans of one person share it."""
     person = {name: scans[0] for scans in SAME_SUBJECT for name in scans}

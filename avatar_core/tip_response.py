@@ -75,6 +75,25 @@ def make_tip_response(
     )
 
 
+def sampled_at_tip(
+    surface: LoadSurface, field: TipField, response: TipResponse, values: np.ndarray
+) -> np.ndarray:
+    """Values at the load positions (n, n_positions), carried to the grid as gamma is.
+
+    Returns
+    -------
+    ndarray float32, shape (n, nx, ny, nz)
+    """
+    shell = response.row >= 0
+    deviation = SMOOTHING * surface.patch_radius / float(field.spacing[0])
+    out = np.zeros((len(values), *shell.shape), np.float32)
+    for k, value in enumerate(values):
+        grid = np.zeros(shell.shape)
+        grid[shell] = (response.share * value[response.carrier]).sum(axis=1)
+        out[k] = smoothed(grid, deviation, shell)
+    return out
+
+
 def closest_weights(surface: LoadSurface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Load positions and their weights at the accessible points closest to some points (n, 3)."""
     _, face, closest = igl.point_mesh_squared_distance(points, surface.centers, surface.corners)

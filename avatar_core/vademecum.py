@@ -14,10 +14,12 @@ import numpy as np
 
 from avatar_core.certificate import Certificate
 from avatar_core.elasticity import Element, Material
+from avatar_core.large_deformation import LargeCertificate, LargeDeformation
 from avatar_core.loads import LoadSurface
 from avatar_core.mesh import Regions, TetMesh
 from avatar_core.near_field import LocalBlocks
-from avatar_core.pgd import EnrichmentReport
+from avatar_core.parametric import ParametricResponse
+from avatar_core.pgd_load import EnrichmentReport
 from avatar_core.separated import SeparatedField
 from avatar_core.tip_field import TipField
 
@@ -95,7 +97,7 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "1.0"
+SCHEMA_VERSION = "2.0"
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,10 @@ class Vademecum:
     contact_near : LocalBlocks, tapered remainder of the contact compliance at load positions,
         symmetric [m/N]
     tip_field : TipField, smooth distance and access that a tool tip feels
+    parametric : ParametricResponse or None, the coordinates of the material: all fields above
+        are those of one choice of their values (:func:`avatar_core.parametric.at_values`)
+    contrast : Young's modulus inside the tumour over that outside; None without a tumour
+    large : LargeDeformation or None, the load's magnitude as a coordinate
     """
 
     name: str
@@ -123,6 +129,9 @@ class Vademecum:
     convergence: Convergence
     provenance: Provenance
     certificate: Certificate | None = None
+    parametric: ParametricResponse | None = None
+    contrast: float | None = None
+    large: LargeDeformation | None = None
     id: str = field(default="", compare=False)
     nbytes: int = field(default=0, compare=False)
 
@@ -161,6 +170,11 @@ class Vademecum:
     def with_certificate(self, certificate: Certificate) -> Vademecum:
         """The same vademecum carrying how wrong it may be."""
         return replace(self, certificate=certificate)
+
+    def with_large_certificate(self, certificate: LargeCertificate) -> Vademecum:
+        """The same vademecum carrying how wrong its large deformation may be."""
+        assert self.large is not None
+        return replace(self, large=replace(self.large, certificate=certificate))
 
     @property
     def surface_vertices(self) -> np.ndarray:

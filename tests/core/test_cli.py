@@ -92,6 +92,12 @@ def test_wrong_unit(
         (["--axes", "XYZ"], "axes"),
         (["--unit", "inch"], "mm"),
         (["--groups", "nothing.npz"], "node groups"),
+        (["--material", "rubber"], "neo-hookean"),
+        (["--material", "neo-hookean", "--max-push", "0"], "20e-3"),
+        (["--material", "neo-hookean", "--poisson", "0.495"], "0.49"),
+        (["--material", "neo-hookean", "--element", "P1"], "P2"),
+        (["--material", "neo-hookean", "--coordinate", "poisson=0.4:0.49"], "two vademecums"),
+        (["--coordinate", "poisson=0.4:0.6"], "0.4999"),
     ],
 )
 def test_bad_option(

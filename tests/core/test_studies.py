@@ -14,9 +14,11 @@ import pytest
 from avatar_core import (
     cli,
     cli_study,
+    study_coordinates,
     study_grid,
     study_in_silico,
     study_leave_one_out,
+    study_pgd,
     study_samples,
 )
 from avatar_core.barycenter import barycenter
@@ -112,6 +114,32 @@ def test_samples(tmp_path: Path) -> None:
     assert summary["lle_seconds_120"] > 0
     assert summary["sklearn_ratio"] > 0
     assert summary["weights_difference"] < 1e-8
+
+
+@pytest.mark.long
+def test_pgd(tmp_path: Path) -> None:
+    found = study_pgd.study(phantom_liver(12e-3), study_pgd.Plan(600, 24, 5))
+    summary = checked_files(found, tmp_path)
+    # no modes are better than the best; the default is exact near the patch
+    assert summary["svd_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
+    assert summary["default_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
+    rows = [r for r in found.rows if r["loads"] == "patch" and r["modes"] == 5]
+    scalar, vector = (
+        next(r["l2_mean"] for r in rows if r["method"] == f"PGD, paper's {name}")
+        for name in ("norm", "vector form")
+    )
+    assert scalar == pytest.approx(vector, rel=0.25)  # one direction: the vector form collapses
+
+
+@pytest.mark.long
+def test_coordinates(tmp_path: Path) -> None:
+    organ = phantom_liver(12e-3)
+    plan = study_coordinates.Plan(600, 600, 24, 12, 2, 1)
+    found = study_coordinates.study(organ, organ, plan)
+    summary = checked_files(found, tmp_path)
+    assert summary["poisson_mean"] < summary["poisson_canonical_small_mesh_mean"]
+    assert summary["linear_over_large_15mm"] > 1.0
+    assert summary["oblique_contact_mean"] < summary["oblique_linear_contact_mean"]
 
 
 def test_samples_without_scikit_learn(monkeypatch: pytest.MonkeyPatch) -> None:

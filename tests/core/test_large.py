@@ -1,0 +1,245 @@
+"""Load magnitude as a coordinate: the series, what is stored of it, and contact with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar_core import loads
+from avatar_core.build_rule import BuildRule, silent
+from avatar_core.contact import ContactModel, Status, prepare, step, stored_energy
+from avatar_core.elasticity import Material
+from avatar_core.equilibrium import NewtonRule, solve
+from avatar_core.errors import MaterialError
+from avatar_core.hyperelasticity import Hyperelasticity
+from avatar_core.large_build import (
+    LargeRule,
+    economised,
+    hyperelastic_problem,
+    with_large_deformation,
+)
+from avatar_core.large_certificate import certify_large, push_rows
+from avatar_core.large_deformation import hyperelastic, powers, push, push_to
+from avatar_core.loads import patch_loads
+from avatar_core.mesh import Regions, TetMesh
+from avatar_core.organ import OrganOptions, vademecum_of
+from avatar_core.parametric import at_values
+from avatar_core.path_series import path_series
+from avatar_core.phantom import phantom_liver
+from avatar_core.storage import load_vademecum, save_vademecum
+from avatar_core.tool_path import inner_positions, middle_of_access
+from avatar_core.vademecum import Vademecum
+
+Box = Callable[[int], tuple[TetMesh, Regions]]
+RADIUS = 5e-3
+both = pytest.mark.parametrize("material", ["neo-hookean", "st-venant-kirchhoff"])
+
+
+@pytest.fixture(scope="module")
+def straight() -> Vademecum:
+    """A coarse phantom with wide patches: few load positions."""
+    options = OrganOptions(
+        n_vertices=600, patch_radius=30e-3, rule=BuildRule(max_modes=60), n_certified=10
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loads, "MIDPOINTS_FROM", 1.0)
+        return vademecum_of(phantom_liver(12e-3), options)
+
+
+@pytest.fixture(scope="module")
+def bent(straight: Vademecum) -> Vademecum:
+    """The same under large pushes, neo-Hookean."""
+    problem = hyperelastic_problem(straight, "neo-hookean")
+    return with_large_deformation(straight, problem, "neo-hookean")
+
+
+@pytest.fixture()
+def model(bent: Vademecum) -> ContactModel:
+    return prepare(bent, (RADIUS,), cloud="volume")
+
+
+def tip_at(v: Vademecum, depth: float, position: int) -> np.ndarray:
+    return (v.surface.centers[position] + (RADIUS - depth) * v.surface.normals[position])[None]
+
+
+# --- the series -------------------------------------------------------------------------------
+
+
+@both
+def test_series_of_order_k_leaves_an_error_of_order_k_plus_one(box: Box, material: str) -> None:
+    mesh, regions = box(3)
+    problem = Hyperelasticity(mesh, hyperelastic(material, Material(1e3, 0.4)), regions.clamped)
+    load = patch_loads(problem.linear, np.array([[0.05, 0.1, 0.05]]), 0.04)
+    load = load @ np.array([0.3, -1.0, 0.2])
+    terms = path_series(problem, load[:, None], 3)[:, :, 0]
+    error = []
+    for force in (0.1, 0.2):
+        exact = solve(problem, force * load, NewtonRule(tolerance=1e-12)).displacement
+        error.append(np.abs(exact - terms.T @ force ** np.arange(1, 4)).max())
+    assert np.log2(error[1] / error[0]) == pytest.approx(4.0, abs=0.35)
+
+
+def test_powers_go_on_tangentially() -> None:
+    np.testing.assert_allclose(powers(2.0, 3.0), [4.0, 8.0])
+    np.testing.assert_allclose(powers(3.5, 3.0), [9.0 + 6.0 * 0.5, 27.0 + 27.0 * 0.5])
+
+
+def test_economised_terms_stand_for_the_whole_series() -> None:
+    """As far from x^4 and x^5 as stated, and no farther, over the whole reach."""
+    reach, a = 0.02, np.linspace(1e-4, 0.02, 400)
+    for order, left in ((4, 0.0385), (5, 0.0754)):
+        terms = np.zeros((5, 1))
+        terms[order - 1] = reach**-order
+        kept = economised(terms, reach)[:, 0]
+        off = np.abs(kept[0] * a**2 + kept[1] * a**3 - (a / reach) ** order) / (a / reach)
+        assert off.max() == pytest.approx(left, rel=0.01)
+
+
+def test_unknown_material_is_refused() -> None:
+    with pytest.raises(MaterialError, match="neo-hookean"):
+        hyperelastic("rubber", Material())
+
+
+# --- what is stored ---------------------------------------------------------------------------
+
+
+def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(bent: Vademecum) -> None:
+    """There nothing is interpolated: what is left is of the terms and the modes."""
+    problem, surface = hyperelastic_problem(bent, "neo-hookean"), bent.surface
+    distance = np.linalg.norm(surface.centers - surface.centers[middle_of_access(bent)], axis=1)
+    for j in np.argsort(distance)[[0, 12]]:
+        triangle, corner = np.argwhere(surface.corners == j)[0]
+        point = tuple(np.eye(3)[corner])
+        rows, lost = push_rows(bent, problem, triangle, np.array([7e-3, 14e-3]), point)
+        assert not lost
+        for row in rows:
+            assert row.contact < 0.02
+            assert row.contact < 0.3 * row.linear_contact
+            assert row.l2 < row.linear_l2
+
+
+def test_certificate_speaks_of_pushes_within_the_range(bent: Vademecum) -> None:
+    certificate, rows = certify_large(bent, hyperelastic_problem(bent, "neo-hookean"), 2, seed=1)
+    inside = [row for row in rows if row.within]
+    assert certificate.n_pushes == len(inside)
+    assert certificate.l2_worst == max(row.l2 for row in inside)
+
+
+def test_a_small_push_is_the_linear_one(bent: Vademecum) -> None:
+    here = np.array([middle_of_access(bent)]), np.ones(1)
+    force, found = push_to(bent, *here, 1e-5)
+    plain, straight = push_to(replace(bent, large=None), *here, 1e-5)
+    assert force == pytest.approx(plain, rel=1e-3)
+    assert np.abs(found.displacement - straight.displacement).max() < 1e-8
+
+
+def test_a_stiffer_organ_takes_more_force_for_the_same_shape(bent: Vademecum) -> None:
+    here = np.array([middle_of_access(bent)]), np.ones(1)
+    stiff = at_values(bent, {"young": 3.0 * bent.material.young_modulus})
+    force, found = push_to(bent, *here, 12e-3)
+    three, same = push_to(stiff, *here, 12e-3)
+    assert three == pytest.approx(3.0 * force, rel=1e-4)
+    np.testing.assert_allclose(same.displacement, found.displacement, atol=1e-7)
+
+
+def test_reach_shrinks_with_the_tolerance(straight: Vademecum, bent: Vademecum) -> None:
+    from avatar_core.large_build import _follow
+
+    problem = hyperelastic_problem(straight, "st-venant-kirchhoff")
+    few = replace(
+        straight.surface,
+        centers=straight.surface.centers[:4],
+        normals=straight.surface.normals[:4],
+    )
+    strict = _follow(problem, few, LargeRule(tolerance=1e-3), silent).reach
+    loose = _follow(problem, few, LargeRule(tolerance=3e-2), silent).reach
+    assert (strict <= loose).all()
+    assert strict.mean() < 0.9 * loose.mean()
+    assert (bent.large is not None) and (bent.large.reach <= 20e-3 * 1.5).all()
+
+
+def test_a_file_keeps_it(bent: Vademecum, tmp_path: Path) -> None:
+    save_vademecum(bent, tmp_path / "bent.h5")
+    again = load_vademecum(tmp_path / "bent.h5")
+    assert bent.large is not None and again.large is not None
+    assert again.large.material == "neo-hookean"
+    for name in ("space", "load", "near", "depth", "reach"):
+        np.testing.assert_array_equal(getattr(again.large, name), getattr(bent.large, name))
+
+
+# --- contact ----------------------------------------------------------------------------------
+
+
+def test_tip_feels_the_bent_force(bent: Vademecum, model: ContactModel) -> None:
+    """As the file says at the load position, but for the smoothing of what a tip feels."""
+    middle = bent.surface.centers[middle_of_access(bent)]
+    distance = np.linalg.norm(bent.surface.centers - middle, axis=1)
+    for j in np.argsort(distance)[:8:2]:
+        model.reset()
+        step(model, tip_at(bent, 4e-3, j))
+        assert step(model, tip_at(bent, 15e-3, j)) in (Status.OK, Status.EXTRAPOLATED)
+        depth = -model.state.gap[0]
+        state = model.state
+        a = state.self_compliance[0] * state.force[0]
+        second, third = powers(a, state.bend[0, 2])
+        felt = a + state.bend[0, 0] * second + state.bend[0, 1] * third
+        assert felt == pytest.approx(depth, rel=1e-6)
+
+
+def test_cloud_is_the_bent_field(bent: Vademecum, model: ContactModel) -> None:
+    v = bent
+    j = middle_of_access(v)
+    step(model, tip_at(v, 4e-3, j))
+    step(model, tip_at(v, 12e-3, j))
+    from avatar_core.tip_response import closest_weights
+
+    positions, weights = (x[0] for x in closest_weights(v.surface, model.state.point[:1]))
+    force = model.state.force[0] * model.state.scale[0]
+    field = push(v, positions, weights, force).displacement
+    straight = push(replace(v, large=None), positions, weights, force).displacement
+    cloud = model.out.cloud[:, 3:].ravel()
+    error = np.linalg.norm(cloud - field)
+    assert error < 0.03 * np.linalg.norm(field)  # the tip's weights are blurred over 6 mm here
+    assert error < 0.3 * np.linalg.norm(cloud - straight)
+
+
+@pytest.mark.parametrize("share", [0.5, 1.3])
+def test_force_is_the_derivative_of_the_energy(bent: Vademecum, share: float) -> None:
+    """Within the stored range, and where it goes on tangentially."""
+    assert bent.large is not None
+    short = replace(bent, large=replace(bent.large, reach=np.full_like(bent.large.reach, 8e-3)))
+    model = prepare(short, (RADIUS,), cloud="off")
+    rng = np.random.default_rng(2)
+    for j in rng.choice(inner_positions(bent), 4):
+        model.reset()
+        step(model, tip_at(bent, 4e-3, j))
+        tip = tip_at(bent, share * 8e-3, j) + rng.uniform(-1e-3, 1e-3, 3)
+        status = step(model, tip)
+        assert status == (Status.OK if share < 1 else Status.EXTRAPOLATED)
+        force, h = model.out.force[0].copy(), 1e-5
+        slope = np.empty(3)
+        for d in range(3):
+            energies = []
+            for sign in (1, -1):
+                moved = tip.copy()
+                moved[0, d] += sign * h
+                step(model, moved)
+                energies.append(stored_energy(model))
+            slope[d] = (energies[0] - energies[1]) / (2 * h)
+        np.testing.assert_allclose(force, -slope, atol=2e-3 * np.linalg.norm(force))
+
+
+def test_two_tips_stay_coupled(bent: Vademecum) -> None:
+    model = prepare(bent, (RADIUS, RADIUS), cloud="off")
+    one, other = inner_positions(bent)[[0, 20]]
+    tips = np.vstack([tip_at(bent, 4e-3, one), tip_at(bent, 4e-3, other)])
+    assert step(model, tips) in (Status.OK, Status.EXTRAPOLATED)
+    both_forces = model.state.force.copy()
+    away = tips.copy()
+    away[1] += 1.0
+    step(model, away)
+    assert model.state.force[0] > both_forces[0]  # the other tip had moved this place already
