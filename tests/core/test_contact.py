@@ -83,10 +83,13 @@ def test_action_is_reaction(phantom_vademecum: Vademecum, model: ContactModel) -
     scale = model.state.scale[0]
     assert scale == pytest.approx(1.0, abs=0.05)
     field = v.displacement(*at_closest_point(v, model)) @ (-n * model.state.force[0] * scale)
-    # the tip's weights are blurred over 1.5 mm, which the vertex right below it notices most
+    # the tip's weights are blurred over 1.5 mm, which the vertices right below it notice most
     cloud = model.out.cloud[:, 3:].ravel()
     assert np.linalg.norm(cloud - field) < 0.01 * np.linalg.norm(field)
-    np.testing.assert_allclose(cloud, field, atol=0.08 * np.abs(field).max())
+    below = np.linalg.norm(v.mesh.vertices - model.state.point[0], axis=1) < 10e-3
+    off = np.abs(cloud - field).reshape(-1, 3).max(axis=1) / np.abs(field).max()
+    assert off[~below].max() < 0.05
+    assert off[below].max(initial=0.0) < 0.15
 
 
 def at_closest_point(v: Vademecum, model: ContactModel) -> tuple[np.ndarray, np.ndarray]:
