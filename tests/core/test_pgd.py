@@ -90,7 +90,7 @@ def test_compression_drops_what_is_not_worth_a_product() -> None:
 
 
 def test_separable_solution_needs_one_product_a_load_pattern() -> None:
-    """K_2 = K_1 makes u = K_1^-1 f / (1 + p c): two terms, as 1/(1 + p c) is not separable."""
+    """p c K u = f with one load pattern: u = K^-1 f / (p c), a single product."""
     problem = _problem()
     same = replace(problem, terms=(problem.terms[0],), factors=(
         np.array([np.linspace(1.0, 3.0, N_NODES[0])]), np.array([np.linspace(0.5, 2.0, N_NODES[1])])
@@ -136,7 +136,7 @@ def test_an_enrichment_that_is_cut_short_is_reported() -> None:
 
 
 def test_stagnation_ends_the_enrichment_and_is_said() -> None:
-    """Products of the wrong operator do not lower the residual of the right one."""
+    """Half the residual in three products is more than a spread of 1,000 allows."""
     found = solve_pgd(_problem(spread=1e3), PGDRule(40, 1e-9, stall=3, least_gain=0.5))
     assert found.outcome is Outcome.STAGNATED
     assert found.field.rank < 40
