@@ -26,7 +26,7 @@ NODES = ("vademecum_loader", "contact")
 
 
 def _state(probe: Any, node: str) -> str:
-    return str(probe.call(GetState, f"{node}/get_state", GetState.Request()).current_state.label)
+    return str(probe.ask(GetState, f"{node}/get_state", GetState.Request()).current_state.label)
 
 
 def _change(probe: Any, node: str, transition: int) -> bool:

@@ -78,12 +78,12 @@ def test_quality_of_service_is_that_of_the_page(running: Any, row: dict[str, str
 
 @pytest.mark.parametrize("node", NODES)
 def test_parameters_are_those_of_the_page(running: Any, node: str) -> None:
-    listed = running.call(ListParameters, f"/{node}/list_parameters", ListParameters.Request())
+    listed = running.ask(ListParameters, f"/{node}/list_parameters", ListParameters.Request())
     declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
     rows = parameter_rows(node)
     assert declared == set(rows)
     request = DescribeParameters.Request(names=sorted(declared))
-    described = running.call(DescribeParameters, f"/{node}/describe_parameters", request)
+    described = running.ask(DescribeParameters, f"/{node}/describe_parameters", request)
     for descriptor in described.descriptors:
         assert descriptor.description
         changeable = "may change while running" in rows[descriptor.name]
@@ -93,9 +93,9 @@ def test_parameters_are_those_of_the_page(running: Any, node: str) -> None:
 def test_the_yaml_file_holds_every_parameter_at_its_default(running: Any) -> None:
     values = yaml_parameters("contact")
     request = GetParameters.Request(names=list(values))
-    answer = running.call(GetParameters, "/contact/get_parameters", request)
+    answer = running.ask(GetParameters, "/contact/get_parameters", request)
     running_with = [parameter_value_to_python(value) for value in answer.values]
     assert dict(zip(values, running_with, strict=True)) == values
-    listed = running.call(ListParameters, "/contact/list_parameters", ListParameters.Request())
+    listed = running.ask(ListParameters, "/contact/list_parameters", ListParameters.Request())
     declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
     assert declared == set(values)

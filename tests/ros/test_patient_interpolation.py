@@ -348,14 +348,12 @@ def test_deactivating_cancels_and_activating_serves_again(
         return bool(probe.call(ChangeState, f"{NODE}/change_state", request).success)
 
     before = files()
-    client = probe.node.create_client(InterpolatePatient, "interpolate_patient")
-    probe.until(client.service_is_ready, TIMEOUT)
+    client = probe.client(InterpolatePatient, "interpolate_patient")
     client.call_async(InterpolatePatient.Request(**PATIENT, fidelity="solved", name="ended"))
     probe.spin(1.0)
     assert change(Transition.TRANSITION_DEACTIVATE)
     assert files() == before
     assert "inactive" in _ask(probe, surface="missing.obj").message
-    probe.node.destroy_client(client)
     assert change(Transition.TRANSITION_ACTIVATE)
     assert "missing.obj" in _ask(probe, surface="missing.obj").message
     assert node.poll() is None
@@ -389,8 +387,7 @@ def test_ending_the_node_half_way_leaves_nothing_behind(
     loader = Module("vademecum_loader", ["--ros-args", "-p", f"library_dir:={folder}"], own_domain)
     try:
         before = files()
-        client = probe.node.create_client(InterpolatePatient, "other/interpolate_patient")
-        probe.until(client.service_is_ready, TIMEOUT)
+        client = probe.client(InterpolatePatient, "other/interpolate_patient")
         probe.until(lambda: bool(_helpers(process)), TIMEOUT)
         probe.spin(3.0)  # until it has the atlas
         client.call_async(InterpolatePatient.Request(**PATIENT, name="killed"))
@@ -401,7 +398,6 @@ def test_ending_the_node_half_way_leaves_nothing_behind(
         assert process.wait(10.0) == (0 if number == signal.SIGINT else -number)
         assert time.monotonic() - begin < 3.0
         probe.until(lambda: not Path(f"/proc/{helper}").exists(), 5.0)
-        probe.node.destroy_client(client)
         assert files() == before
         request = LoadVademecum.Request(name="liver1-interpolated.h5")
         assert probe.call(LoadVademecum, "load_vademecum", request).success
@@ -425,17 +421,17 @@ def test_services_and_actions_are_those_of_the_pages(node: Module, probe: Any) -
 
 
 def test_parameters_are_those_of_page_and_yaml_file(node: Module, probe: Any) -> None:
-    listed = probe.call(ListParameters, f"/{NODE}/list_parameters", ListParameters.Request())
+    listed = probe.ask(ListParameters, f"/{NODE}/list_parameters", ListParameters.Request())
     declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
     assert declared == set(parameter_rows(NODE))
     request = DescribeParameters.Request(names=sorted(declared))
-    described = probe.call(DescribeParameters, f"/{NODE}/describe_parameters", request)
+    described = probe.ask(DescribeParameters, f"/{NODE}/describe_parameters", request)
     assert all(one.description and one.read_only for one in described.descriptors)
     values = yaml_parameters(NODE)
     assert set(values) == declared
     given = {"atlas", "library_dir", "max_megabytes", "vertices", "certify"}  # by this test
     names = sorted(declared - given)
-    answer = probe.call(
+    answer = probe.ask(
         GetParameters, f"/{NODE}/get_parameters", GetParameters.Request(names=names)
     )
     running_with = [parameter_value_to_python(value) for value in answer.values]
