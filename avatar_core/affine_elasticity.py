@@ -10,9 +10,8 @@ from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
 from avatar_core.affine import AffineProblem
 from avatar_core.compact import FloatArray
-from avatar_core.coordinates import Coordinate
+from avatar_core.coordinates import Coordinate, problem_at
 from avatar_core.elasticity import Elasticity
-from avatar_core.parametric_build import problem_at
 
 N_NODES = 8  # Gauss points of a coordinate
 

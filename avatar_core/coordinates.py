@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
+from avatar_core.elasticity import Elasticity
 from avatar_core.errors import CoordinateError
 
 NODES = {"poisson": 3, "contrast": 4}
@@ -140,3 +141,10 @@ def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]
 
 def _known() -> str:
     return ", ".join(_LIMITS)
+
+
+def problem_at(elasticity: Elasticity, values: Mapping[str, float]) -> Elasticity:
+    """The elastic problem at values of the coordinates; what is not given keeps its value."""
+    poisson = values.get("poisson", elasticity.material.poisson_ratio)
+    material = replace(elasticity.material, poisson_ratio=poisson)
+    return elasticity.at(material, values.get("contrast"))

@@ -116,6 +116,49 @@ def pressure_mass(p, q, w):  # type: ignore[no-untyped-def]
     return p * q
 
 
+class _Terms:
+    """The constant matrices that a stiffness is made of, shared by all values of the material.
+
+    share : ndarray, shape (n_tets,), of an inclusion in each tetrahedron, or None
+    """
+
+    def __init__(self, mesh: MeshTet, element: Element, share: np.ndarray | None) -> None:
+        self._mesh, self._element, self._share = mesh, element, share
+        self._shape = ElementTetP1() if element == "P1" else ElementTetP2()
+        self._basis = Basis(mesh, self._shape, intorder=2)
+        self.n_nodes = self._basis.N
+
+    @cached_property
+    def unit_stiffness(self) -> tuple[sp.csr_matrix, ...]:
+        """K_q of :attr:`Elasticity.factors` (P1 and P2; the first for Taylor-Hood too)."""
+        node = np.argsort(self.nodes_first(self._basis))[self._basis.element_dofs.T]
+        if self._share is None:
+            return unit_stiffness(self._basis, node)
+        outside = unit_stiffness(self._basis, node, 1.0 - self._share)
+        return outside + unit_stiffness(self._basis, node, self._share)
+
+    @cached_property
+    def mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
+        """Shear stiffness for mu = 1, divergence and pressure mass of the Taylor-Hood pair."""
+        pressure = Basis(self._mesh, ElementTetP1(), intorder=2)
+        displacement = Basis(self._mesh, ElementVector(self._shape), intorder=2)
+        coupling = divergence.assemble(displacement, pressure).tocsr()
+        coupling = coupling[:, self.nodes_first(displacement)]
+        return self.unit_stiffness[0], coupling, pressure_mass.assemble(pressure).tocsr()
+
+    @cached_property
+    def pressure_factor(self) -> rslab.Ldlt:
+        """The factorized pressure mass."""
+        return rslab.ldlt(sp.csc_matrix(self.mixed[2]))
+
+    def nodes_first(self, basis: Basis) -> np.ndarray:
+        """scikit-fem's number of each degree of freedom, in our order."""
+        dofs = basis.nodal_dofs.T
+        if self._element != "P1":
+            dofs = np.concatenate([dofs, basis.edge_dofs.T])
+        return np.ascontiguousarray(dofs).ravel()
+
+
 class Elasticity:
     """The discrete elastic problem of one mesh, material and clamp.
 
@@ -156,17 +199,9 @@ class Elasticity:
         self._skfem_mesh = MeshTet(
             np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
         )
-        self._shape = ElementTetP1() if self.element == "P1" else ElementTetP2()
-        self._basis = Basis(self._skfem_mesh, self._shape, intorder=2)
-        self.n_nodes = self._basis.N
+        self._terms = _Terms(self._skfem_mesh, self.element, inclusion.share if inclusion else None)
+        self.n_nodes = self._terms.n_nodes
         self.clamped_nodes = np.unique(self.face_nodes[clamped])
-
-    def _nodes_first(self, basis: Basis) -> np.ndarray:
-        """scikit-fem's number of each degree of freedom, in our order."""
-        dofs = basis.nodal_dofs.T
-        if self.element != "P1":
-            dofs = np.concatenate([dofs, basis.edge_dofs.T])
-        return np.ascontiguousarray(dofs).ravel()
 
     def refined(self) -> Elasticity:
         """The same problem with every tetrahedron split into eight; vertices keep their numbers."""
@@ -196,9 +231,6 @@ class Elasticity:
 
     def at(self, material: Material, contrast: float | None = None) -> Elasticity:
         """The same problem with other values on the same element; what can be shared is."""
-        _ = (
-            self._mixed if self.element == "Taylor-Hood" else self._unit_stiffness
-        )  # before the copy
         other = copy(self)
         other.material = material
         if self.inclusion is not None and contrast is not None:
@@ -221,25 +253,6 @@ class Elasticity:
         found = np.searchsorted(key[order], pairs[..., 0] * n_vertices + pairs[..., 1])
         return np.concatenate([faces, n_vertices + order[found]], axis=1)
 
-    @cached_property
-    def _unit_stiffness(self) -> tuple[sp.csr_matrix, ...]:
-        """K_q of :meth:`factors` (P1 and P2; the first for Taylor-Hood too)."""
-        node = np.argsort(self._nodes_first(self._basis))[self._basis.element_dofs.T]
-        if self.inclusion is None:
-            return unit_stiffness(self._basis, node)
-        inside = self.inclusion.share
-        outside = unit_stiffness(self._basis, node, 1.0 - inside)
-        return outside + unit_stiffness(self._basis, node, inside)
-
-    @cached_property
-    def _mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
-        """Shear stiffness for mu = 1, divergence and pressure mass of the Taylor-Hood pair."""
-        pressure = Basis(self._skfem_mesh, ElementTetP1(), intorder=2)
-        displacement = Basis(self._skfem_mesh, ElementVector(self._shape), intorder=2)
-        coupling = divergence.assemble(displacement, pressure).tocsr()
-        coupling = coupling[:, self._nodes_first(displacement)]
-        return self._unit_stiffness[0], coupling, pressure_mass.assemble(pressure).tocsr()
-
     @property
     def factors(self) -> np.ndarray:
         """theta_q at this problem's material, :func:`factors_at`."""
@@ -248,7 +261,7 @@ class Elasticity:
     @cached_property
     def stiffness(self) -> sp.csr_matrix:
         """K without boundary conditions, shape (3 n_nodes, 3 n_nodes) [N/m] (P1 and P2)."""
-        terms = zip(self.factors, self._unit_stiffness, strict=True)
+        terms = zip(self.factors, self._terms.unit_stiffness, strict=True)
         return sum(theta * matrix for theta, matrix in terms).tocsr()
 
     def apply_terms(self, displacement: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -258,12 +271,12 @@ class Elasticity:
     def apply_term(self, q: int, displacement: np.ndarray) -> np.ndarray:
         """K_q u, shape (3 n_nodes, n) [m^2]."""
         if self.element != "Taylor-Hood":
-            return np.asarray(self._unit_stiffness[q] @ displacement)
-        shear, coupling, _ = self._mixed
+            return np.asarray(self._terms.unit_stiffness[q] @ displacement)
+        shear, coupling, _ = self._terms.mixed
         if q == 0:
             return np.asarray(shear @ displacement)
         change = np.asfortranarray(coupling @ displacement)
-        return np.asarray(coupling.T @ self._pressure_factor.solve_many(change))
+        return np.asarray(coupling.T @ self._terms.pressure_factor.solve_many(change))
 
     @cached_property
     def _free(self) -> np.ndarray:
@@ -277,7 +290,7 @@ class Elasticity:
             raise MaterialError("an organ without a clamp has no equilibrium; clamp some faces")
         free = self._free
         if self.element == "Taylor-Hood":
-            shear, coupling, mass = self._mixed
+            shear, coupling, mass = self._terms.mixed
             coupling = coupling[:, free]
             lam, mu = self.material.lame
             shear = mu * shear[free][:, free]
@@ -322,10 +335,6 @@ class Elasticity:
                 "check the mesh for slivers"
             )
         return displacement
-
-    @cached_property
-    def _pressure_factor(self) -> rslab.Ldlt:
-        return rslab.ldlt(sp.csc_matrix(self._mixed[2]))
 
     def apply(self, displacement: np.ndarray) -> np.ndarray:
         """Internal forces K u, shape (3 n_nodes, n) [N]; reactions appear at the clamp."""

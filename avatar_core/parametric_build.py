@@ -14,7 +14,7 @@ towards incompressibility, where the energy norm sees nothing but the change of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from avatar_core.build import find_modes, is_met
 from avatar_core.build_rule import BuildRule, Progress, silent
 from avatar_core.certificate import Certificate, certify, merged
-from avatar_core.coordinates import Coordinate, node_values
+from avatar_core.coordinates import Coordinate, node_values, problem_at
 from avatar_core.elasticity import Elasticity
 from avatar_core.exact_response import (
     ExactResponse,
@@ -68,13 +68,6 @@ class _Reduced:
     basis: SeparatedField
     operators: np.ndarray
     fields: tuple[SeparatedField, ...]
-
-
-def problem_at(elasticity: Elasticity, values: Mapping[str, float]) -> Elasticity:
-    """The elastic problem at values of the coordinates."""
-    poisson = values.get("poisson", elasticity.material.poisson_ratio)
-    material = replace(elasticity.material, poisson_ratio=poisson)
-    return elasticity.at(material, values.get("contrast"))
 
 
 def build_parametric_vademecum(

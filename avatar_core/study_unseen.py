@@ -11,10 +11,9 @@ import scipy.sparse as sp
 from avatar_core.affine import CanonicalField
 from avatar_core.affine_elasticity import N_NODES
 from avatar_core.compact import FloatArray
-from avatar_core.coordinates import Coordinate
+from avatar_core.coordinates import Coordinate, problem_at
 from avatar_core.elasticity import Elasticity
 from avatar_core.loads import LoadSurface, patch_loads
-from avatar_core.parametric_build import problem_at
 
 # Nodal displacement (3 n_nodes, 3 n) under unit forces at points of the surface, at some values
 NodalField = Callable[[Mapping[str, float], np.ndarray, FloatArray], FloatArray]

@@ -11,12 +11,11 @@ import pytest
 from avatar_core.build_rule import BuildRule
 from avatar_core.certificate import certify
 from avatar_core.contact import prepare, step
-from avatar_core.coordinates import Coordinate, node_values, node_weights
+from avatar_core.coordinates import Coordinate, node_values, node_weights, problem_at
 from avatar_core.elasticity import Elasticity, Inclusion, Material
 from avatar_core.errors import CoordinateError, MaterialError, SurfaceError
 from avatar_core.organ import OrganOptions, vademecum_of
 from avatar_core.parametric import at_values
-from avatar_core.parametric_build import problem_at
 from avatar_core.phantom import phantom_liver
 from avatar_core.storage import load_vademecum, save_vademecum
 from avatar_core.surface import SurfaceMesh

@@ -151,7 +151,7 @@ def _manufactured_error(box: Box, n: int) -> float:
         fz = -(lam + mu) * k**2 * c[0] * s[1] * c[2]
         return fx * v[0] + fy * v[1] + fz * v[2]
 
-    force = body_force.assemble(basis)[problem._nodes_first(basis)]
+    force = body_force.assemble(basis)[problem._terms.nodes_first(basis)]
     u = problem.solve(force[:, None])[:, 0].reshape(-1, 3)
     x = _nodes(problem)
     exact = np.zeros_like(u)

@@ -431,8 +431,6 @@ def test_parameters_are_those_of_page_and_yaml_file(node: Module, probe: Any) ->
     assert set(values) == declared
     given = {"atlas", "library_dir", "max_megabytes", "vertices", "certify"}  # by this test
     names = sorted(declared - given)
-    answer = probe.ask(
-        GetParameters, f"/{NODE}/get_parameters", GetParameters.Request(names=names)
-    )
+    answer = probe.ask(GetParameters, f"/{NODE}/get_parameters", GetParameters.Request(names=names))
     running_with = [parameter_value_to_python(value) for value in answer.values]
     assert running_with == [values[name] for name in names]
