@@ -15,6 +15,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from avatar_core.build_rule import Progress
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -95,6 +97,37 @@ def follow(items: Iterable[Item], text: str) -> Iterator[Item]:
     from tqdm import tqdm
 
     yield from tqdm(items, desc=f"{text:28s}", file=sys.stderr, disable=None, leave=False)
+
+
+class Parts:
+    """A progress bar over the long parts of a study, and the stage that one is in.
+
+    A part is begun by :meth:`part`, which gives what its builds report to.
+    """
+
+    def __init__(self, n_parts: int) -> None:
+        self._n_parts, self._begun = n_parts, 0
+
+    def __enter__(self) -> Parts:
+        from tqdm import tqdm
+
+        self._bar = tqdm(total=self._n_parts, file=sys.stderr, disable=None, leave=False)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def part(self, name: str) -> Progress:
+        """Begin a part; the one before is done."""
+        self._bar.update(1 if self._begun else 0)
+        self._begun += 1
+        self._bar.set_description_str(name)
+
+        def progress(stage: str, fraction: float, error: float) -> None:
+            known = "" if math.isnan(error) else f", error {error:.1%}"
+            self._bar.set_description_str(f"{name}: {stage} {fraction:.0%}{known}")
+
+        return progress
 
 
 @contextmanager

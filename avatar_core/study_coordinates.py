@@ -20,8 +20,8 @@ from avatar_core.affine import AffineProblem, Samples
 from avatar_core.affine_elasticity import affine_problem
 from avatar_core.bench import time_steps
 from avatar_core.build import build_vademecum, with_rank
-from avatar_core.build_rule import BuildRule
-from avatar_core.coordinates import Coordinate
+from avatar_core.build_rule import BuildRule, Progress
+from avatar_core.coordinates import Coordinate, problem_at
 from avatar_core.elasticity import Elasticity, Element, Inclusion, Material
 from avatar_core.large_build import (
     LINEAR_RULE,
@@ -29,13 +29,13 @@ from avatar_core.large_build import (
     hyperelastic_problem,
     with_large_deformation,
 )
-from avatar_core.large_certificate import LargeRow, certify_large
+from avatar_core.large_certificate import certify_large
 from avatar_core.large_deformation import LargeMaterial
 from avatar_core.loads import LoadSurface, load_surface, patch_loads
 from avatar_core.mesh import Regions, regions_by_rule, tetrahedralize
-from avatar_core.parametric_build import build_parametric_vademecum, certify_range, problem_at
+from avatar_core.parametric_build import build_parametric_vademecum, certify_range
 from avatar_core.pgd import PGDRule, minimal_residual, solve_pgd
-from avatar_core.study import Study, Value
+from avatar_core.study import Parts, Study, Value
 from avatar_core.study_pushes import push_errors
 from avatar_core.study_shapes import DEFAULT_FOLDER, read_liver
 from avatar_core.study_unseen import canonical_at, errors, unseen
@@ -91,19 +91,25 @@ def study(one: SurfaceMesh, other: SurfaceMesh, plan: Plan) -> Study:
     poisson = (Coordinate("poisson", 0.40, 0.49),)
     incompressible = (Coordinate("poisson", 0.40, 0.499, 4),)
     rows: list[dict[str, Value]] = []
-    for surface in (one, other) if one.name != other.name else (one,):
-        rows += _parametric(_organ(surface, plan.n_vertices), "poisson", poisson, plan)
-    organ = _organ(one, plan.n_vertices, "Taylor-Hood")
-    rows += _parametric(organ, "incompressible", incompressible, plan)
-    rows += _tumour_rows(plan)
-    for name, coordinates, element in (
-        ("poisson", poisson, "P2"),
-        ("incompressible", incompressible, "Taylor-Hood"),
-    ):
-        small = _organ(one, plan.n_vertices_canonical, element)  # type: ignore[arg-type]
-        rows += _canonical(small, name, coordinates, plan)
-    large, pushes, combined = _large(_organ(one, plan.n_vertices), plan)
-    rows += large + pushes + combined
+    with Parts(8) as parts:
+        for surface in (one, other) if one.name != other.name else (one,):
+            progress = parts.part(f"Poisson's ratio, {surface.name}")
+            organ = _organ(surface, plan.n_vertices)
+            rows += _parametric(organ, "poisson", poisson, plan, progress)
+        progress = parts.part("towards incompressibility")
+        organ = _organ(one, plan.n_vertices, "Taylor-Hood")
+        rows += _parametric(organ, "incompressible", incompressible, plan, progress)
+        rows += _tumour_rows(plan, parts.part("tumour"))
+        for name, coordinates, element in (
+            ("poisson", poisson, "P2"),
+            ("incompressible", incompressible, "Taylor-Hood"),
+        ):
+            progress = parts.part(f"canonical PGD, {name}")
+            small = _organ(one, plan.n_vertices_canonical, element)  # type: ignore[arg-type]
+            rows += _canonical(small, name, coordinates, plan, progress)
+        large = _organ(one, plan.n_vertices)
+        rows += _large(large, "neo-hookean", plan, parts.part("neo-Hookean"))
+        rows += _large(large, "st-venant-kirchhoff", plan, parts.part("St Venant-Kirchhoff"))
     summary = _summary(rows)
     return Study(
         name="coordinates",
@@ -136,7 +142,11 @@ def _organ(
 
 
 def _parametric(
-    organ: Organ, name: str, coordinates: tuple[Coordinate, ...], plan: Plan
+    organ: Organ,
+    name: str,
+    coordinates: tuple[Coordinate, ...],
+    plan: Plan,
+    progress: Progress,
 ) -> list[dict[str, Value]]:
     """Errors of the default against modes, and the time of its build."""
     start = time.process_time()
@@ -148,6 +158,7 @@ def _parametric(
         coordinates,
         BuildRule(),
         Provenance(organ.name, ""),
+        progress,
     )
     seconds = time.process_time() - start
     assert vademecum.parametric is not None
@@ -166,18 +177,22 @@ def _parametric(
     return rows
 
 
-def _tumour_rows(plan: Plan) -> list[dict[str, Value]]:
+def _tumour_rows(plan: Plan, progress: Progress) -> list[dict[str, Value]]:
     """Poisson's ratio and the contrast of real tumours together."""
     liver, tumour = TUMOUR_FOLDER / "liver.vtk", TUMOUR_FOLDER / "liver_tumours.vtk"
     if not liver.is_file():
         return []
     organ = _organ(read_surface(liver), plan.n_vertices, tumour=tumour)
     coordinates = (Coordinate("poisson", 0.40, 0.49, 2), Coordinate("contrast", 0.5, 20.0, 4))
-    return _parametric(organ, "tumour", coordinates, plan)
+    return _parametric(organ, "tumour", coordinates, plan, progress)
 
 
 def _canonical(
-    organ: Organ, name: str, coordinates: tuple[Coordinate, ...], plan: Plan
+    organ: Organ,
+    name: str,
+    coordinates: tuple[Coordinate, ...],
+    plan: Plan,
+    progress: Progress,
 ) -> list[dict[str, Value]]:
     """The canonical forms and the default's far field on one small mesh."""
     elasticity, surface = organ.elasticity, organ.loads
@@ -186,13 +201,18 @@ def _canonical(
     norm = _norms(middle, loads)
     problem = affine_problem(middle, loads, coordinates, 1.0 / norm**2)
     cases = unseen(elasticity, surface, coordinates, 4, max(4, plan.n_loads // 8))
-    rows = _parametric(organ, f"{name}, small mesh", coordinates, plan)
+    rows = _parametric(organ, f"{name}, small mesh", coordinates, plan, progress)
     for method, form in (("canonical, Galerkin", problem), ("canonical, minimal residual", None)):
         start = time.process_time()
         rule = PGDRule(
             plan.n_canonical, 1e-4, max_sweeps=4, sweep_tolerance=0.1, solve_tolerance=1e-2
         )
-        found = solve_pgd(minimal_residual(problem) if form is None else form, rule)
+
+        def enriched(rank: int, residual: float, method: str = method) -> None:
+            progress(method, rank / plan.n_canonical, residual)
+
+        affine = minimal_residual(problem) if form is None else form
+        found = solve_pgd(affine, rule, progress=enriched)
         seconds = time.process_time() - start
         for rank in sorted({r for r in RANKS if r < found.field.rank} | {found.field.rank}):
             some = canonical_at(found.field.truncate(rank), coordinates)
@@ -244,38 +264,43 @@ def _row(
 
 
 def _large(
-    organ: Organ, plan: Plan
-) -> tuple[list[dict[str, Value]], list[dict[str, Value]], list[dict[str, Value]]]:
-    """Both materials: summary rows, every push, and combinations of the neo-Hookean one."""
+    organ: Organ, material: LargeMaterial, plan: Plan, progress: Progress
+) -> list[dict[str, Value]]:
+    """One material: its summary, every push, and combinations of neo-Hookean ones."""
+    start = time.process_time()
     linear = build_vademecum(
-        organ.name, organ.elasticity, organ.regions, organ.loads, LINEAR_RULE, Provenance("", "")
+        organ.name,
+        organ.elasticity,
+        organ.regions,
+        organ.loads,
+        LINEAR_RULE,
+        Provenance("", ""),
+        progress,
     )
-    rows: list[dict[str, Value]] = []
-    pushes: list[dict[str, Value]] = []
-    combined: list[dict[str, Value]] = []
-    materials: tuple[LargeMaterial, ...] = ("neo-hookean", "st-venant-kirchhoff")
-    for material in materials:
-        problem = hyperelastic_problem(linear, material)
-        start = time.process_time()
-        bent = with_large_deformation(linear, problem, material, LargeRule(), LINEAR_RULE)
-        seconds = time.process_time() - start
-        certificate, found = certify_large(bent, problem, plan.n_pushed, seed=1)
-        pace = _pace(linear, bent) if material == "neo-hookean" else float("nan")
-        row: dict[str, Value] = {
-            "coordinate": f"large, {material}",
-            "organ": organ.name,
-            "method": "default",
-            "modes": bent.large.space.shape[1] if bent.large else 0,
-            "build_cpu_seconds": seconds,
-            "step_over_linear": pace,
-        }
-        rows.append({**row, **vars(certificate)})
-        pushes += [_push_row(material, row) for row in found]
-        if material == "neo-hookean":
-            depths = np.array([5e-3, 10e-3, 15e-3])
-            found_together = push_errors(bent, problem, depths, plan.n_combined, seed=2)
-            combined += [{"coordinate": "combination", **push} for push in found_together]
-    return rows, pushes, combined
+    problem = hyperelastic_problem(linear, material)
+    bent = with_large_deformation(linear, problem, material, LargeRule(), LINEAR_RULE, progress)
+    seconds = time.process_time() - start
+
+    def pushed(done: int, error: float) -> None:
+        progress("push", done / plan.n_pushed, error)
+
+    certificate, found = certify_large(bent, problem, plan.n_pushed, seed=1, progress=pushed)
+    summary: dict[str, Value] = {
+        "coordinate": f"large, {material}",
+        "organ": organ.name,
+        "method": "default",
+        "modes": bent.large.space.shape[1] if bent.large else 0,
+        "build_cpu_seconds": seconds,
+        **vars(certificate),
+    }
+    rows: list[dict[str, Value]] = [summary]
+    rows += [{"coordinate": f"push, {material}", **vars(row)} for row in found]
+    if material == "neo-hookean":
+        summary["step_over_linear"] = _pace(linear, bent)
+        depths = np.array([5e-3, 10e-3, 15e-3])
+        together = push_errors(bent, problem, depths, plan.n_combined, seed=2)
+        rows += [{"coordinate": "combination", **push} for push in together]
+    return rows
 
 
 def _pace(linear: Vademecum, bent: Vademecum, modes: int = 50) -> float:
@@ -283,10 +308,6 @@ def _pace(linear: Vademecum, bent: Vademecum, modes: int = 50) -> float:
     rule = BuildRule()
     times = [time_steps(with_rank(one, modes, rule), 1).p50_us for one in (linear, bent)]
     return times[1] / times[0]
-
-
-def _push_row(material: str, row: LargeRow) -> dict[str, Value]:
-    return {"coordinate": f"push, {material}", **vars(row)}
 
 
 # --- summary ------------------------------------------------------------------------------------
@@ -311,9 +332,10 @@ def _summary(rows: Sequence[dict[str, Value]]) -> dict[str, float]:
             ("contact_mean", "contact_mean"),
             ("depth", "depth"),
             ("build_cpu_seconds", "build_cpu_seconds"),
-            ("step_over_linear", "step_over_linear"),
         ):
             summary[f"{key}_{ours}"] = float(row[theirs])  # type: ignore[arg-type]
+        if "step_over_linear" in row:
+            summary["large_step_over_linear"] = float(row["step_over_linear"])  # type: ignore[arg-type]
     deep = [
         row
         for row in rows
