@@ -12,7 +12,7 @@ from avatar_core.build_rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.certificate import certify, mesh_error
 from avatar_core.coordinates import Coordinate
 from avatar_core.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
-from avatar_core.errors import CoordinateError, MaterialError
+from avatar_core.errors import CoordinateError, MaterialError, MeshError
 from avatar_core.large_build import LargeRule, hyperelastic_problem, with_large_deformation
 from avatar_core.large_certificate import certify_large
 from avatar_core.large_deformation import LargeMaterial
@@ -51,6 +51,11 @@ class OrganOptions:
     n_pushed : unseen sites at which large deformation is certified, a nonlinear solution each
     n_certified : unseen load positions of the certificate; ``seed`` draws them
     with_mesh_error : also solve on the same mesh refined once (slow)
+
+    Raises
+    ------
+    CoordinateError, MaterialError, MeshError
+        For what cannot be had together, and for a file that is not there, before any work.
     """
 
     n_vertices: int = 2850
@@ -68,6 +73,32 @@ class OrganOptions:
     n_certified: int = 200
     seed: int = 0
     with_mesh_error: bool = False
+
+    def __post_init__(self) -> None:
+        names = [c.name for c in self.coordinates]
+        if len(set(names)) < len(names):
+            raise CoordinateError(f"a coordinate is given twice: {', '.join(names)}")
+        if "contrast" in names and self.tumour is None:
+            raise CoordinateError(
+                "the contrast is that of a tumour; give its surface with --tumour"
+            )
+        if self.large and (self.coordinates or self.tumour):
+            raise CoordinateError(
+                "large deformation is not combined with a tumour or coordinates of the material; "
+                "build two vademecums"
+            )
+        if self.large and (self.element or self.material.element) != "P2":
+            raise MaterialError(
+                f"large deformation is solved on the element P2 up to Poisson's ratio "
+                f"{POISSON_RATIO_P2}; take at most that, and no other --element"
+            )
+        if self.patch_radius is not None and not 1e-3 <= self.patch_radius <= 0.1:
+            raise MeshError(
+                f"a patch of radius {self.patch_radius:g} m is no tool's; give 1e-3 to 0.1 "
+                "(12e-3: 12 mm)"
+            )
+        if self.groups is not None and not self.groups.is_file():
+            raise MeshError(f"cannot read node groups from {self.groups}: there is no such file")
 
 
 def vademecum_of(
@@ -133,22 +164,6 @@ def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress)
 
 def _elasticity(mesh: TetMesh, regions: Regions, options: OrganOptions) -> Elasticity:
     """The elastic problem, on one element that serves the whole range of Poisson's ratio."""
-    contrasts = [c for c in options.coordinates if c.name == "contrast"]
-    if contrasts and options.tumour is None:
-        raise CoordinateError("the contrast is that of a tumour; give its surface with --tumour")
-    if options.large and (options.coordinates or options.tumour):
-        raise CoordinateError(
-            "large deformation is not combined with a tumour or coordinates of the material; build "
-            "two vademecums"
-        )
-    if options.large and (options.element or options.material.element) != "P2":
-        raise MaterialError(
-            f"large deformation is solved on the element P2 up to Poisson's ratio "
-            f"{POISSON_RATIO_P2}; take at most that, and no other --element"
-        )
-    names = [c.name for c in options.coordinates]
-    if len(set(names)) < len(names):
-        raise CoordinateError(f"a coordinate is given twice: {', '.join(names)}")
     ratios = [c.high for c in options.coordinates if c.name == "poisson"]
     stiffest = replace(options.material, poisson_ratio=max(ratios)) if ratios else options.material
     inclusion = None

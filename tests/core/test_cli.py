@@ -32,7 +32,7 @@ def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
 
 
 def phantom_file(folder: Path, scale: float = 1e3) -> Path:
-    liver = phantom_liver()
+    liver = phantom_liver(12e-3)
     return write_obj(folder / "liver.obj", liver.vertices * scale, liver.faces)
 
 
@@ -62,7 +62,7 @@ def test_bad_surface(
 def test_open_surface(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    liver = phantom_liver()
+    liver = phantom_liver(12e-3)
     middle = liver.vertices[liver.faces].mean(axis=1)[:, 0]
     half = liver.faces[middle > np.median(middle)]
     source = write_obj(tmp_path / "half.obj", liver.vertices * 1e3, half)
@@ -108,7 +108,7 @@ def test_bad_option(
     remedy: str,
 ) -> None:
     source = phantom_file(tmp_path)
-    small = [] if "--vertices" in options else ["--vertices", "400"]
+    small = [] if "--vertices" in options else ["--vertices", "800"]
     refused(monkeypatch, capsys, tmp_path, [source, *small, *options], remedy)
 
 
@@ -123,8 +123,8 @@ def test_tolerance_out_of_reach_is_written_and_marked(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     file = tmp_path / "v.h5"
-    options = ["--vertices", "300", "--modes", "6", "--tolerance", "0.001", "--certify", "5"]
-    assert run(monkeypatch, "vademecum", "phantom", "-o", file, *options) == 3
+    options = ["--vertices", "800", "--modes", "6", "--tolerance", "0.001", "--certify", "5"]
+    assert run(monkeypatch, "vademecum", phantom_file(tmp_path), "-o", file, *options) == 3
     assert "not converged" in capsys.readouterr().err
     assert run(monkeypatch, "show", file, "--json") == 0
     shown = json.loads(capsys.readouterr().out)
@@ -178,16 +178,17 @@ def test_ctrl_c_is_said_and_leaves_nothing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     def meshed_then_stopped(*_: object) -> None:
-        tetrahedralize(phantom_liver(), 100)  # a library in there takes the signal for itself
+        tetrahedralize(phantom_liver(12e-3), 800)  # a library in there takes the signal for itself
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(10.0)
 
+    source = phantom_file(tmp_path)
     monkeypatch.setattr("avatar_core.organ.vademecum_of", meshed_then_stopped)
     # a shell starts what runs in the background with the signal ignored
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        assert run(monkeypatch, "vademecum", "phantom", "-o", tmp_path / "liver.h5") == 130
+        assert run(monkeypatch, "vademecum", source, "-o", tmp_path / "liver.h5") == 130
     finally:
         signal.signal(signal.SIGINT, before)
     assert capsys.readouterr().err.splitlines()[-1].startswith("avatar: stopped")
-    assert not list(tmp_path.iterdir())
+    assert list(tmp_path.iterdir()) == [source]

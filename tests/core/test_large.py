@@ -44,7 +44,7 @@ both = pytest.mark.parametrize("material", ["neo-hookean", "st-venant-kirchhoff"
 def straight() -> Vademecum:
     """A coarse phantom with wide patches: few load positions."""
     options = OrganOptions(
-        n_vertices=600, patch_radius=30e-3, rule=BuildRule(max_modes=60), n_certified=10
+        n_vertices=800, patch_radius=30e-3, rule=BuildRule(max_modes=60), n_certified=10
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loads, "MIDPOINTS_FROM", 1.0)

@@ -120,7 +120,9 @@ def organ() -> Any:
     from avatar_core.phantom import phantom_liver
 
     rule = BuildRule(max_modes=30)
-    return vademecum_of(phantom_liver(), OrganOptions(n_vertices=500, rule=rule, n_certified=10))
+    return vademecum_of(
+        phantom_liver(12e-3), OrganOptions(n_vertices=800, rule=rule, n_certified=10)
+    )
 
 
 @pytest.fixture(scope="session")

@@ -34,12 +34,12 @@ pytestmark = pytest.mark.ros
 def soft_organ() -> Any:
     """A coarse phantom over Poisson's ratio."""
     options = OrganOptions(
-        n_vertices=400,
+        n_vertices=800,
         rule=BuildRule(max_modes=30),
         coordinates=(Coordinate("poisson", 0.30, 0.49),),
         n_certified=8,
     )
-    return vademecum_of(phantom_liver(), options)
+    return vademecum_of(phantom_liver(12e-3), options)
 
 
 @pytest.fixture(scope="module")
