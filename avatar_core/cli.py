@@ -140,6 +140,9 @@ def bench_cell(
     surface: Surface = "phantom",
     seconds: Annotated[float, typer.Option(help="of each run [s]")] = 60.0,
     vertices: Vertices = 2850,
+    changes: Annotated[
+        float, typer.Option(help="times a second that the material is changed meanwhile [Hz]")
+    ] = 0.0,
     output: Json = None,
 ) -> None:
     """Time the whole ROS 2 cell: tool, contact and cloud subscriber as separate processes."""
@@ -160,7 +163,7 @@ def bench_cell(
                 )
             file = Path(folder) / "bench.h5"
             save_vademecum(built, file)
-        report = run_cell(file, seconds, output)
+        report = run_cell(file, seconds, output, changes=changes)
     print(report.table())
 
 

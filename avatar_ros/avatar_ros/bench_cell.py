@@ -1,6 +1,7 @@
 """Does this machine hold 1 kHz? Measures a whole cell of real processes over real DDS.
 
-Loader, contact node, a palpating tool, a cloud viewer, and beside them a loop that only sleeps:
+Loader, contact node, a palpating tool, a cloud viewer, on request a slider of the material, and
+beside them a loop that only sleeps:
 what it misses, the machine misses. Run by ``avatar bench cell``.
 """
 
@@ -66,6 +67,7 @@ class CellMeasurement:
     compute_p99_ms : worst second of the contact node, from pose in hand to wrench published
     floor : periods of the sleeping loop in the same seconds
     cloud_hz, cloud_bytes : what the viewer got
+    material_changes : that the contact node accepted in the run
     force_max_n : largest force felt
     felt : every pose and its answer; not in the data file
     """
@@ -85,6 +87,7 @@ class CellMeasurement:
     floor_on_time_fraction: float
     cloud_hz: float
     cloud_bytes: int
+    material_changes: int
     force_max_n: float
     felt: Felt
 
@@ -151,6 +154,7 @@ _ROWS = (
     ("  periods <= 1.5 ms", lambda run: f"{run.floor_on_time_fraction:.3%}"),
     ("clouds at the viewer [Hz]", lambda run: f"{run.cloud_hz:.1f}"),
     ("  bytes each", lambda run: f"{run.cloud_bytes}"),
+    ("changes of the material", lambda run: f"{run.material_changes}"),
     ("largest force [N]", lambda run: f"{run.force_max_n:.2f}"),
 )
 
@@ -162,8 +166,11 @@ def run_cell(
     real_time: bool = True,
     ordinary: bool = True,
     tip_radius: float = 0.005,
+    changes: float = 0.0,
 ) -> CellReport:
     """Measure a cell with real-time priority and without, ``seconds`` each.
+
+    changes : of the material [Hz]
 
     Raises
     ------
@@ -177,8 +184,8 @@ def run_cell(
         machine=f"{platform.machine()} {platform.release()}",
         cores=len(os.sched_getaffinity(0)),
         vademecum=path.name,
-        real_time=_measure(path, seconds, PRIORITY, tip_radius) if granted else None,
-        ordinary=_measure(path, seconds, 0, tip_radius) if ordinary else None,
+        real_time=_measure(path, seconds, PRIORITY, tip_radius, changes) if granted else None,
+        ordinary=_measure(path, seconds, 0, tip_radius, changes) if ordinary else None,
     )
     if output_json is not None:
         report.save(Path(output_json))
@@ -192,22 +199,29 @@ def _priority_is_granted() -> bool:
     )
 
 
-def _measure(path: Path, seconds: float, priority: int, tip_radius: float) -> CellMeasurement:
+def _measure(
+    path: Path, seconds: float, priority: int, tip_radius: float, changes: float
+) -> CellMeasurement:
     load = os.getloadavg()[0]
     with (
         tempfile.TemporaryDirectory(prefix="avatar-bench-") as folder,
         cell(path, tip_radius, priority) as environment,
     ):
         felt_file, view_file = Path(folder, "felt.npz"), Path(folder, "view.json")
+        count_file = Path(folder, "count.json")
         viewer = Module("cloud_viewer", [str(view_file)], environment)
         arguments = [str(path), "--tip-radius", str(tip_radius), "--output", str(felt_file)]
         arguments += ["--seconds", str(seconds), "--priority", str(priority)]
         tool = Module("scripted_tool", arguments, environment)
+        slider = None
         try:
             assert tool.stdout is not None
             if tool.stdout.readline().strip() != READY:
                 tool.wait(_STOP_TIMEOUT)
                 raise CellError(f"the tool did not start: {tool.last_words()}")
+            if changes > 0.0:
+                of_slider = [str(path), str(changes), str(count_file)]
+                slider = Module("material_slider", of_slider, environment)
             floor = Module("realtime", [str(seconds), str(priority)], environment)
             bare, _ = floor.communicate(timeout=seconds + _START_TIMEOUT)
             if tool.wait(timeout=seconds + _START_TIMEOUT) != 0:
@@ -215,12 +229,16 @@ def _measure(path: Path, seconds: float, priority: int, tip_radius: float) -> Ce
         finally:
             tool.finish()
             viewer.finish()
+            code = 0 if slider is None else slider.finish()
+        if slider is not None and code != 0:
+            raise CellError(f"the slider failed: {slider.last_words()}")
+        accepted = 0 if slider is None else json.loads(count_file.read_text())["accepted"]
         felt = Felt.load(felt_file)
-        return _evaluate(felt, json.loads(view_file.read_text()), json.loads(bare), load)
+        return _evaluate(felt, json.loads(view_file.read_text()), json.loads(bare), load, accepted)
 
 
 def _evaluate(
-    felt: Felt, view: dict[str, Any], bare: dict[str, Any], load: float
+    felt: Felt, view: dict[str, Any], bare: dict[str, Any], load: float, accepted: int
 ) -> CellMeasurement:
     windows = [
         w
@@ -251,6 +269,7 @@ def _evaluate(
         floor_on_time_fraction=float(np.mean(floor <= ON_TIME)),
         cloud_hz=np.count_nonzero((clouds > felt.begin) & (clouds < felt.end)) / duration,
         cloud_bytes=view["cloud_bytes"],
+        material_changes=accepted,
         force_max_n=float(np.nanmax(np.linalg.norm(felt.forces, axis=1))),
         felt=felt,
     )
