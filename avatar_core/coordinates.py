@@ -21,7 +21,9 @@ import numpy as np
 from avatar_core.elasticity import Elasticity
 from avatar_core.errors import CoordinateError
 
-NODES = {"poisson": 3, "contrast": 4}
+# Between nodes no farther apart, in the scales above, interpolation adds nothing to the error that
+# can be measured (`avatar study coordinates`).
+_SPACING = {"poisson": 2.4, "contrast": 1.9}
 _LIMITS = {"poisson": (0.0, 0.4999), "contrast": (0.01, 100.0)}
 
 
@@ -32,7 +34,7 @@ class Coordinate:
     name : "poisson" (Poisson's ratio) or "contrast" (Young's modulus inside the tumour over that
         outside)
     low, high : its range
-    n_nodes : at which the near field is computed, both ends included
+    n_nodes : at which the organ is solved, both ends included; 0: as many as the range calls for
 
     Raises
     ------
@@ -55,7 +57,8 @@ class Coordinate:
                 f"{least:g} <= LOW < HIGH <= {most:g}"
             )
         if self.n_nodes == 0:
-            object.__setattr__(self, "n_nodes", NODES[self.name])
+            span = self._scaled(self.high) - self._scaled(self.low)
+            object.__setattr__(self, "n_nodes", 1 + math.ceil(span / _SPACING[self.name]))
         if self.n_nodes < 2:
             raise CoordinateError(f"coordinate {self.name}: give at least 2 nodes")
 

@@ -139,6 +139,7 @@ def _solved(
     missing = Missing(elasticity, surface, response, rule)
     solution, _ = find_modes(elasticity, loads, response, missing, rule, second)
     space = solution.space.astype(np.float32)
+    elasticity = elasticity.at(elasticity.material)  # leaves its factorization behind, 0.5 GB
     return _Snapshot(elasticity, response, missing, space, solution.load, solution.history)
 
 

@@ -89,7 +89,7 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
 def study(one: SurfaceMesh, other: SurfaceMesh, plan: Plan) -> Study:
     """All coordinates on the first organ, Poisson's ratio on both."""
     poisson = (Coordinate("poisson", 0.40, 0.49),)
-    incompressible = (Coordinate("poisson", 0.40, 0.499, 4),)
+    incompressible = (Coordinate("poisson", 0.40, 0.499),)
     rows: list[dict[str, Value]] = []
     with Parts(8) as parts:
         for surface in (one, other) if one.name != other.name else (one,):
@@ -183,7 +183,7 @@ def _tumour_rows(plan: Plan, progress: Progress) -> list[dict[str, Value]]:
     if not liver.is_file():
         return []
     organ = _organ(read_surface(liver), plan.n_vertices, tumour=tumour)
-    coordinates = (Coordinate("poisson", 0.40, 0.49, 2), Coordinate("contrast", 0.5, 20.0, 4))
+    coordinates = (Coordinate("poisson", 0.40, 0.49), Coordinate("contrast", 0.5, 20.0))
     return _parametric(organ, "tumour", coordinates, plan, progress)
 
 

@@ -35,8 +35,8 @@ def soft_organ() -> Any:
     """A coarse phantom over Poisson's ratio."""
     options = OrganOptions(
         n_vertices=800,
-        rule=BuildRule(max_modes=30),
-        coordinates=(Coordinate("poisson", 0.30, 0.49),),
+        rule=BuildRule(max_modes=20, most_oversampling=1.2),
+        coordinates=(Coordinate("poisson", 0.30, 0.49, 2),),
         n_certified=8,
     )
     return vademecum_of(phantom_liver(12e-3), options)
