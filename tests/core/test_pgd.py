@@ -103,6 +103,33 @@ def test_separable_solution_needs_one_product_a_load_pattern() -> None:
     np.testing.assert_allclose(found.field.at((4, 0)), u / (3.0 * 0.5), rtol=1e-5)
 
 
+def test_a_product_leaves_no_residual_in_its_own_directions() -> None:
+    """Galerkin orthogonality: r, tested with three of R, S, P, Q, has nothing in the fourth."""
+    problem = _problem()
+    rule = PGDRule(4, 1e-9, 2000, 1e-10, solve_tolerance=1e-12, update=False, stall=30)
+    field = solve_pgd(problem, rule).field
+    terms, force = [_dense(k) for k in problem.terms], _dense(problem.sources[0])
+    residual = np.empty((*N_NODES, N, N_LOADS))
+    for a, b in np.ndindex(*N_NODES):
+        theta = problem.factors[0][:, a] * problem.factors[1][:, b]
+        stiffness = theta[0] * terms[0] + theta[1] * terms[1]
+        residual[a, b] = force - stiffness @ field.at((a, b))
+    p, c = (w * f[:, -1] for w, f in zip(problem.weights, field.parameters, strict=True))
+    tests = {
+        "a": p,
+        "b": c,
+        "x": field.space[:, -1],
+        "s": problem.load_weights * field.load[:, -1],
+    }
+    for free in tests:
+        others = [letter for letter in tests if letter != free]
+        pattern = f"abxs,{','.join(others)}->{free}"
+        given = [tests[letter] for letter in others]
+        left = np.einsum(pattern, residual, *given)
+        whole = np.einsum(pattern, np.broadcast_to(force, residual.shape), *given)
+        assert np.linalg.norm(left) < 1e-6 * np.linalg.norm(whole), free
+
+
 @pytest.mark.parametrize("variant", ["Galerkin", "no update", "minimal residual"])
 def test_every_variant_closes_in_on_the_direct_solution(variant: str) -> None:
     problem = _problem()
