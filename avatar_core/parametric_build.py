@@ -223,7 +223,8 @@ def _project(
 
 
 def _projected_terms(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
-    terms = np.stack([space.T @ force for force in elasticity.apply_terms(space)])
+    n_terms = len(elasticity.factors)
+    terms = np.stack([space.T @ elasticity.apply_term(q, space) for q in range(n_terms)])
     return (terms + terms.transpose(0, 2, 1)) / 2.0
 
 
