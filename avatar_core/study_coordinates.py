@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
 PAPER: dict[str, Value] = {"large_build_cpu_seconds": "3 to 4 days"}
 TUMOUR_FOLDER = DEFAULT_FOLDER.parent / "tumour"
+TUMOUR_AXES = "LPS"  # as they lie against the phantom; the files do not say
 RANKS = (10, 25, 50, 100)
 
 
@@ -132,7 +133,7 @@ def _organ(
     regions = regions_by_rule(mesh)
     inclusion = None
     if tumour is not None:
-        inclusion = Inclusion(share_inside(mesh, read_tumour(tumour)), 1.0)
+        inclusion = Inclusion(share_inside(mesh, read_tumour(tumour, axes=TUMOUR_AXES)), 1.0)
     material = Material()
     elasticity = Elasticity(mesh, material, regions.clamped, element, inclusion)
     return Organ(surface.name, regions, load_surface(mesh, regions), elasticity)
@@ -182,7 +183,7 @@ def _tumour_rows(plan: Plan, progress: Progress) -> list[dict[str, Value]]:
     liver, tumour = TUMOUR_FOLDER / "liver.vtk", TUMOUR_FOLDER / "liver_tumours.vtk"
     if not liver.is_file():
         return []
-    organ = _organ(read_surface(liver), plan.n_vertices, tumour=tumour)
+    organ = _organ(read_surface(liver, axes=TUMOUR_AXES), plan.n_vertices, tumour=tumour)
     coordinates = (Coordinate("poisson", 0.40, 0.49), Coordinate("contrast", 0.5, 20.0))
     return _parametric(organ, "tumour", coordinates, plan, progress)
 
