@@ -63,8 +63,8 @@ class Plan:
     n_vertices_canonical: int = 1000
     n_loads: int = 160
     n_canonical: int = 60
-    n_pushed: int = 24
-    n_combined: int = 6
+    n_pushed: int = 12
+    n_combined: int = 4
 
 
 FULL = Plan()
