@@ -107,14 +107,16 @@ class Missing:
         self._weight = np.repeat(weight, 3, axis=0).astype(np.float32)
         self._norm = response.norm[self.loads]
         self._columns = response.columns
-        self._left = self._columns.copy()
+        self._left: np.ndarray | None = None
 
     def restart(self) -> None:
-        """Forget all modes."""
-        self._left = self._columns.copy()
+        """Forget all modes, and give their memory back."""
+        self._left = None
 
     def remove(self, space: np.ndarray, load: np.ndarray) -> np.ndarray:
         """Take modes off; the relative L2 error of each kept load, shape (n,)."""
+        if self._left is None:
+            self._left = self._columns.copy()
         self._left -= space.astype(np.float32) @ load[self.loads].astype(np.float32).T
         left = self._left.reshape(len(self._weight), -1, 3)
         squared = np.einsum("vs,vsc,vsc->sc", self._weight, left, left, optimize=False)

@@ -138,6 +138,7 @@ def _solved(
     response = exact_response(elasticity, surface, loads, rule, first)
     missing = Missing(elasticity, surface, response, rule)
     solution, _ = find_modes(elasticity, loads, response, missing, rule, second)
+    missing.restart()
     space = solution.space.astype(np.float32)
     elasticity = elasticity.at(elasticity.material)  # leaves its factorization behind, 0.5 GB
     return _Snapshot(elasticity, response, missing, space, solution.load, solution.history)
@@ -165,8 +166,8 @@ def _errors(snapshots: Sequence[_Snapshot], reduced: _Reduced) -> list[np.ndarra
     """Relative L2 error of the kept loads at every node, near field included."""
     out = []
     for snapshot, field in zip(snapshots, reduced.fields, strict=True):
-        snapshot.missing.restart()
         out.append(snapshot.missing.remove(field.space, field.load))
+        snapshot.missing.restart()
     return out
 
 
