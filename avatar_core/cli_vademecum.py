@@ -286,6 +286,11 @@ def _show_large(v: Vademecum) -> None:
     ):
         print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
     print(f"    the linear vademecum: {c.linear_l2_mean:.1%}, {c.linear_contact_mean:.1%}")
+    if c.n_lost:
+        print(
+            f"    at {c.n_lost} of {c.n_sites} sites full finite elements lost equilibrium before "
+            "the stored range ends"
+        )
 
 
 def finite(value: Any) -> Any:
