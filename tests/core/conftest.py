@@ -68,7 +68,7 @@ def box_elasticity() -> Elasticity:
 
 @pytest.fixture(scope="session")
 def phantom_mesh() -> TetMesh:
-    return tetrahedralize(phantom_liver(12e-3), 800)
+    return tetrahedralize(phantom_liver(), 700)
 
 
 @pytest.fixture(scope="session")
