@@ -123,6 +123,7 @@ def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(bent: Vade
             assert row.l2 < row.linear_l2
 
 
+@pytest.mark.long
 def test_certificate_speaks_of_pushes_within_the_range(bent: Vademecum) -> None:
     certificate, rows = certify_large(bent, hyperelastic_problem(bent, "neo-hookean"), 2, seed=1)
     inside = [row for row in rows if row.within]

@@ -165,6 +165,7 @@ def run(
     return command
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "fidelity", ["interpolated", "reduced", pytest.param("solved", marks=pytest.mark.long)]
 )

@@ -334,6 +334,7 @@ def test_a_large_cavity_and_an_overlapping_part_belong_to_the_organ(tmp_path):
 # --- real livers ------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_all_real_livers_are_accepted_as_they_are(livers_dir):
     for path in sorted(livers_dir.glob("*.obj")):
         liver = read_surface(path)
