@@ -28,7 +28,7 @@ def test_a_broken_vademecum_ends_the_measurement(library: Path) -> None:
 
 @pytest.mark.long
 def test_the_cell_keeps_time(library: Path, tmp_path: Path) -> None:
-    report = run_cell(library / "liver.h5", 10.0, tmp_path / "cell.json", changes=2.0)
+    report = run_cell(library / "liver.h5", 10.0, tmp_path / "cell.json")
     data = json.loads((tmp_path / "cell.json").read_text())
     assert data["summary"] == report.summary
     assert set(report.summary) == {
@@ -44,9 +44,19 @@ def test_the_cell_keeps_time(library: Path, tmp_path: Path) -> None:
         # the luck of two different loops on a shared machine. The targets are measured by
         # `avatar bench cell` on a quiet one.
         assert run.on_time_fraction > run.floor_on_time_fraction - 0.05
-        assert run.material_changes >= 10
+        assert run.material_changes == 0
         assert run.answered_fraction > 0.9
         assert run.latency.p50_ms < 1.0
         assert run.cloud_hz > 0.5 * run.rate_hz
         touched = np.linalg.norm(run.felt.forces, axis=1) > 0.1
         assert 0.3 < touched.mean() < 0.9  # of a touch, pushing and sliding make 0.7
+
+
+@pytest.mark.long
+def test_the_cell_keeps_time_while_the_material_changes(library: Path) -> None:
+    report = run_cell(library / "liver.h5", 6.0, ordinary=False, changes=2.0)
+    run = report.real_time
+    if run is None:
+        pytest.skip("no real-time priority here, without which other processes decide")
+    assert run.material_changes >= 6
+    assert run.on_time_fraction > run.floor_on_time_fraction - 0.05

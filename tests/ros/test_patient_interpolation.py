@@ -379,7 +379,6 @@ def test_the_end_of_the_building_process_is_said_and_survived(
     assert _ask(probe, surface="liver1.obj").success
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_ending_the_node_half_way_leaves_nothing_behind(
     own_domain: dict[str, str], probe: Any, files: Any, folder: Path, number: int
