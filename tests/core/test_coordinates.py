@@ -87,6 +87,20 @@ def test_nodes_span_the_range_and_their_weights_interpolate() -> None:
         assert between.sum() == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    ("text", "n_nodes"),
+    [
+        ("poisson=0.45:0.48", 2),
+        ("poisson=0.40:0.49", 2),
+        ("poisson=0.40:0.499", 3),
+        ("contrast=0.5:20", 3),
+        ("contrast=0.5:20:5", 5),
+    ],
+)
+def test_a_wider_range_gets_more_nodes_unless_they_are_given(text: str, n_nodes: int) -> None:
+    assert Coordinate.parse(text).n_nodes == n_nodes
+
+
 def test_weights_of_several_coordinates_find_their_node() -> None:
     both = (POISSON, CONTRAST)
     for k, values in enumerate(node_values(both)):
@@ -156,6 +170,19 @@ def test_unseen_values_agree_with_full_finite_elements(
     assert c.l2_mean < 0.05
     assert c.l2_worst < 0.12
     assert c.contact_mean < 0.03
+
+
+def test_the_near_field_grows_where_the_modes_do_not_do() -> None:
+    rule = BuildRule(max_modes=5, most_oversampling=1.2)
+    options = OrganOptions(
+        n_vertices=800, rule=rule, coordinates=(Coordinate("poisson", 0.45, 0.48),), n_certified=8
+    )
+    found = vademecum_of(phantom_liver(12e-3), options)
+    at, centers = found.mesh.vertices[found.near.target], found.surface.centers
+    reach = np.linalg.norm(at - centers[found.near.position], axis=1).max()
+    wide = rule.near_growth * rule.near_outer * found.surface.patch_radius
+    assert 0.95 * wide < reach < wide
+    assert not found.convergence.converged
 
 
 def test_at_a_node_the_contact_is_exact_at_the_load_positions(
