@@ -14,6 +14,13 @@ from dataclasses import replace
 import numpy as np
 import scipy.sparse as sp
 
+from avatar_core.body import (
+    LEAST_MODES,
+    N_BODY,
+    BodyResponse,
+    body_functions,
+    body_response,
+)
 from avatar_core.build_rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.elasticity import Elasticity
 from avatar_core.exact_response import (
@@ -54,9 +61,11 @@ def build_vademecum(
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     response = exact_response(elasticity, surface, loads, rule, progress)
     missing = Missing(elasticity, surface, response, rule)
+    rule, with_body = _with_room_for_body(rule)
     solution, weights = find_modes(elasticity, loads, response, missing, rule, progress)
     modes = SeparatedField(elasticity.at_vertices(solution.space), solution.load)
-    modes = modes.sorted_by_worth(np.repeat(elasticity.mesh.vertex_volumes, 3), weights)
+    mixing = modes.mixing_by_worth(np.repeat(elasticity.mesh.vertex_volumes, 3), weights)
+    modes = SeparatedField(modes.space @ mixing, modes.load @ mixing)
     errors = _rank_errors(modes, missing, rule)
     rank, converged = _choose_rank(errors, rule)
     if not converged and rule.near_growth > 1.0:
@@ -64,7 +73,9 @@ def build_vademecum(
         missing = Missing(elasticity, surface, response, rule)
         errors = _rank_errors(modes, missing, rule)
         rank, converged = _choose_rank(errors, rule)
-    far = modes.truncate(rank)
+    far, body = modes.truncate(rank), None
+    if with_body:
+        far, body = _with_body(elasticity, loads, solution.space @ mixing[:, :rank], far.load)
     stubborn = np.empty(0, np.int64)
     if not converged:
         stubborn, final = _stubborn(far, missing, rule)
@@ -81,9 +92,27 @@ def build_vademecum(
         near=displacement_near(far, response, surface, rule, stubborn),
         contact_near=contact_near(far, response, surface, rule),
         tip_field=make_tip_field(elasticity.mesh, regions, surface.patch_radius),
+        body=body,
         convergence=Convergence(converged, rule.tolerance, solution.history, errors),
         provenance=provenance,
     )
+
+
+def _with_room_for_body(rule: BuildRule) -> tuple[BuildRule, bool]:
+    """The rule without the modes that are kept for the body's own functions, if it has enough."""
+    if rule.max_modes < LEAST_MODES:
+        return rule, False
+    return replace(rule, max_modes=rule.max_modes - N_BODY), True
+
+
+def _with_body(
+    elasticity: Elasticity, loads: sp.csr_matrix, space: np.ndarray, load: np.ndarray
+) -> tuple[SeparatedField, BodyResponse]:
+    """The far field with the body's functions beside its modes (3 n_nodes, rank)."""
+    own = body_functions(elasticity, space)
+    space, load = np.hstack([space, own]), np.hstack([load, loads.T @ own])
+    body = body_response(elasticity, space)
+    return SeparatedField(elasticity.at_vertices(space), load), body
 
 
 def with_rank(vademecum: Vademecum, rank: int, rule: BuildRule) -> Vademecum:
@@ -115,6 +144,7 @@ def with_rank(vademecum: Vademecum, rank: int, rule: BuildRule) -> Vademecum:
     return replace(
         vademecum,
         far=far.truncate(rank),
+        body=None,
         near=grown(vademecum.near, dropped.space, vademecum.mesh.vertices, False),
         contact_near=grown(vademecum.contact_near, dropped.load, surface.centers, True),
     )

@@ -116,6 +116,12 @@ def pressure_mass(p, q, w):  # type: ignore[no-untyped-def]
     return p * q
 
 
+@BilinearForm
+def scalar_mass(u, v, w):  # type: ignore[no-untyped-def]
+    """u v, one component."""
+    return u * v
+
+
 class _Terms:
     """The constant matrices that a stiffness is made of, shared by all values of the material.
 
@@ -145,6 +151,13 @@ class _Terms:
         coupling = divergence.assemble(displacement, pressure).tocsr()
         coupling = coupling[:, self.nodes_first(displacement)]
         return self.unit_stiffness[0], coupling, pressure_mass.assemble(pressure).tocsr()
+
+    @cached_property
+    def mass(self) -> sp.csr_matrix:
+        """int N_a N_b dx, shape (n_nodes, n_nodes)."""
+        matrix = scalar_mass.assemble(Basis(self._mesh, self._shape, intorder=4)).tocsr()
+        order = self.nodes_first(self._basis)
+        return matrix[order][:, order]
 
     @cached_property
     def pressure_factor(self) -> rslab.Ldlt:
@@ -298,6 +311,11 @@ class Elasticity:
         else:
             system = self.stiffness[free][:, free]
         return rslab.ldlt(sp.csc_matrix(system))
+
+    @property
+    def mass(self) -> sp.csr_matrix:
+        """Consistent mass of one component for a unit density, (n_nodes, n_nodes) [m^3]."""
+        return self._terms.mass
 
     @property
     def factor_bytes(self) -> int:

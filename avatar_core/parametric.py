@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 
+from avatar_core.body import N_BODY, BodyResponse, completed
 from avatar_core.coordinates import Coordinate, node_weights, require_known
 from avatar_core.elasticity import Material, factors_at
 from avatar_core.near_field import LocalBlocks
@@ -41,6 +42,7 @@ class ParametricResponse:
         pattern of the vademecum's own near fields
     rank : modes of a vademecum at given values
     young_modulus : that the blocks are computed for [Pa]
+    body : BodyResponse of the basis, or None
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -50,6 +52,7 @@ class ParametricResponse:
     contact_near: np.ndarray
     rank: int
     young_modulus: float
+    body: BodyResponse | None = None
 
 
 def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
@@ -82,13 +85,15 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     reference = replace(material, young_modulus=parametric.young_modulus)
     mass = np.repeat(vademecum.mesh.vertex_volumes, 3)
     factors = factors_at(reference, contrast)
-    far = galerkin_field(parametric.basis, parametric.operators, factors, mass)
-    far = far.truncate(parametric.rank)
+    far, body = galerkin_field(
+        parametric.basis, parametric.operators, factors, mass, parametric.rank, parametric.body
+    )
     at_reference = replace(
         vademecum,
         material=reference,
         contrast=contrast,
         far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
+        body=body,
         near=combined(vademecum.near, parametric.near, weights),
         contact_near=combined(vademecum.contact_near, parametric.contact_near, weights),
     )
@@ -106,27 +111,44 @@ def _with_young_modulus(vademecum: Vademecum, material: Material) -> Vademecum:
         vademecum,
         material=material,
         far=SeparatedField(root * far.space, root * far.load),
+        body=vademecum.body.mixed(root * np.eye(far.rank)) if vademecum.body else None,
         near=replace(near, block=np.float32(softer) * near.block),
         contact_near=replace(contact, block=np.float32(softer) * contact.block),
     )
 
 
 def galerkin_field(
-    basis: SeparatedField, operators: np.ndarray, factors: np.ndarray, mass: np.ndarray
-) -> SeparatedField:
-    """The K(p)-orthonormal response in a space, modes sorted by their worth in displacement.
+    basis: SeparatedField,
+    operators: np.ndarray,
+    factors: np.ndarray,
+    mass: np.ndarray,
+    rank: int,
+    body: BodyResponse | None,
+) -> tuple[SeparatedField, BodyResponse | None]:
+    """The K(p)-orthonormal response in a space: the modes worth most, then the body's own.
 
     Parameters
     ----------
     basis : V and V^T f
     operators, factors : A_q and theta_q(p)
     mass : ndarray, shape (3 n_vertices,), lumped
+    rank : modes in all
+    body : of the basis; None for modes of touches alone
     """
     stiffness = np.tensordot(factors, operators, axes=1)
     root = np.linalg.cholesky((stiffness + stiffness.T) / 2.0)
     load = scipy.linalg.solve_triangular(root, basis.load.T, lower=True).T
     space = scipy.linalg.solve_triangular(root, basis.space.T, lower=True).T
-    return SeparatedField(space, load).sorted_by_worth(mass)
+    modes = SeparatedField(space, load)
+    kept = modes.mixing_by_worth(mass)
+    if body is None:
+        kept = kept[:, :rank]
+    else:
+        inverse = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True).T
+        body = body.mixed(inverse)
+        kept = completed(body, kept[:, : rank - N_BODY])
+        body = body.mixed(kept)
+    return SeparatedField(space @ kept, load @ kept), body
 
 
 def combined(near: LocalBlocks, at_nodes: np.ndarray, weights: np.ndarray) -> LocalBlocks:

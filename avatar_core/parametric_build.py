@@ -21,6 +21,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
+from avatar_core.body import LEAST_MODES, BodyResponse, body_response
 from avatar_core.build import find_modes, is_met
 from avatar_core.build_rule import BuildRule, Progress, silent
 from avatar_core.certificate import Certificate, certify, merged
@@ -68,6 +69,7 @@ class _Reduced:
     basis: SeparatedField
     operators: np.ndarray
     fields: tuple[SeparatedField, ...]
+    body: BodyResponse | None
 
 
 def build_parametric_vademecum(
@@ -216,11 +218,12 @@ def _project(
     space, operators = space @ inverse, inverse.T @ operators @ inverse
     basis = SeparatedField(middle.at_vertices(space), loads.T @ space)
     mass = np.repeat(middle.mesh.vertex_volumes, 3)
+    body = body_response(middle, space) if rule.max_modes >= LEAST_MODES else None
     fields = tuple(
-        galerkin_field(basis, operators, snapshot.elasticity.factors, mass).truncate(rule.max_modes)
-        for snapshot in snapshots
+        galerkin_field(basis, operators, s.elasticity.factors, mass, rule.max_modes, body)[0]
+        for s in snapshots
     )
-    return _Reduced(basis, operators, fields)
+    return _Reduced(basis, operators, fields, body)
 
 
 def _projected_terms(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
@@ -269,6 +272,7 @@ def _assemble(
             contact_near=np.stack([blocks.block for blocks in contact]),
             rank=rule.max_modes,
             young_modulus=elasticity.material.young_modulus,
+            body=reduced.body,
         ),
         contrast=first.inclusion.contrast if first.inclusion else None,
     )

@@ -39,7 +39,14 @@ class SeparatedField:
     def sorted_by_worth(
         self, space_mass: np.ndarray, load_mass: np.ndarray | None = None
     ) -> SeparatedField:
-        """The same field with orthogonally mixed modes, of which the first are worth most.
+        """The same field with orthogonally mixed modes, of which the first are worth most."""
+        mixing = self.mixing_by_worth(space_mass, load_mass)
+        return SeparatedField(self.space @ mixing, self.load @ mixing)
+
+    def mixing_by_worth(
+        self, space_mass: np.ndarray, load_mass: np.ndarray | None = None
+    ) -> np.ndarray:
+        """The orthogonal mixing that sorts modes by their worth, shape (rank, rank).
 
         An orthogonal mixing keeps what orthonormal modes are good for: Y Y^T, and that any
         leading ones are a Galerkin subspace. It is the Q of B^T R = Q T, with X^T M X = A^T A,
@@ -56,8 +63,7 @@ class SeparatedField:
             load_mass = 1.0 / np.maximum(((self.load @ a.T) ** 2).sum(axis=1), 1e-300)
         b = _gram_root(self.load, load_mass)
         _, _, right = np.linalg.svd(a @ b.T)
-        mixing = np.linalg.qr(b.T @ right.T)[0]
-        return SeparatedField(self.space @ mixing, self.load @ mixing)
+        return np.asarray(np.linalg.qr(b.T @ right.T)[0])
 
     def norm(self, space_mass: np.ndarray, load_mass: np.ndarray) -> float:
         """sqrt(sum_ij m_i w_j u_ij^2) with lumped masses, never forming u."""

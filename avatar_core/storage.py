@@ -1,6 +1,6 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 2.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 2.1), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
 ``provenance``, ``convergence``, ``certificate``. Datasets:
@@ -21,8 +21,9 @@ the JSON attributes ``coordinates``, ``contrast``, and
     parametric/operators (n_terms, n, n) parametric/rank, parametric/young_modulus [Pa]
     parametric/near, parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N]
 
-and one with large deformation the JSON attribute ``large`` (material, certificate) and, for
-k = 2, 3,
+one that knows the organ's mass (from schema 2.1) body/mass (rank, rank) and body/weight (rank, 3),
+and the same under parametric/body for that basis; one with large deformation the JSON attribute
+``large`` (material, certificate) and, for k = 2, 3,
 
     large/space (3 n_v, n)               large/load (2, n_s, n) [m^(1-k)]
     large/near (2, n_blocks, 3) [m^(1-k)], in the pattern of near/
@@ -41,6 +42,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from avatar_core.body import BodyResponse
 from avatar_core.certificate import Certificate
 from avatar_core.coordinates import Coordinate
 from avatar_core.elasticity import Material
@@ -157,6 +159,8 @@ def _read_arrays(file: h5py.File, path: str, size: int) -> dict[str, np.ndarray]
     total = 0
     keys = _KEYS + (_PARAMETRIC_KEYS if "parametric" in file else ())
     keys += _LARGE_KEYS if "large" in file else ()
+    keys += _BODY_KEYS if "body" in file else ()
+    keys += _PARAMETRIC_BODY_KEYS if "parametric/body" in file else ()
     for key in keys:
         dataset = file[key]
         if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiub":
@@ -202,6 +206,8 @@ _PARAMETRIC_KEYS = (
     "parametric/near",
     "parametric/contact_near",
 )
+_BODY_KEYS = ("body/mass", "body/weight")
+_PARAMETRIC_BODY_KEYS = ("parametric/body/mass", "parametric/body/weight")
 _LARGE_KEYS = ("large/space", "large/load", "large/near", "large/depth", "large/reach")
 
 
@@ -209,6 +215,8 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
     """Every dataset; the keys are attribute paths of the vademecum."""
     arrays = {}
     keys = _KEYS + (_PARAMETRIC_KEYS if v.parametric else ()) + (_LARGE_KEYS if v.large else ())
+    keys += _BODY_KEYS if v.body else ()
+    keys += _PARAMETRIC_BODY_KEYS if v.parametric and v.parametric.body else ()
     for key in keys:
         value: Any = v
         for attribute in key.split("/"):
@@ -267,7 +275,12 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         parametric=_parametric(arrays, attributes),
         contrast=json.loads(attributes.get("contrast", "null")),
         large=_large(arrays, attributes),
+        body=_body(arrays, _BODY_KEYS),
     )
+
+
+def _body(arrays: dict[str, np.ndarray], keys: tuple[str, str]) -> BodyResponse | None:
+    return BodyResponse(*(arrays[key] for key in keys)) if keys[0] in arrays else None
 
 
 def _large_attribute(large: LargeDeformation | None) -> dict[str, Any] | None:
@@ -300,6 +313,7 @@ def _parametric(
         contact_near=part["contact_near"],
         rank=int(part["rank"]),
         young_modulus=float(part["young_modulus"]),
+        body=_body(arrays, _PARAMETRIC_BODY_KEYS),
     )
 
 
@@ -362,6 +376,13 @@ def _check_shapes(a: dict[str, np.ndarray]) -> None:
             and a["large/depth"].shape == (n_powers, n_positions)
             and a["large/reach"].shape == (n_positions,)
         )
+    for (mass, weight), space in (
+        (_BODY_KEYS, "far/space"),
+        (_PARAMETRIC_BODY_KEYS, "parametric/basis/space"),
+    ):
+        if mass in a:
+            n = a[space].shape[1]
+            agree = agree and a[mass].shape == (n, n) and a[weight].shape == (n, 3)
     agree = agree and within(a["surface/corners"], n_positions)
     agree = agree and within(a["surface/vertices"], n_vertices)
     if not agree:

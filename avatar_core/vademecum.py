@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from avatar_core.body import BodyResponse
 from avatar_core.certificate import Certificate
 from avatar_core.elasticity import Element, Material
 from avatar_core.large_deformation import LargeCertificate, LargeDeformation
@@ -97,7 +98,7 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "2.0"
+SCHEMA_VERSION = "2.1"
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,7 @@ class Vademecum:
         are those of one choice of their values (:func:`avatar_core.parametric.at_values`)
     contrast : Young's modulus inside the tumour over that outside; None without a tumour
     large : LargeDeformation or None, the load's magnitude as a coordinate
+    body : BodyResponse or None, mass and weight as the far modes see them
     """
 
     name: str
@@ -132,6 +134,7 @@ class Vademecum:
     parametric: ParametricResponse | None = None
     contrast: float | None = None
     large: LargeDeformation | None = None
+    body: BodyResponse | None = None
     id: str = field(default="", compare=False)
     nbytes: int = field(default=0, compare=False)
 
