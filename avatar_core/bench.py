@@ -16,6 +16,7 @@ from numba import njit
 from avatar_core import contact_kernels as kernels
 from avatar_core.cloud_kernels import write_cloud
 from avatar_core.contact import ContactModel, prepare, step
+from avatar_core.effects import several_tools as coupling
 from avatar_core.elasticity import Elasticity
 from avatar_core.loads import patch_loads
 from avatar_core.near_field import LocalBlocks
@@ -67,7 +68,10 @@ def time_dense_table(vademecum: Vademecum, n_tools: int) -> StepRow:
     compliance = _dense(vademecum.far.load, load, vademecum.contact_near, n_s)
 
     def dense(tips: np.ndarray) -> None:
-        _dense_step(model.arrays, model.state, model.out, tips, columns, compliance)
+        e = model.effects
+        _dense_step(
+            model.arrays, model.state, model.out, tips, e.reply, e.several, columns, compliance
+        )
 
     row = _timed("dense table", vademecum, model, 0, n_tools, dense)
     return StepRow(**{**row.__dict__, "bytes": columns.nbytes + compliance.nbytes})
@@ -110,7 +114,7 @@ def _timed(
     n_tools: int,
     call: Callable[[np.ndarray], object],
 ) -> StepRow:
-    tips = _tool_paths(vademecum, n_tools)
+    tips = tool_paths(vademecum, n_tools)
     passes = [_pass(model, tips, n_tools, call) for _ in range(PASSES)]
     contacts = np.concatenate([contacts for _, contacts in passes])
     return StepRow(
@@ -141,7 +145,7 @@ def _pass(
     return times[kept] * 1e6, contacts[kept]
 
 
-def _tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000) -> np.ndarray:
+def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000) -> np.ndarray:
     """Slides that start far apart, shape (n, n_tools, 3)."""
     centers, inner = vademecum.surface.centers, inner_positions(vademecum)
     starts = [middle_of_access(vademecum)]
@@ -165,22 +169,30 @@ def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: in
 
 
 @njit(cache=True, fastmath=True)
-def _dense_step(model, state, out, tips, columns, compliance):  # type: ignore[no-untyped-def]
+def _dense_step(model, state, out, tips, reply, several, columns, compliance):  # type: ignore[no-untyped-def]
     """:func:`contact_kernels.contact_step` with stored columns instead of modes."""
-    n_active, n_tools = 0, tips.shape[0]
+    n_tools = tips.shape[0]
     for t in range(n_tools):
-        kernels._locate(model, state, t, tips[t])
+        kernels.locate(model, state, t, tips[t], reply)
         state.mode[t] = np.float32(0.0)
-        if state.active[t]:
-            n_active += 1
-    for t in range(n_tools):
-        for s in range(n_tools):
-            state.near[t, s] = True
-            if state.active[t] and state.active[s]:
-                _dense_column(state, t, s, compliance)
-    kernels._assemble(model, state)
-    kernels._solve(state, False)
-    kernels._write_forces(model, state, out, tips, n_active > 1)
+        if not state.active[t]:
+            state.force[t] = 0.0
+            continue
+        _dense_column(state, t, t, compliance, state.column[t])
+        near = kernels.near_along_normal(state, t, state.column[t])
+        kernels.assemble_own(model, state, t, near)
+    if several is not None:
+        for t in range(n_tools):
+            for s in range(n_tools):
+                several.near[t, s] = s != t
+                if s != t and state.active[t] and state.active[s]:
+                    _dense_column(state, t, s, compliance, several.column[t, s])
+    if several is not None:
+        coupling.assemble(state, reply, several)
+        kernels.solve_together(state, reply, several, None)
+    else:
+        kernels.solve_alone(state, reply)
+    kernels.write_forces(model, state, out, tips, reply, several, None, None, None)
     u = state.field[: 3 * out.cloud.shape[0]]
     u[:] = np.float32(0.0)
     for t in range(n_tools):
@@ -194,8 +206,7 @@ def _dense_step(model, state, out, tips, columns, compliance):  # type: ignore[n
 
 
 @njit(cache=True, fastmath=True)
-def _dense_column(state, t, s, compliance):  # type: ignore[no-untyped-def]
-    column = state.column[t, s]
+def _dense_column(state, t, s, compliance, column):  # type: ignore[no-untyped-def]
     column[: state.n_nodes[s]] = 0.0
     for i in range(state.n_nodes[t]):
         for c in range(3):

@@ -3,31 +3,42 @@
     u(x) = - sum_t lambda_t a_t [ sum_k X_k(x) Y_k . f_t  +  sum_j w_j N_j(x) n_t ]
 
 with f_t = w(p_t) n_t as in :mod:`avatar_core.contact_kernels`, N_j the exact near field of load
-position j, and for large deformation the terms of :mod:`avatar_core.large_deformation`.
+position j, and for large deformation the terms of :mod:`avatar_core.large_deformation`. Effects are
+arguments, None where a scene does without, as in :mod:`avatar_core.contact_kernels`.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from avatar_core.effects.large_deformation import add_amplitudes, add_near_row, powers_of_depth
+from avatar_core.effects.respiration import move_cloud
+from avatar_core.effects.viscoelasticity import least_shown
+from avatar_core.step_code import fast, inlined
 
 BLOCK = 256  # displacements that are summed together while they lie in the fastest cache
 LEAST_WEIGHT = 0.02  # what each load position leaves of its near field to the others
 
 
-@njit(cache=True, fastmath=True)
-def contact_deform(model, state, out):  # type: ignore[no-untyped-def]
-    """Second half of a period: the cloud under the forces of the first."""
-    if out.n_contacts[0] == 0:
+@fast
+def deform(model, state, out, reply, large, friction, memory, motion):  # type: ignore[no-untyped-def]
+    """The cloud under the forces of a period."""
+    if reply is None and out.n_contacts[0] == 0:
         state.field[:] = np.float32(0.0)
     else:
-        _amplitudes(model, state)
+        _amplitudes(state, reply, large)
         _far_field(model, state)
-        _near_field(model, state)
+        for t in range(state.passage.shape[0]):
+            if state.force[t] > 0.0:
+                _near_field(model, state, large, friction, memory, t)
+        if memory is not None:
+            _near_trail(model, state, memory)
     write_cloud(model.rest, state.field, out.cloud)
+    if motion is not None:
+        move_cloud(motion, out.cloud)
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
+@fast
 def write_cloud(rest, field, cloud):  # type: ignore[no-untyped-def]
     """Deformed position and displacement of every point (n_points, 6)."""
     n_points = cloud.shape[0]
@@ -37,38 +48,29 @@ def write_cloud(rest, field, cloud):  # type: ignore[no-untyped-def]
             flat_cloud[6 * v + d] = flat_rest[6 * v + d] + field[3 * v + d % 3]
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
-def _amplitudes(model, state):  # type: ignore[no-untyped-def]
+@fast
+def _amplitudes(state, reply, large):  # type: ignore[no-untyped-def]
     """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards. Then the bent ones."""
-    amplitude, bent = state.amplitude, model.bend_load.shape[2]
-    n_modes = amplitude.shape[0] - bent
+    amplitude = state.amplitude
+    n_modes = amplitude.shape[0]
     amplitude[:] = np.float32(0.0)
+    if large is not None:
+        n_modes -= large.load.shape[2]
+    if reply is not None:
+        for k in range(n_modes):
+            amplitude[k] = np.float32(reply.total[k])
     for t in range(state.passage.shape[0]):
         if state.force[t] <= 0.0:
             continue
-        force = np.float32(state.force[t] * state.scale[t])
-        for k in range(n_modes):
-            amplitude[k] -= force * state.mode[t, k]
-        if bent > 0:
-            second, third = _powers(state, t)
-            for i in range(state.n_nodes[t]):
-                w, j = state.weight[t, i, 0], state.nodes[t, i]
-                w2, w3 = np.float32(w * second), np.float32(w * third)
-                y2, y3 = model.bend_load[0, j], model.bend_load[1, j]
-                for k in range(bent):
-                    amplitude[n_modes + k] += w2 * y2[k] + w3 * y3[k]
+        if reply is None:
+            force = np.float32(state.force[t] * state.scale[t])
+            for k in range(n_modes):
+                amplitude[k] -= force * state.mode[t, k]
+        if large is not None:
+            add_amplitudes(state, large, t, amplitude)
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
-def _powers(state, t):  # type: ignore[no-untyped-def]
-    """a^2 and a^3 of a tip's linear depth, tangential beyond the reach."""
-    a = state.self_compliance[t] * state.force[t]
-    inside = min(a, state.bend[t, 2])
-    over = a - inside
-    return inside * (inside + 2.0 * over), inside * inside * (inside + 3.0 * over)
-
-
-@njit(cache=True, fastmath=True, forceinline=True)
+@fast
 def _far_field(model, state):  # type: ignore[no-untyped-def]
     """sum_k X_k a_k, four modes at a time; modes are stored as 16-bit fractions of their peak."""
     amplitude, scale = state.amplitude, model.space_scale
@@ -89,27 +91,42 @@ def _far_field(model, state):  # type: ignore[no-untyped-def]
                 u[i] += x[k, i] * a
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
-def _near_field(model, state):  # type: ignore[no-untyped-def]
-    """The exact remainder around the load positions that carry the forces."""
-    bends = model.bend_near.shape[1] > 0
-    for t in range(state.passage.shape[0]):
-        if state.force[t] <= 0.0:
-            continue
-        kept = 0.0
-        for i in range(state.n_nodes[t]):
-            kept += _shrunk(state.weight[t, i, 0])
-        force = -state.force[t] * state.scale[t] / kept
-        second, third = _powers(state, t)
-        for i in range(state.n_nodes[t]):
-            w = _shrunk(state.weight[t, i, 0])
-            if w != 0.0:
-                _add_row(model, state, state.nodes[t, i], w * force, state.normal[t])
-                if bends:
-                    _add_bent_row(model, state, state.nodes[t, i], w / kept, second, third)
+@fast
+def _near_field(model, state, large, friction, memory, t):  # type: ignore[no-untyped-def]
+    """The exact remainder around the load positions that carry the force of a tip."""
+    kept = 0.0
+    for i in range(state.n_nodes[t]):
+        kept += _shrunk(state.weight[t, i, 0])
+    n, scale = state.normal[t], state.scale[t] / kept
+    f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
+    if friction is not None:
+        f0, f1, f2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
+    second = third = 0.0
+    if large is not None:
+        second, third = powers_of_depth(state, large, t)
+    for i in range(state.n_nodes[t]):
+        w = _shrunk(state.weight[t, i, 0])
+        if w != 0.0:
+            j, part = state.nodes[t, i], w * scale
+            if memory is None:
+                _add_row(model, state, j, part * f0, part * f1, part * f2)
+            if large is not None:
+                add_near_row(model, state, large, j, w / kept, second, third)
 
 
-@njit(cache=True, forceinline=True)
+@fast
+def _near_trail(model, state, memory):  # type: ignore[no-untyped-def]
+    """The same around what a relaxing organ remembers, the weakest of it faded out."""
+    least = least_shown(memory)
+    for m in range(memory.count[0]):
+        e = memory.trail_elastic[m]
+        size = np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
+        if size > least:
+            part = (size - least) / size
+            _add_row(model, state, memory.place[m], part * e[0], part * e[1], part * e[2])
+
+
+@inlined
 def _shrunk(w):  # type: ignore[no-untyped-def]
     """A weight moved towards zero, so that a load position that leaves does so without a jump."""
     if w > 0.0:
@@ -117,22 +134,11 @@ def _shrunk(w):  # type: ignore[no-untyped-def]
     return min(w + LEAST_WEIGHT, 0.0)
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
-def _add_row(model, state, j, force, n):  # type: ignore[no-untyped-def]
-    u = state.field
-    f0, f1, f2 = np.float32(force * n[0]), np.float32(force * n[1]), np.float32(force * n[2])
+@fast
+def _add_row(model, state, j, x, y, z):  # type: ignore[no-untyped-def]
+    u, f0, f1, f2 = state.field, np.float32(x), np.float32(y), np.float32(z)
     for e in range(model.near_start[j], model.near_start[j + 1]):
         v = 3 * model.near_target[e]
         block = model.near_block[e]
         for d in range(3):
             u[v + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2
-
-
-@njit(cache=True, fastmath=True, forceinline=True)
-def _add_bent_row(model, state, j, w, second, third):  # type: ignore[no-untyped-def]
-    u = state.field
-    w2, w3 = np.float32(w * second), np.float32(w * third)
-    for e in range(model.near_start[j], model.near_start[j + 1]):
-        v = 3 * model.near_target[e]
-        for d in range(3):
-            u[v + d] += w2 * model.bend_near[0, e, d] + w3 * model.bend_near[1, e, d]

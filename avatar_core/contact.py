@@ -6,7 +6,7 @@ The compiled code is in :mod:`avatar_core.contact_kernels`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -17,7 +17,22 @@ import numpy as np
 from avatar_core import contact_kernels as kernels
 from avatar_core.cloud_kernels import BLOCK
 from avatar_core.contact_kernels import ModelArrays, Out, State
-from avatar_core.errors import ContactError
+from avatar_core.effects.base import Effect
+from avatar_core.effects.large_deformation import LargeArrays, LargeDeformationEffect
+from avatar_core.effects.selection import (
+    ARRAYS,
+    NO_EFFECTS,
+    Constants,
+    Selection,
+    find,
+    for_cloud,
+    in_its_modes,
+    natural_effects,
+    online,
+    selected_arrays,
+)
+from avatar_core.effects.several_tools import SeveralArrays, SeveralTools
+from avatar_core.errors import ContactError, SceneError
 from avatar_core.near_field import LocalBlocks, hash_rows
 from avatar_core.tip_response import MAX_STENCIL, make_tip_response, sampled_at_tip
 
@@ -28,6 +43,8 @@ Cloud = Literal["surface", "volume", "off"]
 
 LANES = 32  # single numbers that a vectorised loop takes at once
 TIP_RADIUS_RANGE = (2e-3, 20e-3)  # [m]
+PERIOD = 1e-3  # [s]
+FAR_AWAY = 1e3  # where a tool without a pose is, for the step [m]
 
 
 class Status(IntEnum):
@@ -46,31 +63,66 @@ class Status(IntEnum):
 
 
 class Compiled(NamedTuple):
-    """The halves of a step and the whole, compiled for the types of one model.
+    """The halves of a step or the whole, compiled for the types of one model.
 
     Called without numba's look-up of the types, which takes 4 us for as many arrays.
     """
 
-    solve: Callable[..., int]
-    deform: Callable[..., None]
-    step: Callable[..., int]
+    solve: Callable[..., int] | None
+    deform: Callable[..., None] | None
+    step: Callable[..., int] | None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The constant arrays of a step: of the organ and its tools, and of the chosen effects.
+
+    arrays : ModelArrays
+        distance, access, origin, spacing: the tip field; row, carrier, share,
+        self_compliance: the tip response on its grid; position (n_positions, 3) [m];
+        load (n_positions, 3, rank and zeros) and the contact_* blocks, found by their hash tables:
+        compliance [m/N]; softness (1,), added where access fades [m/N];
+        space (n_blocks, rank, BLOCK) int16, modes of the displacement of the cloud, in parts of
+        space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 6), the cloud without
+        displacement [m]; tip_radius (n_tools,) [m]
+    effects : Constants, None for each effect that was not chosen
+    """
+
+    arrays: Any
+    effects: Constants
+
+    def flat(self) -> dict[str, np.ndarray]:
+        """All arrays by name, as "distance" or "friction.coefficients"."""
+        out = dict(self.arrays._asdict())
+        for name, chosen in self.effects._asdict().items():
+            if chosen is not None:
+                out |= {f"{name}.{key}": array for key, array in chosen._asdict().items()}
+        return out
+
+    @staticmethod
+    def of(arrays: dict[str, np.ndarray]) -> Layout:
+        """The inverse of :meth:`flat`."""
+        chosen: dict[str, Any] = {}
+        for name, kind in ARRAYS.items():
+            own = [f"{name}.{key}" for key in kind._fields]
+            chosen[name] = kind(*(arrays[key] for key in own)) if own[0] in arrays else None
+        return Layout(
+            ModelArrays(*(arrays[key] for key in ModelArrays._fields)), Constants(**chosen)
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all of it [bytes]."""
+        return int(sum(array.nbytes for array in self.flat().values()))
 
 
 @dataclass(frozen=True)
 class ContactModel:
     """Everything a step reads and writes.
 
-    arrays : ModelArrays, constant
-        distance, access, origin, spacing: the tip field; row, carrier, share,
-        self_compliance: the tip response on its grid; bend (3 or 0, nx, ny, nz): beta_2, beta_3
-        and the reach there; position (n_positions, 3) [m];
-        load (n_positions, 3, rank and zeros) and the contact_* blocks, found by their hash tables:
-        compliance [m/N]; softness (1,), added where access fades [m/N];
-        space (n_blocks, rank, BLOCK) int16, modes of the displacement of the cloud, in parts of
-        space_scale (rank,), and the near_* blocks [m/N]; bend_load and bend_near, what large
-        deformation adds by powers of the depth; rest (n_points, 6), the cloud without
-        displacement [m]; tip_radius (n_tools,) [m]
+    layout : Layout, constant
     state : State, forces kept for the next period, and scratch
+    effects : Selection, state and scratch of the chosen effects, None for the others
     out : Out
         force, torque (n_tools, 3) [N, N m], of the organ on each tool about its tip (a
         frictionless sphere has no torque about its centre); status (n_tools,), of each;
@@ -81,11 +133,17 @@ class ContactModel:
     compiled : Compiled
     """
 
-    arrays: Any
+    layout: Layout
     state: Any
+    effects: Selection
     out: Any
     tips: np.ndarray
     compiled: Compiled
+
+    @property
+    def arrays(self) -> Any:
+        """Constant arrays of the organ and its tools."""
+        return self.layout.arrays
 
     @property
     def n_tools(self) -> int:
@@ -95,17 +153,29 @@ class ContactModel:
     @property
     def nbytes(self) -> int:
         """Memory of the constant arrays [bytes]."""
-        return int(sum(array.nbytes for array in self.arrays))
+        return self.layout.nbytes
 
     def resume(self, before: ContactModel) -> None:
         """Go on where another model of the same organ and tools is: tips in contact stay so."""
         self.state.passage[:] = before.state.passage
         self.state.force[:] = before.state.force
+        mine, theirs = self.effects, before.effects
+        if mine.friction is not None and theirs.friction is not None:
+            for name in ("anchor", "motion", "push"):
+                getattr(mine.friction, name)[:] = getattr(theirs.friction, name)
+        if mine.motion is not None and theirs.motion is not None:
+            mine.motion.clock[:] = theirs.motion.clock
 
     def reset(self) -> None:
-        """Forget all contacts: the organ is at rest."""
+        """Forget all contacts and all that has passed: the organ is at rest."""
         self.state.passage[:] = kernels.OUTSIDE
         self.state.force[:] = 0.0
+        fresh = _online(self.layout)
+        for mine, new in zip(self.effects, fresh, strict=True):
+            pairs: Any = zip(mine or (), new or (), strict=True)
+            for array, clean in pairs:
+                if array is not clean:  # constants are the same in both
+                    array[...] = clean
 
 
 def prepare(
@@ -113,8 +183,11 @@ def prepare(
     tip_radii: tuple[float, ...] = (5e-3,),
     modes: int | None = None,
     cloud: Cloud = "surface",
+    effects: Sequence[Effect] | None = None,
+    period: float = PERIOD,
+    halves: bool = False,
 ) -> ContactModel:
-    """Lay out a vademecum for the step, and compile the step.
+    """Lay out a vademecum for the step, and compile the step for the effects.
 
     Parameters
     ----------
@@ -123,23 +196,37 @@ def prepare(
     modes : far-field modes of the *displacement*; None for all. Fewer modes leave the force
         exact, since the contact compliance keeps all of them.
     cloud : "surface" or "volume" vertices, or "off"
+    effects : what is simulated; by default what the vademecum and the tools call for
+    period : of the steps [s], for effects that know time
+    halves : to call :func:`solve` and :func:`deform` instead of :func:`step`
 
     Raises
     ------
-    ContactError
-        For radii, modes or clouds out of range.
+    ContactError, SceneError
+        For radii, modes or clouds out of range; for effects that the vademecum cannot serve.
     """
-    return make_model(model_arrays(vademecum, tip_radii, modes, cloud))
+    return make_model(lay_out(vademecum, tip_radii, modes, cloud, effects, period), halves)
 
 
-def model_arrays(
+def lay_out(
     vademecum: Vademecum,
     tip_radii: tuple[float, ...] = (5e-3,),
     modes: int | None = None,
     cloud: Cloud = "surface",
-) -> ModelArrays:
+    effects: Sequence[Effect] | None = None,
+    period: float = PERIOD,
+) -> Layout:
     """The constant arrays of a contact model; see :func:`prepare`."""
     _check(vademecum, tip_radii, modes, cloud)
+    if effects is None:
+        effects = natural_effects(vademecum, len(tip_radii))
+    for effect in effects:
+        effect.require(vademecum)
+    if len(tip_radii) > 1 and find(effects, SeveralTools) is None:
+        raise SceneError(
+            f"{len(tip_radii)} tools without several_tools; add it to the effects, or name one tool"
+        )
+    vademecum, mass = in_its_modes(vademecum, effects)
     surface, mesh = vademecum.surface, vademecum.mesh
     points = {
         "surface": mesh.surface_vertices,
@@ -149,47 +236,49 @@ def model_arrays(
     rank = vademecum.far.rank if modes is None else modes
     near, kept = _near_at(vademecum.near, points, len(mesh.vertices))
     space = vademecum.far.space.reshape(len(mesh.vertices), 3, -1)[points, :, :rank]
-    large = vademecum.large
-    if large is not None:
-        bent = large.space.reshape(len(mesh.vertices), 3, -1)[points]
-        space = np.concatenate([space, bent], axis=2)
     contact = vademecum.contact_near
     contact_start, contact_slot = hash_rows(contact)
     load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
     response = make_tip_response(
         surface, vademecum.tip_field, load, contact, kernels.MAX_DEPTH, max(tip_radii)
     )
-    bend = np.zeros((0, 1, 1, 1), np.float32)
-    if large is not None:
-        bend = sampled_at_tip(
-            surface, vademecum.tip_field, response, np.vstack([large.depth, large.reach])
-        )
+    large = None
+    if find(effects, LargeDeformationEffect) is not None:
+        bent = vademecum.large
+        assert bent is not None  # `require` has seen it
+        at_points = bent.space.reshape(len(mesh.vertices), 3, -1)[points]
+        space = np.concatenate([space, at_points], axis=2)
+        values = np.vstack([bent.depth, bent.reach])
+        grid = sampled_at_tip(surface, vademecum.tip_field, response, values)
+        large = LargeArrays(grid, bent.load, bent.near[:, kept])
     modes_in_blocks, scale = _in_blocks(space)
-    return ModelArrays(
+    arrays = ModelArrays(
         *vademecum.tip_field,
         *response,
-        bend=bend,
         position=np.ascontiguousarray(surface.centers),
         load=_padded(load),
         contact_start=contact_start,
         contact_slot=contact_slot,
         contact_block=contact.block,
-        contact_reach=np.array([_reach(contact, surface.centers)]),
         softness=np.array([float((load**2).sum(axis=(1, 2)).mean() / 3.0)]),
         space=modes_in_blocks,
         space_scale=scale,
         near_start=near.start,
         near_target=near.target,
         near_block=near.block,
-        bend_load=large.load if large else np.zeros((2, 0, 0), np.float32),
-        bend_near=large.near[:, kept] if large else np.zeros((2, 0, 3), np.float32),
         rest=np.pad(mesh.vertices[points], ((0, 0), (0, 3))).astype(np.float32),
         tip_radius=np.array(tip_radii, float),
     )
+    reach = _reach(contact, surface.centers)
+    return Layout(arrays, selected_arrays(vademecum, effects, mass, large, reach, period))
 
 
-def make_model(arrays: ModelArrays) -> ContactModel:
-    """Allocate state and outputs around the constant arrays, and run the step once."""
+def make_model(layout: Layout, halves: bool = False) -> ContactModel:
+    """Allocate state and outputs around the constant arrays, and run the step once.
+
+    halves : compile :func:`solve` and :func:`deform` instead of :func:`step`
+    """
+    arrays = layout.arrays
     n_tools, n_modes = len(arrays.tip_radius), arrays.load.shape[2]
     single = np.float32
     state = State(
@@ -200,8 +289,6 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         slope=np.zeros((n_tools, 3)),
         steepness=np.ones(n_tools),
         normal=np.zeros((n_tools, 3)),
-        turning=np.zeros((n_tools, 3, 3)),
-        hessian=np.zeros((3, 3)),
         access=np.zeros(n_tools),
         access_slope=np.zeros((n_tools, 3)),
         point=np.zeros((n_tools, 3)),
@@ -209,20 +296,13 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         nodes=np.zeros((n_tools, MAX_STENCIL), np.int64),
         n_nodes=np.zeros(n_tools, np.int64),
         weight=np.zeros((n_tools, MAX_STENCIL, 4)),
-        extent=np.zeros(n_tools),
         mode=np.zeros((n_tools, n_modes), single),
-        mode_slope=np.zeros((n_tools, 3, n_modes), single),
-        column=np.zeros((n_tools, n_tools, MAX_STENCIL, 3), single),
-        near=np.zeros((n_tools, n_tools), np.bool_),
+        column=np.zeros((n_tools, MAX_STENCIL, 3), single),
         self_compliance=np.ones(n_tools),
         self_slope=np.zeros((n_tools, 3)),
-        bend=np.zeros((n_tools, 3)),
-        bend_slope=np.zeros((n_tools, 3, 3)),
-        bent=np.zeros((n_tools, 4)),
         gram=np.ones((n_tools, n_tools)),
         scale=np.ones(n_tools),
         compliance=np.zeros((n_tools, n_tools)),
-        gram_slope=np.zeros(3),
         amplitude=np.zeros(len(arrays.space_scale), single),
         field=np.zeros(arrays.space.shape[0] * BLOCK, single),
     )
@@ -238,13 +318,23 @@ def make_model(arrays: ModelArrays) -> ContactModel:
         contact_force=np.zeros((n_tools, 3)),
         contact_penetration=np.zeros(n_tools),
     )
-    far_away = np.full((n_tools, 3), 1e3)
-    compiled = Compiled(
-        _compiled(kernels.contact_solve, arrays, state, out, far_away),
-        _compiled(kernels.contact_deform, arrays, state, out),
-        _compiled(kernels.contact_step, arrays, state, out, far_away),
-    )
-    return ContactModel(arrays, state, out, far_away, compiled)
+    far_away = np.full((n_tools, 3), FAR_AWAY)
+    effects = _online(layout)
+    if halves:
+        first = _compiled(kernels.contact_solve, arrays, state, out, far_away, *effects)
+        second = _compiled(kernels.contact_deform, arrays, state, out, *for_cloud(effects))
+        compiled = Compiled(first, second, None)
+    else:
+        whole = _compiled(kernels.contact_step, arrays, state, out, far_away, *effects)
+        compiled = Compiled(None, None, whole)
+    model = ContactModel(layout, state, effects, out, far_away, compiled)
+    model.reset()
+    return model
+
+
+def _online(layout: Layout) -> Selection:
+    n_positions, _, n_modes = layout.arrays.load.shape
+    return online(layout.effects, len(layout.arrays.tip_radius), n_modes, n_positions)
 
 
 def _compiled(kernel: Any, *arguments: Any) -> Any:
@@ -269,61 +359,78 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
         surface. The tools concerned have no force or a fading one, the others are served.
     """
     model.tips[:] = tips
-    return model.compiled.step(model.arrays, model.state, model.out, model.tips)
+    assert model.compiled.step is not None
+    return model.compiled.step(
+        model.layout.arrays, model.state, model.out, model.tips, *model.effects
+    )
 
 
 def solve(model: ContactModel, tips: np.ndarray) -> int:
     """The first half of :func:`step`: forces and contacts, so that they can leave at once."""
     model.tips[:] = tips
-    return model.compiled.solve(model.arrays, model.state, model.out, model.tips)
+    assert model.compiled.solve is not None
+    return model.compiled.solve(
+        model.layout.arrays, model.state, model.out, model.tips, *model.effects
+    )
 
 
 def deform(model: ContactModel) -> None:
     """The second half of :func:`step`: the cloud under the forces of :func:`solve`."""
-    model.compiled.deform(model.arrays, model.state, model.out)
+    assert model.compiled.deform is not None
+    model.compiled.deform(model.layout.arrays, model.state, model.out, *for_cloud(model.effects))
 
 
 def warm_up(n_tools: int = 1) -> None:
-    """Compile the step (or read it from numba's cache) before any vademecum is at hand."""
+    """Compile the halves of a step, or read them from numba's cache, before there is a model."""
     single, double = np.float32, np.float64
     n, rank, points = 1, 1, 1
     blocks = (np.zeros(n + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, 3, 3), single))
-    make_model(
-        ModelArrays(
-            np.full((8, 8, 8), 1.0, single),
-            np.zeros((8, 8, 8), single),
-            np.zeros(3, double),
-            np.ones(1, double),
-            np.full((8, 8, 8), -1, np.int32),
-            np.zeros((0, 6), np.int32),
-            np.zeros((0, 6), single),
-            np.full((8, 8, 8), 1.0, single),
-            np.zeros((0, 1, 1, 1), single),
-            np.zeros((n, 3), double),
-            np.zeros((n, 3, rank), single),
-            np.array([0, 2], np.int64),
-            np.full((2, 2), -1, np.int32),
-            np.zeros((0, 3, 3), single),
-            np.ones(1, double),
-            np.ones(1, double),
-            np.zeros((1, rank, BLOCK), np.int16),
-            np.zeros(rank, single),
-            *blocks,
-            np.zeros((2, 0, 0), single),
-            np.zeros((2, 0, 3), single),
-            np.zeros((points, 6), single),
-            np.full(n_tools, 5e-3, double),
-        )
+    arrays = ModelArrays(
+        distance=np.full((8, 8, 8), 1.0, single),
+        access=np.zeros((8, 8, 8), single),
+        origin=np.zeros(3, double),
+        spacing=np.ones(1, double),
+        row=np.full((8, 8, 8), -1, np.int32),
+        carrier=np.zeros((0, 6), np.int32),
+        share=np.zeros((0, 6), single),
+        self_compliance=np.full((8, 8, 8), 1.0, single),
+        position=np.zeros((n, 3), double),
+        load=np.zeros((n, 3, rank), single),
+        contact_start=np.array([0, 2], np.int64),
+        contact_slot=np.full((2, 2), -1, np.int32),
+        contact_block=np.zeros((0, 3, 3), single),
+        softness=np.ones(1, double),
+        space=np.zeros((1, rank, BLOCK), np.int16),
+        space_scale=np.zeros(rank, single),
+        near_start=blocks[0],
+        near_target=blocks[1],
+        near_block=blocks[2],
+        rest=np.zeros((points, 6), single),
+        tip_radius=np.full(n_tools, 5e-3, double),
     )
+    several = SeveralArrays(np.ones(1)) if n_tools > 1 else None
+    make_model(Layout(arrays, NO_EFFECTS._replace(several=several)), halves=True)
 
 
 def stored_energy(model: ContactModel) -> float:
-    """Elastic energy lambda . C lambda / 2 of the present contacts, and of bending [J]."""
-    state, force = model.state, model.state.force
-    energy = 0.5 * force @ state.compliance @ force
-    for t in np.flatnonzero(force) if len(model.arrays.bend) else ():
-        h, _, whole, _ = state.bent[t]
-        energy += h * force[t] - whole / state.self_compliance[t]
+    """Energy of the organ: elastic lambda . C lambda / 2, of bending, of the swing [J].
+
+    Not with viscoelasticity, which stores and loses it at once.
+    """
+    state, effects = model.state, model.effects
+    active = np.flatnonzero(state.force > 0.0)
+    if effects.friction is not None:
+        push, compliance = effects.friction.push, effects.friction.compliance
+        energy = 0.5 * sum(
+            float(push[t] @ compliance[t, s] @ push[s]) for t in active for s in active
+        )
+    else:
+        force = state.force[active]
+        energy = 0.5 * force @ state.compliance[np.ix_(active, active)] @ force
+    if effects.large is not None:
+        for t in active:
+            h, _, whole, _ = effects.large.bent[t]
+            energy += h * state.force[t] - whole / state.self_compliance[t]
     return float(energy)
 
 

@@ -49,3 +49,7 @@ class CoordinateError(AvatarError):
 
 class EquilibriumError(AvatarError):
     """A deformed organ has no stable equilibrium under the load that was asked for."""
+
+
+class SceneError(AvatarError):
+    """A scene asks for what does not exist, does not fit together or lies out of range."""

@@ -14,6 +14,8 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
+from avatar_core.step_code import inlined
+
 
 @dataclass(frozen=True)
 class LocalBlocks:
@@ -136,7 +138,7 @@ def _fill_slots(row_start, target, start, slot):  # type: ignore[no-untyped-def]
             slot[start[j] + k, 1] = e
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def find_block(start, slot, row, target):  # type: ignore[no-untyped-def]
     """Index of the block of a row and target in the tables of :func:`hash_rows`, or -1."""
     mask = start[row + 1] - start[row] - 1

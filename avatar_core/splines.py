@@ -8,10 +8,11 @@ second derivatives are bounded. Several fields on one grid share the weights of 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from avatar_core.step_code import entry, fast, inlined
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def on_grid(shape, origin, spacing, p):  # type: ignore[no-untyped-def]
     """Whether all 27 samples around p exist (never for a p that is not finite)."""
     for d in range(3):
@@ -21,7 +22,7 @@ def on_grid(shape, origin, spacing, p):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def cell_at(origin, spacing, p):  # type: ignore[no-untyped-def]
     """Where a p that is :func:`on_grid` lies.
 
@@ -39,18 +40,18 @@ def cell_at(origin, spacing, p):  # type: ignore[no-untyped-def]
     return (i - 1, j - 1, k - 1), weights, slopes
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
+@fast
 def _weights(t):  # type: ignore[no-untyped-def]
     """At t in [-1/2, 1/2) from the middle sample."""
     return (0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2)
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
+@fast
 def _slopes(t, scale):  # type: ignore[no-untyped-def]
     return ((t - 0.5) * scale, -2.0 * t * scale, (t + 0.5) * scale)
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
+@fast
 def in_cell(values, cell, gradient):  # type: ignore[no-untyped-def]
     """Value of a sampled field; its gradient [1/m] into ``gradient``."""
     (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
@@ -71,7 +72,7 @@ def in_cell(values, cell, gradient):  # type: ignore[no-untyped-def]
     return value
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
+@fast
 def second_derivatives(values, cell, spacing, hessian):  # type: ignore[no-untyped-def]
     """Second derivatives [1/m^2] of a sampled field, into (3, 3)."""
     (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
@@ -95,12 +96,12 @@ def second_derivatives(values, cell, spacing, hessian):  # type: ignore[no-untyp
     hessian[1, 2] = hessian[2, 1] = h12
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
+@fast
 def _line(values, i, j, k):  # type: ignore[no-untyped-def]
     return values[i, j, k], values[i, j, k + 1], values[i, j, k + 2]
 
 
-@njit(cache=True)
+@entry
 def evaluate(values, origin, spacing, p, gradient, outside):  # type: ignore[no-untyped-def]
     """Value of a sampled field at p, its gradient into ``gradient``; off the grid ``outside``."""
     if not on_grid(values.shape, origin, spacing, p):

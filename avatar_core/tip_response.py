@@ -27,6 +27,7 @@ from numba import njit
 
 from avatar_core.loads import LoadSurface
 from avatar_core.near_field import LocalBlocks
+from avatar_core.step_code import fast
 from avatar_core.tip_field import TipField, smoothed
 
 SMOOTHING = 0.2  # standard deviation of K, in patch radii
@@ -146,9 +147,9 @@ def _self_compliance(carrier, share, normal, load, start, target, block):  # typ
     return out
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
-def gather(model, state, t, cell):  # type: ignore[no-untyped-def]
-    """Weights of tip t in a cell of the grid, and their gradient.
+@fast
+def gather(model, state, t, cell, reply):  # type: ignore[no-untyped-def]
+    """Weights of tip t in a cell of the grid, and where there is a ``reply`` their gradient.
 
     Of ``state`` it fills ``nodes[t]``, the load positions that carry the tip, their number
     ``n_nodes[t]`` and ``weight[t]``: w, dw/dx, dw/dy, dw/dz of each. ``local`` is scratch.
@@ -162,7 +163,9 @@ def gather(model, state, t, cell):  # type: ignore[no-untyped-def]
                 if row < 0:
                     continue
                 b = wx[i] * wy[j] * wz[k]
-                b0, b1, b2 = dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k], wx[i] * wy[j] * dz[k]
+                if reply is not None:
+                    b0, b1 = dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k]
+                    b2 = wx[i] * wy[j] * dz[k]
                 for e in range(model.carrier.shape[1]):
                     share = model.share[row, e]
                     if share == 0.0:
@@ -177,9 +180,10 @@ def gather(model, state, t, cell):  # type: ignore[no-untyped-def]
                         weight[q] = 0.0
                         n += 1
                     weight[q, 0] += b * share
-                    weight[q, 1] += b0 * share
-                    weight[q, 2] += b1 * share
-                    weight[q, 3] += b2 * share
+                    if reply is not None:
+                        weight[q, 1] += b0 * share
+                        weight[q, 2] += b1 * share
+                        weight[q, 3] += b2 * share
     for q in range(n):
         state.local[nodes[q]] = -1
     state.n_nodes[t] = n

@@ -10,16 +10,18 @@ import pytest
 
 from avatar_core.build_rule import BuildRule
 from avatar_core.certificate import certify
-from avatar_core.contact import prepare, step
+from avatar_core.contact import Status, prepare, step
 from avatar_core.coordinates import Coordinate, node_values, node_weights, problem_at
+from avatar_core.effects import Tumour
 from avatar_core.elasticity import Elasticity, Inclusion, Material
-from avatar_core.errors import CoordinateError, MaterialError, SurfaceError
+from avatar_core.errors import CoordinateError, MaterialError, SceneError, SurfaceError
+from avatar_core.loads import patch_loads
 from avatar_core.organ import OrganOptions, vademecum_of
 from avatar_core.parametric import at_values
 from avatar_core.phantom import phantom_liver
 from avatar_core.storage import load_vademecum, save_vademecum
 from avatar_core.surface import SurfaceMesh
-from avatar_core.tool_path import palpation
+from avatar_core.tool_path import inner_positions, palpation
 from avatar_core.tumour import share_inside
 from avatar_core.vademecum import Vademecum
 
@@ -240,6 +242,34 @@ def test_a_stiffer_organ_pushes_back_harder(organ: Vademecum) -> None:
         step(model, path[4][None])
         force.append(np.linalg.norm(model.out.force))
     assert force[1] == pytest.approx(3.0 * force[0], rel=1e-3)
+
+
+def test_a_hard_inclusion_is_felt(
+    organ: Vademecum, problem: Elasticity, tumour: SurfaceMesh
+) -> None:
+    """The force rises over the tumour as full finite elements say, and only if the scene has it."""
+    surface = organ.surface
+    distance = np.linalg.norm(surface.centers - tumour.vertices.mean(axis=0), axis=1)
+    j = min(inner_positions(organ), key=lambda i: distance[i])
+    tip = (surface.centers[j] + 1e-3 * surface.normals[j])[None]  # 4 mm deep
+    felt, full = [], []
+    for contrast in (1.0, 10.0):
+        effects = (Tumour(contrast),) if contrast != 1.0 else ()
+        model = prepare(organ, (5e-3,), cloud="off", effects=effects)
+        assert step(model, tip) == Status.OK
+        felt.append(model.state.force[0])
+        here = problem_at(problem, {"poisson": organ.material.poisson_ratio, "contrast": contrast})
+        load = patch_loads(here, surface.centers[[j]], surface.patch_radius) @ surface.normals[j]
+        full.append(1.0 / float(load @ here.solve(load[:, None])[:, 0]))
+    assert full[1] > 1.2 * full[0]
+    assert felt[1] / felt[0] == pytest.approx(full[1] / full[0], rel=0.05)
+
+
+def test_a_tumour_that_no_file_has_is_refused(organ: Vademecum) -> None:
+    with pytest.raises(SceneError, match="--tumour FILE"):
+        prepare(replace(organ, parametric=None, contrast=None), effects=(Tumour(5.0),))
+    with pytest.raises(SceneError, match=r"contrast is 50, the vademecum holds 0\.5 to 10"):
+        prepare(organ, effects=(Tumour(50.0),))
 
 
 def test_tips_stay_in_contact_when_the_material_changes(organ: Vademecum) -> None:

@@ -1,0 +1,68 @@
+"""An organ that is all flat: one load position, the same response everywhere, known by hand.
+
+phi = z; the patch answers with the compliance C = far + near in every direction, so that contact,
+friction and relaxation have closed forms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from avatar_core.cloud_kernels import BLOCK
+from avatar_core.contact import LANES, ContactModel, Layout, make_model
+from avatar_core.contact_kernels import ModelArrays
+from avatar_core.effects.base import Effect
+from avatar_core.effects.selection import selected_arrays
+from avatar_core.near_field import LocalBlocks, hash_rows
+
+FAR, NEAR = 3e-4, 1e-4  # [m/N]
+COMPLIANCE = FAR + NEAR
+RADIUS = 5e-3
+
+
+def flat_organ(effects: Sequence[Effect] = (), period: float = 1e-3) -> ContactModel:
+    """The contact model of the flat organ, one tool."""
+    shape, spacing = (41, 41, 21), 3e-3
+    origin = np.array([-60e-3, -60e-3, -30e-3])
+    z = origin[2] + spacing * np.arange(shape[2])
+    single = np.float32
+    # weights are sums of splines: a row for every grid point, all carried by the one position
+    load = np.zeros((1, 3, LANES), single)
+    load[0, :, :3] = np.sqrt(FAR) * np.eye(3)
+    blocks = LocalBlocks(
+        np.array([0, 1]), np.zeros(1, np.int32), (NEAR * np.eye(3, dtype=single))[None]
+    )
+    start, slot = hash_rows(blocks)
+    gamma = float((load[0, 2] ** 2).sum()) + float(single(NEAR))
+    arrays = ModelArrays(
+        distance=np.broadcast_to(z, shape).astype(single).copy(),
+        access=np.ones(shape, single),
+        origin=origin,
+        spacing=np.array([spacing]),
+        row=np.zeros(shape, np.int32),
+        carrier=np.zeros((1, 3), np.int32),
+        share=np.array([[1.0, 0.0, 0.0]], single),
+        self_compliance=np.full(shape, gamma, single),
+        position=np.zeros((1, 3)),
+        load=load,
+        contact_start=start,
+        contact_slot=slot,
+        contact_block=blocks.block,
+        softness=np.ones(1),
+        space=np.zeros((1, LANES, BLOCK), np.int16),
+        space_scale=np.zeros(LANES, single),
+        near_start=np.zeros(2, np.int64),
+        near_target=np.zeros(0, np.int32),
+        near_block=np.zeros((0, 3, 3), single),
+        rest=np.zeros((1, 6), single),
+        tip_radius=np.array([RADIUS]),
+    )
+    constants = selected_arrays(None, effects, None, None, 0.1, period)  # type: ignore[arg-type]
+    return make_model(Layout(arrays, constants))
+
+
+def at_depth(depth: float, x: float = 0.0, y: float = 0.0) -> np.ndarray:
+    """Centre of a tip that presses this deep into the flat organ at rest, (1, 3)."""
+    return np.array([[x, y, RADIUS - depth]])
