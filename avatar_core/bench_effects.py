@@ -1,0 +1,211 @@
+"""``avatar bench effects``: what each effect of a scene costs in a step, all in one run.
+
+Every effect stands alone against the bare scene, in alternating slides so that both see the same
+machine; the bare scene stands against a linear step that was fused by hand into one function.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numba
+import numpy as np
+
+from avatar_core.bench import SPHERE, tool_paths
+from avatar_core.build import build_vademecum
+from avatar_core.build_rule import BuildRule, Progress
+from avatar_core.contact import ContactModel, prepare, step
+from avatar_core.effects import (
+    Effect,
+    Friction,
+    Inertia,
+    LargeDeformationEffect,
+    Respiration,
+    SelfWeight,
+    SeveralTools,
+    Viscoelasticity,
+)
+from avatar_core.elasticity import Elasticity, Material
+from avatar_core.large_build import LargeRule, hyperelastic_problem, with_large_deformation
+from avatar_core.loads import load_surface
+from avatar_core.mesh import regions_by_rule, tetrahedralize
+from avatar_core.surface import SurfaceMesh
+from avatar_core.vademecum import Provenance, Vademecum
+
+ROUNDS = 7  # pairs of slides; other processes disturb some of them
+N_STEPS = 1500
+_WARM = 200  # steps until the caches are
+
+# One tool each, but where there must be two; the breath is too small to lift the organ off the tip.
+CASES: tuple[tuple[str, int, tuple[Effect, ...]], ...] = (
+    ("large_deformation", 1, (LargeDeformationEffect(),)),
+    ("friction", 1, (Friction(),)),
+    ("viscoelasticity", 1, (Viscoelasticity((0.3, 0.25), (0.5, 8.0)),)),
+    ("inertia", 1, (Inertia(),)),
+    ("self_weight", 1, (SelfWeight(gravity=1.0),)),
+    ("respiration", 1, (Respiration(amplitude=1e-3),)),
+    ("several_tools", 2, (SeveralTools(),)),
+)
+EVERYTHING = tuple(effect for _, _, effects in CASES for effect in effects)
+
+
+@dataclass(frozen=True)
+class EffectRow:
+    """Step times of one scene.
+
+    p50_us, p99_us : medians over the rounds [us]; ratio : of p50 to the bare scene's in the same
+        rounds, their median
+    contacts_mean : active contacts in the steps that were timed
+    bytes : constant arrays of the model
+    """
+
+    scene: str
+    tools: int
+    contacts_mean: float
+    p50_us: float
+    p99_us: float
+    ratio: float
+    bytes: int
+
+
+def module_of(path: Path) -> ModuleType:
+    """A Python file outside of any package, under its own name, where numba's cache finds it."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def build_for_effects(
+    surface: SurfaceMesh, n_vertices: int, modes: int, progress: Progress
+) -> Vademecum:
+    """A vademecum of exactly so many modes that serves all effects (minutes)."""
+    rule = BuildRule(
+        tolerance=1e-9, max_modes=modes, oversampling=1.2, most_oversampling=1.2, near_growth=1.0
+    )
+    mesh = tetrahedralize(surface, n_vertices)
+    regions = regions_by_rule(mesh)
+    elasticity = Elasticity(mesh, Material(), regions.clamped)
+    loads = load_surface(mesh, regions)
+    provenance = Provenance(surface.name, surface.source_sha256)
+    linear = build_vademecum(surface.name, elasticity, regions, loads, rule, provenance, progress)
+    problem = hyperelastic_problem(linear, "neo-hookean")
+    return with_large_deformation(linear, problem, "neo-hookean", LargeRule(), rule, progress)
+
+
+def run_effects_bench(
+    vademecum: Vademecum, fused: Callable[..., int] | None, progress: Callable[[str], None]
+) -> tuple[list[EffectRow], dict[str, float]]:
+    """Rows and summary.
+
+    Parameters
+    ----------
+    fused : the step fused by hand, jitted; None leaves ``bare_ratio`` out
+    """
+    linear = replace(vademecum, large=None)
+    progress("bare")
+    bare = prepare(linear, (SPHERE,), cloud="volume", effects=())
+    path = {n: tool_paths(linear, n, N_STEPS) for n in (1, 2)}
+    rows = [_row("bare", bare, bare, path[1], path[1])]
+    for name, n_tools, effects in (*CASES, ("everything", 2, EVERYTHING)):
+        progress(name)
+        model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume", effects=effects)
+        rows.append(_row(name, model, bare, path[n_tools], path[1]))
+    summary = {
+        "worst_single_ratio": max(row.ratio for row in rows[1:-1]),
+        "everything_p99_us": rows[-1].p99_us,
+    }
+    if fused is not None:
+        progress("fused by hand")
+        summary = {"bare_ratio": _fused_ratio(bare, fused, path[1]), **summary}
+    return rows, summary
+
+
+def _row(
+    name: str, model: ContactModel, bare: ContactModel, path: np.ndarray, bare_path: np.ndarray
+) -> EffectRow:
+    own, ratio, contacts = [], [], []
+    for _ in range(ROUNDS):
+        micro, touching = _slide(model, path)
+        contacts.append(touching.mean())
+        own.append((np.median(micro), np.quantile(micro, 0.99)))
+        ratio.append(own[-1][0] / np.median(_slide(bare, bare_path)[0]))
+    p50, p99 = np.median(own, axis=0)
+    return EffectRow(
+        name,
+        model.n_tools,
+        float(np.mean(contacts)),
+        float(p50),
+        float(p99),
+        float(np.median(ratio)),
+        model.nbytes,
+    )
+
+
+def _slide(model: ContactModel, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times [us] and contacts of the steps of one slide in which a tool touches."""
+    model.reset()
+    times, contacts = np.empty(len(path)), np.empty(len(path), int)
+    for k, tips in enumerate(path):
+        start = time.perf_counter_ns()
+        step(model, tips)
+        times[k] = time.perf_counter_ns() - start
+        contacts[k] = model.out.n_contacts[0]
+    kept = (np.arange(len(path)) >= _WARM) & (contacts >= 1)
+    return times[kept] * 1e-3, contacts[kept]
+
+
+def _fused_ratio(bare: ContactModel, fused: Callable[..., int], path: np.ndarray) -> float:
+    """Median over pairs of slides of bare over fused; both work on the same arrays.
+
+    Raises
+    ------
+    AssertionError
+        If the two disagree by more than 1e-12 of the force, or in the cloud.
+    """
+    arguments = (bare.layout.arrays, bare.state, bare.out, bare.tips)
+    bare.tips[:] = path[0]
+    fused(*arguments)
+    overload: Any = fused.get_overload(tuple(map(numba.typeof, arguments)))  # type: ignore[attr-defined]
+    compiled = bare.compiled.step
+    assert compiled is not None
+    _agree(bare, lambda: overload(*arguments), path[::50])
+    calls = (lambda: overload(*arguments), lambda: compiled(*arguments, *bare.effects))
+    ratios = []
+    for first in range(_WARM, len(path) - 100, 100):
+        for _ in range(3):
+            taken, part = [0.0, 0.0], path[first : first + 100]
+            for which in (0, 1, 1, 0):  # neither is always the one that finds warm caches
+                taken[which] += _median_time(calls[which], bare.tips, part)
+            ratios.append(taken[1] / taken[0])
+    return float(np.median(ratios))
+
+
+def _median_time(call: Callable[[], int], tips: np.ndarray, path: np.ndarray) -> float:
+    times = np.empty(len(path))
+    for k, tip in enumerate(path):
+        tips[:] = tip
+        start = time.perf_counter_ns()
+        call()
+        times[k] = time.perf_counter_ns() - start
+    return float(np.median(times))
+
+
+def _agree(bare: ContactModel, fused: Callable[[], int], path: Sequence[Any] | np.ndarray) -> None:
+    for tips in path:
+        step(bare, tips)
+        force, cloud = bare.out.force.copy(), bare.out.cloud.copy()
+        bare.tips[:] = tips
+        fused()
+        scale = max(float(np.abs(force).max()), 1e-9)
+        assert np.abs(bare.out.force - force).max() <= 1e-12 * scale, "forces differ"
+        assert np.abs(bare.out.cloud - cloud).max() <= 1e-12, "clouds differ"

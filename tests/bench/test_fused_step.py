@@ -1,0 +1,50 @@
+"""The bare step of a scene gives what the step fused by hand gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from avatar_core.bench_effects import module_of
+from avatar_core.contact import prepare, step
+from avatar_core.organ import OrganOptions, vademecum_of
+from avatar_core.phantom import phantom_liver
+from avatar_core.tool_path import slide
+from avatar_core.vademecum import Vademecum
+
+TIP = 10e-3
+
+
+@pytest.fixture(scope="module")
+def fused() -> ModuleType:
+    return module_of(Path(__file__).with_name("fused_step.py"))
+
+
+@pytest.fixture(scope="module")
+def organ() -> Vademecum:
+    return vademecum_of(phantom_liver(12e-3), OrganOptions(n_vertices=800, n_certified=3))
+
+
+def test_the_bare_step_agrees_with_the_one_fused_by_hand(
+    fused: ModuleType, organ: Vademecum
+) -> None:
+    """To 1e-12 on and off the surface, past the rim of access, in the depth and far away."""
+    bare = prepare(organ, (TIP,), cloud="volume", effects=())
+    other = prepare(organ, (TIP,), cloud="volume", effects=())
+    path = slide(organ, TIP, 5e-3, 60e-3, step=5e-4)
+    rng = np.random.default_rng(0)
+    low, high = organ.mesh.vertices.min(axis=0), organ.mesh.vertices.max(axis=0)
+    path = np.concatenate([path, rng.uniform(low - 0.02, high + 0.02, (300, 3)), [[np.nan, 0, 0]]])
+    touched = 0
+    for tip in path:
+        status = step(bare, tip[None])
+        assert fused.fused_step(other.arrays, other.state, other.out, tip[None].copy()) == status
+        scale = max(1.0, np.abs(bare.out.force).max())
+        np.testing.assert_allclose(other.out.force, bare.out.force, rtol=0, atol=1e-12 * scale)
+        np.testing.assert_allclose(other.out.cloud, bare.out.cloud, rtol=0, atol=1e-12)
+        assert other.out.n_contacts[0] == bare.out.n_contacts[0]
+        touched += int(bare.out.n_contacts[0])
+    assert 100 < touched < len(path)
