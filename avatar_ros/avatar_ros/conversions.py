@@ -67,7 +67,8 @@ class PoseReader:
     """Reads serialised PoseStamped of one frame.
 
     ``read`` returns a status of ContactState; after STATUS_OK ``position`` holds the tip
-    [m] and ``stamp`` the eight bytes of the time stamp.
+    [m], ``orientation`` its unit quaternion (x, y, z, w) and ``stamp`` the eight bytes of the
+    time stamp.
     """
 
     def __init__(self, frame_id: str) -> None:
@@ -87,6 +88,7 @@ class PoseReader:
         self._frame = serialised[self._frame_start : self._frame_end]
         self._unpack = struct.Struct("=7d").unpack_from
         self.position = (0.0, 0.0, 0.0)
+        self.orientation = (0.0, 0.0, 0.0, 1.0)
         self.stamp = NO_STAMP
 
     def read(self, raw: bytes) -> int:
@@ -100,8 +102,27 @@ class PoseReader:
         if not math.isfinite(x + y + z) or not abs(norm - 1.0) < 2.0 * _UNIT_NORM_TOLERANCE:
             return int(ContactState.STATUS_INVALID_POSE)
         self.position = (x, y, z)
+        self.orientation = (i, j, k, w)
         self.stamp = stamp
         return int(ContactState.STATUS_OK)
+
+
+def small_turn(
+    before: tuple[float, float, float, float], now: tuple[float, float, float, float]
+) -> tuple[float, float, float]:
+    """Rotation vector from one orientation to another, in the frame of both [rad].
+
+    Twice the vector part of q_now q_before*, with the sign of the shorter way: to second order
+    in the angle, 4 % short at 1 rad.
+    """
+    a, b, c, d = before
+    i, j, k, w = now
+    twice = 2.0 if a * i + b * j + c * k + d * w >= 0.0 else -2.0
+    return (
+        twice * (d * i - w * a - j * c + k * b),
+        twice * (d * j - w * b - k * a + i * c),
+        twice * (d * k - w * c - i * b + j * a),
+    )
 
 
 def stamp_nanoseconds(stamp: bytes) -> int:

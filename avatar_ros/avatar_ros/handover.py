@@ -1,11 +1,15 @@
 """A vademecum on its way into the loop's process, without the loop noticing.
 
 Deserialising 40 MB, verifying them and preparing the contact model would each hold Python's
-global lock for tens of milliseconds. A process of its own does all three: it subscribes to
-`vademecum`, and puts the prepared arrays into a sealed piece of shared memory, whose handle it
-sends through a socket. The loop's process only maps that memory; nothing lies in a file system.
+global lock for tens of milliseconds; compiling the step for a new selection of effects, for tens of
+seconds. A process of its own does all that: it subscribes to `vademecum`, and puts the prepared
+arrays into a sealed piece of shared memory, whose handle it sends through a socket. The loop's
+process only maps that memory, and reads the compiled step from numba's cache.
 
-Run as ``python -m avatar_ros.handover JSON`` by ``Handover``, never by hand.
+The socket carries JSON: to the process the whole ``Order`` first, then changes of it, each with a
+number; back a note for each, with what is in force from now on or why it is refused.
+
+Run as ``python -m avatar_ros.handover`` by ``Handover``, never by hand.
 """
 
 from __future__ import annotations
@@ -22,14 +26,17 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from avatar_ros import realtime
 
+if TYPE_CHECKING:
+    from avatar_core.contact import Cloud
+
 _ALIGNMENT = 64
-_PACKET = 1 << 16
+_PACKET = 1 << 18  # the longest scene, quotes and all
 _RESTART_DELAY = 1.0  # [s]
 _STOP_TIMEOUT = 1.0  # [s]
 _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
@@ -37,15 +44,26 @@ _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_S
 
 @dataclass(frozen=True)
 class Order:
-    """What the receiving process prepares, and where it gets it."""
+    """What the receiving process prepares, and where it gets it.
+
+    tip_radii, modes, cloud : without a scene; their number is that of the tools in any case
+    period : of the steps [s]
+    material : values by name of the coordinate; they go before those of the scene
+    scene : YAML; empty for the natural effects of the vademecum
+    """
 
     topic: str
     node_name: str
     namespace: str
     tip_radii: tuple[float, ...]
     modes: int | None
-    cloud: Literal["surface", "volume", "off"]
+    cloud: Cloud
+    period: float
     material: dict[str, float] = field(default_factory=dict)
+    scene: str = ""
+
+
+Change = dict[str, Any]  # fields of an Order; or scene_file, a path, in place of scene
 
 
 @dataclass(frozen=True)
@@ -53,21 +71,35 @@ class Prepared:
     """A verified vademecum's contact model as arrays in shared memory.
 
     ranges : lowest and highest value of each coordinate that the vademecum has
+    effects : that are simulated, by name
+    cloud_divisor : of the scene; None without one
     """
 
     id: str
     name: str
     arrays: dict[str, np.ndarray]
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    effects: tuple[str, ...] = ()
+    cloud_divisor: int | None = None
+
+
+# Called with what is in use now and "", or with None and why it was refused; with None and "" if
+# there is no vademecum yet, and the change waits for one.
+Answer = Callable[[Prepared | None, str], None]
+
+
+OVERTAKEN = "overtaken by a later one, which is tried instead"
 
 
 class Handover:
     """Keeps the receiving process running and calls back with what it prepared.
 
-    Both callbacks run in a thread of this object, one at a time.
+    Callbacks run in a thread of this object, one at a time. Changes are passed on one by one, when
+    the last is in use; of those that wait only the newest of a kind counts, so that a slider that
+    is dragged fills neither time nor memory.
 
-    on_model : called with each vademecum that was verified and prepared
-    on_refusal : called with one line when one was refused or the process ended
+    on_model : called with each model that was verified and prepared; puts it into use
+    on_refusal : called with one line when a vademecum was refused or the process ended
     """
 
     def __init__(
@@ -76,21 +108,49 @@ class Handover:
         on_model: Callable[[Prepared], None],
         on_refusal: Callable[[str], None],
     ) -> None:
-        self._order = order
+        self._order = order  # in force, for a process that is started anew
         self._on_model = on_model
         self._on_refusal = on_refusal
         self._stop = threading.Event()
-        self._process: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()  # of the four below
         self._line: socket.socket | None = None
+        self._waiting: dict[str, tuple[Change, Answer]] = {}  # by kind
+        self._asked: Answer | None = None
+        self._number = 0
+        self._process: subprocess.Popen[bytes] | None = None
         self._thread = threading.Thread(target=self._supervise, name="handover", daemon=True)
         self._thread.start()
 
-    def choose(self, material: dict[str, float]) -> None:
-        """Have the vademecum prepared anew at other values of its coordinates; returns at once."""
-        self._order = replace(self._order, material=material)  # for a process that is started anew
-        if self._line is not None:
-            with contextlib.suppress(OSError):
-                self._line.send(json.dumps(material).encode())
+    def ask(self, change: Change, answer: Answer) -> None:
+        """Have the vademecum prepared anew after a change of the order; returns at once.
+
+        A change of the same kind that waits is refused as ``OVERTAKEN``, in the caller's thread.
+        """
+        kind = "material" if "material" in change else "scene"
+        with self._lock:
+            _, overtaken = self._waiting.pop(kind, (None, None))
+            self._waiting[kind] = (change, answer)
+        if overtaken is not None:
+            overtaken(None, OVERTAKEN)
+        self._pass_on()
+
+    def _pass_on(self) -> None:
+        """Send the next change, if the process is there and has answered the last."""
+        with self._lock:
+            if self._line is None or self._asked is not None or not self._waiting:
+                return
+            change, answer = self._waiting.pop(next(iter(self._waiting)))
+            self._number += 1
+            packet = json.dumps({"number": self._number, "change": change}, ensure_ascii=False)
+            try:
+                self._line.send(packet.encode(errors="replace"), socket.MSG_DONTWAIT)
+            except OSError as error:
+                refusal = f"not passed on ({error.strerror}); ask with less"
+            else:
+                self._asked, refusal = answer, ""
+        if refusal:
+            answer(None, refusal)
+            self._pass_on()
 
     def stop(self) -> None:
         """End the receiving process; returns when it has ended."""
@@ -105,14 +165,26 @@ class Handover:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with ours:
                 with theirs:
-                    self._process = _start(self._order, theirs)
-                    self._line = ours
-                self._receive(ours)
-                self._line = None
+                    ours.send(json.dumps(asdict(self._order)).encode())
+                    self._process = _start(theirs)
+                    with self._lock:
+                        self._line = ours
+                self._pass_on()
+                with contextlib.suppress(ConnectionResetError):  # it ended with packets unread
+                    self._receive(ours)
+                with self._lock:
+                    self._line = None
+                    answer, self._asked = self._asked, None
             _end(self._process)
+            if answer is not None:  # not tried again: it may be what ended the process
+                answer(None, "the process that prepares models ended; ask again")
             if not self._stop.is_set():
                 self._on_refusal("the process that receives vademecums ended; starting another")
                 self._stop.wait(_RESTART_DELAY)
+        with self._lock:
+            waiting, self._waiting = self._waiting, {}
+        for _, answer in waiting.values():
+            answer(None, "the node was cleaned up meanwhile; configure and ask again")
 
     def _receive(self, ours: socket.socket) -> None:
         while True:
@@ -120,17 +192,45 @@ class Handover:
             if not packet:
                 return
             note = json.loads(packet)
+            refusal, prepared = note.get("refusal", ""), None
             if handles:
-                arrays = _map(handles[0], note["arrays"])
-                self._on_model(Prepared(note["id"], note["name"], arrays, note["ranges"]))
-            else:
-                self._on_refusal(note["refusal"])
+                try:
+                    prepared = _prepared(note, handles[0])
+                    self._on_model(prepared)
+                except Exception as error:  # the node goes on with what it has
+                    prepared, refusal = None, _reason(error)
+            if not refusal:
+                self._order = replace(self._order, **note["change"])
+            if note["number"] == 0:  # a vademecum came
+                if refusal:
+                    self._on_refusal(refusal)
+                continue
+            with self._lock:
+                answer, self._asked = self._asked, None
+            if answer is not None:
+                answer(prepared, refusal)
+            self._pass_on()
 
 
-def _start(order: Order, theirs: socket.socket) -> subprocess.Popen[bytes]:
+def _prepared(note: dict[str, Any], handle: int) -> Prepared:
+    return Prepared(
+        id=note["id"],
+        name=note["name"],
+        arrays=_map(handle, note["arrays"]),
+        ranges=note["ranges"],
+        effects=tuple(note["effects"]),
+        cloud_divisor=note["cloud_divisor"],
+    )
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _start(theirs: socket.socket) -> subprocess.Popen[bytes]:
     environment = realtime.single_threaded_libraries(dict(os.environ))
     return subprocess.Popen(
-        [sys.executable, "-m", "avatar_ros.handover", json.dumps(asdict(order))],
+        [sys.executable, "-m", "avatar_ros.handover"],
         stdin=theirs.fileno(),
         env=environment,
         cwd="/",  # -m would let whatever lies where the node was started stand first
@@ -194,7 +294,7 @@ def _view(memory: mmap.mmap, entry: dict[str, Any]) -> np.ndarray:
 class Receiver:
     """Verifies and prepares what comes in, and reports through a socket.
 
-    Vademecums come in the thread of the node, values of the material in that of :meth:`listen`.
+    Vademecums come in the thread of the node, changes of the order in that of :meth:`listen`.
     """
 
     def __init__(self, order: Order, report: socket.socket) -> None:
@@ -210,53 +310,76 @@ class Receiver:
                 return  # a loader that was started again
             try:
                 vademecum = _verified(message.id, memoryview(message.data))
-                self._hand_over(vademecum)
+                self._hand_over(vademecum, self._order, {"number": 0, "change": {}})
             except Exception as error:  # whatever a file from elsewhere provokes, the loop goes on
-                self._refuse(f"vademecum {message.name!r} refused", error)
+                refusal = f"vademecum {message.name!r} refused: {_reason(error)}"
+                self._send({"number": 0, "refusal": refusal})
                 return
             self._vademecum = vademecum
 
     def listen(self) -> None:
-        """Take values of the material until the line is closed."""
+        """Take changes of the order until the line is closed."""
         while packet := self._report.recv(_PACKET):
+            asked = json.loads(packet)
             with self._lock:
-                before = self._order
-                self._order = replace(self._order, material=json.loads(packet))
-                if self._vademecum is None:
-                    continue
                 try:
-                    self._hand_over(self._vademecum)
+                    self._change(asked["number"], asked["change"])
                 except Exception as error:  # as above
-                    self._order = before
-                    self._refuse("material refused", error)
+                    self._send({"number": asked["number"], "refusal": _reason(error)})
 
-    def _hand_over(self, vademecum: Any) -> None:
-        """Prepare a vademecum at the values in force, and send it."""
-        from avatar_core import contact
-        from avatar_core.parametric import at_values
+    def _change(self, number: int, change: Change) -> None:
+        from avatar_core.errors import SceneError
 
-        order = self._order
+        change = _with_plain_scene(change)
+        order = replace(self._order, **change)
+        note = {"number": number, "change": change}
+        if self._vademecum is not None:
+            self._hand_over(self._vademecum, order, note)
+        elif "scene" in change:
+            raise SceneError("there is no vademecum yet; load one, then the scene")
+        else:
+            self._send(note)
+        self._order = order
+
+    def _hand_over(self, vademecum: Any, order: Order, note: dict[str, Any]) -> None:
+        """Prepare a vademecum as an order says, and send it with a note."""
+        from avatar_core.contact import Layout, make_model
+        from avatar_core.scene_file import parse_scene
+        from avatar_ros import scenes
+
+        scene = parse_scene(order.scene, "scene") if order.scene else None
+        laid_out = scenes.lay_out(vademecum, order, scene)
+        handle, contents = share(laid_out.layout.flat())
         coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
-        chosen = at_values(vademecum, order.material)
-        arrays = contact.model_arrays(chosen, tuple(order.tip_radii), order.modes, order.cloud)
-        handle, contents = share(dict(arrays._asdict()))
-        note = {
+        note |= {
             "id": vademecum.id,
             "name": vademecum.name,
             "arrays": contents,
             "ranges": {c.name: (c.low, c.high) for c in coordinates},
+            "effects": laid_out.effects,
+            "cloud_divisor": scene.cloud_divisor if scene else None,
         }
         try:
+            # Compiles the step for these effects, if that was never done on this machine, from
+            # arrays as the node will map them: it then finds the same types in numba's cache.
+            make_model(Layout.of(_map(os.dup(handle), contents)), halves=True)
             self._send(note, handle)
         finally:
             os.close(handle)
 
-    def _refuse(self, what: str, error: Exception) -> None:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        self._send({"refusal": f"{what}: {reason}"})
-
     def _send(self, note: dict[str, Any], *handles: int) -> None:
         socket.send_fds(self._report, [json.dumps(note).encode()], handles)
+
+
+def _with_plain_scene(change: Change) -> Change:
+    """A change whose scene is checked, and whole: no file has to be read again for it."""
+    from avatar_core.scene_file import parse_scene, read_scene, write_scene
+
+    if "scene_file" in change:
+        return {"scene": write_scene(read_scene(change["scene_file"]))}
+    if "scene" in change:
+        return {"scene": write_scene(parse_scene(change["scene"], "yaml"))}
+    return change
 
 
 def _verified(identity: str, data: memoryview) -> Any:
@@ -279,10 +402,10 @@ def main() -> int:
     from avatar_ros.msg import VademecumFile
 
     stop = StopSignal()
-    order = Order(**json.loads(sys.argv[1]))
     report = socket.socket(fileno=os.dup(sys.stdin.fileno()))
+    order = Order(**json.loads(report.recv(_PACKET)))
     receiver = Receiver(order, report)
-    threading.Thread(target=receiver.listen, name="material", daemon=True).start()
+    threading.Thread(target=receiver.listen, name="changes", daemon=True).start()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(
         order.node_name,

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import os
-import re
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, get_args
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
+from avatar_core.contact import TIP_RADIUS_RANGE, Cloud
+from avatar_core.errors import SceneError
+from avatar_core.scene import Scene, Tool
+from avatar_core.scene_file import read_scene, write_scene
+from avatar_ros import scenes
 from avatar_ros.patient_builder import Rules
 
-CLOUDS = ("surface", "volume", "off")
+CLOUDS = get_args(Cloud)
 WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
-_TOOL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-_TIP_RADIUS_RANGE = (0.002, 0.020)
 
 
 class ParameterError(ValueError):
@@ -94,8 +96,15 @@ CONTACT = (
     Parameter(
         "tip_radius",
         0.005,
-        "radius of the spherical tool tips [m], 0.002 to 0.020; one number or one per tool",
+        f"radius of the spherical tool tips [m], {TIP_RADIUS_RANGE[0]:g} to "
+        f"{TIP_RADIUS_RANGE[1]:g}; one number or one per tool",
         any_type=True,
+    ),
+    Parameter(
+        "scene",
+        "",
+        "scene in params/scenes, or the path of one (with a /); its tips, cloud and modes go "
+        "before those here; empty: the natural effects of the vademecum",
     ),
     Parameter("rate", 1000.0, "steps per second [Hz]", range=(100.0, 2000.0)),
     Parameter("cloud", "surface", "vertices in deformation: surface, volume or off"),
@@ -172,13 +181,15 @@ class InterpolationSettings:
 class ContactSettings:
     """Parameters of the contact node; rates [Hz], times [s], radii [m].
 
+    scene : YAML, checked; empty for the natural effects of the vademecum
     material : values chosen, by name of the coordinate; the others are those of the vademecum
     """
 
     tools: tuple[str, ...]
     tip_radii: tuple[float, ...]
+    scene: str
     rate: float
-    cloud: Literal["surface", "volume", "off"]
+    cloud: Cloud
     cloud_divisor: int
     modes: int | None
     frame_id: str
@@ -253,13 +264,18 @@ def read_contact(node: Node) -> ContactSettings:
     if not tools or len(set(tools)) != len(tools):
         raise ParameterError("parameter tools: give at least one name, each once")
     for tool in tools:
-        if not _TOOL_NAME.fullmatch(tool):
-            raise ParameterError(f"parameter tools: {tool!r} cannot be part of a topic's name")
+        try:
+            Tool(tool)
+        except SceneError as error:
+            raise ParameterError(
+                f"parameter tools: {tool!r} cannot be part of a topic's name"
+            ) from error
     if value["cloud"] not in CLOUDS:
         raise ParameterError(f"parameter cloud: give one of {', '.join(CLOUDS)}")
-    return ContactSettings(
+    settings = ContactSettings(
         tools=tools,
         tip_radii=_tip_radii(value["tip_radius"], len(tools)),
+        scene="",
         rate=value["rate"],
         cloud=value["cloud"],
         cloud_divisor=value["cloud_divisor"],
@@ -270,6 +286,24 @@ def read_contact(node: Node) -> ContactSettings:
         priority=value["realtime.priority"],
         cpu=value["realtime.cpu"],
         lock_memory=value["realtime.lock_memory"],
+    )
+    return _with_scene(settings, value["scene"]) if value["scene"] else settings
+
+
+def _with_scene(settings: ContactSettings, value: str) -> ContactSettings:
+    """Settings with what a scene says of tips and outputs."""
+    try:
+        scene: Scene = read_scene(scenes.scene_file(value))
+        scenes.require_tools(scene, len(settings.tools))
+    except SceneError as error:
+        raise ParameterError(f"parameter scene: {error}") from error
+    return replace(
+        settings,
+        tip_radii=tuple(tool.tip_radius for tool in scene.tools),
+        scene=write_scene(scene),
+        cloud=scene.cloud,
+        cloud_divisor=scene.cloud_divisor,
+        modes=scene.modes,
     )
 
 
@@ -290,7 +324,7 @@ def _frame(name: str) -> str:
 
 def _tip_radii(value: Any, n_tools: int) -> tuple[float, ...]:
     numbers = [value] if isinstance(value, int | float) else value
-    low, high = _TIP_RADIUS_RANGE
+    low, high = TIP_RADIUS_RANGE
     try:
         radii = [float(number) for number in numbers]
     except (TypeError, ValueError):
