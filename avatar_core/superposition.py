@@ -50,7 +50,6 @@ Reply = namedtuple(
 
 def make_reply(n_tools: int, n_modes: int, n_nodes: int) -> Reply:
     """Scratch, at rest."""
-    single = np.float32
     return Reply(
         free=np.zeros(n_modes),
         gain=np.ones(n_modes),
@@ -58,9 +57,9 @@ def make_reply(n_tools: int, n_modes: int, n_nodes: int) -> Reply:
         near_gain=np.ones(1),
         lift=np.zeros(n_tools),
         lifted=np.zeros((n_tools, 3)),
-        trail=np.zeros((n_tools, n_nodes, 3), single),
-        own=np.zeros((n_nodes, 3), single),
-        joint=np.zeros((n_nodes, 3), single),
+        trail=np.zeros((n_tools, n_nodes, 3)),
+        own=np.zeros((n_nodes, 3)),
+        joint=np.zeros((n_nodes, 3)),
         hessian=np.zeros((3, 3)),
         turning=np.zeros((3, 3)),
     )
@@ -130,7 +129,7 @@ def add_superposed_force(  # type: ignore[no-untyped-def]
     if friction is not None:
         stick_slip.add_near(model, state, reply, several, friction, t)
     else:
-        near = np.float32(-state.force[t] * a * reply.near_gain[0])
+        near = -state.force[t] * a * reply.near_gain[0]
         for i in range(count):
             for d in range(3):
                 reply.joint[i, d] += near * state.column[t, i, d]

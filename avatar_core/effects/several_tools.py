@@ -136,7 +136,7 @@ def add_near(state, reply, several, t):  # type: ignore[no-untyped-def]
     for s in range(state.passage.shape[0]):
         if s == t or state.force[s] <= 0.0 or not several.near[s, t]:
             continue
-        force = np.float32(-state.force[s] * state.scale[s] * reply.near_gain[0])
+        force = -state.force[s] * state.scale[s] * reply.near_gain[0]
         for i in range(state.n_nodes[t]):
             for d in range(3):
                 reply.joint[i, d] += force * several.column[s, t, i, d]

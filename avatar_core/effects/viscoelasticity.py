@@ -160,9 +160,9 @@ def leave_trail(model, state, memory, t, trail):  # type: ignore[no-untyped-def]
                 u0 -= b[0, 0] * f[0] + b[1, 0] * f[1] + b[2, 0] * f[2]
                 u1 -= b[0, 1] * f[0] + b[1, 1] * f[1] + b[2, 1] * f[2]
                 u2 -= b[0, 2] * f[0] + b[1, 2] * f[1] + b[2, 2] * f[2]
-        trail[i, 0] = np.float32(gain * u0)
-        trail[i, 1] = np.float32(gain * u1)
-        trail[i, 2] = np.float32(gain * u2)
+        trail[i, 0] = gain * u0
+        trail[i, 1] = gain * u1
+        trail[i, 2] = gain * u2
 
 
 @fast

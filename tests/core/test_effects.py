@@ -435,7 +435,8 @@ def test_energy_never_grows_in_a_minute_of_swinging(phantom_vademecum: Vademecum
         held = 0.5 * near * model.state.force[0] ** 2 if model.state.force[0] > 0.0 else 0.0
         energy.append(swing_energy(model) + held)
     energy = np.array(energy)
-    assert (np.diff(energy) <= 1e-9 * energy[0]).all()
+    assert (np.diff(energy) <= 1e-8 * energy[0]).all()  # single precision of the near field
+    assert (energy[100:] - energy[:-100] <= 1e-9 * energy[0]).all()
 
 
 def test_a_slow_push_does_not_feel_the_mass(phantom_vademecum: Vademecum) -> None:
