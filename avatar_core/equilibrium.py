@@ -19,7 +19,7 @@ at negative curvature, and Alg. 16.2 for the projection onto the constraint.)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,6 +102,7 @@ def press(
     depths: Sequence[float],
     rule: NewtonRule | None = None,
     preload: np.ndarray | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Iterator[State]:
     """The equilibria of a patch that is moved to increasing depths, as by a tool that holds it.
 
@@ -118,6 +119,7 @@ def press(
     rule : NewtonRule
     preload : ndarray, shape (3 n_nodes,), a dead load such as weight, carried before and during
         the push; depths count from there
+    progress : called with the share of the last depth that is reached, at every Newton iteration
 
     Raises
     ------
@@ -132,7 +134,7 @@ def press(
     if preload is not None:
         newton.load = _free_load(problem, preload)
         newton.rest = replace(newton.rest, displacement=solve(problem, preload, rule).displacement)
-    return _march(newton, list(depths))
+    return _march(newton, list(depths), progress)
 
 
 def _free_load(problem: Hyperelasticity, load: np.ndarray) -> np.ndarray:
@@ -147,10 +149,13 @@ def _free_load(problem: Hyperelasticity, load: np.ndarray) -> np.ndarray:
     return load[problem.free]
 
 
-def _march(newton: _Newton, targets: list[float]) -> Iterator[State]:
+def _march(
+    newton: _Newton, targets: list[float], progress: Callable[[float], None] = lambda share: None
+) -> Iterator[State]:
     """States at increasing targets of load factor or depth, in steps of adapted size."""
     rule, whole = newton.rule, targets[-1]
     state, reached, step = newton.rest, 0.0, rule.first_step * whole
+    newton.on_iteration = lambda: progress(reached / whole)
     for target in targets:
         newton.iterations = 0
         while reached < target:
@@ -182,7 +187,7 @@ class _Newton(ABC):
 
     load : ndarray, shape (n_free,), dead
     held : ndarray, shape (n_free, m), C of the constraint C^T u = const, or None
-    iterations : a counter
+    iterations : a counter; on_iteration : called at each
     """
 
     quantity: str
@@ -200,6 +205,7 @@ class _Newton(ABC):
             np.zeros(3 * problem.n_nodes), np.zeros(n_loads), 0.0, np.zeros(1), 1.0, 0
         )
         self.iterations = 0
+        self.on_iteration: Callable[[], None] = lambda: None
         self._use(problem.rest_factor)
 
     @abstractmethod
@@ -295,6 +301,7 @@ class _Newton(ABC):
             # as accurate as the Newton step itself, which keeps the convergence quadratic
             forcing = max(min(0.1, residual), 0.1 * self.rule.tolerance / residual)
             self.iterations += 1
+            self.on_iteration()
             direction = self._direction(self.problem.tangent(u), -gradient, forcing)
             u = self._line_search(u, load, gradient, direction)
             gradient, residual = self._gradient(u, load)

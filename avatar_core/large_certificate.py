@@ -7,7 +7,7 @@ build knows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from avatar_core.compact import FloatArray
 from avatar_core.equilibrium import NewtonRule, press
 from avatar_core.errors import EquilibriumError
 from avatar_core.hyperelasticity import Hyperelasticity
+from avatar_core.large_combinations import CombinedRow, mean_error
 from avatar_core.large_deformation import LargeCertificate, push_to
 from avatar_core.loads import patch_loads, patch_normals
 from avatar_core.vademecum import Vademecum
@@ -46,11 +47,11 @@ def certify_large(
     n_sites: int = 12,
     max_push: float = 20e-3,
     seed: int = 0,
-    progress: Callable[[int, float], None] = lambda done, error: None,
+    progress: Callable[[float, float], None] = lambda share, error: None,
 ) -> tuple[LargeCertificate, tuple[LargeRow, ...]]:
     """Push at random centroids to the depths 1/4, 1/2, 3/4 and 1 of what is stored there.
 
-    progress : called with the sites done and the mean error so far
+    progress : called with the share that is done and the mean error so far
 
     Random factors of 0.9 to 1 keep the depths from being round.
     """
@@ -59,13 +60,31 @@ def certify_large(
     sites = rng.permutation(len(surface.corners))[:n_sites]
     rows: list[LargeRow] = []
     n_lost = 0
+    error = np.nan
     for done, triangle in enumerate(sites):
         depths = max_push * np.array([0.25, 0.5, 0.75, 1.0]) * rng.uniform(0.9, 1.0, 4)
-        found, lost = push_rows(vademecum, problem, int(triangle), depths)
+
+        def pushed(share: float, done: int = done, error: float = error) -> None:
+            progress((done + share) / len(sites), error)
+
+        found, lost = push_rows(vademecum, problem, int(triangle), depths, progress=pushed)
         rows += found
         n_lost += lost
-        progress(done + 1, float(np.mean([row.l2 for row in rows] or [np.nan])))
+        error = float(np.mean([row.l2 for row in rows] or [np.nan]))
+        progress((done + 1) / len(sites), error)
     return summary(vademecum, rows, len(sites), n_lost), tuple(rows)
+
+
+def with_combinations(
+    certificate: LargeCertificate, rows: Sequence[CombinedRow]
+) -> LargeCertificate:
+    """The certificate with the figures of pushes together with other effects."""
+    return replace(
+        certificate,
+        oblique_contact_mean=mean_error(rows, "oblique"),
+        two_tools_contact_mean=mean_error(rows, "two tools"),
+        gravity_contact_mean=mean_error(rows, "gravity"),
+    )
 
 
 def push_rows(
@@ -74,10 +93,12 @@ def push_rows(
     triangle: int,
     depths: FloatArray,
     barycentric: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3),
+    progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[list[LargeRow], bool]:
     """Errors at a point of one face; whether equilibrium was lost within the stored range.
 
     barycentric : of the point; the centroid by default
+    progress : called with the share of the last depth that is reached
     """
     surface = vademecum.surface
     place = np.array([barycentric])
@@ -89,7 +110,7 @@ def push_rows(
     rows: list[LargeRow] = []
     rule = NewtonRule(exact_stability=False)
     try:
-        for state in press(problem, load, np.ones(1), list(depths), rule):
+        for state in press(problem, load, np.ones(1), list(depths), rule, progress=progress):
             truth = state.displacement[: 3 * len(vademecum.mesh.vertices)]
             force, found = push_to(vademecum, positions, weights, state.depth)
             plain, straight = push_to(linear, positions, weights, state.depth)

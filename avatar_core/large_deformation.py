@@ -12,7 +12,7 @@ low rank far away, exact near the patch. They hold up to a_max(s); beyond, both 
 As stress is proportional to Young's modulus, V_k and beta_k do not depend on it.
 
 Only the response of a tip to itself bends: the way from one tip to another, and a force across the
-normal, stay linear. What that costs is measured by :mod:`avatar_core.large_certificate`.
+normal, stay linear. What that costs is measured by :mod:`avatar_core.large_combinations`.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ class LargeCertificate:
     n_sites, n_pushes : that could be compared; n_lost : sites where equilibrium was lost before
         the range ended
     depth : the deepest push compared [m]
+    oblique_contact_mean, two_tools_contact_mean, gravity_contact_mean : of the force, where other
+        effects are added (:mod:`avatar_core.large_combinations`); NaN: not measured
     """
 
     l2_mean: float
@@ -56,6 +58,9 @@ class LargeCertificate:
     depth: float
     reach_median: float
     reach_least: float
+    oblique_contact_mean: float = float("nan")
+    two_tools_contact_mean: float = float("nan")
+    gravity_contact_mean: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)

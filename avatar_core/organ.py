@@ -14,7 +14,8 @@ from avatar_core.coordinates import Coordinate
 from avatar_core.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
 from avatar_core.errors import CoordinateError, MaterialError, MeshError
 from avatar_core.large_build import LargeRule, hyperelastic_problem, with_large_deformation
-from avatar_core.large_certificate import certify_large
+from avatar_core.large_certificate import certify_large, with_combinations
+from avatar_core.large_combinations import COMBINATIONS, SHARES, push_errors
 from avatar_core.large_deformation import LargeMaterial
 from avatar_core.level_set import orientation_offset
 from avatar_core.loads import load_surface
@@ -31,6 +32,7 @@ from avatar_core.surface import SurfaceMesh
 from avatar_core.tumour import share_inside
 from avatar_core.vademecum import Provenance, Vademecum
 
+COMBINED_SITES = 2  # at which large pushes are certified together with other effects
 _RECORDED = ("avatar", "numpy", "scipy", "scikit-fem", "libigl", "pytetwild", "rslab", "h5py")
 
 
@@ -48,7 +50,8 @@ class OrganOptions:
     tumour : surface inside the organ, with another stiffness; ``contrast`` of Young's moduli
     large : material of large strains, with which the load's magnitude becomes a coordinate up to
         the depth ``large_rule.max_push``; None for small strains
-    n_pushed : unseen sites at which large deformation is certified, a nonlinear solution each
+    n_pushed : unseen sites at which large deformation is certified, four nonlinear solutions each;
+        at the first ``COMBINED_SITES`` together with other effects too, nine more each
     n_certified : unseen load positions of the certificate; ``seed`` draws them
     with_mesh_error : also solve on the same mesh refined once (slow)
 
@@ -151,15 +154,26 @@ def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress)
     )
     if options.n_pushed == 0:
         return vademecum
+    n_combined = min(COMBINED_SITES, options.n_pushed)
+    # a combination takes about as long as two sites: it loses equilibrium sooner
+    alone = options.n_pushed / (options.n_pushed + 2 * n_combined * len(COMBINATIONS))
     certificate, _ = certify_large(
         vademecum,
         problem,
         options.n_pushed,
         options.large_rule.max_push,
         options.seed,
-        lambda done, error: progress("push", done / options.n_pushed, error),
+        lambda share, error: progress("push", alone * share, error),
     )
-    return vademecum.with_large_certificate(certificate)
+    rows = push_errors(
+        vademecum,
+        problem,
+        [share * options.large_rule.max_push for share in SHARES],
+        n_combined,
+        options.seed,
+        progress=lambda share: progress("push", alone + (1.0 - alone) * share, certificate.l2_mean),
+    )
+    return vademecum.with_large_certificate(with_combinations(certificate, rows))
 
 
 def _elasticity(mesh: TetMesh, regions: Regions, options: OrganOptions) -> Elasticity:

@@ -30,13 +30,13 @@ from avatar_core.large_build import (
     with_large_deformation,
 )
 from avatar_core.large_certificate import certify_large
+from avatar_core.large_combinations import COMBINATIONS, push_errors
 from avatar_core.large_deformation import LargeMaterial
 from avatar_core.loads import LoadSurface, load_surface, patch_loads
 from avatar_core.mesh import Regions, regions_by_rule, tetrahedralize
 from avatar_core.parametric_build import build_parametric_vademecum, certify_range
 from avatar_core.pgd import PGDRule, minimal_residual, solve_pgd
 from avatar_core.study import Parts, Study, Value
-from avatar_core.study_pushes import push_errors
 from avatar_core.study_shapes import DEFAULT_FOLDER, read_liver
 from avatar_core.study_unseen import canonical_at, errors, unseen
 from avatar_core.surface import SurfaceMesh, read_surface
@@ -282,8 +282,8 @@ def _large(
     bent = with_large_deformation(linear, problem, material, LargeRule(), LINEAR_RULE, progress)
     seconds = time.process_time() - start
 
-    def pushed(done: int, error: float) -> None:
-        progress("push", done / plan.n_pushed, error)
+    def pushed(share: float, error: float) -> None:
+        progress("push", share, error)
 
     certificate, found = certify_large(bent, problem, plan.n_pushed, seed=1, progress=pushed)
     summary: dict[str, Value] = {
@@ -298,9 +298,13 @@ def _large(
     rows += [{"coordinate": f"push, {material}", **vars(row)} for row in found]
     if material == "neo-hookean":
         summary["step_over_linear"] = _pace(linear, bent)
-        depths = np.array([5e-3, 10e-3, 15e-3])
-        together = push_errors(bent, problem, depths, plan.n_combined, seed=2)
-        rows += [{"coordinate": "combination", **push} for push in together]
+        depths = (5e-3, 10e-3, 15e-3)
+
+        def combined(share: float) -> None:
+            progress("combine", share, certificate.l2_mean)
+
+        together = push_errors(bent, problem, depths, plan.n_combined, 2, True, combined)
+        rows += [{"coordinate": "combination", **vars(row)} for row in together]
     return rows
 
 
@@ -346,7 +350,7 @@ def _summary(rows: Sequence[dict[str, Value]]) -> dict[str, float]:
     ]
     ratio = [float(row["linear_l2"]) / float(row["l2"]) for row in deep]  # type: ignore[arg-type]
     summary["linear_over_large_15mm"] = float(np.mean(ratio)) if ratio else float("nan")
-    for name in ("oblique", "two tools", "gravity"):
+    for name in COMBINATIONS:
         found = [row for row in rows if row.get("combination") == name]
         for key in ("contact", "linear_contact"):
             values = [float(row[key]) for row in found]  # type: ignore[arg-type]

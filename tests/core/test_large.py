@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import loads
+from avatar_core import loads, organ, storage
 from avatar_core.build_rule import BuildRule, silent
+from avatar_core.cli_vademecum import show_text
 from avatar_core.contact import ContactModel, Status, prepare, step
+from avatar_core.effects import Friction, LargeDeformationEffect
 from avatar_core.elasticity import Material
 from avatar_core.equilibrium import NewtonRule, solve
-from avatar_core.errors import MaterialError
+from avatar_core.errors import MaterialError, SceneError
 from avatar_core.hyperelasticity import Hyperelasticity
 from avatar_core.large_build import (
     LargeRule,
@@ -22,14 +25,16 @@ from avatar_core.large_build import (
     hyperelastic_problem,
     with_large_deformation,
 )
-from avatar_core.large_certificate import certify_large, push_rows
-from avatar_core.large_deformation import hyperelastic, powers, push, push_to
+from avatar_core.large_certificate import certify_large, push_rows, summary, with_combinations
+from avatar_core.large_combinations import COMBINATIONS, CombinedRow, mean_error, push_errors
+from avatar_core.large_deformation import LargeCertificate, hyperelastic, powers, push, push_to
 from avatar_core.loads import patch_loads
 from avatar_core.mesh import Regions, TetMesh
 from avatar_core.organ import OrganOptions, vademecum_of
 from avatar_core.parametric import at_values
 from avatar_core.path_series import path_series
 from avatar_core.phantom import phantom_liver
+from avatar_core.scene import REFUSED, Scene, combinations
 from avatar_core.storage import load_vademecum, save_vademecum
 from avatar_core.tool_path import inner_positions, middle_of_access
 from avatar_core.vademecum import Vademecum
@@ -171,6 +176,153 @@ def test_a_file_keeps_it(bent: Vademecum, tmp_path: Path) -> None:
     assert again.large.material == "neo-hookean"
     for name in ("space", "load", "near", "depth", "reach"):
         np.testing.assert_array_equal(getattr(again.large, name), getattr(bent.large, name))
+
+
+# --- together with other effects --------------------------------------------------------------
+
+FIGURES = ("oblique_contact_mean", "two_tools_contact_mean", "gravity_contact_mean")
+
+
+def combined_rows(*errors: float) -> list[CombinedRow]:
+    """One push of each combination."""
+    pairs = zip(COMBINATIONS, errors, strict=True)
+    return [CombinedRow(name, 0, 10e-3, error, 1.0, True) for name, error in pairs]
+
+
+def certified(bent: Vademecum, certificate: LargeCertificate | None = None) -> Vademecum:
+    """With a certificate of no push, unless another is given."""
+    return bent.with_large_certificate(certificate or summary(bent, [], 0, 0))
+
+
+def test_what_is_added_linearly_to_a_large_push_is_nearly_right(bent: Vademecum) -> None:
+    """Wrong by less than half; together less than without the bending of each tip for itself."""
+    shares: list[float] = []
+    problem = hyperelastic_problem(bent, "neo-hookean")
+    rows = push_errors(bent, problem, (5e-3,), 1, progress=shares.append)
+    assert [row.combination for row in rows] == list(COMBINATIONS)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    assert {1 / 3, 2 / 3} < set(shares) and len(shares) > 9  # each Newton iteration says so
+    for row in rows:
+        assert row.within and row.depth == 5e-3
+        assert row.contact < 0.5
+    assert sum(row.contact for row in rows) < sum(row.linear_contact for row in rows)
+    found = with_combinations(summary(bent, [], 0, 0), rows)
+    assert [getattr(found, key) for key in FIGURES] == [row.contact for row in rows]
+
+
+def test_no_equilibrium_is_sought_beyond_the_range(bent: Vademecum) -> None:
+    assert bent.large is not None
+    short = replace(bent, large=replace(bent.large, reach=np.full_like(bent.large.reach, 1e-3)))
+    shares: list[float] = []
+    problem = hyperelastic_problem(bent, "neo-hookean")
+    assert push_errors(short, problem, (9e-3, 12e-3), 2, progress=shares.append) == []
+    np.testing.assert_allclose(shares, np.arange(1, 7) / 6)
+
+
+def test_figures_are_of_pushes_within_the_range() -> None:
+    rows = combined_rows(0.1, 0.2, 0.3)
+    beyond = [replace(row, contact=0.9, within=False) for row in rows]
+    for name, error in zip(COMBINATIONS, (0.1, 0.2, 0.3), strict=True):
+        assert mean_error(rows + beyond, name) == error
+        assert np.isnan(mean_error(beyond, name))
+
+
+@pytest.mark.parametrize(("n_pushed", "n_combined"), [(12, 2), (1, 1), (0, 0)])
+def test_a_build_measures_combinations_at_few_of_its_sites(
+    bent: Vademecum, monkeypatch: pytest.MonkeyPatch, n_pushed: int, n_combined: int
+) -> None:
+    """As deep as three quarters of what is aimed at, and the bar goes on without a jump back."""
+    asked: list[tuple[object, int]] = []
+
+    def pushed(vademecum, problem, n, depth, seed, progress):  # type: ignore[no-untyped-def]
+        progress(0.5, 0.04)
+        progress(1.0, 0.04)
+        return summary(vademecum, [], n, 0), ()
+
+    def combined(vademecum, problem, depths, n, seed, progress):  # type: ignore[no-untyped-def]
+        asked.append((depths, n))
+        progress(0.5)
+        progress(1.0)
+        return combined_rows(0.07, 0.08, 0.05)
+
+    monkeypatch.setattr(organ, "with_large_deformation", lambda *_: bent)
+    monkeypatch.setattr(organ, "certify_large", pushed)
+    monkeypatch.setattr(organ, "push_errors", combined)
+    shares: list[float] = []
+
+    def progress(stage: str, share: float, _: float) -> None:
+        assert stage == "push"
+        shares.append(share)
+
+    options = OrganOptions(large="neo-hookean", n_pushed=n_pushed)
+    found = organ._with_large(bent, options, progress).large
+    assert found is not None
+    if n_pushed == 0:
+        assert found.certificate is None and not asked
+        return
+    assert [getattr(found.certificate, key) for key in FIGURES] == [0.07, 0.08, 0.05]
+    ((depths, n_sites),) = asked
+    assert depths == pytest.approx([5e-3, 10e-3, 15e-3])
+    assert n_sites == n_combined
+    assert shares == sorted(shares) and shares[-1] == 1.0
+
+
+def test_a_file_keeps_what_was_measured_and_what_was_not(
+    bent: Vademecum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stored(certificate: LargeCertificate) -> list[float]:
+        save_vademecum(certified(bent, certificate), tmp_path / "bent.h5")
+        again = load_vademecum(tmp_path / "bent.h5").large
+        assert again is not None and again.certificate is not None
+        assert again.certificate.reach_least == certificate.reach_least
+        return [getattr(again.certificate, key) for key in FIGURES]
+
+    unmeasured = summary(bent, [], 0, 0)
+    measured = with_combinations(unmeasured, combined_rows(0.07, 0.08, 0.05))
+    assert stored(measured) == [0.07, 0.08, 0.05]
+    assert np.isnan(stored(unmeasured)).all()
+    whole = storage._large_attribute
+
+    def of_an_older_version(large):  # type: ignore[no-untyped-def]
+        attribute = whole(large)
+        return {
+            **attribute,
+            "certificate": {k: v for k, v in attribute["certificate"].items() if k not in FIGURES},
+        }
+
+    monkeypatch.setattr(storage, "_large_attribute", of_an_older_version)
+    assert np.isnan(stored(measured)).all()
+
+
+def test_show_tells_what_combinations_cost(
+    bent: Vademecum, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nan = float("nan")
+    rows = combined_rows(0.0712, nan, 0.0512)
+    show_text(certified(bent, with_combinations(summary(bent, [], 0, 0), rows)))
+    shown = capsys.readouterr().out
+    for line in (
+        r"30 degrees off the normal +7\.12%",
+        r"two tools 40 mm apart +not measured",
+        r"an organ under its weight +5\.12%",
+    ):
+        assert re.search(line, shown)
+
+
+def test_a_scene_is_refused_where_the_file_says_that_its_effects_combine_badly(
+    bent: Vademecum,
+) -> None:
+    scene = Scene(effects=(Friction(), LargeDeformationEffect()))
+    scene.require(certified(bent))  # not measured
+    for error in (REFUSED, 0.163):
+        figures = with_combinations(summary(bent, [], 0, 0), combined_rows(error, 0.9, 0.9))
+        vademecum = certified(bent, figures)
+        assert [one.error for one in combinations(scene, vademecum)] == [error]
+        if error == REFUSED:
+            scene.require(vademecum)
+            continue
+        with pytest.raises(SceneError, match=r"large_deformation with friction: .*16%.*15%"):
+            scene.require(vademecum)
 
 
 # --- contact ----------------------------------------------------------------------------------
