@@ -114,7 +114,10 @@ def test_unknown_material_is_refused() -> None:
 
 
 def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(bent: Vademecum) -> None:
-    """There nothing is interpolated: what is left is of the terms and the modes."""
+    """There nothing is interpolated: what is left is of the terms and the modes.
+
+    Of the terms, the rule lets the deeper push, close to the reach, be wrong by its tolerance.
+    """
     problem, surface = hyperelastic_problem(bent, "neo-hookean"), bent.surface
     distance = np.linalg.norm(surface.centers - surface.centers[middle_of_access(bent)], axis=1)
     for j in np.argsort(distance)[[0, 12]]:
@@ -123,7 +126,7 @@ def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(bent: Vade
         rows, lost = push_rows(bent, problem, triangle, np.array([7e-3, 14e-3]), point)
         assert not lost
         for row in rows:
-            assert row.contact < 0.02
+            assert row.contact < (0.02 if row.depth < 10e-3 else LargeRule().tolerance)
             assert row.contact < 0.3 * row.linear_contact
             assert row.l2 < row.linear_l2
 
