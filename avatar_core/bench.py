@@ -20,7 +20,7 @@ from avatar_core.effects import several_tools as coupling
 from avatar_core.elasticity import Elasticity
 from avatar_core.loads import patch_loads
 from avatar_core.near_field import LocalBlocks
-from avatar_core.tool_path import inner_positions, middle_of_access, slide
+from avatar_core.tool_path import slide, starts_apart
 from avatar_core.vademecum import Vademecum
 
 SPHERE, DEPTH = 10e-3, 5e-3  # [m] the benchmark's tip and how deep it slides
@@ -115,7 +115,7 @@ def _timed(
     call: Callable[[np.ndarray], object],
 ) -> StepRow:
     tips = tool_paths(vademecum, n_tools)
-    passes = [_pass(model, tips, n_tools, call) for _ in range(PASSES)]
+    passes = [one_pass(model, tips, call) for _ in range(PASSES)]
     contacts = np.concatenate([contacts for _, contacts in passes])
     return StepRow(
         method,
@@ -130,10 +130,13 @@ def _timed(
     )
 
 
-def _pass(
-    model: ContactModel, tips: np.ndarray, n_tools: int, call: Callable[[np.ndarray], object]
+def one_pass(
+    model: ContactModel, tips: np.ndarray, call: Callable[[np.ndarray], object]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times [us] and contacts of the steps of one slide in which all tools touch."""
+    """Times [us] and contacts of the steps of one path in which all tools touch.
+
+    tips : ndarray, shape (n, n_tools, 3) [m]
+    """
     times = np.empty(len(tips))
     contacts = np.empty(len(tips), int)
     for k in range(len(tips)):
@@ -141,19 +144,13 @@ def _pass(
         call(tips[k])
         times[k] = time.perf_counter() - start
         contacts[k] = model.out.n_contacts[0]
-    kept = (np.arange(len(tips)) >= 200) & (contacts >= n_tools)  # caches are warm by then
+    kept = (np.arange(len(tips)) >= 200) & (contacts >= tips.shape[1])  # caches are warm by then
     return times[kept] * 1e6, contacts[kept]
 
 
 def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000) -> np.ndarray:
     """Slides that start far apart, shape (n, n_tools, 3)."""
-    centers, inner = vademecum.surface.centers, inner_positions(vademecum)
-    starts = [middle_of_access(vademecum)]
-    while len(starts) < n_tools:
-        distance = np.min(
-            [np.linalg.norm(centers[inner] - centers[s], axis=1) for s in starts], axis=0
-        )
-        starts.append(int(inner[np.argmax(distance)]))
+    starts = starts_apart(vademecum, n_tools)
     paths = [slide(vademecum, SPHERE, DEPTH, n * 1e-4, position=start) for start in starts]
     return np.ascontiguousarray(np.stack(paths, axis=1))
 

@@ -18,7 +18,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from avatar_core.bench import SPHERE, tool_paths
+from avatar_core.bench import SPHERE, one_pass, tool_paths
 from avatar_core.build import build_vademecum
 from avatar_core.build_rule import BuildRule, Progress
 from avatar_core.contact import ContactModel, prepare, step
@@ -152,16 +152,9 @@ def _row(
 
 
 def _slide(model: ContactModel, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Times [us] and contacts of the steps of one slide in which a tool touches."""
+    """Times [us] and contacts of one slide over an organ at rest."""
     model.reset()
-    times, contacts = np.empty(len(path)), np.empty(len(path), int)
-    for k, tips in enumerate(path):
-        start = time.perf_counter_ns()
-        step(model, tips)
-        times[k] = time.perf_counter_ns() - start
-        contacts[k] = model.out.n_contacts[0]
-    kept = (np.arange(len(path)) >= _WARM) & (contacts >= 1)
-    return times[kept] * 1e-3, contacts[kept]
+    return one_pass(model, path, lambda tips: step(model, tips))
 
 
 def _fused_ratio(bare: ContactModel, fused: Callable[..., int], path: np.ndarray) -> float:

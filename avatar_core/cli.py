@@ -11,6 +11,7 @@ import typer
 from avatar_core.cli_atlas import atlas
 from avatar_core.cli_bench import bench, ros_cell
 from avatar_core.cli_patient import patient
+from avatar_core.cli_scene import scene
 from avatar_core.cli_study import study
 from avatar_core.cli_vademecum import (
     BuildBar,
@@ -35,6 +36,7 @@ app = typer.Typer(
 )
 app.add_typer(bench, name="bench")
 app.add_typer(atlas, name="atlas")
+app.add_typer(scene, name="scene")
 app.command()(vademecum)
 app.command()(show)
 app.command()(patient)

@@ -173,8 +173,8 @@ _WITH_LARGE = (
 )
 
 
-def combinations(scene: Scene, vademecum: Vademecum) -> tuple[Combination, ...]:
-    """The effects of a scene that share the response, all by pairs.
+def combinations(scene: Scene, vademecum: Vademecum | None) -> tuple[Combination, ...]:
+    """The effects of a scene that share the response, all by pairs; without an organ, no figures.
 
     Only large deformation does not superpose. Several tools count where there are several.
     """
@@ -183,7 +183,7 @@ def combinations(scene: Scene, vademecum: Vademecum) -> tuple[Combination, ...]:
         chosen.discard("several_tools")
     if "large_deformation" not in chosen:
         return ()
-    certificate = vademecum.large.certificate if vademecum.large else None
+    certificate = vademecum.large.certificate if vademecum and vademecum.large else None
     return tuple(
         Combination(("large_deformation", other), how, _figure(certificate, key))
         for other, how, key in _WITH_LARGE

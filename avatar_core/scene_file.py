@@ -16,6 +16,7 @@ import yaml
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from avatar_core.effects import EFFECTS, Effect, Viscoelasticity
+from avatar_core.errors import SceneError
 from avatar_core.prony import parse_prony
 from avatar_core.quantities import check_line, is_whole, lies_in
 from avatar_core.scene import Scene, Tool
@@ -39,7 +40,39 @@ SECTIONS = {
     "material": ("young_modulus", "poisson_ratio"),
     "outputs": ("cloud", "cloud_divisor", "modes"),
 }
+SHIPPED = Path("params") / "scenes"  # in the project; installed below share/avatar_ros
 _KEYS = ("name", "text", "organ", "material", "tools", "outputs", "effects")
+
+
+def shipped_scenes() -> dict[str, Path]:
+    """Files of the scenes that come with the project, by bare name; sorted.
+
+    They lie beside the code, in its repository, or below the prefix that it is installed in.
+    """
+    package = Path(__file__).resolve().parent
+    installed = [prefix / "share" / "avatar_ros" / SHIPPED for prefix in package.parents]
+    for folder in (package.parent / SHIPPED, *installed):
+        if folder.is_dir():
+            return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {}
+
+
+def scene_path(name: str) -> Path:
+    """The file of a scene: a path, or the bare name of a shipped one.
+
+    Raises
+    ------
+    SceneError
+        Naming the shipped scenes, for a bare name that none of them has.
+    """
+    path, shipped = Path(name), shipped_scenes()
+    if path.is_file() or path.name != name or path.suffix:
+        return path
+    if name not in shipped:
+        raise SceneError(
+            f"there is no scene '{name}'; give a file or one of {', '.join(shipped) or 'none'}"
+        )
+    return shipped[name]
 
 
 def read_scene(path: str | Path) -> Scene:

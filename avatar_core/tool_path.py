@@ -26,6 +26,18 @@ def middle_of_access(vademecum: Vademecum) -> int:
     return int(inner[np.argmin(np.linalg.norm(centers[inner] - centers.mean(axis=0), axis=1))])
 
 
+def starts_apart(vademecum: Vademecum, n: int) -> list[int]:
+    """Load positions for several tools: the middle one, then each the farthest from the others."""
+    centers, inner = vademecum.surface.centers, inner_positions(vademecum)
+    starts = [middle_of_access(vademecum)]
+    while len(starts) < n:
+        distance = np.min(
+            [np.linalg.norm(centers[inner] - centers[s], axis=1) for s in starts], axis=0
+        )
+        starts.append(int(inner[np.argmax(distance)]))
+    return starts
+
+
 def palpation(
     vademecum: Vademecum, radius: float, depth: float, n: int, position: int | None = None
 ) -> np.ndarray:
@@ -70,6 +82,25 @@ def slide(
         along = direction - (direction @ normal) * normal
         p = p + step * along / np.linalg.norm(along)
     return path
+
+
+def push_and_slide(
+    vademecum: Vademecum, radius: float, push: float, depth: float, n: int, position: int
+) -> np.ndarray:
+    """A push and back out, then in again and along, shape (n, 3) [m]: a third, and two thirds.
+
+    push, depth : of the push and of the slide [m]
+    """
+    third = n // 3
+    way_in = palpation(vademecum, radius, depth, third, position)[: third // 2]
+    length = (n - third - len(way_in)) * 1e-4
+    return np.concatenate(
+        [
+            palpation(vademecum, radius, push, third, position),
+            way_in,
+            slide(vademecum, radius, depth, length, position=position),
+        ]
+    )
 
 
 def _gradient(field: TipField, p: np.ndarray) -> np.ndarray:
