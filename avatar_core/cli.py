@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from avatar_core.cli_atlas import atlas
-from avatar_core.cli_bench import bench, ros_cell
+from avatar_core.cli_bench import bench, require_ros, run_cell
 from avatar_core.cli_patient import patient
 from avatar_core.cli_scene import scene
 from avatar_core.cli_study import study
@@ -82,7 +82,7 @@ def demo(
     from avatar_core.picture import palpation_picture
     from avatar_core.storage import load_vademecum, save_vademecum
 
-    run_cell = ros_cell()
+    require_ros()
     print("1. a liver that the code generates becomes a vademecum")
     with BuildBar() as progress:
         built = vademecum_of(phantom_liver(), OrganOptions(n_vertices=vertices), progress)
@@ -92,8 +92,7 @@ def demo(
         v = load_vademecum(file)
         show_text(v)
         print(f"2. loader, contact and tool as real ROS 2 processes for {seconds:g} s")
-        report = run_cell(file, seconds)
-    print(report.table())
+        run_cell(file, seconds)
     print("3. the picture")
     palpation_picture(v, output)
     print(f"   {output}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -126,7 +128,7 @@ def bench_cell(
     from avatar_core.organ import OrganOptions, vademecum_of
     from avatar_core.storage import save_vademecum
 
-    run_cell = ros_cell()
+    require_ros()
     with tempfile.TemporaryDirectory(prefix="avatar_bench_") as folder:
         file = Path(surface)
         if file.suffix != ".h5":
@@ -138,19 +140,30 @@ def bench_cell(
                 )
             file = Path(folder) / "bench.h5"
             save_vademecum(built, file)
-        report = run_cell(file, seconds, output, changes=changes)
-    print(report.table())
+        run_cell(file, seconds, output, changes)
 
 
-def ros_cell() -> Any:
-    try:
-        from avatar_ros.bench_cell import run_cell
-    except ImportError as error:
+def require_ros() -> None:
+    """Refuse before anything is built where the cell could not be started."""
+    missing = [name for name in ("avatar_ros", "rclpy") if find_spec(name) is None]
+    if missing:
         raise AvatarError(
-            f"ROS 2 is not installed here ({error}); install avatar without AVATAR_NO_ROS on "
-            "Linux x86_64: pip install ."
-        ) from error
-    return run_cell
+            f"ROS 2 is not installed here (no {missing[0]}); install avatar without AVATAR_NO_ROS "
+            "on Linux x86_64: pip install ."
+        )
+
+
+def run_cell(
+    vademecum: Path, seconds: float, output: Path | None = None, changes: float = 0.0
+) -> None:
+    """Measure the cell in a process of its own, which prints its table or one line of error."""
+    command = [sys.executable, "-m", "avatar_ros.bench_cell", str(vademecum), f"{seconds:g}"]
+    command += ["--changes", f"{changes:g}"]
+    command += ["--output", str(output)] if output is not None else []
+    sys.stdout.flush()  # what was said before comes first in a file too
+    code = subprocess.run(command, check=False).returncode
+    if code != 0:
+        raise typer.Exit(code)
 
 
 def _step_table(rows: list[StepRow]) -> str:

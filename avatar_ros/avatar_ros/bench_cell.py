@@ -2,11 +2,13 @@
 
 Loader, contact node, a palpating tool, a cloud viewer, on request a slider of the material, and
 beside them a loop that only sleeps:
-what it misses, the machine misses. Run by ``avatar bench cell``.
+what it misses, the machine misses. ``avatar bench cell`` and ``avatar demo`` run it as
+``python -m avatar_ros.bench_cell VADEMECUM SECONDS``.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -341,3 +343,25 @@ class Module(subprocess.Popen[str]):
         except subprocess.TimeoutExpired:
             self.kill()
             return self.wait()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m avatar_ros.bench_cell")
+    parser.add_argument("vademecum", type=Path)
+    parser.add_argument("seconds", type=float, help="of each run [s]")
+    parser.add_argument("--changes", type=float, default=0.0, help="of the material [Hz]")
+    parser.add_argument("--output", type=Path, help="write all figures as JSON")
+    chosen = parser.parse_args()
+    try:
+        report = run_cell(chosen.vademecum, chosen.seconds, chosen.output, changes=chosen.changes)
+    except AvatarError as error:
+        print(f"avatar: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130  # by Ctrl-C, as shells count it
+    print(report.table(), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
