@@ -98,7 +98,7 @@ class ErrorEstimate:
 
 
 class Samples:
-    """Some loads and nodes of the parameters, at which residuals are formed in full.
+    """Some loads, not zero, and nodes of the parameters, where residuals are formed in full.
 
     Parameters
     ----------
@@ -114,13 +114,16 @@ class Samples:
     def __init__(self, problem: AffineProblem, n: int, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
         self._problem = problem
-        self.loads = rng.choice(len(problem.load_weights), n, p=_share(problem.load_weights))
+        acting = _acting(problem)
+        if not acting.any():
+            raise ConvergenceError("all loads are zero: there is nothing to separate")
+        self.loads = rng.choice(len(acting), n, p=_share(problem.load_weights * acting))
         nodes = [rng.choice(len(w), n, p=_share(w)) for w in problem.weights]
         self.nodes: NDArray[np.int64] = np.stack([*nodes, np.zeros(n, np.int64)])[:-1].T
         self._force = np.column_stack([self._right(k) for k in range(n)])
         self._size = self._norm(self._force)
         if not self._size > 0:
-            raise ConvergenceError("all loads are zero: there is nothing to separate")
+            raise ConvergenceError("the right-hand side is zero at all sampled nodes; take more")
 
     def residual(self, field: CanonicalField) -> float:
         """|r| / |f| in the norm of K_0^-1, root mean square."""
@@ -178,6 +181,12 @@ def _at_nodes(factors: tuple[FloatArray, ...], nodes: NDArray[np.int64], n: int)
     for factor, node in zip(factors, nodes, strict=True):
         out = out * factor[:, node]
     return out
+
+
+def _acting(problem: AffineProblem) -> NDArray[np.bool_]:
+    """Which loads are not zero, by their work on a random displacement, shape (n_loads,)."""
+    probe = np.random.default_rng(0).standard_normal(problem.n)
+    return np.any([source.rmatvec(probe) != 0.0 for source in problem.sources], axis=0)
 
 
 def _share(weights: FloatArray) -> FloatArray:

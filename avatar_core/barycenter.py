@@ -20,7 +20,7 @@ IntArray = NDArray[np.int64]
 Vectors = Sequence[FloatArray] | FloatArray  # one row, or one array, a shape
 
 DEFAULT_REGULARIZATION = 1e-6  # real livers: leave-one-out Dice .94, with the usual 1e-3 less
-SAME = 1e-6  # vectors closer than this part of their length are one: 0.1 um between livers
+SAME = 1e-6  # vectors closer than this part of the base's size are one: 0.1 um between livers
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +83,11 @@ def barycenter_weights(gram: FloatArray, regularization: float) -> FloatArray:
     """
     require_regularization(regularization)
     k = gram.shape[-1]
-    trace = np.trace(gram, axis1=-2, axis2=-1)[..., None, None]
+    # by a power of two, which changes no digit, to a trace from 1/2 to 1, or 0: nothing underflows
+    trace, exponent = np.frexp(np.trace(gram, axis1=-2, axis2=-1)[..., None, None])
     shift = regularization * np.where(trace > 0, trace, 1.0)
     right = np.ones((*gram.shape[:-1], 1))
-    weights = np.linalg.solve(gram + shift * np.eye(k), right)[..., 0]
+    weights = np.linalg.solve(np.ldexp(gram, -exponent) + shift * np.eye(k), right)[..., 0]
     return weights / weights.sum(axis=-1, keepdims=True)
 
 
@@ -129,11 +130,11 @@ def barycenter(
     require_regularization(regularization)
     candidates = np.array([j for j in range(len(vectors)) if j not in leave_out], dtype=np.int64)
     k, notices = _truncated(n_neighbors, len(candidates))
-    distance = np.array([np.linalg.norm(vectors[j] - x) for j in candidates])
+    distance = _distances(vectors, candidates, x)
+    size = distance.max()  # of the base, seen from the point; not of the vectors: their zero is any
     order = np.argsort(distance, kind="stable")[:k]
     chosen, distance = candidates[order], distance[order]
-    length = max(np.linalg.norm(v - vectors[0]) for v in (x, vectors[chosen[0]]))
-    if distance[0] <= SAME * length:
+    if distance[0] <= SAME * size:
         off, whole = float(distance[0]), np.eye(1, k)[0]
         return Barycenter(chosen, whole, distance, off, 0.0, 1.0, int(chosen[0]), notices)
     neighbors = [vectors[j] for j in chosen]
@@ -149,6 +150,17 @@ def barycenter(
         condition=_condition(gram),
         notices=notices,
     )
+
+
+def _distances(vectors: Vectors, candidates: IntArray, x: FloatArray) -> FloatArray:
+    """|x - X_j| of some members, shape (len(candidates),)."""
+    if any(np.shape(vectors[j]) != x.shape for j in candidates):
+        raise LLEError("lle: the vectors differ in length; compute all on one grid")
+    distance = np.array([np.linalg.norm(vectors[j] - x) for j in candidates])
+    if not np.isfinite(distance).all():
+        bad = candidates[~np.isfinite(distance)][0]
+        raise LLEError(f"lle: vector {bad} is NaN or infinite; compute its distances again")
+    return distance
 
 
 def _distance_to(x: FloatArray, neighbors: list[FloatArray], weights: FloatArray) -> float:

@@ -56,8 +56,13 @@ class Coordinate:
                 f"coordinate {self.name}={self.low:g}:{self.high:g}: give LOW:HIGH with "
                 f"{least:g} <= LOW < HIGH <= {most:g}"
             )
+        span = self._scaled(self.high) - self._scaled(self.low)
+        if span == 0.0:  # neighbours whose logarithms round to one number
+            raise CoordinateError(
+                f"coordinate {self.name}={self.low!r}:{self.high!r}: the range is empty to "
+                "rounding; give a wider one"
+            )
         if self.n_nodes == 0:
-            span = self._scaled(self.high) - self._scaled(self.low)
             object.__setattr__(self, "n_nodes", 1 + math.ceil(span / _SPACING[self.name]))
         if self.n_nodes < 2:
             raise CoordinateError(f"coordinate {self.name}: give at least 2 nodes")

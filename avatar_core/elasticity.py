@@ -35,7 +35,7 @@ from skfem import (
 )
 from skfem.helpers import div
 
-from avatar_core.errors import ConvergenceError, MaterialError
+from avatar_core.errors import ConvergenceError, MaterialError, MeshError
 from avatar_core.mesh import TetMesh, make_mesh
 from avatar_core.stiffness import unit_stiffness
 
@@ -301,6 +301,7 @@ class Elasticity:
     def _factor(self) -> rslab.Ldlt:
         if len(self.clamped_nodes) == 0:
             raise MaterialError("an organ without a clamp has no equilibrium; clamp some faces")
+        self._require_all_held()
         free = self._free
         if self.element == "Taylor-Hood":
             shear, coupling, mass = self._terms.mixed
@@ -311,6 +312,24 @@ class Elasticity:
         else:
             system = self.stiffness[free][:, free]
         return rslab.ldlt(sp.csc_matrix(system))
+
+    def _require_all_held(self) -> None:
+        """Raise MeshError if a part of the organ can move off without resistance.
+
+        The factorization of such a system need not fail, nor a load on the other parts show it.
+        """
+        mesh, held = self.mesh, self.mesh.boundary_faces[self._clamped_faces]
+        n_pieces = int(mesh.pieces.max()) + 1
+        loose = [
+            k
+            for k in range(n_pieces if n_pieces > 1 else 0)
+            if not np.isin(held, mesh.tets[mesh.pieces == k]).all(axis=1).any()
+        ]
+        if loose:
+            raise MeshError(
+                f"{len(loose)} of {n_pieces} pieces that hang together by faces are not clamped; "
+                "clamp a face of each or remove them"
+            )
 
     @property
     def mass(self) -> sp.csr_matrix:
@@ -335,6 +354,8 @@ class Elasticity:
 
         Raises
         ------
+        MaterialError, MeshError
+            For an organ, or a piece of it, without a clamp.
         ConvergenceError
             If the factorization failed and the solution does not balance the load.
         """

@@ -65,7 +65,7 @@ class State:
     force : ndarray, shape (n_loads,), factors of the loads given; [N] for unit loads
     depth : of the patch, for :func:`press` [m]
     residuals : ndarray, shape (n_iterations + 1,), residual over load in the last load step
-    min_det : smallest det F over the quadrature points
+    min_det : smallest det F over quadrature points and corners of the elements
     newton_iterations : all that were made since the state before, load steps that failed included
     """
 
@@ -155,6 +155,7 @@ def _march(
     """States at increasing targets of load factor or depth, in steps of adapted size."""
     rule, whole = newton.rule, targets[-1]
     state, reached, step = newton.rest, 0.0, rule.first_step * whole
+    stable, careful = (state, reached), False
     newton.on_iteration = lambda: progress(reached / whole)
     for target in targets:
         newton.iterations = 0
@@ -162,9 +163,13 @@ def _march(
             aim = target if reached + 1.01 * step >= target else reached + step
             try:
                 new = newton.advance(state, aim)
-                if aim == target and rule.exact_stability:
+                if rule.exact_stability and (careful or aim == target):
                     newton.check_stability(new)
+                    stable = new, aim
             except _LostError as lost:
+                if rule.exact_stability and not careful:
+                    # equilibrium may have been lost at a step before, where it was not checked
+                    careful, (state, reached) = True, stable
                 step = (aim - reached) / 2.0
                 if step < rule.least_step * whole:
                     raise EquilibriumError(
@@ -231,7 +236,10 @@ class _Newton(ABC):
         u, residuals = self._descend(start, self._dead_load(aim))
         if np.linalg.norm(u - start) > _STRAYED * np.linalg.norm(step):
             raise _LostError("the organ snaps to another shape")
-        return self._state(u, aim, residuals)
+        new = self._state(u, aim, residuals)
+        if not new.min_det > 0.0:  # at a corner, which the energy does not see
+            raise _LostError("a corner of an element turns inside out")
+        return new
 
     def _state(self, u: np.ndarray, aim: float, residuals: list[float]) -> State:
         """The state that was aimed at; multipliers replace the load factor."""

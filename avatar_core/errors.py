@@ -51,5 +51,9 @@ class EquilibriumError(AvatarError):
     """A deformed organ has no stable equilibrium under the load that was asked for."""
 
 
+class AccuracyError(AvatarError):
+    """A budget of error and time that cannot be met, or was never measured."""
+
+
 class SceneError(AvatarError):
     """A scene asks for what does not exist, does not fit together or lies out of range."""

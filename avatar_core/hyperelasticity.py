@@ -26,6 +26,8 @@ from avatar_core.mesh import TetMesh
 # Four points, one for each coefficient of the linear F of an element, so that nothing but a rigid
 # motion is free of energy; exact for the stiffness at rest.
 _QUADRATURE_DEGREE = 2
+# Corners of the reference element: a strain that is linear in an element is extreme there.
+_CORNERS = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 class Hyperelasticity:
@@ -57,15 +59,12 @@ class Hyperelasticity:
             raise MaterialError("an organ without a clamp has no equilibrium; clamp some faces")
         self.mesh, self.material = mesh, material
         self.linear = Elasticity(mesh, material.linear, clamped, "P2")
-        basis = Basis(
-            MeshTet(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)),
-            ElementTetP2(),
-            intorder=_QUADRATURE_DEGREE,
-        )
+        tets = MeshTet(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T))
+        basis = Basis(tets, ElementTetP2(), intorder=_QUADRATURE_DEGREE)
         self.nodes = np.ascontiguousarray(basis.element_dofs.T)  # as Elasticity numbers them
-        gradients = np.stack([shape[0].grad for shape in basis.basis])  # (10, 3, element, point)
-        self.gradients = np.ascontiguousarray(gradients.transpose(2, 3, 0, 1))
-        self.volumes = basis.dx
+        self.gradients, self.volumes = _gradients(basis), basis.dx
+        corners = Basis(tets, ElementTetP2(), quadrature=(_CORNERS, np.full(4, 1.0 / 24.0)))
+        self._corner_gradients = _gradients(corners)
 
     @property
     def n_nodes(self) -> int:
@@ -81,15 +80,20 @@ class Hyperelasticity:
 
     def deformation_gradient(self, displacement: np.ndarray) -> np.ndarray:
         """F = I + grad u at the quadrature points, shape (n_tets, 4, 3, 3)."""
+        return self._deformation_gradient(displacement, self.gradients)
+
+    def _deformation_gradient(self, displacement: np.ndarray, gradients: np.ndarray) -> np.ndarray:
         local = displacement.reshape(-1, 3)[self.nodes]
-        return np.eye(3) + local.transpose(0, 2, 1)[:, None] @ self.gradients
+        return np.eye(3) + local.transpose(0, 2, 1)[:, None] @ gradients
 
     def min_det(self, displacement: np.ndarray) -> float:
-        """Smallest det F over the quadrature points; negative where an element is inverted."""
-        return float(determinant(self.deformation_gradient(displacement)).min())
+        """Smallest det F over quadrature points and corners; negative where one is inverted."""
+        inside = determinant(self.deformation_gradient(displacement)).min()
+        corners = self._deformation_gradient(displacement, self._corner_gradients)
+        return float(min(inside, determinant(corners).min()))
 
     def energy(self, displacement: np.ndarray) -> float:
-        """Stored energy int psi dx [J]; infinite where an element is inverted."""
+        """Stored energy int psi dx [J]; infinite where a quadrature point is inverted."""
         F = self.deformation_gradient(displacement)
         if determinant(F).min() <= 0.0:
             return float("inf")
@@ -149,6 +153,12 @@ class Hyperelasticity:
         indptr = np.searchsorted(entries, n * np.arange(n + 1))
         slot = slot.reshape(low.shape).astype(np.int32)
         return (entries % n).astype(np.int32), indptr.astype(np.int32), slot
+
+
+def _gradients(basis: Basis) -> np.ndarray:
+    """Gradients of the shape functions at its points, shape (n_tets, n_points, 10, 3) [1/m]."""
+    gradients = np.stack([shape[0].grad for shape in basis.basis])  # (10, 3, element, point)
+    return np.ascontiguousarray(gradients.transpose(2, 3, 0, 1))
 
 
 @njit(cache=True)

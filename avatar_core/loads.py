@@ -123,16 +123,16 @@ def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = N
     Raises
     ------
     MeshError
-        If the patch radius is not a length that the surface can resolve.
+        If the patch radius is not a length that the surface can resolve, or no face has room.
     """
     if patch_radius is None:
         patch_radius = default_patch_radius(mesh, regions)
-    if not 0.2 * mesh.mean_surface_edge <= patch_radius < np.inf:
-        raise MeshError(
-            f"a patch of radius {patch_radius:g} m cannot be resolved by surface edges of "
-            f"{mesh.mean_surface_edge:.2g} m; refine the mesh or take a radius above 12 mm"
-        )
     faces = _open_faces(mesh, mesh.boundary_faces[regions.accessible], patch_radius)
+    if len(faces) == 0:
+        raise MeshError(
+            f"a patch of radius {patch_radius:g} m reaches around the organ, wherever it presses; "
+            "take a smaller radius (12e-3: 12 mm)"
+        )
     vertices, corner = np.unique(faces, return_inverse=True)
     corner = corner.reshape(-1, 3)
     a, b = np.unique(np.sort(corner[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0).T
@@ -199,7 +199,7 @@ def patch_loads(elasticity: Elasticity, centers: np.ndarray, radius: float) -> s
     Raises
     ------
     MeshError
-        If a patch meets no quadrature point of the surface.
+        If the surface cannot resolve the radius, or a patch meets no point of it.
     """
     points = _surface_points(elasticity.mesh, radius)
     profile = _bump(points, centers, radius).tocoo()
@@ -211,6 +211,21 @@ def patch_loads(elasticity: Elasticity, centers: np.ndarray, radius: float) -> s
         raise MeshError(f"a patch of radius {radius:g} m holds no surface; enlarge it")
     scalar = sp.diags(1.0 / total) @ profile @ _trace(elasticity, points)
     return sp.kron(scalar, sp.identity(3), format="csr").T.tocsr()
+
+
+def _require_resolved(mesh: TetMesh, radius: float) -> None:
+    """Raise MeshError unless a patch is larger than the faces are fine, smaller than the organ."""
+    if not 0.2 * mesh.mean_surface_edge <= radius < np.inf:
+        raise MeshError(
+            f"a patch of radius {radius:g} m cannot be resolved by surface edges of "
+            f"{mesh.mean_surface_edge:.2g} m; refine the mesh or take a radius above 12 mm"
+        )
+    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    if radius >= diagonal:  # all of the surface, whose mean normal is zero
+        raise MeshError(
+            f"a patch of radius {radius:g} m is larger than the organ of {diagonal:.2g} m; "
+            "take a smaller radius (12e-3: 12 mm)"
+        )
 
 
 @dataclass(frozen=True)
@@ -227,6 +242,7 @@ class _SurfacePoints:
 
 
 def _surface_points(mesh: TetMesh, radius: float) -> _SurfacePoints:
+    _require_resolved(mesh, radius)
     pieces = max(1, int(np.ceil(1.5 * mesh.mean_surface_edge / radius)))
     barycentric, weight = _subdivided_rule(pieces)
     corners = mesh.vertices[mesh.boundary_faces]

@@ -89,6 +89,11 @@ class TetMesh:
         quarter = np.repeat(self.tet_volumes / 4.0, 4)
         return np.bincount(self.tets.ravel(), weights=quarter, minlength=len(self.vertices))
 
+    @cached_property
+    def pieces(self) -> np.ndarray:
+        """Number of the piece, hanging together by faces, of each element, shape (n_tets,)."""
+        return _face_components(self.tets)
+
     @property
     def volume(self) -> float:
         """Volume of the organ [m^3]."""
@@ -246,13 +251,17 @@ def _own_interrupt() -> Iterator[None]:
 
 def _largest_component(tets: np.ndarray) -> np.ndarray:
     """Elements of the largest piece that hangs together by faces."""
+    label = _face_components(tets)
+    return tets[label == np.bincount(label).argmax()]
+
+
+def _face_components(tets: np.ndarray) -> np.ndarray:
     faces = np.sort(tets[:, _TET_FACES].reshape(-1, 3), axis=1)
     _, face_id = np.unique(faces, axis=0, return_inverse=True)
     face_id = face_id.ravel()
     owner = np.repeat(np.arange(len(tets)), 4)
     incidence = sp.csr_matrix((np.ones(len(owner)), (owner, face_id)))
-    _, label = connected_components(incidence @ incidence.T, directed=False)
-    return tets[label == np.bincount(label).argmax()]
+    return np.asarray(connected_components(incidence @ incidence.T, directed=False)[1])
 
 
 def regions_by_rule(

@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from avatar_core.body import LEAST_MODES, BodyResponse, body_response
 from avatar_core.build import find_modes, is_met
 from avatar_core.build_rule import BuildRule, Progress, silent
-from avatar_core.certificate import Certificate, certify, merged
+from avatar_core.certificate import Certificate, certificate_of, measured
 from avatar_core.coordinates import Coordinate, node_values, problem_at
 from avatar_core.elasticity import Elasticity
 from avatar_core.exact_response import (
@@ -305,9 +305,9 @@ def certify_range(
     found = []
     for k, point in enumerate(values):
         here = at_values(vademecum, point)
-        found.append(certify(here, problem_at(elasticity, point), n_each, seed + k))
+        found.append(measured(here, problem_at(elasticity, point), n_each, seed + k))
         progress((k + 1) * n_each)
-    return merged(found)
+    return certificate_of(vademecum, found, seed)
 
 
 def _certified_values(coordinates: Sequence[Coordinate], seed: int) -> list[dict[str, float]]:

@@ -38,11 +38,16 @@ from avatar_core.affine import AffineProblem, CanonicalField, Samples
 from avatar_core.compact import FloatArray
 from avatar_core.errors import ConvergenceError
 
+# A product that holds less of the energy than this is made of rounding errors, and those after it
+# of theirs.
+_ROUNDING = 1e-26
+
 
 class Outcome(Enum):
     """How an enrichment, or the whole decomposition, ended."""
 
     CONVERGED = "converged"
+    EXHAUSTED = "exhausted"  # the residual is rounding; nothing was added
     SWEEP_LIMIT = "sweep limit"  # accepted: the product lowers the error, less than it could
     STAGNATED = "stagnated"  # the last enrichments hardly lowered the residual
     MODE_LIMIT = "mode limit"  # the tolerance was not met with the modes allowed
@@ -94,9 +99,9 @@ class PGDSolution:
 
     @property
     def converged(self) -> bool:
-        """The tolerance was met and no enrichment had to be cut short."""
+        """The tolerance or rounding was met and no enrichment had to be cut short."""
         cut = any(step.outcome is Outcome.SWEEP_LIMIT for step in self.history)
-        return self.outcome is Outcome.CONVERGED and not cut
+        return self.outcome in (Outcome.CONVERGED, Outcome.EXHAUSTED) and not cut
 
 
 def solve_pgd(
@@ -120,6 +125,8 @@ def solve_pgd(
     history: list[Enrichment] = []
     while len(history) < rule.max_modes:
         product, outcome, sweeps, change = _enrich(expansion, rule)
+        if product is None:
+            return PGDSolution(expansion.field, Outcome.EXHAUSTED, tuple(history))
         expansion.append(product)
         if rule.update:
             expansion.update()
@@ -143,20 +150,36 @@ def _stagnated(history: list[Enrichment], rule: PGDRule) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Product:
-    """R S prod_d P^d with unit S and P^d, and the rows R . K_q X_k (last: R . K_q R)."""
+    """R S prod_d P^d with unit P^d, the rows R . K_q X_k (last: R . K_q R), and its energy."""
 
     space: FloatArray
     load: FloatArray
     parameters: tuple[FloatArray, ...]
     rows: FloatArray  # (n_terms, rank + 1)
+    energy: float
 
 
-def _enrich(expansion: _Expansion, rule: PGDRule) -> tuple[_Product, Outcome, int, float]:
-    """Alternating directions from a random load function and constant parameters."""
+def _enrich(expansion: _Expansion, rule: PGDRule) -> tuple[_Product | None, Outcome, int, float]:
+    """Alternating directions from a random load function and constant parameters.
+
+    Where constants see nothing of the residual, its mean being zero, random parameters may.
+    """
     problem = expansion.problem
     rng = np.random.default_rng(expansion.field.rank)
     load = _unit(rng.standard_normal(len(problem.load_weights)), problem.load_weights)
-    parameters = tuple(_unit(np.ones(len(w)), w) for w in problem.weights)
+    constant = tuple(_unit(np.ones(len(w)), w) for w in problem.weights)
+    found = _alternate(expansion, rule, load, constant)
+    if found[0] is None:
+        anything = tuple(_unit(rng.standard_normal(len(w)), w) for w in problem.weights)
+        found = _alternate(expansion, rule, load, anything)
+    return found
+
+
+def _alternate(
+    expansion: _Expansion, rule: PGDRule, load: FloatArray, parameters: tuple[FloatArray, ...]
+) -> tuple[_Product | None, Outcome, int, float]:
+    """Sweeps from a start; no product if what is left is rounding."""
+    problem = expansion.problem
     product: _Product | None = None
     change = np.inf
     for sweep in range(1, rule.max_sweeps + 1):
@@ -164,13 +187,19 @@ def _enrich(expansion: _Expansion, rule: PGDRule) -> tuple[_Product, Outcome, in
         start = None if before is None else before.space
         space = expansion.space_step(load, parameters, rule.solve_tolerance, start)
         rows = expansion.rows(space)
+        stiffness = float(rows[:, -1] @ expansion.couplings(parameters)[0])
+        if not stiffness > 0.0:
+            return None, Outcome.EXHAUSTED, sweep, 0.0
         amplitudes = expansion.load_step(space, rows, parameters)
+        size = float(np.sqrt(problem.load_weights @ amplitudes**2))
+        energy = size**2 * stiffness
+        if energy <= _ROUNDING * expansion.largest:
+            return None, Outcome.EXHAUSTED, sweep, 0.0
         load = _unit(amplitudes, problem.load_weights)
         for d in range(len(parameters)):
             found = expansion.parameter_step(d, space, rows, load, parameters)
             parameters = (*parameters[:d], _unit(found, problem.weights[d]), *parameters[d + 1 :])
-        size = float(np.sqrt(problem.load_weights @ amplitudes**2))
-        product = _Product(space, size * load, parameters, rows)
+        product = _Product(space, size * load, parameters, rows, energy)
         change = _change(problem, before, product)
         if change <= rule.sweep_tolerance:
             return product, Outcome.CONVERGED, sweep, change
@@ -204,6 +233,7 @@ class _Expansion:
 
     gram : X^T K_q X, shape (n_terms, rank, rank)
     projected : X^T F_j, shape (n_sources, rank, n_loads)
+    largest : energy of the product that held most
     """
 
     def __init__(self, problem: AffineProblem) -> None:
@@ -216,6 +246,7 @@ class _Expansion:
         )
         self.gram = np.zeros((len(problem.terms), 0, 0))
         self.projected = np.zeros((len(problem.sources), 0, n_loads))
+        self.largest = 0.0
 
     def couplings(
         self, parameters: tuple[FloatArray, ...], skipped: int | None = None
@@ -312,6 +343,7 @@ class _Expansion:
 
     def append(self, product: _Product) -> None:
         """Add a product."""
+        self.largest = max(self.largest, product.energy)
         rank, old = self.field.rank, self.gram
         self.gram = np.zeros((len(old), rank + 1, rank + 1))
         self.gram[:, :rank, :rank] = old

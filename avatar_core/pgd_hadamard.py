@@ -22,6 +22,9 @@ from avatar_core.compact import FloatArray
 from avatar_core.elasticity import Elasticity
 from avatar_core.errors import ConvergenceError
 
+# An enrichment with less energy than this, of the largest one's, is made of rounding errors.
+_ROUNDING = 1e-26
+
 
 @dataclass(frozen=True, eq=False)
 class HadamardField:
@@ -29,11 +32,13 @@ class HadamardField:
 
     space : ndarray, shape (n_nodes, 3, rank) [m]; load : ndarray, shape (n_loads, 3, rank)
     sweeps : of each enrichment, shape (rank,)
+    converged : whether they met their tolerance, or ended at the limit; shape (rank,)
     """
 
     space: FloatArray
     load: FloatArray
     sweeps: tuple[int, ...]
+    converged: tuple[bool, ...]
 
     def evaluate(self, rank: int | None = None) -> FloatArray:
         """The field with the first modes, shape (3 n_nodes, n_loads)."""
@@ -54,22 +59,35 @@ def solve_hadamard(
     Parameters
     ----------
     loads : sparse, shape (3 n_nodes, n_loads)
+    n_modes : at most, as it stops where only rounding is left
 
     Raises
     ------
     ConvergenceError
-        If a linear system is not solved.
+        If the right-hand side is zero, or a linear system is not solved.
     """
     state = _State(elasticity, loads)
-    sweeps = []
+    ends: list[tuple[int, bool]] = []
+    largest = 0.0
     for _ in range(n_modes):
-        sweeps.append(_enrich(state, max_sweeps, sweep_tolerance))
-        progress(len(sweeps))
-    return HadamardField(np.stack(state.space, axis=2), np.stack(state.load, axis=2), tuple(sweeps))
+        space, load, n_sweeps, enough = _enrich(state, max_sweeps, sweep_tolerance)
+        energy = state.energy(space, load)
+        if energy <= _ROUNDING * largest:
+            break
+        largest = max(largest, energy)
+        state.append(space, load)
+        ends.append((n_sweeps, enough))
+        progress(len(ends))
+    sweeps, converged = zip(*ends, strict=True)
+    return HadamardField(
+        np.stack(state.space, axis=2), np.stack(state.load, axis=2), sweeps, converged
+    )
 
 
-def _enrich(state: _State, max_sweeps: int, tolerance: float) -> int:
-    """One R o S; the number of sweeps it took."""
+def _enrich(
+    state: _State, max_sweeps: int, tolerance: float
+) -> tuple[FloatArray, FloatArray, int, bool]:
+    """One R o S, the number of sweeps it took, and whether that was enough."""
     rng = np.random.default_rng(len(state.space))
     load: FloatArray = rng.standard_normal((state.n_loads, 3))
     before: FloatArray | None = None
@@ -81,13 +99,12 @@ def _enrich(state: _State, max_sweeps: int, tolerance: float) -> int:
         if before is not None:
             change = np.linalg.norm(space - before) / np.linalg.norm(space)
             if change < tolerance:
-                break
+                return space, load, sweep, True
         size = np.linalg.norm(load, axis=0)
         size[size == 0.0] = 1.0
         load = load / size
         before = space * size
-    state.append(space, load)
-    return sweep
+    return space, load, sweep, False
 
 
 class _State:
@@ -98,6 +115,8 @@ class _State:
         stiffness = elasticity.stiffness
         self._blocks = [[stiffness[c::3, d::3].tocsr() for d in range(3)] for c in range(3)]
         self._force = loads.toarray().reshape(elasticity.n_nodes, 3, -1)
+        if not self._force[self._free].any():
+            raise ConvergenceError("all loads are zero: there is nothing to separate")
         self.n_loads = loads.shape[1]
         self.space: list[FloatArray] = []
         self.load: list[FloatArray] = []
@@ -147,15 +166,23 @@ class _State:
 
     def load_step(self, space: FloatArray) -> FloatArray:
         """S, a 3 x 3 system at each load, shape (n_loads, 3)."""
-        blocks = self._blocks
-        matrix = np.array(
-            [[space[:, c] @ (blocks[c][d] @ space[:, d]) for d in range(3)] for c in range(3)]
-        )
+        matrix = self._own(space)
         right = np.einsum("xc,xcs->sc", space, self._force)
         for images, known in zip(self._images, self.load, strict=True):
             coupled = np.array([[space[:, c] @ images[c][d] for d in range(3)] for c in range(3)])
             right -= known @ coupled.T
         return np.asarray(np.linalg.lstsq(matrix, right.T, rcond=1e-10)[0].T)
+
+    def energy(self, space: FloatArray, load: FloatArray) -> float:
+        """Of R o S, summed over the loads."""
+        return float(np.einsum("sc,cd,sd->", load, self._own(space), load))
+
+    def _own(self, space: FloatArray) -> FloatArray:
+        """R^c . K_cd R^d, shape (3, 3)."""
+        blocks = self._blocks
+        return np.array(
+            [[space[:, c] @ (blocks[c][d] @ space[:, d]) for d in range(3)] for c in range(3)]
+        )
 
     def append(self, space: FloatArray, load: FloatArray) -> None:
         """Keep R o S."""

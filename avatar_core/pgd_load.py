@@ -204,8 +204,21 @@ def _enrich(expansion: _Expansion, rule: PGDRule) -> EnrichmentReport:
         change = abs(captured - before) / captured
         if change <= rule.sweep_tolerance:
             status = EnrichmentStatus.CONVERGED
-    modes = expansion.append(space)
+    modes = expansion.append(_above_rounding(space, load, problem.weights, rounding))
     return EnrichmentReport(status, modes, sweeps, change, expansion.error)
+
+
+def _above_rounding(
+    space: np.ndarray, load: np.ndarray, weights: np.ndarray, rounding: float
+) -> np.ndarray:
+    """The combinations of a block's pairs that capture more energy than rounding does.
+
+    A block may ask for more than is left; what it then holds beside that is noise.
+    """
+    energy, mixing = np.linalg.eigh(load.T @ (weights[:, None] * load))
+    if energy[0] > rounding:
+        return space
+    return space @ mixing[:, energy > min(rounding, 0.5 * energy[-1])]
 
 
 def _start(expansion: _Expansion, block: int) -> np.ndarray:

@@ -72,6 +72,18 @@ def in_cell(values, cell, gradient):  # type: ignore[no-untyped-def]
     return value
 
 
+@inlined
+def value_in_cell(values, cell):  # type: ignore[no-untyped-def]
+    """Value of a sampled field; NaN where a sample is."""
+    (nx, ny, nz), (wx, wy, wz), _ = cell
+    value = 0.0
+    for i in range(3):
+        for j in range(3):
+            v0, v1, v2 = _line(values, nx + i, ny + j, nz)
+            value += wx[i] * wy[j] * (wz[0] * v0 + wz[1] * v1 + wz[2] * v2)
+    return value
+
+
 @fast
 def second_derivatives(values, cell, spacing, hessian):  # type: ignore[no-untyped-def]
     """Second derivatives [1/m^2] of a sampled field, into (3, 3)."""

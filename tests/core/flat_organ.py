@@ -1,12 +1,12 @@
-"""An organ that is all flat: one load position, the same response everywhere, known by hand.
+"""An organ that is all flat, or a ball: one load position, the same response everywhere.
 
-phi = z; the patch answers with the compliance C = far + near in every direction, so that contact,
-friction and relaxation have closed forms.
+phi = z, or |x| - R; the patch answers with the compliance C = far + near in every direction, so
+that contact, friction and relaxation have closed forms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -22,22 +22,44 @@ COMPLIANCE = FAR + NEAR
 RADIUS = 5e-3
 
 
-def flat_organ(effects: Sequence[Effect] = (), period: float = 1e-3) -> ContactModel:
+BALL = 40e-3  # radius of the ball [m]
+
+
+def flat_organ(
+    effects: Sequence[Effect] = (), period: float = 1e-3, compliance: float = COMPLIANCE
+) -> ContactModel:
     """The contact model of the flat organ, one tool."""
-    shape, spacing = (41, 41, 21), 3e-3
-    origin = np.array([-60e-3, -60e-3, -30e-3])
-    z = origin[2] + spacing * np.arange(shape[2])
-    single = np.float32
+    return _organ((41, 41, 21), lambda x, y, z: z + 0 * x + 0 * y, effects, period, compliance)
+
+
+def ball_organ(compliance: float = COMPLIANCE) -> ContactModel:
+    """The contact model of the ball, one tool."""
+    return _organ(
+        (41, 41, 41), lambda x, y, z: np.sqrt(x**2 + y**2 + z**2) - BALL, (), 1e-3, compliance
+    )
+
+
+def _organ(
+    shape: tuple[int, int, int],
+    phi: Callable[..., np.ndarray],
+    effects: Sequence[Effect],
+    period: float,
+    compliance: float,
+) -> ContactModel:
+    spacing, single = 3e-3, np.float32
+    origin = -0.5 * spacing * (np.array(shape) - 1)
+    grid = [o + spacing * np.arange(n) for o, n in zip(origin, shape, strict=True)]
+    far, near = compliance * FAR / COMPLIANCE, compliance * NEAR / COMPLIANCE
     # weights are sums of splines: a row for every grid point, all carried by the one position
     load = np.zeros((1, 3, LANES), single)
-    load[0, :, :3] = np.sqrt(FAR) * np.eye(3)
+    load[0, :, :3] = np.sqrt(far) * np.eye(3)
     blocks = LocalBlocks(
-        np.array([0, 1]), np.zeros(1, np.int32), (NEAR * np.eye(3, dtype=single))[None]
+        np.array([0, 1]), np.zeros(1, np.int32), (near * np.eye(3, dtype=single))[None]
     )
     start, slot = hash_rows(blocks)
-    gamma = float((load[0, 2] ** 2).sum()) + float(single(NEAR))
+    gamma = float((load[0, 2] ** 2).sum()) + float(single(near))
     arrays = ModelArrays(
-        distance=np.broadcast_to(z, shape).astype(single).copy(),
+        distance=phi(*np.meshgrid(*grid, indexing="ij")).astype(single),
         access=np.ones(shape, single),
         origin=origin,
         spacing=np.array([spacing]),
@@ -45,6 +67,7 @@ def flat_organ(effects: Sequence[Effect] = (), period: float = 1e-3) -> ContactM
         carrier=np.zeros((1, 3), np.int32),
         share=np.array([[1.0, 0.0, 0.0]], single),
         self_compliance=np.full(shape, gamma, single),
+        force_error=np.zeros(shape, single),
         position=np.zeros((1, 3)),
         load=load,
         contact_start=start,

@@ -1,0 +1,113 @@
+"""A soft box for large deformation, and what is asked of every path through it: which steps were
+taken, whether an element turned over, whether the work of the force is stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from avatar_core.equilibrium import NewtonRule, State, _DepthControl, _march, _Newton
+from avatar_core.errors import EquilibriumError
+from avatar_core.hyperelasticity import Hyperelasticity
+from avatar_core.materials import HyperelasticMaterial
+from tests.core.conftest import box_mesh, box_regions
+
+LENGTH = 0.1  # [m]
+
+
+def box(material: HyperelasticMaterial, n: int = 2) -> Hyperelasticity:
+    mesh = box_mesh(n, 3 * (LENGTH,))
+    return Hyperelasticity(mesh, material, box_regions(mesh).clamped)
+
+
+def nodes_of(problem: Hyperelasticity) -> np.ndarray:
+    """Node positions, shape (n_nodes, 3) [m]."""
+    vertices, edges = problem.mesh.vertices, problem.linear._skfem_mesh.edges.T
+    return np.concatenate([vertices, vertices[edges].mean(axis=1)])
+
+
+def stretched(problem: Hyperelasticity, s: float) -> np.ndarray:
+    """Displacement of y -> s y."""
+    return (nodes_of(problem) * [0.0, s - 1.0, 0.0]).ravel()
+
+
+def held(problem: Hyperelasticity, dofs: np.ndarray) -> np.ndarray:
+    """A unit load for each of these degrees of freedom, shape (3 n_nodes, n)."""
+    unit = np.zeros((3 * problem.n_nodes, len(dofs)))
+    unit[dofs, np.arange(len(dofs))] = 1.0
+    return unit
+
+
+def followed(
+    problem: Hyperelasticity, loads: np.ndarray, motions: Sequence[np.ndarray]
+) -> Iterator[State]:
+    """States after one imposed motion after the other; press starts from rest each time."""
+    displacement = np.zeros(3 * problem.n_nodes)
+    for motion in motions:
+        newton = _DepthControl(problem, loads[problem.free], motion, NewtonRule())
+        newton.rest = replace(newton.rest, displacement=displacement)
+        state = next(_march(newton, [1.0]))
+        displacement = state.displacement
+        yield state
+
+
+@contextmanager
+def accepted_steps() -> Iterator[list[State]]:
+    """Every step that Newton's method accepts, not only those that are returned."""
+    states: list[State] = []
+    advance = _Newton.advance
+
+    def recorded(self: _Newton, state: State, aim: float) -> State:
+        states.append(advance(self, state, aim))
+        return states[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_Newton, "advance", recorded)
+        yield states
+
+
+def least_det(problem: Hyperelasticity, displacement: np.ndarray) -> float:
+    """Smallest det F at quadrature points and corners, not by the code's own formulas.
+
+    Along the edge from corner i to j, x = X + u changes by 4 x_ij - 3 x_i - x_j at i.
+    """
+    inside = np.linalg.det(problem.deformation_gradient(displacement)).min()
+    X, number = nodes_of(problem), np.zeros((4, 4), int)
+    for column, (i, j) in enumerate([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)], start=4):
+        number[i, j] = number[j, i] = column
+    x, corner = X + displacement.reshape(-1, 3), [inside]
+    for i in range(4):
+        others = [j for j in range(4) if j != i]
+        end = problem.nodes[:, others]
+        start, middle = problem.nodes[:, [i]], problem.nodes[:, number[i, others]]
+        bent = np.linalg.det(4.0 * x[middle] - 3.0 * x[start] - x[end])
+        corner.append((bent / np.linalg.det(X[end] - X[start])).min())
+    return float(min(corner))
+
+
+def stored_and_done(depths: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray, float]:
+    """Work of the force up to each depth, by a spline, and how wrong that may be.
+
+    As far off as every second state would be, which is an upper bound for a rule of fourth order.
+    """
+    work = CubicSpline(depths, forces).antiderivative()(depths)
+    kept = np.unique([0, *range(len(depths) - 1, 0, -2)])
+    coarse = CubicSpline(depths[kept], forces[kept]).antiderivative()(depths[kept])
+    return work, float(np.abs(coarse - work[kept]).max())
+
+
+def carried(states: Iterator[State]) -> tuple[list[State], str]:
+    """The states up to where equilibrium is lost, and what is said then; "" if it is not."""
+    found: list[State] = []
+    try:
+        found.extend(states)
+    except EquilibriumError as error:
+        assert "\n" not in str(error)
+        return found, str(error)
+    return found, ""
