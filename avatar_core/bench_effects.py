@@ -44,7 +44,8 @@ N_STEPS = 1500
 _WARM = 200  # steps until the caches are
 
 # One tool each, but where there must be two; the breath is too small to lift the organ off the tip.
-CASES: tuple[tuple[str, int, tuple[Effect, ...]], ...] = (
+Case = tuple[str, int, tuple[Effect, ...]]  # name, tools, effects
+CASES: tuple[Case, ...] = (
     ("large_deformation", 1, (LargeDeformationEffect(),)),
     ("friction", 1, (Friction(),)),
     ("viscoelasticity", 1, (Viscoelasticity((0.3, 0.25), (0.5, 8.0)),)),
@@ -111,15 +112,8 @@ def run_effects_bench(
     ----------
     fused : the step fused by hand, jitted; None leaves ``bare_ratio`` out
     """
-    linear = replace(vademecum, large=None)
-    progress("bare")
-    bare = prepare(linear, (SPHERE,), cloud="volume", effects=())
-    path = {n: tool_paths(linear, n, N_STEPS) for n in (1, 2)}
-    rows = [_row("bare", bare, bare, path[1], path[1])]
-    for name, n_tools, effects in (*CASES, ("everything", 2, EVERYTHING)):
-        progress(name)
-        model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume", effects=effects)
-        rows.append(_row(name, model, bare, path[n_tools], path[1]))
+    bare, path = _bare(vademecum)
+    rows = effect_rows(vademecum, (*CASES, ("everything", 2, EVERYTHING)), progress)
     summary = {
         "worst_single_ratio": max(row.ratio for row in rows[1:-1]),
         "everything_p99_us": rows[-1].p99_us,
@@ -128,6 +122,27 @@ def run_effects_bench(
         progress("fused by hand")
         summary = {"bare_ratio": _fused_ratio(bare, fused, path[1]), **summary}
     return rows, summary
+
+
+def effect_rows(
+    vademecum: Vademecum, cases: Sequence[Case], progress: Callable[[str], None] = lambda name: None
+) -> list[EffectRow]:
+    """The bare scene, then each case against it."""
+    progress("bare")
+    bare, path = _bare(vademecum)
+    rows = [_row("bare", bare, bare, path[1], path[1])]
+    for name, n_tools, effects in cases:
+        progress(name)
+        model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume", effects=effects)
+        rows.append(_row(name, model, bare, path[n_tools], path[1]))
+    return rows
+
+
+def _bare(vademecum: Vademecum) -> tuple[ContactModel, dict[int, np.ndarray]]:
+    """The scene without effects, and slides of one and two tools."""
+    linear = replace(vademecum, large=None)
+    bare = prepare(linear, (SPHERE,), cloud="volume", effects=())
+    return bare, {n: tool_paths(linear, n, N_STEPS) for n in (1, 2)}
 
 
 def _row(

@@ -1,20 +1,25 @@
 """How wrong a vademecum is, on loads that it has never seen, and what it cost.
 
 The truth is the full finite element solution on the same mesh. Loads are patches centred at face
-centroids, which no part of the build uses, in three directions.
+centroids, which no part of the build uses, in three directions; what a tip feels is measured
+anywhere on the faces.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from avatar_core.accuracy import AccuracyCurve
+from avatar_core.accuracy_curve import DisplayErrors, curve_of
+from avatar_core.force_error import ForceError, calibrated
 from avatar_core.loads import patch_loads, patch_normals
 from avatar_core.splines import evaluate
 from avatar_core.tip_response import make_tip_response
+from avatar_core.unseen_contacts import HEIGHTS, draw_contacts
 
 if TYPE_CHECKING:
     from avatar_core.elasticity import Elasticity
@@ -22,9 +27,6 @@ if TYPE_CHECKING:
     from avatar_core.vademecum import Vademecum
 
 _BATCH = 40  # load positions solved at once
-_TIP_RADIUS = 2e-3  # [m]
-_MEANS = ("l2_mean", "contact_mean", "force_mean", "felt_mean")
-_WORST = ("l2_worst", "contact_worst", "force_worst", "felt_worst", "vertex_contact_worst")
 
 
 @dataclass(frozen=True)
@@ -34,12 +36,14 @@ class Certificate:
     l2 : |u - u_FE| / |u_FE| over all vertices, mass-weighted, each load and direction
     contact : |C - C_FE|_F / |C_FE|_F of the 3 x 3 compliance of the loaded patch
     force : |F / F_FE - 1| of the normal force for an imposed normal indentation
-    felt : the same as a 2 mm tip feels it when it touches, through the compliance that the
-        contact step smooths so that no edge of the mesh is felt
+    felt : the same as a tip feels it anywhere on the accessible faces, through the compliance that
+        the contact step smooths so that no edge of the mesh is felt
     vertex_contact_worst : contact error at load positions of the build, on fresh solves
     n_loads : unseen load positions; ``seed`` draws them
     build_cpu_seconds : user + system time of everything, meshing and this certificate included
     mesh_l2, mesh_contact : change of the reference when the mesh is refined once (NaN: not asked)
+    force_error : how wrong the force at a place may be, calibrated on the same loads
+    curve : the same errors for displacements that are shown less finely, and what a step takes
     """
 
     l2_mean: float
@@ -57,6 +61,8 @@ class Certificate:
     build_cpu_seconds: float = float("nan")
     mesh_l2: float = float("nan")
     mesh_contact: float = float("nan")
+    force_error: ForceError = field(default_factory=ForceError)
+    curve: AccuracyCurve | None = None
 
     @classmethod
     def unknown(cls) -> Certificate:
@@ -82,77 +88,115 @@ def certify(
     seed : of the random choice
     progress : called with the number of positions done so far
     """
+    errors = measured(vademecum, elasticity, n_loads, seed, progress)
+    return certificate_of(vademecum, [errors], seed)
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenErrors:
+    """Relative errors, a row for each unseen load; see :class:`Certificate`.
+
+    l2 (n, 3); contact, force, felt (n,); smoothing (n,), what smoothing changed of the compliance
+    that is felt; shown (n_details, 3 n), of the displacement as it would be shown; vertex_contact
+    (m,), at load positions of the build
+    """
+
+    l2: np.ndarray
+    contact: np.ndarray
+    force: np.ndarray
+    felt: np.ndarray
+    smoothing: np.ndarray
+    shown: np.ndarray
+    vertex_contact: np.ndarray
+
+
+def measured(
+    vademecum: Vademecum,
+    elasticity: Elasticity,
+    n_loads: int,
+    seed: int,
+    progress: Callable[[int], None] | None = None,
+) -> UnseenErrors:
+    """The errors that :func:`certify` sums up."""
     surface = vademecum.surface
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(len(surface.corners))[:n_loads]
     normals = patch_normals(elasticity.mesh, surface.centroids, surface.patch_radius)
-    felt_compliance = _FeltCompliance(vademecum)
-    l2, contact, force, felt = [], [], [], []
+    display = DisplayErrors(vademecum)
+    l2, shown, contact, force = [], [], [], []
     for batch in np.array_split(chosen, max(1, len(chosen) // _BATCH)):
         truth, compliance = _reference(elasticity, surface.centroids[batch], vademecum)
         for k, triangle in enumerate(batch):
-            normal = normals[triangle]
+            n, exact = normals[triangle], compliance[k]
             here = _at_centroid(surface, triangle)
             l2.append(_l2(vademecum, vademecum.displacement(*here), truth[k]))
+            shown.append(display(*here, truth[k]))
             estimate = vademecum.compliance(*here)
-            contact.append(_frobenius(estimate, compliance[k]))
-            force.append(abs(normal @ compliance[k] @ normal / (normal @ estimate @ normal) - 1))
-            felt.append(abs(normal @ compliance[k] @ normal / felt_compliance(triangle) - 1))
+            contact.append(_frobenius(estimate, exact))
+            force.append(abs((n @ exact @ n) / (n @ estimate @ n) - 1.0))
         if progress is not None:
-            progress(len(contact))
-    return Certificate(
-        l2_mean=float(np.mean(l2)),
-        l2_worst=float(np.max(l2)),
-        contact_mean=float(np.mean(contact)),
-        contact_worst=float(np.max(contact)),
-        force_mean=float(np.mean(force)),
-        force_worst=float(np.max(force)),
-        felt_mean=float(np.mean(felt)),
-        felt_worst=float(np.max(felt)),
-        vertex_contact_worst=_vertex_contact(vademecum, elasticity, rng),
-        n_loads=len(chosen),
-        seed=seed,
-        modes=vademecum.far.rank,
+            progress(len(l2))
+    felt, smoothing = _felt(vademecum, elasticity, len(chosen), seed)
+    return UnseenErrors(
+        np.array(l2),
+        np.array(contact),
+        np.array(force),
+        felt,
+        smoothing,
+        np.concatenate(shown, axis=1),
+        _vertex_contact(vademecum, elasticity, rng),
     )
 
 
-def merged(parts: Sequence[Certificate]) -> Certificate:
-    """One certificate of several equally large ones: means of the means, worst of the worst."""
+def _felt(
+    vademecum: Vademecum, elasticity: Elasticity, n: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Error of the force on tips anywhere, and what smoothing changed of the compliance, (n,)."""
+    contacts = draw_contacts(vademecum, n, seed)
+    surface, field = vademecum.surface, vademecum.tip_field
+    load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
+    response = make_tip_response(surface, field, load, vademecum.contact_near, 0.0, HEIGHTS[1])
+    slope = np.zeros(3)
+    felt, smoothing = (
+        np.array(
+            [evaluate(grid, field.origin, field.spacing[0], p, slope, np.nan) for p in contacts.tip]
+        )
+        for grid in (response.self_compliance, response.smoothing)
+    )
+    return np.abs(contacts.true_compliance(surface, elasticity) / felt - 1.0), smoothing
 
-    def mean(name: str) -> float:
-        return float(np.mean([getattr(part, name) for part in parts]))
 
-    def worst(name: str) -> float:
-        return float(np.max([getattr(part, name) for part in parts]))
+def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: int) -> Certificate:
+    """One certificate of all errors: at one choice of the coordinates, or at several."""
 
-    values: dict[str, Any] = {name: mean(name) for name in _MEANS}
-    values |= {name: worst(name) for name in _WORST}
-    return replace(parts[0], **values, n_loads=sum(part.n_loads for part in parts))
+    def all_of(name: str) -> np.ndarray:
+        return np.concatenate(
+            [getattr(part, name) for part in parts], axis=-1 if name == "shown" else 0
+        )
+
+    l2, contact, force, felt = (all_of(name) for name in ("l2", "contact", "force", "felt"))
+    return Certificate(
+        l2_mean=float(l2.mean()),
+        l2_worst=float(l2.max()),
+        contact_mean=float(contact.mean()),
+        contact_worst=float(contact.max()),
+        force_mean=float(force.mean()),
+        force_worst=float(force.max()),
+        felt_mean=float(felt.mean()),
+        felt_worst=float(felt.max()),
+        vertex_contact_worst=float(all_of("vertex_contact").max()),
+        n_loads=len(contact),
+        seed=seed,
+        modes=vademecum.far.rank,
+        force_error=calibrated(all_of("smoothing"), felt),
+        curve=curve_of(vademecum, all_of("shown"), felt),
+    )
 
 
 def _at_centroid(surface: LoadSurface, triangle: int) -> tuple[np.ndarray, np.ndarray]:
     """Load positions and weights at the centroid of an accessible face."""
     positions, weights = surface.weights(np.array([triangle]), np.full((1, 3), 1.0 / 3.0))
     return positions[0], weights[0]
-
-
-class _FeltCompliance:
-    """The compliance that a small tip feels as it touches an accessible face at its centroid."""
-
-    def __init__(self, vademecum: Vademecum) -> None:
-        surface, self._field = vademecum.surface, vademecum.tip_field
-        load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
-        response = make_tip_response(
-            surface, self._field, load, vademecum.contact_near, _TIP_RADIUS, _TIP_RADIUS
-        )
-        self._values = response.self_compliance
-        self._tips = surface.centroids + _TIP_RADIUS * surface.face_normals
-
-    def __call__(self, triangle: int) -> float:
-        field, tip = self._field, self._tips[triangle]
-        return float(
-            evaluate(self._values, field.origin, field.spacing[0], tip, np.zeros(3), np.nan)
-        )
 
 
 def _reference(
@@ -179,13 +223,15 @@ def _frobenius(estimate: np.ndarray, truth: np.ndarray) -> float:
 
 def _vertex_contact(
     vademecum: Vademecum, elasticity: Elasticity, rng: np.random.Generator
-) -> float:
+) -> np.ndarray:
     surface = vademecum.surface
     some = rng.permutation(len(surface.vertices))[:_BATCH]
     _, compliance = _reference(elasticity, surface.centers[some], vademecum)
-    return max(
-        _frobenius(vademecum.compliance(np.array([i]), np.ones(1)), compliance[k])
-        for k, i in enumerate(some)
+    return np.array(
+        [
+            _frobenius(vademecum.compliance(np.array([i]), np.ones(1)), compliance[k])
+            for k, i in enumerate(some)
+        ]
     )
 
 

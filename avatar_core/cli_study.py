@@ -20,6 +20,8 @@ STUDIES = {
     "transport": "avatar_core.study_transport",
     "pgd": "avatar_core.study_pgd",
     "coordinates": "avatar_core.study_coordinates",
+    "accuracy-time": "avatar_core.study_accuracy_time",
+    "passivity": "avatar_core.study_passivity",
 }
 USAGE = 2
 

@@ -14,6 +14,8 @@ import typer
 from avatar_core.errors import AvatarError
 
 if TYPE_CHECKING:
+    from avatar_core.accuracy import AccuracyCurve, CurvePoint
+    from avatar_core.build_rule import Progress
     from avatar_core.surface import SurfaceMesh
     from avatar_core.vademecum import Vademecum
 
@@ -150,7 +152,7 @@ def vademecum(
     if warning:
         print(f"warning: {warning}", file=sys.stderr)
     with BuildBar(material != "linear") as progress:
-        built = vademecum_of(organ, options, progress)
+        built = _timed(vademecum_of(organ, options, progress), progress)
     save_vademecum(built, output)
     show_text(load_vademecum(output))
     if not built.convergence.converged:
@@ -164,6 +166,18 @@ def vademecum(
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
+def _timed(built: Vademecum, progress: Progress) -> Vademecum:
+    """The vademecum with the steps of its accuracy curve timed on this machine."""
+    from avatar_core.accuracy_timing import timed
+
+    certificate = built.certificate
+    assert certificate is not None and certificate.curve is not None
+    curve = timed(
+        built, certificate.curve, progress=lambda share: progress("time", share, math.nan)
+    )
+    return built.with_certificate(replace(certificate, curve=curve))
+
+
 def show(
     file: Annotated[Path, typer.Argument(help="a vademecum (.h5)")],
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
@@ -175,7 +189,9 @@ def show(
     if not as_json:
         show_text(v)
         return
-    certificate = {**(asdict(v.certificate) if v.certificate else {}), "bytes": v.nbytes}
+    curve = v.certificate.curve if v.certificate else None
+    certificate = asdict(replace(v.certificate, curve=None)) if v.certificate else {}
+    certificate |= {"bytes": v.nbytes}
     print(
         json.dumps(
             finite(
@@ -188,6 +204,7 @@ def show(
                     ],
                     "certificate": certificate,
                     "large": _large_summary(v),
+                    "accuracy": curve.plain() if curve else None,
                     "provenance": asdict(v.provenance),
                     "rank_errors": [asdict(error) for error in v.convergence.rank_errors],
                 }
@@ -263,12 +280,35 @@ def show_text(v: Vademecum) -> None:
     ):
         print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
     _show_large(v)
+    if c.curve is not None:
+        _show_curve(c.curve)
     print(f"  built in {c.build_cpu_seconds:.0f} s of CPU time", end="")
     tolerance = v.convergence.tolerance
     state = "converged" if info.converged else "NOT CONVERGED"
     print(", interpolated" if math.isnan(tolerance) else f", {state} (tolerance {tolerance:.1%})")
     if not math.isnan(c.mesh_l2):
         print(f"  mesh refined once: displacement {c.mesh_l2:.1%}, contact {c.mesh_contact:.1%}")
+
+
+def _show_curve(curve: AccuracyCurve) -> None:
+    """Fewer modes beside all of them, and the force beside both."""
+    from avatar_core.accuracy import Detail
+
+    row = curve.like(Detail(1, "surface")).points
+    where = f", timed on {curve.machine}" if curve.machine else ", not timed"
+    print(f"  error that 95 % of touches keep, surface shown at every step{where}")
+    for point in row[::2] if len(row) > 4 else row:
+        _show_point(point)
+    if row[-1] not in row[::2]:
+        _show_point(row[-1])
+    print(f"    {'force, with any number of modes':38s} {row[-1].force:8.2%}")
+
+
+def _show_point(point: CurvePoint) -> None:
+    spent = (
+        "" if math.isnan(point.p50) else f"  {1e6 * point.p50:5.0f} us (p99 {1e6 * point.p99:.0f})"
+    )
+    print(f"    {f'{point.detail.modes} modes':38s} {point.l2:8.2%}{spent}")
 
 
 def _show_large(v: Vademecum) -> None:
@@ -318,14 +358,15 @@ def finite(value: Any) -> Any:
 class BuildBar:
     """One progress bar over the stages of a build."""
 
-    _LINEAR: ClassVar = {"mesh": 0.1, "solve": 0.4, "modes": 0.35, "certify": 0.15}
+    _LINEAR: ClassVar = {"mesh": 0.1, "solve": 0.35, "modes": 0.3, "certify": 0.15, "time": 0.1}
     _LARGE: ClassVar = {
         "mesh": 0.02,
         "solve": 0.05,
         "modes": 0.05,
         "certify": 0.03,
         "large": 0.3,
-        "push": 0.55,
+        "push": 0.5,
+        "time": 0.05,
     }
 
     def __init__(self, large: bool = False) -> None:

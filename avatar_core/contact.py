@@ -7,15 +7,16 @@ The compiled code is in :mod:`avatar_core.contact_kernels`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numba
 import numpy as np
 
 from avatar_core import contact_kernels as kernels
-from avatar_core.cloud_kernels import BLOCK
+from avatar_core.certificate import Certificate
+from avatar_core.cloud_arrays import BLOCK, Cloud, Precision, cloud_arrays
 from avatar_core.contact_kernels import ModelArrays, Out, State
 from avatar_core.effects.base import Effect
 from avatar_core.effects.large_deformation import LargeArrays, LargeDeformationEffect
@@ -38,8 +39,6 @@ from avatar_core.tip_response import MAX_STENCIL, make_tip_response, sampled_at_
 
 if TYPE_CHECKING:
     from avatar_core.vademecum import Vademecum
-
-Cloud = Literal["surface", "volume", "off"]
 
 LANES = 32  # single numbers that a vectorised loop takes at once
 TIP_RADIUS_RANGE = (2e-3, 20e-3)  # [m]
@@ -79,9 +78,10 @@ class Layout:
 
     arrays : ModelArrays
         distance, access, origin, spacing: the tip field; row, carrier, share,
-        self_compliance: the tip response on its grid; position (n_positions, 3) [m];
-        load (n_positions, 3, rank and zeros) and the contact_* blocks, found by their hash tables:
-        compliance [m/N]; softness (1,), added where access fades [m/N];
+        self_compliance: the tip response on its grid; force_error, relative, on it too;
+        position (n_positions, 3) [m]; load (n_positions, 3, rank and zeros) and the contact_*
+        blocks, found by their hash tables: compliance [m/N]; softness (1,), added where access
+        fades [m/N];
         space (n_blocks, rank, BLOCK) int16, modes of the displacement of the cloud, in parts of
         space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 6), the cloud without
         displacement [m]; tip_radius (n_tools,) [m]
@@ -127,6 +127,7 @@ class ContactModel:
         force, torque (n_tools, 3) [N, N m], of the organ on each tool about its tip (a
         frictionless sphere has no torque about its centre); status (n_tools,), of each;
         cloud (n_points, 6) float32, deformed position and displacement [m];
+        force_error (n_tools,), that one contact in ten exceeds [N], by :func:`estimate_error`;
         n_contacts (1,), then contact_tool, contact_position, contact_normal (organ to tool),
         contact_force (on the tool), contact_penetration of the active contacts
     tips : ndarray, shape (n_tools, 3), sphere centres of the present step [m]
@@ -154,6 +155,23 @@ class ContactModel:
     def nbytes(self) -> int:
         """Memory of the constant arrays [bytes]."""
         return self.layout.nbytes
+
+    @property
+    def n_modes(self) -> int:
+        """Modes of the far field that the cloud can show."""
+        return _n_far(self.layout)
+
+    @property
+    def n_shown(self) -> int:
+        """Modes of the far field that the cloud shows."""
+        return int(self.state.shown[0])
+
+    def show(self, modes: int) -> None:
+        """Show the displacement with fewer modes, or with all again, from the next step on.
+
+        The force does not change: the contact compliance keeps all modes and the near field.
+        """
+        self.state.shown[0] = min(max(modes, 0), self.n_modes)
 
     def resume(self, before: ContactModel) -> None:
         """Go on where another model of the same organ and tools is: tips in contact stay so."""
@@ -186,6 +204,8 @@ def prepare(
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
     halves: bool = False,
+    precision: Precision = "int16",
+    near: float = 1.0,
 ) -> ContactModel:
     """Lay out a vademecum for the step, and compile the step for the effects.
 
@@ -199,13 +219,16 @@ def prepare(
     effects : what is simulated; by default what the vademecum and the tools call for
     period : of the steps [s], for effects that know time
     halves : to call :func:`solve` and :func:`deform` instead of :func:`step`
+    precision : of the displacement's modes
+    near : radius of the displacement's near field over the vademecum's own, 0 to 1
 
     Raises
     ------
     ContactError, SceneError
         For radii, modes or clouds out of range; for effects that the vademecum cannot serve.
     """
-    return make_model(lay_out(vademecum, tip_radii, modes, cloud, effects, period), halves)
+    layout = lay_out(vademecum, tip_radii, modes, cloud, effects, period, precision, near)
+    return make_model(layout, halves)
 
 
 def lay_out(
@@ -215,9 +238,11 @@ def lay_out(
     cloud: Cloud = "surface",
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
+    precision: Precision = "int16",
+    near: float = 1.0,
 ) -> Layout:
     """The constant arrays of a contact model; see :func:`prepare`."""
-    _check(vademecum, tip_radii, modes, cloud)
+    _check(vademecum, tip_radii, modes, cloud, precision, near)
     if effects is None:
         effects = natural_effects(vademecum, len(tip_radii))
     for effect in effects:
@@ -228,45 +253,41 @@ def lay_out(
         )
     vademecum, mass = in_its_modes(vademecum, effects)
     surface, mesh = vademecum.surface, vademecum.mesh
-    points = {
-        "surface": mesh.surface_vertices,
-        "volume": np.arange(len(mesh.vertices)),
-        "off": np.empty(0, np.int64),
-    }[cloud]
-    rank = vademecum.far.rank if modes is None else modes
-    near, kept = _near_at(vademecum.near, points, len(mesh.vertices))
-    space = vademecum.far.space.reshape(len(mesh.vertices), 3, -1)[points, :, :rank]
     contact = vademecum.contact_near
     contact_start, contact_slot = hash_rows(contact)
     load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
     response = make_tip_response(
         surface, vademecum.tip_field, load, contact, kernels.MAX_DEPTH, max(tip_radii)
     )
+    bends = find(effects, LargeDeformationEffect) is not None
+    bent = vademecum.large if bends else None
+    shown = cloud_arrays(vademecum, modes, cloud, precision, near, bent.space if bent else None)
     large = None
-    if find(effects, LargeDeformationEffect) is not None:
-        bent = vademecum.large
-        assert bent is not None  # `require` has seen it
-        at_points = bent.space.reshape(len(mesh.vertices), 3, -1)[points]
-        space = np.concatenate([space, at_points], axis=2)
+    if bent is not None:
         values = np.vstack([bent.depth, bent.reach])
         grid = sampled_at_tip(surface, vademecum.tip_field, response, values)
-        large = LargeArrays(grid, bent.load, bent.near[:, kept])
-    modes_in_blocks, scale = _in_blocks(space)
+        kept = shown.fade > 0.0
+        fade = shown.fade[kept, None].astype(bent.near.dtype)
+        large = LargeArrays(grid, bent.load, bent.near[:, kept] * fade)
     arrays = ModelArrays(
         *vademecum.tip_field,
-        *response,
+        row=response.row,
+        carrier=response.carrier,
+        share=response.share,
+        self_compliance=response.self_compliance,
+        force_error=_force_error(vademecum, response.smoothing, bends),
         position=np.ascontiguousarray(surface.centers),
         load=_padded(load),
         contact_start=contact_start,
         contact_slot=contact_slot,
         contact_block=contact.block,
         softness=np.array([float((load**2).sum(axis=(1, 2)).mean() / 3.0)]),
-        space=modes_in_blocks,
-        space_scale=scale,
-        near_start=near.start,
-        near_target=near.target,
-        near_block=near.block,
-        rest=np.pad(mesh.vertices[points], ((0, 0), (0, 3))).astype(np.float32),
+        space=shown.space,
+        space_scale=shown.space_scale,
+        near_start=shown.near.start,
+        near_target=shown.near.target,
+        near_block=shown.near.block,
+        rest=np.pad(mesh.vertices[shown.points], ((0, 0), (0, 3))).astype(np.float32),
         tip_radius=np.array(tip_radii, float),
     )
     reach = _reach(contact, surface.centers)
@@ -281,6 +302,7 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     arrays = layout.arrays
     n_tools, n_modes = len(arrays.tip_radius), arrays.load.shape[2]
     single = np.float32
+    n_far = _n_far(layout)
     state = State(
         passage=np.zeros(n_tools, np.int64),
         force=np.zeros(n_tools),
@@ -303,12 +325,14 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
         gram=np.ones((n_tools, n_tools)),
         scale=np.ones(n_tools),
         compliance=np.zeros((n_tools, n_tools)),
+        shown=np.array([n_far], np.int64),
         amplitude=np.zeros(len(arrays.space_scale), single),
         field=np.zeros(arrays.space.shape[0] * BLOCK, single),
     )
     out = Out(
         force=np.zeros((n_tools, 3)),
         torque=np.zeros((n_tools, 3)),
+        force_error=np.zeros(n_tools),
         status=np.zeros(n_tools, np.int64),
         cloud=np.zeros((len(arrays.rest), 6), np.float32),
         n_contacts=np.zeros(1, np.int64),
@@ -320,6 +344,7 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     )
     far_away = np.full((n_tools, 3), FAR_AWAY)
     effects = _online(layout)
+    kernels.force_error(arrays, out, far_away)
     if halves:
         first = _compiled(kernels.contact_solve, arrays, state, out, far_away, *effects)
         second = _compiled(kernels.contact_deform, arrays, state, out, *for_cloud(effects))
@@ -330,6 +355,12 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     model = ContactModel(layout, state, effects, out, far_away, compiled)
     model.reset()
     return model
+
+
+def _n_far(layout: Layout) -> int:
+    """Modes of the far field that the cloud can show."""
+    large = layout.effects.large
+    return len(layout.arrays.space_scale) - (0 if large is None else large.load.shape[2])
 
 
 def _online(layout: Layout) -> Selection:
@@ -380,6 +411,15 @@ def deform(model: ContactModel) -> None:
     model.compiled.deform(model.layout.arrays, model.state, model.out, *for_cloud(model.effects))
 
 
+def estimate_error(model: ContactModel) -> None:
+    """How wrong the forces of the last step may be, into ``out.force_error`` [N].
+
+    One contact in ten exceeds it; see :mod:`avatar_core.force_error`. NaN where the vademecum was
+    not measured. Real-time safe, and apart from the step, so that forces can leave before.
+    """
+    kernels.force_error(model.layout.arrays, model.out, model.tips)
+
+
 def warm_up(n_tools: int = 1) -> None:
     """Compile the halves of a step, or read them from numba's cache, before there is a model."""
     single, double = np.float32, np.float64
@@ -394,6 +434,7 @@ def warm_up(n_tools: int = 1) -> None:
         carrier=np.zeros((0, 6), np.int32),
         share=np.zeros((0, 6), single),
         self_compliance=np.full((8, 8, 8), 1.0, single),
+        force_error=np.zeros((8, 8, 8), single),
         position=np.zeros((n, 3), double),
         load=np.zeros((n, 3, rank), single),
         contact_start=np.array([0, 2], np.int64),
@@ -434,6 +475,16 @@ def stored_energy(model: ContactModel) -> float:
     return float(energy)
 
 
+def _force_error(vademecum: Vademecum, smoothing: np.ndarray, bends: bool) -> np.ndarray:
+    """The relative error of the force on the grid of the tip field; NaN if it is not known."""
+    certificate = vademecum.certificate or Certificate.unknown()
+    bending = 0.0
+    if bends and vademecum.large is not None:
+        pushed = vademecum.large.certificate
+        bending = pushed.contact_mean if pushed else float("nan")
+    return certificate.force_error.relative(smoothing, bending)
+
+
 def _reach(near: LocalBlocks, centers: np.ndarray) -> float:
     """Longest distance between the two positions of a block [m]."""
     distance = np.linalg.norm(centers[near.position] - centers[near.target], axis=1)
@@ -445,34 +496,13 @@ def _padded(load: np.ndarray) -> np.ndarray:
     return np.pad(load, ((0, 0), (0, 0), (0, -load.shape[2] % LANES)))
 
 
-def _in_blocks(space: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Modes (n_points, 3, rank) as int16 (n_blocks, rank, BLOCK), and what one step is worth.
-
-    Half the memory of single precision, which is what the cloud waits for; rounding costs
-    1 / 65536 of each mode's peak.
-    """
-    flat = space.reshape(-1, space.shape[2])
-    scale = (np.abs(flat).max(axis=0, initial=1e-30) / 32767.0).astype(np.float32)
-    n_blocks = -(-len(flat) // BLOCK)
-    padded = np.zeros((n_blocks * BLOCK, len(scale)), np.int16)
-    padded[: len(flat)] = np.rint(flat / scale)
-    blocks = padded.reshape(n_blocks, BLOCK, len(scale)).transpose(0, 2, 1)
-    return np.ascontiguousarray(blocks), scale
-
-
-def _near_at(
-    near: LocalBlocks, points: np.ndarray, n_vertices: int
-) -> tuple[LocalBlocks, np.ndarray]:
-    """The near field at some vertices, renumbered to their order, and which blocks these are."""
-    number = np.full(n_vertices, -1, np.int32)
-    number[points] = np.arange(len(points), dtype=np.int32)
-    mask = number[near.target] >= 0
-    kept = near.kept(mask)
-    return replace(kept, target=number[kept.target]), mask
-
-
 def _check(
-    vademecum: Vademecum, tip_radii: tuple[float, ...], modes: int | None, cloud: str
+    vademecum: Vademecum,
+    tip_radii: tuple[float, ...],
+    modes: int | None,
+    cloud: str,
+    precision: str,
+    near: float,
 ) -> None:
     low, high = TIP_RADIUS_RANGE
     if not 1 <= len(tip_radii) <= kernels.MAX_TOOLS:
@@ -482,5 +512,11 @@ def _check(
             raise ContactError(f"tip radius {radius:g} m; it must lie in {low:g} to {high:g} m")
     if modes is not None and not 1 <= modes <= vademecum.far.rank:
         raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {vademecum.far.rank}")
-    if cloud not in ("surface", "volume", "off"):
-        raise ContactError(f"cloud '{cloud}' is unknown; choose surface, volume or off")
+    for name, value, known in (
+        ("cloud", cloud, get_args(Cloud)),
+        ("precision", precision, get_args(Precision)),
+    ):
+        if value not in known:
+            raise ContactError(f"{name} '{value}' is unknown; choose {', '.join(known)}")
+    if not 0.0 <= near <= 1.0:
+        raise ContactError(f"near is {near:g}; give a part of the near field's radius, 0 to 1")

@@ -34,7 +34,7 @@ from avatar_core.effects import respiration as breath
 from avatar_core.effects import several_tools as coupling
 from avatar_core.effects import viscoelasticity as relaxation
 from avatar_core.near_field import find_block
-from avatar_core.splines import cell_at, in_cell, on_grid
+from avatar_core.splines import cell_at, in_cell, on_grid, value_in_cell
 from avatar_core.step_code import entry, fast, inlined
 from avatar_core.superposition import add_superposed_force, lift_tip, superpose
 from avatar_core.tip_response import gather
@@ -67,6 +67,7 @@ ModelArrays = namedtuple(
         "carrier",
         "share",
         "self_compliance",
+        "force_error",
         "position",
         "load",
         "contact_start",
@@ -108,6 +109,7 @@ State = namedtuple(
         "gram",  # (T, T) f_t . C f_t'
         "scale",  # (T,) a_t
         "compliance",  # (T, T)
+        "shown",  # (1,) modes of the far field that the cloud shows
         "amplitude",  # (rank,) of the far field, and last of what large deformation adds
         "field",  # (n_blocks BLOCK,) displacement of the cloud, component after component
     ],
@@ -118,6 +120,7 @@ Out = namedtuple(
     [
         "force",
         "torque",
+        "force_error",
         "status",
         "cloud",
         "n_contacts",
@@ -158,6 +161,18 @@ def contact_deform(  # type: ignore[no-untyped-def]
 ):
     """Second half: the cloud under the forces of the first."""
     deform(model, state, out, reply, large, friction, memory, motion)
+
+
+@entry
+def force_error(model, out, tips):  # type: ignore[no-untyped-def]
+    """How wrong the forces of a period may be: the relative error at the tip, times the force."""
+    for t in range(tips.shape[0]):
+        force = out.force[t]
+        size = np.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+        out.force_error[t] = 0.0
+        if size > 0.0:
+            cell = cell_at(model.origin, model.spacing[0], tips[t])
+            out.force_error[t] = size * value_in_cell(model.force_error, cell)
 
 
 @inlined

@@ -1,9 +1,10 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 2.1), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 2.2), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
-``provenance``, ``convergence``, ``certificate``. Datasets:
+``provenance``, ``convergence``, ``certificate``, and from schema 2.2 ``accuracy``, its curve.
+Datasets:
 
     mesh/vertices (n_v, 3) [m]          mesh/tets (n_t, 4)
     regions/clamped, regions/accessible over the boundary faces
@@ -42,11 +43,13 @@ from typing import Any
 import h5py
 import numpy as np
 
+from avatar_core.accuracy import AccuracyCurve
 from avatar_core.body import BodyResponse
 from avatar_core.certificate import Certificate
 from avatar_core.coordinates import Coordinate
 from avatar_core.elasticity import Material
 from avatar_core.errors import AvatarError, StorageError
+from avatar_core.force_error import ForceError
 from avatar_core.hdf5 import checksum, reason, replace_file, within
 from avatar_core.large_deformation import POWERS, LargeCertificate, LargeDeformation
 from avatar_core.loads import LoadSurface
@@ -69,7 +72,7 @@ MAX_FILE_BYTES = 4 << 30
 MAX_ARRAY_BYTES = 2 << 30
 
 _JSON = ("material", "provenance", "convergence", "certificate")
-_JSON_LATER = ("coordinates", "contrast", "large")  # from schema 2.0
+_JSON_LATER = ("coordinates", "contrast", "large", "accuracy")  # from schema 2.0, the last 2.2
 
 
 def save_vademecum(vademecum: Vademecum, path: str | Path) -> None:
@@ -226,6 +229,7 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
 
 
 def _attributes(v: Vademecum) -> dict[str, str]:
+    curve = v.certificate.curve if v.certificate else None
     convergence = asdict(v.convergence)
     for report in convergence["enrichments"]:
         report["status"] = report["status"].value
@@ -238,7 +242,8 @@ def _attributes(v: Vademecum) -> dict[str, str]:
         "material": json.dumps(asdict(v.material)),
         "provenance": json.dumps(asdict(v.provenance)),
         "convergence": json.dumps(convergence),
-        "certificate": json.dumps(asdict(v.certificate) if v.certificate else None),
+        "certificate": json.dumps(_certificate_attribute(v.certificate)),
+        "accuracy": json.dumps(curve.plain() if curve else None),
         "coordinates": json.dumps(coordinates),
         "contrast": json.dumps(v.contrast),
         "large": json.dumps(_large_attribute(v.large)),
@@ -271,7 +276,7 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         tip_field=TipField(*(arrays[f"tip_field/{name}"] for name in TipField._fields)),
         convergence=_convergence(convergence),
         provenance=_provenance(provenance),
-        certificate=Certificate(**certificate) if certificate else None,
+        certificate=_certificate(certificate, json.loads(attributes.get("accuracy", "null"))),
         parametric=_parametric(arrays, attributes),
         contrast=json.loads(attributes.get("contrast", "null")),
         large=_large(arrays, attributes),
@@ -281,6 +286,20 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
 
 def _body(arrays: dict[str, np.ndarray], keys: tuple[str, str]) -> BodyResponse | None:
     return BodyResponse(*(arrays[key] for key in keys)) if keys[0] in arrays else None
+
+
+def _certificate_attribute(certificate: Certificate | None) -> dict[str, Any] | None:
+    return asdict(replace(certificate, curve=None)) if certificate else None
+
+
+def _certificate(stored: dict[str, Any] | None, curve: dict[str, Any] | None) -> Certificate | None:
+    if stored is None:
+        return None
+    values = dict(stored)
+    if "force_error" in values:
+        values["force_error"] = ForceError(**values["force_error"])
+    values["curve"] = AccuracyCurve.of_plain(curve) if curve else None
+    return Certificate(**values)
 
 
 def _large_attribute(large: LargeDeformation | None) -> dict[str, Any] | None:

@@ -78,7 +78,7 @@ def write_study(study: Study, folder: Path, seconds: float) -> tuple[Path, Path]
 def machine() -> dict[str, Value]:
     """Processor, cores, load and versions."""
     found: dict[str, Value] = {
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "load_average": os.getloadavg()[0],
         "system": platform.platform(),
@@ -163,7 +163,8 @@ def _draw(study: Study, path: Path) -> None:
     plt.close(figure)
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -6,11 +6,11 @@ folds would be felt as jumps. What a moving tip needs is therefore sampled on th
 field and evaluated by the same B-splines B_q(p), twice differentiable almost everywhere:
 
     w_j(p)   = sum_q B_q(p) w_j(s(x_q))         share of load position j, sum_j w_j = 1
-    gamma(p) = sum_q B_q(p) [K gamma_0](x_q)    gamma_0 = n_s . C(s, s) n_s at s = s(x_q)
+    gamma(p) = sum_q B_q(p) [K gamma_0](x_q)    gamma_0 = n . C(s, s) n at s = s(x_q)
 
-with n_s the normal of the patch and K the kernel of the tip field, over a fifth of the patch
-radius. gamma is the compliance that one tip feels; between tips t and t', whose normals are
-n = grad phi / |grad phi|, it is
+with n = grad phi / |grad phi| the normal that a tip presses along and K the kernel of the tip
+field, over a fifth of the patch radius. gamma is the compliance that one tip feels; between tips t
+and t' it is
 
     C_tt' = a_t a_t' f_t . C f_t',    f_t = w(p_t) n(p_t),    a_t^2 = gamma(p_t) / (f_t . C f_t),
 
@@ -35,8 +35,9 @@ MAX_STENCIL = 128  # load positions that carry one tip, at most
 
 # row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
 # 6) int32 load positions and share (n_rows, 3 or 6) float32, their weights;
-# self_compliance (nx, ny, nz) float32, gamma [m/N]
-TipResponse = namedtuple("TipResponse", ["row", "carrier", "share", "self_compliance"])
+# self_compliance, smoothing (nx, ny, nz) float32, gamma [m/N] and what smoothing changed of it,
+# K |gamma_0 / gamma - 1|
+TipResponse = namedtuple("TipResponse", ["row", "carrier", "share", "self_compliance", "smoothing"])
 
 
 def make_tip_response(
@@ -62,18 +63,31 @@ def make_tip_response(
     shell &= _dilated(field.access > 0.0)
     points = field.origin + spacing * np.argwhere(shell)
     carrier, share = closest_weights(surface, points)
-    normal = np.einsum("qi,qid->qd", share, surface.normals[carrier])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = _normals(field)[shell]
     compliance = np.zeros(shell.shape)
     compliance[shell] = _self_compliance(
         carrier, share, normal, load, near.start, near.target, near.block
     )
-    compliance = smoothed(compliance, SMOOTHING * surface.patch_radius / spacing, shell)
+    deviation = SMOOTHING * surface.patch_radius / spacing
+    smooth = smoothed(compliance, deviation, shell)
+    change = np.zeros(shell.shape)
+    change[shell] = np.abs(compliance[shell] / smooth[shell] - 1.0)
     row = np.full(shell.shape, -1, np.int32)
     row[shell] = np.arange(len(points), dtype=np.int32)
     return TipResponse(
-        row, carrier.astype(np.int32), share.astype(np.float32), compliance.astype(np.float32)
+        row,
+        carrier.astype(np.int32),
+        share.astype(np.float32),
+        smooth.astype(np.float32),
+        smoothed(change, deviation, shell).astype(np.float32),
     )
+
+
+def _normals(field: TipField) -> np.ndarray:
+    """grad phi / |grad phi| at the grid points, shape (nx, ny, nz, 3)."""
+    spacing = float(field.spacing[0])
+    slope = np.stack(np.gradient(field.distance.astype(float), spacing), axis=-1)
+    return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-3)
 
 
 def sampled_at_tip(

@@ -87,11 +87,15 @@ def natural_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
 def in_its_modes(
     vademecum: Vademecum, effects: Sequence[Effect]
 ) -> tuple[Vademecum, np.ndarray | None]:
-    """The vademecum as the effects need it, and the mass of its modes, if it swings."""
+    """The vademecum as the effects need it, and the mass of its modes, if it swings.
+
+    Modes that the body itself moves in come first, since a cloud may show only the first.
+    """
     vademecum = at_contrast(vademecum, find(effects, Tumour))
     swing = find(effects, Inertia)
     if swing is None:
-        return vademecum, None
+        hangs = find(effects, SelfWeight) is not None and vademecum.body is not None
+        return (self_weight.body_first(vademecum) if hangs else vademecum), None
     return inertia.turned_modes(vademecum, swing.density)
 
 

@@ -7,13 +7,15 @@ X^T M 1 rho g, M the mass of a unit density: one amplitude each. What relaxes ha
 from __future__ import annotations
 
 from collections import namedtuple
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from avatar_core.body import N_BODY, BodyResponse
 from avatar_core.effects.base import Effect, direction, require_body
 from avatar_core.quantities import quantity
+from avatar_core.separated import SeparatedField
 
 if TYPE_CHECKING:
     from avatar_core.vademecum import Vademecum
@@ -38,6 +40,16 @@ class SelfWeight(Effect):
 
     def require(self, vademecum: Vademecum) -> None:
         require_body(vademecum, self.name)
+
+
+def body_first(vademecum: Vademecum) -> Vademecum:
+    """The vademecum with the body's own functions, which are its last modes, before the others."""
+    far, body = vademecum.far, vademecum.body
+    assert body is not None  # `require` has seen it
+    order = np.roll(np.arange(far.rank), N_BODY)
+    turned = BodyResponse(body.mass[np.ix_(order, order)], body.weight[order])
+    far = SeparatedField(far.space[:, order], far.load[:, order])
+    return replace(vademecum, far=far, body=turned)
 
 
 WeightArrays = namedtuple("WeightArrays", ["amplitude"])  # (k,) of the modes, the organ hanging

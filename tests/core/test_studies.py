@@ -14,10 +14,12 @@ import pytest
 from avatar_core import (
     cli,
     cli_study,
+    study_accuracy_time,
     study_coordinates,
     study_grid,
     study_in_silico,
     study_leave_one_out,
+    study_passivity,
     study_pgd,
     study_samples,
 )
@@ -142,6 +144,15 @@ def test_coordinates(tmp_path: Path) -> None:
     assert summary["oblique_contact_mean"] < summary["oblique_linear_contact_mean"]
 
 
+def test_passivity(tmp_path: Path) -> None:
+    summary = checked_files(study_passivity.study(study_passivity.Plan(5, 2, 700)), tmp_path)
+    assert summary["border_error_worst"] < 0.01
+    assert summary["map_given_with_mJ"] < summary["bound_mJ_delay_2"] < 2.0
+    assert summary["hands_given_with_mJ"] < summary["bound_mJ_delay_2"]
+    assert summary["map_given_without_mJ"] > 20.0 * summary["bound_mJ_delay_2"]
+    assert summary["force_changed_stable_median"] < 0.05
+
+
 def test_samples_without_scikit_learn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sklearn.manifold", None)
     vectors = np.random.default_rng(0).standard_normal((30, 40))
@@ -250,6 +261,24 @@ def test_json_has_no_nan(tmp_path: Path) -> None:
     document = json.loads(record.read_text())
     assert document["summary"]["a"] is None
     assert document["rows"][0]["b"] == 2.0
+
+
+@pytest.mark.usefixtures("no_folder")
+@pytest.mark.long
+def test_accuracy_time(tmp_path: Path) -> None:
+    plan = study_accuracy_time.Plan(500, 60, 40, 150, (300,), (20e-3, 10e-3), 8, 3, 300)
+    found = study_accuracy_time.study(None, plan, tmp_path)
+    summary = checked_files(found, tmp_path)
+    assert summary["promise_kept_fraction"] >= 0.95
+    assert summary["force_error_coverage"] >= 0.85  # 150 contacts: 90 % less two deviations
+    assert summary["force_error_overestimate"] <= 3.0
+    assert summary["front_points"] >= 5
+    page = (tmp_path / "accuracy-time.html").read_text()
+    assert page.count("<figure>") == 7 and 'src="http' not in page  # it stands alone
+    rows = (tmp_path / "accuracy-time.csv").read_text().splitlines()
+    assert len(rows) == len(found.rows) + 1
+    methods = {row["method"] for row in found.rows}
+    assert {"SVD optimum", "dense table", "direct solve", "PCA", "nearest neighbour"} <= methods
 
 
 # --- the command ------------------------------------------------------------------------------

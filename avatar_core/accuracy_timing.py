@@ -1,0 +1,95 @@
+"""The times of an accuracy curve, measured on the machine that will keep them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from avatar_core.accuracy import AccuracyCurve, CurvePoint, Detail
+from avatar_core.contact import PERIOD, ContactModel, deform, lay_out, make_model, solve, step
+from avatar_core.effects.base import Effect
+from avatar_core.study import processor
+from avatar_core.tool_path import slide, starts_apart
+from avatar_core.vademecum import Vademecum
+
+_TIP, _DEPTH = 10e-3, 5e-3  # [m] of the slide that is timed
+_STEPS, _WARM, _ROUNDS = 300, 50, 5
+
+
+def timed(
+    vademecum: Vademecum,
+    curve: AccuracyCurve,
+    tip_radii: tuple[float, ...] = (_TIP,),
+    effects: Sequence[Effect] | None = None,
+    period: float = PERIOD,
+    halves: bool = False,
+    progress: Callable[[float], None] = lambda share: None,
+) -> AccuracyCurve:
+    """The same curve with the times of steps on this machine, all tools 5 mm deep.
+
+    halves : time :func:`avatar_core.contact.solve` and ``deform``, as a node calls them
+    """
+    paths = slides(vademecum, tip_radii)
+    points: list[CurvePoint] = []
+    for group in _same_arrays(curve):
+        first = group[0].detail
+        layout = lay_out(
+            vademecum, tip_radii, None, first.cloud, effects, period, first.precision, first.near
+        )
+        points += timed_points(make_model(layout, halves), group, paths)
+        progress(len(points) / len(curve.points))
+    return replace(curve, points=tuple(points), machine=processor())
+
+
+def timed_points(
+    model: ContactModel, points: Sequence[CurvePoint], paths: np.ndarray
+) -> list[CurvePoint]:
+    """Points that differ in modes alone, timed on a model that has all of these.
+
+    Each is timed in several rounds and its median counts: other processes disturb some.
+    """
+    found = [_timed(model, point, paths) for point in points]
+    model.show(model.n_modes)
+    model.reset()
+    return found
+
+
+def slides(vademecum: Vademecum, tip_radii: tuple[float, ...]) -> np.ndarray:
+    """Ways of tips that start far apart, 5 mm deep, shape (n, n_tools, 3) [m]."""
+    starts = starts_apart(vademecum, len(tip_radii))
+    paths = [
+        slide(vademecum, radius, min(_DEPTH, radius), _STEPS * 1e-4, position=start)
+        for radius, start in zip(tip_radii, starts, strict=True)
+    ]
+    return np.ascontiguousarray(np.stack(paths, axis=1))
+
+
+def _same_arrays(curve: AccuracyCurve) -> list[list[CurvePoint]]:
+    """Points by what they share but for the number of modes."""
+    groups: dict[Detail, list[CurvePoint]] = {}
+    for point in curve.points:
+        groups.setdefault(replace(point.detail, modes=0), []).append(point)
+    return list(groups.values())
+
+
+def _timed(model: ContactModel, point: CurvePoint, paths: np.ndarray) -> CurvePoint:
+    model.show(point.detail.modes)
+    whole = model.compiled.step is not None
+    found = []
+    for _ in range(_ROUNDS):
+        model.reset()
+        times = np.empty(len(paths))
+        for k, tips in enumerate(paths):
+            start = time.perf_counter()
+            if whole:
+                step(model, tips)
+            else:
+                solve(model, tips)
+                deform(model)
+            times[k] = time.perf_counter() - start
+        found.append((np.median(times[_WARM:]), np.quantile(times[_WARM:], 0.99)))
+    p50, p99 = np.median(found, axis=0)
+    return replace(point, p50=float(p50), p99=float(p99))

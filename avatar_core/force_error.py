@@ -1,0 +1,59 @@
+"""How wrong the force on a tip may be, said along with it.
+
+What separates the felt compliance from the true one is smoothing, which differs from place to
+place and is known, and what the interpolation between load positions leaves, which does not and is
+not. The estimate of the relative error at a place s is
+
+    e(s) = factor [ smoothing(s) + floor ],
+
+calibrated by split conformal prediction (Lei et al., JASA 113, 2018): ``factor`` is the quantile of
+|F / F_FE - 1| / [ smoothing + floor ] over unseen loads that covers the asked part of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+COVERED = 0.925  # of the contacts calibrated with, so that fresh ones keep the promise
+PROMISED = 0.9  # of all contacts
+_FLOORS = np.geomspace(2e-3, 0.2, 15)
+_WORST_OVER_MEAN = 2.06  # that 10 % of half-normal errors exceed
+
+
+@dataclass(frozen=True)
+class ForceError:
+    """The calibrated estimate; NaN: there is none."""
+
+    factor: float = float("nan")
+    floor: float = float("nan")
+
+    def relative(self, smoothing: np.ndarray, bending: float = 0.0) -> np.ndarray:
+        """Relative error that one contact in ten may exceed.
+
+        Parameters
+        ----------
+        smoothing : relative change of the compliance by smoothing, any shape
+        bending : mean relative error that large deformation adds
+        """
+        own = self.factor * (np.asarray(smoothing) + self.floor)
+        return np.asarray(own + _WORST_OVER_MEAN * bending, np.float32)
+
+
+def calibrated(smoothing: np.ndarray, error: np.ndarray) -> ForceError:
+    """Factor and floor from unseen contacts, both (n,).
+
+    The floor is that under which the errors are most likely, were they exponential.
+    """
+    n = len(error)
+    if n == 0:
+        return ForceError()
+
+    def surprise(floor: float) -> float:
+        scale = smoothing + floor
+        return float(np.log(np.mean(error / scale)) + np.mean(np.log(scale)))
+
+    floor = float(min(_FLOORS, key=surprise))
+    rank = min(int(np.ceil(COVERED * (n + 1))), n)
+    return ForceError(float(np.sort(error / (smoothing + floor))[rank - 1]), floor)

@@ -1,0 +1,251 @@
+"""Accuracy against time: the curve's promises, the choice among them, fewer modes at run time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from avatar_core.accuracy import (
+    AccuracyCurve,
+    Budget,
+    CurvePoint,
+    Detail,
+    choose,
+    upper_quantile,
+)
+from avatar_core.accuracy_timing import timed
+from avatar_core.certificate import measured
+from avatar_core.contact import estimate_error, lay_out, make_model, prepare, step
+from avatar_core.effects import SelfWeight
+from avatar_core.elasticity import Elasticity
+from avatar_core.errors import AccuracyError
+from avatar_core.force_error import PROMISED, ForceError, calibrated
+from avatar_core.study_force_error import force_errors
+from avatar_core.tool_path import palpation
+from avatar_core.vademecum import Vademecum
+
+
+def some_curve(seed: int) -> AccuracyCurve:
+    """A curve in which error and time are related only loosely."""
+    rng = np.random.default_rng(seed)
+    points = []
+    for modes, cloud in product(range(5, 50, 5), ("surface", "volume")):
+        p50 = (modes + rng.uniform(0, 30)) * 1e-6
+        error, force = rng.uniform(0.2, 1.0, 2) / modes
+        points.append(
+            CurvePoint(
+                Detail(modes, cloud), error, force, 1000 * modes, p50, p50 * rng.uniform(1, 3)
+            )
+        )
+    return AccuracyCurve(tuple(points), 600, "some machine")
+
+
+@given(
+    st.integers(0, 50),
+    st.floats(1e-3, 1.0),
+    st.floats(1e-6, 1e-3),
+    st.sampled_from(["l2", "force"]),
+)
+def test_choice_is_the_fastest_of_all_that_meet_the_budget(
+    seed: int, tolerance: float, deadline: float, quantity: str
+) -> None:
+    curve = some_curve(seed)
+    best = None
+    for point in curve.points:  # enumeration
+        error = point.l2 if quantity == "l2" else point.force
+        if error <= tolerance and point.p99 <= deadline and (best is None or point.p50 < best.p50):
+            best = point
+    budget = Budget(tolerance, deadline, quantity)  # type: ignore[arg-type]
+    if best is None:
+        with pytest.raises(AccuracyError):
+            choose(curve, budget)
+    else:
+        assert choose(curve, budget) == best
+
+
+@given(st.integers(0, 50), st.floats(1e-3, 1.0), st.floats(1.0, 10.0))
+def test_looser_tolerance_is_never_slower(seed: int, tolerance: float, looser: float) -> None:
+    curve = some_curve(seed)
+    try:
+        tight = choose(curve, Budget(tolerance, np.inf))
+    except AccuracyError:
+        return
+    assert choose(curve, Budget(tolerance * looser, np.inf)).p50 <= tight.p50
+
+
+def test_infeasible_budget_names_the_two_nearest_points() -> None:
+    points = (
+        CurvePoint(Detail(10), 0.20, 0.05, 1, 10e-6, 12e-6),
+        CurvePoint(Detail(50), 0.04, 0.05, 1, 50e-6, 60e-6),
+        CurvePoint(Detail(90), 0.03, 0.05, 1, 90e-6, 99e-6),
+    )
+    with pytest.raises(AccuracyError) as refusal:
+        choose(AccuracyCurve(points, 1), Budget(0.05, 20e-6))
+    message = str(refusal.value)
+    assert "\n" not in message
+    assert "0.04 in 60 us (50 modes" in message  # the fastest that is exact enough
+    assert "0.2 in 12 us (10 modes" in message  # the most exact that is fast enough
+    assert "0.03" not in message
+
+
+@pytest.mark.parametrize("tolerance, deadline", [(0.0, 1.0), (np.nan, 1.0), (1.0, -1.0)])
+def test_budget_of_nothing_is_refused(tolerance: float, deadline: float) -> None:
+    with pytest.raises(AccuracyError, match="above 0"):
+        Budget(tolerance, deadline)
+
+
+def test_bound_covers_what_it_says() -> None:
+    """Over many draws of 200, at least 95 of 100 bounds cover 95 % of the population."""
+    rng = np.random.default_rng(0)
+    kept = [np.mean(rng.exponential(size=5000) <= upper_quantile(d)) for d in _draws(rng)]
+    assert np.mean(np.array(kept) >= 0.95 - 0.01) >= 0.93
+
+
+def _draws(rng: np.random.Generator) -> np.ndarray:
+    return rng.exponential(size=(400, 200))
+
+
+def test_curve_survives_the_file() -> None:
+    curve = some_curve(3)
+    assert AccuracyCurve.of_plain(curve.plain()) == curve
+
+
+def test_front_is_beaten_by_none() -> None:
+    curve = some_curve(1)
+    front = curve.front()
+    for point in front:
+        assert not any(p.p50 < point.p50 and p.l2 < point.l2 for p in curve.points)
+    for point in set(curve.points) - set(front):
+        assert any(p.p50 <= point.p50 and p.l2 <= point.l2 for p in front)
+
+
+# --- Measured on an organ ------------------------------------------------------------------------
+
+
+def test_promised_errors_hold_on_fresh_loads(phantom_vademecum: Vademecum) -> None:
+    """At least 95 of 100 pairs of a detail and a fresh load keep what the curve promised."""
+    v = phantom_vademecum
+    assert v.certificate is not None and v.certificate.curve is not None
+    problem = Elasticity(v.mesh, v.material, v.regions.clamped)
+    fresh = measured(v, problem, 60, seed=1).shown
+    promised = np.array([point.l2 for point in v.certificate.curve.points[:-1]])
+    kept = fresh <= promised[:, None]
+    assert kept.mean() >= 0.95
+
+
+def test_curve_errors_are_those_of_the_cloud_that_a_step_writes(
+    phantom_vademecum: Vademecum,
+) -> None:
+    """Coarser details show a coarser cloud, each as wrong as its point says in the mean."""
+    v = phantom_vademecum
+    tip = palpation(v, 5e-3, 3e-3, 41)[20]
+    whole = prepare(v, cloud="volume", precision="float32")
+    step(whole, tip[None])
+    exact = whole.out.cloud[:, 3:].copy()
+    wrong = {}
+    for precision, near in product(("int16", "int8"), (0.0, 0.5, 1.0)):
+        model = prepare(v, cloud="volume", precision=precision, near=near)  # type: ignore[arg-type]
+        step(model, tip[None])
+        assert np.array_equal(model.out.force, whole.out.force)
+        wrong[precision, near] = _difference(model.out.cloud[:, 3:], exact)
+    assert wrong["int16", 1.0] < 1e-3 < wrong["int8", 1.0] < 3e-2
+    assert wrong["int16", 1.0] < wrong["int16", 0.5] < wrong["int16", 0.0]
+
+
+def test_fewer_modes_leave_the_force_as_it_is(phantom_vademecum: Vademecum) -> None:
+    """To the bit; the cloud comes nearer to the whole one with every mode."""
+    v = phantom_vademecum
+    model = prepare(v, cloud="volume")
+    tip = palpation(v, 5e-3, 3e-3, 41)[20]
+    step(model, tip[None])
+    force, cloud = model.out.force.copy(), model.out.cloud[:, 3:].copy()
+    errors = []
+    for modes in (5, 12, 24, model.n_modes):
+        model.show(modes)
+        step(model, tip[None])
+        assert model.n_shown == modes
+        assert np.array_equal(model.out.force, force)
+        errors.append(_difference(model.out.cloud[:, 3:], cloud))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[0] > 0.1 and errors[-1] == 0.0
+
+
+def test_sag_stays_when_modes_are_left_out(
+    phantom_vademecum: Vademecum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An organ that hangs must not rise because the machine is busy."""
+
+    def lost(modes: float) -> float:
+        model = prepare(phantom_vademecum, cloud="volume", effects=(SelfWeight(),))
+        step(model, np.full((1, 3), 1e3))
+        sag = model.out.cloud[:, 3:].copy()
+        assert np.abs(sag).max() > 1e-3
+        model.show(round(modes * model.n_modes))
+        step(model, np.full((1, 3), 1e3))
+        return _difference(model.out.cloud[:, 3:], sag)
+
+    kept = lost(0.75)
+    monkeypatch.setattr("avatar_core.effects.self_weight.body_first", lambda vademecum: vademecum)
+    assert kept < 0.1 and kept < 0.5 * lost(0.75)  # in their own order the last modes hold it
+
+
+def test_timing_finds_more_modes_slower(phantom_vademecum: Vademecum) -> None:
+    """Medians over ten times the modes, so that no machine's noise decides."""
+    v = phantom_vademecum
+    assert v.certificate is not None and v.certificate.curve is not None
+    curve = v.certificate.curve.of("volume").like(Detail(1, "volume", "float32", 1.0))
+    few, many = curve.points[0], curve.points[-1]
+    found = timed(v, replace(curve, points=(few, many)))
+    assert found.machine
+    assert found.points[0].p50 < found.points[1].p50
+    assert all(point.p50 <= point.p99 for point in found.points)
+
+
+# --- The error that goes with the force ----------------------------------------------------------
+
+
+def test_calibration_covers_and_is_sharp() -> None:
+    """Errors that grow with smoothing: covered to nine in ten, at most three times too large."""
+    rng = np.random.default_rng(0)
+    smoothing = rng.exponential(0.03, 4000)
+    error = np.abs(rng.normal(size=4000)) * (0.6 * smoothing + 0.01)
+    estimate = calibrated(smoothing[:300], error[:300]).relative(smoothing[300:])
+    assert np.mean(error[300:] <= estimate) >= PROMISED
+    assert np.median(estimate / error[300:]) <= 3.0
+
+
+def test_no_estimate_without_a_measurement() -> None:
+    assert np.isnan(ForceError().relative(np.array([0.1]))).all()
+    assert np.isnan(calibrated(np.empty(0), np.empty(0)).factor)
+
+
+def test_error_that_goes_with_the_force_covers_unseen_contacts(
+    phantom_vademecum: Vademecum,
+) -> None:
+    """By the step itself; and the estimate is not so large as to say nothing."""
+    v = phantom_vademecum
+    problem = Elasticity(v.mesh, v.material, v.regions.clamped)
+    contacts = force_errors(v, problem, 150, seed=7)
+    assert contacts.coverage >= PROMISED - 0.05  # 150 contacts: two deviations
+    assert contacts.overestimate <= 3.0
+
+
+def test_model_without_certificate_knows_no_error(phantom_vademecum: Vademecum) -> None:
+    bare = replace(phantom_vademecum, certificate=None)
+    model = make_model(lay_out(bare))
+    tip = palpation(bare, 5e-3, 3e-3, 41)[20]
+    step(model, tip[None])
+    estimate_error(model)
+    assert np.isnan(model.out.force_error[0])
+    step(model, np.full((1, 3), 1e3))
+    estimate_error(model)
+    assert model.out.force_error[0] == 0.0  # no force, no error
+
+
+def _difference(found: np.ndarray, wanted: np.ndarray) -> float:
+    return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
