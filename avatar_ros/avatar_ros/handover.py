@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from avatar_ros import realtime
+from avatar_ros.budgets import Budgets
 
 if TYPE_CHECKING:
     from avatar_core.contact import Cloud
@@ -50,6 +51,7 @@ class Order:
     period : of the steps [s]
     material : values by name of the coordinate; they go before those of the scene
     scene : YAML; empty for the natural effects of the vademecum
+    budget : fields of an avatar_core.accuracy.Budget; empty for all modes in ordinary precision
     """
 
     topic: str
@@ -61,6 +63,7 @@ class Order:
     period: float
     material: dict[str, float] = field(default_factory=dict)
     scene: str = ""
+    budget: dict[str, Any] = field(default_factory=dict)
 
 
 Change = dict[str, Any]  # fields of an Order; or scene_file, a path, in place of scene
@@ -73,6 +76,7 @@ class Prepared:
     ranges : lowest and highest value of each coordinate that the vademecum has
     effects : that are simulated, by name
     cloud_divisor : of the scene; None without one
+    curve : the AccuracyCurve of what is shown and of fewer modes, in plain form; None: not measured
     """
 
     id: str
@@ -81,6 +85,7 @@ class Prepared:
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
     effects: tuple[str, ...] = ()
     cloud_divisor: int | None = None
+    curve: dict[str, Any] | None = None
 
 
 # Called with what is in use now and "", or with None and why it was refused; with None and "" if
@@ -126,7 +131,7 @@ class Handover:
 
         A change of the same kind that waits is refused as ``OVERTAKEN``, in the caller's thread.
         """
-        kind = "material" if "material" in change else "scene"
+        kind = next((kind for kind in ("material", "budget") if kind in change), "scene")
         with self._lock:
             _, overtaken = self._waiting.pop(kind, (None, None))
             self._waiting[kind] = (change, answer)
@@ -220,6 +225,7 @@ def _prepared(note: dict[str, Any], handle: int) -> Prepared:
         ranges=note["ranges"],
         effects=tuple(note["effects"]),
         cloud_divisor=note["cloud_divisor"],
+        curve=note["curve"],
     )
 
 
@@ -301,6 +307,7 @@ class Receiver:
         self._order = order
         self._report = report
         self._vademecum: Any = None
+        self._budgets = Budgets()
         self._lock = threading.Lock()
 
     def receive(self, message: Any) -> None:
@@ -348,21 +355,24 @@ class Receiver:
         from avatar_ros import scenes
 
         scene = parse_scene(order.scene, "scene") if order.scene else None
-        laid_out = scenes.lay_out(vademecum, order, scene)
-        handle, contents = share(laid_out.layout.flat())
+        plan = scenes.plan(vademecum, order, scene)
+        detail = self._budgets.detail(plan, order)
+        layout = scenes.lay_out(plan, detail, order.period)
+        handle, contents = share(layout.flat())
         coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
         note |= {
             "id": vademecum.id,
             "name": vademecum.name,
             "arrays": contents,
             "ranges": {c.name: (c.low, c.high) for c in coordinates},
-            "effects": laid_out.effects,
+            "effects": plan.effect_names,
             "cloud_divisor": scene.cloud_divisor if scene else None,
         }
         try:
             # Compiles the step for these effects, if that was never done on this machine, from
             # arrays as the node will map them: it then finds the same types in numba's cache.
-            make_model(Layout.of(_map(os.dup(handle), contents)), halves=True)
+            model = make_model(Layout.of(_map(os.dup(handle), contents)), halves=True)
+            note["curve"] = self._budgets.curve(plan, detail, model)
             self._send(note, handle)
         finally:
             os.close(handle)

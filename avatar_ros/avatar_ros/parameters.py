@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, replace
 from typing import Any, get_args
@@ -10,6 +11,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
+from avatar_core.accuracy import Budget, Quantity
 from avatar_core.contact import TIP_RADIUS_RANGE, Cloud
 from avatar_core.errors import SceneError
 from avatar_core.scene import Scene, Tool
@@ -145,6 +147,26 @@ CONTACT = (
         range=(0.0, 100.0),
         read_only=False,
     ),
+    Parameter(
+        "accuracy.tolerance",
+        0.0,
+        "relative error that 95 % of touches must keep; 0: as exact as the vademecum is",
+        range=(0.0, 1.0),
+        read_only=False,
+    ),
+    Parameter(
+        "accuracy.quantity",
+        "l2",
+        "whose error that is: l2 (displacement) or force",
+        read_only=False,
+    ),
+    Parameter(
+        "accuracy.deadline",
+        0.0,
+        "time that 99 % of steps must keep, forces and deformation computed [s]; 0: none",
+        range=(0.0, 0.01),
+        read_only=False,
+    ),
     Parameter("realtime.priority", 0, "SCHED_FIFO priority asked for; 0: ordinary", range=(0, 98)),
     Parameter("realtime.cpu", -1, "core the loop is bound to; -1: any", range=(-1, 1023)),
     Parameter("realtime.lock_memory", True, "keep the process in memory; needs a priority"),
@@ -183,6 +205,7 @@ class ContactSettings:
 
     scene : YAML, checked; empty for the natural effects of the vademecum
     material : values chosen, by name of the coordinate; the others are those of the vademecum
+    budget : of error and time; None for none
     """
 
     tools: tuple[str, ...]
@@ -195,6 +218,7 @@ class ContactSettings:
     frame_id: str
     pose_timeout: float
     material: dict[str, float]
+    budget: Budget | None
     priority: int
     cpu: int
     lock_memory: bool
@@ -283,6 +307,7 @@ def read_contact(node: Node) -> ContactSettings:
         frame_id=_frame(value["frame_id"]),
         pose_timeout=value["pose_timeout"],
         material=chosen_material(value),
+        budget=chosen_budget(value),
         priority=value["realtime.priority"],
         cpu=value["realtime.cpu"],
         lock_memory=value["realtime.lock_memory"],
@@ -310,6 +335,35 @@ def _with_scene(settings: ContactSettings, value: str) -> ContactSettings:
 def chosen_material(value: dict[str, Any]) -> dict[str, float]:
     """The values of the material that are not left to the vademecum."""
     return {name: value[key] for key, name in MATERIAL.items() if value[key] != 0.0}
+
+
+def chosen_budget(value: dict[str, Any]) -> Budget | None:
+    """What accuracy.* asks for; None if nothing.
+
+    Raises
+    ------
+    ParameterError : naming the parameter and what it takes
+    """
+    if value["accuracy.quantity"] not in get_args(Quantity):
+        raise ParameterError(f"parameter accuracy.quantity: give {' or '.join(get_args(Quantity))}")
+    tolerance, deadline = value["accuracy.tolerance"], value["accuracy.deadline"]
+    if tolerance == 0.0 and deadline == 0.0:
+        return None
+    return Budget(tolerance or math.inf, deadline or math.inf, value["accuracy.quantity"])
+
+
+def of_budget(budget: Budget | None) -> dict[str, Any]:
+    """The inverse of :func:`chosen_budget`."""
+    if budget is None:
+        return {"accuracy.tolerance": 0.0, "accuracy.deadline": 0.0}
+    finite = {
+        "accuracy.tolerance": budget.tolerance,
+        "accuracy.deadline": budget.deadline,
+    }
+    return {
+        "accuracy.quantity": budget.quantity,
+        **{name: 0.0 if math.isinf(value) else value for name, value in finite.items()},
+    }
 
 
 def _values(node: Node, parameters: tuple[Parameter, ...]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from avatar_core.scene import Scene
 from avatar_core.yaml_lines import MAX_BYTES
 
 if TYPE_CHECKING:
+    from avatar_core.accuracy import Detail
     from avatar_core.vademecum import Vademecum
     from avatar_ros.handover import Order
 
@@ -71,17 +72,27 @@ def change_of(request: Any) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class LaidOut:
-    """Constant arrays of a contact model, and the effects that are in them."""
+class Plan:
+    """What an order and a scene make of a vademecum.
 
-    layout: contact.Layout
-    effects: tuple[str, ...]
+    vademecum : at the values chosen of its material; modes : at most; None for all
+    """
+
+    vademecum: Vademecum
+    tip_radii: tuple[float, ...]
+    modes: int | None
+    cloud: contact.Cloud
+    effects: tuple[Effect, ...]
+
+    @property
+    def effect_names(self) -> tuple[str, ...]:
+        return tuple(effect.name for effect in self.effects)
 
 
-def lay_out(vademecum: Vademecum, order: Order, scene: Scene | None) -> LaidOut:
-    """What an order and a scene make of a vademecum; without a scene, its natural effects.
+def plan(vademecum: Vademecum, order: Order, scene: Scene | None) -> Plan:
+    """Tips, cloud and modes are those of the scene; without one, effects are the natural ones.
 
-    Tips, cloud and modes are those of the scene. The order's material goes before the scene's.
+    The order's material goes before the scene's.
 
     Raises
     ------
@@ -90,19 +101,31 @@ def lay_out(vademecum: Vademecum, order: Order, scene: Scene | None) -> LaidOut:
     """
     if scene is None:
         chosen = at_values(vademecum, order.material)
-        effects = natural_effects(chosen, len(order.tip_radii))
-        radii, modes, cloud = tuple(order.tip_radii), order.modes, order.cloud
-    else:
-        require_tools(scene, len(order.tip_radii))
-        values = dict(order.material)
-        if "contrast" in values:
-            scene = _with_contrast(scene, values.pop("contrast"))
-        scene.require(vademecum)
-        chosen = at_values(vademecum, scene.values | values)
-        effects, modes, cloud = scene.effects, scene.modes, scene.cloud
-        radii = tuple(tool.tip_radius for tool in scene.tools)
-    layout = contact.lay_out(chosen, radii, modes, cloud, effects, order.period)
-    return LaidOut(layout, tuple(effect.name for effect in effects))
+        radii = tuple(order.tip_radii)
+        effects = natural_effects(chosen, len(radii))
+        return Plan(chosen, radii, order.modes, order.cloud, effects)
+    require_tools(scene, len(order.tip_radii))
+    values = dict(order.material)
+    if "contrast" in values:
+        scene = _with_contrast(scene, values.pop("contrast"))
+    scene.require(vademecum)
+    chosen = at_values(vademecum, scene.values | values)
+    radii = tuple(tool.tip_radius for tool in scene.tools)
+    return Plan(chosen, radii, scene.modes, scene.cloud, scene.effects)
+
+
+def lay_out(what: Plan, detail: Detail, period: float) -> contact.Layout:
+    """Constant arrays of a contact model that shows a detail."""
+    return contact.lay_out(
+        what.vademecum,
+        what.tip_radii,
+        detail.modes,
+        detail.cloud,
+        what.effects,
+        period,
+        detail.precision,
+        detail.near,
+    )
 
 
 def require_tools(scene: Scene, n_tools: int) -> None:

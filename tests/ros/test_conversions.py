@@ -113,7 +113,9 @@ def test_cloud(frame: str) -> None:
 def test_state(n_contacts: int, identity: str) -> None:
     template = StateTemplate("organ", "tool", identity, 64)
     template.contacts[:] = np.arange(640).reshape(64, 10)
-    state = deserialize_message(template.serialise(stamp_bytes(STAMP), 7, n_contacts), ContactState)
+    state = deserialize_message(
+        template.serialise(stamp_bytes(STAMP), 7, n_contacts, 0.125), ContactState
+    )
     assert (state.tool, state.vademecum_id, state.status) == ("tool", identity, 7)
     assert [c.penetration for c in state.contacts] == [10.0 * i + 9 for i in range(n_contacts)]
-    assert math.isnan(state.force_error)
+    assert state.force_error == 0.125

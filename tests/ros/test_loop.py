@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 import rclpy
-from avatar_ros.contact import BLEND, OK, ContactLoop, Online
+from avatar_ros.contact_loop import BLEND, OK, ContactLoop, Online
 from avatar_ros.conversions import WrenchTemplate, small_turn, stamp_bytes
 from avatar_ros.parameters import ContactSettings
 from geometry_msgs.msg import WrenchStamped
@@ -38,6 +38,7 @@ SETTINGS = ContactSettings(
     frame_id="organ",
     pose_timeout=0.02,
     material={},
+    budget=None,
     priority=0,
     cpu=-1,
     lock_memory=False,

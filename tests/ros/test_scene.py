@@ -16,8 +16,9 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.bench_cell import Module
+from avatar_ros.budgets import Budgets
 from avatar_ros.handover import Order
-from avatar_ros.scenes import lay_out, shipped_scene
+from avatar_ros.scenes import lay_out, plan, shipped_scene
 from geometry_msgs.msg import Quaternion, WrenchStamped
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -110,7 +111,8 @@ def palpation(lasting_palpation: Palpation) -> Palpation:
 def _refusal(path: Path, organ: Any) -> str:
     """Why the organ of the tests cannot serve a scene; empty if it can."""
     try:
-        lay_out(organ, ORDER, read_scene(path))
+        what = plan(organ, ORDER, read_scene(path))
+        lay_out(what, Budgets().detail(what, ORDER), ORDER.period)
     except AvatarError as error:
         return str(error)
     return ""

@@ -1,0 +1,83 @@
+"""Times of the contact loop: written by it, summed up once a second by the node."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avatar_ros.msg import LoopStatistics
+
+LATE = 1.5  # a period this many times the nominal one counts as missed
+
+
+class Record:
+    """Times of the steps since the record was begun [ns]; writing allocates nothing."""
+
+    CAPACITY = 4096
+
+    def __init__(self, begin: int) -> None:
+        self.begin = begin
+        self.n_periods = 0
+        self.n_steps = 0
+        self.n_ages = 0
+        self.n_models = 0
+        self.periods = np.zeros(self.CAPACITY, np.int64)
+        self.computes = np.zeros(self.CAPACITY, np.int64)
+        self.ages = np.zeros(self.CAPACITY, np.int64)
+        self.models = np.zeros(self.CAPACITY, np.int64)
+
+    def note_period(self, period: int) -> None:
+        if self.n_periods < self.CAPACITY:
+            self.periods[self.n_periods] = period
+            self.n_periods += 1
+
+    def note_step(self, compute: int) -> None:
+        if self.n_steps < self.CAPACITY:
+            self.computes[self.n_steps] = compute
+            self.n_steps += 1
+
+    def note_model(self, duration: int) -> None:
+        """Of the computation alone: forces and cloud, no message."""
+        if self.n_models < self.CAPACITY:
+            self.models[self.n_models] = duration
+            self.n_models += 1
+
+    def note_age(self, age: int) -> None:
+        if self.n_ages < self.CAPACITY:
+            self.ages[self.n_ages] = age
+            self.n_ages += 1
+
+
+def statistics(record: Record, end: int, rate: float) -> LoopStatistics:
+    """Summary of a record that ended at ``end`` [ns] of a loop with a nominal rate [Hz]."""
+    periods = record.periods[: record.n_periods] * 1e-9
+    computes = record.computes[: record.n_steps] * 1e-9
+    ages = record.ages[: record.n_ages] * 1e-9
+    window = (end - record.begin) * 1e-9
+    period_p50, period_p99, period_max = _percentiles(periods)
+    compute_p50, compute_p99, compute_max = _percentiles(computes)
+    age_p50, age_p99, _ = _percentiles(ages)
+    model_p50, model_p99, _ = _percentiles(record.models[: record.n_models] * 1e-9)
+    return LoopStatistics(
+        window=window,
+        rate=len(periods) / window,
+        periods=len(periods),
+        missed=int(np.count_nonzero(periods > LATE / rate)),
+        period_p50=period_p50,
+        period_p99=period_p99,
+        period_max=period_max,
+        compute_p50=compute_p50,
+        compute_p99=compute_p99,
+        compute_max=compute_max,
+        pose_age_p50=age_p50,
+        pose_age_p99=age_p99,
+        step_p50=model_p50,
+        step_p99=model_p99,
+    )
+
+
+def _percentiles(values: np.ndarray) -> tuple[float, float, float]:
+    """Median, 99th percentile and maximum; NaN of nothing."""
+    if len(values) == 0:
+        return (np.nan, np.nan, np.nan)
+    p50, p99, largest = np.percentile(values, (50, 99, 100))
+    return float(p50), float(p99), float(largest)

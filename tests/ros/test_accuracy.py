@@ -1,0 +1,197 @@
+"""Accuracy and time as the contact node promises, keeps and says them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.accuracy import Accuracy
+from avatar_ros.bench_cell import Module
+from avatar_ros.budgets import Budgets
+from avatar_ros.handover import Order
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
+
+from avatar_core.accuracy import Detail
+from avatar_core.contact import prepare
+from avatar_core.errors import AccuracyError
+from avatar_ros import qos, scenes
+from avatar_ros.msg import ContactState, LoopStatistics
+from tests.ros.conftest import START_TIMEOUT
+from tests.ros.test_cell import Hand, _force
+
+pytestmark = pytest.mark.ros
+
+
+# --- Shedding, without a node ------------------------------------------------------------------
+
+
+def window(missed: int, step_p99: float) -> LoopStatistics:
+    return LoopStatistics(periods=1000, missed=missed, step_p99=step_p99)
+
+
+def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> None:
+    model = prepare(organ, halves=True)
+    accuracy = Accuracy(model, organ.certificate.curve.of("surface"), float("inf"))
+    report = accuracy.after(window(50, 30e-6))
+    assert report.shedding and report.changed
+    assert model.n_shown < model.n_modes
+    assert "5.0% of the periods missed" in report.text and "force keeps all modes" in report.text
+    for _ in range(5):
+        report = accuracy.after(window(0, 30e-6))
+    assert not report.shedding and model.n_shown == model.n_modes
+
+
+def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> None:
+    model = prepare(organ, halves=True)
+    points = {p.detail.modes: p for p in organ.certificate.curve.like(_ordinary(model)).points}
+    accuracy = Accuracy(model, organ.certificate.curve.like(_ordinary(model)), float("inf"))
+    first, second = window(50, 30e-6), window(0, 30e-6)
+    accuracy.after(first)
+    accuracy.after(second)
+    assert first.modes_shown == first.modes == model.n_modes
+    assert first.promised_l2 == points[model.n_modes].l2
+    assert second.modes_shown == model.n_shown
+    assert second.promised_l2 == points[model.n_shown].l2 > first.promised_l2
+    assert second.promised_force == first.promised_force
+
+
+def test_a_budget_chooses_what_keeps_it(organ: Any) -> None:
+    order = Order("vademecum", "handover", "/", (5e-3,), None, "surface", 1e-3)
+    what, budgets = scenes.plan(organ, order, None), Budgets()
+    exact = budgets.detail(what, order)
+    assert exact == Detail(organ.far.rank)
+    errors = {p.detail: p.l2 for p in organ.certificate.curve.points}
+    loose = replace(order, budget={"tolerance": 3.0 * errors[exact], "deadline": 1.0})
+    coarse = budgets.detail(what, loose)
+    assert coarse != exact and errors[coarse] <= 3.0 * errors[exact]
+    curve = budgets.curve(what, coarse, prepare(organ, halves=True))
+    assert curve is not None
+    assert max(curve["modes"]) == coarse.modes and set(curve["precision"]) == {coarse.precision}
+    assert all(0.0 < p50 <= p99 for p50, p99 in zip(curve["p50"], curve["p99"], strict=True))
+    tight = replace(order, budget={"tolerance": 1e-6, "deadline": 1.0})
+    with pytest.raises(AccuracyError, match="nearest: "):
+        budgets.detail(what, tight)
+
+
+def _ordinary(model: Any) -> Any:
+    return Detail(model.n_modes)
+
+
+# --- In the cell -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def nodes(own_domain: dict[str, str], library: Path) -> Iterator[dict[str, Module]]:
+    files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
+    processes = {
+        "vademecum_loader": Module("vademecum_loader", ["--ros-args", *files], own_domain),
+        "contact": Module("contact", [], own_domain),
+    }
+    yield processes
+    assert [process.finish() for process in processes.values()] == [0, 0]
+
+
+@pytest.fixture
+def hand(nodes: dict[str, Module], probe: Any, touch: tuple[np.ndarray, np.ndarray]) -> Hand:
+    probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
+    return Hand(probe, touch[0])
+
+
+def set_budget(probe: Any, **values: Any) -> Any:
+    """Set parameters below ``accuracy``; the first answer."""
+    kinds = {float: ("double", ParameterType.PARAMETER_DOUBLE)}
+    kinds[str] = ("string", ParameterType.PARAMETER_STRING)
+    named = []
+    for name, value in values.items():
+        field, kind = kinds[type(value)]
+        given = ParameterValue(type=kind, **{f"{field}_value": value})
+        named.append(Parameter(name=f"accuracy.{name}", value=given))
+    request = SetParameters.Request(parameters=named)
+    return probe.call(SetParameters, "/contact/set_parameters", request).results[0]
+
+
+def statistics(probe: Any, hand: Hand, wanted: Any) -> LoopStatistics:
+    return probe.next(LoopStatistics, "statistics", qos.STATISTICS, wanted, 2 * START_TIMEOUT, hand)
+
+
+def test_force_comes_with_its_error(probe: Any, hand: Hand) -> None:
+    state = probe.next(
+        ContactState,
+        "contact_state",
+        qos.state(1),
+        lambda state: state.contacts and state.status == ContactState.STATUS_OK,
+        meanwhile=hand,
+    )
+    force = state.contacts[0].force
+    size = np.linalg.norm([force.x, force.y, force.z])
+    assert 1e-4 * size < state.force_error < size
+
+
+def felt(probe: Any, hand: Hand) -> np.ndarray:
+    wanted = lambda w: _force(w).any()  # noqa: E731
+    return _force(
+        probe.next(WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND, wanted, 60.0, hand)
+    )
+
+
+def test_a_tolerance_shows_fewer_modes_and_leaves_the_force(
+    probe: Any, hand: Hand, organ: Any
+) -> None:
+    """However noisy the machine, the fastest of all details is none with all modes."""
+    rank = organ.far.rank
+    before = statistics(probe, hand, lambda s: s.modes == rank and s.step_p99 > 0.0)
+    assert before.modes_shown == rank or before.missed > 0
+    force = felt(probe, hand)
+    assert set_budget(probe, tolerance=1.0).successful
+    after = statistics(probe, hand, lambda s: 0 < s.modes < rank)
+    assert organ.certificate.curve.like(Detail(rank)).points[-1].l2 < after.promised_l2 <= 1.0
+    np.testing.assert_allclose(felt(probe, hand), force, rtol=1e-6)
+    assert set_budget(probe, tolerance=0.0).successful
+    statistics(probe, hand, lambda s: s.modes == rank)
+
+
+def test_an_infeasible_budget_gives_way_to_the_one_before(probe: Any, hand: Hand) -> None:
+    assert set_budget(probe, tolerance=1e-6).successful  # known to be infeasible when chosen
+
+    def tolerance() -> float:
+        request = GetParameters.Request(names=["accuracy.tolerance"])
+        answer = probe.ask(GetParameters, "/contact/get_parameters", request)
+        return float(answer.values[0].double_value)
+
+    deadline = time.monotonic() + 2 * START_TIMEOUT
+    while tolerance() != 0.0:
+        assert time.monotonic() < deadline
+        hand()
+        probe.spin(0.1)
+    statistics(probe, hand, lambda s: s.modes_shown > 0)  # it goes on
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [({"quantity": "taste"}, "l2 or force"), ({"tolerance": -1.0}, "range")],
+)
+def test_a_budget_without_meaning_is_refused_at_once(
+    probe: Any, hand: Hand, values: dict[str, Any], reason: str
+) -> None:
+    answer = set_budget(probe, **values)
+    assert not answer.successful and reason in answer.reason
+
+
+def test_diagnostics_say_what_is_shown(probe: Any, hand: Hand) -> None:
+    array = probe.next(DiagnosticArray, "/diagnostics", qos.STATISTICS, meanwhile=hand)
+    (status,) = array.status
+    assert status.name == "contact: accuracy"
+    assert status.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
+    assert "modes shown" in status.message
