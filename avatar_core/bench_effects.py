@@ -1,24 +1,20 @@
 """``avatar bench effects``: what each effect of a scene costs in a step, all in one run.
 
 Every effect stands alone against the bare scene, in alternating slides so that both see the same
-machine; the bare scene stands against a linear step that was fused by hand into one function.
+machine; the bare scene stands against a linear step that was fused by hand into one function
+(:mod:`avatar_core.bench_fused`).
 """
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
-import numba
 import numpy as np
 
 from avatar_core.bench import SPHERE, one_pass, tool_paths
+from avatar_core.bench_fused import fused_ratios
 from avatar_core.build import build_vademecum
 from avatar_core.build_rule import BuildRule, Progress
 from avatar_core.contact import ContactModel, prepare, step
@@ -41,7 +37,6 @@ from avatar_core.vademecum import Provenance, Vademecum
 
 ROUNDS = 7  # pairs of slides; other processes disturb some of them
 N_STEPS = 1500
-_WARM = 200  # steps until the caches are
 
 # One tool each, but where there must be two; the breath is too small to lift the organ off the tip.
 Case = tuple[str, int, tuple[Effect, ...]]  # name, tools, effects
@@ -76,16 +71,6 @@ class EffectRow:
     bytes: int
 
 
-def module_of(path: Path) -> ModuleType:
-    """A Python file outside of any package, under its own name, where numba's cache finds it."""
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 def build_for_effects(
     surface: SurfaceMesh, n_vertices: int, modes: int, progress: Progress
 ) -> Vademecum:
@@ -104,15 +89,14 @@ def build_for_effects(
 
 
 def run_effects_bench(
-    vademecum: Vademecum, fused: Callable[..., int] | None, progress: Callable[[str], None]
+    vademecum: Vademecum, fused: Path | None, progress: Callable[[str], None]
 ) -> tuple[list[EffectRow], dict[str, float]]:
     """Rows and summary.
 
     Parameters
     ----------
-    fused : the step fused by hand, jitted; None leaves ``bare_ratio`` out
+    fused : file with the step fused by hand; None leaves ``bare_ratio`` out
     """
-    bare, path = _bare(vademecum)
     rows = effect_rows(vademecum, (*CASES, ("everything", 2, EVERYTHING)), progress)
     summary = {
         "worst_single_ratio": max(row.ratio for row in rows[1:-1]),
@@ -120,7 +104,10 @@ def run_effects_bench(
     }
     if fused is not None:
         progress("fused by hand")
-        summary = {"bare_ratio": _fused_ratio(bare, fused, path[1]), **summary}
+        linear = replace(vademecum, large=None)
+        ratios = fused_ratios(linear, tool_paths(linear, 1, N_STEPS), fused)
+        spread = {"bare_ratio_least": min(ratios), "bare_ratio_most": max(ratios)}
+        summary = {"bare_ratio": float(np.median(ratios)), **spread, **summary}
     return rows, summary
 
 
@@ -170,50 +157,3 @@ def _slide(model: ContactModel, path: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Times [us] and contacts of one slide over an organ at rest."""
     model.reset()
     return one_pass(model, path, lambda tips: step(model, tips))
-
-
-def _fused_ratio(bare: ContactModel, fused: Callable[..., int], path: np.ndarray) -> float:
-    """Median over pairs of slides of bare over fused; both work on the same arrays.
-
-    Raises
-    ------
-    AssertionError
-        If the two disagree by more than 1e-12 of the force, or in the cloud.
-    """
-    arguments = (bare.layout.arrays, bare.state, bare.out, bare.tips)
-    bare.tips[:] = path[0]
-    fused(*arguments)
-    overload: Any = fused.get_overload(tuple(map(numba.typeof, arguments)))  # type: ignore[attr-defined]
-    compiled = bare.compiled.step
-    assert compiled is not None
-    _agree(bare, lambda: overload(*arguments), path[::50])
-    calls = (lambda: overload(*arguments), lambda: compiled(*arguments, *bare.effects))
-    ratios = []
-    for first in range(_WARM, len(path) - 100, 100):
-        for _ in range(3):
-            taken, part = [0.0, 0.0], path[first : first + 100]
-            for which in (0, 1, 1, 0):  # neither is always the one that finds warm caches
-                taken[which] += _median_time(calls[which], bare.tips, part)
-            ratios.append(taken[1] / taken[0])
-    return float(np.median(ratios))
-
-
-def _median_time(call: Callable[[], int], tips: np.ndarray, path: np.ndarray) -> float:
-    times = np.empty(len(path))
-    for k, tip in enumerate(path):
-        tips[:] = tip
-        start = time.perf_counter_ns()
-        call()
-        times[k] = time.perf_counter_ns() - start
-    return float(np.median(times))
-
-
-def _agree(bare: ContactModel, fused: Callable[[], int], path: Sequence[Any] | np.ndarray) -> None:
-    for tips in path:
-        step(bare, tips)
-        force, cloud = bare.out.force.copy(), bare.out.cloud.copy()
-        bare.tips[:] = tips
-        fused()
-        scale = max(float(np.abs(force).max()), 1e-9)
-        assert np.abs(bare.out.force - force).max() <= 1e-12 * scale, "forces differ"
-        assert np.abs(bare.out.cloud - cloud).max() <= 1e-12, "clouds differ"

@@ -77,13 +77,13 @@ def bench_effects(
 ) -> None:
     """Time the step bare, with each effect alone, and with everything (minutes to build)."""
     from avatar_core.bench import load_average
-    from avatar_core.bench_effects import build_for_effects, module_of, run_effects_bench
+    from avatar_core.bench_effects import build_for_effects, run_effects_bench
 
     require(modes >= 36, f"--modes is {modes}; inertia and self_weight need at least 36")
     organ = read_organ(surface, unit, axes, label)
     with BuildBar(large=True) as progress:
         vademecum = build_for_effects(organ, vertices, modes, progress)
-    yardstick = module_of(fused).fused_step if fused.is_file() else None
+    yardstick = fused if fused.is_file() else None
     if yardstick is None:
         print(f"notice: no {fused} here, so nothing to compare the bare step with", file=sys.stderr)
 

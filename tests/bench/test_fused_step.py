@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from avatar_core.bench_effects import module_of
+from avatar_core.bench_fused import module_of
 from avatar_core.contact import prepare, step
 from avatar_core.organ import OrganOptions, vademecum_of
 from avatar_core.phantom import phantom_liver
