@@ -6,23 +6,25 @@ from collections.abc import Callable
 
 import pytest
 
-_FIGURES = pytest.StashKey[list[tuple[str, str]]]()
+_FIGURE = "figure"  # property of a test's report: those cross from a worker's process
 
 
 @pytest.fixture
 def figure(request: pytest.FixtureRequest) -> Callable[[str], None]:
     """Reports what a case came to, beside its name."""
-    figures = request.config.stash.setdefault(_FIGURES, [])
     name = f"{request.path.stem.removeprefix('test_')}: {request.node.name.removeprefix('test_')}"
 
     def report(value: str) -> None:
-        figures.append((name, value))
+        request.node.user_properties.append((_FIGURE, (name, value)))
 
     return report
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    figures = sorted(set(terminalreporter.config.stash.get(_FIGURES, [])))
+    reports = [r for key in ("passed", "failed") for r in terminalreporter.getreports(key)]
+    figures = sorted(
+        {tuple(value) for r in reports for key, value in r.user_properties if key == _FIGURE}
+    )
     if not figures:
         return
     terminalreporter.section("hard cases")
