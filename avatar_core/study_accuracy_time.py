@@ -23,6 +23,7 @@ from avatar_core.study import Parts, Study, Value
 from avatar_core.study_force_error import ForceErrors, force_errors
 from avatar_core.study_offline_cost import grid_rows, mesh_rows, patient_rows, shape_rows
 from avatar_core.study_online_cost import (
+    budget_rows,
     cost_of_effects,
     curve_rows,
     fastest_within,
@@ -84,7 +85,7 @@ def study(surfaces: Path | None, plan: Plan, folder: Path) -> Study:
         kept = promises(curve, fresh, again)
         contacts = force_errors(vademecum, elasticity, plan.n_contacts, FRESH)
         parts.part("rivals")
-        rows = curve_rows(curve)
+        rows = curve_rows(curve) + budget_rows(curve)
         rows += rival_rows(vademecum, elasticity, curve, plan.n_fresh // 2, FRESH)
         rows += cost_of_effects(vademecum)
         parts.part("mesh and grid")
@@ -99,6 +100,7 @@ def study(surfaces: Path | None, plan: Plan, folder: Path) -> Study:
         "time_promise_kept_fraction": kept.times_kept,
         "force_error_coverage": contacts.coverage,
         "force_error_overestimate": contacts.overestimate,
+        "budgets_as_enumerated": float(np.mean([r["as_enumerated"] for r in _of(rows, "choose")])),
         "front_points": sum(bool(row.get("front")) for row in rows),
         "l2_95": _best(rows)["error"],
         "force_95": float(np.quantile(contacts.error / contacts.force, 0.95)),
@@ -124,7 +126,7 @@ def study(surfaces: Path | None, plan: Plan, folder: Path) -> Study:
 
 
 def short_table(rows: list[dict[str, Value]]) -> tuple[str, ...]:
-    """The README's table: the fastest step within some errors, the rivals, all vertices shown."""
+    """The README's table: fastest steps within some errors, rivals, budgets; all vertices shown."""
     volume = [row for row in rows if row.get("cloud") == "volume"]
     lines = ["| 95 % of loads within | step p50 / p99 [us] | by | MB |", "|---|---|---|---|"]
     for error in (0.05, 0.06, 0.10, 0.20, 0.40):
@@ -136,6 +138,10 @@ def short_table(rows: list[dict[str, Value]]) -> tuple[str, ...]:
     for name in ("dense table", "direct solve"):
         (row,) = (row for row in volume if row["method"] == name)
         lines.append(_line(f"{row['error']:.1%}", row, name))
+    lines += [
+        f"{row['tolerance']:.0%} in {row['deadline_us']:.0f} us: {row['setting']}"
+        for row in _of(rows, "choose")
+    ]
     return tuple(lines)
 
 

@@ -15,12 +15,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avatar_core.accuracy import AccuracyCurve, CurvePoint, Detail, upper_quantile
+from avatar_core.accuracy import (
+    CONTENT,
+    AccuracyCurve,
+    Budget,
+    CurvePoint,
+    Detail,
+    choose,
+    upper_quantile,
+)
 from avatar_core.bench import StepRow, time_dense_table, time_direct
 from avatar_core.bench_effects import CASES, effect_rows
 from avatar_core.certificate import UnseenErrors
 from avatar_core.effects import LargeDeformationEffect
 from avatar_core.elasticity import Elasticity
+from avatar_core.errors import AccuracyError
 from avatar_core.loads import patch_loads
 from avatar_core.study import Value
 from avatar_core.vademecum import Vademecum
@@ -28,6 +37,7 @@ from avatar_core.vademecum import Vademecum
 ON_TIME = 1.3  # times the promised p99 that a fresh p99 may be
 N_SNAPSHOTS = 150  # loads, three directions each
 _BATCH = 40
+TOLERANCES, DEADLINES = (0.01, 0.05, 0.20), (100e-6, 1e-3)  # [-], [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +63,7 @@ def promises(curve: AccuracyCurve, fresh: UnseenErrors, again: AccuracyCurve) ->
     after = np.array([point.p99 for point in again.points])
     return Promises(
         float(kept.mean()),
-        float(np.mean(kept.mean(axis=1) >= 0.9)),
+        float(np.mean(kept.mean(axis=1) >= CONTENT)),
         float(np.mean(after <= ON_TIME * before)),
     )
 
@@ -62,6 +72,33 @@ def curve_rows(curve: AccuracyCurve) -> list[dict[str, Value]]:
     """The points of a curve; on the front: none of the same cloud is both faster and better."""
     front = {id(p) for cloud in ("surface", "volume") for p in curve.of(cloud).front()}
     return [_row("vademecum", p, id(p) in front) for p in curve.points if p.detail.cloud != "off"]
+
+
+def budget_rows(curve: AccuracyCurve) -> list[dict[str, Value]]:
+    """What is chosen for some budgets, all vertices shown, and whether going through all agrees."""
+    points = curve.of("volume")
+    rows: list[dict[str, Value]] = []
+    for tolerance in TOLERANCES:
+        for deadline in DEADLINES:
+            found: CurvePoint | None = None
+            try:
+                found = choose(points, Budget(tolerance, deadline))
+                setting = str(found.detail)
+            except AccuracyError as error:
+                setting = f"refused: {error}"
+            met = [p for p in points.points if p.l2 <= tolerance and p.p99 <= deadline]
+            rows.append(
+                {
+                    "stage": "budget",
+                    "method": "choose",
+                    "setting": setting,
+                    "tolerance": tolerance,
+                    "deadline_us": 1e6 * deadline,
+                    "p50_us": 1e6 * found.p50 if found else None,
+                    "as_enumerated": found == min(met, key=lambda p: p.p50, default=None),
+                }
+            )
+    return rows
 
 
 def _row(method: str, point: CurvePoint, front: bool = False) -> dict[str, Value]:

@@ -274,6 +274,7 @@ def test_accuracy_time(tmp_path: Path) -> None:
     assert summary["force_error_coverage"] >= 0.85  # 150 contacts: 90 % less two deviations
     assert summary["force_error_overestimate"] <= 3.0
     assert summary["front_points"] >= 5
+    assert summary["budgets_as_enumerated"] == 1.0
     page = (tmp_path / "accuracy-time.html").read_text()
     assert page.count("<figure>") == 7 and 'src="http' not in page  # it stands alone
     rows = (tmp_path / "accuracy-time.csv").read_text().splitlines()
