@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
-from avatar_core.surface import SurfaceMesh, winding_number
+from avatar_core.surface import SurfaceMesh
 from avatar_core.surface_files import march
 
 FloatArray = NDArray[np.float64]
@@ -130,19 +130,17 @@ class OrientationOffset:
 
 
 def signed_distance(points: FloatArray, surface: SurfaceMesh) -> FloatArray:
-    """Distance to the surface, negative where the winding number exceeds 1/2, shape (k,) [m].
+    """Distance to the boundary of the solid inside the surface, negative inside, shape (k,) [m].
 
     points : ndarray, shape (k, 3) [m]
 
-    Distance (AABB tree) and sign are asked separately: pseudo-normals and rays give wrong signs
-    on cracked surfaces.
+    Distance (AABB tree) and sign (winding number) are asked separately: pseudo-normals and rays
+    give wrong signs on cracked surfaces. Both are asked of the surface's skin: holes are covered,
+    what lies inside does not count, and an inside-out surface has the same inside.
+
+    Raises SurfaceError if the surface encloses nothing or has a large hole.
     """
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    squared, _, _ = igl.point_mesh_squared_distance(
-        points, surface.vertices, surface.faces.astype(np.int64)
-    )
-    inside = winding_number(surface, points) > 0.5
-    return np.where(inside, -1.0, 1.0) * np.sqrt(squared)
+    return surface.skin.signed_distance(points)
 
 
 def padded_box(surfaces: Sequence[SurfaceMesh], spacing: float, padding: float) -> GridBox:
