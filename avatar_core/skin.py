@@ -24,6 +24,7 @@ IntArray = NDArray[np.int64]
 Soup = tuple[FloatArray, IntArray]
 
 CRACK = 0.05  # gaps narrower than this are cracks, no holes [mean edges]
+OFF = 0.01  # a cover farther than this from the surface does not lie on it [mean edges]
 UNDECIDED = (0.25, 0.75)  # winding numbers of a hole's cover, over the layers of the surface
 LARGEST_HOLE = 0.1  # a flat cover loses 3 % of a ball's volume there [area of all]
 HALVINGS = 3  # of the triangles that an intersection cuts: it is met to an eighth of them
@@ -113,11 +114,11 @@ def _covers(vertices: FloatArray, faces: IntArray) -> Soup:
     count = np.bincount(label)
     middles = place[rim].mean(axis=1)
     apices = np.stack([np.bincount(label, middles[:, k]) / count for k in range(3)], axis=1)
-    centres = (2 * middles + apices[label]) / 3
-    squared = igl.point_mesh_squared_distance(centres, vertices, faces)[0]
-    winding = np.abs(igl.fast_winding_number(vertices, faces, centres)) / layers
+    points = (middles + 2 * apices[label]) / 3  # of each triangle, away from the rim
+    squared = igl.point_mesh_squared_distance(points, vertices, faces)[0]
+    winding = np.abs(igl.fast_winding_number(vertices, faces, points)) / layers
     open_there = (winding > UNDECIDED[0]) & (winding < UNDECIDED[1])
-    is_hole = np.bincount(label, open_there & (squared > (CRACK * edge) ** 2)) > 0
+    is_hole = np.bincount(label, open_there & (squared > (OFF * edge) ** 2)) > 0
     chosen = np.repeat(np.flatnonzero(is_hole[label]), layers[is_hole[label]])
     corners = vertex[rim[chosen]]
     return apices, np.column_stack([corners[:, ::-1], len(vertices) + label[chosen]])
