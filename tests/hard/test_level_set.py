@@ -198,6 +198,17 @@ def test_a_second_skin_just_inside_changes_nothing(figure, tmp_path_factory, gap
         figure(f"volume {error:+.3%}")
 
 
+def test_a_hole_through_both_skins(figure):
+    """The winding number is 2 inside and 1 in the hole, which would count as inside."""
+    one = with_hole(WHOLE, UP, 0.04)
+    for gap in (0.0, 2e-5):
+        both = joined(one, SurfaceMesh((1 - gap / RADIUS) * one.vertices, one.faces))
+        grid, alone = (distance_grid(s, H, 2 * H) for s in (both, one))
+        assert np.allclose(grid.values, alone.values, rtol=0, atol=2 * gap + 1e-9)
+        assert steepest(grid) < 1 + 1e-9
+    figure(f"volume {grid.volume / ball_volume() - 1:+.2%}")
+
+
 def test_a_skin_turned_against_the_first_is_refused(tmp_path):
     for gap in (0.0, 1e-3):
         both = joined(WHOLE, inside_out(ball(RADIUS - gap)))
