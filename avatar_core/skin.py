@@ -26,7 +26,7 @@ Soup = tuple[FloatArray, IntArray]
 CRACK = 0.05  # gaps narrower than this are cracks, no holes [mean edges]
 OFF = 0.01  # a cover farther than this from the surface does not lie on it [mean edges]
 UNDECIDED = (0.25, 0.75)  # winding numbers of a hole's cover, over the layers of the surface
-LARGEST_HOLE = 0.1  # a flat cover loses 3 % of a ball's volume there [area of all]
+LARGEST_HOLE = 0.1  # [area of all]; a flat cover loses 3 % of a ball's volume there
 HALVINGS = 3  # of the triangles that an intersection cuts: it is met to an eighth of them
 BESIDE = 1e-4  # where the two sides of a triangle are asked [edges]
 
