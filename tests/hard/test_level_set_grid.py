@@ -37,7 +37,7 @@ from .surfaces import (
 )
 
 few = settings(
-    max_examples=8,
+    max_examples=5,
     deadline=None,
     print_blob=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],  # figures are only added to
