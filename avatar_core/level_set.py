@@ -14,10 +14,11 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
-from avatar_core.surface import SurfaceMesh, winding_number
+from avatar_core.surface import SurfaceMesh
 from avatar_core.surface_files import march
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 # Shapes are compared at one volume, on one cube of grid points; far outside, where thin lobes
 # differ most from organ to organ, the distance saturates early.
@@ -87,8 +88,12 @@ class DistanceGrid:
 
     @cached_property
     def volume(self) -> float:
-        """Volume inside, V = h^3 sum clip(1/2 - phi/h, 0, 1) [m3]."""
-        inside = np.clip(0.5 - self.values / self.spacing, 0.0, 1.0)
+        """Volume inside, V = h^3 sum clip(1/2 - phi/h, 0, 1), cut off at the border [m3]."""
+        cut = self.values.copy()
+        for axis in range(3):  # phi of the box is 0 at its border, -h and less farther in
+            sides = np.moveaxis(cut, axis, 0)
+            sides[[0, -1]] = np.maximum(sides[[0, -1]], 0.0)
+        inside = np.clip(0.5 - cut / self.spacing, 0.0, 1.0)
         return float(self.spacing**3 * inside.sum())
 
     def sample(self, points: FloatArray) -> FloatArray:
@@ -130,19 +135,17 @@ class OrientationOffset:
 
 
 def signed_distance(points: FloatArray, surface: SurfaceMesh) -> FloatArray:
-    """Distance to the surface, negative where the winding number exceeds 1/2, shape (k,) [m].
+    """Distance to the boundary of the solid inside the surface, negative inside, shape (k,) [m].
 
     points : ndarray, shape (k, 3) [m]
 
-    Distance (AABB tree) and sign are asked separately: pseudo-normals and rays give wrong signs
-    on cracked surfaces.
+    Distance (AABB tree) and sign (winding number) are asked separately: pseudo-normals and rays
+    give wrong signs on cracked surfaces. Both are asked of the surface's skin: holes are covered,
+    what lies inside does not count, and an inside-out surface has the same inside.
+
+    Raises SurfaceError if the surface encloses nothing or has a large hole.
     """
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    squared, _, _ = igl.point_mesh_squared_distance(
-        points, surface.vertices, surface.faces.astype(np.int64)
-    )
-    inside = winding_number(surface, points) > 0.5
-    return np.where(inside, -1.0, 1.0) * np.sqrt(squared)
+    return surface.skin.signed_distance(points)
 
 
 def padded_box(surfaces: Sequence[SurfaceMesh], spacing: float, padding: float) -> GridBox:
@@ -216,7 +219,7 @@ def reinitialize(grid: DistanceGrid) -> DistanceGrid:
 
     Raises SurfaceError if the grid has no zero surface.
     """
-    zero = isosurface(grid)
+    zero = _in_space(grid, *march(grid.values), "zero surface")  # no lid: the organ goes on there
     squared, _, _ = igl.point_mesh_squared_distance(
         grid.points, zero.vertices, zero.faces.astype(np.int64)
     )
@@ -240,12 +243,26 @@ def dice(one: DistanceGrid, other: DistanceGrid) -> float:
 
 
 def isosurface(grid: DistanceGrid, name: str = "isosurface") -> SurfaceMesh:
-    """Zero surface of the grid by marching cubes, faces outward.
+    """Zero surface of the grid by marching cubes, faces outward, closed along the border.
+
+    What is inside at the border of the grid is cut off there.
 
     Raises SurfaceError if the grid has no zero surface.
     """
-    vertices, faces = march(grid.values)
-    return SurfaceMesh(grid.origin + grid.spacing * vertices, faces.astype(np.int32), name=name)
+    outside = np.abs(grid.values).max() + grid.spacing
+    index, faces = march(np.pad(grid.values, 1, constant_values=outside))
+    index = np.clip(index - 1, 0, np.array(grid.values.shape) - 1)  # the lid onto the border
+    return _in_space(grid, index, faces, name)
+
+
+def _in_space(grid: DistanceGrid, index: FloatArray, faces: IntArray, name: str) -> SurfaceMesh:
+    """A marched surface from index coordinates to metres."""
+    if len(faces) == 0:
+        raise SurfaceError(
+            f"{name}: nothing of the organ lies in the grid; move the box onto it, or choose a "
+            f"spacing below {grid.spacing:.3g} m"
+        )
+    return SurfaceMesh(grid.origin + grid.spacing * index, faces.astype(np.int32), name=name)
 
 
 def grid_points(origin: FloatArray, spacing: float, shape: Sequence[int]) -> FloatArray:

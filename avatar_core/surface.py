@@ -16,11 +16,10 @@ from typing import Any
 import igl
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from avatar_core.errors import SurfaceError
+from avatar_core.skin import Skin, components, directed_edges, skin_of, weld
 from avatar_core.surface_files import content_of, parse
 
 FloatArray = NDArray[np.float64]
@@ -89,7 +88,7 @@ class SurfaceMesh:
     @cached_property
     def is_watertight(self) -> bool:
         """Whether as many faces run along each edge (vertices merged) one way as the other."""
-        directed = _directed_edges(_weld(self.vertices)[self.faces])
+        directed = directed_edges(weld(self.vertices)[self.faces])
         forth, n_forth = np.unique(directed, axis=0, return_counts=True)
         back, n_back = np.unique(directed[:, ::-1], axis=0, return_counts=True)
         return np.array_equal(forth, back) and np.array_equal(n_forth, n_back)
@@ -98,6 +97,14 @@ class SurfaceMesh:
     def clear_winding(self) -> FloatArray:
         """Winding number on a grid in the bounding box, at the points clearly off the surface."""
         return _clear_winding(self)
+
+    @cached_property
+    def skin(self) -> Skin:
+        """Boundary of the solid inside: holes covered, triangles that lie inside dropped.
+
+        Raises SurfaceError if the surface encloses nothing or has a large hole.
+        """
+        return skin_of(self.vertices, self.faces, self.name)
 
     @property
     def bounding_box(self) -> tuple[FloatArray, FloatArray]:
@@ -301,8 +308,8 @@ def _patch_labels(vertices: FloatArray, faces: NDArray[np.int32]) -> IntArray:
 
     Vertices are merged by position; open patches whose rims come closer than the mean edge join.
     """
-    triangles = _weld(vertices)[faces]
-    links = _directed_edges(triangles)
+    triangles = weld(vertices)[faces]
+    links = directed_edges(triangles)
     rim = _rim(links)
     edge = float(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1).mean())
     positions = np.empty((triangles.max() + 1, 3))
@@ -310,23 +317,8 @@ def _patch_labels(vertices: FloatArray, faces: NDArray[np.int32]) -> IntArray:
     near = cKDTree(positions[rim]).query_pairs(edge, output_type="ndarray") if len(rim) else None
     if near is not None and len(near):
         links = np.vstack([links, rim[near]])
-    n = len(positions)
-    graph = coo_matrix((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
-    vertex_labels = connected_components(graph, directed=False)[1]
+    vertex_labels = components(links, len(positions))
     return np.unique(vertex_labels[triangles[:, 0]], return_inverse=True)[1].astype(np.int64)
-
-
-def _weld(vertices: FloatArray, tolerance: float = 1e-7) -> IntArray:
-    """Index of the merged vertex of each vertex, shape (n,); tolerance x diagonal."""
-    cell = tolerance * float(np.linalg.norm(np.ptp(vertices, axis=0))) or 1.0
-    key = np.round((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
-    return np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
-
-
-def _directed_edges(triangles: NDArray[Any]) -> IntArray:
-    """Edges (from, to) of all faces without those of zero length, shape (<= 3 m, 2)."""
-    edges = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    return edges[edges[:, 0] != edges[:, 1]].astype(np.int64)
 
 
 def _rim(edges: IntArray) -> IntArray:
@@ -383,7 +375,7 @@ def _signed_volume(vertices: FloatArray, faces: NDArray[Any]) -> float:
 
 
 def _winding_volume(surface: SurfaceMesh, n: int = 48) -> float:
-    """Volume of |w| > 1/2 by quadrature with the indicator clip(1/2 - phi / h, 0, 1) [m3].
+    """Volume inside the skin by quadrature with the indicator clip(1/2 - phi / h, 0, 1) [m3].
 
     phi is the signed distance, h the cell: n of them along the longest side of the box.
     """
@@ -391,9 +383,8 @@ def _winding_volume(surface: SurfaceMesh, n: int = 48) -> float:
     low = surface.bounding_box[0] - h
     cells = np.ceil(surface.extent / h).astype(int) + 2
     points = _box_points(low, low + h * cells, cells.tolist())
-    squared, _, _ = igl.point_mesh_squared_distance(points, surface.vertices, _int64(surface.faces))
-    sign = np.where(np.abs(winding_number(surface, points)) > 0.5, -1.0, 1.0)
-    return float(h**3 * np.clip(0.5 - sign * np.sqrt(squared) / h, 0.0, 1.0).sum())
+    phi = surface.skin.signed_distance(points)
+    return float(h**3 * np.clip(0.5 - phi / h, 0.0, 1.0).sum())
 
 
 def _box_points(low: FloatArray, high: FloatArray, shape: Iterable[int]) -> FloatArray:
