@@ -17,11 +17,12 @@ from avatar_core.surface import SurfaceMesh
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+@pytest.hookimpl(tryfirst=True)  # before the plugin reads the marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """A file's tests stay with one worker, for its fixtures; all of ROS with one, for its time."""
     for item in items:
         folder = item.path.parent.name
-        item.add_marker(pytest.mark.xdist_group("ros" if folder == "ros" else str(item.path)))
+        item.add_marker(pytest.mark.xdist_group("ros" if folder == "ros" else item.path.stem))
 
 
 @pytest.fixture(scope="session")
