@@ -1,11 +1,11 @@
-"""Shared fixtures: the phantom, and real data where it is present; who runs what."""
+"""Shared fixtures: the phantom, and real data where it is present."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-# Before numpy: as many workers as cores, so one thread each.
+# Before numpy: where tests run side by side, one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -15,14 +15,6 @@ from avatar_core.phantom import phantom_liver
 from avatar_core.surface import SurfaceMesh
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
-
-
-@pytest.hookimpl(tryfirst=True)  # before the plugin reads the marks
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A file's tests stay with one worker, for its fixtures; all of ROS with one, for its time."""
-    for item in items:
-        folder = item.path.parent.name
-        item.add_marker(pytest.mark.xdist_group("ros" if folder == "ros" else item.path.stem))
 
 
 @pytest.fixture(scope="session")
