@@ -53,6 +53,7 @@ GAP_TOLERANCE = 1e-9  # [m] of gap change that ends Gauss-Seidel
 ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not come in through the surface
 MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
 MIN_ACCESS = 1e-2  # below, the tip is off the accessible surface
+LEAP = 50e-3  # [m] in a period: whoever is that far off did not move there, but comes in anew
 FULL_ACCESS = 0.99  # below, the force fades
 
 # What the step reads; `prepare` fills it once. Shapes in avatar_core.contact.ContactModel.
@@ -84,13 +85,14 @@ ModelArrays = namedtuple(
     ],
 )
 
-# What the step keeps between calls (passage, force) and its scratch.
+# What the step keeps between calls (passage, seen, active, force) and its scratch.
 State = namedtuple(
     "State",
     [
         "passage",  # (T,) whether the tip came in through the surface: OUTSIDE, ENTERED, BARRED
         "force",  # (T,) lambda
         "active",  # (T,) the tip is closer than its radius, where it may touch
+        "seen",  # (T, 3) the last valid tip that was in contact [m]
         "gap",  # (T,) phi - r
         "slope",  # (T, 3) grad phi
         "steepness",  # (T,) |grad phi|
@@ -239,10 +241,10 @@ def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
     """Gap, normal, access, compliance, surface point and load positions of a tip, if it touches."""
     state.active[t] = False
     state.access[t] = 1.0
-    before = state.passage[t]
-    state.passage[t] = OUTSIDE
+    before, goes_on = state.passage[t], _goes_on(state, t, tip)
     if not np.isfinite(tip[0] + tip[1] + tip[2]):
-        return INVALID_POSE
+        return INVALID_POSE  # wherever the tip is: it may well be where it was
+    state.passage[t] = OUTSIDE
     if not on_grid(model.distance.shape, model.origin, model.spacing[0], tip):
         return OK
     cell = cell_at(model.origin, model.spacing[0], tip)
@@ -254,7 +256,7 @@ def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
     state.access[t] = min(access, 1.0)
     if access < MIN_ACCESS:
         return OUT_OF_RANGE
-    deepest = MAX_DEPTH if before == ENTERED else ENTRY_DEPTH
+    deepest = MAX_DEPTH if before == ENTERED and goes_on else ENTRY_DEPTH
     if before == BARRED or phi < -deepest:
         state.passage[t] = BARRED
         return OUT_OF_RANGE
@@ -262,12 +264,29 @@ def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
     state.active[t] = True
     _direct(state, t, tip, phi)
     state.self_compliance[t] = in_cell(model.self_compliance, cell, state.self_slope[t])
+    for d in range(3):
+        state.seen[t, d] = tip[d]
+    if not goes_on:
+        state.force[t] = 0.0
     gather(model, state, t, cell, reply)
     return OK if access >= FULL_ACCESS else OUT_OF_RANGE
 
 
 @inlined
 def _direct(state, t, p, phi):  # type: ignore[no-untyped-def]
+@inlined
+def _goes_on(state, t, tip):  # type: ignore[no-untyped-def]
+    """Whether a tip in contact is where it can have moved from its last contact.
+
+    After invalid poses nobody has seen it move: as deep as a contact may begin, it may have.
+    """
+    square = 0.0
+    for d in range(3):
+        square += (tip[d] - state.seen[t, d]) ** 2
+    farthest = LEAP if state.active[t] else ENTRY_DEPTH
+    return square < farthest * farthest
+
+
     """n = g / |g| with g = grad phi, and s = p - phi n."""
     g = state.slope[t]
     state.steepness[t] = max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)

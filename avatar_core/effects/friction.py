@@ -169,6 +169,9 @@ def solve(model, state, tips, reply, several, large, friction):  # type: ignore[
     converged = _sweep(state, reply, several, large, friction)
     again = False
     for t in range(state.passage.shape[0]):
+        if state.force[t] <= 0.0:  # none before, or it was taken from a tip that leapt
+            friction.motion[t] = NONE
+            friction.push[t] = 0.0
         if state.active[t] and friction.motion[t] == STICKS and not _holds(state, friction, t):
             friction.limit[t] = mu_k
             again = True
