@@ -49,11 +49,13 @@ UNKNOWN_FRAME, EXTRAPOLATED = 8, 9
 # that began at depth would give back energy that nobody put in.
 OUTSIDE, ENTERED, BARRED = range(3)
 
+PATIENCE = 8  # sweeps before the exact solution is worth its time,
+MAX_EXACT = 64  # and after which it has not helped
 GAP_TOLERANCE = 1e-9  # [m] of gap change that ends Gauss-Seidel
 ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not come in through the surface
+LEAP = 50e-3  # [m] in a period: whoever is that far off did not move there, but comes in anew
 MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
 MIN_ACCESS = 1e-2  # below, the tip is off the accessible surface
-LEAP = 50e-3  # [m] in a period: whoever is that far off did not move there, but comes in anew
 FULL_ACCESS = 0.99  # below, the force fades
 
 # What the step reads; `prepare` fills it once. Shapes in avatar_core.contact.ContactModel.
@@ -90,9 +92,9 @@ State = namedtuple(
     "State",
     [
         "passage",  # (T,) whether the tip came in through the surface: OUTSIDE, ENTERED, BARRED
+        "seen",  # (T, 3) the last valid tip that was in contact [m]
         "force",  # (T,) lambda
         "active",  # (T,) the tip is closer than its radius, where it may touch
-        "seen",  # (T, 3) the last valid tip that was in contact [m]
         "gap",  # (T,) phi - r
         "slope",  # (T, 3) grad phi
         "steepness",  # (T,) |grad phi|
@@ -239,9 +241,9 @@ def _solve_period(  # type: ignore[no-untyped-def]
 @inlined
 def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
     """Gap, normal, access, compliance, surface point and load positions of a tip, if it touches."""
+    before, goes_on = state.passage[t], _goes_on(state, t, tip)
     state.active[t] = False
     state.access[t] = 1.0
-    before, goes_on = state.passage[t], _goes_on(state, t, tip)
     if not np.isfinite(tip[0] + tip[1] + tip[2]):
         return INVALID_POSE  # wherever the tip is: it may well be where it was
     state.passage[t] = OUTSIDE
@@ -262,18 +264,16 @@ def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
         return OUT_OF_RANGE
     state.passage[t] = ENTERED
     state.active[t] = True
-    _direct(state, t, tip, phi)
-    state.self_compliance[t] = in_cell(model.self_compliance, cell, state.self_slope[t])
     for d in range(3):
         state.seen[t, d] = tip[d]
     if not goes_on:
         state.force[t] = 0.0
+    _direct(state, t, tip, phi)
+    state.self_compliance[t] = in_cell(model.self_compliance, cell, state.self_slope[t])
     gather(model, state, t, cell, reply)
     return OK if access >= FULL_ACCESS else OUT_OF_RANGE
 
 
-@inlined
-def _direct(state, t, p, phi):  # type: ignore[no-untyped-def]
 @inlined
 def _goes_on(state, t, tip):  # type: ignore[no-untyped-def]
     """Whether a tip in contact is where it can have moved from its last contact.
@@ -287,6 +287,8 @@ def _goes_on(state, t, tip):  # type: ignore[no-untyped-def]
     return square < farthest * farthest
 
 
+@inlined
+def _direct(state, t, p, phi):  # type: ignore[no-untyped-def]
     """n = g / |g| with g = grad phi, and s = p - phi n."""
     g = state.slope[t]
     state.steepness[t] = max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
@@ -428,10 +430,13 @@ def solve_alone(state, reply):  # type: ignore[no-untyped-def]
 def solve_together(state, reply, several, large):  # type: ignore[no-untyped-def]
     """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda + h >= 0, from the last forces.
 
-    Where the depth is bent each update is one of Newton's.
+    Where the depth is bent each update is one of Newton's. Tips close to each other share forces
+    that sweeps hardly change: then the sweeps start again from the exact solution.
     """
     n_tools = state.passage.shape[0]
-    for _ in range(MAX_SWEEPS):
+    for sweep in range(MAX_SWEEPS):
+        if several is not None and sweep < MAX_EXACT and sweep % PATIENCE == PATIENCE - 1:
+            coupling.share(state, reply, several, large)
         worst = 0.0
         for t in range(n_tools):
             if not state.active[t]:
