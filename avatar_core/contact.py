@@ -175,8 +175,8 @@ class ContactModel:
 
     def resume(self, before: ContactModel) -> None:
         """Go on where another model of the same organ and tools is: tips in contact stay so."""
-        self.state.passage[:] = before.state.passage
-        self.state.force[:] = before.state.force
+        for name in ("passage", "seen", "active", "force"):
+            getattr(self.state, name)[:] = getattr(before.state, name)
         mine, theirs = self.effects, before.effects
         if mine.friction is not None and theirs.friction is not None:
             for name in ("anchor", "motion", "push"):
@@ -305,6 +305,7 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     n_far = _n_far(layout)
     state = State(
         passage=np.zeros(n_tools, np.int64),
+        seen=np.zeros((n_tools, 3)),
         force=np.zeros(n_tools),
         active=np.zeros(n_tools, np.bool_),
         gap=np.zeros(n_tools),

@@ -49,8 +49,11 @@ UNKNOWN_FRAME, EXTRAPOLATED = 8, 9
 # that began at depth would give back energy that nobody put in.
 OUTSIDE, ENTERED, BARRED = range(3)
 
+PATIENCE = 8  # sweeps before the exact solution is worth its time,
+MAX_EXACT = 64  # and after which it has not helped
 GAP_TOLERANCE = 1e-9  # [m] of gap change that ends Gauss-Seidel
 ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not come in through the surface
+LEAP = 50e-3  # [m] in a period: whoever is that far off did not move there, but comes in anew
 MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
 MIN_ACCESS = 1e-2  # below, the tip is off the accessible surface
 FULL_ACCESS = 0.99  # below, the force fades
@@ -84,11 +87,12 @@ ModelArrays = namedtuple(
     ],
 )
 
-# What the step keeps between calls (passage, force) and its scratch.
+# What the step keeps between calls (passage, seen, active, force) and its scratch.
 State = namedtuple(
     "State",
     [
         "passage",  # (T,) whether the tip came in through the surface: OUTSIDE, ENTERED, BARRED
+        "seen",  # (T, 3) the last valid tip that was in contact [m]
         "force",  # (T,) lambda
         "active",  # (T,) the tip is closer than its radius, where it may touch
         "gap",  # (T,) phi - r
@@ -237,12 +241,12 @@ def _solve_period(  # type: ignore[no-untyped-def]
 @inlined
 def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
     """Gap, normal, access, compliance, surface point and load positions of a tip, if it touches."""
+    before, goes_on = state.passage[t], _goes_on(state, t, tip)
     state.active[t] = False
     state.access[t] = 1.0
-    before = state.passage[t]
-    state.passage[t] = OUTSIDE
     if not np.isfinite(tip[0] + tip[1] + tip[2]):
-        return INVALID_POSE
+        return INVALID_POSE  # wherever the tip is: it may well be where it was
+    state.passage[t] = OUTSIDE
     if not on_grid(model.distance.shape, model.origin, model.spacing[0], tip):
         return OK
     cell = cell_at(model.origin, model.spacing[0], tip)
@@ -254,16 +258,33 @@ def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
     state.access[t] = min(access, 1.0)
     if access < MIN_ACCESS:
         return OUT_OF_RANGE
-    deepest = MAX_DEPTH if before == ENTERED else ENTRY_DEPTH
+    deepest = MAX_DEPTH if before == ENTERED and goes_on else ENTRY_DEPTH
     if before == BARRED or phi < -deepest:
         state.passage[t] = BARRED
         return OUT_OF_RANGE
     state.passage[t] = ENTERED
     state.active[t] = True
+    for d in range(3):
+        state.seen[t, d] = tip[d]
+    if not goes_on:
+        state.force[t] = 0.0
     _direct(state, t, tip, phi)
     state.self_compliance[t] = in_cell(model.self_compliance, cell, state.self_slope[t])
     gather(model, state, t, cell, reply)
     return OK if access >= FULL_ACCESS else OUT_OF_RANGE
+
+
+@inlined
+def _goes_on(state, t, tip):  # type: ignore[no-untyped-def]
+    """Whether a tip in contact is where it can have moved from its last contact.
+
+    After invalid poses nobody has seen it move: as deep as a contact may begin, it may have.
+    """
+    square = 0.0
+    for d in range(3):
+        square += (tip[d] - state.seen[t, d]) ** 2
+    farthest = LEAP if state.active[t] else ENTRY_DEPTH
+    return square < farthest * farthest
 
 
 @inlined
@@ -409,10 +430,13 @@ def solve_alone(state, reply):  # type: ignore[no-untyped-def]
 def solve_together(state, reply, several, large):  # type: ignore[no-untyped-def]
     """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda + h >= 0, from the last forces.
 
-    Where the depth is bent each update is one of Newton's.
+    Where the depth is bent each update is one of Newton's. Tips close to each other share forces
+    that sweeps hardly change: then the sweeps start again from the exact solution.
     """
     n_tools = state.passage.shape[0]
-    for _ in range(MAX_SWEEPS):
+    for sweep in range(MAX_SWEEPS):
+        if several is not None and sweep < MAX_EXACT and sweep % PATIENCE == PATIENCE - 1:
+            coupling.share(state, reply, several, large)
         worst = 0.0
         for t in range(n_tools):
             if not state.active[t]:

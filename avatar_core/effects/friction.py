@@ -22,6 +22,7 @@ from typing import ClassVar
 import numpy as np
 
 from avatar_core.effects.base import Effect
+from avatar_core.effects.friction_newton import approach, displaced
 from avatar_core.effects.large_deformation import bend
 from avatar_core.errors import SceneError
 from avatar_core.near_field import find_block
@@ -49,6 +50,8 @@ class Friction(Effect):
 
 
 MAX_SWEEPS = 1000
+PATIENCE = 8  # sweeps before Newton's steps are worth their time,
+MAX_NEWTON = 64  # and after which they have not helped
 GAP_TOLERANCE = 1e-9  # [m]
 NONE, STICKS, SLIPS = range(3)  # what a tip did in the last period
 
@@ -67,6 +70,9 @@ StickSlip = namedtuple(
         "compliance",  # (T, T, 3, 3) C
         "asked",  # (T, 3) c - s_a
         "slipped",  # (T,) way of the anchor in this period [m]
+        "matrix",  # (3T, 3T) of Newton's steps
+        "side",  # (3T,) [N]
+        "best",  # (T, 3) push nearest to the solution among them [N]
     ],
 )
 
@@ -90,6 +96,9 @@ def make_stick_slip(arrays: FrictionArrays, n_tools: int, n_modes: int) -> Stick
         compliance=np.zeros((n_tools, n_tools, 3, 3)),
         asked=np.zeros((n_tools, 3)),
         slipped=np.zeros(n_tools),
+        matrix=np.zeros((3 * n_tools, 3 * n_tools)),
+        side=np.zeros(3 * n_tools),
+        best=np.zeros((n_tools, 3)),
     )
 
 
@@ -160,6 +169,9 @@ def solve(model, state, tips, reply, several, large, friction):  # type: ignore[
             friction.motion[t] = NONE
             friction.push[t] = 0.0
             continue
+        if state.force[t] <= 0.0:  # none before, or it was taken from a tip that leapt
+            friction.motion[t] = NONE
+            friction.push[t] = 0.0
         _ask(model, state, friction, tips, t)
         friction.limit[t] = 0.0  # a new contact starts without friction
         if friction.motion[t] == STICKS:
@@ -194,24 +206,12 @@ def _ask(model, state, friction, tips, t):  # type: ignore[no-untyped-def]
         friction.asked[t, d] = tips[t, d] - r * n[d] - friction.anchor[t, d]
 
 
-@fast
-def _displaced(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
-    """U of a tip's patch under the present pushes and all that is there without them."""
-    u0, u1, u2 = reply.lifted[t, 0], reply.lifted[t, 1], reply.lifted[t, 2]
-    for s in range(state.passage.shape[0]):
-        if s != t and (several is None or not state.active[s]):
-            continue
-        c, g = friction.compliance[t, s], friction.push[s]
-        u0 += c[0, 0] * g[0] + c[0, 1] * g[1] + c[0, 2] * g[2]
-        u1 += c[1, 0] * g[0] + c[1, 1] * g[1] + c[1, 2] * g[2]
-        u2 += c[2, 0] * g[0] + c[2, 1] * g[1] + c[2, 2] * g[2]
-    return u0, u1, u2
-
-
 @inlined
 def _sweep(state, reply, several, large, friction):  # type: ignore[no-untyped-def]
     """Gauss-Seidel over the tips, the normal and then the tangential force of each."""
-    for _ in range(MAX_SWEEPS):
+    for sweep in range(MAX_SWEEPS):
+        if several is not None and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
+            approach(state, reply, several, large, friction)
         worst = 0.0
         for t in range(state.passage.shape[0]):
             if state.active[t]:
@@ -226,7 +226,7 @@ def _sweep(state, reply, several, large, friction):  # type: ignore[no-untyped-d
 def _press(state, reply, several, large, friction, t):  # type: ignore[no-untyped-def]
     """0 <= lambda  perp  gap - n . U + h >= 0."""
     n, c = state.normal[t], friction.compliance[t, t]
-    u0, u1, u2 = _displaced(state, reply, several, friction, t)
+    u0, u1, u2 = displaced(state, reply, several, friction, t)
     gap = state.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2)
     stiff = 0.0
     for i in range(3):
@@ -250,7 +250,7 @@ def _press(state, reply, several, large, friction, t):  # type: ignore[no-untype
 def _drag(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
     """tau <- tau + (what is asked - U) / stiffness, not beyond mu lambda."""
     n, c, g, y = state.normal[t], friction.compliance[t, t], friction.push[t], friction.asked[t]
-    u0, u1, u2 = _displaced(state, reply, several, friction, t)
+    u0, u1, u2 = displaced(state, reply, several, friction, t)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
     along = x0 * n[0] + x1 * n[1] + x2 * n[2]
     across = c[0, 0] + c[1, 1] + c[2, 2]
@@ -298,7 +298,7 @@ def _settle(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
         friction.motion[t] = STICKS
         return
     n, y = state.normal[t], friction.asked[t]
-    u0, u1, u2 = _displaced(state, reply, several, friction, t)
+    u0, u1, u2 = displaced(state, reply, several, friction, t)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
     if friction.motion[t] != NONE:
         along = x0 * n[0] + x1 * n[1] + x2 * n[2]

@@ -15,8 +15,13 @@ from typing import ClassVar
 import numpy as np
 
 from avatar_core.effects.base import Effect
+from avatar_core.effects.large_deformation import bend
 from avatar_core.near_field import find_block
 from avatar_core.step_code import fast, inlined
+
+MAX_EXCHANGES = 4  # for each tool, of the tips that are held
+INSIDE = 1e-9  # [m] deeper inside, a tip has to be held
+LEAST_PIVOT = 1e-8  # of a tip's own compliance
 
 
 @dataclass(frozen=True)
@@ -28,9 +33,21 @@ class SeveralTools(Effect):
 
 
 SeveralArrays = namedtuple("SeveralArrays", ["reach"])  # (1,) of the near field [m]
-# column (T, T, MAX_STENCIL, 3): near displacement at the nodes of the second tip by a unit normal
-# force of the first; near (T, T): whether it is any; extent (T,): radius of a tip's nodes
-Several = namedtuple("Several", ["reach", "column", "near", "extent"])
+Several = namedtuple(
+    "Several",
+    [
+        "reach",  # (1,) of the near field [m]
+        "column",  # (T, T, MAX_STENCIL, 3) near displacement at the nodes of the second tip by a
+        # unit normal force of the first
+        "near",  # (T, T) whether it is any
+        "extent",  # (T,) radius of a tip's nodes [m]
+        "matrix",  # (T, T) C, with what large deformation adds
+        "factor",  # (T, T) its Cholesky factor
+        "asked",  # (T,) the gap without any force [m]
+        "trial",  # (T,) forces that close the gaps of the tips that are held [N]
+        "held",  # (T,)
+    ],
+)
 
 
 def make_several(arrays: SeveralArrays, n_tools: int, n_nodes: int) -> Several:
@@ -40,6 +57,11 @@ def make_several(arrays: SeveralArrays, n_tools: int, n_nodes: int) -> Several:
         np.zeros((n_tools, n_tools, n_nodes, 3), np.float32),
         np.zeros((n_tools, n_tools), np.bool_),
         np.zeros(n_tools),
+        np.zeros((n_tools, n_tools)),
+        np.zeros((n_tools, n_tools)),
+        np.zeros(n_tools),
+        np.zeros(n_tools),
+        np.zeros(n_tools, np.bool_),
     )
 
 
@@ -128,6 +150,94 @@ def assemble(state, reply, several):  # type: ignore[no-untyped-def]
             state.gram[t, s] = state.gram[s, t] = value
             value *= state.scale[t] * state.scale[s]
             state.compliance[t, s] = state.compliance[s, t] = value
+
+
+@inlined
+def share(state, reply, several, large):  # type: ignore[no-untyped-def]
+    """The forces that solve the contact, by exchange of the tips that are held.
+
+    Nonnegative least squares in the energy (Lawson & Hanson, Solving Least Squares Problems,
+    Sec. 23.3): solve for the tips that are held; where one would be pulled, go as far as none is
+    and let it go; else hold the one that is inside deepest. Forces stay >= 0 and the energy falls,
+    however close the tips are. Of large deformation it is one step of Newton's.
+    """
+    _linearise(state, reply, several, large)
+    n_tools, force, trial, held = state.passage.shape[0], state.force, several.trial, several.held
+    for _ in range(MAX_EXCHANGES * n_tools):
+        _close_gaps(several)
+        part, pulled = 1.0, -1
+        for t in range(n_tools):
+            if held[t] and trial[t] < 0.0 and force[t] <= part * (force[t] - trial[t]):
+                part, pulled = force[t] / (force[t] - trial[t]), t
+        for t in range(n_tools):
+            if held[t]:
+                force[t] += part * (trial[t] - force[t])
+        if pulled >= 0:
+            force[pulled], held[pulled] = 0.0, False
+            continue
+        least, deepest = -INSIDE, -1
+        for t in range(n_tools):
+            if state.active[t] and not held[t]:
+                gap = several.asked[t]
+                for s in range(n_tools):
+                    if held[s]:
+                        gap += several.matrix[t, s] * force[s]
+                if gap < least:
+                    least, deepest = gap, t
+        if deepest < 0:
+            return
+        held[deepest] = True
+
+
+@inlined
+def _linearise(state, reply, several, large):  # type: ignore[no-untyped-def]
+    """Gap without forces and compliance, about the present forces; who has one is held."""
+    for t in range(state.passage.shape[0]):
+        several.held[t] = False
+        if not state.active[t]:
+            continue
+        several.held[t] = state.force[t] > 0.0
+        for s in range(state.passage.shape[0]):
+            several.matrix[t, s] = state.compliance[t, s]
+        several.asked[t] = state.gap[t] - reply.lift[t]
+        if large is not None:
+            bend(state, large, t)
+            stiff = large.bent[t, 1] * state.self_compliance[t]
+            several.matrix[t, t] += stiff
+            several.asked[t] += large.bent[t, 0] - stiff * state.force[t]
+
+
+@inlined
+def _close_gaps(several):  # type: ignore[no-untyped-def]
+    """matrix trial = - asked among the tips that are held, by Cholesky.
+
+    Of two tips in one place the second has no pivot: it gets a small one, and what is left of its
+    gap goes to the force of whoever is deeper.
+    """
+    held, c, root, x = several.held, several.matrix, several.factor, several.trial
+    for t in range(held.shape[0]):
+        if not held[t]:
+            continue
+        x[t] = -several.asked[t]
+        for s in range(t + 1):
+            if not held[s]:
+                continue
+            value = c[t, s]
+            for k in range(s):
+                if held[k]:
+                    value -= root[t, k] * root[s, k]
+            if s < t:
+                root[t, s] = value / root[s, s]
+                x[t] -= root[t, s] * x[s]
+            else:
+                root[t, t] = np.sqrt(max(value, LEAST_PIVOT * c[t, t]))
+        x[t] /= root[t, t]
+    for t in range(held.shape[0] - 1, -1, -1):
+        if held[t]:
+            for k in range(t + 1, held.shape[0]):
+                if held[k]:
+                    x[t] -= root[k, t] * x[k]
+            x[t] /= root[t, t]
 
 
 @fast

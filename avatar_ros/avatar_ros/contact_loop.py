@@ -40,12 +40,14 @@ OK = int(ContactState.STATUS_OK)
 NO_MODEL = int(ContactState.STATUS_NO_MODEL)
 NO_POSE = int(ContactState.STATUS_NO_POSE)
 STALE_POSE = int(ContactState.STATUS_STALE_POSE)
+INVALID_POSE = int(ContactState.STATUS_INVALID_POSE)
 
 BLEND = 0.1  # [s]
 _PATIENCE = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own
 _SHORTEST = 0.5  # periods between two answers to poses, however fast they come
 _NO_ERROR = float("nan")  # of a force that no model gave
 _FAR_AWAY = 1e3  # where a tool without a pose is, for the step [m]
+_UNKNOWN = float("nan")  # and one whose last pose was broken: it may go on where it was
 
 
 class OwnThread(CallbackGroup):
@@ -94,7 +96,7 @@ class Tool:
         self.status = self._reader.read(taken[0])
         if self.status != OK:
             self._orientation = None
-            tip[:] = _FAR_AWAY
+            tip[:] = _UNKNOWN if self.status == INVALID_POSE else _FAR_AWAY
             return False
         tip[:] = self._reader.position
         if self._orientation is not None:
@@ -232,15 +234,16 @@ class ContactLoop:
         timeout = round(settings.pose_timeout * 1e9)
         if online is not self._used:
             self._begin_change(online)
-        fresh = False
+        fresh, answered = False, NO_STAMP
         for tool, tip, turn in zip(self._tools, self._tips, self._turns, strict=True):
-            fresh |= tool.take(start, timeout, tip, turn)
+            if tool.take(start, timeout, tip, turn):
+                fresh, answered = True, tool.stamp
         record.note_period(start - self._step_start)
         self._step_start = start
         self._due = self._next_due(start, fresh)
         if fresh:
             self._answered = start
-            record.note_age(time.time_ns() - stamp_nanoseconds(self._tools[0].stamp))
+            record.note_age(time.time_ns() - stamp_nanoseconds(answered))
         model, leaving = online.model, self._leaving
         busy = 0
         if model is not None:

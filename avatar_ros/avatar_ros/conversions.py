@@ -244,8 +244,11 @@ class StateTemplate:
         def set_count(n_contacts: int) -> None:
             message.contacts = [Contact() for _ in range(n_contacts)]
 
-        self._status = _find_byte(message, lambda status: setattr(message, "status", status))
-        least = _find_byte(message, set_count)  # byte of the number of contacts
+        self._status = _find_byte(
+            message, lambda status: setattr(message, "status", status), lambda read: read.status
+        )
+        # byte of the number of contacts
+        least = _find_byte(message, set_count, lambda read: len(read.contacts))
         self._count = least if sys.byteorder == "little" else least - 3
         set_count(capacity)
         contact = message.contacts[0]
@@ -292,21 +295,32 @@ def _contact_numbers(contact: Contact) -> list[float]:
     return [p.x, p.y, p.z, n.x, n.y, n.z, f.x, f.y, f.z, contact.penetration]
 
 
-def _find_byte(message: ContactState, set_byte: Callable[[int], None]) -> int:
-    """Byte offset of what ``set_byte`` sets: the only byte that follows it.
+def _find_byte(
+    message: ContactState,
+    set_byte: Callable[[int], None],
+    read_byte: Callable[[ContactState], int],
+) -> int:
+    """Byte offset of what ``set_byte`` sets: the only byte that follows it and is read again.
 
-    Marks will not do for a small number, and one comparison neither: padding may hold anything.
+    Marks will not do for a small number, and one comparison neither: padding may hold anything,
+    even a copy of the number.
     """
-    values = (5, 3, 7, 2)
+    values = (5, 3, 7, 2, 6)
     serialised = []
     for value in values:
         set_byte(value)
         serialised.append(serialize_message(message))
     follows = [i for i, held in enumerate(zip(*serialised, strict=False)) if held == values]
     set_byte(0)
-    if len(follows) != 1:
+    found = []
+    for i in follows:
+        changed = bytearray(serialised[-1])
+        changed[i] = 4  # fewer than are there, so that no reader runs out of bytes
+        if read_byte(deserialize_message(bytes(changed), ContactState)) == 4:
+            found.append(i)
+    if len(found) != 1:
         raise LayoutError("a number is not stored in one place: use rmw_fastrtps_cpp")
-    return follows[0]
+    return found[0]
 
 
 # --- Outside the loop ------------------------------------------------------------------------

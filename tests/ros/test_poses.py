@@ -1,0 +1,312 @@
+"""Poses as no driver should send them, through the parser and the loop, without any other process.
+
+The loop is stepped by hand on a clock that the test sets; tools read serialised poses from a queue
+of depth one, as the subscription's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+import rclpy
+from avatar_ros.contact_loop import ContactLoop, Online, Tool
+from avatar_ros.conversions import PoseReader, StateTemplate, stamp_bytes, stamp_nanoseconds
+from avatar_ros.loop_statistics import statistics
+from avatar_ros.parameters import ContactSettings
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
+from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import Header
+
+from avatar_core.contact import prepare
+from avatar_ros import contact_loop
+from avatar_ros.msg import ContactState
+
+pytestmark = pytest.mark.ros
+
+OK, INVALID = int(ContactState.STATUS_OK), int(ContactState.STATUS_INVALID_POSE)
+STALE, BARRED = int(ContactState.STATUS_STALE_POSE), int(ContactState.STATUS_OUT_OF_RANGE)
+UNKNOWN_FRAME = int(ContactState.STATUS_UNKNOWN_FRAME)
+SECOND = 1_000_000_000
+TIP = np.array([0.0, 0.6, 0.0, 0.8])  # a unit quaternion
+NOW = 1_700_000_000 * SECOND
+often = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def pose(
+    position: np.ndarray, stamp: int = NOW, quaternion: np.ndarray = TIP, frame: str = "organ"
+) -> bytes:
+    header = Header(frame_id=frame)
+    header.stamp.sec, header.stamp.nanosec = divmod(stamp, SECOND)
+    x, y, z = (float(p) for p in position)
+    i, j, k, w = (float(q) for q in quaternion)
+    message = Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=i, y=j, z=k, w=w))
+    return serialize_message(PoseStamped(header=header, pose=message))
+
+
+class Queue:
+    """A subscription of depth one, and a publisher."""
+
+    def __init__(self) -> None:
+        self.handle = self
+        self.waiting: bytes | None = None
+        self.sent: list[bytes] = []
+
+    def take_message(self, kind: type, raw: bool) -> tuple[bytes, None] | None:
+        taken, self.waiting = self.waiting, None
+        return None if taken is None else (taken, None)
+
+    def publish_raw(self, message: bytes) -> None:
+        self.sent.append(message)
+
+
+class Bench:
+    """A loop on a clock of its own; ``now`` is in seconds since it began."""
+
+    def __init__(self, organ: Any, context: Any, timeout: float, n_tools: int = 1) -> None:
+        names = tuple(f"tool{i}" for i in range(n_tools))
+        base: dict[str, Any] = dict.fromkeys(ContactSettings.__dataclass_fields__)
+        base |= {"tools": names, "tip_radii": (5e-3,) * n_tools, "scene": "", "rate": 1000.0}
+        base |= {"cloud": "off", "cloud_divisor": 1, "frame_id": "organ", "material": {}}
+        self.settings = ContactSettings(**(base | {"pose_timeout": timeout}))
+        self.now = 0.0
+        self.poses = [Queue() for _ in names]
+        self.tools = [Tool(queue, queue, "organ") for queue in self.poses]
+        self.state = Queue()
+        outlets = SimpleNamespace(
+            state=self.state, deformation=Queue(), statistics=Queue(), diagnostics=Queue()
+        )
+        self.loop = ContactLoop(self.settings, self.tools, outlets, context)
+        model = prepare(organ, (5e-3,) * n_tools, cloud="off", halves=True)
+        self.loop.online = Online("a", model, self.settings)
+        self.loop._used = self.loop.online  # at once, not faded in
+
+    def step(self, *messages: bytes | None, after: float = 1e-3) -> tuple[int, np.ndarray]:
+        """Status and force of the first tool in the period after some messages."""
+        for queue, message in zip(self.poses, messages, strict=False):
+            queue.waiting = message if message is not None else queue.waiting
+        self.now += after
+        self.loop._step()
+        state = deserialize_message(self.state.sent[-len(self.tools)], ContactState)
+        force = deserialize_message(self.poses[0].sent[-1], WrenchStamped).wrench.force
+        return state.status, np.array([force.x, force.y, force.z])
+
+    def press(self, touch: tuple[np.ndarray, np.ndarray], depth: float) -> np.ndarray:
+        """Come in from the surface, 1 mm a period; the tip there."""
+        for d in np.append(np.arange(-6e-3, depth, 1e-3), depth):
+            status, _ = self.step(pose(touch[0] - d * touch[1]))
+            assert status == OK
+        return touch[0] - depth * touch[1]
+
+
+@pytest.fixture
+def bench(organ: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    context = rclpy.Context()
+    context.init()
+    made: list[Bench] = []
+    clock = SimpleNamespace(
+        monotonic_ns=lambda: round(1e9 * made[-1].now) if made else 0,
+        time_ns=lambda: NOW + (round(1e9 * made[-1].now) if made else 0),
+    )
+    monkeypatch.setattr(contact_loop, "time", clock)
+
+    def make(timeout: float = 0.02, n_tools: int = 1) -> Bench:
+        made.append(Bench(organ, context, timeout, n_tools))
+        return made[-1]
+
+    yield make
+    context.try_shutdown()
+
+
+# --- The parser ---------------------------------------------------------------------------------
+
+
+@often
+@given(norm=st.floats(0.0, 2.0), axis=st.tuples(*4 * [st.floats(-1.0, 1.0)]))
+@example(norm=0.0, axis=(0.0, 0.0, 0.0, 1.0))
+@example(norm=2.0, axis=(0.0, 0.0, 0.0, 1.0))
+@example(norm=1.0, axis=(1e-200, 0.0, 0.0, 0.0))
+def test_only_unit_quaternions_are_orientations(
+    norm: float, axis: tuple[float, float, float, float]
+) -> None:
+    size = np.linalg.norm(axis)
+    quaternion = norm * np.array(axis) / size if size > 1e-6 else np.zeros(4)
+    found = float(np.linalg.norm(quaternion))
+    if abs(abs(found - 1.0) - 1e-3) < 1e-5:
+        return  # at the tolerance itself
+    status = PoseReader("organ").read(pose(np.zeros(3), quaternion=quaternion))
+    assert status == (OK if abs(found - 1.0) < 1e-3 else INVALID)
+
+
+@often
+@given(st.tuples(*7 * [st.sampled_from([0.0, 1.0, math.nan, math.inf, -math.inf, 1e308, 1e200])]))
+def test_numbers_beyond_all_measure_are_refused(numbers: tuple[float, ...]) -> None:
+    reader = PoseReader("organ")
+    status = reader.read(pose(np.array(numbers[:3]), quaternion=np.array(numbers[3:])))
+    assert status in (OK, INVALID)
+    if status == OK:
+        assert np.isfinite(numbers).all()
+        assert sum(q * q for q in numbers[3:]) == pytest.approx(1.0, abs=3e-3)
+
+
+@often
+@given(st.data())
+def test_no_bytes_upset_the_reader(data: st.DataObject) -> None:
+    """Flipped, cut, continued or made up: a status, and nothing of it is kept if it is not OK."""
+    reader, whole = PoseReader("organ"), bytearray(pose(np.array([1.0, 2.0, 3.0])))
+    for place, value in data.draw(
+        st.lists(st.tuples(st.integers(0, len(whole) - 1), st.integers(0, 255)), max_size=8)
+    ):
+        whole[place] = value
+    cut = data.draw(st.integers(0, len(whole)))
+    raw = data.draw(
+        st.sampled_from([bytes(whole), bytes(whole[:cut]), bytes(whole[cut:]), bytes(whole) * 2])
+        | st.binary(max_size=200)
+    )
+    status = reader.read(raw)
+    assert status in (OK, INVALID, UNKNOWN_FRAME)
+    if status == OK:
+        assert np.isfinite(reader.position).all()
+        assert len(reader.stamp) == 8
+    else:
+        assert reader.position == (0.0, 0.0, 0.0)
+        assert stamp_nanoseconds(reader.stamp) == 0
+
+
+@often
+@given(
+    frame=st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1, max_size=40),
+    tool=st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=40),
+    capacity=st.integers(1, 8),
+)
+@example(frame="\x05\x03\x07\x02", tool="\x05\x03\x07\x02", capacity=5)
+@example(frame="Ω", tool="", capacity=1)
+def test_state_of_any_names(frame: str, tool: str, capacity: int) -> None:
+    template = StateTemplate(frame, tool, "", capacity)
+    template.contacts[:] = 0.5
+    raw = template.serialise(stamp_bytes(NOW), 9, capacity, 2.0)
+    state = deserialize_message(raw, ContactState)
+    assert (state.header.frame_id, state.tool, state.status) == (frame, tool, 9)
+    assert [c.penetration for c in state.contacts] == [0.5] * capacity
+    assert PoseReader(frame).read(pose(np.zeros(3), frame=frame)) == OK
+    assert PoseReader(frame).read(pose(np.zeros(3), frame=frame + "x")) == UNKNOWN_FRAME
+
+
+# --- The loop -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("depth", [0.0, 8e-3])
+def test_a_broken_pose_costs_one_period(bench: Any, touch: Any, depth: float) -> None:
+    """Even where a tip is deeper than any contact may begin: 7 mm of its centre, after that."""
+    cell = bench()
+    tip = cell.press(touch, depth)
+    before = cell.step(pose(tip))[1]
+    assert before.any()
+    broken = {
+        "norm 0": pose(tip, quaternion=0.0 * TIP),
+        "norm 2": pose(tip, quaternion=2.0 * TIP),
+        "NaN": pose(tip * np.array([1.0, math.nan, 1.0])),
+        "infinite": pose(tip + math.inf),
+        "no stamp": pose(tip, stamp=0),
+        "cut": pose(tip)[:40],
+        "empty": b"organ"[:0],
+    }
+    for name, message in broken.items():
+        status, force = cell.step(message)
+        assert status in (INVALID, UNKNOWN_FRAME), name
+        assert not force.any(), name
+        if status == UNKNOWN_FRAME:  # its header was cut; who it was is not known
+            cell.press(touch, depth)
+        status, after = cell.step(pose(tip))
+        assert status == OK, name
+        np.testing.assert_allclose(after, before, rtol=1e-12, err_msg=name)
+
+
+def test_a_clock_that_goes_back_is_only_told(bench: Any, touch: Any) -> None:
+    """Poses count by when they come; the answer carries their stamp, whatever it says."""
+    cell = bench()
+    tip = cell.press(touch, 0.0)
+    before = cell.step(pose(tip))[1]
+    for back in (1, SECOND, 3600 * SECOND, 1_699_999_999 * SECOND, -300 * SECOND):
+        status, force = cell.step(pose(tip, stamp=NOW - back))
+        assert status == OK
+        np.testing.assert_array_equal(force, before)
+        wrench = deserialize_message(cell.poses[0].sent[-1], WrenchStamped)
+        stamp = wrench.header.stamp
+        assert stamp.sec * SECOND + stamp.nanosec == NOW - back
+    summary = statistics(cell.loop.record, round(1e9 * cell.now), 1000.0)
+    assert math.isfinite(summary.pose_age_p99)
+    assert summary.missed == 0
+
+
+def test_the_age_is_that_of_the_pose_that_was_answered(bench: Any, touch: Any) -> None:
+    """A first tool without a pose was 54 years old."""
+    cell = bench(n_tools=2)
+    for _ in range(5):
+        cell.now += 1e-3
+        cell.poses[1].waiting = pose(touch[0], stamp=NOW + round(1e9 * cell.now) - 200_000)
+        cell.loop._step()
+    ages = cell.loop.record.ages[: cell.loop.record.n_ages]
+    np.testing.assert_array_equal(ages, 200_000)
+
+
+def test_5_khz_and_10_hz(bench: Any, touch: Any) -> None:
+    """Of five poses in a period the last counts; between two in 100 periods the last holds."""
+    path = [touch[0] - 1e-3 * math.sin(k / 300) * touch[1] for k in range(3000)]
+    cell = bench(timeout=0.5)
+    cell.press(touch, 0.0)
+    fine: list[list[float]] = []
+    for k in range(0, 3000, 5):
+        for tip in path[k : k + 4]:
+            cell.poses[0].waiting = pose(tip)
+        status, force = cell.step(pose(path[k + 4]))
+        assert status == OK
+        if k % 500 == 0:
+            fine.append([k, *force])
+    cell = bench(timeout=0.5)
+    cell.press(touch, 0.0)
+    for k, *force in fine:
+        for period in range(100):
+            status, held = cell.step(pose(path[int(k) + 4]) if period == 0 else None)
+            assert status == OK
+            np.testing.assert_array_equal(held, force)
+    assert np.ptp(np.linalg.norm(np.array(fine)[:, 1:], axis=1)) > 0.1
+
+
+def test_10_hz_below_the_timeout_is_stale_in_between(bench: Any, touch: Any) -> None:
+    cell = bench(timeout=0.02)
+    tip = cell.press(touch, 0.0)
+    for _ in range(3):
+        found = [cell.step(pose(tip) if k == 0 else None) for k in range(100)]
+        statuses = np.array([status for status, _ in found])
+        assert (statuses[:20] == OK).all() and (statuses[22:] == STALE).all()
+        assert found[0][1].any()
+        assert not np.array([force for _, force in found])[statuses == STALE].any()
+
+
+@pytest.mark.parametrize(("depth", "expected"), [(0.0, OK), (10e-3, BARRED)])
+def test_a_minutes_silence(bench: Any, touch: Any, depth: float, expected: int) -> None:
+    """Who comes back where a contact may begin has force again; deeper, it has to come out."""
+    cell = bench()
+    tip = cell.press(touch, depth)
+    before = cell.step(pose(tip))[1]
+    status, force = cell.step(None, after=60.0)
+    assert status == STALE and not force.any()
+    status, force = cell.step(pose(tip))
+    assert status == expected
+    if expected == OK:
+        np.testing.assert_array_equal(force, before)
+        return
+    assert not force.any()
+    cell.step(pose(touch[0] + 12e-3 * touch[1]))
+    np.testing.assert_array_equal(cell.step(pose(cell.press(touch, depth)))[1], before)
