@@ -6,6 +6,7 @@ the trapezoidal rule makes of every contact that ends within a step h: K h^2 / 8
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import re
 import tracemalloc
@@ -23,6 +24,7 @@ from .touching import AWAY, RADIUS, Spot, spots, touched
 
 Figure = Callable[[str], None]
 MINUTE = 60_000  # periods
+PR_SET_THP_DISABLE = 41
 STATES = Path(__file__).resolve().parents[2] / "msg_docs" / "contact_state.md"
 SCENES = {
     "bare": ((), 1),
@@ -38,6 +40,11 @@ def resident() -> int:
     gc.collect()
     status = Path("/proc/self/status").read_text()
     return sum(1024 * int(kib) for kib in re.findall(r"(?:RssAnon|VmSwap):\s+(\d+) kB", status))
+
+
+def without_huge_pages() -> None:
+    """Else the kernel joins pages every ten seconds, and counts those that nobody has touched."""
+    ctypes.CDLL(None).prctl(PR_SET_THP_DISABLE, 1, 0, 0, 0)
 
 
 def documented() -> set[int]:
@@ -105,6 +112,7 @@ def stretch(
 
 
 def endure(scene: str, minutes: float) -> tuple[str, list[Stretch], set[int]]:
+    without_huge_pages()
     effects, n_tools = SCENES[scene]
     model = touched(effects, n_tools)
     rng, seen, places = np.random.default_rng(7), set[int](), spots(30e-3)
