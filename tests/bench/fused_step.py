@@ -28,14 +28,18 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
     out.n_contacts[0] = 0
     out.status[0] = OK
     x, y, z = tips[0, 0], tips[0, 1], tips[0, 2]
-    before = state.passage[0]
-    state.passage[0] = OUTSIDE
+    before, seen = state.passage[0], state.seen[0]
+    farthest = 50e-3 if state.active[0] else 5e-3
+    way = (x - seen[0]) ** 2 + (y - seen[1]) ** 2 + (z - seen[2]) ** 2
+    goes_on = way < farthest * farthest
+    state.active[0] = False
     state.force[0] = 0.0
     touches = False
     status = OK
     if not (abs(x) < np.inf and abs(y) < np.inf and abs(z) < np.inf):
         status = INVALID_POSE
     else:
+        state.passage[0] = OUTSIDE
         # --- where the tip is on the grid, and its B-splines -----------------------------------
         scale = 1.0 / model.spacing[0]
         shape = model.distance.shape
@@ -100,15 +104,16 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
                 g2 += wx[i] * along_z
             gap = phi - model.tip_radius[0]
             if gap < 0.0:
-                deepest = 25e-3 if before == ENTERED else 5e-3
+                deepest = 25e-3 if before == ENTERED and goes_on else 5e-3
                 if chi < 1e-2:
                     status = OUT_OF_RANGE
                 elif before == BARRED or phi < -deepest:
                     state.passage[0] = BARRED
                     status = OUT_OF_RANGE
                 else:
-                    touches = True
+                    state.active[0] = touches = True
                     state.passage[0] = ENTERED
+                    seen[0], seen[1], seen[2] = x, y, z
                     if chi < 0.99:
                         status = OUT_OF_RANGE
     out.status[0] = status

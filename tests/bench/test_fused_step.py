@@ -37,7 +37,9 @@ def test_the_bare_step_agrees_with_the_one_fused_by_hand(
     path = slide(organ, TIP, 5e-3, 60e-3, step=5e-4)
     rng = np.random.default_rng(0)
     low, high = organ.mesh.vertices.min(axis=0), organ.mesh.vertices.max(axis=0)
-    path = np.concatenate([path, rng.uniform(low - 0.02, high + 0.02, (300, 3)), [[np.nan, 0, 0]]])
+    leaps = rng.uniform(low - 0.02, high + 0.02, (300, 3))
+    back = np.repeat(path[len(path) // 2][None], 2, axis=0)  # before and after a broken pose
+    path = np.concatenate([path, leaps, back[:1], [[np.nan, 0, 0]], back[1:], leaps[:20]])
     touched = 0
     for tip in path:
         status = step(bare, tip[None])
