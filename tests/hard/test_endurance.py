@@ -10,6 +10,7 @@ import ctypes
 import gc
 import re
 import tracemalloc
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -40,6 +41,12 @@ def resident() -> int:
     gc.collect()
     status = Path("/proc/self/status").read_text()
     return sum(1024 * int(kib) for kib in re.findall(r"(?:RssAnon|VmSwap):\s+(\d+) kB", status))
+
+
+def items() -> int:
+    """What all lists, dictionaries and sets hold: their memory grows too seldom to tell."""
+    gc.collect()
+    return sum(len(o) for o in gc.get_objects() if type(o) in (list, dict, set, deque))
 
 
 def without_huge_pages() -> None:
@@ -130,9 +137,10 @@ def endure(scene: str, minutes: float) -> tuple[str, list[Stretch], set[int]]:
             memory.append(resident())
     grown = memory[-1] - memory[0]
     tracemalloc.start()
-    before = tracemalloc.take_snapshot()
+    before, held = tracemalloc.take_snapshot(), items()
     for tips in wander(places[0], n_tools, 2000, rng):
         step(model, tips)
+    more = items() - held
     after = tracemalloc.take_snapshot()
     tracemalloc.stop()
     core = [tracemalloc.Filter(True, "*avatar_core*")]
@@ -142,6 +150,7 @@ def endure(scene: str, minutes: float) -> tuple[str, list[Stretch], set[int]]:
     )
     assert grown < 2**20, f"{grown} bytes more"
     assert kept < 4096, f"{kept} bytes of Python objects more"
+    assert more < 200, f"{more} more items in lists, dictionaries and sets"
     touching = np.mean([run.contacts for run in runs])
     assert touching > 0.15
     for run in runs:
