@@ -219,7 +219,7 @@ def test_very_stiff_organs_stay_complementary(figure: Figure) -> None:
     CLOSED.clear()
     check_stiff()
     left, pressed = np.max(CLOSED, axis=0)
-    assert pressed > 2
+    assert pressed > 1  # or nothing was shared
     figure(f"1e3 to 1e8 N/m, up to {pressed:.0f} tools pressed: gaps closed within {left:.1e} m")
 
 
