@@ -109,6 +109,9 @@ def test_one_sweep_over_coordinates_is_reported(figure: Figure) -> None:
     assert [step.sweeps for step in found.history] == 8 * [1]
     assert found.outcome is pgd.Outcome.MODE_LIMIT
     assert not found.converged
+    met = pgd.solve_pgd(problem, replace(rule, tolerance=0.9))  # by a product that was cut short
+    assert met.outcome is pgd.Outcome.CONVERGED
+    assert not met.converged
     terms = np.array([k @ np.eye(N) for k in problem.terms])
     energies = []
     for rank in range(1, 9):
@@ -220,6 +223,10 @@ def test_rank_one_takes_one_product(figure: Figure) -> None:
     figure(f"{found.field.rank} product, {error:.1e} off")
     assert (found.field.rank, found.outcome) == (1, pgd.Outcome.CONVERGED)
     assert error < 1e-9
+    # by alternating directions alone too, which the update would otherwise make up for
+    alone = pgd.solve_pgd(single, replace(EXACT, tolerance=1e-8, update=False))
+    assert (alone.field.rank, alone.outcome) == (1, pgd.Outcome.CONVERGED)
+    assert off(alone.field, exact) < 1e-9
 
 
 def test_any_rank_over_loads_takes_as_many_modes(block: Elasticity, figure: Figure) -> None:
@@ -242,6 +249,8 @@ def test_any_rank_over_loads_takes_as_many_modes(block: Elasticity, figure: Figu
         np.testing.assert_allclose(gram, np.eye(rank), atol=1e-10)
         worst.append(np.abs(found.space @ found.load.T - exact).max() / np.abs(exact).max())
         assert worst[-1] < 1e-7  # what the bar of energy at rounding, 1e-13, allows
+        most = max(1, rank - 1)  # no block goes beyond what is allowed
+        assert pgd_load.solve_pgd(problem, replace(rule, max_modes=most)).space.shape[1] == most
 
     check()
     figure(f"{max(worst):.1e} off with as many modes as the rank, 1 to 16")
@@ -265,8 +274,8 @@ def test_full_rank_over_coordinates_closes_in(figure: Figure) -> None:
         for rank in (10, 40, 120)
     ]
     figure("10, 40, 120 products: " + ", ".join(f"{error:.1e}" for error in errors) + " off")
-    assert errors[1] < 0.2 * errors[0]
-    assert errors[2] < 1e-4
+    assert errors[1] < 0.01 * errors[0]
+    assert errors[2] < 1e-9  # any field of 12 places at 4 nodes is a sum of 48 products
 
 
 # --- nothing left but rounding ----------------------------------------------------------------
