@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import gc
 import math
+import threading
 import time
 from dataclasses import asdict, replace
 from typing import Any
@@ -29,6 +30,7 @@ from avatar_core.accuracy import AccuracyCurve, Budget
 from avatar_core.errors import AccuracyError, SceneError
 from avatar_ros import parameters, qos, realtime, scenes
 from avatar_ros.accuracy import Accuracy, Report
+from avatar_ros.budget_requests import BudgetRequests
 from avatar_ros.contact_loop import BLEND, ContactLoop, Online, Outlets, OwnThread, Tool
 from avatar_ros.handover import OVERTAKEN, Change, Handover, Order, Prepared
 from avatar_ros.loop_statistics import Record, statistics
@@ -46,11 +48,13 @@ class ContactNode(ManagedNode):
     def __init__(self) -> None:
         self._loop: ContactLoop | None = None
         self._handover: Handover | None = None
+        self._budget: BudgetRequests | None = None
         self._tools: list[Tool] = []
         self._outlets: Outlets | None = None
         self._timer: Any = None
         self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
         self._n_awaited = 0
+        self._changing = threading.RLock()
         super().__init__("contact", parameters.CONTACT)
         # As long as the node, and beside everything else: an answer may take a minute.
         self.create_service(
@@ -107,6 +111,9 @@ class ContactNode(ManagedNode):
             budget=asdict(settings.budget) if settings.budget else {},
         )
         self._handover = Handover(order, self._take_model, self.get_logger().error)
+        self._budget = BudgetRequests(
+            settings.budget, self._handover.ask, self._keep_budget, self._refuse_budget
+        )
 
     def activate(self) -> None:
         assert self._loop is not None
@@ -129,7 +136,7 @@ class ContactNode(ManagedNode):
     def clean_up(self) -> None:
         if self._handover is not None:
             self._handover.stop()
-            self._handover = None
+            self._handover = self._budget = None
         self._loop = None
         for tool in self._tools:
             self.destroy_subscription(tool.subscription)
@@ -150,8 +157,8 @@ class ContactNode(ManagedNode):
         replaced = loop.online
         self._ranges = prepared.ranges
         curve = AccuracyCurve.of_plain(prepared.curve) if prepared.curve else None
-        deadline = loop.settings.budget.deadline if loop.settings.budget else math.inf
-        accuracy = Accuracy(model, curve, deadline)
+        kept = self._budget.kept if self._budget is not None else None
+        accuracy = Accuracy(model, curve, _deadline(kept))
         loop.online = Online(prepared.id, model, loop.settings, prepared.effects, accuracy)
         what = ", ".join(prepared.effects) or "no effects"
         self.get_logger().info(
@@ -212,8 +219,13 @@ class ContactNode(ManagedNode):
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         """Type and range were checked; those that may change take effect with the next step.
 
-        A change of the material takes some tenths of a second, in the handover's process.
+        A change of the material takes some tenths of a second, in the handover's process. Called
+        by the executor, and in the handover's thread where a refused budget is put back.
         """
+        with self._changing:
+            return self._change(changes)
+
+    def _change(self, changes: list[Parameter]) -> SetParametersResult:
         loop = self._loop
         if loop is None:
             return SetParametersResult(successful=True)
@@ -236,8 +248,8 @@ class ContactNode(ManagedNode):
         changed = {p.name: p.value for p in changes if hasattr(loop.settings, p.name)}
         if material != settings.material and self._handover is not None:
             self._handover.ask({"material": material}, self._note_material)
-        if budget != settings.budget and self._handover is not None:
-            self._ask_budget(budget)
+        if self._budget is not None:
+            self._budget.ask(budget)
         loop.settings = replace(settings, **changed, material=material)
         return SetParametersResult(successful=True)
 
@@ -246,24 +258,15 @@ class ContactNode(ManagedNode):
         value = {name: self.get_parameter(name).value for name in names}
         return parameters.chosen_budget(value | {p.name: p.value for p in changes})
 
-    def _ask_budget(self, budget: Budget | None) -> None:
-        """Have the detail chosen anew; a budget that cannot be met gives way to the one before."""
-        assert self._handover is not None
+    def _keep_budget(self, budget: Budget | None) -> None:
+        loop = self._loop
+        if loop is not None and loop.online.accuracy is not None:
+            loop.online.accuracy.keep(_deadline(budget))
 
-        def answer(prepared: Prepared | None, refusal: str) -> None:
-            loop = self._loop
-            if loop is None or refusal == OVERTAKEN:
-                return
-            if not refusal:
-                loop.settings = replace(loop.settings, budget=budget)
-                if loop.online.accuracy is not None and budget is not None:
-                    loop.online.accuracy.keep(budget.deadline)
-                return
-            self.get_logger().error(f"budget refused: {refusal}")
-            kept = parameters.of_budget(loop.settings.budget)
-            self.set_parameters([Parameter(name, value=value) for name, value in kept.items()])
-
-        self._handover.ask({"budget": asdict(budget) if budget else {}}, answer)
+    def _refuse_budget(self, kept: Budget | None, refusal: str) -> None:
+        self.get_logger().error(f"budget refused: {refusal}")
+        values = parameters.of_budget(kept)
+        self.set_parameters([Parameter(name, value=value) for name, value in values.items()])
 
     def _note_material(self, prepared: Prepared | None, refusal: str) -> None:
         if refusal and refusal != OVERTAKEN:
@@ -305,6 +308,10 @@ class ContactNode(ManagedNode):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._outlets.diagnostics.publish(message)
+
+
+def _deadline(budget: Budget | None) -> float:
+    return budget.deadline if budget else math.inf
 
 
 def _never_called(message: bytes) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,15 +13,15 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.accuracy import Accuracy
-from avatar_ros.bench_cell import Module
+from avatar_ros.budget_requests import BudgetRequests
 from avatar_ros.budgets import Budgets
-from avatar_ros.handover import Order
+from avatar_ros.handover import Answer, Change, Order
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 
-from avatar_core.accuracy import Detail
+from avatar_core.accuracy import Budget, Detail
 from avatar_core.contact import prepare
 from avatar_core.errors import AccuracyError
 from avatar_ros import qos, scenes
@@ -89,22 +87,54 @@ def _ordinary(model: Any) -> Any:
     return Detail(model.n_modes)
 
 
+class Waiting:
+    """In place of the handover: keeps what is asked, for the test to answer."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Change, Answer]] = []
+        self.told: list[Any] = []
+        self.requests = BudgetRequests(
+            None,
+            lambda change, answer: self.asked.append((change, answer)),
+            self.told.append,
+            lambda kept, refusal: self.told.append((kept, refusal)),
+        )
+
+
+def test_a_budget_that_is_taken_back_before_it_was_answered_is_asked_for_again() -> None:
+    handover = Waiting()
+    handover.requests.ask(Budget(1.0, 1e-3))
+    handover.requests.ask(None)  # which is still in force
+    (_, loose), (change, none) = handover.asked
+    assert change == {"budget": {}}
+    loose(None, "")
+    none(None, "")
+    assert handover.told == [Budget(1.0, 1e-3), None]
+    assert handover.requests.kept is None
+
+
+def test_a_refused_budget_gives_way_to_the_one_in_force_unless_a_newer_one_comes() -> None:
+    handover = Waiting()
+    good, bad = Budget(1.0, 1e-3), Budget(1e-6, 1e-3)
+    handover.requests.ask(good)
+    handover.asked[0][1](None, "")
+    handover.requests.ask(bad)
+    handover.asked[1][1](None, "infeasible")
+    assert handover.told == [good, (good, "infeasible")]
+    handover.requests.ask(good)  # as its parameters are put back
+    assert len(handover.asked) == 2
+    handover.requests.ask(bad)
+    handover.requests.ask(None)
+    handover.asked[2][1](None, "infeasible")
+    handover.asked[3][1](None, "")
+    assert handover.told[2:] == [None]
+
+
 # --- In the cell -------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def nodes(own_domain: dict[str, str], library: Path) -> Iterator[dict[str, Module]]:
-    files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
-    processes = {
-        "vademecum_loader": Module("vademecum_loader", ["--ros-args", *files], own_domain),
-        "contact": Module("contact", [], own_domain),
-    }
-    yield processes
-    assert [process.finish() for process in processes.values()] == [0, 0]
-
-
 @pytest.fixture
-def hand(nodes: dict[str, Module], probe: Any, touch: tuple[np.ndarray, np.ndarray]) -> Hand:
+def hand(cell: dict[str, Any], probe: Any, touch: tuple[np.ndarray, np.ndarray]) -> Hand:
     probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
     return Hand(probe, touch[0])
 
