@@ -23,7 +23,7 @@ from avatar_core.organ import OrganOptions
 from avatar_core.phantom import phantom_liver
 from avatar_core.vademecum import Provenance
 
-from .shapes import TOP, compliance, cube, nodes_of, regions_of
+from .shapes import TOP, block, compliance, cube, nodes_of, regions_of
 
 Figure = Callable[[str], None]
 
@@ -224,15 +224,26 @@ def test_a_patch_larger_than_the_organ_is_refused(figure: Figure) -> None:
             return
         total = patch_loads(problem, TOP, radius).toarray().reshape(-1, 3, 6).sum(axis=0)
         np.testing.assert_allclose(total, np.hstack([np.eye(3), np.eye(3)]), atol=1e-12)
-        try:
-            surface = load_surface(mesh, regions_of(mesh), radius)
-        except MeshError as refused:  # from 0.12 m on: around the cube
-            assert "reaches around the organ" in str(refused)
-            assert radius > 0.1
-        else:
-            held.append(radius)
-            np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1.0)
-            assert (surface.normals[:, 1] > 0.5).all()
+        surface = load_surface(mesh, regions_of(mesh), radius)
+        held.append(radius)
+        assert surface.n_positions > 0
+        np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1.0)
+        assert (surface.normals[:, 1] > 0.5).all()
 
     check()
     figure(f"refused from the diagonal of the organ on; the largest held is {max(held):.3f} m")
+
+
+@pytest.mark.parametrize("thickness", [2e-3, 30e-3])
+def test_a_patch_around_a_leaf_is_refused(thickness: float, figure: Figure) -> None:
+    """Much thinner than the patch, its two sides cancel; as thick as that, a side has a normal."""
+    line = np.linspace(0.0, 0.1, 6)
+    leaf = block(line, np.linspace(0.0, thickness, 2), line)
+    if thickness > 0.02:
+        normals = load_surface(leaf, regions_of(leaf), 0.03).normals
+        figure(f"turned by {np.degrees(np.arccos(normals[:, 1].min())):.0f} deg at the rim")
+        assert (normals[:, 1] > 0.5).all()
+        return
+    with pytest.raises(MeshError, match=r"reaches around the organ.*take a smaller") as refused:
+        load_surface(leaf, regions_of(leaf), 0.03)
+    figure(f"refused: {refused.value}")
