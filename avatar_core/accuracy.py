@@ -47,7 +47,7 @@ class CurvePoint:
 
     l2, force : relative error that 95 % of unseen loads stay below, of the displacement of the
         cloud and of the normal force; l2 is NaN where nothing is shown
-    p50, p99 : time of a step [s]; NaN before it was timed
+    p50, p99 : time that a step takes of the processor [s]; NaN before it was timed
     nbytes : of what the step reads to show the displacement
     """
 
@@ -68,7 +68,7 @@ class Budget:
     """What is asked of a step.
 
     tolerance : on the relative error of ``quantity``, which 95 % of the loads keep
-    deadline : on the time of a step, which 99 % keep [s]
+    deadline : on the time that a step takes of the processor, which 99 % keep [s]
 
     Raises
     ------

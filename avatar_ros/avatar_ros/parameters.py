@@ -163,7 +163,7 @@ CONTACT = (
     Parameter(
         "accuracy.deadline",
         0.0,
-        "time that 99 % of steps must keep, forces and deformation computed [s]; 0: none",
+        "processor time that 99 % of steps must keep, forces and deformation [s]; 0: none",
         range=(0.0, 0.01),
         read_only=False,
     ),

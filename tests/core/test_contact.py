@@ -148,21 +148,47 @@ def test_closed_paths_on_real_livers_do_no_work(real_vademecum: Vademecum) -> No
 @pytest.mark.long
 @pytest.mark.parametrize("depth", [2e-3, 5e-3])
 def test_sliding_force_on_real_livers_has_no_steps(real_vademecum: Vademecum, depth: float) -> None:
-    jump, peak = largest_force_step(real_vademecum, prepare(real_vademecum, (RADIUS,)), depth)
-    print(f"{real_vademecum.name}: largest force step {jump:.2%} of the peak {peak:.1f} N")
-    assert peak > 1.0
-    # 0.4 to 1.4 % on most meshes, 2.9 % on one of Amos-007, where a fold of its wall is sharp
-    assert jump < 0.04
+    """99 % change by less than 2 % of the peak per 0.1 mm; a sharp fold may be steeper.
+
+    Once in many slides one is, by 3 %. What changes as much in 0.01 mm would be a step.
+    """
+    v, model = real_vademecum, prepare(real_vademecum, (RADIUS,))
+    others = np.random.default_rng(3).choice(inner_positions(v, 20e-3), 4, replace=False)
+    slides = [force_steps(v, model, depth, j) for j in (None, *others)]
+    coarse, fine, peak = (np.array(values) for values in zip(*slides, strict=True))
+    print(
+        f"{v.name}: largest force step {coarse.max():.2%} of the peak per 0.1 mm, 99 % within "
+        f"{np.quantile(coarse, 0.99):.2%}; {fine.max():.2%} per 0.01 mm"
+    )
+    assert (peak > 0.5).all()
+    assert np.quantile(coarse, 0.99) < 0.02
+    assert fine.max() < 0.02 / 4
 
 
-def largest_force_step(v: Vademecum, model: ContactModel, depth: float) -> tuple[float, float]:
-    """Over 200 mm at constant depth in steps of 0.1 mm: as part of the peak, and the peak [N]."""
-    forces = []
-    for tip in slide(v, RADIUS, depth, 0.2):
-        assert step(model, tip[None].copy()) == Status.OK
-        forces.append(model.out.force[0].copy())
+def force_steps(
+    v: Vademecum, model: ContactModel, depth: float, position: int | None = None
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Force steps over 200 mm at constant depth, 0.1 mm each; and 0.01 mm where it changes most.
+
+    Both as part of the peak, and the peak [N].
+    """
+    path = slide(v, RADIUS, depth, 0.2, position=position)
+    forces = forces_along(model, path)
     peak = np.linalg.norm(forces, axis=1).max()
-    return float(np.linalg.norm(np.diff(forces, axis=0), axis=1).max() / peak), float(peak)
+    steps = np.linalg.norm(np.diff(forces, axis=0), axis=1) / peak
+    k = int(steps.argmax())
+    fine = forces_along(model, np.concatenate([path[:k], refined(path[k : k + 2], 10)]))[k:]
+    return steps, np.linalg.norm(np.diff(fine, axis=0), axis=1) / peak, float(peak)
+
+
+def forces_along(model: ContactModel, path: np.ndarray) -> np.ndarray:
+    """Force on a tip that goes along a path, without a step that fails, shape (n, 3) [N]."""
+    model.reset()
+    forces = np.empty_like(path)
+    for k, tip in enumerate(path):
+        assert step(model, tip[None].copy()) == Status.OK
+        forces[k] = model.out.force[0]
+    return forces
 
 
 def closed_path_work(v: Vademecum, model: ContactModel, n_paths: int, seed: int) -> float:
@@ -217,10 +243,10 @@ def test_sliding_force_has_no_steps(
     phantom_vademecum: Vademecum, model: ContactModel, depth: float
 ) -> None:
     """200 mm at constant depth in steps of 0.1 mm: no step above 2 % of the peak force."""
-    jump, peak = largest_force_step(phantom_vademecum, model, depth)
+    coarse, fine, peak = force_steps(phantom_vademecum, model, depth)
     assert peak > 1.0
-    # 0.4 to 1.4 % on most meshes, 2.9 % on one of Amos-007, where a fold of its wall is sharp
-    assert jump < 0.04
+    assert coarse.max() < 0.02
+    assert fine.max() < 0.02 / 4
 
 
 def test_small_tip_is_felt_between_vertices(phantom_vademecum: Vademecum) -> None:
