@@ -6,6 +6,7 @@ measured error and time of many, and :func:`choose` picks among them for a :clas
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
@@ -191,18 +192,24 @@ def _first(
     return (min(known, key=key),) if known else ()
 
 
-def upper_quantile(values: np.ndarray, content: float = CONTENT) -> float:
+def upper_quantile(
+    values: np.ndarray, content: float = CONTENT, n_independent: int | None = None
+) -> float:
     """A bound that holds for a part ``content`` of what the values were drawn from.
 
     Distribution-free tolerance bound (Wilks, Annals of Mathematical Statistics 12, 1941): the
     smallest order statistic x_(r) with P[B >= r] <= 1 - confidence, B binomial of n and
-    ``content``; the largest value where the sample is too small for the confidence.
+    ``content``; the largest value where the sample is too small for the confidence. Where only
+    some of the values are independent, r / n is that of so many: the three directions of a load
+    are wrong together.
+
+    n_independent : of the values; None for all
     """
     from scipy.stats import binom
 
     ordered = np.sort(np.asarray(values, float).ravel())
-    n = len(ordered)
-    if n == 0:
+    if len(ordered) == 0:
         return float("nan")
-    rank = int(binom.ppf(_CONFIDENCE, n, content)) + 1
-    return float(ordered[min(rank, n) - 1])
+    n = n_independent or len(ordered)
+    rank = min(int(binom.ppf(_CONFIDENCE, n, content)) + 1, n)
+    return float(ordered[math.ceil(rank / n * len(ordered)) - 1])

@@ -100,12 +100,14 @@ def curve_of(vademecum: Vademecum, shown: np.ndarray, force: np.ndarray) -> Accu
 
     Parameters
     ----------
-    shown : ndarray, shape (n_details - 1, n), relative errors of the displacement
+    shown : ndarray, shape (n_details - 1, 3 n_loads), relative errors of the displacement, the
+        directions of a load together
     force : ndarray, shape (m,), of the normal force
     """
     details = details_of(vademecum.far.rank)
     felt = upper_quantile(force)
-    errors = [*(upper_quantile(row) for row in shown), float("nan")]
+    n_loads = shown.shape[1] // 3
+    errors = [*(upper_quantile(row, n_independent=n_loads) for row in shown), float("nan")]
     sizes = _sizes(vademecum, details)
     points = (
         CurvePoint(detail, error, felt, size)

@@ -10,6 +10,7 @@ import typer
 
 from avatar_core.cli_atlas import atlas
 from avatar_core.cli_bench import bench, require_ros, run_cell
+from avatar_core.cli_cell import cell
 from avatar_core.cli_patient import patient
 from avatar_core.cli_scene import scene
 from avatar_core.cli_study import study
@@ -41,6 +42,7 @@ app.command()(vademecum)
 app.command()(show)
 app.command()(patient)
 app.command()(study)
+app.command()(cell)
 
 
 def main() -> int:

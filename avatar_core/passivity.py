@@ -133,6 +133,11 @@ def reset(passivity: Passivity) -> None:
         array[...] = 0
 
 
+def warm_up() -> None:
+    """Compile :func:`limit`, or read it from numba's cache."""
+    limit(make_passivity(1, 1, 0.0), np.zeros((1, 3)), np.zeros((1, 3)))
+
+
 @entry
 def limit(passivity, tips, force):  # type: ignore[no-untyped-def]
     """Turn the organ's forces at these tips into those to send, in place; every period once.

@@ -17,7 +17,7 @@ import time
 from dataclasses import asdict, replace
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -25,20 +25,25 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
 
-from avatar_core import contact
+from avatar_core import contact, passivity
 from avatar_core.accuracy import AccuracyCurve, Budget
 from avatar_core.errors import AccuracyError, SceneError
-from avatar_ros import parameters, qos, realtime, scenes
+from avatar_ros import diagnostics, parameters, qos, realtime, scenes
 from avatar_ros.accuracy import Accuracy, Report
 from avatar_ros.budget_requests import BudgetRequests
-from avatar_ros.contact_loop import BLEND, ContactLoop, Online, Outlets, OwnThread, Tool
+from avatar_ros.contact_loop import BLEND, ContactLoop, Online, Outlets, OwnThread
+from avatar_ros.declared import ParameterError
 from avatar_ros.handover import OVERTAKEN, Change, Handover, Order, Prepared
 from avatar_ros.loop_statistics import Record, statistics
 from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_ros.safety import SAFETY, chosen_safety
 from avatar_ros.srv import LoadScene
+from avatar_ros.tool import Tool
 
 _STATISTICS_PERIOD = 1.0  # [s]
+_COUNT_PERIOD = 0.1  # from one count of the tools' publishers to the next [s]
+_BUDGET = ("accuracy.tolerance", "accuracy.quantity", "accuracy.deadline")
 _GRACE = 0.1  # a replaced model is kept for so long after the last step that uses it [s]
 
 
@@ -51,7 +56,9 @@ class ContactNode(ManagedNode):
         self._budget: BudgetRequests | None = None
         self._tools: list[Tool] = []
         self._outlets: Outlets | None = None
-        self._timer: Any = None
+        self._timers: list[Any] = []
+        self._faults: diagnostics.FaultCounter | None = None
+        self._said: dict[str, str] = {}  # of each tool's faults, last
         self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
         self._n_awaited = 0
         self._changing = threading.RLock()
@@ -75,6 +82,8 @@ class ContactNode(ManagedNode):
         if settings.scene:
             self._say_divisor(settings.cloud_divisor)
         contact.warm_up(len(settings.tools))
+        if settings.safety.passivity != "off":
+            passivity.warm_up()
         own = OwnThread()
         self._tools = [
             Tool(
@@ -88,6 +97,7 @@ class ContactNode(ManagedNode):
                 ),
                 self.create_publisher(WrenchStamped, f"{name}/spatial/servo_cf", qos.COMMAND),
                 settings.frame_id,
+                settings.safety,
             )
             for name in settings.tools
         ]
@@ -124,12 +134,21 @@ class ContactNode(ManagedNode):
         realtime.calm_interpreter()
         self._loop.record = Record(time.monotonic_ns())
         self._loop.start(granted.cpu)
-        self._timer = self.create_timer(_STATISTICS_PERIOD, self._publish_statistics)
+        self._faults = diagnostics.FaultCounter(self._tools)
+        self._timers = [
+            self.create_timer(_STATISTICS_PERIOD, self._publish_statistics),
+            self.create_timer(_COUNT_PERIOD, self._count_publishers),
+        ]
+        limits = settings.safety.limits
+        self.get_logger().info(
+            f"forces of at most {limits.force:g} N and {limits.slew:g} N/s "
+            f"({self.get_parameter('safety.device').value}; safety.device, safety.max_*)"
+        )
 
     def deactivate(self) -> None:
-        if self._timer is not None:
-            self.destroy_timer(self._timer)
-            self._timer = None
+        for timer in self._timers:
+            self.destroy_timer(timer)
+        self._timers = []
         if self._loop is not None:
             self._loop.stop()
 
@@ -198,7 +217,7 @@ class ContactNode(ManagedNode):
         """
         executor, handover = self.executor, self._handover
         assert executor is not None  # which runs this
-        if handover is None or self._timer is None:
+        if handover is None or not self._timers:
             raise SceneError("the node is inactive; activate it first")
         done = Future(executor=executor)
 
@@ -231,8 +250,9 @@ class ContactNode(ManagedNode):
             return SetParametersResult(successful=True)
         settings = loop.settings
         try:
-            budget = self._changed_budget(changes)
-        except (AccuracyError, parameters.ParameterError) as error:
+            budget = parameters.chosen_budget(self._values(_BUDGET, changes))
+            safety = chosen_safety(self._values(tuple(p.name for p in SAFETY), changes))
+        except (AccuracyError, ParameterError) as error:
             return SetParametersResult(successful=False, reason=str(error))
         material = dict(settings.material)
         for change in changes:
@@ -250,13 +270,13 @@ class ContactNode(ManagedNode):
             self._handover.ask({"material": material}, self._note_material)
         if self._budget is not None:
             self._budget.ask(budget)
-        loop.settings = replace(settings, **changed, material=material)
+        loop.settings = replace(settings, **changed, material=material, safety=safety)
         return SetParametersResult(successful=True)
 
-    def _changed_budget(self, changes: list[Parameter]) -> Budget | None:
-        names = ("accuracy.tolerance", "accuracy.quantity", "accuracy.deadline")
+    def _values(self, names: tuple[str, ...], changes: list[Parameter]) -> dict[str, Any]:
+        """Of some parameters, after changes."""
         value = {name: self.get_parameter(name).value for name in names}
-        return parameters.chosen_budget(value | {p.name: p.value for p in changes})
+        return value | {p.name: p.value for p in changes if p.name in value}
 
     def _keep_budget(self, budget: Budget | None) -> None:
         loop = self._loop
@@ -290,24 +310,55 @@ class ContactNode(ManagedNode):
         message = statistics(record, end, loop.settings.rate)
         message.header.stamp = self.get_clock().now().to_msg()
         accuracy = loop.online.accuracy
-        if accuracy is not None:
-            self._tell(accuracy.after(message))
+        report = accuracy.after(message) if accuracy is not None else None
         outlets.statistics.publish(message)
+        self._publish_diagnostics(loop, message, report)
         gc.collect()
 
-    def _tell(self, report: Report) -> None:
-        """Of modes that were left out or taken back: a line when it changes, diagnostics always."""
+    def _publish_diagnostics(
+        self, loop: ContactLoop, window: LoopStatistics, report: Report | None
+    ) -> None:
+        assert self._outlets is not None and self._faults is not None
+        name, online = self.get_name(), loop.online
+        limits = {p.name: self.get_parameter(p.name).value for p in diagnostics.THRESHOLDS}
+        promise = online.accuracy.promise if online.accuracy is not None else ""
+        statuses = [
+            diagnostics.loop_status(name, window, loop.settings.rate, limits),
+            diagnostics.vademecum_status(name, online.id, promise),
+        ]
+        if report is not None:
+            self._say_shown(report)
+            statuses.append(diagnostics.accuracy_status(name, report.text, report.shedding, window))
+        for i, faults in enumerate(self._faults.window()):
+            tool_name = loop.settings.tools[i]
+            self._say_fault(tool_name, faults.text)
+            statuses.append(
+                diagnostics.tool_status(
+                    name, tool_name, self._tools[i], loop.guards[i], faults, loop.energies, i
+                )
+            )
+        message = DiagnosticArray(status=statuses)
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._outlets.diagnostics.publish(message)
+
+    def _say_shown(self, report: Report) -> None:
+        """Of modes that were left out or taken back: a line when it changes."""
         if report.changed:
             say = self.get_logger().warning if report.shedding else self.get_logger().info
             say(report.text)
-        assert self._outlets is not None
-        level = DiagnosticStatus.WARN if report.shedding else DiagnosticStatus.OK
-        status = DiagnosticStatus(
-            name=f"{self.get_name()}: accuracy", level=level, message=report.text
-        )
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._outlets.diagnostics.publish(message)
+
+    def _say_fault(self, tool: str, text: str) -> None:
+        """A line when a tool's fault is another than a window ago."""
+        if text != self._said.get(tool, ""):
+            self._said[tool] = text
+            if text:
+                self.get_logger().warning(f"{tool}: {text}")
+            else:
+                self.get_logger().info(f"{tool}: poses are sound again")
+
+    def _count_publishers(self) -> None:
+        for tool in self._tools:
+            tool.publishers = tool.subscription.get_publisher_count()
 
 
 def _deadline(budget: Budget | None) -> float:

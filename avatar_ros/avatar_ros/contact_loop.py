@@ -5,49 +5,41 @@ two references, whole: the model in use and the record of times.
 
 A model that replaces another is faded in over ``BLEND`` seconds, during which the loop steps both:
 what is published changes per period by its share of the difference, beside what motion does.
+
+What the organ answers goes through a guard (:mod:`avatar_core.force_guard`) to each tool: limits, a
+ramp to none on a fault, a soft return. To stop is a fault as well.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
-from avatar_core import contact
+from avatar_core import contact, passivity
+from avatar_core.force_guard import ForceGuard
 from avatar_ros import realtime
 from avatar_ros.accuracy import Accuracy
-from avatar_ros.conversions import (
-    NO_STAMP,
-    CloudTemplate,
-    PoseReader,
-    StateTemplate,
-    WrenchTemplate,
-    small_turn,
-    stamp_nanoseconds,
-)
+from avatar_ros.conversions import NO_STAMP, CloudTemplate, StateTemplate, stamp_nanoseconds
 from avatar_ros.loop_statistics import Record
 from avatar_ros.msg import ContactState
 from avatar_ros.parameters import ContactSettings
+from avatar_ros.tool import FAR_AWAY, OK, Tool
 
-OK = int(ContactState.STATUS_OK)
 NO_MODEL = int(ContactState.STATUS_NO_MODEL)
-NO_POSE = int(ContactState.STATUS_NO_POSE)
-STALE_POSE = int(ContactState.STATUS_STALE_POSE)
-INVALID_POSE = int(ContactState.STATUS_INVALID_POSE)
+ENGAGING = int(ContactState.STATUS_ENGAGING)
+INACTIVE = int(ContactState.STATUS_INACTIVE)
 
 BLEND = 0.1  # [s]
 _PATIENCE = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own
 _SHORTEST = 0.5  # periods between two answers to poses, however fast they come
 _NO_ERROR = float("nan")  # of a force that no model gave
-_FAR_AWAY = 1e3  # where a tool without a pose is, for the step [m]
-_UNKNOWN = float("nan")  # and one whose last pose was broken: it may go on where it was
 
 
 class OwnThread(CallbackGroup):
@@ -61,50 +53,6 @@ class OwnThread(CallbackGroup):
 
     def ending_execution(self, entity: Any) -> None:
         pass
-
-
-class Tool:
-    """One tool's subscription, publisher and last pose.
-
-    status : OK with a usable pose, otherwise why not
-    stamp : of the last valid pose, eight bytes; zero before the first
-    """
-
-    def __init__(self, subscription: Any, publisher: Any, frame_id: str) -> None:
-        self.subscription = subscription
-        self.publisher = publisher
-        self.wrench = WrenchTemplate(frame_id)
-        self.status = NO_POSE
-        self.stamp = NO_STAMP
-        self._reader = PoseReader(frame_id)
-        self._received = 0  # [ns]
-        self._orientation: tuple[float, float, float, float] | None = None  # of the last valid pose
-
-    def take(self, now: int, timeout: int, tip: np.ndarray, turn: np.ndarray) -> bool:
-        """Take the newest pose, if any, and place ``tip``; true if a valid one came.
-
-        ``turn`` is what it turned since the last valid one [rad]; zero after a gap.
-        """
-        turn[:] = 0.0
-        taken = self.subscription.handle.take_message(PoseStamped, True)
-        if taken is None:
-            if self.status == OK and now - self._received > timeout:
-                self.status = STALE_POSE
-                self._orientation = None
-                tip[:] = _FAR_AWAY
-            return False
-        self.status = self._reader.read(taken[0])
-        if self.status != OK:
-            self._orientation = None
-            tip[:] = _UNKNOWN if self.status == INVALID_POSE else _FAR_AWAY
-            return False
-        tip[:] = self._reader.position
-        if self._orientation is not None:
-            turn[:] = small_turn(self._orientation, self._reader.orientation)
-        self._orientation = self._reader.orientation
-        self.stamp = self._reader.stamp
-        self._received = now
-        return True
 
 
 class Online:
@@ -152,6 +100,8 @@ class ContactLoop:
     online : what is simulated; exchange it when ``is_changing`` is false, for a smooth change
     record : where times go; exchange it at any time
     failure : what ended the loop before ``stop``, else empty
+    guards : of the force on each tool
+    energies : of the loop and hold, by tool; None where nothing keeps account
     """
 
     def __init__(
@@ -165,9 +115,13 @@ class ContactLoop:
         self.online = Online("", None, settings)
         self.record = Record(time.monotonic_ns())
         self.failure = ""
+        period = 1.0 / settings.rate
+        self.guards = [ForceGuard(settings.safety.limits) for _ in tools]
+        self.energies = settings.safety.observer(len(tools), period)
         self._tools = tools
+        self._forces = np.zeros((len(tools), 3))
         self._outlets = outlets
-        self._tips = np.full((len(tools), 3), _FAR_AWAY)
+        self._tips = np.full((len(tools), 3), FAR_AWAY)
         self._turns = np.zeros((len(tools), 3))
         self._used = self.online  # of the last step
         self._leaving: Any = None  # the model that it replaces, while both are stepped
@@ -176,6 +130,7 @@ class ContactLoop:
         self._wait_set = _rclpy.WaitSet(len(tools), 0, 0, 0, 0, 0, context.handle)
         self._period = round(1e9 / settings.rate)
         self._running = False
+        self._stopping = False
         self._thread: threading.Thread | None = None
         self._step_start = 0  # of the last step [ns]
         self._due = 0  # the next step, if no pose comes before [ns]
@@ -189,17 +144,18 @@ class ContactLoop:
         return self._running and not self.failure and changing
 
     def start(self, cpu: int = -1) -> None:
-        self._running = True
+        self._running, self._stopping = True, False
         self._used, self._leaving = self.online, None
         self._thread = threading.Thread(target=self._run, args=(cpu,), name="contact loop")
         self._thread.start()
 
     def stop(self) -> None:
-        """Returns when the last step is over, within two periods."""
-        self._running = False
+        """Returns when all forces have faded out and the last step is over, within 20 ms."""
+        self._stopping = True
         if self._thread is not None:
             self._thread.join()
             self._thread = None
+        self._running = False
 
     def _run(self, cpu: int) -> None:
         try:
@@ -209,11 +165,13 @@ class ContactLoop:
                 in_use.enter_context(self._wait_set)
                 realtime.bind_thread(cpu)
                 self._step_start = self._due = time.monotonic_ns()
-                while self._running:
+                while not (self._stopping and all(guard.silent for guard in self.guards)):
                     self._wait()
                     self._step()
         except Exception as error:
             self.failure = f"the contact loop ended: {type(error).__name__}: {error}"
+            with suppress(Exception):
+                self._let_go()
 
     def _ports(self) -> list[Any]:
         of_tools = [port for tool in self._tools for port in (tool.subscription, tool.publisher)]
@@ -236,7 +194,7 @@ class ContactLoop:
             self._begin_change(online)
         fresh, answered = False, NO_STAMP
         for tool, tip, turn in zip(self._tools, self._tips, self._turns, strict=True):
-            if tool.take(start, timeout, tip, turn):
+            if tool.take(start, timeout, tip, turn, settings.safety.leap):
                 fresh, answered = True, tool.stamp
         record.note_period(start - self._step_start)
         self._step_start = start
@@ -254,8 +212,7 @@ class ContactLoop:
             self._part = min(1.0, self._part + self._part_per_step)
             _fade_in(model.out.force, leaving.out.force, self._part)
             _fade_in(model.out.torque, leaving.out.torque, self._part)
-        for i, tool in enumerate(self._tools):
-            self._publish_wrench(i, tool, model)
+        self._publish_wrenches(start * 1e-9, model)
         record.note_step(time.monotonic_ns() - start)
         if model is not None:
             contact.estimate_error(model)
@@ -296,30 +253,52 @@ class ContactLoop:
         due = self._due + self._period
         return due if due > start else start + self._period
 
-    def _publish_wrench(self, i: int, tool: Tool, model: Any) -> None:
-        wrench = tool.wrench
-        if model is None or tool.status != OK:
-            wrench.force[:] = 0.0
-            wrench.torque[:] = 0.0
-        else:
-            wrench.force[:] = model.out.force[i]
-            wrench.torque[:] = model.out.torque[i]
-        tool.publisher.handle.publish_raw(wrench.serialise(tool.stamp))
+    def _publish_wrenches(self, now: float, model: Any) -> None:
+        """What the organ answers, as far as it is safe; none without a model or a pose."""
+        limits, energies = self.settings.safety.limits, self.energies
+        self._forces[:] = 0.0 if model is None else model.out.force
+        if energies is not None:
+            passivity.limit(energies, self._tips, self._forces)
+            if model is not None and self.settings.safety.passivity == "observe":
+                self._forces[:] = model.out.force
+        for i, (tool, guard) in enumerate(zip(self._tools, self.guards, strict=True)):
+            wrench = tool.wrench
+            wrench.force[:] = self._forces[i]
+            wrench.torque[:] = 0.0 if model is None else model.out.torque[i]
+            guard.limits = limits
+            guard.update(now, tool.status == OK and not self._stopping, wrench.force, wrench.torque)
+            if energies is not None:
+                energies.held[i, -1] = wrench.force
+            tool.answer()
+
+    def _let_go(self) -> None:
+        """After a failure: a last wrench of zero to every tool."""
+        for tool in self._tools:
+            tool.wrench.force[:] = 0.0
+            tool.wrench.torque[:] = 0.0
+            tool.answer()
 
     def _publish_state(self, i: int, tool: Tool, online: Online) -> None:
         template = online.states[i]
+        guard = self.guards[i]
         status = tool.status
-        if online.model is None:
+        if self._stopping:
+            status = INACTIVE
+        elif online.model is None:
             status = NO_MODEL
         elif status == OK:
             status = int(online.model.out.status[i])
+            if status == OK and not guard.engaged:
+                status = ENGAGING
         n, error = 0, _NO_ERROR
         if online.model is not None:
             n, error = (
                 _write_contacts(template, online.model.out, i),
                 online.model.out.force_error[i],
             )
-        self._outlets.state.handle.publish_raw(template.serialise(tool.stamp, status, n, error))
+        self._outlets.state.handle.publish_raw(
+            template.serialise(tool.stamp, status, n, error, guard.share)
+        )
 
 
 def _fade_in(new: np.ndarray, old: np.ndarray, part: float) -> None:

@@ -260,24 +260,33 @@ class StateTemplate:
         end = start + 8 * _CONTACT_NUMBERS * capacity
         self._tail = bytearray(serialised[end:])
         self._error = _find_number(message, lambda x: setattr(message, "force_error", x)) - end
+        self._share = _find_number(message, lambda x: setattr(message, "force_share", x)) - end
         self._block = bytearray(8 * _CONTACT_NUMBERS * capacity)
         self.contacts = np.frombuffer(self._block, dtype=np.float64).reshape(capacity, -1)
         if last != start + 72 or not all(self._reads_back(n) for n in {0, 1, capacity}):
             raise LayoutError("contacts are not ten float64 each in a row: use rmw_fastrtps_cpp")
 
-    def serialise(self, stamp: bytes, status: int, n_contacts: int, force_error: float) -> bytes:
+    def serialise(
+        self,
+        stamp: bytes,
+        status: int,
+        n_contacts: int,
+        force_error: float,
+        force_share: float = 1.0,
+    ) -> bytes:
         head = self._head
         head[self._stamp : self._stamp + _STAMP_BYTES] = stamp
         head[self._status] = status
         head[self._count : self._count + 4] = n_contacts.to_bytes(4, sys.byteorder)
         used = 8 * _CONTACT_NUMBERS * n_contacts
         struct.pack_into("=d", self._tail, self._error, force_error)
+        struct.pack_into("=d", self._tail, self._share, force_share)
         return bytes(head) + bytes(memoryview(self._block)[:used]) + bytes(self._tail)
 
     def _reads_back(self, n_contacts: int) -> bool:
         """A message of so many contacts means what was written; its padding may be anything."""
         self.contacts[:] = np.arange(self.contacts.size).reshape(self.contacts.shape)
-        sent = self.serialise(struct.pack("=iI", 3, 4), 5, n_contacts, 0.25)
+        sent = self.serialise(struct.pack("=iI", 3, 4), 5, n_contacts, 0.25, 0.5)
         read = deserialize_message(sent, ContactState)
         numbers = [_contact_numbers(contact) for contact in read.contacts]
         written = self.contacts[:n_contacts].tolist()
@@ -286,7 +295,7 @@ class StateTemplate:
         return (
             numbers == written
             and (stamp.sec, stamp.nanosec, read.status) == (3, 4, 5)
-            and read.force_error == 0.25
+            and (read.force_error, read.force_share) == (0.25, 0.5)
         )
 
 

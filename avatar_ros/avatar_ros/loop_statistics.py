@@ -65,6 +65,7 @@ def statistics(record: Record, end: int, rate: float) -> LoopStatistics:
         period_p50=period_p50,
         period_p99=period_p99,
         period_max=period_max,
+        compute_mean=float(computes.mean()) if len(computes) else np.nan,
         compute_p50=compute_p50,
         compute_p99=compute_p99,
         compute_max=compute_max,

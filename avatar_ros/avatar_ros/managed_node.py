@@ -16,8 +16,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from avatar_core.errors import AvatarError
-from avatar_ros import parameters
-from avatar_ros.parameters import Parameter, ParameterError
+from avatar_ros.declared import Parameter, ParameterError, declare
 
 _SIGNAL_LATENCY = 0.1  # longest until a signal is noticed [s]
 _LAST_ANSWERS = 1.0  # for what is still to be answered when the node ends [s]
@@ -36,7 +35,7 @@ class ManagedNode(LifecycleNode, ABC):
     def __init__(self, name: str, declared: tuple[Parameter, ...]) -> None:
         super().__init__(name)
         self.refusal = ""
-        parameters.declare(self, declared)
+        declare(self, declared)
 
     @abstractmethod
     def configure(self) -> None:

@@ -1,14 +1,12 @@
-"""The parameters of the nodes: each declared once, with type, default, range and meaning."""
+"""The parameters of the nodes, and the settings that they come to."""
 
 from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, get_args
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
 from avatar_core.accuracy import Budget, Quantity
@@ -17,48 +15,13 @@ from avatar_core.errors import SceneError
 from avatar_core.scene import Scene, Tool
 from avatar_core.scene_file import read_scene, write_scene
 from avatar_ros import scenes
+from avatar_ros.declared import Parameter, ParameterError
+from avatar_ros.diagnostics import THRESHOLDS
 from avatar_ros.patient_builder import Rules
+from avatar_ros.safety import SAFETY, Safety, chosen_safety
 
 CLOUDS = get_args(Cloud)
 WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
-
-
-class ParameterError(ValueError):
-    """A parameter has a value that the node cannot work with; the message says what it takes."""
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of a node.
-
-    range : smallest and largest value of a number
-    any_type : the type may differ from the default's; checked where it is read
-    """
-
-    name: str
-    default: Any
-    description: str
-    range: tuple[float, float] | None = None
-    read_only: bool = True
-    any_type: bool = False
-
-    def descriptor(self) -> ParameterDescriptor:
-        descriptor = ParameterDescriptor(
-            description=self.description, read_only=self.read_only, dynamic_typing=self.any_type
-        )
-        if self.range is not None and isinstance(self.default, float):
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=self.range[0], to_value=self.range[1])
-            ]
-        elif self.range is not None:
-            low, high = (int(bound) for bound in self.range)
-            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
-        return descriptor
-
-    def wanted(self) -> str:
-        kind = "a number with a decimal point" if isinstance(self.default, float) else "a value"
-        bounds = f" from {self.range[0]:g} to {self.range[1]:g}" if self.range else ""
-        return f"{kind}{bounds} like {self.default!r}"
 
 
 AUTOSTART = Parameter(
@@ -170,6 +133,8 @@ CONTACT = (
     Parameter("realtime.priority", 0, "SCHED_FIFO priority asked for; 0: ordinary", range=(0, 98)),
     Parameter("realtime.cpu", -1, "core the loop is bound to; -1: any", range=(-1, 1023)),
     Parameter("realtime.lock_memory", True, "keep the process in memory; needs a priority"),
+    *SAFETY,
+    *THRESHOLDS,
 )
 
 
@@ -222,22 +187,7 @@ class ContactSettings:
     priority: int
     cpu: int
     lock_memory: bool
-
-
-def declare(node: Node, parameters: tuple[Parameter, ...]) -> None:
-    """Declare all, with the values given by files and command line.
-
-    Raises
-    ------
-    ParameterError : a given value has the wrong type or lies out of range
-    """
-    for parameter in parameters:
-        try:
-            node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
-        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            raise ParameterError(
-                f"parameter {parameter.name}: give {parameter.wanted()} ({parameter.description})"
-            ) from error
+    safety: Safety = field(default_factory=Safety)
 
 
 def read_loader(node: Node) -> LoaderSettings:
@@ -311,6 +261,7 @@ def read_contact(node: Node) -> ContactSettings:
         priority=value["realtime.priority"],
         cpu=value["realtime.cpu"],
         lock_memory=value["realtime.lock_memory"],
+        safety=chosen_safety(value),
     )
     return _with_scene(settings, value["scene"]) if value["scene"] else settings
 

@@ -16,8 +16,9 @@ from rclpy.task import Future
 
 from avatar_ros import conversions, parameters
 from avatar_ros.action import BuildPatient
+from avatar_ros.declared import ParameterError
 from avatar_ros.managed_node import ManagedNode, run
-from avatar_ros.parameters import InterpolationSettings, ParameterError
+from avatar_ros.parameters import InterpolationSettings
 from avatar_ros.patient_builder import (
     Built,
     BusyError,

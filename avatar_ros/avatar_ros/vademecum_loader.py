@@ -14,9 +14,10 @@ from std_msgs.msg import Header
 from avatar_core import storage
 from avatar_core.errors import AvatarError
 from avatar_ros import conversions, parameters, qos
+from avatar_ros.declared import ParameterError
 from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.msg import VademecumFile, VademecumInfo
-from avatar_ros.parameters import LoaderSettings, ParameterError
+from avatar_ros.parameters import LoaderSettings
 from avatar_ros.srv import LoadVademecum
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import product
 
@@ -104,6 +105,19 @@ def test_bound_covers_what_it_says() -> None:
     rng = np.random.default_rng(0)
     kept = [np.mean(rng.exponential(size=5000) <= upper_quantile(d)) for d in _draws(rng)]
     assert np.mean(np.array(kept) >= 0.95 - 0.01) >= 0.93
+
+
+def test_values_that_come_in_threes_count_once() -> None:
+    """Directions of a load that are wrong by the same: three times the values, no more draws."""
+    rng = np.random.default_rng(0)
+    kept: dict[int | None, list[float]] = {200: [], None: []}
+    for drawn in _draws(rng):
+        for n, found in kept.items():
+            bound = upper_quantile(np.repeat(drawn, 3), n_independent=n)
+            found.append(1.0 - math.exp(-bound))
+    share = {n: np.mean(np.array(found) >= 0.95) for n, found in kept.items()}
+    assert share[200] >= 0.93
+    assert share[None] < 0.92  # were they taken for independent
 
 
 def _draws(rng: np.random.Generator) -> np.ndarray:

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 TIP_RADIUS = 0.005  # [m]
+# Of a contact node: a test may be kept from sending poses for longer than a driver.
+PATIENT = ["--ros-args", "-p", "pose_timeout:=0.5"]
 START_TIMEOUT = 120.0  # of a process, its compilation included, on a busy machine [s]
 DISCOVERY = 0.3  # of a client by its service [s]
 TOUCH_DEPTH = 0.004  # [m]
@@ -168,7 +170,7 @@ def cell(own_domain: dict[str, str], library: Path) -> Iterator[dict[str, Any]]:
     files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
     processes = {
         "vademecum_loader": Module("vademecum_loader", ["--ros-args", *files], own_domain),
-        "contact": Module("contact", [], own_domain),
+        "contact": Module("contact", PATIENT, own_domain),
     }
     yield processes
     codes = {name: process.finish() for name, process in processes.items()}

@@ -67,8 +67,8 @@ def parameter_rows(node: str) -> dict[str, str]:
 
 
 def yaml_parameters(node: str) -> dict[str, Any]:
-    """The parameters in the node's YAML file, nested names joined by dots."""
-    content = yaml.safe_load((ROOT / "params" / f"{node}.yaml").read_text())
+    """The parameters in the cell's YAML file, nested names joined by dots."""
+    content = yaml.safe_load((ROOT / "params" / "planning_cell.yaml").read_text())
     return _flat(content[node]["ros__parameters"])
 
 

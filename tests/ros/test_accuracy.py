@@ -17,7 +17,6 @@ from avatar_ros.budget_requests import BudgetRequests
 from avatar_ros.budgets import Budgets
 from avatar_ros.handover import Answer, Change, Order
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 
@@ -27,7 +26,7 @@ from avatar_core.errors import AccuracyError
 from avatar_ros import qos, scenes
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import START_TIMEOUT
-from tests.ros.test_cell import Hand, _force
+from tests.ros.test_cell import Hand, felt
 
 pytestmark = pytest.mark.ros
 
@@ -169,13 +168,6 @@ def test_force_comes_with_its_error(probe: Any, hand: Hand) -> None:
     assert 1e-4 * size < state.force_error < size
 
 
-def felt(probe: Any, hand: Hand) -> np.ndarray:
-    wanted = lambda w: _force(w).any()  # noqa: E731
-    return _force(
-        probe.next(WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND, wanted, 60.0, hand)
-    )
-
-
 def test_a_tolerance_shows_fewer_modes_and_leaves_the_force(
     probe: Any, hand: Hand, organ: Any
 ) -> None:
@@ -183,11 +175,11 @@ def test_a_tolerance_shows_fewer_modes_and_leaves_the_force(
     rank = organ.far.rank
     before = statistics(probe, hand, lambda s: s.modes == rank and s.step_p99 > 0.0)
     assert before.modes_shown == rank or before.missed > 0
-    force = felt(probe, hand)
+    _, force = felt(probe, hand)
     assert set_budget(probe, tolerance=1.0).successful
     after = statistics(probe, hand, lambda s: 0 < s.modes < rank)
     assert organ.certificate.curve.like(Detail(rank)).points[-1].l2 < after.promised_l2 <= 1.0
-    np.testing.assert_allclose(felt(probe, hand), force, rtol=1e-6)
+    np.testing.assert_allclose(felt(probe, hand)[1], force, rtol=1e-6)
     assert set_budget(probe, tolerance=0.0).successful
     statistics(probe, hand, lambda s: s.modes == rank)
 
@@ -219,9 +211,33 @@ def test_a_budget_without_meaning_is_refused_at_once(
     assert not answer.successful and reason in answer.reason
 
 
-def test_diagnostics_say_what_is_shown(probe: Any, hand: Hand) -> None:
-    array = probe.next(DiagnosticArray, "/diagnostics", qos.STATISTICS, meanwhile=hand)
-    (status,) = array.status
-    assert status.name == "contact: accuracy"
-    assert status.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
-    assert "modes shown" in status.message
+def diagnostics(probe: Any, hand: Hand, wanted: Any) -> dict[str, DiagnosticStatus]:
+    """The statuses of the contact node by name, once they are ``wanted``."""
+    named = lambda array: {status.name: status for status in array.status}  # noqa: E731
+    array = probe.next(
+        DiagnosticArray, "/diagnostics", qos.STATISTICS, lambda a: wanted(named(a)), 60.0, hand
+    )
+    return named(array)
+
+
+def test_diagnostics_say_what_is_shown_and_how_the_loop_is(
+    probe: Any, hand: Hand, organ: Any
+) -> None:
+    found = diagnostics(probe, hand, lambda named: "contact: accuracy" in named)
+    accuracy = found["contact: accuracy"]
+    assert accuracy.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
+    assert "modes shown" in accuracy.message
+    assert {v.key: v.value for v in found["contact: vademecum"].values}["id"] == organ.id
+    loop = {v.key: float(v.value) for v in found["contact: loop"].values}
+    assert loop["rate [Hz]"] == pytest.approx(1e6 / loop["period mean [us]"], rel=1e-3)
+    assert loop["execution mean [us]"] <= loop["execution max [us]"]
+
+
+def test_diagnostics_name_a_fault_its_remedy_and_its_end(probe: Any, hand: Hand) -> None:
+    hand.pose.header.frame_id = "world"
+    fault = diagnostics(probe, hand, lambda n: "another frame" in n["contact: tool"].message)
+    assert fault["contact: tool"].level == DiagnosticStatus.WARN
+    assert "tool_transform" in fault["contact: tool"].message
+    hand.pose.header.frame_id = "organ"
+    sound = diagnostics(probe, hand, lambda n: n["contact: tool"].level == DiagnosticStatus.OK)
+    assert sound["contact: tool"].message == "poses sound, force sent whole"

@@ -13,15 +13,17 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 import rclpy
-from avatar_ros.contact_loop import BLEND, OK, ContactLoop, Online
+from avatar_ros.contact_loop import BLEND, ContactLoop, Online
 from avatar_ros.conversions import WrenchTemplate, small_turn, stamp_bytes
 from avatar_ros.parameters import ContactSettings
+from avatar_ros.tool import OK
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from avatar_core.contact import prepare
 from avatar_core.effects import Friction, Viscoelasticity
+from tests.ros.through import Through
 
 pytestmark = pytest.mark.ros
 
@@ -65,9 +67,12 @@ class HeldTool:
         self.wrench = WrenchTemplate("organ")
         self.status, self.stamp = OK, stamp_bytes(1)
 
-    def take(self, now: int, timeout: int, tip: np.ndarray, turn: np.ndarray) -> bool:
+    def take(self, now: int, timeout: int, tip: np.ndarray, turn: np.ndarray, leap: float) -> bool:
         tip[:], turn[:] = self.tip, self.turn
         return True
+
+    def answer(self) -> None:
+        self.publisher.publish_raw(self.wrench.serialise(self.stamp))
 
 
 class Bench:
@@ -79,6 +84,7 @@ class Bench:
         self.cloud = Outlet()
         outlets = SimpleNamespace(state=Outlet(), deformation=self.cloud, statistics=Outlet())
         self.loop = ContactLoop(SETTINGS, [self.tool], outlets, context)
+        self.loop.guards = [Through()]
 
     def use(self, *effects: Any, identity: str = "a", cloud: Any = "surface") -> None:
         model = prepare(self.organ, effects=effects, cloud=cloud, period=1.0 / RATE, halves=True)

@@ -26,7 +26,8 @@ from avatar_core.storage import save_vademecum
 from avatar_core.tool_path import middle_of_access
 from avatar_ros import qos
 from avatar_ros.msg import ContactState, LoopStatistics
-from tests.ros.test_cell import Hand, _force
+from tests.ros.conftest import PATIENT
+from tests.ros.test_cell import Hand, _force, felt
 
 pytestmark = pytest.mark.ros
 
@@ -52,7 +53,7 @@ def nodes(
     options = ["--ros-args", "-p", f"library_dir:={folder}", "-p", "vademecum:=soft.h5"]
     processes = {
         "vademecum_loader": Module("vademecum_loader", options, own_domain),
-        "contact": Module("contact", [], own_domain),
+        "contact": Module("contact", PATIENT, own_domain),
     }
     yield processes
     assert [process.finish() for process in processes.values()] == [0, 0]
@@ -70,14 +71,8 @@ def hand(nodes: dict[str, Module], probe: Any, soft_organ: Any) -> Hand:
 
 
 def _settled(probe: Any, hand: Hand) -> np.ndarray:
-    """The force after a while."""
-    for _ in range(200):
-        hand()
-        probe.spin(0.002)
-    wrench = probe.next(
-        WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND, lambda w: _force(w).any(), 10.0, hand
-    )
-    return _force(wrench)
+    """The force once it is engaged."""
+    return felt(probe, hand)[1]
 
 
 def _set(probe: Any, **values: float) -> Any:

@@ -20,10 +20,12 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 import rclpy
-from avatar_ros.contact_loop import ContactLoop, Online, Tool
+from avatar_ros.contact_loop import ContactLoop, Online
 from avatar_ros.conversions import PoseReader, StateTemplate, stamp_bytes, stamp_nanoseconds
 from avatar_ros.loop_statistics import statistics
 from avatar_ros.parameters import ContactSettings
+from avatar_ros.safety import Safety
+from avatar_ros.tool import Tool
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
@@ -31,6 +33,7 @@ from std_msgs.msg import Header
 from avatar_core.contact import prepare
 from avatar_ros import contact_loop
 from avatar_ros.msg import ContactState
+from tests.ros.through import Through
 
 pytestmark = pytest.mark.ros
 
@@ -60,11 +63,14 @@ class Queue:
     def __init__(self) -> None:
         self.handle = self
         self.waiting: bytes | None = None
+        self.number = 0  # of the message that is taken next, as its publisher counts
         self.sent: list[bytes] = []
 
-    def take_message(self, kind: type, raw: bool) -> tuple[bytes, None] | None:
+    def take_message(self, kind: type, raw: bool) -> tuple[bytes, dict[str, int]] | None:
         taken, self.waiting = self.waiting, None
-        return None if taken is None else (taken, None)
+        self.number += 1
+        info = {"publication_sequence_number": self.number}
+        return None if taken is None else (taken, info)
 
     def publish_raw(self, message: bytes) -> None:
         self.sent.append(message)
@@ -77,7 +83,13 @@ class Bench:
         names = tuple(f"tool{i}" for i in range(n_tools))
         base: dict[str, Any] = dict.fromkeys(ContactSettings.__dataclass_fields__)
         base |= {"tools": names, "tip_radii": (5e-3,) * n_tools, "scene": "", "rate": 1000.0}
-        base |= {"cloud": "off", "cloud_divisor": 1, "frame_id": "organ", "material": {}}
+        base |= {
+            "safety": Safety(leap=math.inf),
+            "cloud": "off",
+            "cloud_divisor": 1,
+            "frame_id": "organ",
+            "material": {},
+        }
         self.settings = ContactSettings(**(base | {"pose_timeout": timeout}))
         self.now = 0.0
         self.poses = [Queue() for _ in names]
@@ -87,6 +99,7 @@ class Bench:
             state=self.state, deformation=Queue(), statistics=Queue(), diagnostics=Queue()
         )
         self.loop = ContactLoop(self.settings, self.tools, outlets, context)
+        self.loop.guards = [Through() for _ in names]
         model = prepare(organ, (5e-3,) * n_tools, cloud="off", halves=True)
         self.loop.online = Online("a", model, self.settings)
         self.loop._used = self.loop.online  # at once, not faded in

@@ -16,6 +16,7 @@ from avatar_ros.bench_cell import Module
 
 from avatar_ros import qos
 from avatar_ros.msg import ContactState, LoopStatistics
+from tests.ros.conftest import PATIENT
 from tests.ros.test_scene import Palpation
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]
@@ -31,7 +32,7 @@ def test_the_loop_goes_on_while_a_scene_is_compiled(
     environment = own_domain | {"NUMBA_CACHE_DIR": str(tmp_path)}  # nothing is compiled yet
     files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
     loader = Module("vademecum_loader", ["--ros-args", *files], environment)
-    contact = Module("contact", [], environment)
+    contact = Module("contact", PATIENT, environment)
     palpation = None
     windows: list[LoopStatistics] = []
     try:

@@ -1,0 +1,69 @@
+"""`avatar cell`: all nodes from one file, which end together."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros import qos
+from avatar_ros.msg import ContactState
+from tests.ros.conftest import START_TIMEOUT
+from tests.ros.pages import ROOT
+
+pytestmark = pytest.mark.ros
+
+
+@contextmanager
+def started(arguments: list[str], domain: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-c", "from avatar_core.cli import main; raise SystemExit(main())"]
+    process = subprocess.Popen(
+        [*command, "cell", *arguments], cwd="/", env=domain, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_one_file_of_parameters_starts_a_cell_that_a_signal_ends(
+    own_domain: dict[str, str], library: Path, tmp_path: Path, probe: Any, number: int
+) -> None:
+    file = tmp_path / "cell.yaml"
+    text = (ROOT / "params" / "planning_cell.yaml").read_text()
+    text = text.replace("library_dir: . # nothing", f"library_dir: {library} # nothing")
+    text = text.replace('vademecum: "" # file', "vademecum: liver.h5 # file")
+    file.write_text(text)
+    with started(["--params", str(file)], own_domain) as process:
+        probe.next(
+            ContactState, "contact_state", qos.state(1), lambda s: s.vademecum_id, START_TIMEOUT
+        )
+        begin = time.monotonic()
+        process.send_signal(number)
+        assert process.wait(15.0) == 0
+        print(f"ended in {time.monotonic() - begin:.1f} s")
+
+
+def test_a_node_that_ends_ends_the_cell_and_is_named(
+    own_domain: dict[str, str], tmp_path: Path
+) -> None:
+    file = tmp_path / "bad.yaml"
+    file.write_text("contact:\n  ros__parameters: {rate: 5.0}\n")
+    with started(["--params", str(file)], own_domain) as process:
+        _, said = process.communicate(timeout=START_TIMEOUT)
+    assert process.returncode == 1
+    assert "contact ended with code 1; ending the cell" in said
+    assert "parameter rate" in said
