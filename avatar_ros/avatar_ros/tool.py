@@ -108,11 +108,13 @@ class Tool:
             return status
         interval = max((now - self._received) * 1e-9, _LEAP_INTERVAL)
         leapt = math.dist(self._reader.position, self._last) * _LEAP_INTERVAL > leap * interval
-        known = self.status in (OK, LEAP, INVALID_POSE) and now - self._received <= timeout
+        late = now - self._received > timeout
         self._last[:] = self._reader.position
         self._received = now
         self.stamp = self._reader.stamp
-        return LEAP if leapt and known else OK
+        if late:  # of a pose that was good, only if the loop itself stood still meanwhile
+            return STALE_POSE if self.status == OK else OK
+        return LEAP if leapt and self.status in (OK, LEAP, INVALID_POSE) else OK
 
     def _comes_from_several(self, info: Any, now: int) -> bool:
         """Whether the numbers of the messages went back twice lately: once is a restart."""

@@ -105,6 +105,12 @@ def second_publisher(cell: Cell) -> tuple[int, np.ndarray]:
     return ContactState.STATUS_SEVERAL_PUBLISHERS, found
 
 
+def standstill(cell: Cell) -> tuple[int, np.ndarray]:
+    """The whole process is stopped for 2 s, and wakes up to a new pose."""
+    status, force = cell.bench.step(pose(cell.tip), after=2.0)
+    return ContactState.STATUS_STALE_POSE, np.vstack([[status, *force], cell.hold(11)])
+
+
 def lost(cell: Cell) -> tuple[int, np.ndarray]:
     cell.tool.publishers = 0
     cell.hold(20, lambda: None)
@@ -113,7 +119,9 @@ def lost(cell: Cell) -> tuple[int, np.ndarray]:
     return ContactState.STATUS_LOST_TOOL, found
 
 
-@pytest.mark.parametrize("fault", [silence, broken, foreign, leap, second_publisher, lost])
+@pytest.mark.parametrize(
+    "fault", [silence, broken, foreign, leap, second_publisher, standstill, lost]
+)
 def test_a_fault_ends_the_force_within_10_ms_and_it_comes_back_softly(
     cell: Cell, fault: Callable[[Cell], tuple[int, np.ndarray]]
 ) -> None:
