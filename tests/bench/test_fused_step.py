@@ -28,6 +28,7 @@ def organ() -> Vademecum:
     return vademecum_of(phantom_liver(12e-3), OrganOptions(n_vertices=800, n_certified=3))
 
 
+@pytest.mark.long
 def test_the_bare_step_agrees_with_the_one_fused_by_hand(
     fused: ModuleType, organ: Vademecum
 ) -> None:

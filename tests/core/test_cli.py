@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import cli
+from avatar_core import cli, loads
 from avatar_core.mesh import tetrahedralize
 from avatar_core.phantom import phantom_liver
 
@@ -122,8 +122,9 @@ def test_missing_output_folder(
 def test_tolerance_out_of_reach_is_written_and_marked(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
+    monkeypatch.setattr(loads, "MIDPOINTS_FROM", 1.0)  # fewer load positions
     file = tmp_path / "v.h5"
-    options = ["--vertices", "800", "--modes", "6", "--tolerance", "0.001", "--certify", "5"]
+    options = ["--vertices", "400", "--modes", "6", "--tolerance", "0.001", "--certify", "5"]
     assert run(monkeypatch, "vademecum", phantom_file(tmp_path), "-o", file, *options) == 3
     assert "not converged" in capsys.readouterr().err
     assert run(monkeypatch, "show", file, "--json") == 0

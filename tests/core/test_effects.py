@@ -10,7 +10,7 @@ import scipy.sparse.linalg as sla
 from skfem import Basis, BilinearForm, ElementTetP1, ElementTetP2, ElementVector, MeshTet
 from skfem.helpers import dot
 
-from avatar_core.contact import ContactModel, Layout, Status, prepare, step
+from avatar_core.contact import ContactModel, Layout, Status, lay_out, prepare, step
 from avatar_core.effects import (
     EFFECTS,
     Effect,
@@ -108,7 +108,7 @@ def test_the_list_of_effects_is_complete() -> None:
 
 def test_a_layout_survives_being_flat(phantom_vademecum: Vademecum) -> None:
     effects = tuple(effect for effect, _ in CHOICES.values())
-    layout = prepare(phantom_vademecum, (TIP,), cloud="off", effects=effects).layout
+    layout = lay_out(phantom_vademecum, (TIP,), cloud="off", effects=effects)
     again = Layout.of(layout.flat())
     for a, b in zip(layout.effects, again.effects, strict=True):
         assert (a is None) == (b is None)
@@ -529,6 +529,7 @@ def test_two_tools_without_the_effect_are_refused(phantom_vademecum: Vademecum) 
         prepare(phantom_vademecum, (TIP, TIP), effects=())
 
 
+@pytest.mark.long
 def test_everything_at_once_stays_sane(phantom_vademecum: Vademecum) -> None:
     """Two tools, all effects, ten seconds of touching: finite, bounded, and at rest in the end."""
     v = phantom_vademecum

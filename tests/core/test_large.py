@@ -371,7 +371,7 @@ def test_force_is_the_derivative_of_the_energy(bent: Vademecum, share: float) ->
     """Within the stored range, and where it goes on tangentially."""
     assert bent.large is not None
     short = replace(bent, large=replace(bent.large, reach=np.full_like(bent.large.reach, 8e-3)))
-    model = prepare(short, (RADIUS,), cloud="off")
+    model = prepare(short, (RADIUS,), cloud="volume")  # the compiled step of the other tests
     rng = np.random.default_rng(2)
     for j in rng.choice(inner_positions(bent), 4):
         model.reset()

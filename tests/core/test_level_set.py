@@ -442,7 +442,7 @@ def test_orientation_ignores_place_and_size(phantom):
 
 
 TURNED = {f"LiTS-{n}" for n in (6, 7, 8, 9, 10)}
-UPRIGHT = ("Amos-007", "LiTS-0", "LiTS-4", "LiTS-60", "LiTS-74")  # of every kind
+UPRIGHT = ("Amos-007", "LiTS-4")  # of two sources
 
 
 def turns(files, phantom):
@@ -453,8 +453,10 @@ def turns(files, phantom):
 
 
 def test_turned_livers_warn_and_upright_ones_do_not(livers_dir, phantom):
-    files = [livers_dir / f"{name}.obj" for name in (*TURNED, *UPRIGHT)]
-    assert turns(files, phantom)[1] == TURNED
+    """Two of each kind; the long test below asks all."""
+    some = sorted(TURNED)[:2]
+    files = [livers_dir / f"{name}.obj" for name in (*some, *UPRIGHT)]
+    assert turns(files, phantom)[1] == set(some)
 
 
 @pytest.mark.long
@@ -466,7 +468,9 @@ def test_only_the_turned_livers_warn(livers_dir, phantom):
     assert min(gains[name] for name in turned) > 1.25
 
 
-@pytest.mark.parametrize("name", ["LiTS-16", "LiTS-50", "Amos-007"])
+@pytest.mark.parametrize(
+    "name", ["LiTS-16", *(pytest.param(n, marks=pytest.mark.long) for n in ("LiTS-50", "Amos-007"))]
+)
 def test_a_real_liver_with_wrong_axes_warns(livers_dir, phantom, name):
     path = livers_dir / f"{name}.obj"
     for axes in ("LPS", "RIA", "RSP", "SRA", "LIP"):
