@@ -1,0 +1,129 @@
+"""avatar atlas: create, add, show, go on, refuse."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar_core import atlas_build, cli
+from avatar_core.atlas import Atlas
+from avatar_core.atlas_build import (
+    AtlasOptions,
+)
+from avatar_core.atlas_storage import save_atlas
+from avatar_core.registration import RegistrationRule, Template
+from avatar_core.surface import SurfaceMesh
+from tests.core.atlas.rough import ROUGH, write_obj
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], template: Template
+) -> Callable[..., tuple[int, str, str]]:
+    """Runs ``avatar atlas`` with a small template and a rough registration."""
+    monkeypatch.setattr(atlas_build, "default_template", lambda n: template)
+    monkeypatch.setattr(atlas_build, "AtlasOptions", partial(AtlasOptions, rule=ROUGH))
+
+    def command(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["avatar", "atlas", *map(str, arguments)])
+        code = cli.main()
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return command
+
+
+def test_create_add_and_show(
+    run: Callable[..., tuple[int, str, str]], livers: list[SurfaceMesh], tmp_path: Path
+) -> None:
+    file, folder = tmp_path / "a.h5", tmp_path / "livers"
+    folder.mkdir()
+    for liver in livers[:2]:
+        write_obj(folder / f"{liver.name}.obj", liver)
+    (folder / "empty.obj").touch()
+    (folder / "notes.txt").write_text("no surface")
+    code, out, err = run("create", file, folder, "--spacing", 0.02, "--jobs", 1)
+    assert code == 0 and "2 of 3 added, 1 skipped; 2 anatomies" in out
+    assert "skipped: empty:" in err and "Traceback" not in err
+
+    shutil.copy(folder / "liver0.obj", tmp_path / "twin.obj")
+    code, out, err = run("add", file, tmp_path / "twin.obj", "--jobs", 1)
+    assert code == 0 and "1 of 1 added, 0 skipped; 3 anatomies" in out
+    assert "notice: twin is the same file as liver0" in err
+
+    code, out, _ = run("show", file, "--json")
+    shown = json.loads(out)
+    assert code == 0 and shown["n_anatomies"] == 3 and shown["n_duplicates"] == 1
+    assert shown["bytes"] == file.stat().st_size
+    assert shown["box"]["spacing"] == 0.02
+    assert shown["box"]["n_points"] == np.prod(shown["box"]["shape"])
+    assert [one["duplicate_of"] for one in shown["anatomies"]] == [None, None, "liver0"]
+    for one, liver in zip(shown["anatomies"], livers[:2], strict=False):
+        assert one["name"] == liver.name and one["axes"] == "RAS"
+        assert one["volume"] == pytest.approx(liver.volume, rel=1e-6)
+        assert 0 < one["mean_distance"] < ROUGH.largest_mean
+    code, out, _ = run("show", file)
+    assert code == 0 and "duplicate of liver0" in out and "3 anatomies (1 duplicates)" in out
+
+
+def test_a_stopped_command_goes_on(
+    run: Callable[..., tuple[int, str, str]],
+    livers: list[SurfaceMesh],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = tmp_path / "a.h5"
+    files = [write_obj(tmp_path / f"{liver.name}.obj", liver) for liver in livers[:2]]
+    register = atlas_build.register
+
+    def stopped(template: Template, surface: SurfaceMesh, rule: RegistrationRule):
+        if surface.name == "liver1":
+            raise KeyboardInterrupt
+        return register(template, surface, rule)
+
+    monkeypatch.setattr(atlas_build, "register", stopped)
+    code, _, err = run("create", file, *files, "--spacing", 0.02, "--jobs", 1)
+    assert code == 130 and "the same command goes on" in err and not file.exists()
+    monkeypatch.setattr(atlas_build, "register", register)
+    code, out, _ = run("create", file, *files, "--spacing", 0.02, "--jobs", 1)
+    assert code == 0 and "1 of them from an interrupted build" in out
+
+
+def test_the_command_refuses_clearly(
+    run: Callable[..., tuple[int, str, str]],
+    atlas: Atlas,
+    livers: list[SurfaceMesh],
+    tmp_path: Path,
+) -> None:
+    file, liver = tmp_path / "a.h5", write_obj(tmp_path / "liver0.obj", livers[0])
+    hollow = tmp_path / "hollow"
+    hollow.mkdir()
+    save_atlas(atlas, file)
+    before = file.read_bytes()
+    for arguments, remedy in [
+        (["create", file, liver], "avatar atlas add"),
+        (["create", tmp_path / "b.h5", hollow], "should hold"),
+        (["create", tmp_path / "b.h5", tmp_path / "missing.obj", "--jobs", 1], "nothing was"),
+        (["create", tmp_path / "no" / "b.h5", liver], "create its folder"),
+        (["create", tmp_path / "b.h5", liver, "--spacing", 0], "spacing"),
+        (["create", tmp_path / "b.h5", liver, "--unit", "inch"], "--unit"),
+        (["create", tmp_path / "b.h5", liver, "--axes", "XYZ"], "axes"),
+        (["create", tmp_path / "b.h5", liver, "--box", 0.1, 0.1, 0.1, "--jobs", 1], "--box"),
+        (["add", tmp_path / "b.h5", liver], "avatar atlas create"),
+        (["add", file, liver, "--jobs", 0], "--jobs"),
+        (["add", file, liver, "--unit", "m", "--jobs", 1], "--unit"),
+        (["show", tmp_path / "b.h5"], "avatar atlas create"),
+        (["show", liver], "atlas"),
+    ]:
+        code, _, err = run(*arguments)
+        assert code == 1, arguments
+        assert remedy in err and "Traceback" not in err, (arguments, err)
+    assert file.read_bytes() == before
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.h5", "hollow", "liver0.obj"]

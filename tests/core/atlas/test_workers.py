@@ -1,0 +1,123 @@
+"""Bad surfaces are skipped and named; processes and a cluster give the same atlas."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar_core import atlas_build
+from avatar_core.atlas_anatomy import Anatomy, AtlasError
+from avatar_core.atlas_build import (
+    SurfaceFile,
+    create_atlas,
+)
+from avatar_core.atlas_storage import load_atlas
+from avatar_core.atlas_workers import Workers
+from avatar_core.registration import RegistrationRule, Template
+from avatar_core.surface import SurfaceMesh
+from tests.core.atlas.rough import ALONE, OPTIONS, write_obj
+
+# --- bad surfaces -----------------------------------------------------------------------------
+
+
+def test_bad_surfaces_are_skipped(
+    template: Template, livers: list[SurfaceMesh], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register = atlas_build.register
+
+    def sometimes(template: Template, surface: SurfaceMesh, rule: RegistrationRule):
+        if surface.name == "liver1":
+            raise np.linalg.LinAlgError("singular")
+        return register(template, surface, rule)
+
+    monkeypatch.setattr(atlas_build, "register", sometimes)
+    half = replace(livers[0], faces=livers[0].faces[: len(livers[0].faces) // 2], name="half")
+    sources = [
+        SurfaceFile(write_obj(tmp_path / "half.obj", half)),
+        livers[1],
+        SurfaceFile(tmp_path / "missing.obj"),
+        replace(livers[2], vertices=3 * livers[2].vertices),
+        livers[3],
+    ]
+    growth = create_atlas(tmp_path / "a.h5", sources, OPTIONS, template=template, workers=ALONE)
+    assert growth.added == ("liver3",) == load_atlas(tmp_path / "a.h5").names
+    assert [one.name for one in growth.skipped] == ["half", "liver1", "missing", "liver2"]
+    reasons = [one.reason for one in growth.skipped]
+    words = ("open", "LinAlgError", "check the path", "--box")
+    for reason, word in zip(reasons, words, strict=True):
+        assert word in reason and "\n" not in reason
+
+
+def test_nothing_is_written_if_no_surface_can_be_used(template: Template, tmp_path: Path) -> None:
+    growth = create_atlas(
+        tmp_path / "a.h5",
+        [SurfaceFile(tmp_path / "missing.obj")],
+        OPTIONS,
+        template=template,
+        workers=ALONE,
+    )
+    assert growth.added == () and len(growth.skipped) == 1
+    assert not any(tmp_path.iterdir())
+
+
+# --- many at once -----------------------------------------------------------------------------
+
+
+def test_processes_give_the_same_atlas(
+    template: Template, livers: list[SurfaceMesh], members: list[Anatomy], tmp_path: Path
+) -> None:
+    threads = os.environ.get("OMP_NUM_THREADS")
+    file = tmp_path / "a.h5"
+    growth = create_atlas(file, livers[:2], OPTIONS, template=template, workers=Workers(jobs=2))
+    assert growth.added == ("liver0", "liver1")
+    # sums in other orders when threads are more or fewer: rounding, through a converged iteration
+    for one, other in zip(load_atlas(file).vectors, members, strict=False):
+        np.testing.assert_allclose(one, other.distances, atol=1e-6)
+    assert os.environ.get("OMP_NUM_THREADS") == threads
+
+
+def test_a_process_that_dies_costs_its_own_result_only() -> None:
+    work = ["1 + 1", "__import__('os')._exit(1)", "2 + 2"]
+    results = dict(Workers(jobs=2).map(eval, work))
+    assert results[0] == 2 and results[2] == 4
+    assert isinstance(results[1], RuntimeError) and "memory" in str(results[1])
+
+
+def test_a_cluster_builds_too(
+    template: Template, livers: list[SurfaceMesh], members: list[Anatomy], tmp_path: Path
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    quiet = {"processes": False, "dashboard_address": None, "threads_per_worker": 1}
+    source = SurfaceFile(write_obj(tmp_path / "liver0.obj", livers[0]))
+    missing = SurfaceFile(tmp_path / "missing.obj")
+    with distributed.LocalCluster(n_workers=1, **quiet) as cluster:
+        growth = create_atlas(
+            tmp_path / "a.h5",
+            [source, livers[1], missing],
+            OPTIONS,
+            template=template,
+            workers=Workers(scheduler=cluster.scheduler_address),
+        )
+    assert growth.added == ("liver0", "liver1") and growth.skipped[0].name == "missing"
+    # the OBJ holds its coordinates to the last digit, in mm
+    np.testing.assert_allclose(growth.atlas.vectors[0], members[0].distances, atol=1e-6)
+
+
+def test_without_dask_the_extra_is_named(
+    template: Template, livers: list[SurfaceMesh], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    workers = Workers(scheduler="tcp://127.0.0.1:1")
+    with pytest.raises(AtlasError, match=r"avatar\[cluster\]"):
+        create_atlas(tmp_path / "a.h5", livers[:1], OPTIONS, template=template, workers=workers)
+    assert not any(tmp_path.iterdir())
+
+
+def test_no_jobs_are_refused() -> None:
+    with pytest.raises(AtlasError, match="--jobs"):
+        Workers(jobs=0)
