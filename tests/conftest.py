@@ -11,8 +11,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
+from avatar_core import loads
+from avatar_core.build_rule import BuildRule
+from avatar_core.large_build import hyperelastic_problem, with_large_deformation
+from avatar_core.organ import OrganOptions, vademecum_of
 from avatar_core.phantom import phantom_liver
 from avatar_core.surface import SurfaceMesh
+from avatar_core.vademecum import Vademecum
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -33,6 +38,24 @@ def tumour_dir() -> Path:
 def phantom() -> SurfaceMesh:
     """The built-in liver at its usual spacing."""
     return phantom_liver()
+
+
+@pytest.fixture(scope="session")
+def straight() -> Vademecum:
+    """A coarse phantom with wide patches: few load positions."""
+    options = OrganOptions(
+        n_vertices=800, patch_radius=30e-3, rule=BuildRule(max_modes=60), n_certified=10
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loads, "MIDPOINTS_FROM", 1.0)
+        return vademecum_of(phantom_liver(12e-3), options)
+
+
+@pytest.fixture(scope="session")
+def bent(straight: Vademecum) -> Vademecum:
+    """The same under large pushes."""
+    problem = hyperelastic_problem(straight, "neo-hookean")
+    return with_large_deformation(straight, problem, "neo-hookean")
 
 
 def _data(name: str) -> Path:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import loads, organ, storage
-from avatar_core.build_rule import BuildRule, silent
+from avatar_core import organ, storage
+from avatar_core.build_rule import silent
 from avatar_core.cli_vademecum import show_text
 from avatar_core.contact import ContactModel, Status, prepare, step
 from avatar_core.effects import Friction, LargeDeformationEffect
@@ -23,17 +23,15 @@ from avatar_core.large_build import (
     LargeRule,
     economised,
     hyperelastic_problem,
-    with_large_deformation,
 )
 from avatar_core.large_certificate import certify_large, push_rows, summary, with_combinations
 from avatar_core.large_combinations import COMBINATIONS, CombinedRow, mean_error, push_errors
 from avatar_core.large_deformation import LargeCertificate, hyperelastic, powers, push, push_to
 from avatar_core.loads import patch_loads
 from avatar_core.mesh import Regions, TetMesh
-from avatar_core.organ import OrganOptions, vademecum_of
+from avatar_core.organ import OrganOptions
 from avatar_core.parametric import at_values
 from avatar_core.path_series import path_series
-from avatar_core.phantom import phantom_liver
 from avatar_core.scene import REFUSED, Scene, combinations
 from avatar_core.storage import load_vademecum, save_vademecum
 from avatar_core.tool_path import inner_positions, middle_of_access
@@ -43,24 +41,6 @@ from tests.core.test_contact import carriers, energy_slope
 Box = Callable[[int], tuple[TetMesh, Regions]]
 RADIUS = 5e-3
 both = pytest.mark.parametrize("material", ["neo-hookean", "st-venant-kirchhoff"])
-
-
-@pytest.fixture(scope="module")
-def straight() -> Vademecum:
-    """A coarse phantom with wide patches: few load positions."""
-    options = OrganOptions(
-        n_vertices=800, patch_radius=30e-3, rule=BuildRule(max_modes=60), n_certified=10
-    )
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loads, "MIDPOINTS_FROM", 1.0)
-        return vademecum_of(phantom_liver(12e-3), options)
-
-
-@pytest.fixture(scope="module")
-def bent(straight: Vademecum) -> Vademecum:
-    """The same under large pushes, neo-Hookean."""
-    problem = hyperelastic_problem(straight, "neo-hookean")
-    return with_large_deformation(straight, problem, "neo-hookean")
 
 
 @pytest.fixture()

@@ -10,20 +10,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from avatar_core import loads
-from avatar_core.build_rule import BuildRule
 from avatar_core.contact import Status, prepare, step
 from avatar_core.contact_kernels import MAX_DEPTH
 from avatar_core.elasticity import Material
 from avatar_core.equilibrium import NewtonRule, State, _LoadControl, _LostError, press, solve
 from avatar_core.errors import EquilibriumError
 from avatar_core.hyperelasticity import Hyperelasticity
-from avatar_core.large_build import hyperelastic_problem, with_large_deformation
 from avatar_core.loads import patch_loads, patch_normals
 from avatar_core.materials import HyperelasticMaterial, NeoHookean, StVenantKirchhoff
 from avatar_core.mesh import TetMesh, make_mesh
-from avatar_core.organ import OrganOptions, vademecum_of
-from avatar_core.phantom import phantom_liver
 from avatar_core.tool_path import middle_of_access
 from avatar_core.vademecum import Vademecum
 from tests.core.conftest import box_mesh, box_regions
@@ -366,20 +361,6 @@ def test_weight_first_or_push_first(kind: type, figure: Figure) -> None:
     assert off < 1e-6
     assert np.abs(further.displacement - other.displacement).max() < 1e-6 * size
     figure(f"apart by {off:.0e} of the displacement")
-
-
-@pytest.fixture(scope="module")
-def bent() -> Vademecum:
-    """A coarse liver under large pushes: few, wide load positions."""
-    options = OrganOptions(
-        n_vertices=400, patch_radius=30e-3, rule=BuildRule(max_modes=40), n_certified=3
-    )
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loads, "MIDPOINTS_FROM", 1.0)
-        vademecum = vademecum_of(phantom_liver(12e-3), options)
-    return with_large_deformation(
-        vademecum, hyperelastic_problem(vademecum, "neo-hookean"), "neo-hookean"
-    )
 
 
 @pytest.mark.long
