@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,12 @@ class Probe:
         client = self._clients[kind, name]
         self.until(client.service_is_ready, START_TIMEOUT)
         return client
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    """Run alone without ROS, these tests are skipped by the file, which pytest takes for none."""
+    if exitstatus == pytest.ExitCode.NO_TESTS_COLLECTED and find_spec("rclpy") is None:
+        session.exitstatus = pytest.ExitCode.OK
 
 
 @pytest.fixture(scope="session", autouse=True)
