@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +86,12 @@ def phantom_vademecum() -> Vademecum:
 REAL = ("LiTS-4", "LiTS-10", "LiTS-60", "Amos-007", "LiTS-23")  # five patients, one cracked
 
 
+@cache  # pytest keeps one value of a fixture with parameters, and comes back to the others
+def _vademecum_of_file(path: Path) -> Vademecum:
+    options = OrganOptions(n_vertices=1500, rule=BuildRule(max_modes=60), n_certified=3)
+    return vademecum_of(read_surface(path), options)
+
+
 @pytest.fixture(scope="session", params=REAL)
 def real_vademecum(request: pytest.FixtureRequest, livers_dir: Path) -> Vademecum:
-    options = OrganOptions(n_vertices=1500, rule=BuildRule(max_modes=60), n_certified=3)
-    return vademecum_of(read_surface(livers_dir / f"{request.param}.obj"), options)
+    return _vademecum_of_file(livers_dir / f"{request.param}.obj")

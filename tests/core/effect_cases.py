@@ -41,12 +41,13 @@ def push_and_drag(v: Vademecum, n: int = 60) -> np.ndarray:
 
 
 def forces(model: ContactModel, path: np.ndarray) -> np.ndarray:
+    """Forces on the first tool where all tools go along one path, shape (n, 3)."""
     model.reset()
-    out = []
-    for tip in path:
-        step(model, np.tile(tip, (model.n_tools, 1)))
-        out.append(model.out.force[0].copy())
-    return np.array(out)
+    out = np.empty(path.shape)
+    for tips, force in zip(np.repeat(path[:, None], model.n_tools, axis=1), out, strict=True):
+        step(model, tips)
+        force[:] = model.out.force[0]
+    return out
 
 
 @BilinearForm

@@ -140,7 +140,7 @@ def test_closed_paths_do_no_work(phantom_vademecum: Vademecum, model: ContactMod
 
 @pytest.mark.long
 def test_closed_paths_on_real_livers_do_no_work(real_vademecum: Vademecum) -> None:
-    worst = closed_path_work(real_vademecum, prepare(real_vademecum, (RADIUS,)), 1000, seed=1)
+    worst = closed_path_work(real_vademecum, prepare(real_vademecum, (RADIUS,)), 300, seed=1)
     print(f"{real_vademecum.name}: work at most {worst:.2%} of the peak stored energy")
     assert worst < 0.01
 
@@ -233,7 +233,8 @@ def work_along(model: ContactModel, path: np.ndarray) -> tuple[float, float]:
     for k, tip in enumerate(path):
         step(model, tip[None].copy())
         force[k] = model.out.force[0]
-        peak = max(peak, stored_energy(model))
+        if force[k].any():
+            peak = max(peak, stored_energy(model))
     work = 0.5 * ((force[1:] + force[:-1]) * np.diff(path, axis=0)).sum()
     return abs(float(work)), peak
 
@@ -320,7 +321,7 @@ def test_fewer_modes_keep_the_compliance_positive_definite(phantom_vademecum: Va
 
 @pytest.mark.long
 def test_compliance_between_tips_on_real_livers(real_vademecum: Vademecum) -> None:
-    smallest, asymmetry = active_set_spectrum(real_vademecum, 1000, seed=1)
+    smallest, asymmetry = active_set_spectrum(real_vademecum, 300, seed=1)
     print(f"{real_vademecum.name}: smallest eigenvalue {smallest:.2e} of the mean diagonal")
     assert smallest > 0
     assert asymmetry < 1e-6
