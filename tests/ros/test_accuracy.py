@@ -220,14 +220,13 @@ def diagnostics(probe: Any, hand: Hand, wanted: Any) -> dict[str, DiagnosticStat
     return named(array)
 
 
-def test_diagnostics_say_what_is_shown_and_how_the_loop_is(
-    probe: Any, hand: Hand, organ: Any
-) -> None:
+def test_diagnostics_say_what_is_shown_and_how_the_loop_is(probe: Any, hand: Hand) -> None:
+    state, _ = felt(probe, hand)
     found = diagnostics(probe, hand, lambda named: "contact: accuracy" in named)
     accuracy = found["contact: accuracy"]
     assert accuracy.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
     assert "modes shown" in accuracy.message
-    assert {v.key: v.value for v in found["contact: vademecum"].values}["id"] == organ.id
+    assert {v.key: v.value for v in found["contact: vademecum"].values}["id"] == state.vademecum_id
     loop = {v.key: float(v.value) for v in found["contact: loop"].values}
     assert loop["rate [Hz]"] == pytest.approx(1e6 / loop["period mean [us]"], rel=1e-3)
     assert loop["execution mean [us]"] <= loop["execution max [us]"]
