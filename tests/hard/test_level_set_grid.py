@@ -59,6 +59,7 @@ def box_around(surface: SurfaceMesh, spacing: float, shift: tuple[float, float, 
 @few
 @given(tube=st.floats(0.012, 0.035), shift=fractions)
 @example(tube=0.035, shift=(0.5, 0.5, 0.5))
+@example(tube=0.03164487096685557, shift=(0.0, 0.595703125, 0.861328125))
 def test_a_handle_stays_a_handle(figure, tube, shift):
     spacing, surface = 5e-3, torus(0.045, tube)
     box = box_around(surface, spacing, shift)
@@ -71,7 +72,9 @@ def test_a_handle_stays_a_handle(figure, tube, shift):
     assert abs(error) < 0.25 * (spacing / tube) ** 2
     ring = np.hypot(grid.points[:, 0], grid.points[:, 1]) - 0.045
     exact = np.hypot(ring, grid.points[:, 2]) - tube
-    clear = np.abs(exact) > 1e-4  # the facets' depth
+    # 48 facets about the tube, 96 about the axis: they lie inside by at most both sagittas
+    depth = tube * (1 - np.cos(np.pi / 48)) + (0.045 + tube) * (1 - np.cos(np.pi / 96))
+    clear = np.abs(exact) > depth
     assert np.array_equal(grid.values.ravel()[clear] < 0, exact[clear] < 0)
     again = isosurface(reinitialize(grid))
     assert bodies_and_handles(again) == (1, 1)
