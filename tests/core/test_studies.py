@@ -125,14 +125,12 @@ def test_pgd(tmp_path: Path) -> None:
     # no modes are better than the best; the default is exact near the patch
     assert summary["svd_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
     assert summary["default_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
-    rows = [r for r in found.rows if r["loads"] == "patch" and r["modes"] == 5]
-    scalar, vector = (
-        next(r["l2_mean"] for r in rows if r["method"] == f"PGD, paper's {name}")
-        for name in ("norm", "vector form")
-    )
-    # one direction: the vector form collapses, so that its three functions gain nothing; how much
-    # worse it is depends on where its sweeps stop, from mesh to mesh
-    assert vector > 0.75 * scalar
+    rows = {
+        r["method"]: r["l2_mean"] for r in found.rows if r["loads"] == "patch" and r["modes"] == 5
+    }
+    # which of the paper's two forms is better depends on where its sweeps stop, from mesh to mesh
+    for name in ("norm", "vector form"):
+        assert rows["SVD optimum"] < rows[f"PGD, paper's {name}"] < 1.0
 
 
 @pytest.mark.long
