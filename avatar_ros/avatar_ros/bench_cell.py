@@ -328,10 +328,14 @@ class Module(subprocess.Popen[str]):
             text=True,
         )
 
+    def said(self) -> str:
+        """All of standard error so far; where the process writes next is left alone."""
+        number = self._said.fileno()
+        return os.pread(number, os.fstat(number).st_size, 0).decode(errors="replace")
+
     def last_words(self) -> str:
         """The last line of standard error."""
-        self._said.seek(0)
-        lines = [line.strip() for line in self._said if line.strip()]
+        lines = [line.strip() for line in self.said().splitlines() if line.strip()]
         return lines[-1] if lines else f"it said nothing, exit code {self.poll()}"
 
     def finish(self) -> int:

@@ -303,8 +303,8 @@ def test_the_scene_may_be_a_parameter(own_domain: dict[str, str], library: Path)
     contact = Module("contact", ["--ros-args", "-p", "scene:=relaxation"], domain)
     try:
         deadline = time.monotonic() + 120.0
-        while "with viscoelasticity" not in contact.last_words():
-            assert time.monotonic() < deadline, contact.last_words()
+        while "with viscoelasticity" not in contact.said():
+            assert time.monotonic() < deadline, contact.said()
             time.sleep(0.2)
     finally:
         codes = [process.finish() for process in (contact, loader)]
