@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 HEIGHTS = (0.0, 6e-3)  # of a tip's centre above the surface, pressed in or just touching [m]
 _OPEN = 0.999  # access from which a tip may touch without the force fading
+_WAY = np.linspace(1 / 3, 7 / 3, 8)  # heights above a tip in which it comes in [HEIGHTS[1]]
 _BATCH = 40  # patches solved at once
 
 
@@ -45,7 +46,10 @@ class UnseenContacts:
 
 
 def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
-    """Tips above points that are drawn evenly over the accessible faces."""
+    """Tips above points that are drawn evenly over the accessible faces.
+
+    Each can come in along its normal: no other lobe of the organ hangs over it.
+    """
     surface, field = vademecum.surface, vademecum.tip_field
     rng = np.random.default_rng(seed)
     corner = surface.centers[surface.corners]
@@ -62,11 +66,27 @@ def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
         if _at(field, field.access, tip, gradient) < _OPEN:
             continue
         _at(field, field.distance, tip, gradient)
-        tips[found], normals[found] = tip, gradient / np.linalg.norm(gradient)
+        normal = gradient / np.linalg.norm(gradient)
+        if _is_barred(field, tip, normal):
+            continue
+        tips[found], normals[found] = tip, normal
         found += 1
     place = igl.point_mesh_squared_distance(tips, surface.centers, surface.corners)[2]
     return UnseenContacts(tips, np.ascontiguousarray(place), normals)
 
 
-def _at(field: TipField, values: np.ndarray, tip: np.ndarray, gradient: np.ndarray) -> float:
-    return float(evaluate(values, field.origin, field.spacing[0], tip, gradient, 0.0))
+def _is_barred(field: TipField, tip: np.ndarray, normal: np.ndarray) -> bool:
+    """Whether the organ itself is in the way of a tip along its normal."""
+    way = tip + HEIGHTS[1] * np.outer(_WAY, normal)
+    slope = np.zeros(3)
+    return min(_at(field, field.distance, p, slope, outside=np.inf) for p in way) <= 0.0
+
+
+def _at(
+    field: TipField,
+    values: np.ndarray,
+    point: np.ndarray,
+    gradient: np.ndarray,
+    outside: float = 0.0,
+) -> float:
+    return float(evaluate(values, field.origin, field.spacing[0], point, gradient, outside))
