@@ -15,37 +15,109 @@ Layout (schema 1.0), attributes at the root: ``format`` = "avatar atlas", ``sche
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import asdict
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import h5py
 import numpy as np
 
+from avatar_core.array_shapes import Shapes, require_indices, require_shapes
 from avatar_core.atlas import Atlas
 from avatar_core.atlas_anatomy import Anatomy, Response
-from avatar_core.elasticity import Material
+from avatar_core.elasticity import Element, Material
 from avatar_core.errors import AvatarError, StorageError
-from avatar_core.hdf5 import checksum, reason, replace_file, within
+from avatar_core.files import FileError, opened
+from avatar_core.hdf5 import replace_file, require_schema, verified
 from avatar_core.level_set import GridBox
 from avatar_core.lle import Gram
-from avatar_core.mesh import MeshQuality, Regions, TetMesh
+from avatar_core.mesh import Regions, TetMesh
+from avatar_core.plain import of_plain, parsed, require_name
 from avatar_core.registration import (
     RegistrationQuality,
     RegistrationRule,
     SimilarityTransform,
     Template,
 )
-from avatar_core.surface import SurfaceMesh
+from avatar_core.surface import SurfaceMesh, axes_matrix
 
 ATLAS_SCHEMA = "1.0"
 ATLAS_FORMAT = "avatar atlas"
 ANATOMY_FORMAT = "avatar anatomy"
 RESPONSE_KEYS = ("space", "load", "missing")
 MAX_FILE_BYTES = 64 << 30
+MAX_POINTS = 10_000_000  # of the box; an atlas has 50,000
+MOST_STEPS = 1000  # of a registration, in each of its loops
 
 Arrays = dict[str, np.ndarray]
+Made = TypeVar("Made")
+
+_TEMPLATE: Shapes = {
+    "template/vertices": "f: template 3",
+    "template/tets": "i: tets 4",
+    "template/clamped": "b: faces",
+    "template/accessible": "b: faces",
+    "gram/origin": "f: points",
+    "gram/products": "f: n n",
+}
+_ANATOMY: Shapes = {
+    "about": "i: letters",
+    "vertices": "f: vertices 3",
+    "faces": "i: faces 3",
+    "distances": "f: points",
+    "registered": "f: template 3",
+}
+_RESPONSE: Shapes = {
+    "space": "f: 3*template rank",
+    "load": "f: 3*positions rank",
+    "missing": "f: positions 3 3",
+}
+
+
+@dataclass(frozen=True)
+class _Surface:
+    name: str
+    unit: str
+    axes: tuple[tuple[float, ...], ...]
+    notices: tuple[str, ...]
+    source_sha256: str
+
+
+@dataclass(frozen=True)
+class _Alignment:
+    scale: float
+    rotation: tuple[tuple[float, ...], ...]
+    translation: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Response:
+    material: Material
+    element: Element
+    patch_radius: float
+
+
+@dataclass(frozen=True)
+class _Anatomy:
+    """Everything of an anatomy that is no array."""
+
+    name: str
+    volume: float
+    converged: bool
+    quality: RegistrationQuality
+    surface: _Surface
+    alignment: _Alignment
+    response: _Response | None = None
+
+
+@dataclass(frozen=True)
+class _About:
+    """Everything of an atlas that is no array."""
+
+    template: str
+    box: GridBox
+    rule: RegistrationRule
 
 
 def save_atlas(atlas: Atlas, path: str | Path) -> None:
@@ -80,10 +152,7 @@ def load_atlas(path: str | Path) -> Atlas:
     StorageError
         For a missing, truncated, altered, foreign or newer file.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise StorageError(f"no atlas at {path}; make one with 'avatar atlas create'")
-    return _read(path, ATLAS_FORMAT, _atlas)
+    return _read(Path(path), ATLAS_FORMAT, _atlas)
 
 
 def save_anatomy(anatomy: Anatomy, path: Path) -> None:
@@ -140,139 +209,133 @@ def _anatomy_arrays(anatomy: Anatomy) -> Arrays:
 
 
 def _anatomy(arrays: Arrays) -> Anatomy:
-    _require_finite(arrays)
-    about = json.loads(arrays["about"].tobytes())
-    stored, quality = about["surface"], about["quality"]
-    surface = SurfaceMesh(
-        arrays["vertices"],
-        arrays["faces"],
-        stored["name"],
-        stored["unit"],
-        np.array(stored["axes"]),
-        tuple(stored["notices"]),
-        stored["source_sha256"],
-    )
-    alignment = about["alignment"]
+    sizes = require_shapes(arrays, _ANATOMY | (_RESPONSE if "space" in arrays else {}))
+    require_indices("faces", arrays["faces"], sizes["vertices"])
+    text = arrays["about"].astype(np.uint8).tobytes().decode(errors="replace")
+    about = of_plain(_Anatomy, parsed(text, "about"), "about")
+    stored, alignment = about.surface, about.alignment
+    rotation, translation = np.array(alignment.rotation), np.array(alignment.translation)
+    placed = np.isfinite([alignment.scale, about.volume, *rotation.flat, *translation.flat]).all()
+    if rotation.shape != (3, 3) or translation.shape != (3,) or not placed:
+        raise StorageError("'about' has an alignment or a volume that is none; build it again")
     return Anatomy(
-        name=about["name"],
-        surface=surface,
-        volume=about["volume"],
-        alignment=SimilarityTransform(
-            alignment["scale"], np.array(alignment["rotation"]), np.array(alignment["translation"])
+        name=require_name(about.name, "about.name"),
+        surface=SurfaceMesh(
+            arrays["vertices"],
+            arrays["faces"],
+            require_name(stored.name, "about.surface.name"),
+            stored.unit,
+            axes_matrix(stored.axes),
+            stored.notices,
+            stored.source_sha256,
         ),
+        volume=about.volume,
+        alignment=SimilarityTransform(alignment.scale, rotation, translation),
         distances=arrays["distances"],
         registered=arrays["registered"],
-        quality=RegistrationQuality(**{**quality, "shape": MeshQuality(**quality["shape"])}),
-        converged=about["converged"],
-        response=_response(arrays, about.get("response")),
+        quality=about.quality,
+        converged=about.converged,
+        response=_response(arrays, about.response),
     )
 
 
-def _response(arrays: Arrays, about: dict[str, Any] | None) -> Response | None:
+def _response(arrays: Arrays, about: _Response | None) -> Response | None:
+    if (about is None) != ("space" not in arrays):
+        raise StorageError("a response is there in part; build the file again")
     if about is None:
         return None
     return Response(
         space=arrays["space"],
         load=arrays["load"],
         missing=arrays["missing"],
-        material=Material(**about["material"]),
-        element=about["element"],
-        patch_radius=about["patch_radius"],
+        material=about.material,
+        element=about.element,
+        patch_radius=about.patch_radius,
     )
 
 
-def _atlas(arrays: Arrays, about: dict[str, Any]) -> Atlas:
-    box = about["box"]
+def _atlas(arrays: Arrays, about: Any) -> Atlas:
+    require_shapes(arrays, _TEMPLATE)
+    said = of_plain(_About, about, "about")
+    _require_box(said.box)
+    _require_rule(said.rule)
     return Atlas(
-        template=_template(arrays, about["template"]),
-        box=GridBox(tuple(box["origin"]), box["spacing"], tuple(box["shape"])),
-        rule=RegistrationRule(**about["rule"]),
-        anatomies=tuple(_anatomy(group) for group in _groups(arrays)),
+        template=_template(arrays, require_name(said.template, "about.template")),
+        box=said.box,
+        rule=said.rule,
+        anatomies=tuple(_named(number, group) for number, group in _groups(arrays)),
         gram=Gram(arrays["gram/origin"], arrays["gram/products"]),
     )
 
 
+def _named(number: str, group: Arrays) -> Anatomy:
+    try:
+        return _anatomy(group)
+    except AvatarError as error:
+        raise StorageError(f"anatomies/{number}: {error}") from error
+
+
 def _template(arrays: Arrays, name: str) -> Template:
     part = {key: arrays[f"template/{key}"] for key in ("vertices", "tets", "clamped", "accessible")}
-    _require_finite({"gram": arrays["gram/products"], **part})
+    require_indices("template/tets", part["tets"], len(part["vertices"]))
     mesh = TetMesh(part["vertices"], part["tets"])
-    fits = part["vertices"].shape[1:] == (3,) and part["tets"].shape[1:] == (4,)
-    fits = fits and within(part["tets"], len(part["vertices"]))
-    n_faces = len(mesh.boundary_faces) if fits else 0
-    if not fits or not part["clamped"].shape == part["accessible"].shape == (n_faces,):
-        raise StorageError("the template's arrays do not fit together; build the atlas again")
+    if len(mesh.boundary_faces) != len(part["clamped"]):
+        raise StorageError("the regions are not those of the template; build the atlas again")
     return Template(name, mesh, Regions(part["clamped"], part["accessible"]))
 
 
-def _groups(arrays: Arrays) -> Iterator[Arrays]:
-    """The arrays of each anatomy, in the order of their numbers."""
+def _require_box(box: GridBox) -> None:
+    finite = all(map(math.isfinite, (*box.origin, box.spacing)))
+    if not finite or box.spacing <= 0.0 or min(box.shape) < 1 or math.prod(box.shape) > MAX_POINTS:
+        raise StorageError("'about.box' is no grid of this project; build the atlas again")
+
+
+def _require_rule(rule: RegistrationRule) -> None:
+    loops = (rule.n_stages, rule.sweeps)
+    finite = all(math.isfinite(value) and value >= 0 for value in asdict(rule).values())
+    if not finite or not all(1 <= n <= MOST_STEPS for n in loops) or rule.n_samples > MAX_POINTS:
+        raise StorageError("'about.rule' would register nothing; build the atlas again")
+
+
+def _groups(arrays: Arrays) -> Iterator[tuple[str, Arrays]]:
+    """Number and arrays of each anatomy, in the order of their numbers."""
     groups: dict[str, Arrays] = {}
     for key in sorted(arrays):
         if key.startswith("anatomies/"):
-            _, number, name = key.split("/")
-            groups.setdefault(number, {})[name] = arrays[key]
-    yield from groups.values()
-
-
-def _require_finite(arrays: Arrays) -> None:
-    for key, array in arrays.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise StorageError(f"'{key}' is NaN or infinite; build the atlas again")
+            _, number, *name = key.split("/")
+            groups.setdefault(number, {})["/".join(name)] = arrays[key]
+    yield from groups.items()
 
 
 # --- files ------------------------------------------------------------------------------------
 
 
-def _read(path: Path, kind: str, assemble: Any) -> Any:
+def _read(path: Path, kind: str, assemble: Callable[[Arrays, Any], Made]) -> Made:
     """What `assemble` makes of the arrays and the JSON, once both are verified."""
-    size = path.stat().st_size
-    if size > MAX_FILE_BYTES:
-        raise StorageError(f"{path} has {size >> 20} MiB, more than an atlas may have")
+    what = kind.removeprefix("avatar ")
     try:
-        with h5py.File(path, "r") as file:
-            attributes = _read_attributes(file, kind, path)
-            arrays = _read_arrays(file, path, size)
-            stated = str(file.attrs["checksum"])
-        if stated != checksum(arrays, attributes):
-            raise StorageError(f"{path} was altered or damaged (checksum); build it again")
-        return assemble(arrays, json.loads(attributes["about"]))
-    except AvatarError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError) as error:
+        with opened(path, MAX_FILE_BYTES) as source:
+            attributes, arrays = verified(source, str(path), what, _attributes_of(kind), list)
+    except FileError as error:
         raise StorageError(
-            f"{path} is no readable {kind.removeprefix('avatar ')} ({reason(error)}); it may be "
-            "truncated: build or copy it again"
+            f"no {what} at {path} ({error}); make one with 'avatar atlas create'"
         ) from error
+    try:
+        return assemble(arrays, parsed(attributes["about"], "about"))
+    except AvatarError as error:
+        raise StorageError(f"{path}: {error}") from error
 
 
-def _read_attributes(file: h5py.File, kind: str, path: Path) -> dict[str, str]:
-    if str(file.attrs.get("format", "")) != kind:
-        raise StorageError(
-            f"{path} is HDF5 but no {kind.removeprefix('avatar ')}; make one with 'avatar atlas "
-            "create'"
-        )
-    schema = str(file.attrs["schema"])
-    if int(schema.split(".")[0]) > int(ATLAS_SCHEMA.split(".")[0]):
-        raise StorageError(
-            f"{path} has schema {schema}, this version reads up to {ATLAS_SCHEMA}; upgrade avatar"
-        )
-    return {key: str(file.attrs[key]) for key in ("format", "schema", "about")}
+def _attributes_of(kind: str) -> Callable[[dict[str, str], str], dict[str, str]]:
+    """Those that count, of a file of this kind that is not too new."""
 
+    def choose(held: dict[str, str], origin: str) -> dict[str, str]:
+        if held.get("format") != kind:
+            raise StorageError(
+                f"{origin} is HDF5 but no {kind.removeprefix('avatar ')}; make one with 'avatar "
+                "atlas create'"
+            )
+        require_schema(held, ATLAS_SCHEMA, origin)
+        return {key: held[key] for key in ("format", "schema", "about")}
 
-def _read_arrays(file: h5py.File, path: Path, size: int) -> Arrays:
-    """All datasets; what a file claims is weighed against its size before it is read."""
-    datasets: dict[str, h5py.Dataset] = {}
-    file.visititems(lambda key, item: _collect(datasets, key, item))
-    total = 0
-    for key, dataset in datasets.items():
-        if dataset.dtype.kind not in "fiub" or dataset.is_virtual or dataset.external:
-            raise StorageError(f"{path}: '{key}' is no array of numbers; build the file again")
-        total += dataset.nbytes
-        if total > size:
-            raise StorageError(f"{path}: '{key}' claims more data than the file holds")
-    return {key: dataset[...] for key, dataset in datasets.items()}
-
-
-def _collect(datasets: dict[str, h5py.Dataset], key: str, item: object) -> None:
-    if isinstance(item, h5py.Dataset):
-        datasets[key] = item
+    return choose

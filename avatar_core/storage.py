@@ -36,9 +36,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from dataclasses import asdict, replace
+import math
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -46,30 +47,32 @@ import numpy as np
 from avatar_core.accuracy import AccuracyCurve
 from avatar_core.body import BodyResponse
 from avatar_core.certificate import Certificate
+from avatar_core.cloud_arrays import Cloud, Precision
 from avatar_core.coordinates import Coordinate
-from avatar_core.elasticity import Material
+from avatar_core.elasticity import Element, Material
 from avatar_core.errors import AvatarError, StorageError
-from avatar_core.force_error import ForceError
-from avatar_core.hdf5 import checksum, reason, replace_file, within
-from avatar_core.large_deformation import POWERS, LargeCertificate, LargeDeformation
+from avatar_core.files import FileError, opened
+from avatar_core.hdf5 import UNREADABLE, replace_file, require_schema, root_attributes, verified
+from avatar_core.large_deformation import LargeCertificate, LargeDeformation, LargeMaterial
 from avatar_core.loads import LoadSurface
 from avatar_core.mesh import Regions, TetMesh
 from avatar_core.near_field import LocalBlocks
 from avatar_core.parametric import ParametricResponse
-from avatar_core.pgd_load import EnrichmentReport, EnrichmentStatus
+from avatar_core.plain import of_plain, parsed, require_name
 from avatar_core.separated import SeparatedField
 from avatar_core.tip_field import TipField
-from avatar_core.vademecum import (
-    SCHEMA_VERSION,
-    Convergence,
-    Provenance,
-    RankError,
-    Vademecum,
+from avatar_core.vademecum import SCHEMA_VERSION, Convergence, Provenance, Vademecum
+from avatar_core.vademecum_arrays import (
+    BODY_KEYS,
+    LARGE_KEYS,
+    PARAMETRIC_BODY_KEYS,
+    PARAMETRIC_KEYS,
+    require_sound,
+    shapes_of,
 )
 
 FORMAT = "avatar vademecum"
 MAX_FILE_BYTES = 4 << 30
-MAX_ARRAY_BYTES = 2 << 30
 
 _JSON = ("material", "provenance", "convergence", "certificate")
 _JSON_LATER = ("coordinates", "contrast", "large", "accuracy")  # from schema 2.0, the last 2.2
@@ -97,9 +100,13 @@ def load_vademecum(path: str | Path) -> Vademecum:
         For a missing, truncated, altered, foreign or newer file.
     """
     path = Path(path)
-    if not path.is_file():
-        raise StorageError(f"no vademecum at {path}; build one with 'avatar vademecum'")
-    return _read(path, path.stat().st_size, str(path), file_id(path))
+    try:
+        with opened(path, MAX_FILE_BYTES) as source:
+            return _read(source, str(path))
+    except FileError as error:
+        raise StorageError(
+            f"no vademecum at {path} ({error}); build one with 'avatar vademecum'"
+        ) from error
 
 
 def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
@@ -110,117 +117,59 @@ def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
     content : the bytes of a vademecum file
     origin : what messages call it
     """
-    digest = hashlib.sha256(content).hexdigest()
-    return _read(io.BytesIO(content), len(content), origin, digest)
+    if len(content) > MAX_FILE_BYTES:
+        raise StorageError(f"{origin} has {len(content) >> 20} MiB, more than a vademecum may have")
+    return _read(io.BytesIO(content), origin)
 
 
-def _read(source: Path | io.BytesIO, size: int, origin: str, identity: str) -> Vademecum:
-    if size > MAX_FILE_BYTES:
-        raise StorageError(f"{origin} has {size >> 20} MiB, more than a vademecum may have")
+def is_vademecum(path: str | Path) -> bool:
+    """Whether a path is an ordinary file that calls itself a vademecum; nothing else is read."""
     try:
-        with h5py.File(source, "r") as file:
-            attributes = _read_attributes(file, origin)
-            arrays = _read_arrays(file, origin, size)
-            stated = str(file.attrs["checksum"])
-        if stated != checksum(arrays, attributes):
-            raise StorageError(f"{origin} was altered or damaged (checksum); build it again")
+        with opened(Path(path), MAX_FILE_BYTES) as source, h5py.File(source, "r") as file:
+            return root_attributes(file).get("format") == FORMAT
+    except (FileError, *UNREADABLE):
+        return False
+
+
+def _read(source: BinaryIO, origin: str) -> Vademecum:
+    attributes, arrays = verified(source, origin, "vademecum", _attributes_of, shapes_of)
+    try:
         vademecum = _assemble(arrays, attributes)
-    except AvatarError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError) as error:
-        raise StorageError(
-            f"{origin} is no readable vademecum ({reason(error)}); it may be truncated: "
-            "build or copy it again"
-        ) from error
-    return replace(vademecum, id=identity, nbytes=size)
+    except AvatarError as error:
+        raise StorageError(f"{origin}: {error}") from error
+    return replace(vademecum, id=_digest(source), nbytes=source.tell())
 
 
 def file_id(path: str | Path) -> str:
     """SHA-256 of the file, the id under which a vademecum is announced."""
-    digest = hashlib.sha256()
     with Path(path).open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
+        return _digest(file)
+
+
+def _digest(source: BinaryIO) -> str:
+    digest = hashlib.sha256()
+    source.seek(0)
+    while block := source.read(1 << 20):
+        digest.update(block)
     return digest.hexdigest()
 
 
-def _read_attributes(file: h5py.File, path: str) -> dict[str, str]:
-    if str(file.attrs.get("format", "")) != FORMAT:
-        raise StorageError(f"{path} is HDF5 but no vademecum; build one with 'avatar vademecum'")
-    schema = str(file.attrs["schema"])
-    if int(schema.split(".")[0]) > int(SCHEMA_VERSION.split(".")[0]):
-        raise StorageError(
-            f"{path} has schema {schema}, this version reads up to {SCHEMA_VERSION}; upgrade avatar"
-        )
+def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:
+    """The attributes that count, of a file that is a vademecum and not too new."""
+    if held.get("format") != FORMAT:
+        raise StorageError(f"{origin} is HDF5 but no vademecum; build one with 'avatar vademecum'")
+    require_schema(held, SCHEMA_VERSION, origin)
     keys = ("format", "schema", "name", "element", *_JSON)
-    optional = tuple(key for key in _JSON_LATER if key in file.attrs)
-    return {key: str(file.attrs[key]) for key in keys + optional}
-
-
-def _read_arrays(file: h5py.File, path: str, size: int) -> dict[str, np.ndarray]:
-    arrays: dict[str, np.ndarray] = {}
-    total = 0
-    keys = _KEYS + (_PARAMETRIC_KEYS if "parametric" in file else ())
-    keys += _LARGE_KEYS if "large" in file else ()
-    keys += _BODY_KEYS if "body" in file else ()
-    keys += _PARAMETRIC_BODY_KEYS if "parametric/body" in file else ()
-    for key in keys:
-        dataset = file[key]
-        if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiub":
-            raise StorageError(f"{path}: '{key}' is no array of numbers; build the file again")
-        if dataset.is_virtual or dataset.external:
-            raise StorageError(f"{path}: '{key}' points outside the file; build it again")
-        total += dataset.nbytes
-        if dataset.nbytes > MAX_ARRAY_BYTES or total > size:
-            raise StorageError(f"{path}: '{key}' claims more data than the file holds")
-        arrays[key] = dataset[...]
-    return arrays
-
-
-_KEYS = (
-    "mesh/vertices",
-    "mesh/tets",
-    "regions/clamped",
-    "regions/accessible",
-    "surface/centers",
-    "surface/normals",
-    "surface/corners",
-    "surface/vertices",
-    "surface/patch_radius",
-    "far/space",
-    "far/load",
-    "near/start",
-    "near/target",
-    "near/block",
-    "contact_near/start",
-    "contact_near/target",
-    "contact_near/block",
-    "tip_field/distance",
-    "tip_field/access",
-    "tip_field/origin",
-    "tip_field/spacing",
-)
-_PARAMETRIC_KEYS = (
-    "parametric/basis/space",
-    "parametric/basis/load",
-    "parametric/operators",
-    "parametric/rank",
-    "parametric/young_modulus",
-    "parametric/near",
-    "parametric/contact_near",
-)
-_BODY_KEYS = ("body/mass", "body/weight")
-_PARAMETRIC_BODY_KEYS = ("parametric/body/mass", "parametric/body/weight")
-_LARGE_KEYS = ("large/space", "large/load", "large/near", "large/depth", "large/reach")
+    return {key: held[key] for key in (*keys, *_JSON_LATER) if key in held or key in keys}
 
 
 def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
     """Every dataset; the keys are attribute paths of the vademecum."""
     arrays = {}
-    keys = _KEYS + (_PARAMETRIC_KEYS if v.parametric else ()) + (_LARGE_KEYS if v.large else ())
-    keys += _BODY_KEYS if v.body else ()
-    keys += _PARAMETRIC_BODY_KEYS if v.parametric and v.parametric.body else ()
-    for key in keys:
+    held = PARAMETRIC_KEYS[:1] * bool(v.parametric) + LARGE_KEYS[:1] * bool(v.large)
+    held += BODY_KEYS[:1] * bool(v.body)
+    held += PARAMETRIC_BODY_KEYS[:1] * bool(v.parametric and v.parametric.body)
+    for key in shapes_of(held):
         value: Any = v
         for attribute in key.split("/"):
             value = getattr(value, attribute)
@@ -251,18 +200,19 @@ def _attributes(v: Vademecum) -> dict[str, str]:
 
 
 def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vademecum:
-    _check_shapes(arrays)
-    material, provenance, convergence, certificate = (json.loads(attributes[k]) for k in _JSON)
+    """The vademecum of arrays and attributes from elsewhere; all are checked first."""
+    require_sound(arrays)
+    plain = {key: parsed(attributes.get(key, "null"), key) for key in (*_JSON, *_JSON_LATER)}
 
     def blocks(name: str) -> LocalBlocks:
         return LocalBlocks(*(arrays[f"{name}/{k}"] for k in ("start", "target", "block")))
 
     return Vademecum(
-        name=attributes["name"],
+        name=require_name(attributes["name"], "name"),
         mesh=TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"]),
         regions=Regions(arrays["regions/clamped"], arrays["regions/accessible"]),
-        material=Material(**material),
-        element=attributes["element"],  # type: ignore[arg-type]
+        material=of_plain(Material, plain["material"], "material"),
+        element=of_plain(Element, attributes["element"], "element"),  # type: ignore[arg-type]
         surface=LoadSurface(
             arrays["surface/centers"],
             arrays["surface/normals"],
@@ -274,32 +224,64 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         near=blocks("near"),
         contact_near=blocks("contact_near"),
         tip_field=TipField(*(arrays[f"tip_field/{name}"] for name in TipField._fields)),
-        convergence=_convergence(convergence),
-        provenance=_provenance(provenance),
-        certificate=_certificate(certificate, json.loads(attributes.get("accuracy", "null"))),
-        parametric=_parametric(arrays, attributes),
-        contrast=json.loads(attributes.get("contrast", "null")),
-        large=_large(arrays, attributes),
-        body=_body(arrays, _BODY_KEYS),
+        convergence=of_plain(Convergence, plain["convergence"], "convergence"),
+        provenance=of_plain(Provenance, plain["provenance"], "provenance"),
+        certificate=_certificate(plain["certificate"], plain["accuracy"]),
+        parametric=_parametric(arrays, plain["coordinates"]),
+        contrast=_contrast(plain["contrast"]),
+        large=_large(arrays, plain["large"]),
+        body=_body(arrays, BODY_KEYS),
     )
 
 
-def _body(arrays: dict[str, np.ndarray], keys: tuple[str, str]) -> BodyResponse | None:
+def _body(arrays: dict[str, np.ndarray], keys: tuple[str, ...]) -> BodyResponse | None:
     return BodyResponse(*(arrays[key] for key in keys)) if keys[0] in arrays else None
+
+
+def _contrast(stored: Any) -> float | None:
+    contrast = of_plain(float | None, stored, "contrast")  # type: ignore[arg-type]
+    if contrast is not None and not (math.isfinite(contrast) and contrast > 0.0):
+        raise StorageError(f"'contrast' is {contrast:g}, not above 0; build the file again")
+    return contrast
 
 
 def _certificate_attribute(certificate: Certificate | None) -> dict[str, Any] | None:
     return asdict(replace(certificate, curve=None)) if certificate else None
 
 
-def _certificate(stored: dict[str, Any] | None, curve: dict[str, Any] | None) -> Certificate | None:
-    if stored is None:
-        return None
-    values = dict(stored)
-    if "force_error" in values:
-        values["force_error"] = ForceError(**values["force_error"])
-    values["curve"] = AccuracyCurve.of_plain(curve) if curve else None
-    return Certificate(**values)
+def _certificate(stored: Any, curve: Any) -> Certificate | None:
+    certificate = of_plain(Certificate | None, stored, "certificate")  # type: ignore[arg-type]
+    if certificate is None or curve is None:
+        return certificate
+    columns = asdict(of_plain(_Curve, curve, "accuracy"))
+    if len({len(column) for column in columns.values() if isinstance(column, tuple)}) != 1:
+        raise StorageError("'accuracy' has columns of several lengths; build the file again")
+    return replace(certificate, curve=AccuracyCurve.of_plain(columns))
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """What AccuracyCurve.plain() gives."""
+
+    modes: tuple[int, ...]
+    cloud: tuple[Cloud, ...]
+    precision: tuple[Precision, ...]
+    near: tuple[float, ...]
+    l2: tuple[float, ...]
+    force: tuple[float, ...]
+    nbytes: tuple[int, ...]
+    p50: tuple[float, ...]
+    p99: tuple[float, ...]
+    n_errors: int
+    machine: str
+
+
+@dataclass(frozen=True)
+class _Large:
+    """What is stored of large deformation beside its arrays."""
+
+    material: LargeMaterial
+    certificate: LargeCertificate | None
 
 
 def _large_attribute(large: LargeDeformation | None) -> dict[str, Any] | None:
@@ -309,100 +291,29 @@ def _large_attribute(large: LargeDeformation | None) -> dict[str, Any] | None:
     return {"material": large.material, "certificate": certificate}
 
 
-def _large(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> LargeDeformation | None:
-    if "large/space" not in arrays:
+def _large(arrays: dict[str, np.ndarray], stored: Any) -> LargeDeformation | None:
+    if LARGE_KEYS[0] not in arrays:
         return None
-    stored = json.loads(attributes["large"])
-    certificate = LargeCertificate(**stored["certificate"]) if stored["certificate"] else None
-    space, load, near, depth, reach = (arrays[key] for key in _LARGE_KEYS)
-    return LargeDeformation(stored["material"], space, load, near, depth, reach, certificate)
+    said = of_plain(_Large, stored, "large")
+    space, load, near, depth, reach = (arrays[key] for key in LARGE_KEYS)
+    return LargeDeformation(said.material, space, load, near, depth, reach, said.certificate)
 
 
-def _parametric(
-    arrays: dict[str, np.ndarray], attributes: dict[str, str]
-) -> ParametricResponse | None:
-    if "parametric/basis/space" not in arrays:
+def _parametric(arrays: dict[str, np.ndarray], stored: Any) -> ParametricResponse | None:
+    if PARAMETRIC_KEYS[0] not in arrays:
         return None
-    part = {key.removeprefix("parametric/"): arrays[key] for key in _PARAMETRIC_KEYS}
+    part = {key.removeprefix("parametric/"): arrays[key] for key in PARAMETRIC_KEYS}
+    coordinates = of_plain(tuple[Coordinate, ...], stored, "coordinates")
+    n_nodes = math.prod(coordinate.n_nodes for coordinate in coordinates)
+    if not coordinates or n_nodes != len(part["near"]):
+        raise StorageError("'coordinates' do not fit 'parametric/near'; build the file again")
     return ParametricResponse(
-        coordinates=tuple(Coordinate(**c) for c in json.loads(attributes["coordinates"])),
+        coordinates=coordinates,
         basis=SeparatedField(part["basis/space"], part["basis/load"]),
         operators=part["operators"],
         near=part["near"],
         contact_near=part["contact_near"],
         rank=int(part["rank"]),
-        young_modulus=float(part["young_modulus"]),
-        body=_body(arrays, _PARAMETRIC_BODY_KEYS),
+        young_modulus=Material(float(part["young_modulus"])).young_modulus,
+        body=_body(arrays, PARAMETRIC_BODY_KEYS),
     )
-
-
-def _provenance(stored: dict[str, Any]) -> Provenance:
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()}
-    return Provenance(**values)
-
-
-def _convergence(stored: dict[str, Any]) -> Convergence:
-    return Convergence(
-        stored["converged"],
-        stored["tolerance"],
-        tuple(
-            EnrichmentReport(**{**report, "status": EnrichmentStatus(report["status"])})
-            for report in stored["enrichments"]
-        ),
-        tuple(RankError(**error) for error in stored["rank_errors"]),
-    )
-
-
-def _check_shapes(a: dict[str, np.ndarray]) -> None:
-    """Indices within bounds and sizes that agree, so that compiled code cannot go astray."""
-    n_vertices, n_positions = len(a["mesh/vertices"]), len(a["surface/centers"])
-    rank = a["far/space"].shape[1]
-    agree = (
-        a["far/space"].shape == (3 * n_vertices, rank)
-        and a["far/load"].shape == (3 * n_positions, rank)
-        and a["surface/normals"].shape == (n_positions, 3)
-        and a["tip_field/distance"].shape == a["tip_field/access"].shape
-        and a["tip_field/origin"].shape == (3,)
-        and all(np.isfinite(v).all() for v in a.values() if v.dtype.kind == "f")
-    )
-    for name, target in (("near", n_vertices), ("contact_near", n_positions)):
-        start, index = a[f"{name}/start"], a[f"{name}/target"]
-        agree = agree and (
-            len(start) == n_positions + 1
-            and start[0] == 0
-            and bool((np.diff(start) >= 0).all())
-            and start[-1] == len(index)
-            and a[f"{name}/block"].shape == (len(index), 3, 3)
-            and within(index, target)
-        )
-    agree = agree and within(a["mesh/tets"], n_vertices)
-    if "parametric/basis/space" in a:
-        n, n_nodes = a["parametric/basis/space"].shape[1], len(a["parametric/near"])
-        agree = agree and (
-            a["parametric/basis/space"].shape == (3 * n_vertices, n)
-            and a["parametric/basis/load"].shape == (3 * n_positions, n)
-            and a["parametric/operators"].shape[1:] == (n, n)
-            and a["parametric/near"].shape == (n_nodes, *a["near/block"].shape)
-            and a["parametric/contact_near"].shape == (n_nodes, *a["contact_near/block"].shape)
-            and 1 <= int(a["parametric/rank"]) <= n
-        )
-    if "large/space" in a:
-        n, n_powers = a["large/space"].shape[1], len(POWERS)
-        agree = agree and (
-            a["large/space"].shape == (3 * n_vertices, n)
-            and a["large/load"].shape == (n_powers, n_positions, n)
-            and a["large/near"].shape == (n_powers, len(a["near/target"]), 3)
-            and a["large/depth"].shape == (n_powers, n_positions)
-            and a["large/reach"].shape == (n_positions,)
-        )
-    for (mass, weight), space in (
-        (_BODY_KEYS, "far/space"),
-        (_PARAMETRIC_BODY_KEYS, "parametric/basis/space"),
-    ):
-        if mass in a:
-            n = a[space].shape[1]
-            agree = agree and a[mass].shape == (n, n) and a[weight].shape == (n, 3)
-    agree = agree and within(a["surface/corners"], n_positions)
-    agree = agree and within(a["surface/vertices"], n_vertices)
-    if not agree:
-        raise StorageError("the arrays of the file do not fit together; build it again")

@@ -1,0 +1,65 @@
+"""What arrays of a file have to look like, as tables: kind of number, and sizes by name.
+
+    {"mesh/vertices": "f: vertices 3", "far/space": "f: 3*vertices rank"}
+
+A name is one size wherever it stands; ``3*vertices`` is three times that of ``vertices``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from avatar_core.errors import StorageError
+
+Shapes = dict[str, str]
+
+# f: float32 or float64; i: whole numbers; b: truth values
+_KINDS = {"f": "f", "i": "iu", "b": "b"}
+
+
+def require_shapes(arrays: Mapping[str, np.ndarray], shapes: Shapes) -> dict[str, int]:
+    """The size of each name.
+
+    Raises
+    ------
+    StorageError
+        Naming the first array that is missing, of another kind, not finite, or of sizes that
+        do not fit those before it.
+    """
+    sizes: dict[str, int] = {}
+    for key, wanted in shapes.items():
+        if key not in arrays:
+            raise StorageError(f"'{key}' is missing; build the file again")
+        kind, _, names = wanted.partition(":")
+        array = arrays[key]
+        if array.dtype.kind not in _KINDS[kind]:
+            raise StorageError(f"'{key}' holds numbers of another kind; build the file again")
+        if not _fits(array.shape, names.split(), sizes):
+            raise StorageError(
+                f"'{key}' has the shape {array.shape}, which does not fit the other arrays; build "
+                "the file again"
+            )
+        if kind == "f" and not np.isfinite(array).all():
+            raise StorageError(f"'{key}' is NaN or infinite; build the file again")
+    return sizes
+
+
+def require_indices(key: str, index: np.ndarray, limit: int) -> None:
+    """Raise StorageError unless all indices lie in 0 ... limit - 1."""
+    if index.size and not (int(index.min()) >= 0 and int(index.max()) < limit):
+        raise StorageError(f"'{key}' points outside its target; build the file again")
+
+
+def _fits(shape: tuple[int, ...], names: list[str], sizes: dict[str, int]) -> bool:
+    """Whether a shape has the sizes of its names; a name that is new takes its size."""
+    if len(shape) != len(names):
+        return False
+    for n, name in zip(shape, names, strict=True):
+        factor, _, base = name.rpartition("*")
+        times = int(factor or 1)
+        wanted = int(base) if base.isdigit() else sizes.setdefault(base, n // times)
+        if n != times * wanted:
+            return False
+    return True

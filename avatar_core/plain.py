@@ -1,0 +1,127 @@
+"""Dataclasses out of JSON from elsewhere: every value has the type that the field says.
+
+The inverse of ``json.dumps(dataclasses.asdict(...))``.
+"""
+
+from __future__ import annotations
+
+import json
+import types
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from avatar_core.errors import StorageError
+
+Kind = TypeVar("Kind")
+
+MAX_LETTERS = 4 << 20  # of JSON; the curve of a large vademecum has 50,000
+MAX_NAME = 200  # letters of what people call a thing
+
+
+def parsed(text: str, key: str) -> Any:
+    """What JSON text says.
+
+    Raises
+    ------
+    StorageError
+        If it is too long, nested too deep or no JSON.
+    """
+    if len(text) > MAX_LETTERS:
+        raise StorageError(f"'{key}' has {len(text)} letters; build the file again")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise StorageError(f"'{key}' cannot be understood; build the file again") from error
+
+
+def of_plain(kind: type[Kind], value: Any, key: str) -> Kind:
+    """A value of some type: a number, text, tuple, Literal, Enum, union or dataclass of these.
+
+    Parameters
+    ----------
+    key : where the value stands, for errors
+
+    Raises
+    ------
+    StorageError
+        Naming the field that is missing, unknown or of another type.
+    AvatarError
+        What the dataclass itself says of its values.
+    """
+    if is_dataclass(kind):
+        return _instance(kind, value, key)
+    made: Kind = _value(kind, value, key)
+    return made
+
+
+def require_name(name: Any, key: str) -> str:
+    """A name that can be said in one line.
+
+    Raises StorageError for other things.
+    """
+    if not isinstance(name, str) or not name.isprintable() or len(name) > MAX_NAME:
+        raise StorageError(
+            f"'{key}' is no name of at most {MAX_NAME} printable letters; build the file again"
+        )
+    return name
+
+
+def _instance(kind: Any, value: Any, key: str) -> Any:
+    if not isinstance(value, dict):
+        raise _other(key, "named values", value)
+    hints = get_type_hints(kind)
+    own = {field.name: field for field in fields(kind) if field.init}
+    unknown = sorted(set(value) - set(own))
+    if unknown:
+        raise StorageError(f"'{key}' has an unknown value '{unknown[0][:40]}'; upgrade avatar")
+    for name, field in own.items():
+        optional = field.default is not MISSING or field.default_factory is not MISSING
+        if name not in value and not optional:
+            raise StorageError(f"'{key}.{name}' is missing; build the file again")
+    return kind(**{name: of_plain(hints[name], v, f"{key}.{name}") for name, v in value.items()})
+
+
+def _value(kind: Any, value: Any, key: str) -> Any:
+    origin = get_origin(kind)
+    if origin is Literal:
+        if value not in get_args(kind):
+            raise _other(key, f"one of {', '.join(map(str, get_args(kind)))}", value)
+        return value
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in get_args(kind):
+            return None
+        (rest,) = (one for one in get_args(kind) if one is not type(None))
+        return of_plain(rest, value, key)
+    if origin is tuple:
+        return _tuple(get_args(kind), value, key)
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        try:
+            return kind(value)
+        except ValueError as error:
+            raise _other(key, f"one of {', '.join(one.value for one in kind)}", value) from error
+    if kind is float and type(value) is int and abs(value) < 2**53:
+        return float(value)
+    if type(value) is not kind:  # a truth value is no number
+        raise _other(key, {float: "a number", int: "a whole number"}.get(kind, "text"), value)
+    if kind is int and abs(value) >= 2**53:
+        raise _other(key, "a number", value)
+    return value
+
+
+def _tuple(kinds: tuple[Any, ...], value: Any, key: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise _other(key, "a list", value)
+    if len(kinds) == 2 and kinds[1] is Ellipsis:
+        kinds = (kinds[0],) * len(value)
+    if len(kinds) != len(value):
+        raise _other(key, f"{len(kinds)} values", value)
+    return tuple(
+        of_plain(kind, one, f"{key}[{k}]")
+        for k, (kind, one) in enumerate(zip(kinds, value, strict=True))
+    )
+
+
+def _other(key: str, wanted: str, value: Any) -> StorageError:
+    shown = " ".join(str(value)[:40].split())
+    return StorageError(f"'{key}' is {shown!r}, not {wanted}; build the file again")
