@@ -111,9 +111,9 @@ def verified(
     except StorageError:
         raise
     except UNREADABLE as error:
+        why = f"{error} is missing" if isinstance(error, KeyError) else reason(error)
         raise StorageError(
-            f"{origin} is no readable {what} ({reason(error)}); it may be truncated: build or copy "
-            "it again"
+            f"{origin} is no readable {what} ({why}); it may be truncated: build or copy it again"
         ) from error
     if stated != checksum(arrays, attributes):
         raise StorageError(f"{origin} was altered or damaged (checksum); build it again")
@@ -139,6 +139,8 @@ def _arrays(
     keys = list(keys_of(datasets))
     claimed = 0
     for key in keys:
+        if key not in datasets:
+            raise ValueError(f"'{key}' is missing or only a link")
         _require_plain(key, datasets[key])
         claimed += datasets[key].nbytes
         if claimed > size:

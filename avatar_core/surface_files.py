@@ -15,23 +15,26 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
+from avatar_core import files
 from avatar_core.errors import SurfaceError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Soup = tuple[FloatArray, IntArray]
 
+MAX_FILE_BYTES = 4 << 30
 MAX_LABEL_BYTES = 2**30  # of a decompressed label map
 LABEL_SPACING = 2.0  # label maps finer than this are averaged to it [mm]
 
 
 def content_of(path: Path) -> bytes:
-    """The file's bytes, for its hash; SurfaceError if there is no such file."""
+    """The file's bytes, for its hash; SurfaceError if there is no such ordinary file."""
     try:
-        return path.read_bytes()
-    except OSError as error:
+        with files.opened(path, MAX_FILE_BYTES) as source:
+            return files.content_of(source)
+    except files.FileError as error:
         raise SurfaceError(
-            f"cannot read {path}: {error.strerror}; check the path and its permissions"
+            f"cannot read {path}: {error}; check the path and its permissions"
         ) from error
 
 

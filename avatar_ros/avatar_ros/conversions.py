@@ -358,6 +358,8 @@ def surface_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 
 def mesh_arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) and faces (m, 3) of a message, whatever they hold."""
-    vertices = np.array([(p.x, p.y, p.z) for p in mesh.vertices], dtype=np.float64)
-    faces = np.array([t.vertex_indices for t in mesh.triangles], dtype=np.int64)
-    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+    n, m = len(mesh.vertices), len(mesh.triangles)
+    numbers = (x for p in mesh.vertices for x in (p.x, p.y, p.z))
+    corners = (corner for triangle in mesh.triangles for corner in triangle.vertex_indices)
+    vertices = np.fromiter(numbers, np.float64, 3 * n)  # lists of them would take ten times more
+    return vertices.reshape(n, 3), np.fromiter(corners, np.int64, 3 * m).reshape(m, 3)

@@ -32,12 +32,16 @@ import numpy as np
 
 from avatar_ros import realtime
 from avatar_ros.budgets import Budgets
+from avatar_ros.library import one_line
+from avatar_ros.reader import Reader
 
 if TYPE_CHECKING:
     from avatar_core.contact import Cloud
 
 _ALIGNMENT = 64
 _PACKET = 1 << 18  # the longest scene, quotes and all
+_SHOWN = 80  # letters of a name from elsewhere
+_LARGEST = 1 << 30  # vademecum that can be received [bytes]
 _RESTART_DELAY = 1.0  # [s]
 _STOP_TIMEOUT = 1.0  # [s]
 _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
@@ -203,7 +207,7 @@ class Handover:
                     prepared = _prepared(note, handles[0])
                     self._on_model(prepared)
                 except Exception as error:  # the node goes on with what it has
-                    prepared, refusal = None, _reason(error)
+                    prepared, refusal = None, one_line(error)
             if not refusal:
                 self._order = replace(self._order, **note["change"])
             if note["number"] == 0:  # a vademecum came
@@ -227,10 +231,6 @@ def _prepared(note: dict[str, Any], handle: int) -> Prepared:
         cloud_divisor=note["cloud_divisor"],
         curve=note["curve"],
     )
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _start(theirs: socket.socket) -> subprocess.Popen[bytes]:
@@ -307,6 +307,7 @@ class Receiver:
         self._order = order
         self._report = report
         self._vademecum: Any = None
+        self._reader = Reader(_LARGEST)
         self._budgets = Budgets()
         self._lock = threading.Lock()
 
@@ -316,10 +317,10 @@ class Receiver:
             if self._vademecum is not None and message.id == self._vademecum.id:
                 return  # a loader that was started again
             try:
-                vademecum = _verified(message.id, memoryview(message.data))
+                vademecum = _verified(message.id, bytes(message.data), self._reader)
                 self._hand_over(vademecum, self._order, {"number": 0, "change": {}})
             except Exception as error:  # whatever a file from elsewhere provokes, the loop goes on
-                refusal = f"vademecum {message.name!r} refused: {_reason(error)}"
+                refusal = f"vademecum {message.name[:_SHOWN]!r} refused: {one_line(error)}"
                 self._send({"number": 0, "refusal": refusal})
                 return
             self._vademecum = vademecum
@@ -332,7 +333,7 @@ class Receiver:
                 try:
                     self._change(asked["number"], asked["change"])
                 except Exception as error:  # as above
-                    self._send({"number": asked["number"], "refusal": _reason(error)})
+                    self._send({"number": asked["number"], "refusal": one_line(error)})
 
     def _change(self, number: int, change: Change) -> None:
         from avatar_core.errors import SceneError
@@ -392,10 +393,11 @@ def _with_plain_scene(change: Change) -> Change:
     return change
 
 
-def _verified(identity: str, data: memoryview) -> Any:
+def _verified(identity: str, data: bytes, reader: Reader) -> Any:
     from avatar_core import storage
 
-    vademecum = storage.parse_vademecum(data, "the received vademecum")
+    origin = "the received vademecum"
+    vademecum = reader.read(origin, len(data), storage.parse_vademecum, data, origin)
     if vademecum.id != identity:
         raise ValueError("altered on the way, its checksum differs: load it again")
     return vademecum

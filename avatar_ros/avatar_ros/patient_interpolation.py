@@ -17,6 +17,7 @@ from rclpy.task import Future
 from avatar_ros import conversions, parameters
 from avatar_ros.action import BuildPatient
 from avatar_ros.declared import ParameterError
+from avatar_ros.library import RefusedError, file_name, find_in_library, one_line
 from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.parameters import InterpolationSettings
 from avatar_ros.patient_builder import (
@@ -28,9 +29,7 @@ from avatar_ros.patient_builder import (
     Stage,
 )
 from avatar_ros.srv import InterpolatePatient
-from avatar_ros.vademecum_loader import RefusedError, find_in_library
 
-_LONGEST_NAME = 200  # of a file, with room for what is added while it is written
 _DEFAULT_FIDELITY = "interpolated"
 
 
@@ -77,18 +76,6 @@ def order_of(request: Any, settings: InterpolationSettings) -> Order:
         name=output.removesuffix(".h5"),
         output=str(Path(settings.library_dir).resolve() / output),
     )
-
-
-def file_name(name: str) -> str:
-    """A file in library_dir itself, ending in .h5.
-
-    Raises RefusedError for a path, a hidden or an overlong name.
-    """
-    if "/" in name or "\0" in name or name.startswith("."):
-        raise RefusedError(f"name {name!r}: give a plain file name, no path and no leading dot")
-    if len(name.encode()) > _LONGEST_NAME:
-        raise RefusedError(f"name: longer than {_LONGEST_NAME} bytes; give a shorter one")
-    return name if name.endswith(".h5") else f"{name}.h5"
 
 
 def _require_metres(request: Any, max_bytes: int) -> None:
@@ -229,7 +216,7 @@ class PatientInterpolationNode(ManagedNode):
 
     def _refuse(self, what: str, answer: Any, error: Exception) -> None:
         answer.success = False
-        answer.message = " ".join(str(error).split()) or type(error).__name__
+        answer.message = one_line(error)
         answer.displacement_error = math.nan
         text = f"{what}: {answer.message}"
         if isinstance(error, BusyError | CancelledError):

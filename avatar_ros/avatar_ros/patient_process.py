@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from avatar_core import storage
@@ -29,17 +28,14 @@ from avatar_core.patient import (
     require_fidelity,
 )
 from avatar_core.patient_base import PatientBase, base_of, numbers_of
-from avatar_core.surface import (
-    SurfaceMesh,
-    keep_organ,
-    orient_outward,
-    read_surface,
-    require_closed,
-    require_plausible_size,
-)
+from avatar_core.surface import SurfaceMesh
 from avatar_ros import realtime
+from avatar_ros.library import RefusedError, one_line
 from avatar_ros.patient_builder import BuildError, Built, Order, Ready, Refused, Rules, Stage
+from avatar_ros.patient_surface import read_confined
+from avatar_ros.reader import Reader
 
+_LARGEST = 1 << 30  # surface, unpacked [bytes]
 _NICENESS = 10  # a contact loop on the same machine goes first
 
 
@@ -57,7 +53,7 @@ class Source:
         return cls(base_of(atlas), {one.name: one.volume for one in atlas.anatomies})
 
 
-def build(order: Order, source: Source, rules: Rules, notes: Connection) -> Built:
+def build(order: Order, source: Source, rules: Rules, reader: Reader, notes: Connection) -> Built:
     """Build one patient and write it.
 
     Raises
@@ -70,40 +66,27 @@ def build(order: Order, source: Source, rules: Rules, notes: Connection) -> Buil
 
     require_fidelity(order.fidelity)
     options = _options(order, source.base, rules)
-    require_replaceable(Path(order.output))
+    require_replaceable(Path(order.output), reader)
     report("surface", 0.0, math.nan)
-    surface = surface_of(order)
+    surface = read_confined(order, reader)
     fidelity: Fidelity = order.fidelity  # type: ignore[assignment]
     patient = patient_vademecum(surface, source.base, fidelity, options, report)
     report("save", 0.0, math.nan)
     with _uninterrupted():
-        require_replaceable(Path(order.output))
+        require_replaceable(Path(order.output), reader)
         storage.save_vademecum(patient.vademecum, order.output)
         built = _account(patient, surface, source, order)
         notes.send(built)
     return built
 
 
-def surface_of(order: Order) -> SurfaceMesh:
-    """The surface of the order's file or arrays, checked alike.
-
-    Raises SurfaceError as ``read_surface`` does.
-    """
-    if order.vertices is None or order.faces is None:
-        return read_surface(order.surface, order.unit, order.axes)
-    surface = SurfaceMesh(order.vertices, order.faces, order.name)
-    surface = orient_outward(require_closed(keep_organ(surface)))
-    require_plausible_size(surface)
-    return surface
-
-
-def require_replaceable(path: Path) -> None:
+def require_replaceable(path: Path, reader: Reader) -> None:
     """Raise BuildError unless there is nothing at the path, or a vademecum: an atlas must stay."""
-    if not path.exists():
+    if not os.path.lexists(path):
         return
-    if path.is_file() and h5py.is_hdf5(path):
-        with h5py.File(path, "r") as file:
-            if str(file.attrs.get("format", "")) == storage.FORMAT:
+    if not path.is_symlink() and path.is_file():
+        with contextlib.suppress(RefusedError):
+            if reader.read(path.name, 0, storage.is_vademecum, path):
                 return
     raise BuildError(f"{path.name} exists and is no vademecum; choose another name")
 
@@ -169,21 +152,18 @@ def serve(rules: Rules, notes: Connection) -> None:
     try:
         source = Source.load(rules.atlas)
     except Exception as error:  # whatever a file provokes, the node says it in one line
-        notes.send(Refused(_in_one_line(error)))
+        notes.send(Refused(one_line(error)))
         return
     notes.send(Ready(len(source.base.names)))
+    reader = Reader(_LARGEST)
     while True:
         order = notes.recv()
         try:
-            build(order, source, rules, notes)
+            build(order, source, rules, reader, notes)
         except (BrokenPipeError, EOFError):
             raise
         except Exception as error:  # as above
-            notes.send(Refused(_in_one_line(error)))
-
-
-def _in_one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+            notes.send(Refused(one_line(error)))
 
 
 def main() -> int:

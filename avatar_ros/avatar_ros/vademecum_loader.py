@@ -2,55 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import stat
-from pathlib import Path
 from typing import Any
 
 from shape_msgs.msg import Mesh
 from std_msgs.msg import Header
 
 from avatar_core import storage
-from avatar_core.errors import AvatarError
 from avatar_ros import conversions, parameters, qos
 from avatar_ros.declared import ParameterError
+from avatar_ros.library import one_line, read_in_library
 from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.msg import VademecumFile, VademecumInfo
 from avatar_ros.parameters import LoaderSettings
+from avatar_ros.reader import Reader
 from avatar_ros.srv import LoadVademecum
-
-
-class RefusedError(AvatarError):
-    """A file that is not offered by this loader."""
-
-
-def find_in_library(name: str, library_dir: str, max_bytes: int) -> Path:
-    """The file ``name`` of the library.
-
-    Raises
-    ------
-    RefusedError : it lies outside, is no regular file, is missing or too large
-    """
-    if not name or "\0" in name:
-        raise RefusedError("no file name: give one in library_dir")
-    wanted = Path(name)
-    if wanted.is_absolute() or ".." in wanted.parts:
-        raise RefusedError(f"{name}: give a path inside library_dir, not absolute and without ..")
-    library = Path(library_dir).resolve()
-    try:
-        path = (library / wanted).resolve(strict=True)
-        status = path.stat()
-    except (OSError, RuntimeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "links to itself"
-        raise RefusedError(f"{name}: {reason}; the library is {library}") from error
-    if not path.is_relative_to(library):
-        raise RefusedError(f"{name}: a link out of library_dir; copy the file into {library}")
-    if not stat.S_ISREG(status.st_mode):
-        raise RefusedError(f"{name}: not a file")
-    if status.st_size > max_bytes:
-        raise RefusedError(f"{name}: {status.st_size / 1e6:.0f} MB; raise max_megabytes to read it")
-    return path
 
 
 class LoaderNode(ManagedNode):
@@ -58,6 +24,7 @@ class LoaderNode(ManagedNode):
 
     def __init__(self) -> None:
         self._settings: LoaderSettings | None = None
+        self._reader: Reader | None = None
         self._outlets: dict[type, Any] = {}
         self._service: Any = None
         super().__init__("vademecum_loader", parameters.VADEMECUM_LOADER)
@@ -68,6 +35,7 @@ class LoaderNode(ManagedNode):
             raise ParameterError(
                 f"parameter library_dir: {self._settings.library_dir} is not a directory"
             )
+        self._reader = Reader(self._settings.max_bytes)
         self._outlets = {
             kind: self.create_publisher(kind, topic, qos.LATCHED)
             for kind, topic in (
@@ -89,6 +57,9 @@ class LoaderNode(ManagedNode):
             self._service = None
 
     def clean_up(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = None
         for publisher in self._outlets.values():
             self.destroy_publisher(publisher)
         self._outlets = {}
@@ -98,14 +69,11 @@ class LoaderNode(ManagedNode):
 
         Raises
         ------
-        AvatarError, OSError : the file is refused; nothing was announced
+        AvatarError : the file is refused; nothing was announced
         """
-        assert self._settings is not None
-        path = find_in_library(name, self._settings.library_dir, self._settings.max_bytes)
-        vademecum = storage.load_vademecum(path)
-        data = path.read_bytes()
-        if hashlib.sha256(data).hexdigest() != vademecum.id:
-            raise RefusedError(f"{name}: changed while it was read; load it again")
+        assert self._settings is not None and self._reader is not None
+        data = read_in_library(name, self._settings.library_dir, self._settings.max_bytes)
+        vademecum = self._reader.read(name, len(data), storage.parse_vademecum, data, name)
         header = Header(frame_id=self._settings.frame_id, stamp=self.get_clock().now().to_msg())
         info = conversions.vademecum_info(vademecum.info(), header)
         surface = conversions.surface_mesh(vademecum.surface_vertices, vademecum.surface_faces)
@@ -126,7 +94,7 @@ class LoaderNode(ManagedNode):
             response.info = self.load(request.name)
             response.success = True
         except Exception as error:  # a service always answers; the file decides what is raised
-            response.message = " ".join(str(error).split()) or type(error).__name__
+            response.message = one_line(error)
             self.get_logger().error(f"load_vademecum: {response.message}")
         return response
 

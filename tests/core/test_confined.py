@@ -1,0 +1,70 @@
+"""Calls in a process that may die of them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from avatar_core.confined import Confined, ConfinedError
+from avatar_core.errors import StorageError
+from avatar_core.storage import load_vademecum
+
+SECONDS = 20.0
+
+
+@pytest.fixture
+def confined() -> Iterator[Confined]:
+    caller = Confined(1 << 30)
+    yield caller
+    caller.close()
+
+
+def test_a_call_gives_what_the_function_gives(confined: Confined) -> None:
+    made = confined.call(SECONDS, np.linspace, 0.0, 1.0, num=5)
+    np.testing.assert_array_equal(made, [0.0, 0.25, 0.5, 0.75, 1.0])
+
+
+def test_an_error_of_ours_comes_back_as_it_is(confined: Confined) -> None:
+    with pytest.raises(StorageError, match="no vademecum at /none"):
+        confined.call(SECONDS, load_vademecum, "/none")
+
+
+def test_another_error_comes_back_in_a_line(confined: Confined) -> None:
+    with pytest.raises(ConfinedError, match="invalid literal"):
+        confined.call(SECONDS, int, "x")
+
+
+def test_a_crash_is_an_error_and_the_next_call_works(confined: Confined) -> None:
+    first = confined.call(SECONDS, os.getpid)
+    with pytest.raises(ConfinedError, match="Segmentation fault"):
+        confined.call(SECONDS, os.kill, first, signal.SIGSEGV)
+    assert confined.call(SECONDS, os.getpid) not in (first, os.getpid())
+
+
+def test_a_hang_is_an_error_and_the_next_call_works(confined: Confined) -> None:
+    confined.call(SECONDS, os.getpid)
+    begin = time.monotonic()
+    with pytest.raises(ConfinedError, match="longer than 1 s"):
+        confined.call(1.0, time.sleep, 60.0)
+    assert time.monotonic() - begin < 10.0
+    assert confined.call(SECONDS, os.getpid) == confined.pid
+
+
+def test_memory_has_a_limit(confined: Confined) -> None:
+    with pytest.raises(ConfinedError, match="allocate"):
+        confined.call(SECONDS, np.empty, 2 << 30, np.uint8)
+    assert confined.call(SECONDS, np.empty, 1 << 20, np.uint8).size == 1 << 20
+
+
+def test_the_process_ends_with_the_caller() -> None:
+    confined = Confined()
+    number = confined.call(SECONDS, os.getpid)
+    confined.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(number, 0)
+    confined.close()

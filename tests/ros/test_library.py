@@ -1,0 +1,171 @@
+"""Names from the network: inside the library, ordinary files, one line about the others."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.handover import Order, Receiver
+from avatar_ros.library import (
+    RefusedError,
+    file_name,
+    find_in_library,
+    one_line,
+    read_in_library,
+)
+from avatar_ros.patient_builder import BuildError
+from avatar_ros.patient_interpolation import order_of
+from avatar_ros.patient_process import require_replaceable
+from avatar_ros.reader import Reader
+
+from avatar_ros import conversions, library
+from avatar_ros.msg import VademecumFile
+from avatar_ros.srv import InterpolatePatient
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> Path:
+    """A library with one file and ways out."""
+    folder = tmp_path / "library"
+    (folder / "sub").mkdir(parents=True)
+    (folder / "a.h5").write_bytes(b"inside")
+    (folder / "sub" / "b.h5").write_bytes(b"below")
+    (tmp_path / "secret").write_bytes(b"outside")
+    (folder / "out").symlink_to(tmp_path / "secret")
+    (folder / "up").symlink_to("..")
+    (folder / "in").symlink_to("a.h5")
+    (folder / "round").symlink_to("round")
+    (folder / "zero").symlink_to("/dev/zero")
+    os.mkfifo(folder / "pipe")
+    return folder
+
+
+BAD = {
+    "": "no file name",
+    "/etc/passwd": "inside library_dir",
+    "../secret": "inside library_dir",
+    "sub/../../secret": "inside library_dir",
+    "out": "link out",
+    "up/secret": "link out",
+    "zero": "link out",
+    "round": "links to itself|symbolic links",
+    "pipe": "not a file",
+    "sub": "not a file",
+    ".": "not a file",
+    "none": "No such file",
+    "a.h5\n[INFO] all is well": "printable",
+    "a\0b": "printable",
+    "\x1b[2J": "printable",
+    "x" * 2000: "printable",
+    "x" * 500: "File name too long",
+}
+
+
+@pytest.mark.parametrize("read", [find_in_library, read_in_library])
+@pytest.mark.parametrize("name", BAD, ids=[repr(name)[:20] for name in BAD])
+def test_a_name_that_leads_elsewhere_is_refused(
+    shelf: Path, name: str, read: Callable[..., Any]
+) -> None:
+    with pytest.raises(RefusedError, match=BAD[name]) as caught:
+        read(name, str(shelf), 100)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_names_inside_are_found(shelf: Path) -> None:
+    assert read_in_library("a.h5", str(shelf), 6) == b"inside"
+    assert read_in_library("sub/b.h5", str(shelf), 100) == b"below"
+    assert find_in_library("in", str(shelf), 100) == (shelf / "a.h5").resolve()
+    with pytest.raises(RefusedError, match="raise max_megabytes"):
+        read_in_library("a.h5", str(shelf), 5)
+
+
+def test_a_library_that_is_changed_meanwhile_leads_nowhere(
+    shelf: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The name becomes a link out between the look and the opening."""
+    true = library.opened
+
+    def swapped(path: Path, max_bytes: int) -> Any:
+        path.unlink()
+        path.symlink_to(shelf.parent / "secret")
+        return true(path, max_bytes)
+
+    monkeypatch.setattr(library, "opened", swapped)
+    with pytest.raises(RefusedError, match="led out of library_dir"):
+        read_in_library("a.h5", str(shelf), 100)
+
+
+@pytest.mark.parametrize("name", ["../x", "/x", ".x", "x" * 201, "a\nb", "a\0b"])
+def test_a_result_has_a_plain_name(name: str) -> None:
+    with pytest.raises(RefusedError):
+        file_name(name)
+    assert file_name("x") == file_name("x.h5") == "x.h5"
+
+
+def test_nothing_but_a_vademecum_is_replaced(shelf: Path, library: Path) -> None:
+    reader = Reader(1 << 20)
+    require_replaceable(shelf / "new.h5", reader)
+    require_replaceable(library / "liver.h5", reader)
+    (shelf / "link.h5").symlink_to(library / "liver.h5")
+    (shelf / "nowhere.h5").symlink_to("/nowhere/at/all")
+    for name in ("a.h5", "sub", "pipe", "link.h5", "nowhere.h5"):
+        with pytest.raises(BuildError, match="choose another name"):
+            require_replaceable(shelf / name, reader)
+    reader.close()
+
+
+def test_a_large_mesh_is_refused_before_it_is_copied(
+    shelf: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = InterpolatePatient.Request()
+    request.mesh = conversions.surface_mesh(*_triangles(1000))
+    settings: Any = SimpleNamespace(library_dir=str(shelf), max_bytes=36_000)
+    order = order_of(request, settings)
+    assert order.vertices is not None and order.vertices.shape == (1000, 3)
+
+    def never(mesh: Any) -> Any:
+        raise AssertionError("copied")
+
+    monkeypatch.setattr(conversions, "mesh_arrays", never)
+    settings.max_bytes = 35_999
+    with pytest.raises(RefusedError, match="raise max_megabytes"):
+        order_of(request, settings)
+
+
+def _triangles(n: int) -> tuple[Any, Any]:
+    import numpy as np
+
+    return np.zeros((n, 3)), np.zeros((n, 3), dtype=np.int64)
+
+
+def test_an_answer_is_one_short_line() -> None:
+    assert one_line(ValueError("a\n b\t c")) == "a b c"
+    assert one_line(ValueError()) == "ValueError"
+    assert one_line(ValueError("\x1b[31m")) == "?[31m"
+    assert len(one_line(ValueError("x" * 10_000))) == 500
+
+
+def test_a_forged_vademecum_with_a_long_name_is_refused_in_one_packet() -> None:
+    """The refusal goes through a socket that takes some 200 kB; the receiver has to survive it."""
+    import json
+    import socket
+
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    order = Order("vademecum", "n", "/", (0.005,), None, "surface", 1e-3)
+    with ours, theirs:
+        Receiver(order, theirs).receive(
+            VademecumFile(id="0" * 64, name="x\n" * 1_000_000, data=b"no file")
+        )
+        said = json.loads(ours.recv(1 << 20))["refusal"]
+    assert "refused" in said and "\n" not in said and len(said) < 1000
