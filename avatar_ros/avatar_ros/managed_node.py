@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from avatar_core.errors import AvatarError
+from avatar_ros import discovery
 from avatar_ros.declared import Parameter, ParameterError, declare
 
 _SIGNAL_LATENCY = 0.1  # longest until a signal is noticed [s]
@@ -139,6 +140,7 @@ def run(make_node: Callable[[], ManagedNode]) -> int:
     """
     stop = StopSignal()
     try:
+        discovery.stay_local()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         return _live(make_node(), stop)
     except (ParameterError, AvatarError) as error:
