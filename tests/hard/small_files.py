@@ -1,0 +1,180 @@
+"""The smallest vademecum and atlas that the loaders take: every array is there, none is large.
+
+A mutation of such a file hits its structure as often as its numbers, and thousands are read in a
+minute. The organ is a ball; what no formula of the loader depends on is random.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from avatar_core.atlas import Atlas
+from avatar_core.atlas_anatomy import Anatomy, Response
+from avatar_core.body import BodyResponse
+from avatar_core.certificate import Certificate
+from avatar_core.coordinates import Coordinate
+from avatar_core.elasticity import Material
+from avatar_core.large_deformation import POWERS, LargeCertificate, LargeDeformation
+from avatar_core.level_set import GridBox
+from avatar_core.loads import LoadSurface
+from avatar_core.mesh import MeshQuality, Regions, TetMesh
+from avatar_core.near_field import LocalBlocks
+from avatar_core.parametric import ParametricResponse
+from avatar_core.pgd_load import EnrichmentReport, EnrichmentStatus
+from avatar_core.registration import RegistrationQuality, SimilarityTransform, Template
+from avatar_core.separated import SeparatedField
+from avatar_core.surface import SurfaceMesh
+from avatar_core.tip_field import TipField
+from avatar_core.vademecum import Convergence, Provenance, RankError, Vademecum
+
+RADIUS = 0.06  # [m]
+RANK = 3
+
+
+def ball(n: int = 24, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) [m] on a sphere, spread evenly, and outward faces (2 n - 4, 3)."""
+    k = np.arange(n) + 0.5
+    z, turn = 1.0 - 2.0 * k / n, np.pi * (1.0 + 5.0**0.5) * k
+    flat = np.sqrt(1.0 - z**2)
+    unit = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+    faces = ConvexHull(unit).simplices.astype(np.int64)
+    inward = np.linalg.det(unit[faces]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return radius * unit, faces
+
+
+def small_vademecum(parametric: bool = False, large: bool = False) -> Vademecum:
+    """A ball of tetrahedra about its centre, all of its faces accessible but one."""
+    rng = np.random.default_rng(0)
+    points, faces = ball()
+    n, n_vertices = len(points), len(points) + 1
+    vertices = np.vstack([points, np.zeros(3)])
+    mesh = TetMesh(vertices, np.column_stack([np.full(len(faces), n), faces]))
+    clamped = np.arange(len(faces)) == 0
+    near, contact_near = _blocks(rng, n, n_vertices), _blocks(rng, n, n)
+    vademecum = Vademecum(
+        name="ball",
+        mesh=mesh,
+        regions=Regions(clamped, ~clamped),
+        material=Material(),
+        element="P2",
+        surface=LoadSurface(
+            points, points / RADIUS, faces[1:], np.arange(n, dtype=np.int64), 0.012
+        ),
+        far=_field(rng, 3 * n_vertices, 3 * n, RANK),
+        near=near,
+        contact_near=contact_near,
+        tip_field=_tip_field(),
+        convergence=Convergence(
+            True,
+            0.05,
+            (EnrichmentReport(EnrichmentStatus.CONVERGED, RANK, 2, 1e-3, 0.02),),
+            (RankError(RANK, 0.03, 0.08),),
+        ),
+        provenance=Provenance("ball.obj", "", versions=("avatar 0",), notices=("a ball",)),
+        certificate=replace(Certificate.unknown(), l2_mean=0.03, n_loads=5),
+        body=_body(rng, RANK),
+    )
+    if parametric:
+        vademecum = replace(vademecum, parametric=_parametric(rng, vademecum))
+    return replace(vademecum, large=_large(rng, vademecum)) if large else vademecum
+
+
+def small_atlas(n_anatomies: int = 2) -> Atlas:
+    """Balls of some sizes, with responses, on a grid of 27 points."""
+    rng = np.random.default_rng(1)
+    points, faces = ball()
+    vertices = np.vstack([points, np.zeros(3)])
+    mesh = TetMesh(vertices, np.column_stack([np.full(len(faces), len(points)), faces]))
+    clamped = np.arange(len(mesh.boundary_faces)) == 0
+    box = GridBox((-0.1, -0.1, -0.1), 0.1, (3, 3, 3))
+    empty = Atlas(Template("ball", mesh, Regions(clamped, ~clamped)), box)
+    anatomies = []
+    for k in range(n_anatomies):
+        size = 1.0 + 0.1 * k
+        quality = RegistrationQuality(
+            1e-3, 2e-3, 1e-3, 2e-3, 0.9, 0.01, MeshQuality(30.0, 120.0, 0.5)
+        )
+        field = _field(rng, vertices.size, 3 * len(points), RANK)
+        anatomies.append(
+            Anatomy(
+                name=f"ball-{k}",
+                surface=SurfaceMesh(size * points, faces, f"ball-{k}", source_sha256=f"{k:064d}"),
+                volume=4e-4 * size**3,
+                alignment=SimilarityTransform(size, np.eye(3), np.zeros(3)),
+                distances=np.linalg.norm(box.points, axis=1) - size * RADIUS,
+                registered=size * vertices,
+                quality=quality,
+                converged=True,
+                response=Response(
+                    field.space,
+                    field.load,
+                    np.tile(np.eye(3), (len(points), 1, 1)) * 1e-4,
+                    Material(),
+                    "P2",
+                    0.012,
+                ),
+            )
+        )
+    return empty.with_anatomies(anatomies)
+
+
+def _field(rng: np.random.Generator, n_dofs: int, n_loads: int, rank: int) -> SeparatedField:
+    return SeparatedField(
+        rng.normal(size=(n_dofs, rank)).astype(np.float32),
+        1e-2 * rng.normal(size=(n_loads, rank)).astype(np.float32),
+    )
+
+
+def _blocks(rng: np.random.Generator, n_positions: int, n_targets: int) -> LocalBlocks:
+    """Two blocks for each position, the first of them its own."""
+    own = np.arange(n_positions)
+    target = np.sort(np.column_stack([own, (own + 1) % n_targets]), axis=1).ravel()
+    block = np.tile(1e-4 * np.eye(3, dtype=np.float32), (len(target), 1, 1))
+    return LocalBlocks(np.arange(0, len(target) + 1, 2), target.astype(np.int32), block)
+
+
+def _body(rng: np.random.Generator, rank: int) -> BodyResponse:
+    return BodyResponse(1e-6 * np.eye(rank), 1e-4 * rng.normal(size=(rank, 3)))
+
+
+def _tip_field() -> TipField:
+    axis = np.linspace(-0.1, 0.1, 9)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    distance = (np.sqrt(x**2 + y**2 + z**2) - RADIUS).astype(np.float32)
+    return TipField(
+        distance, np.ones_like(distance), np.full(3, axis[0]), np.array([axis[1] - axis[0]])
+    )
+
+
+def _parametric(rng: np.random.Generator, vademecum: Vademecum) -> ParametricResponse:
+    n, rank = len(vademecum.surface.centers), RANK + 2
+    coordinate = Coordinate("poisson", 0.40, 0.48, 2)
+    nodes = coordinate.n_nodes
+    return ParametricResponse(
+        (coordinate,),
+        _field(rng, 3 * len(vademecum.mesh.vertices), 3 * n, rank),
+        np.tile(np.eye(rank), (2, 1, 1)),
+        np.tile(vademecum.near.block, (nodes, 1, 1, 1)),
+        np.tile(vademecum.contact_near.block, (nodes, 1, 1, 1)),
+        RANK,
+        vademecum.material.young_modulus,
+        _body(rng, rank),
+    )
+
+
+def _large(rng: np.random.Generator, vademecum: Vademecum) -> LargeDeformation:
+    n, powers = len(vademecum.surface.centers), len(POWERS)
+    field = _field(rng, 3 * len(vademecum.mesh.vertices), powers * n, 2)
+    return LargeDeformation(
+        "neo-hookean",
+        field.space,
+        field.load.reshape(powers, n, 2),
+        1e-2 * rng.normal(size=(powers, len(vademecum.near.target), 3)).astype(np.float32),
+        np.zeros((powers, n)),
+        np.full(n, 0.01),
+        LargeCertificate(0.02, 0.05, 0.01, 0.04, 0.1, 0.1, 3, 9, 0, 0.01, 0.01, 0.01),
+    )
