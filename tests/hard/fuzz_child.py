@@ -24,7 +24,7 @@ sys.path[:1] = []  # this folder, whose modules are named from the top
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 
 SECONDS = 4.0  # to read, as in a node
-PATIENCE = 20.0  # for the process that reads to be started again, too
+PATIENCE = 90.0  # for the process that reads to be started again on a busy machine, too
 MEMORY = 2 << 30  # of it
 LONGEST_LINE = 600
 
