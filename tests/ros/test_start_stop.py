@@ -1,0 +1,91 @@
+"""The executables of the installation, as `ros2 run` finds them: start, signal, end.
+
+The prefix is that of the Python that runs the tests; CI makes it afresh, as the README says.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from lifecycle_msgs.srv import GetState
+
+pytestmark = [pytest.mark.ros, pytest.mark.long]
+
+END = 2.0  # from a signal to the end [s]
+PREFIX = Path(sys.prefix)
+# Without an atlas, which takes minutes to make, that node waits to be configured.
+ARGUMENTS = {"patient_interpolation": ["--ros-args", "-p", "autostart:=false"]}
+STATES = {"patient_interpolation": "unconfigured"}
+EXECUTABLES = {"contact", "patient_interpolation", "vademecum_loader"}
+
+
+@pytest.fixture
+def shell(own_domain: dict[str, str]) -> dict[str, str]:
+    """What a user's shell has after the README's export, and the tests' domain."""
+    kept = ("HOME", "LANG", "NUMBA_CACHE_DIR", "TMPDIR")
+    environment = {name: os.environ[name] for name in kept if name in os.environ}
+    environment |= {name: value for name, value in own_domain.items() if name.startswith("ROS_")}
+    return environment | {
+        "AMENT_PREFIX_PATH": str(PREFIX),
+        "PATH": f"{PREFIX / 'bin'}:/usr/bin:/bin",
+    }
+
+
+def _run(shell: dict[str, str], code: str) -> str:
+    command = [str(PREFIX / "bin" / "python"), "-c", code]
+    return subprocess.run(
+        command, env=shell, cwd="/", check=True, capture_output=True, text=True
+    ).stdout.strip()
+
+
+def test_the_prefix_is_found_by_ament(shell: dict[str, str]) -> None:
+    code = "from ament_index_python.packages import get_package_prefix as p; print(p('avatar_ros'))"
+    assert Path(_run(shell, code)).resolve() == PREFIX.resolve()
+    share = PREFIX / "share" / "avatar_ros"
+    for wanted in ("package.xml", "launch/contact.launch.py", "params/contact.yaml"):
+        assert (share / wanted).is_file()
+
+
+def test_the_executables_are_those_that_are_documented() -> None:
+    assert {path.name for path in (PREFIX / "lib" / "avatar_ros").iterdir()} == EXECUTABLES
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+@pytest.mark.parametrize("name", sorted(EXECUTABLES))
+def test_an_executable_starts_and_ends_cleanly(
+    shell: dict[str, str], lasting_probe: Any, name: str, number: signal.Signals
+) -> None:
+    begin = time.monotonic()
+    process = subprocess.Popen(
+        [PREFIX / "lib" / "avatar_ros" / name, *ARGUMENTS.get(name, [])],
+        env=shell,
+        cwd="/",
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        state = lasting_probe.ask(GetState, f"{name}/get_state", GetState.Request())
+        started = time.monotonic() - begin
+        assert state.current_state.label == STATES.get(name, "active")
+        begin = time.monotonic()
+        process.send_signal(number)
+        assert process.wait(10.0) == 0
+        ended = time.monotonic() - begin
+    finally:
+        process.kill()
+        _, said = process.communicate()
+    print(f"{name}, {number.name}: answers after {started:.2f} s, ended after {ended:.2f} s")
+    assert ended < END
+    assert "Traceback" not in said
+    assert "rror" not in said
