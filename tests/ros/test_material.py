@@ -29,7 +29,7 @@ from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import PATIENT
 from tests.ros.test_cell import Hand, _force, felt
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.long]  # an organ with coordinates is solved first
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ from tests.ros.conftest import START_TIMEOUT
 from tests.ros.test_cell import Hand, _force
 from tests.ros.test_material import _set
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.long]  # a step is compiled for each scene
 
 SCENES = sorted((Path(__file__).parents[2] / "params" / "scenes").glob("*.yaml"))
 ALONE = ("breathing", "hanging", "release")  # scenes for which nothing else compiles the step
