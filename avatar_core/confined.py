@@ -26,7 +26,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from avatar_core.errors import AvatarError
+from avatar_core.errors import AvatarError, one_line
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -158,7 +158,7 @@ def _called(function: Callable[..., Any], args: Any, kwargs: Any) -> tuple[str, 
             return RAISED, error
         return FAILED, str(error)
     except Exception as error:
-        return FAILED, " ".join(str(error).split())[:120] or type(error).__name__
+        return FAILED, one_line(error, 120)
 
 
 def main(max_bytes: int) -> int:

@@ -7,6 +7,12 @@ class AvatarError(Exception):
     """Base of every error that a user can cause and cure."""
 
 
+def one_line(error: object, longest: int = 500) -> str:
+    """What an error or a text says, in one line of at most so many printable letters."""
+    line = " ".join(str(error).split()) or type(error).__name__
+    return "".join(letter if letter.isprintable() else "?" for letter in line[:longest])
+
+
 class SurfaceError(AvatarError):
     """The organ surface cannot be read or does not bound one organ of plausible size."""
 

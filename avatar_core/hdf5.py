@@ -18,7 +18,7 @@ from typing import BinaryIO
 import h5py
 import numpy as np
 
-from avatar_core.errors import StorageError
+from avatar_core.errors import StorageError, one_line
 
 Arrays = dict[str, np.ndarray]
 Attributes = dict[str, str]
@@ -52,7 +52,8 @@ def replace_file(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str
             raise
     except OSError as error:
         raise StorageError(
-            f"cannot write {path} ({reason(error)}); free disk space or choose another folder"
+            f"cannot write {path} ({one_line(error, 120)}); "
+            "free disk space or choose another folder"
         ) from error
 
 
@@ -111,7 +112,7 @@ def verified(
     except StorageError:
         raise
     except UNREADABLE as error:
-        why = f"{error} is missing" if isinstance(error, KeyError) else reason(error)
+        why = f"{error} is missing" if isinstance(error, KeyError) else one_line(error, 120)
         raise StorageError(
             f"{origin} is no readable {what} ({why}); it may be truncated: build or copy it again"
         ) from error
@@ -174,8 +175,3 @@ def require_schema(attributes: Attributes, newest: str, origin: str) -> None:
         raise StorageError(
             f"{origin} has schema {schema}, this version reads up to {newest}; upgrade avatar"
         )
-
-
-def reason(error: BaseException) -> str:
-    """What an error says, in one short line."""
-    return " ".join(str(error).split())[:120] or type(error).__name__

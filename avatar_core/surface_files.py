@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avatar_core import files
-from avatar_core.errors import SurfaceError
+from avatar_core.errors import SurfaceError, one_line
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -49,13 +49,9 @@ def parse(path: Path, label: int | None) -> Soup:
         raise
     except Exception as error:  # the parsers of five formats raise whatever they like
         raise SurfaceError(
-            f"{path.name}: not a readable {kind[1:].upper()} file ({_one_line(error)}); "
+            f"{path.name}: not a readable {kind[1:].upper()} file ({one_line(error, 80)}); "
             "export it again"
         ) from error
-
-
-def _one_line(error: Exception, length: int = 80) -> str:
-    return (" ".join(str(error).split()) or type(error).__name__)[:length]
 
 
 def _read_obj(path: Path) -> Soup:

@@ -16,10 +16,11 @@ from typing import Any
 import yaml
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-from avatar_core.errors import SceneError
+from avatar_core.errors import SceneError, one_line
 
 MAX_BYTES = 64 * 1024
 MAX_DEPTH = 8  # a scene needs 6
+_UNKNOWN = "it cannot be understood"
 
 _TAGS = {
     f"tag:yaml.org,2002:{kind}"
@@ -71,10 +72,14 @@ def compose(text: str, source: str) -> Node:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1
-        raise SceneError(f"{source}:{line}: is not YAML: {_one_line(error.problem)}") from error
+        raise SceneError(
+            f"{source}:{line}: is not YAML: {one_line(error.problem or _UNKNOWN, 120)}"
+        ) from error
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
-        raise SceneError(f"{source}:{line}: is not YAML: {_one_line(error.reason)}") from error
+        raise SceneError(
+            f"{source}:{line}: is not YAML: {one_line(error.reason or _UNKNOWN, 120)}"
+        ) from error
     if root is None:
         raise SceneError(f"{source}:1: is empty; write at least 'name: ...'")
     return root
@@ -174,7 +179,3 @@ def _check_size(size: int, source: str) -> None:
         raise SceneError(
             f"{source}: has {size} bytes; at most {MAX_BYTES} are read: is it the right file?"
         )
-
-
-def _one_line(text: str | None) -> str:
-    return " ".join((text or "it cannot be understood").split())[:120]

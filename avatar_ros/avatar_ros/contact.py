@@ -27,7 +27,7 @@ from sensor_msgs.msg import PointCloud2
 
 from avatar_core import contact, passivity
 from avatar_core.accuracy import AccuracyCurve, Budget
-from avatar_core.errors import AccuracyError, SceneError
+from avatar_core.errors import AccuracyError, SceneError, one_line
 from avatar_ros import diagnostics, parameters, qos, realtime, scenes
 from avatar_ros.accuracy import Accuracy, Report
 from avatar_ros.budget_requests import BudgetRequests
@@ -198,7 +198,7 @@ class ContactNode(ManagedNode):
                 self._say_divisor(prepared.cloud_divisor)
             response.success = True
         except Exception as error:  # a service always answers; the text decides what is raised
-            response.message = " ".join(str(error).split()) or type(error).__name__
+            response.message = one_line(error)
             self.get_logger().error(f"load_scene: {response.message}")
         if self._loop is not None:
             response.effects = list(self._loop.online.effects)

@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from avatar_core.errors import one_line
 from avatar_ros import realtime
 from avatar_ros.budgets import Budgets
-from avatar_ros.library import one_line
 from avatar_ros.reader import Reader
 
 if TYPE_CHECKING:

@@ -18,7 +18,6 @@ from avatar_core.files import FileError, content_of, opened
 
 LONGEST_NAME = 200  # of a file, with room for what is added while it is written [bytes]
 LONGEST_PATH = 1000  # [letters]
-LONGEST_LINE = 500  # of an answer [letters]
 
 
 class RefusedError(AvatarError):
@@ -57,12 +56,6 @@ def file_name(name: str) -> str:
     if len(name.encode()) > LONGEST_NAME:
         raise RefusedError(f"name: longer than {LONGEST_NAME} bytes; give a shorter one")
     return name if name.endswith(".h5") else f"{name}.h5"
-
-
-def one_line(error: BaseException) -> str:
-    """What an error says, for answers and logs: one line of printable letters, not too long."""
-    line = " ".join(str(error).split()) or type(error).__name__
-    return "".join(letter if letter.isprintable() else "?" for letter in line[:LONGEST_LINE])
 
 
 @contextmanager

@@ -14,10 +14,11 @@ from rclpy.action import ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 
+from avatar_core.errors import one_line
 from avatar_ros import conversions, parameters
 from avatar_ros.action import BuildPatient
 from avatar_ros.declared import ParameterError
-from avatar_ros.library import RefusedError, file_name, find_in_library, one_line
+from avatar_ros.library import RefusedError, file_name, find_in_library
 from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.parameters import InterpolationSettings
 from avatar_ros.patient_builder import (

@@ -20,6 +20,7 @@ import numpy as np
 
 from avatar_core import storage
 from avatar_core.atlas_storage import load_atlas
+from avatar_core.errors import one_line
 from avatar_core.patient import (
     Fidelity,
     Patient,
@@ -30,7 +31,7 @@ from avatar_core.patient import (
 from avatar_core.patient_base import PatientBase, base_of, numbers_of
 from avatar_core.surface import SurfaceMesh
 from avatar_ros import realtime
-from avatar_ros.library import RefusedError, one_line
+from avatar_ros.library import RefusedError
 from avatar_ros.patient_builder import BuildError, Built, Order, Ready, Refused, Rules, Stage
 from avatar_ros.patient_surface import read_confined
 from avatar_ros.reader import Reader

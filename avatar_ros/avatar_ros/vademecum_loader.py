@@ -9,9 +9,10 @@ from shape_msgs.msg import Mesh
 from std_msgs.msg import Header
 
 from avatar_core import storage
+from avatar_core.errors import one_line
 from avatar_ros import conversions, parameters, qos
 from avatar_ros.declared import ParameterError
-from avatar_ros.library import one_line, read_in_library
+from avatar_ros.library import read_in_library
 from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.msg import VademecumFile, VademecumInfo
 from avatar_ros.parameters import LoaderSettings

@@ -18,7 +18,6 @@ from avatar_ros.library import (
     RefusedError,
     file_name,
     find_in_library,
-    one_line,
     read_in_library,
 )
 from avatar_ros.patient_builder import BuildError
@@ -26,6 +25,7 @@ from avatar_ros.patient_interpolation import order_of
 from avatar_ros.patient_process import require_replaceable
 from avatar_ros.reader import Reader
 
+from avatar_core.errors import one_line
 from avatar_ros import conversions, library
 from avatar_ros.msg import VademecumFile
 from avatar_ros.srv import InterpolatePatient
