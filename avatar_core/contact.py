@@ -268,7 +268,8 @@ def lay_out(
         grid = sampled_at_tip(surface, vademecum.tip_field, response, values)
         kept = shown.fade > 0.0
         fade = shown.fade[kept, None].astype(bent.near.dtype)
-        large = LargeArrays(grid, bent.load, bent.near[:, kept] * fade)
+        # in rows whether or not blocks were left out: one layout, one compilation
+        large = LargeArrays(grid, bent.load, np.ascontiguousarray(bent.near[:, kept] * fade))
     arrays = ModelArrays(
         *vademecum.tip_field,
         row=response.row,
