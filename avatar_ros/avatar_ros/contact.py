@@ -84,28 +84,32 @@ class ContactNode(ManagedNode):
         contact.warm_up(len(settings.tools))
         if settings.safety.passivity != "off":
             passivity.warm_up()
-        own = OwnThread()
+        own, period = OwnThread(), 1.0 / settings.rate
         self._tools = [
             Tool(
-                self.create_subscription(
+                self.ports.subscription(
                     PoseStamped,
                     f"{name}/measured_cp",
                     _never_called,
-                    qos.NEWEST,
+                    qos.poses(period),
                     callback_group=own,
                     raw=True,
                 ),
-                self.create_publisher(WrenchStamped, f"{name}/spatial/servo_cf", qos.COMMAND),
+                self.ports.publisher(
+                    WrenchStamped, f"{name}/spatial/servo_cf", qos.wrenches(period)
+                ),
                 settings.frame_id,
                 settings.safety,
             )
             for name in settings.tools
         ]
         self._outlets = Outlets(
-            self.create_publisher(ContactState, "contact_state", qos.state(len(self._tools))),
-            self.create_publisher(PointCloud2, "deformation", qos.NEWEST),
-            self.create_publisher(LoopStatistics, "statistics", qos.STATISTICS),
-            self.create_publisher(DiagnosticArray, "/diagnostics", qos.STATISTICS),
+            self.ports.publisher(
+                ContactState, "contact_state", qos.states(len(self._tools), period)
+            ),
+            self.ports.publisher(PointCloud2, "deformation", qos.clouds(period)),
+            self.ports.publisher(LoopStatistics, "statistics", qos.reports(_STATISTICS_PERIOD)),
+            self.ports.publisher(DiagnosticArray, "/diagnostics", qos.reports(_STATISTICS_PERIOD)),
         )
         self._loop = ContactLoop(settings, self._tools, self._outlets, self.context)
         order = Order(
@@ -115,7 +119,7 @@ class ContactNode(ManagedNode):
             tip_radii=settings.tip_radii,
             modes=settings.modes,
             cloud=settings.cloud,
-            period=1.0 / settings.rate,
+            period=period,
             material=settings.material,
             scene=settings.scene,
             budget=asdict(settings.budget) if settings.budget else {},
@@ -325,6 +329,7 @@ class ContactNode(ManagedNode):
         statuses = [
             diagnostics.loop_status(name, window, loop.settings.rate, limits),
             diagnostics.vademecum_status(name, online.id, promise),
+            diagnostics.qos_status(name, self.ports.mismatches()),
         ]
         if report is not None:
             self._say_shown(report)

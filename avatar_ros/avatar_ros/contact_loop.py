@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import EventHandler
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 from avatar_core import contact, passivity
@@ -43,13 +44,13 @@ _NO_ERROR = float("nan")  # of a force that no model gave
 
 
 class OwnThread(CallbackGroup):
-    """For subscriptions that the loop takes from itself: no executor ever touches them."""
+    """For subscriptions that the loop takes from itself: an executor sees their events alone."""
 
     def can_execute(self, entity: Any) -> bool:
-        return False
+        return isinstance(entity, EventHandler)
 
     def beginning_execution(self, entity: Any) -> bool:
-        return False
+        return isinstance(entity, EventHandler)
 
     def ending_execution(self, entity: Any) -> None:
         pass

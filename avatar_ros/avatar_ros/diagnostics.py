@@ -178,6 +178,19 @@ def vademecum_status(name: str, identity: str, promise: str) -> DiagnosticStatus
     return _status(f"{name}: vademecum", OK, promise, {"id": identity})
 
 
+def qos_status(name: str, mismatches: list[str]) -> DiagnosticStatus:
+    """Of ends elsewhere that get or send nothing; ``mismatches`` are one line each."""
+    text = "; ".join(mismatches)
+    if not text:
+        return _status(f"{name}: quality of service", OK, "no other end was found not to match", {})
+    return _status(
+        f"{name}: quality of service",
+        WARN,
+        f"{text}: change theirs, or qos_overrides.* here",
+        {"ends not matched": len(mismatches)},
+    )
+
+
 def accuracy_status(name: str, text: str, shedding: bool, window: LoopStatistics) -> Any:
     """Of what is shown, promised and held."""
     return _status(

@@ -18,6 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from avatar_core.errors import AvatarError
 from avatar_ros import discovery
 from avatar_ros.declared import Parameter, ParameterError, declare
+from avatar_ros.ports import Ports
 
 _SIGNAL_LATENCY = 0.1  # longest until a signal is noticed [s]
 _LAST_ANSWERS = 1.0  # for what is still to be answered when the node ends [s]
@@ -31,11 +32,13 @@ class ManagedNode(LifecycleNode, ABC):
     before anything starts.
 
     refusal : why the last transition failed
+    ports : makes publishers and subscriptions
     """
 
     def __init__(self, name: str, declared: tuple[Parameter, ...]) -> None:
         super().__init__(name)
         self.refusal = ""
+        self.ports = Ports(self)
         declare(self, declared)
 
     @abstractmethod

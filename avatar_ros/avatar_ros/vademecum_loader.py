@@ -38,7 +38,7 @@ class LoaderNode(ManagedNode):
             )
         self._reader = Reader(self._settings.max_bytes)
         self._outlets = {
-            kind: self.create_publisher(kind, topic, qos.LATCHED)
+            kind: self.ports.publisher(kind, topic, qos.ONCE)
             for kind, topic in (
                 (VademecumInfo, "vademecum_info"),
                 (Mesh, "rest_surface"),

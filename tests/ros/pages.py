@@ -66,6 +66,22 @@ def parameter_rows(node: str) -> dict[str, str]:
     return dict(re.findall(r"^\| `([^`]+)` (\|.*)$", section, re.MULTILINE))
 
 
+def quality_rows(node: str) -> dict[str, str]:
+    """Of a node's topics: each ``qos_overrides`` parameter and the default that the page says."""
+    cells = r"`([^`]+)` \| (subscription|publisher) \| (.+) \| (.+) \| (.+) \| (.+)"
+    page = (PAGES / "parameters.md").read_text()
+    found = {}
+    own = {row["interface"] for row in index() if row["node"] == node}
+    for interface, side, *values in re.findall(rf"^\| {cells} \|$", page, re.MULTILINE):
+        if interface not in own:
+            continue
+        name = f"qos_overrides.{topic({'interface': interface})}.{side}"
+        policies = ("reliability", "durability", "depth", "deadline")
+        for policy, value in zip(policies, values, strict=True):
+            found[f"{name}.{policy}"] = re.split(r"[ ,]", value)[0]
+    return found
+
+
 def yaml_parameters(node: str) -> dict[str, Any]:
     """The parameters in the cell's YAML file, nested names joined by dots."""
     content = yaml.safe_load((ROOT / "params" / "planning_cell.yaml").read_text())

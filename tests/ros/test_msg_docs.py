@@ -10,12 +10,22 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rclpy.duration import Infinite
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from avatar_ros import qos
 from avatar_ros.msg import ContactState
-from tests.ros.pages import PAGES, entry, index, offered, parameter_rows, topic, yaml_parameters
+from tests.ros.pages import (
+    PAGES,
+    entry,
+    index,
+    offered,
+    parameter_rows,
+    quality_rows,
+    topic,
+    yaml_parameters,
+)
 
 pytestmark = pytest.mark.ros
 
@@ -75,15 +85,26 @@ def test_quality_of_service_is_that_of_the_page(running: Any, row: dict[str, str
     latched = end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert said.startswith("RELIABLE" if reliable else "BEST_EFFORT")
     assert ("TRANSIENT_LOCAL" in said) == latched
+    deadline = end.qos_profile.deadline
+    assert ("deadline of" in said) == (deadline < Infinite)
+    if deadline < Infinite:
+        assert f"({deadline.nanoseconds * 1e-6:g} ms)" in said
 
 
 @pytest.mark.parametrize("node", NODES)
 def test_parameters_are_those_of_the_page(running: Any, node: str) -> None:
     listed = running.ask(ListParameters, f"/{node}/list_parameters", ListParameters.Request())
     declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
-    rows = parameter_rows(node)
-    assert declared == set(rows)
-    request = DescribeParameters.Request(names=sorted(declared))
+    rows, quality = parameter_rows(node), quality_rows(node)
+    assert quality
+    assert declared == set(rows) | set(quality)
+    request = GetParameters.Request(names=list(quality))
+    values = running.ask(GetParameters, f"/{node}/get_parameters", request).values
+    assert quality == {
+        name: str(parameter_value_to_python(value))
+        for name, value in zip(quality, values, strict=True)
+    }
+    request = DescribeParameters.Request(names=sorted(rows))
     described = running.ask(DescribeParameters, f"/{node}/describe_parameters", request)
     for descriptor in described.descriptors:
         assert descriptor.description
