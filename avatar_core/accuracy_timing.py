@@ -51,10 +51,13 @@ def timed(
 
 
 def timed_points(
-    model: ContactModel, points: Sequence[CurvePoint], paths: np.ndarray
+    model: ContactModel,
+    points: Sequence[CurvePoint],
+    paths: np.ndarray,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> list[CurvePoint]:
     """Points that differ in modes alone, timed on a model that has all of these."""
-    found = _timed([(model, point) for point in points], paths)
+    found = _timed([(model, point) for point in points], paths, progress)
     model.show(model.n_modes)
     model.reset()
     return found

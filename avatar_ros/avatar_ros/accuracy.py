@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,7 +33,7 @@ class Accuracy:
     Parameters
     ----------
     model : ContactModel
-    curve : points that differ in modes alone, timed on this machine; None where none was measured
+    curve : points that differ in modes alone; None where none was measured
     deadline : of a step [s]; infinity for none
     """
 
@@ -54,9 +55,15 @@ class Accuracy:
         if point is not None:
             text += (
                 f", displacement within {point.l2:.1%} and force within {point.force:.1%} for 95 % "
-                f"of touches, steps of {point.p99 * 1e6:.0f} us"
+                "of touches"
             )
+            if not math.isnan(point.p99):
+                text += f", steps of {point.p99 * 1e6:.0f} us"
         return text
+
+    def learn(self, curve: AccuracyCurve) -> None:
+        """Promise the times of the same points, timed on this machine since."""
+        self._points = {p.detail.modes: p for p in curve.points}
 
     def keep(self, deadline: float) -> None:
         """Shed by another deadline from now on [s]."""

@@ -1,11 +1,13 @@
 """Which detail a budget chooses, in the process that prepares models; and what it is timed at.
 
 Times are measured when a vademecum or a scene is new here, and kept while only the material
-changes. Core modules are imported where they are used: the contact node needs none of them.
+changes: before it is used where a budget chooses by them, else after. Core modules are imported
+where they are used: the contact node needs none of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +16,10 @@ if TYPE_CHECKING:
     from avatar_core.contact import ContactModel
     from avatar_ros.handover import Order
     from avatar_ros.scenes import Plan
+
+
+class OvertakenError(Exception):
+    """Something came that is to be prepared before anything is timed."""
 
 
 class Budgets:
@@ -57,26 +63,50 @@ class Budgets:
         some = tuple(p for p in self._timed.points if p.detail.modes <= most)
         return choose(replace(self._timed, points=some), Budget(**order.budget)).detail
 
-    def curve(self, plan: Plan, detail: Detail, model: ContactModel) -> dict[str, Any] | None:
+    def curve(self, plan: Plan, detail: Detail) -> dict[str, Any] | None:
         """The plain form of the points with up to the modes of ``detail``; None: not measured.
 
-        They are timed on ``model``, which shows it, if they were not.
+        Their times are NaN until :meth:`times` measured them, or a budget did.
+        """
+        if detail in self._rows:
+            return self._rows[detail]
+        row = self._row(plan, detail)
+        if row is None:
+            return None
+        if self._timed is not None or not row.points:
+            self._rows[detail] = row.plain()
+        return row.plain()
+
+    def times(
+        self, plan: Plan, detail: Detail, model: ContactModel, overtaken: Callable[[], bool]
+    ) -> dict[str, Any] | None:
+        """The same once timed on ``model``, which shows the detail; None if that was known.
+
+        Raises
+        ------
+        OvertakenError : as soon as ``overtaken`` says so
         """
         from avatar_core.accuracy_timing import slides, timed_points
 
+        def go_on(share: float) -> None:
+            if overtaken():
+                raise OvertakenError
+
+        go_on(0.0)
+        row = self._row(plan, detail)
+        if row is None or detail in self._rows:
+            return None
+        paths = slides(plan.vademecum, plan.tip_radii)
+        row = replace(row, points=tuple(timed_points(model, row.points, paths, go_on)))
+        self._rows[detail] = row.plain()
+        return self._rows[detail]
+
+    def _row(self, plan: Plan, detail: Detail) -> AccuracyCurve | None:
         curve = self._timed or _curve_of(plan)
         if curve is None:
             return None
-        if detail not in self._rows:
-            row = curve.like(detail)
-            row = replace(
-                row, points=tuple(p for p in row.points if p.detail.modes <= detail.modes)
-            )
-            if self._timed is None and row.points:
-                paths = slides(plan.vademecum, plan.tip_radii)
-                row = replace(row, points=tuple(timed_points(model, row.points, paths)))
-            self._rows[detail] = row.plain()
-        return self._rows[detail]
+        row = curve.like(detail)
+        return replace(row, points=tuple(p for p in row.points if p.detail.modes <= detail.modes))
 
     def _keep_for(self, plan: Plan) -> None:
         key = (plan.vademecum.id, plan.tip_radii, plan.cloud, plan.effect_names)

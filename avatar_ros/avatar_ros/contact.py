@@ -124,7 +124,9 @@ class ContactNode(ManagedNode):
             scene=settings.scene,
             budget=asdict(settings.budget) if settings.budget else {},
         )
-        self._handover = Handover(order, self._take_model, self.get_logger().error)
+        self._handover = Handover(
+            order, self._take_model, self._take_times, self.get_logger().error
+        )
         self._budget = BudgetRequests(
             settings.budget, self._handover.ask, self._keep_budget, self._refuse_budget
         )
@@ -192,6 +194,13 @@ class ContactNode(ManagedNode):
             time.sleep(BLEND / 4)
         time.sleep(_GRACE)
         del replaced  # frees its memory here, not in the loop
+
+    def _take_times(self, curve: dict[str, Any]) -> None:
+        """In the handover's thread: promise the times of the model in use, measured since."""
+        loop = self._loop
+        if loop is not None and loop.online.accuracy is not None:
+            loop.online.accuracy.learn(AccuracyCurve.of_plain(curve))
+            self.get_logger().info(f"timed here: {loop.online.accuracy.promise}")
 
     async def _load_scene(
         self, request: LoadScene.Request, response: LoadScene.Response

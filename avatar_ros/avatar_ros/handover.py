@@ -7,7 +7,8 @@ arrays into a sealed piece of shared memory, whose handle it sends through a soc
 process only maps that memory, and reads the compiled step from numba's cache.
 
 The socket carries JSON: to the process the whole ``Order`` first, then changes of it, each with a
-number; back a note for each, with what is in force from now on or why it is refused.
+number; back a note for each, with what is in force from now on or why it is refused. A model is
+sent as soon as it is prepared; how long its steps take is measured then, and sent after it.
 
 Run as ``python -m avatar_ros.handover`` by ``Handover``, never by hand.
 """
@@ -24,15 +25,15 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from avatar_core.errors import one_line
 from avatar_ros import realtime
-from avatar_ros.budgets import Budgets
+from avatar_ros.budgets import Budgets, OvertakenError
 from avatar_ros.reader import Reader
 
 if TYPE_CHECKING:
@@ -80,7 +81,8 @@ class Prepared:
     ranges : lowest and highest value of each coordinate that the vademecum has
     effects : that are simulated, by name
     cloud_divisor : of the scene; None without one
-    curve : the AccuracyCurve of what is shown and of fewer modes, in plain form; None: not measured
+    curve : the AccuracyCurve of what is shown and of fewer modes, in plain form, with NaN for times
+        that were not measured yet; None: no errors were measured
     """
 
     id: str
@@ -108,6 +110,7 @@ class Handover:
     is dragged fills neither time nor memory.
 
     on_model : called with each model that was verified and prepared; puts it into use
+    on_times : called with the curve of the model in use when its times were measured
     on_refusal : called with one line when a vademecum was refused or the process ended
     """
 
@@ -115,10 +118,12 @@ class Handover:
         self,
         order: Order,
         on_model: Callable[[Prepared], None],
+        on_times: Callable[[dict[str, Any]], None],
         on_refusal: Callable[[str], None],
     ) -> None:
         self._order = order  # in force, for a process that is started anew
         self._on_model = on_model
+        self._on_times = on_times
         self._on_refusal = on_refusal
         self._stop = threading.Event()
         self._lock = threading.Lock()  # of the four below
@@ -196,11 +201,16 @@ class Handover:
             answer(None, "the node was cleaned up meanwhile; configure and ask again")
 
     def _receive(self, ours: socket.socket) -> None:
+        taken = False  # the last model that came
         while True:
             packet, handles, _, _ = socket.recv_fds(ours, _PACKET, 1)
             if not packet:
                 return
             note = json.loads(packet)
+            if "times" in note:
+                if taken:
+                    self._on_times(note["times"])
+                continue
             refusal, prepared = note.get("refusal", ""), None
             if handles:
                 try:
@@ -208,6 +218,7 @@ class Handover:
                     self._on_model(prepared)
                 except Exception as error:  # the node goes on with what it has
                     prepared, refusal = None, one_line(error)
+                taken = prepared is not None
             if not refusal:
                 self._order = replace(self._order, **note["change"])
             if note["number"] == 0:  # a vademecum came
@@ -297,10 +308,19 @@ def _view(memory: mmap.mmap, entry: dict[str, Any]) -> np.ndarray:
 # --- The receiving process -------------------------------------------------------------------
 
 
+class Shown(NamedTuple):
+    """A model that was sent, of which plan and with which detail."""
+
+    plan: Any
+    detail: Any
+    model: Any
+
+
 class Receiver:
     """Verifies and prepares what comes in, and reports through a socket.
 
-    Vademecums come in the thread of the node, changes of the order in that of :meth:`listen`.
+    Vademecums come in the thread of the node, changes of the order in that of :meth:`listen`. What
+    is prepared is timed when it is in use, unless something waits: then that is prepared first.
     """
 
     def __init__(self, order: Order, report: socket.socket) -> None:
@@ -310,46 +330,62 @@ class Receiver:
         self._reader = Reader(_LARGEST)
         self._budgets = Budgets()
         self._lock = threading.Lock()
+        self._waiting: set[int] = set()  # threads
+
+    @contextlib.contextmanager
+    def _turn(self) -> Iterator[None]:
+        """Who comes in ends the timing that is under way."""
+        self._waiting.add(threading.get_ident())
+        with self._lock:
+            self._waiting.discard(threading.get_ident())
+            yield
 
     def receive(self, message: Any) -> None:
         """Take a VademecumFile."""
-        with self._lock:
+        with self._turn():
             if self._vademecum is not None and message.id == self._vademecum.id:
                 return  # a loader that was started again
             try:
                 vademecum = _verified(message.id, bytes(message.data), self._reader)
-                self._hand_over(vademecum, self._order, {"number": 0, "change": {}})
+                shown = self._hand_over(vademecum, self._order, {"number": 0, "change": {}})
             except Exception as error:  # whatever a file from elsewhere provokes, the loop goes on
                 refusal = f"vademecum {message.name[:_SHOWN]!r} refused: {one_line(error)}"
                 self._send({"number": 0, "refusal": refusal})
                 return
             self._vademecum = vademecum
+            self._time(shown)
 
     def listen(self) -> None:
         """Take changes of the order until the line is closed."""
         while packet := self._report.recv(_PACKET):
             asked = json.loads(packet)
-            with self._lock:
+            with self._turn():
                 try:
-                    self._change(asked["number"], asked["change"])
+                    shown = self._change(asked["number"], asked["change"])
                 except Exception as error:  # as above
                     self._send({"number": asked["number"], "refusal": one_line(error)})
+                    continue
+                if shown is not None:
+                    self._time(shown)
 
-    def _change(self, number: int, change: Change) -> None:
+    def _change(self, number: int, change: Change) -> Shown | None:
+        """What is shown then; None without a vademecum."""
         from avatar_core.errors import SceneError
 
         change = _with_plain_scene(change)
         order = replace(self._order, **change)
         note = {"number": number, "change": change}
+        shown = None
         if self._vademecum is not None:
-            self._hand_over(self._vademecum, order, note)
+            shown = self._hand_over(self._vademecum, order, note)
         elif "scene" in change:
             raise SceneError("there is no vademecum yet; load one, then the scene")
         else:
             self._send(note)
         self._order = order
+        return shown
 
-    def _hand_over(self, vademecum: Any, order: Order, note: dict[str, Any]) -> None:
+    def _hand_over(self, vademecum: Any, order: Order, note: dict[str, Any]) -> Shown:
         """Prepare a vademecum as an order says, and send it with a note."""
         from avatar_core.contact import Layout, make_model
         from avatar_core.scene_file import parse_scene
@@ -373,10 +409,18 @@ class Receiver:
             # Compiles the step for these effects, if that was never done on this machine, from
             # arrays as the node will map them: it then finds the same types in numba's cache.
             model = make_model(Layout.of(_map(os.dup(handle), contents)), halves=True)
-            note["curve"] = self._budgets.curve(plan, detail, model)
+            note["curve"] = self._budgets.curve(plan, detail)
             self._send(note, handle)
         finally:
             os.close(handle)
+        return Shown(plan, detail, model)
+
+    def _time(self, shown: Shown) -> None:
+        """Measure the times of what was sent, and send them, unless they were known."""
+        with contextlib.suppress(OvertakenError):
+            curve = self._budgets.times(*shown, overtaken=lambda: bool(self._waiting))
+            if curve is not None:
+                self._send({"times": curve})
 
     def _send(self, note: dict[str, Any], *handles: int) -> None:
         socket.send_fds(self._report, [json.dumps(note).encode()], handles)

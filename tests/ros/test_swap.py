@@ -1,0 +1,140 @@
+"""A vademecum is in use first and timed afterwards."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.bench_cell import Module
+from avatar_ros.conversions import vademecum_file
+from avatar_ros.handover import Order, Receiver
+
+from avatar_core.storage import load_vademecum, save_vademecum
+from avatar_ros import qos
+from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_ros.srv import LoadVademecum
+from tests.ros.conftest import PATIENT
+from tests.ros.test_cell import Hand
+
+pytestmark = pytest.mark.ros
+
+ORDER = Order("vademecum", "handover", "/", (5e-3,), None, "surface", 1e-3)
+SWAPS = 6
+
+
+@pytest.fixture(scope="module")
+def twins(organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same organ under two names: two vademecums."""
+    folder = tmp_path_factory.mktemp("twins")
+    for name in ("one", "two"):
+        save_vademecum(replace(organ, name=name), folder / f"{name}.h5")
+    return folder
+
+
+class Line:
+    """The end of a receiver's socket that the contact node has."""
+
+    def __init__(self) -> None:
+        self.ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.ours.settimeout(60.0)
+        self.receiver = Receiver(ORDER, theirs)
+
+    def note(self) -> tuple[dict[str, Any], int]:
+        """The next note, and how many handles came with it."""
+        packet, handles, _, _ = socket.recv_fds(self.ours, 1 << 20, 1)
+        for handle in handles:
+            socket.close(handle)
+        return json.loads(packet), len(handles)
+
+
+def test_a_model_is_sent_before_its_times(twins: Path) -> None:
+    line = Line()
+    data = (twins / "one.h5").read_bytes()
+    identity = load_vademecum(twins / "one.h5").id
+    line.receiver.receive(vademecum_file(identity, "one", data))
+    model, n = line.note()
+    assert (n, model["id"]) == (1, identity)
+    assert model["curve"]["l2"] and all(map(math.isnan, model["curve"]["p99"]))
+    times, n = line.note()
+    assert n == 0 and set(times) == {"times"}
+    assert times["times"]["l2"] == model["curve"]["l2"]
+    pairs = zip(times["times"]["p50"], times["times"]["p99"], strict=True)
+    assert all(0.0 < p50 <= p99 for p50, p99 in pairs)
+
+
+def test_a_change_that_waits_comes_before_the_times(
+    twins: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is prepared next is what is timed."""
+    line = Line()
+    receiver = line.receiver
+    data = (twins / "one.h5").read_bytes()
+    monkeypatch.setattr(receiver, "_waiting", {1})
+    receiver.receive(vademecum_file(load_vademecum(twins / "one.h5").id, "one", data))
+    assert line.note()[1] == 1
+    line.ours.settimeout(0.0)
+    with pytest.raises(BlockingIOError):
+        line.note()
+    line.ours.settimeout(60.0)
+    monkeypatch.setattr(receiver, "_waiting", set())
+    threading.Thread(target=receiver.listen, daemon=True).start()
+    change = {"number": 1, "change": {"material": {"young": 0.3e6}}}
+    line.ours.send(json.dumps(change).encode())
+    assert line.note()[0]["number"] == 1
+    assert "times" in line.note()[0]
+
+
+@pytest.fixture
+def hand(
+    own_domain: dict[str, str], twins: Path, probe: Any, touch: tuple[np.ndarray, np.ndarray]
+) -> Iterator[Hand]:
+    """A tool that presses the first of them."""
+    files = ["-p", f"library_dir:={twins}", "-p", "vademecum:=one.h5"]
+    loader = Module("vademecum_loader", ["--ros-args", *files], own_domain)
+    contact = Module("contact", PATIENT, own_domain)
+    probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
+    yield Hand(probe, touch[0])
+    assert [contact.finish(), loader.finish()] == [0, 0]
+
+
+def test_another_vademecum_is_felt_soon_and_timed_later(probe: Any, hand: Hand) -> None:
+    probe.client(LoadVademecum, "load_vademecum")
+    seconds = []
+    for k in range(SWAPS):
+        name = ("two.h5", "one.h5")[k % 2]
+        wanted = probe.call(LoadVademecum, "load_vademecum", LoadVademecum.Request(name=name))
+        asked = time.monotonic()
+        probe.next(
+            ContactState,
+            "contact_state",
+            qos.state(1),
+            lambda s, wanted=wanted: s.vademecum_id == wanted.info.id and s.contacts,
+            60.0,
+            hand,
+        )
+        seconds.append(time.monotonic() - asked)
+        probe.next(
+            LoopStatistics,
+            "statistics",
+            qos.STATISTICS,
+            lambda w: math.isfinite(w.promised_step_p99),
+            60.0,
+            hand,
+        )
+    print(
+        f"\nfrom the answer of load_vademecum to the first force of the new one: median "
+        f"{np.median(seconds):.2f} s, worst {max(seconds):.2f} s of {SWAPS}"
+    )
