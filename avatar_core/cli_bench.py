@@ -122,7 +122,11 @@ def bench_cell(
     ] = 0.0,
     output: Json = None,
 ) -> None:
-    """Time the whole ROS 2 cell: tool, contact and cloud subscriber as separate processes."""
+    """Time the whole ROS 2 cell: tool, contact and cloud subscriber as separate processes.
+
+    Says, too, whether one of them takes more and more memory, files or threads: a soak, with
+    --seconds 600.
+    """
     import tempfile
 
     from avatar_core.organ import OrganOptions, vademecum_of

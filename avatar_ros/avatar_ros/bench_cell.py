@@ -2,8 +2,9 @@
 
 Loader, contact node, a palpating tool, a cloud viewer, on request a slider of the material, and
 beside them a loop that only sleeps:
-what it misses, the machine misses. ``avatar bench cell`` and ``avatar demo`` run it as
-``python -m avatar_ros.bench_cell VADEMECUM SECONDS``.
+what it misses, the machine misses. Of every process it says what memory, files and threads it has
+at the begin and at the end: ten minutes of it are a soak. ``avatar bench cell`` and ``avatar demo``
+run it as ``python -m avatar_ros.bench_cell VADEMECUM SECONDS``.
 """
 
 from __future__ import annotations
@@ -19,146 +20,29 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from avatar_core.errors import AvatarError
-from avatar_ros import realtime
+from avatar_ros import footprint, realtime
+from avatar_ros.cell_report import CellMeasurement, CellReport, Times
+from avatar_ros.footprint import Growth, footprints
 from avatar_ros.scripted_tool import READY, Felt
 
 PERIOD = 1e-3  # [s]
 ON_TIME = 1.5e-3  # longest period that is on time [s]
 PRIORITY = 80  # of contact node, tool and sleeping loop in the real-time mode
 _START_TIMEOUT = 120.0  # compilation included [s]
+_WARM = 0.1  # part of a run, before what the processes have is noted for the first time
+_LAST = 1.5  # before its end, when the tool is still there, it is noted again [s]
 _STOP_TIMEOUT = 2.0  # a node ends within [s]
 _DOMAINS = range(1, 102)  # of DDS, those that work on every platform
 
 
 class CellError(AvatarError):
     """A process of the measured cell did not do its part."""
-
-
-@dataclass(frozen=True)
-class Times:
-    """Of periods or latencies [ms]."""
-
-    p50_ms: float
-    p99_ms: float
-    max_ms: float
-
-    @staticmethod
-    def of(seconds: np.ndarray) -> Times:
-        if len(seconds) == 0:
-            return Times(np.nan, np.nan, np.nan)
-        return Times(*(float(x) for x in 1e3 * np.percentile(seconds, (50, 99, 100))))
-
-
-@dataclass(frozen=True)
-class CellMeasurement:
-    """One run of the cell.
-
-    priority : SCHED_FIFO priority that the tool was granted, 0 without
-    load_average : of the last minute, before the run; processes of others disturb
-    rate_hz, on_time_fraction : periods of the contact loop, by its own clock; on time: <= 1.5 ms
-    rate_at_tool_hz, on_time_at_tool_fraction : periods between wrenches that reached the tool
-    latency : from publishing a pose to its wrench in hand, in the tool
-    answered_fraction : poses that got a wrench of their own
-    compute_p99_ms : worst second of the contact node, from pose in hand to wrench published
-    floor : periods of the sleeping loop in the same seconds
-    cloud_hz, cloud_bytes : what the viewer got
-    material_changes : that the contact node accepted in the run
-    force_max_n : largest force felt
-    felt : every pose and its answer; not in the data file
-    """
-
-    priority: int
-    load_average: float
-    seconds: float
-    rate_hz: float
-    on_time_fraction: float
-    period_max_ms: float
-    rate_at_tool_hz: float
-    on_time_at_tool_fraction: float
-    latency: Times
-    answered_fraction: float
-    compute_p99_ms: float
-    floor: Times
-    floor_on_time_fraction: float
-    cloud_hz: float
-    cloud_bytes: int
-    material_changes: int
-    force_max_n: float
-    felt: Felt
-
-
-@dataclass(frozen=True)
-class CellReport:
-    """What ``avatar bench cell`` prints; ``real_time`` is None where priority is refused."""
-
-    machine: str
-    cores: int
-    vademecum: str
-    real_time: CellMeasurement | None
-    ordinary: CellMeasurement | None
-
-    @property
-    def summary(self) -> dict[str, float]:
-        """The figures of the better mode that was run, under the names of the data file."""
-        best = self.real_time or self.ordinary
-        if best is None:
-            return {}
-        return {
-            "rate_hz": best.rate_hz,
-            "on_time_fraction": best.on_time_fraction,
-            "latency_p50_ms": best.latency.p50_ms,
-            "latency_p99_ms": best.latency.p99_ms,
-        }
-
-    def save(self, path: Path) -> None:
-        """Write all figures as JSON; those that could not be measured are null."""
-        document = {"name": "cell", "summary": self.summary, **asdict(self)}
-        path.write_text(json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
-
-    def table(self) -> str:
-        """Both modes side by side, one figure a line."""
-        runs = [run for run in (self.real_time, self.ordinary) if run is not None]
-        names = [f"SCHED_FIFO {run.priority}" if run.priority else "ordinary" for run in runs]
-        lines = [f"{'':34}" + "".join(f"{name:>16}" for name in names)]
-        for label, value in _ROWS:
-            lines.append(f"{label:34}" + "".join(f"{value(run):>16}" for run in runs))
-        return "\n".join(lines)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(held) for name, held in value.items() if name != "felt"}
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _times(times: Times) -> str:
-    return f"{times.p50_ms:.2f} {times.p99_ms:.2f} {times.max_ms:.1f}"
-
-
-_ROWS = (
-    ("load average before", lambda run: f"{run.load_average:.2f}"),
-    ("contact loop rate [Hz]", lambda run: f"{run.rate_hz:.1f}"),
-    ("  periods <= 1.5 ms", lambda run: f"{run.on_time_fraction:.3%}"),
-    ("  longest period [ms]", lambda run: f"{run.period_max_ms:.1f}"),
-    ("wrenches at the tool [Hz]", lambda run: f"{run.rate_at_tool_hz:.1f}"),
-    ("  periods <= 1.5 ms", lambda run: f"{run.on_time_at_tool_fraction:.3%}"),
-    ("pose to wrench p50 p99 max [ms]", lambda run: _times(run.latency)),
-    ("  poses answered", lambda run: f"{run.answered_fraction:.3%}"),
-    ("  computing, worst p99 [ms]", lambda run: f"{run.compute_p99_ms:.3f}"),
-    ("bare sleep p50 p99 max [ms]", lambda run: _times(run.floor)),
-    ("  periods <= 1.5 ms", lambda run: f"{run.floor_on_time_fraction:.3%}"),
-    ("clouds at the viewer [Hz]", lambda run: f"{run.cloud_hz:.1f}"),
-    ("  bytes each", lambda run: f"{run.cloud_bytes}"),
-    ("changes of the material", lambda run: f"{run.material_changes}"),
-    ("largest force [N]", lambda run: f"{run.force_max_n:.2f}"),
-)
 
 
 def run_cell(
@@ -207,13 +91,14 @@ def _measure(
     load = os.getloadavg()[0]
     with (
         tempfile.TemporaryDirectory(prefix="avatar-bench-") as folder,
-        cell(path, tip_radius, priority) as environment,
+        cell(path, tip_radius, priority) as (environment, processes),
     ):
         felt_file, view_file = Path(folder, "felt.npz"), Path(folder, "view.json")
         count_file = Path(folder, "count.json")
         viewer = Module("cloud_viewer", [str(view_file)], environment)
         arguments = [str(path), "--tip-radius", str(tip_radius), "--output", str(felt_file)]
         arguments += ["--seconds", str(seconds), "--priority", str(priority)]
+        arguments += ["--timeout", str(_START_TIMEOUT)]
         tool = Module("scripted_tool", arguments, environment)
         slider = None
         try:
@@ -225,6 +110,7 @@ def _measure(
                 of_slider = [str(path), str(changes), str(count_file)]
                 slider = Module("material_slider", of_slider, environment)
             floor = Module("realtime", [str(seconds), str(priority)], environment)
+            grown = _growths(seconds, processes | {"cloud_viewer": viewer, "scripted_tool": tool})
             bare, _ = floor.communicate(timeout=seconds + _START_TIMEOUT)
             if tool.wait(timeout=seconds + _START_TIMEOUT) != 0:
                 raise CellError(f"the tool failed: {tool.last_words()}")
@@ -236,11 +122,32 @@ def _measure(
             raise CellError(f"the slider failed: {slider.last_words()}")
         accepted = 0 if slider is None else json.loads(count_file.read_text())["accepted"]
         felt = Felt.load(felt_file)
-        return _evaluate(felt, json.loads(view_file.read_text()), json.loads(bare), load, accepted)
+        view = json.loads(view_file.read_text())
+        return _evaluate(felt, view, json.loads(bare), load, accepted, grown)
+
+
+def _growths(seconds: float, processes: dict[str, Module]) -> tuple[Growth, ...]:
+    """Of all processes over a run that begins now; returns shortly before its end."""
+    begin = time.monotonic()
+    pids = {name: process.pid for name, process in processes.items()}
+    helpers = footprint.children(pids["contact"])
+    pids |= {f"contact's helper {k}": pid for k, pid in enumerate(sorted(helpers), 1)}
+    time.sleep(_WARM * seconds)
+    try:
+        first = footprints(pids)
+        time.sleep(max(0.0, begin + seconds - _LAST - time.monotonic()))
+        return footprint.growths(first, footprints(pids))
+    except OSError:  # one ended, and who looks after it will say so
+        return ()
 
 
 def _evaluate(
-    felt: Felt, view: dict[str, Any], bare: dict[str, Any], load: float, accepted: int
+    felt: Felt,
+    view: dict[str, Any],
+    bare: dict[str, Any],
+    load: float,
+    accepted: int,
+    grown: tuple[Growth, ...],
 ) -> CellMeasurement:
     windows = [
         w
@@ -251,7 +158,7 @@ def _evaluate(
         raise CellError("no statistics from the contact node: measure for 3 s or longer")
     periods = sum(w["periods"] for w in windows)
     duration = float(felt.end - felt.begin)
-    clouds = np.array(view["clouds"])
+    clouds = [n for at, n in view["clouds"].items() if felt.begin < int(at) < felt.end - 1.0]
     floor = np.array(bare["periods"])
     at_tool = np.diff(felt.arrivals)
     answered = felt.latencies[np.isfinite(felt.latencies)]
@@ -269,10 +176,11 @@ def _evaluate(
         compute_p99_ms=1e3 * max(w["compute_p99"] for w in windows),
         floor=Times.of(floor),
         floor_on_time_fraction=float(np.mean(floor <= ON_TIME)),
-        cloud_hz=np.count_nonzero((clouds > felt.begin) & (clouds < felt.end)) / duration,
+        cloud_hz=float(np.mean(clouds)) if clouds else 0.0,
         cloud_bytes=view["cloud_bytes"],
         material_changes=accepted,
         force_max_n=float(np.nanmax(np.linalg.norm(felt.forces, axis=1))),
+        growths=grown,
         felt=felt,
     )
 
@@ -291,8 +199,10 @@ def isolated_environment() -> dict[str, str]:
 
 
 @contextmanager
-def cell(vademecum: Path, tip_radius: float = 0.005, priority: int = 0) -> Iterator[dict[str, str]]:
-    """Loader and contact node as processes; gives the environment to join them.
+def cell(
+    vademecum: Path, tip_radius: float = 0.005, priority: int = 0
+) -> Iterator[tuple[dict[str, str], dict[str, Module]]]:
+    """Loader and contact node as processes; gives the environment to join them, and them.
 
     Raises
     ------
@@ -304,7 +214,7 @@ def cell(vademecum: Path, tip_radius: float = 0.005, priority: int = 0) -> Itera
     numbers = ["-p", f"tip_radius:={float(tip_radius)}", "-p", f"realtime.priority:={priority}"]
     contact = Module("contact", ["--ros-args", *numbers], environment)
     try:
-        yield environment
+        yield environment, {"vademecum_loader": loader, "contact": contact}
         for name, process in (("vademecum_loader", loader), ("contact", contact)):
             if process.poll() is not None:
                 raise CellError(f"{name} ended by itself: {process.last_words()}")

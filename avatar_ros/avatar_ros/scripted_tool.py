@@ -151,8 +151,8 @@ class ScriptedTool:
         n = len(tips)
         forces = np.full((n, 3), np.nan)
         latencies = np.full(n, np.nan)
-        sent = np.zeros(n, np.int64)
-        arrivals = np.zeros(4 * n + 64, np.int64)
+        sent = np.full(n, 0)  # in memory now, not page by page
+        arrivals = np.full(4 * n + 64, 0)
         n_arrivals = 0
         offset = time.time_ns() - time.monotonic_ns()
         first = time.monotonic_ns() + self._period

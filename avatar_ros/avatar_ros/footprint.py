@@ -1,0 +1,90 @@
+"""What processes take of the machine, and what of it they take more and more of."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+MOST_GROWTH = 5.0  # of a process in a run, that is none [MB]
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Of one process at one moment.
+
+    memory_mb : that the system cannot take back: neither code nor pages of files
+    files : open descriptors, sockets among them
+    """
+
+    memory_mb: float
+    files: int
+    threads: int
+
+    @staticmethod
+    def of(pid: int) -> Footprint:
+        """Raises OSError where there is no such process, or it is not ours to look at."""
+        lines = (line.split(":") for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+        status = {name: text.split() for name, text in lines}
+        if "RssAnon" not in status:
+            raise ProcessLookupError(f"process {pid} has ended")
+        held = sum(int(status[name][0]) for name in ("RssAnon", "RssShmem", "VmSwap"))
+        return Footprint(
+            1024e-6 * held, len(os.listdir(f"/proc/{pid}/fd")), int(status["Threads"][0])
+        )
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Of one process over a run."""
+
+    process: str
+    begin: Footprint
+    end: Footprint
+
+    @property
+    def memory_mb(self) -> float:
+        return self.end.memory_mb - self.begin.memory_mb
+
+    @property
+    def complaint(self) -> str:
+        """What it took more of, in words; empty if nothing."""
+        found = []
+        if self.memory_mb >= MOST_GROWTH:
+            found.append(f"{self.memory_mb:.1f} MB")
+        for name in ("files", "threads"):
+            more = getattr(self.end, name) - getattr(self.begin, name)
+            if more > 0:
+                found.append(f"{more} {name}")
+        return f"{self.process} took {' and '.join(found)} more" if found else ""
+
+    def row(self) -> str:
+        a, b = self.begin, self.end
+        return (
+            f"{self.process:34}{f'{a.memory_mb:.1f}':>10} {f'{self.memory_mb:+.1f}':>6}"
+            f"{f'{a.files} {b.files}':>10}{f'{a.threads} {b.threads}':>10}"
+        )
+
+
+HEADER = f"{'process':34}{'MB':>10} {'growth':>6}{'files':>10}{'threads':>10}"
+
+
+def footprints(pids: dict[str, int]) -> dict[str, Footprint]:
+    """Of processes by name."""
+    return {name: Footprint.of(pid) for name, pid in pids.items()}
+
+
+def growths(begin: dict[str, Footprint], end: dict[str, Footprint]) -> tuple[Growth, ...]:
+    return tuple(Growth(name, begin[name], end[name]) for name in begin)
+
+
+def children(pid: int) -> Iterable[int]:
+    """Processes that a process started and that run."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(stat.read_text().rsplit(")", 1)[1].split()[1])
+        except OSError:  # it has just ended
+            continue
+        if parent == pid:
+            yield int(stat.parent.name)
