@@ -321,15 +321,20 @@ class Receiver:
 
     Vademecums come in the thread of the node, changes of the order in that of :meth:`listen`. What
     is prepared is timed when it is in use, unless something waits: then that is prepared first.
+
+    stop : true when the process is to end
     """
 
-    def __init__(self, order: Order, report: socket.socket) -> None:
+    def __init__(
+        self, order: Order, report: socket.socket, stop: Callable[[], bool] = lambda: False
+    ) -> None:
         self._order = order
         self._report = report
         self._vademecum: Any = None
         self._reader = Reader(_LARGEST)
         self._budgets = Budgets()
         self._lock = threading.Lock()
+        self._stop = stop
         self._waiting: set[int] = set()  # threads
 
     @contextlib.contextmanager
@@ -418,7 +423,9 @@ class Receiver:
     def _time(self, shown: Shown) -> None:
         """Measure the times of what was sent, and send them, unless they were known."""
         with contextlib.suppress(OvertakenError):
-            curve = self._budgets.times(*shown, overtaken=lambda: bool(self._waiting))
+            curve = self._budgets.times(
+                *shown, overtaken=lambda: bool(self._waiting) or self._stop()
+            )
             if curve is not None:
                 self._send({"times": curve})
 
@@ -460,7 +467,7 @@ def main() -> int:
     stop = StopSignal()
     report = socket.socket(fileno=os.dup(sys.stdin.fileno()))
     order = Order(**json.loads(report.recv(_PACKET)))
-    receiver = Receiver(order, report)
+    receiver = Receiver(order, report, lambda: bool(stop))
     threading.Thread(target=receiver.listen, name="changes", daemon=True).start()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(
