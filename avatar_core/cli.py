@@ -11,6 +11,7 @@ import typer
 from avatar_core.cli_atlas import atlas
 from avatar_core.cli_bench import bench, require_ros, run_cell
 from avatar_core.cli_cell import cell
+from avatar_core.cli_export import export
 from avatar_core.cli_patient import patient
 from avatar_core.cli_scene import scene
 from avatar_core.cli_study import study
@@ -40,6 +41,7 @@ app.add_typer(atlas, name="atlas")
 app.add_typer(scene, name="scene")
 app.command()(vademecum)
 app.command()(show)
+app.command()(export)
 app.command()(patient)
 app.command()(study)
 app.command()(cell)
