@@ -13,6 +13,7 @@ from avatar_core.cli_bench import bench, require_ros, run_cell
 from avatar_core.cli_cell import cell
 from avatar_core.cli_export import export
 from avatar_core.cli_patient import patient
+from avatar_core.cli_replay import replay
 from avatar_core.cli_scene import scene
 from avatar_core.cli_study import study
 from avatar_core.cli_vademecum import (
@@ -43,6 +44,7 @@ app.command()(vademecum)
 app.command()(show)
 app.command()(export)
 app.command()(patient)
+app.command()(replay)
 app.command()(study)
 app.command()(cell)
 

@@ -1,0 +1,175 @@
+"""A recording replayed gives the same forces, where it can; where it cannot, it says so."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from avatar_core import cli, contact
+from avatar_core.contact import FAR_AWAY, prepare
+from avatar_core.effects import Effect, Friction, Respiration, Viscoelasticity
+from avatar_core.effects.selection import natural_effects
+from avatar_core.errors import StorageError
+from avatar_core.recording import Clouds, Periods, Recording, load_recording, save_recording
+from avatar_core.replay import replay
+from avatar_core.scene import Scene
+from avatar_core.scene_file import write_scene
+from avatar_core.storage import load_vademecum, save_vademecum
+from avatar_core.tool_path import push_and_slide
+from avatar_core.vademecum import Vademecum
+
+RADIUS = 5e-3
+SAME = 1e-9  # [N], as promised; the difference is 0 in fact
+VISCOUS = Viscoelasticity(g=(0.3,), tau=(0.1,))
+
+
+def stored(vademecum: Vademecum, folder: Path) -> Vademecum:
+    save_vademecum(vademecum, folder / "liver.h5")
+    return load_vademecum(folder / "liver.h5")
+
+
+def recorded(vademecum: Vademecum, effects: Sequence[Effect], skipped: int = 0) -> Recording:
+    """What a loop would record: a push and a slide, with poses that fail; from a period on."""
+    tips = push_and_slide(vademecum, RADIUS, 4e-3, 3e-3, 900, 40)[:, None].copy()
+    tips[200:210] = np.nan
+    tips[300:350] = FAR_AWAY
+    tips = np.concatenate([np.full((20, 1, 3), FAR_AWAY), tips, np.full((5, 1, 3), FAR_AWAY)])
+    turn = np.zeros(tips.shape)
+    turn[500:600] = [0.0, 1e-3, 0.0]
+    model = prepare(vademecum, (RADIUS,), cloud="off", effects=effects, halves=True)
+    force, status = np.empty(tips.shape), np.empty((len(tips), 1), np.uint8)
+    for k, tip in enumerate(tips):
+        if model.effects.friction is not None:
+            model.effects.friction.spin[:] = turn[k]
+        contact.solve(model, tip)
+        force[k], status[k] = model.out.force, model.out.status
+    n = len(tips)
+    periods = Periods(
+        number=np.arange(n) + 100,
+        stamp=np.arange(n) * 1_000_000,
+        tip=tips,
+        turn=turn,
+        status=status,
+        force=force,
+        error=np.zeros((n, 1)),
+        share=np.ones((n, 1)),
+    )
+    kept = {name: value[skipped:] for name, value in vars(periods).items()}
+    return Recording(
+        vademecum.id,
+        vademecum.name,
+        write_scene(Scene(effects=tuple(effects))),
+        1000.0,
+        skipped == 0,
+        Periods(**kept),
+        Clouds(np.array([100, 133]), np.zeros((2, 7, 3), np.float32)),
+    )
+
+
+@pytest.fixture(scope="module")
+def organ(straight: Vademecum, tmp_path_factory: pytest.TempPathFactory) -> Vademecum:
+    return stored(straight, tmp_path_factory.mktemp("replay"))
+
+
+@pytest.mark.parametrize(
+    "effects", [(), (Friction(),), (VISCOUS,)], ids=["elastic", "friction", "viscous"]
+)
+def test_the_forces_are_the_same(
+    organ: Vademecum, effects: tuple[Effect, ...], tmp_path: Path
+) -> None:
+    made = recorded(organ, effects)
+    save_recording(made, tmp_path / "push.h5")
+    read = load_recording(tmp_path / "push.h5")
+    found = replay(read, organ)
+    assert np.linalg.norm(read.periods.force, axis=2).max() > 0.1
+    assert found.known.all()
+    assert found.difference(read) <= SAME
+    for part in ("periods", "clouds"):
+        for name, value in vars(getattr(made, part)).items():
+            np.testing.assert_array_equal(getattr(getattr(read, part), name), value)
+
+
+def test_large_pushes_too(bent: Vademecum, tmp_path: Path) -> None:
+    organ = stored(bent, tmp_path)
+    made = recorded(organ, natural_effects(organ, 1))
+    assert replay(made, organ).difference(made) <= SAME
+
+
+def test_a_start_in_contact_is_compared_from_the_first_free_period_on(organ: Vademecum) -> None:
+    made = recorded(organ, (Friction(),), skipped=120)
+    force = made.periods.force[:, 0]
+    assert force[0].any()
+    found = replay(made, organ)
+    first = int(np.argmin(force.any(axis=1)))  # where the poses fail, the tip may be inside still
+    assert not found.known[: first + 1].any()
+    assert found.known[-1] and found.difference(made) <= SAME
+
+
+def test_after_lost_periods_what_relaxes_is_unknown(organ: Vademecum) -> None:
+    elastic, viscous = recorded(organ, ()), recorded(organ, (VISCOUS,))
+    for made, goes_on in ((elastic, True), (viscous, False)):
+        kept = {k: np.delete(v, slice(430, 440), axis=0) for k, v in vars(made.periods).items()}
+        with_gap = replace(made, periods=Periods(**kept))
+        assert int(with_gap.periods.lost.sum()) == 10
+        found = replay(with_gap, organ)
+        assert found.known[:430].all() and not found.known[430]
+        assert bool(found.known[-1]) == goes_on
+        assert found.difference(with_gap) <= SAME
+
+
+def test_breath_is_never_known(organ: Vademecum) -> None:
+    assert not replay(recorded(organ, (Respiration(),)), organ).known.any()
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["avatar", "replay", *map(str, arguments)])
+    return cli.main()
+
+
+def test_the_command_says_how_far_forces_differ(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    straight: Vademecum,
+    tmp_path: Path,
+) -> None:
+    organ = stored(straight, tmp_path)
+    file, made = tmp_path / "push.h5", recorded(organ, ())
+    save_recording(made, file)
+    given = (file, "--vademecum", tmp_path / "liver.h5")
+    assert run(monkeypatch, *given) == 0
+    assert "largest difference 0.00e+00 N" in capsys.readouterr().out
+    made.periods.force[500] += 1e-6
+    save_recording(made, file)
+    assert run(monkeypatch, *given) == 1
+    assert "forces differ by 1.73e-06 N" in capsys.readouterr().err
+    save_recording(recorded(organ, (Respiration(),)), file)
+    assert run(monkeypatch, *given) == 1
+    assert "record without respiration" in capsys.readouterr().err
+
+
+def test_another_vademecum_is_refused(organ: Vademecum) -> None:
+    other = replace(recorded(organ, ()), vademecum_id="0" * 64)
+    with pytest.raises(StorageError, match="give the file it was made with"):
+        replay(other, organ)
+
+
+def test_a_spoilt_file_is_refused(organ: Vademecum, tmp_path: Path) -> None:
+    file = tmp_path / "push.h5"
+    save_recording(recorded(organ, ()), file)
+    content = file.read_bytes()
+    with h5py.File(file, "r+") as opened:
+        opened["periods/force"][3] += 1.0
+    with pytest.raises(StorageError, match="altered"):
+        load_recording(file)
+    file.write_bytes(content[: len(content) // 2])
+    with pytest.raises(StorageError, match="truncated"):
+        load_recording(file)
+    save_vademecum(organ, file)
+    with pytest.raises(StorageError, match="no recording"):
+        load_recording(file)
