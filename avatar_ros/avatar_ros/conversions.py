@@ -37,25 +37,31 @@ class LayoutError(RuntimeError):
     """The middleware's serialisation is not what a template needs."""
 
 
-def _find(mark: bytes, serialised: bytes) -> int:
+def find_bytes(mark: bytes, serialised: bytes) -> int:
+    """Where a mark lies.
+
+    Raises
+    ------
+    LayoutError : not exactly once
+    """
     start = serialised.find(mark)
     if start < 0 or serialised.find(mark, start + 1) >= 0:
         raise LayoutError("a field is not stored once and in full: use rmw_fastrtps_cpp")
     return start
 
 
-def _find_number(message: Any, set_number: Callable[[float], None]) -> int:
-    """Byte offset of the float64 that ``set_number`` sets in ``message``."""
+def find_number(message: Any, set_number: Callable[[float], None]) -> int:
+    """Byte offset of the float64 that ``set_number`` sets in ``message``; raises LayoutError."""
     mark: float = struct.unpack("=d", struct.pack("=Q", _MARK))[0]
     set_number(mark)
-    start = _find(struct.pack("=d", mark), serialize_message(message))
+    start = find_bytes(struct.pack("=d", mark), serialize_message(message))
     set_number(0.0)
     return start
 
 
 def _find_stamp(message: Any) -> int:
     message.header.stamp.sec, message.header.stamp.nanosec = 0x5A3C96E1, 0x1EADBEEF
-    start = _find(struct.pack("=iI", 0x5A3C96E1, 0x1EADBEEF), serialize_message(message))
+    start = find_bytes(struct.pack("=iI", 0x5A3C96E1, 0x1EADBEEF), serialize_message(message))
     message.header.stamp.sec = message.header.stamp.nanosec = 0
     return start
 
@@ -75,8 +81,8 @@ class PoseReader:
         message = PoseStamped(header=Header(frame_id=frame_id))
         pose = message.pose
         self._stamp = _find_stamp(message)
-        self._numbers = _find_number(message, lambda x: setattr(pose.position, "x", x))
-        last = _find_number(message, lambda x: setattr(pose.orientation, "w", x))
+        self._numbers = find_number(message, lambda x: setattr(pose.position, "x", x))
+        last = find_number(message, lambda x: setattr(pose.orientation, "w", x))
         if last != self._numbers + 48:
             raise LayoutError("a pose is not seven float64 in a row: use rmw_fastrtps_cpp")
         serialised = serialize_message(message)
@@ -135,7 +141,7 @@ def stamp_bytes(nanoseconds: int) -> bytes:
     return struct.pack("=iI", nanoseconds // 1_000_000_000, nanoseconds % 1_000_000_000)
 
 
-class _StampedTemplate:
+class StampedTemplate:
     """A message serialised once; each time only its stamp and its numbers are written anew."""
 
     def __init__(self, message: Any) -> None:
@@ -150,14 +156,14 @@ class _StampedTemplate:
         return np.frombuffer(self._buffer, dtype=np.float64, count=count, offset=start)
 
 
-class WrenchTemplate(_StampedTemplate):
+class WrenchTemplate(StampedTemplate):
     """A serialised WrenchStamped; ``force`` and ``torque`` are views of its numbers."""
 
     def __init__(self, frame_id: str) -> None:
         message = WrenchStamped(header=Header(frame_id=frame_id))
         wrench = message.wrench
-        start = _find_number(message, lambda x: setattr(wrench.force, "x", x))
-        last = _find_number(message, lambda x: setattr(wrench.torque, "z", x))
+        start = find_number(message, lambda x: setattr(wrench.force, "x", x))
+        last = find_number(message, lambda x: setattr(wrench.torque, "z", x))
         if last != start + 40:
             raise LayoutError("a wrench is not six float64 in a row: use rmw_fastrtps_cpp")
         super().__init__(message)
@@ -165,13 +171,13 @@ class WrenchTemplate(_StampedTemplate):
         self.force, self.torque = numbers[:3], numbers[3:]
 
 
-class PoseTemplate(_StampedTemplate):
+class PoseTemplate(StampedTemplate):
     """A serialised PoseStamped without rotation; ``position`` is a view of its numbers."""
 
     def __init__(self, frame_id: str) -> None:
         message = PoseStamped(header=Header(frame_id=frame_id))
         position = message.pose.position
-        start = _find_number(message, lambda x: setattr(position, "x", x))
+        start = find_number(message, lambda x: setattr(position, "x", x))
         message.pose.orientation.w = 1.0
         super().__init__(message)
         self.position = self._numbers(start, 3)
@@ -184,7 +190,7 @@ class WrenchReader:
         message = WrenchStamped(header=Header(frame_id=frame_id))
         force = message.wrench.force
         self._stamp = _find_stamp(message)
-        self._start = _find_number(message, lambda x: setattr(force, "x", x))
+        self._start = find_number(message, lambda x: setattr(force, "x", x))
         self._unpack = struct.Struct("=3d").unpack_from
 
     def read(self, raw: bytes) -> tuple[int, tuple[float, ...]]:
@@ -193,7 +199,10 @@ class WrenchReader:
 
 
 class CloudTemplate:
-    """A serialised PointCloud2; ``points`` is a view of its numbers, shape (n_points, 6)."""
+    """A serialised PointCloud2; ``points`` is a view of its numbers, shape (n_points, 6).
+
+    start, stamp_start : of these numbers and of the stamp in the serialised message [byte]
+    """
 
     def __init__(self, frame_id: str, n_points: int) -> None:
         names = ("x", "y", "z", "dx", "dy", "dz")
@@ -209,15 +218,15 @@ class CloudTemplate:
             row_step=POINT_BYTES * n_points,
             is_dense=True,
         )
-        self._stamp = _find_stamp(message)
+        self._stamp = self.stamp_start = _find_stamp(message)
         mark = struct.pack("=QQQ", _MARK, _MARK ^ 1, _MARK ^ 2)
         data = array.array("B", bytes(POINT_BYTES * n_points))
         data[:POINT_BYTES] = array.array("B", mark)
         message.data = data
         self._buffer = bytearray(serialize_message(message))
-        start = _find(mark, bytes(self._buffer))
+        self.start = find_bytes(mark, bytes(self._buffer))
         self.points = np.frombuffer(
-            self._buffer, dtype=np.float32, count=6 * n_points, offset=start
+            self._buffer, dtype=np.float32, count=6 * n_points, offset=self.start
         ).reshape(n_points, 6)
         self.points[:] = 0.0
 
@@ -253,14 +262,14 @@ class StateTemplate:
         set_count(capacity)
         contact = message.contacts[0]
         self._stamp = _find_stamp(message)
-        start = _find_number(message, lambda x: setattr(contact.position, "x", x))
-        last = _find_number(message, lambda x: setattr(contact, "penetration", x))
+        start = find_number(message, lambda x: setattr(contact.position, "x", x))
+        last = find_number(message, lambda x: setattr(contact, "penetration", x))
         serialised = serialize_message(message)
         self._head = bytearray(serialised[:start])
         end = start + 8 * _CONTACT_NUMBERS * capacity
         self._tail = bytearray(serialised[end:])
-        self._error = _find_number(message, lambda x: setattr(message, "force_error", x)) - end
-        self._share = _find_number(message, lambda x: setattr(message, "force_share", x)) - end
+        self._error = find_number(message, lambda x: setattr(message, "force_error", x)) - end
+        self._share = find_number(message, lambda x: setattr(message, "force_share", x)) - end
         self._block = bytearray(8 * _CONTACT_NUMBERS * capacity)
         self.contacts = np.frombuffer(self._block, dtype=np.float64).reshape(capacity, -1)
         if last != start + 72 or not all(self._reads_back(n) for n in {0, 1, capacity}):

@@ -54,6 +54,18 @@ PATIENT_INTERPOLATION = (
     Parameter("threads", 1, "of the numerical libraries", range=(1, 64)),
 )
 
+ORGAN_MARKERS = (
+    AUTOSTART,
+    Parameter("rate", 30.0, "of organ_deformed, at most [Hz]", range=(0.1, 100.0)),
+    Parameter(
+        "full_scale",
+        0.01,
+        "displacement that has the last colour [m]",
+        range=(1e-4, 1.0),
+        read_only=False,
+    ),
+)
+
 CONTACT = (
     AUTOSTART,
     FRAME_ID,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
+from avatar_ros.bench_cell import Module
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.duration import Infinite
 from rclpy.parameter import parameter_value_to_python
@@ -29,7 +31,15 @@ from tests.ros.pages import (
 
 pytestmark = pytest.mark.ros
 
-NODES = ("vademecum_loader", "contact")
+NODES = ("vademecum_loader", "contact", "organ_markers")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def markers(own_domain: dict[str, str]) -> Iterator[None]:
+    """The node for RViz and Foxglove, beside the cell."""
+    process = Module("organ_markers", [], own_domain)
+    yield
+    assert process.finish() == 0
 
 
 @pytest.fixture
