@@ -10,7 +10,7 @@ import typer
 
 from avatar_core.cli_atlas import atlas
 from avatar_core.cli_bench import bench, require_ros, run_cell
-from avatar_core.cli_cell import cell
+from avatar_core.cli_cell import Host, Port, cell, require_ui, run_page
 from avatar_core.cli_export import export
 from avatar_core.cli_patient import patient
 from avatar_core.cli_replay import replay
@@ -79,6 +79,11 @@ def demo(
     ),
     seconds: Annotated[float, typer.Option(help="of palpation over ROS 2 [s]")] = 10.0,
     vertices: Vertices = 1200,
+    ui: Annotated[
+        bool, typer.Option("--ui", help="a page for the browser instead of script and picture")
+    ] = False,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
 ) -> None:
     """Phantom -> vademecum -> ROS 2 nodes at 1 kHz under a scripted tool -> table, picture."""
     import tempfile
@@ -89,6 +94,8 @@ def demo(
     from avatar_core.storage import load_vademecum, save_vademecum
 
     require_ros()
+    if ui:
+        require_ui()
     print("1. a liver that the code generates becomes a vademecum")
     with BuildBar() as progress:
         built = vademecum_of(phantom_liver(), OrganOptions(n_vertices=vertices), progress)
@@ -97,6 +104,10 @@ def demo(
         save_vademecum(built, file)
         v = load_vademecum(file)
         show_text(v)
+        if ui:
+            print(f"2. the cell, and its page on http://{host}:{port} (open it; Ctrl-C ends both)")
+            run_page(file, host, port)
+            return
         print(f"2. loader, contact and tool as real ROS 2 processes for {seconds:g} s")
         run_cell(file, seconds)
     print("3. the picture")

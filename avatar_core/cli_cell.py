@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
+from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from avatar_core.cli_bench import require_ros
+from avatar_core.errors import AvatarError
+
+Host = Annotated[
+    str, typer.Option(help="address that the page is served on; 0.0.0.0: any, without a password")
+]
+Port = Annotated[int, typer.Option(help="of the page; the next free one if it is taken")]
 
 
 def cell(
@@ -28,6 +37,9 @@ def cell(
         typer.Option(exists=True, dir_okay=False, help="for the node that makes patients"),
     ] = None,
     scene: Annotated[str, typer.Option(help="effects to simulate")] = "",
+    ui: Annotated[bool, typer.Option("--ui", help="serve the planning page, too")] = False,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
 ) -> None:
     """Run loader, contact node and, with an atlas, the node that makes patients, until Ctrl-C.
 
@@ -35,16 +47,46 @@ def cell(
     planning_cell.launch.py` does; all end when one of them does.
     """
     require_ros()
+    page = {"host": host, "port": str(port)} if ui else {}
     given = {
         "params": params and params.resolve(),
         "library_dir": library_dir and library_dir.resolve(),
         "vademecum": vademecum,
         "atlas": atlas and atlas.resolve(),
         "scene": scene,
+        **page,
     }
     command = [sys.executable, "-m", "avatar_ros.cell"]
     for name, value in given.items():
         command += [f"--{name}", str(value)] if value else []
+    if ui:
+        require_ui()
+        command.append("--ui")
     sys.stdout.flush()
     os.chdir("/")  # -m would let a checkout here stand before what is installed
     os.execv(sys.executable, command)  # signals are for the cell
+
+
+def require_ui() -> None:
+    """Refuse where the planning page could not be served."""
+    if find_spec("viser") is None:
+        raise AvatarError("the planning page needs viser; install it with pip install '.[ui]'")
+
+
+def run_page(vademecum: Path, host: str, port: int) -> None:
+    """Serve the planning page with the cell that it shows, until Ctrl-C."""
+    given = {
+        "library_dir": str(vademecum.parent),
+        "vademecum": vademecum.name,
+        "host": host,
+        "port": str(port),
+    }
+    command = [sys.executable, "-m", "avatar_ros.cell", "--ui"]
+    command += [word for name, value in given.items() for word in (f"--{name}", value)]
+    sys.stdout.flush()
+    with subprocess.Popen(command, cwd="/") as process:
+        while process.poll() is None:
+            with suppress(KeyboardInterrupt):  # it got the signal, too, and ends its nodes
+                process.wait()
+    if process.returncode != 0:
+        raise typer.Exit(process.returncode)

@@ -30,8 +30,8 @@ def replay(
     size = (periods.force**2).sum(axis=2) ** 0.5
     print(
         f"{recording.vademecum_name} ({recording.vademecum_id[:12]}): {len(periods)} periods, "
-        f"{recording.seconds:.1f} s at {recording.rate:g} Hz, {int(periods.lost.sum())} lost, "
-        f"{len(recording.clouds.period)} clouds"
+        f"{int(periods.lost.sum())} lost, in {recording.seconds:.1f} s (nominally "
+        f"{recording.rate:g} Hz), {len(recording.clouds.period)} clouds"
     )
     print(f"  largest force {size.max():.3f} N, in contact {(size > 0).any(axis=1).mean():.0%}")
     difference = found.difference(recording)

@@ -86,9 +86,9 @@ class Recording:
 
     @property
     def seconds(self) -> float:
-        """From the first period to the last [s]."""
-        number = self.periods.number
-        return float(number[-1] - number[0] + 1) / self.rate
+        """From the first pose to the last [s]; a loop that misses periods has fewer of them."""
+        stamp = self.periods.stamp
+        return float(stamp[-1] - stamp[0]) * 1e-9
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:

@@ -101,7 +101,7 @@ def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray
         return known
     forgets = not names & set(_REMEMBER_FOR_EVER)
     inside = periods.force.any(axis=2) | np.isin(periods.status, _MAY_BE_INSIDE)
-    free, lost = ~inside.any(axis=1), periods.lost > 0
+    free, lost = np.logical_not(inside.any(axis=1)), periods.lost > 0
     sure = from_rest
     for k in range(len(periods)):
         sure = (sure and not lost[k]) or bool(forgets and free[k])

@@ -25,14 +25,17 @@ TAKES = {
     "vademecum_loader": ("library_dir", "vademecum"),
     "contact": ("scene",),
     "patient_interpolation": ("library_dir", "atlas"),
+    "planning_ui": ("library_dir", "host", "port"),
 }
+# Nodes that run only where this was given.
+ASKED_FOR = {"patient_interpolation": "atlas", "planning_ui": "ui"}
 
 
 def commands(params: Path | None, given: dict[str, str]) -> dict[str, list[str]]:
-    """Of each node that runs, by name; the node that makes patients only with an atlas."""
+    """Of each node that runs, by name; some only if they are asked for."""
     found = {}
     for node, names in TAKES.items():
-        if node == "patient_interpolation" and "atlas" not in given:
+        if ASKED_FOR.get(node, node) not in {node, *given}:
             continue
         own = [f"{name}:={given[name]}" for name in names if name in given]
         arguments = ["--params-file", str(params)] if params is not None else []
@@ -84,6 +87,7 @@ def main() -> int:
     parser.add_argument("--params", type=Path)
     for name in sorted({name for names in TAKES.values() for name in names}):
         parser.add_argument(f"--{name}")
+    parser.add_argument("--ui", action="store_const", const="yes")
     chosen = vars(parser.parse_args())
     params = chosen.pop("params")
     return run(commands(params, {name: value for name, value in chosen.items() if value}))

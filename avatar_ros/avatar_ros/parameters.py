@@ -66,6 +66,15 @@ ORGAN_MARKERS = (
     ),
 )
 
+PLANNING_UI = (
+    AUTOSTART,
+    Parameter("host", "127.0.0.1", "address to listen on; 0.0.0.0: any, without a password"),
+    Parameter("port", 8080, "to listen on; the next free one if it is taken", range=(1, 65535)),
+    Parameter("library_dir", ".", "of the loader too; recordings are written there"),
+    Parameter("tool", "tool", "name of the tool that is moved, of those of contact"),
+    Parameter("tumour", "", "its surface in library_dir, shown in the organ; empty: none"),
+)
+
 CONTACT = (
     AUTOSTART,
     FRAME_ID,

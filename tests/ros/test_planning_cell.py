@@ -16,6 +16,8 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
+from avatar_ros.cell import commands
+
 from avatar_ros import qos
 from avatar_ros.msg import ContactState
 from tests.ros.conftest import START_TIMEOUT
@@ -67,3 +69,12 @@ def test_a_node_that_ends_ends_the_cell_and_is_named(
     assert process.returncode == 1
     assert "contact ended with code 1; ending the cell" in said
     assert "parameter rate" in said
+
+
+def test_page_and_patients_run_only_if_asked_for() -> None:
+    always = {"vademecum_loader", "contact"}
+    assert set(commands(None, {})) == always
+    assert set(commands(None, {"atlas": "atlas.h5"})) == {*always, "patient_interpolation"}
+    page = commands(None, {"ui": "yes", "port": "8081"})
+    assert set(page) == {*always, "planning_ui"}
+    assert page["planning_ui"][-1] == "port:=8081"

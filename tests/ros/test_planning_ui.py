@@ -1,0 +1,310 @@
+"""The planning page in a real browser: dragged, felt, recorded, and well again after a crash."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
+pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+
+from avatar_ros.bench_cell import Module
+from avatar_ros.ui_organ import Organ
+from avatar_ros.ui_scene import camera_of
+from playwright.sync_api import Error, sync_playwright
+from rcl_interfaces.srv import ListParameters
+
+from avatar_core.recording import load_recording
+from avatar_core.replay import replay
+from avatar_core.storage import load_vademecum, save_vademecum
+from avatar_ros.msg import VademecumFile
+from tests.ros.conftest import PATIENT
+from tests.ros.pages import parameter_rows
+from tests.ros.test_patient_interpolation import folder, livers
+
+__all__ = ["folder", "livers"]  # fixtures
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
+]
+
+SIZES = ((1280, 800), (800, 600))
+SLOW = 300_000  # of what starts, compiles or builds, on a busy machine [ms]
+TABS = ("Tool", "Organ", "Patient", "Scene", "Timing")
+# Software rendering: there is no graphics card where this runs.
+OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+# What is seen of a page's controls: name, left, top, right, bottom [px].
+CONTROLS = """() => [...document.querySelectorAll('button, input, [role=tab]')]
+  .filter(e => e.checkVisibility() && e.getBoundingClientRect().width > 12)
+  .map(e => [e.innerText || e.value || e.tagName, e.getBoundingClientRect()])
+  .map(([name, r]) => [name, r.left, r.top, r.right, r.bottom])"""
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where screenshots are kept: AVATAR_SHOTS, if given."""
+    given = os.environ.get("AVATAR_SHOTS")
+    path = Path(given) if given else tmp_path_factory.mktemp("shots")
+    path.mkdir(exist_ok=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def nodes(
+    own_domain: dict[str, str], folder: Path, organ: Any, port: int
+) -> Iterator[dict[str, Module]]:
+    """A cell with a page; what a test kills, it starts again."""
+    save_vademecum(organ, folder / "liver.h5")
+    library = ["-p", f"library_dir:={folder}"]
+    atlas = ["-p", f"atlas:={folder / 'atlas.h5'}", "-p", "vertices:=350"]
+    running = {
+        name: Module(name, arguments, own_domain)
+        for name, arguments in (
+            ("vademecum_loader", ["--ros-args", *library, "-p", "vademecum:=liver.h5"]),
+            ("contact", PATIENT),
+            ("patient_interpolation", ["--ros-args", *library, *atlas]),
+            ("planning_ui", ["--ros-args", *library, "-p", f"port:={port}"]),
+        )
+    }
+    yield running
+    codes = {name: process.finish() for name, process in running.items()}
+    assert codes == dict.fromkeys(running, 0)
+
+
+@pytest.fixture(scope="module")
+def page(nodes: dict[str, Module], port: int, shots: Path) -> Iterator[Any]:
+    """The page, with an organ and all nodes there."""
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        page = browser.new_page(viewport={"width": SIZES[0][0], "height": SIZES[0][1]})
+        foreign: list[str] = []
+        page.on("request", lambda asked: foreign.append(asked.url))
+        for _ in range(60):
+            try:
+                page.goto(f"http://127.0.0.1:{port}")
+                break
+            except Error:  # not there yet
+                page.wait_for_timeout(1000)
+        try:
+            page.get_by_text("is shown").wait_for(timeout=SLOW)
+            page.get_by_text("All nodes answer").wait_for(timeout=SLOW)
+        finally:
+            page.screenshot(path=shots / "first.png")
+        page.wait_for_timeout(3000)  # software rendering takes its time, and says so
+        for close in page.locator(".mantine-Notification-closeButton").all():
+            close.click()
+        yield page
+        browser.close()
+        local = ("http://127.0.0.1", "ws://127.0.0.1", "data:", "blob:")
+        assert not [url for url in foreign if not url.startswith(local)]
+
+
+def force_of(page: Any) -> float:
+    """As the page writes it [N]."""
+    found = re.search(r"Force ([\d.]+) N", page.inner_text("body"))
+    return float(found[1]) if found else 0.0
+
+
+def until(page: Any, reached: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
+    for _ in range(round(4 * seconds)):
+        if reached():
+            return
+        page.wait_for_timeout(250)
+    raise AssertionError(f"{what}: not within {seconds:g} s; {page.inner_text('body')[:400]}")
+
+
+@pytest.fixture(scope="module")
+def shown(folder: Path, nodes: Any) -> Organ:
+    message = VademecumFile(name="liver")
+    message.data = (folder / "liver.h5").read_bytes()
+    return Organ.of(message)
+
+
+def screen_of(page: Any, shown: Organ, point: np.ndarray) -> tuple[float, float]:
+    """Where a point [m] is on the page, before the view was turned [px]."""
+    position, look_at, fov = camera_of(shown)
+    ahead = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    box = page.locator("canvas").first.bounding_box()
+    way = point - position
+    scale = 0.5 * box["height"] / np.tan(0.5 * fov) / (way @ ahead)
+    x = box["x"] + 0.5 * box["width"] + scale * (way @ right)
+    return float(x), float(box["y"] + 0.5 * box["height"] - scale * (way @ up))
+
+
+def drag(page: Any, shown: Organ, begin: float, end: float) -> None:
+    """The tool from one height over the organ to another, with the mouse; the button stays down."""
+    x0, y0 = screen_of(page, shown, shown.above(begin))
+    x1, y1 = screen_of(page, shown, shown.above(end))
+    page.mouse.move(x0, y0)
+    page.wait_for_timeout(500)
+    page.mouse.down()
+    for share in np.linspace(0.0, 1.0, 20):
+        page.mouse.move(x0 + share * (x1 - x0), y0 + share * (y1 - y0))
+        page.wait_for_timeout(60)
+
+
+def choose(page: Any, label: str, option: str) -> None:
+    page.get_by_label(label, exact=True).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def open_tab(page: Any, name: str) -> None:
+    page.get_by_role("tab", name=name, exact=True).click()
+    page.wait_for_timeout(500)
+
+
+def test_a_drag_is_felt_and_the_surface_gives_way(page: Any, shown: Organ, shots: Path) -> None:
+    page.screenshot(path=shots / "start.png")
+    drag(page, shown, 0.020, -0.004)
+    until(page, lambda: force_of(page) > 0.05, "a force")
+    found = re.search(r"displacement ([\d.]+) mm", page.inner_text("body"))
+    assert found and float(found[1]) > 1.0
+    page.wait_for_timeout(1500)
+    page.screenshot(path=shots / "drag.png")
+    page.mouse.up()
+    page.get_by_role("button", name="Lift off the organ").click()
+    until(page, lambda: force_of(page) == 0.0, "the organ left")
+
+
+def test_keys_move_the_tool(page: Any) -> None:
+    page.mouse.click(60, 700)  # nothing is there, but the page listens
+    for _ in range(60):
+        page.keyboard.press("u")
+        page.wait_for_timeout(120)
+        if force_of(page) > 0.05:
+            break
+    until(page, lambda: force_of(page) > 0.05, "a force", 5.0)
+    page.get_by_role("button", name="Lift off the organ").click()
+    until(page, lambda: force_of(page) == 0.0, "the organ left")
+
+
+def test_a_recording_replays(page: Any, shown: Organ, folder: Path) -> None:
+    open_tab(page, "Tool")
+    page.get_by_role("button", name="Record").click()
+    page.get_by_text("natural effects runs").wait_for(timeout=SLOW)
+    page.wait_for_timeout(500)
+    for _ in range(45):
+        page.get_by_text("press 1 mm", exact=True).click()
+        page.wait_for_timeout(60)
+        if force_of(page) > 0.3:
+            break
+    page.wait_for_timeout(1000)
+    page.get_by_role("button", name="Lift off the organ").click()
+    page.wait_for_timeout(1500)
+    page.get_by_role("button", name="Stop and save").click()
+    page.get_by_text("recording-").wait_for(timeout=SLOW)
+    (file,) = folder.glob("recording-*.h5")
+    recording = load_recording(file)
+    found = replay(recording, load_vademecum(folder / "liver.h5"))
+    largest = np.linalg.norm(recording.periods.force, axis=2).max()
+    print(
+        f"{len(recording.periods)} periods, {recording.periods.lost.sum()} lost, "
+        f"{len(recording.clouds.period)} clouds, largest force {largest:.2f} N, "
+        f"{found.known.sum()} known, difference {found.difference(recording):.1e} N"
+    )
+    assert largest > 0.1
+    assert found.known.mean() > 0.5
+    assert found.difference(recording) <= 1e-9
+    assert len(recording.clouds.period) > 5
+    assert recording.clouds.displacement.max() > 1e-4
+
+
+def test_effects_are_switched(page: Any, shots: Path) -> None:
+    open_tab(page, "Scene")
+    choose(page, "Scene", "relaxation")
+    page.get_by_text("viscoelasticity").first.wait_for()
+    page.get_by_role("button", name="Switch to scene").click()
+    page.get_by_text("relaxation runs, with viscoelasticity").wait_for(timeout=SLOW)
+    page.screenshot(path=shots / "scene.png")
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+def test_nothing_overlaps_or_is_cut(page: Any, shots: Path, size: tuple[int, int]) -> None:
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    page.wait_for_timeout(1500)
+    for tab in TABS:
+        open_tab(page, tab)
+        page.screenshot(path=shots / f"{tab}-{size[0]}.png")
+        boxes = page.evaluate(CONTROLS)
+        assert len(boxes) >= len(TABS)
+        for name, left, top, right, _ in boxes:
+            assert left >= 0 and right <= size[0] and top >= 0, f"{tab}: {name} is cut"
+        for i, a in enumerate(boxes):
+            for b in boxes[:i]:
+                across = min(a[3], b[3]) - max(a[1], b[1])
+                down = min(a[4], b[4]) - max(a[2], b[2])
+                least = min(a[3] - a[1], b[3] - b[1]), min(a[4] - a[2], b[4] - b[2])
+                within = across >= least[0] - 1 and down >= least[1] - 1  # arrows of a number
+                assert across < 2 or down < 2 or within, f"{tab}: {a[0]} lies over {b[0]}"
+    open_tab(page, "Tool")
+    low = page.get_by_role("button", name="Record").bounding_box()
+    assert low["y"] + low["height"] <= size[1], "Record is not on the screen"
+    page.set_viewport_size({"width": SIZES[0][0], "height": SIZES[0][1]})
+    page.wait_for_timeout(1000)
+
+
+def test_a_killed_contact_node_is_missed_and_found_again(
+    page: Any, nodes: dict[str, Module], own_domain: dict[str, str], shots: Path
+) -> None:
+    open_tab(page, "Tool")
+    nodes["contact"].send_signal(signal.SIGKILL)
+    nodes["contact"].wait()
+    page.get_by_text("The contact node is not running").wait_for(timeout=SLOW)
+    page.screenshot(path=shots / "missing.png")
+    nodes["contact"] = Module("contact", PATIENT, own_domain)
+    page.get_by_text("All nodes answer").wait_for(timeout=SLOW)
+    page.get_by_text("relaxation runs, with viscoelasticity").wait_for(timeout=SLOW)
+    for _ in range(60):
+        page.get_by_text("press 1 mm", exact=True).click()
+        page.wait_for_timeout(100)
+        if force_of(page) > 0.05:
+            break
+    until(page, lambda: force_of(page) > 0.05, "a force again")
+    page.get_by_role("button", name="Lift off the organ").click()
+
+
+def test_a_new_patient_is_built_and_shown(page: Any, shots: Path) -> None:
+    open_tab(page, "Patient")
+    choose(page, "Surface", "liver3.obj")
+    page.get_by_role("button", name="Build patient").click()
+    until(
+        page,
+        lambda: bool(re.search(r"\n\w+: \d+%", page.inner_text("body"))),
+        "progress",
+    )
+    page.screenshot(path=shots / "patient.png")
+    page.get_by_text("liver3 is shown").wait_for(timeout=SLOW)
+    open_tab(page, "Organ")
+    assert page.get_by_text("liver3", exact=True).count() >= 1
+    page.screenshot(path=shots / "organ.png")
+
+
+def test_parameters_are_those_of_the_page(page: Any, lasting_probe: Any) -> None:
+    request = ListParameters.Request()
+    listed = lasting_probe.ask(ListParameters, "/planning_ui/list_parameters", request)
+    declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
+    assert declared == set(parameter_rows("planning_ui"))
