@@ -12,8 +12,7 @@ import igl
 import meshio
 import numpy as np
 
-from avatar_core.errors import LoadError, StorageError
-from avatar_core.hdf5 import reason
+from avatar_core.errors import LoadError, StorageError, one_line
 from avatar_core.large_deformation import push
 from avatar_core.tool_path import middle_of_access
 from avatar_core.vademecum import Vademecum
@@ -134,5 +133,6 @@ def write_mesh(mesh: meshio.Mesh, path: str | Path) -> None:
             os.replace(whole, path)
     except OSError as error:
         raise StorageError(
-            f"cannot write {path} ({reason(error)}); free disk space or choose another folder"
+            f"cannot write {path} ({one_line(error, 120)}); "
+            "free disk space or choose another folder"
         ) from error

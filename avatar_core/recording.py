@@ -24,8 +24,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from avatar_core.errors import StorageError
-from avatar_core.hdf5 import checksum, reason, replace_file
+from avatar_core.errors import StorageError, one_line
+from avatar_core.hdf5 import checksum, replace_file
 
 FORMAT = "avatar recording"
 SCHEMA_VERSION = "1.0"
@@ -131,7 +131,8 @@ def load_recording(path: str | Path) -> Recording:
             return _read(file, path)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise StorageError(
-            f"{path} is no readable recording ({reason(error)}); it may be truncated: record again"
+            f"{path} is no readable recording ({one_line(error, 120)}); "
+            "it may be truncated: record again"
         ) from error
 
 

@@ -454,6 +454,12 @@ def _verified(identity: str, data: bytes, reader: Reader) -> Any:
     return vademecum
 
 
+def _listen(receiver: Receiver) -> None:
+    """Until the contact node is gone; then at once, whatever is being prepared for it."""
+    receiver.listen()
+    os._exit(0)
+
+
 def main() -> int:
     realtime.die_with_parent(signal.SIGTERM)
     realtime.release()
@@ -468,7 +474,7 @@ def main() -> int:
     report = socket.socket(fileno=os.dup(sys.stdin.fileno()))
     order = Order(**json.loads(report.recv(_PACKET)))
     receiver = Receiver(order, report, lambda: bool(stop))
-    threading.Thread(target=receiver.listen, name="changes", daemon=True).start()
+    threading.Thread(target=_listen, args=[receiver], name="changes", daemon=True).start()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(
         order.node_name,

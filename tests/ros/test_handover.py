@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import mmap
 import os
+import socket
+import subprocess
+import sys
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 pytest.importorskip("avatar_ros.handover", reason="avatar_ros is not installed")
 
-from avatar_ros.handover import _map, share
+from avatar_ros.handover import Order, _map, share
 
 pytestmark = pytest.mark.ros
 
@@ -44,3 +49,22 @@ def test_neither_side_can_alter_what_was_handed_over() -> None:
     with pytest.raises(PermissionError):
         mmap.mmap(handle, 0)
     os.close(handle)
+
+
+def test_the_receiving_process_ends_with_the_node(own_domain: dict[str, str]) -> None:
+    """Which may have been killed before its child could ask to be told."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    order = Order("vademecum", "orphan", "/", (0.005,), None, "surface", 1e-3)
+    ours.send(json.dumps(asdict(order)).encode())
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "avatar_ros.handover"],
+            stdin=theirs.fileno(),
+            env=own_domain,
+            cwd="/",
+        )
+    ours.close()
+    try:
+        assert process.wait(60.0) == 0
+    finally:
+        process.kill()
