@@ -27,7 +27,7 @@ from avatar_ros.declared import ParameterError
 from avatar_ros.display import RATE, NewestCloud
 from avatar_ros.hand_line import HandLine, HandProcess
 from avatar_ros.managed_node import ManagedNode, run
-from avatar_ros.msg import LoopStatistics, VademecumFile, VademecumInfo
+from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
 from avatar_ros.parameters import MATERIAL
 from avatar_ros.scenes import scene_file
 from avatar_ros.ui_library import Library
@@ -58,7 +58,7 @@ class PlanningNode(ManagedNode):
         self._material: dict[str, float] = {}  # chosen here, by coordinate
         self._scene = ""  # chosen here, by name
         self._contact: dict[str, Any] = {}  # parameters of the contact node
-        self._was_missing = True
+        self._was_missing, self._is_to_restore = True, False
         self._frame, self._frame_id = 0, FRAME
         self._began = time.monotonic()
         self._subscriptions_of_mine: list[Any] = []
@@ -215,11 +215,17 @@ class PlanningNode(ManagedNode):
         elif self._was_missing:
             self._was_missing = False
             self._requests.parameters_of_contact((*_OF_CONTACT, *MATERIAL), self._meet_contact)
+        elif self._is_to_restore and status not in (None, ContactState.STATUS_NO_MODEL):
+            self._restore()
 
     def _meet_contact(self, values: dict[str, Any]) -> None:
-        """The contact node is there, for the first time or again: it shall do what is chosen."""
-        self._contact = values
+        """The contact node is there, for the first time or again."""
+        self._contact, self._is_to_restore = values, True
         self._view.resize_tool(self._radius())
+
+    def _restore(self) -> None:
+        """What was chosen here, once the contact node has an organ again."""
+        self._is_to_restore = False
         if self._scene:
             self._choose_scene(self._scene)
         if self._material:

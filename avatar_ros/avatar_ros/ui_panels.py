@@ -168,9 +168,9 @@ class Panels:
             (empty, empty),
             (
                 uplot.Series(label="time [s]"),
-                uplot.Series(label="step, 99 of 100 [us]", stroke="#0072B2", width=2),
+                uplot.Series(label="step, 99 of 100 [ms]", stroke="#0072B2", width=2),
             ),
-            title="Time of a step [us] over time [s]",
+            title="Time of a step [ms] over time [s]",
             scales={"x": uplot.Scale(time=False)},
             axes=axes,
             height=110,
@@ -239,7 +239,7 @@ class Panels:
 
     def show_loop(self, now: float, step: float, missed: float) -> None:
         """Of the last second: 99 of 100 steps took less [s], periods missed."""
-        self._loop.append((now, 1e6 * step, missed))
+        self._loop.append((now, 1e3 * step, missed))
         values = np.array(self._loop)
         self._step_plot.data = (values[:, 0].copy(), values[:, 1].copy())
         self._missed_plot.data = (values[:, 0].copy(), values[:, 2].copy())
