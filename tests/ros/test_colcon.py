@@ -27,7 +27,9 @@ def test_colcon_builds_it_and_what_it_built_runs(tmp_path: Path) -> None:
     installed = tmp_path / "workspace" / "install" / "avatar_ros"
     assert {path.name for path in (installed / "lib" / "avatar_ros").iterdir()} == {
         "contact",
+        "organ_markers",
         "patient_interpolation",
+        "planning_ui",
         "vademecum_loader",
     }
     assert (installed / "bin" / "avatar").is_file()

@@ -27,7 +27,13 @@ PREFIX = Path(sys.prefix)
 # Without an atlas, which takes minutes to make, that node waits to be configured.
 ARGUMENTS = {"patient_interpolation": ["--ros-args", "-p", "autostart:=false"]}
 STATES = {"patient_interpolation": "unconfigured"}
-EXECUTABLES = {"contact", "patient_interpolation", "vademecum_loader"}
+EXECUTABLES = {
+    "contact",
+    "organ_markers",
+    "patient_interpolation",
+    "planning_ui",
+    "vademecum_loader",
+}
 
 
 @pytest.fixture
@@ -53,7 +59,7 @@ def test_the_prefix_is_found_by_ament(shell: dict[str, str]) -> None:
     code = "from ament_index_python.packages import get_package_prefix as p; print(p('avatar_ros'))"
     assert Path(_run(shell, code)).resolve() == PREFIX.resolve()
     share = PREFIX / "share" / "avatar_ros"
-    for wanted in ("package.xml", "launch/contact.launch.py", "params/contact.yaml"):
+    for wanted in ("package.xml", "launch/planning_cell.launch.py", "params/planning_cell.yaml"):
         assert (share / wanted).is_file()
 
 
@@ -66,6 +72,8 @@ def test_the_executables_are_those_that_are_documented() -> None:
 def test_an_executable_starts_and_ends_cleanly(
     shell: dict[str, str], lasting_probe: Any, name: str, number: signal.Signals
 ) -> None:
+    if name == "planning_ui":
+        pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
     begin = time.monotonic()
     process = subprocess.Popen(
         [PREFIX / "lib" / "avatar_ros" / name, *ARGUMENTS.get(name, [])],
