@@ -88,7 +88,10 @@ def nodes(
         )
     }
     yield running
-    codes = {name: process.finish() for name, process in running.items()}
+    for process in running.values():
+        process.send_signal(signal.SIGINT)
+    # `finish` is impatient where a browser shares the cores with all of them
+    codes = {name: process.wait(60.0) for name, process in running.items()}
     assert codes == dict.fromkeys(running, 0)
 
 
