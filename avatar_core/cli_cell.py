@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
-from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -86,7 +86,9 @@ def run_page(vademecum: Path, host: str, port: int) -> None:
     sys.stdout.flush()
     with subprocess.Popen(command, cwd="/") as process:
         while process.poll() is None:
-            with suppress(KeyboardInterrupt):  # it got the signal, too, and ends its nodes
+            try:
                 process.wait()
+            except KeyboardInterrupt:  # a terminal told it as well; told twice, it ends once
+                process.send_signal(signal.SIGINT)
     if process.returncode != 0:
         raise typer.Exit(process.returncode)
