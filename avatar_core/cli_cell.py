@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,8 @@ import typer
 
 from avatar_core.cli_bench import require_ros
 from avatar_core.errors import AvatarError
+
+_AGAIN = 1.0  # until a cell that does not end is told again [s]
 
 Host = Annotated[
     str, typer.Option(help="address that the page is served on; 0.0.0.0: any, without a password")
@@ -73,6 +76,10 @@ def require_ui() -> None:
         raise AvatarError("the planning page needs viser; install it with pip install '.[ui]'")
 
 
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def run_page(vademecum: Path, host: str, port: int) -> None:
     """Serve the planning page with the cell that it shows, until Ctrl-C."""
     given = {
@@ -84,11 +91,16 @@ def run_page(vademecum: Path, host: str, port: int) -> None:
     command = [sys.executable, "-m", "avatar_ros.cell", "--ui"]
     command += [word for name, value in given.items() for word in (f"--{name}", value)]
     sys.stdout.flush()
-    with subprocess.Popen(command, cwd="/") as process:
+    told = False
+    # Deaf until it listens for itself: half started, it would end with a traceback.
+    with subprocess.Popen(command, cwd="/", preexec_fn=_ignore_interrupts) as process:
         while process.poll() is None:
             try:
-                process.wait()
-            except KeyboardInterrupt:  # a terminal told it as well; told twice, it ends once
-                process.send_signal(signal.SIGINT)
+                if told:  # a terminal told it as well; told twice, it ends once
+                    process.send_signal(signal.SIGINT)
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(_AGAIN)
+            except KeyboardInterrupt:
+                told = True
     if process.returncode != 0:
         raise typer.Exit(process.returncode)

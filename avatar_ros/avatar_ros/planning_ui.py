@@ -21,6 +21,7 @@ except ImportError as error:
 from avatar_core.errors import AvatarError
 from avatar_core.scene import Scene
 from avatar_core.scene_file import read_scene, shipped_scenes
+from avatar_core.storage import parse_vademecum
 from avatar_core.tumour import read_tumour
 from avatar_ros import parameters, qos
 from avatar_ros.declared import ParameterError
@@ -29,6 +30,7 @@ from avatar_ros.hand_line import HandLine, HandProcess
 from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
 from avatar_ros.parameters import MATERIAL
+from avatar_ros.reader import Reader
 from avatar_ros.scenes import scene_file
 from avatar_ros.ui_library import Library
 from avatar_ros.ui_organ import Organ
@@ -53,6 +55,7 @@ class PlanningNode(ManagedNode):
         self._line = HandLine.make()
         self._hand = HandProcess(self._line)
         self._recorder = Recorder(self._line)
+        self._reader = Reader(1 << 30)
         self._organ: Organ | None = None
         self._cloud: NewestCloud | None = None
         self._material: dict[str, float] = {}  # chosen here, by coordinate
@@ -123,6 +126,7 @@ class PlanningNode(ManagedNode):
             self._cloud = None
         if self._server is not None:
             self._requests.close()
+            self._reader.close()
             self._server.stop()
             self._server = None
 
@@ -145,7 +149,9 @@ class PlanningNode(ManagedNode):
         if self._organ is not None and self._organ.id == message.id:
             return
         try:
-            organ = Organ.of(message)
+            data = bytes(message.data)
+            name = "the vademecum that was announced"
+            organ = Organ.of(self._reader.read(name, len(data), parse_vademecum, data, name))
             tumour = read_tumour(self._library.folder / self._tumour) if self._tumour else None
         except AvatarError as error:
             self._say(str(error))

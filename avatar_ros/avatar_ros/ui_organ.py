@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from avatar_core.storage import parse_vademecum
 from avatar_core.tool_path import middle_of_access
 from avatar_core.vademecum import Vademecum
 
@@ -38,9 +36,8 @@ class Organ:
     ranges: dict[str, tuple[float, float, float]]
 
     @staticmethod
-    def of(message: Any) -> Organ:
-        """From a VademecumFile; raises AvatarError if it cannot be read."""
-        v = parse_vademecum(bytes(message.data), message.name)
+    def of(v: Vademecum) -> Organ:
+        """That of a vademecum."""
         vertices = v.surface_vertices
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         j = middle_of_access(v)

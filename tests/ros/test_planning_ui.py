@@ -28,7 +28,6 @@ from rcl_interfaces.srv import ListParameters
 from avatar_core.recording import load_recording
 from avatar_core.replay import replay
 from avatar_core.storage import load_vademecum, save_vademecum
-from avatar_ros.msg import VademecumFile
 from tests.ros.conftest import PATIENT
 from tests.ros.pages import parameter_rows
 from tests.ros.test_patient_interpolation import folder, livers
@@ -38,6 +37,7 @@ __all__ = ["folder", "livers"]  # fixtures
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
     pytest.mark.ros,
+    pytest.mark.long,  # a browser that draws without a graphics card takes both cores
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
 ]
 
@@ -139,9 +139,7 @@ def until(page: Any, reached: Callable[[], bool], what: str, seconds: float = 12
 
 @pytest.fixture(scope="module")
 def shown(folder: Path, nodes: Any) -> Organ:
-    message = VademecumFile(name="liver")
-    message.data = (folder / "liver.h5").read_bytes()
-    return Organ.of(message)
+    return Organ.of(load_vademecum(folder / "liver.h5"))
 
 
 def screen_of(page: Any, shown: Organ, point: np.ndarray) -> tuple[float, float]:
