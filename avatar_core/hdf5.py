@@ -153,7 +153,7 @@ def _require_plain(key: str, dataset: h5py.Dataset) -> None:
     if dataset.is_virtual or dataset.external:
         raise ValueError(f"'{key}' points outside the file")
     dtype = dataset.dtype
-    plain = dtype.kind in "iub" or (dtype.kind == "f" and dtype.itemsize in (4, 8))
+    plain = np.can_cast(dtype, np.int64) or (dtype.kind == "f" and dtype.itemsize in (4, 8))
     if not (plain and dtype.isnative):
         raise ValueError(f"'{key}' is no array of plain numbers")
 
