@@ -92,6 +92,7 @@ class ContactNode(ManagedNode):
                     f"{name}/measured_cp",
                     _never_called,
                     qos.poses(period),
+                    silent=True,
                     callback_group=own,
                     raw=True,
                 ),

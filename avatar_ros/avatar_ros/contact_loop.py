@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.callback_groups import CallbackGroup
-from rclpy.event_handler import EventHandler
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 from avatar_core import contact, passivity
@@ -44,13 +43,16 @@ _NO_ERROR = float("nan")  # of a force that no model gave
 
 
 class OwnThread(CallbackGroup):
-    """For subscriptions that the loop takes from itself: an executor sees their events alone."""
+    """For subscriptions that the loop takes from itself: no executor ever touches them.
+
+    Nor their events: one that waits for these is woken by every pose, and holds up the loop.
+    """
 
     def can_execute(self, entity: Any) -> bool:
-        return isinstance(entity, EventHandler)
+        return False
 
     def beginning_execution(self, entity: Any) -> bool:
-        return isinstance(entity, EventHandler)
+        return False
 
     def ending_execution(self, entity: Any) -> None:
         pass

@@ -33,6 +33,9 @@ POLICIES = (
 )
 
 
+_MOST_TOLD = 100  # lines; then diagnostics alone tell
+
+
 class Ports:
     """Makes those of a node, and tells of ends elsewhere that do not match them.
 
@@ -44,6 +47,8 @@ class Ports:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._suspects: dict[tuple[str, str], QoSProfile] = {}  # that once had an end not matching
+        self._silent: set[str] = set()  # topics whose events nobody hears: always suspect
+        self._told: set[str] = set()
 
     def publisher(self, kind: type, topic: str, quality: Quality) -> Any:
         profile, name = quality.fresh(), self._node.resolve_topic_name(topic)
@@ -63,19 +68,30 @@ class Ports:
         )
 
     def subscription(
-        self, kind: type, topic: str, callback: Callable[[Any], None], quality: Quality, **how: Any
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        quality: Quality,
+        silent: bool = False,
+        **how: Any,
     ) -> Any:
-        """``how`` goes on to rclpy."""
+        """``how`` goes on to rclpy; ``silent``: its events are not waited for."""
         profile, name = quality.fresh(), self._node.resolve_topic_name(topic)
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=lambda event: self._tell("subscription", name, profile, event)
+        )
+        if silent:
+            events = SubscriptionEventCallbacks(use_default_callbacks=False)
+            self._suspects["subscription", name] = profile
+            self._silent.add(name)
         return self._made(
             lambda options: self._node.create_subscription(
                 kind,
                 topic,
                 callback,
                 profile,
-                event_callbacks=SubscriptionEventCallbacks(
-                    incompatible_qos=lambda event: self._tell("subscription", name, profile, event)
-                ),
+                event_callbacks=events,
                 qos_overriding_options=options,
                 **how,
             ),
@@ -87,7 +103,7 @@ class Ports:
     def mismatches(self) -> list[str]:
         """Who, of those known now, gets or sends nothing for its quality of service; a line each.
 
-        Looks at nothing where there never was one.
+        Looks at nothing where there never was one, unless it is silent.
         """
         found = []
         for (side, topic), own in list(self._suspects.items()):
@@ -101,6 +117,8 @@ class Ports:
                 if compatible == QoSCompatibility.ERROR:
                     cause = " ".join(reason.removeprefix("ERROR: ").split()).rstrip(";")
                     found.append(f"{topic}: not matched with {end.node_name} ({cause})")
+                    if topic in self._silent:
+                        self._tell_once(topic, end.node_name, cause)
         return found
 
     def _made(
@@ -124,6 +142,15 @@ class Ports:
                 f"parameter {prefix}.*: {text}; give reliability and durability as words, depth "
                 "and deadline [ns] as whole numbers"
             ) from error
+
+    def _tell_once(self, topic: str, name: str, cause: str) -> None:
+        line = (
+            f"{topic}: {name} is not heard here ({cause}); change its policy, or "
+            f"qos_overrides.{topic}.subscription.* of this node"
+        )
+        if line not in self._told and len(self._told) < _MOST_TOLD:
+            self._told.add(line)
+            self._node.get_logger().warning(line)
 
     def _tell(self, side: str, topic: str, profile: QoSProfile, event: Any) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind).split(".")[-1].lower()
