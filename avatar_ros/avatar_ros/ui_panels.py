@@ -83,19 +83,11 @@ class Panels:
         self._add_keys()
 
     def _fill_tool(self) -> None:
-        empty = np.zeros(2)
-        self._force_plot = self._gui.add_uplot(
-            (empty, empty, empty),
-            (
-                uplot.Series(label="time [s]"),
-                uplot.Series(label="force [N]", stroke="#0072B2", width=2),
-                uplot.Series(label="error, 9 of 10 [N]", stroke="#D55E00", width=2, dash=(6, 4)),
-            ),
-            title="Force on the tool [N] over time [s]",
-            scales={"x": uplot.Scale(time=False)},
-            axes=(uplot.Axis(), uplot.Axis()),
-            height=120,
-            padding=_PADDING,
+        self._force_plot = self._plot(
+            "Force on the tool [N]",
+            120,
+            uplot.Series(label="force [N]", stroke="#0072B2", width=2),
+            uplot.Series(label="error, 9 of 10 [N]", stroke="#D55E00", width=2, dash=(6, 4)),
         )
         for labels in (("press 1 mm", "lift 1 mm"), ("right", "left", "up", "down")):
             group = self._gui.add_button_group("Tool" if len(labels) == 2 else "1 mm", labels)
@@ -162,30 +154,26 @@ class Panels:
         self._scene_texts: dict[str, str] = {}
 
     def _fill_timing(self) -> None:
-        empty = np.zeros(2)
-        axes = (uplot.Axis(), uplot.Axis())
-        self._step_plot = self._gui.add_uplot(
-            (empty, empty),
-            (
-                uplot.Series(label="time [s]"),
-                uplot.Series(label="step, 99 of 100 [ms]", stroke="#0072B2", width=2),
-            ),
-            title="Time of a step [ms] over time [s]",
-            scales={"x": uplot.Scale(time=False)},
-            axes=axes,
-            height=110,
-            padding=_PADDING,
+        self._step_plot = self._plot(
+            "Time of a step [ms]",
+            110,
+            uplot.Series(label="step, 99 of 100 [ms]", stroke="#0072B2", width=2),
         )
-        self._missed_plot = self._gui.add_uplot(
-            (empty, empty),
-            (
-                uplot.Series(label="time [s]"),
-                uplot.Series(label="missed periods [1/s]", stroke="#D55E00", width=2),
-            ),
-            title="Missed periods [1/s] over time [s]",
+        self._missed_plot = self._plot(
+            "Missed periods [1/s]",
+            110,
+            uplot.Series(label="missed periods [1/s]", stroke="#D55E00", width=2),
+        )
+
+    def _plot(self, what: str, height: int, *curves: Any) -> Any:
+        """Of some curves over time, still empty; its height [px]."""
+        return self._gui.add_uplot(
+            tuple(np.zeros(2) for _ in range(1 + len(curves))),
+            (uplot.Series(label="time [s]"), *curves),
+            title=f"{what} over time [s]",
             scales={"x": uplot.Scale(time=False)},
-            axes=axes,
-            height=110,
+            axes=(uplot.Axis(), uplot.Axis()),
+            height=height,
             padding=_PADDING,
         )
 
