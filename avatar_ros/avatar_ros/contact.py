@@ -34,9 +34,11 @@ from avatar_ros.budget_requests import BudgetRequests
 from avatar_ros.contact_loop import BLEND, ContactLoop, Online, Outlets, OwnThread
 from avatar_ros.declared import ParameterError
 from avatar_ros.handover import OVERTAKEN, Change, Handover, Order, Prepared
+from avatar_ros.kept_state import KeptState
 from avatar_ros.loop_statistics import Record, statistics
 from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_ros.parameters import ContactSettings
 from avatar_ros.safety import SAFETY, chosen_safety
 from avatar_ros.srv import LoadScene
 from avatar_ros.tool import Tool
@@ -63,11 +65,14 @@ class ContactNode(ManagedNode):
         self._n_awaited = 0
         self._changing = threading.RLock()
         super().__init__("contact", parameters.CONTACT)
+        self._state = KeptState(self, self._values((*parameters.CHANGEABLE, "scene"), []))
+        self._scene = self._go_on(self._state.kept())  # YAML, in place of the parameter's
         # As long as the node, and beside everything else: an answer may take a minute.
         self.create_service(
             LoadScene, "load_scene", self._load_scene, callback_group=ReentrantCallbackGroup()
         )
         self.add_on_set_parameters_callback(self._change_parameters)
+        self.add_post_set_parameters_callback(lambda changes: self._keep_state())
 
     @property
     def failure(self) -> str:
@@ -78,7 +83,7 @@ class ContactNode(ManagedNode):
         return self._n_awaited > 0
 
     def configure(self) -> None:
-        settings = parameters.read_contact(self)
+        settings = self._settings()
         if settings.scene:
             self._say_divisor(settings.cloud_divisor)
         contact.warm_up(len(settings.tools))
@@ -131,6 +136,18 @@ class ContactNode(ManagedNode):
         self._budget = BudgetRequests(
             settings.budget, self._handover.ask, self._keep_budget, self._refuse_budget
         )
+        self._keep_state()
+
+    def _settings(self) -> ContactSettings:
+        """Of parameters and kept scene; without that where it does not fit any more."""
+        try:
+            return parameters.read_contact(self, self._scene)
+        except ParameterError as error:
+            if not self._scene:
+                raise
+            self.get_logger().error(f"the scene that was kept is not used: {error}")
+            self._scene = ""
+            return parameters.read_contact(self)
 
     def activate(self) -> None:
         assert self._loop is not None
@@ -163,6 +180,7 @@ class ContactNode(ManagedNode):
         if self._handover is not None:
             self._handover.stop()
             self._handover = self._budget = None
+            self._scene = ""
         self._loop = None
         for tool in self._tools:
             self.destroy_subscription(tool.subscription)
@@ -210,6 +228,8 @@ class ContactNode(ManagedNode):
             prepared = await self._in_use(scenes.change_of(request))
             if prepared.cloud_divisor is not None:
                 self._say_divisor(prepared.cloud_divisor)
+            self._scene = self._handover.scene if self._handover is not None else ""
+            self._keep_state()
             response.success = True
         except Exception as error:  # a service always answers; the text decides what is raised
             response.message = one_line(error)
@@ -217,6 +237,27 @@ class ContactNode(ManagedNode):
         if self._loop is not None:
             response.effects = list(self._loop.online.effects)
         return response
+
+    def _go_on(self, kept: dict[str, Any]) -> str:
+        """Set parameters that were kept; the scene, if one was."""
+        scene = str(kept.pop("scene", ""))
+        for result in self.set_parameters([Parameter(n, value=v) for n, v in kept.items()]):
+            if not result.successful:
+                self.get_logger().error(f"a value that was kept is not used: {result.reason}")
+        if scene or kept:
+            named = [*sorted(kept), *(["the scene"] if scene else [])]
+            self.get_logger().info(f"goes on with {', '.join(named)} of the last run (state_dir)")
+        return scene
+
+    def _keep_state(self) -> None:
+        """For the next start: what is in force, of a budget the one that was granted."""
+        with self._changing:
+            if self._budget is None:
+                return
+            now = self._values(parameters.CHANGEABLE, [])
+            now |= parameters.of_budget(self._budget.kept)
+            now["scene"] = self._scene or self.get_parameter("scene").value
+            self._state.keep(now)
 
     def _say_divisor(self, divisor: int) -> None:
         """A scene's own is in force from now on, and free to change."""
@@ -296,6 +337,7 @@ class ContactNode(ManagedNode):
         loop = self._loop
         if loop is not None and loop.online.accuracy is not None:
             loop.online.accuracy.keep(_deadline(budget))
+        self._keep_state()
 
     def _refuse_budget(self, kept: Budget | None, refusal: str) -> None:
         self.get_logger().error(f"budget refused: {refusal}")

@@ -135,6 +135,11 @@ class Handover:
         self._thread = threading.Thread(target=self._supervise, name="handover", daemon=True)
         self._thread.start()
 
+    @property
+    def scene(self) -> str:
+        """YAML of the scene in force; empty for the natural effects of the vademecum."""
+        return self._order.scene
+
     def ask(self, change: Change, answer: Answer) -> None:
         """Have the vademecum prepared anew after a change of the order; returns at once.
 

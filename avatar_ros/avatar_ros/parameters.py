@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, get_args
 
@@ -13,10 +14,11 @@ from avatar_core.accuracy import Budget, Quantity
 from avatar_core.contact import TIP_RADIUS_RANGE, Cloud
 from avatar_core.errors import SceneError
 from avatar_core.scene import Scene, Tool
-from avatar_core.scene_file import read_scene, write_scene
+from avatar_core.scene_file import parse_scene, read_scene, write_scene
 from avatar_ros import scenes
 from avatar_ros.declared import Parameter, ParameterError
 from avatar_ros.diagnostics import THRESHOLDS
+from avatar_ros.kept_state import STATE_DIR
 from avatar_ros.patient_builder import Rules
 from avatar_ros.safety import SAFETY, Safety, chosen_safety
 
@@ -35,6 +37,7 @@ VADEMECUM_LOADER = (
     Parameter("library_dir", ".", "directory of the vademecums; nothing outside it is read"),
     Parameter("vademecum", "", "file in library_dir to load at start; empty: none"),
     Parameter("max_megabytes", 1024, "largest file that is read [MB]", range=(1, 65536)),
+    STATE_DIR,
 )
 
 PATIENT_INTERPOLATION = (
@@ -156,7 +159,10 @@ CONTACT = (
     Parameter("realtime.lock_memory", True, "keep the process in memory; needs a priority"),
     *SAFETY,
     *THRESHOLDS,
+    STATE_DIR,
 )
+# Of the contact node: what a node that is started again goes on with, and the scene.
+CHANGEABLE = tuple(p.name for p in CONTACT if not p.read_only)
 
 
 # Names that the core gives to what these parameters choose.
@@ -247,8 +253,10 @@ def read_interpolation(node: Node) -> InterpolationSettings:
     )
 
 
-def read_contact(node: Node) -> ContactSettings:
+def read_contact(node: Node, kept_scene: str = "") -> ContactSettings:
     """The contact node's parameters, checked against one another.
+
+    kept_scene : YAML, which goes before the parameter ``scene``
 
     Raises
     ------
@@ -284,13 +292,18 @@ def read_contact(node: Node) -> ContactSettings:
         lock_memory=value["realtime.lock_memory"],
         safety=chosen_safety(value),
     )
-    return _with_scene(settings, value["scene"]) if value["scene"] else settings
+    if kept_scene:
+        kept = _with_scene(settings, lambda: parse_scene(kept_scene, "kept"))
+        return replace(kept, cloud_divisor=settings.cloud_divisor)  # may have changed since
+    if value["scene"]:
+        return _with_scene(settings, lambda: read_scene(scenes.scene_file(value["scene"])))
+    return settings
 
 
-def _with_scene(settings: ContactSettings, value: str) -> ContactSettings:
+def _with_scene(settings: ContactSettings, read: Callable[[], Scene]) -> ContactSettings:
     """Settings with what a scene says of tips and outputs."""
     try:
-        scene: Scene = read_scene(scenes.scene_file(value))
+        scene = read()
         scenes.require_tools(scene, len(settings.tools))
     except SceneError as error:
         raise ParameterError(f"parameter scene: {error}") from error

@@ -9,9 +9,10 @@ from shape_msgs.msg import Mesh
 from std_msgs.msg import Header
 
 from avatar_core import storage
-from avatar_core.errors import one_line
+from avatar_core.errors import AvatarError, one_line
 from avatar_ros import conversions, parameters, qos
 from avatar_ros.declared import ParameterError
+from avatar_ros.kept_state import KeptState
 from avatar_ros.library import read_in_library
 from avatar_ros.managed_node import ManagedNode, run
 from avatar_ros.msg import VademecumFile, VademecumInfo
@@ -29,6 +30,8 @@ class LoaderNode(ManagedNode):
         self._outlets: dict[type, Any] = {}
         self._service: Any = None
         super().__init__("vademecum_loader", parameters.VADEMECUM_LOADER)
+        started = self.get_parameter("vademecum").value
+        self._state = KeptState(self, {"vademecum": started})
 
     def configure(self) -> None:
         self._settings = parameters.read_loader(self)
@@ -48,8 +51,7 @@ class LoaderNode(ManagedNode):
 
     def activate(self) -> None:
         assert self._settings is not None
-        if self._settings.vademecum:
-            self.load(self._settings.vademecum)
+        self._load_first(self._settings.vademecum)
         self._service = self.create_service(LoadVademecum, "load_vademecum", self._answer)
 
     def deactivate(self) -> None:
@@ -64,6 +66,18 @@ class LoaderNode(ManagedNode):
         for publisher in self._outlets.values():
             self.destroy_publisher(publisher)
         self._outlets = {}
+
+    def _load_first(self, name: str) -> None:
+        """What was loaded last, else the parameter's."""
+        kept = self._state.kept().get("vademecum", name)
+        if kept != name:
+            try:
+                self.load(kept)
+                return
+            except (AvatarError, OSError) as error:
+                self.get_logger().error(f"not loaded again: {error}")
+        if name:
+            self.load(name)
 
     def load(self, name: str) -> VademecumInfo:
         """Verify a file of the library and announce it.
@@ -93,6 +107,7 @@ class LoaderNode(ManagedNode):
     ) -> LoadVademecum.Response:
         try:
             response.info = self.load(request.name)
+            self._state.keep({"vademecum": request.name})
             response.success = True
         except Exception as error:  # a service always answers; the file decides what is raised
             response.message = one_line(error)

@@ -24,6 +24,7 @@ from rclpy.serialization import deserialize_message
 
 from avatar_ros import qos
 from avatar_ros.msg import ContactState, LoopStatistics
+from tests.ros.steady_tool import SWING
 
 MOST = 5.0  # [N], the limit that the contact node is given
 _CALM = 0.3  # of ordinary palpation, that counts as recovered [s]
@@ -112,8 +113,18 @@ class Ear:
 class FaultCell:
     """Loader, contact node, patient node, tool and a viewer of clouds, each a process."""
 
-    def __init__(self, library: Path, patients: Path, touch: Any, domain: dict[str, str]) -> None:
+    def __init__(
+        self,
+        library: Path,
+        patients: Path,
+        touch: Any,
+        domain: dict[str, str],
+        state_dir: Path | str = "",
+        swing: float = SWING,
+        contact: tuple[str, ...] = (),
+    ) -> None:
         self.library, self.patients, self.domain = library, patients, domain
+        self._state_dir, self._swing, self._contact = state_dir, swing, contact
         tip, normal = touch
         self._tool = [f"{x:.9g}" for x in (*(tip + 4e-3 * normal), *normal)]
         self.processes: dict[str, subprocess.Popen[Any]] = {}
@@ -123,11 +134,12 @@ class FaultCell:
 
     def start(self, name: str, rate: float = 1000.0) -> None:
         """Start a process anew."""
-        files = [f"library_dir:={self.library}", "vademecum:=liver.h5"]
+        kept = [f"state_dir:={self._state_dir}"] if self._state_dir else []
+        files = [f"library_dir:={self.library}", "vademecum:=liver.h5", *kept]
         rough = [f"library_dir:={self.patients}", f"atlas:={self.patients / 'atlas.h5'}"]
         modules = {
             "loader": ("vademecum_loader", files),
-            "contact": ("contact", [f"safety.max_force:={MOST}"]),
+            "contact": ("contact", [f"safety.max_force:={MOST}", *self._contact, *kept]),
             "patients": ("patient_interpolation", rough),
         }
         if name in modules:
@@ -139,7 +151,7 @@ class FaultCell:
             self.processes[name] = Module("cloud_viewer", [output], self.domain)
         else:
             script = str(Path(__file__).with_name("steady_tool.py"))
-            command = [sys.executable, script, *self._tool, f"{rate:g}"]
+            command = [sys.executable, script, *self._tool, f"{rate:g}", f"{self._swing:g}"]
             self.processes[name] = subprocess.Popen(command, cwd="/", env=self.domain)
 
     def end(self, name: str) -> None:
