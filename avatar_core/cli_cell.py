@@ -40,6 +40,10 @@ def cell(
         typer.Option(exists=True, dir_okay=False, help="for the node that makes patients"),
     ] = None,
     scene: Annotated[str, typer.Option(help="effects to simulate")] = "",
+    state_dir: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="where nodes keep their state, if any"),
+    ] = None,
     ui: Annotated[bool, typer.Option("--ui", help="serve the planning page, too")] = False,
     host: Host = "127.0.0.1",
     port: Port = 8080,
@@ -57,6 +61,7 @@ def cell(
         "vademecum": vademecum,
         "atlas": atlas and atlas.resolve(),
         "scene": scene,
+        "state_dir": state_dir and state_dir.resolve(),
         **page,
     }
     command = [sys.executable, "-m", "avatar_ros.cell"]

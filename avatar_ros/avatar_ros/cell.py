@@ -22,8 +22,8 @@ _STOP_TIMEOUT = 5.0  # for a node to end by itself [s]
 
 # What goes before the file of parameters, by node.
 TAKES = {
-    "vademecum_loader": ("library_dir", "vademecum"),
-    "contact": ("scene",),
+    "vademecum_loader": ("library_dir", "vademecum", "state_dir"),
+    "contact": ("scene", "state_dir"),
     "patient_interpolation": ("library_dir", "atlas"),
     "planning_ui": ("library_dir", "host", "port"),
 }

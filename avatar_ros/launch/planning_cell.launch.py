@@ -1,7 +1,8 @@
 """A planning cell: `ros2 launch avatar_ros planning_cell.launch.py params:=FILE.yaml`.
 
-All that the nodes are told stands in ``params``; ``library_dir``, ``vademecum``, ``scene`` and
-``atlas`` go before what it says of them. The node that makes patients runs with an atlas only.
+All that the nodes are told stands in ``params``; ``library_dir``, ``vademecum``, ``scene``,
+``atlas`` and ``state_dir`` go before what it says of them. The node that makes patients runs with
+an atlas only.
 """
 
 from launch import LaunchContext, LaunchDescription
@@ -11,8 +12,8 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 TAKES = {
-    "vademecum_loader": ("library_dir", "vademecum"),
-    "contact": ("scene",),
+    "vademecum_loader": ("library_dir", "vademecum", "state_dir"),
+    "contact": ("scene", "state_dir"),
     "patient_interpolation": ("library_dir", "atlas"),
 }
 
@@ -27,6 +28,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("vademecum", default_value="", description="file to load"),
             DeclareLaunchArgument("scene", default_value="", description="effects to simulate"),
             DeclareLaunchArgument("atlas", default_value="", description="empty: no patients"),
+            DeclareLaunchArgument("state_dir", default_value="", description="empty: none is kept"),
             OpaqueFunction(function=nodes),
         ]
     )

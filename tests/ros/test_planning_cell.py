@@ -75,6 +75,8 @@ def test_page_and_patients_run_only_if_asked_for() -> None:
     always = {"vademecum_loader", "contact"}
     assert set(commands(None, {})) == always
     assert set(commands(None, {"atlas": "atlas.h5"})) == {*always, "patient_interpolation"}
+    kept = commands(None, {"state_dir": "/kept"})
+    assert all(kept[node][-1] == "state_dir:=/kept" for node in always)
     page = commands(None, {"ui": "yes", "port": "8081"})
     assert set(page) == {*always, "planning_ui"}
     assert page["planning_ui"][-1] == "port:=8081"

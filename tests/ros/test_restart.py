@@ -129,6 +129,7 @@ def state(cell: FaultCell, own_domain: dict[str, str]) -> Iterator[tuple[State, 
     probe.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", HOW)
 @pytest.mark.parametrize("name", ["loader", "contact", "patients"])
 def test_what_is_started_again_goes_on_as_before(
@@ -155,6 +156,7 @@ def test_what_is_started_again_goes_on_as_before(
     )
 
 
+@pytest.mark.long
 def test_a_budget_that_was_granted_is_in_force_again(
     cell: FaultCell, state: tuple[State, str], organ: Any
 ) -> None:
