@@ -8,15 +8,21 @@ from avatar_core.splines import evaluate
 from avatar_core.tip_field import FAR, TipField
 from avatar_core.vademecum import Vademecum
 
+_PRESSED = 5e-3  # how deep a tip may go from an inner position [m]
+
 
 def inner_positions(vademecum: Vademecum, margin: float = 12e-3) -> np.ndarray:
-    """Load positions with full access ``margin`` [m] around them (all, if there are none)."""
+    """Load positions with full access ``margin`` [m] around them (all, if there are none).
+
+    Above, and below where a tip presses: in a fold, the access fades inside the organ first.
+    """
     surface, field = vademecum.surface, vademecum.tip_field
     around = margin * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    raised = surface.centers + 5e-3 * surface.normals
-    inner = [
-        j for j, p in enumerate(raised) if min(access(field, p + step) for step in around) > 0.999
-    ]
+    inner = []
+    for j, (center, n) in enumerate(zip(surface.centers, surface.normals, strict=True)):
+        points = [*(center + _PRESSED * n + around), center, center - _PRESSED * n]
+        if min(access(field, p) for p in points) > 0.999:
+            inner.append(j)
     return np.array(inner) if inner else np.arange(surface.n_positions)
 
 

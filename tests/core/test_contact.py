@@ -150,7 +150,8 @@ def test_closed_paths_on_real_livers_do_no_work(real_vademecum: Vademecum) -> No
 def test_sliding_force_on_real_livers_has_no_steps(real_vademecum: Vademecum, depth: float) -> None:
     """99 % change by less than 2 % of the peak per 0.1 mm; a sharp fold may be steeper.
 
-    Once in many slides one is, by 3 %. What changes as much in 0.01 mm would be a step.
+    How steep is the mesh's: once in many slides 3 to 6 %. A slope, walked ten times finer, changes
+    by a tenth per step; a step by all of it.
     """
     v, model = real_vademecum, prepare(real_vademecum, (RADIUS,))
     others = np.random.default_rng(3).choice(inner_positions(v, 20e-3), 4, replace=False)
@@ -162,7 +163,21 @@ def test_sliding_force_on_real_livers_has_no_steps(real_vademecum: Vademecum, de
     )
     assert (peak > 0.5).all()
     assert np.quantile(coarse, 0.99) < 0.02
-    assert fine.max() < 0.02 / 4
+    steepest = np.maximum(coarse.max(axis=1), 0.02)
+    assert (fine.max(axis=1) < steepest / 4).all()
+
+
+@pytest.mark.long
+def test_a_tip_may_press_at_every_inner_position(real_vademecum: Vademecum) -> None:
+    """5 mm deep, straight in along the normal of the undeformed surface."""
+    v, model = real_vademecum, prepare(real_vademecum, (RADIUS,))
+    refused = []
+    for j in inner_positions(v, 20e-3):
+        model.reset()
+        tip = slide(v, RADIUS, 5e-3, 1e-4, position=j)
+        if step(model, tip) != Status.OK:
+            refused.append(j)
+    assert not refused
 
 
 def force_steps(
@@ -247,7 +262,8 @@ def test_sliding_force_has_no_steps(
     coarse, fine, peak = force_steps(phantom_vademecum, model, depth)
     assert peak > 1.0
     assert coarse.max() < 0.02
-    assert fine.max() < 0.02 / 4
+    steepest = np.maximum(coarse.max(axis=1), 0.02)
+    assert (fine.max(axis=1) < steepest / 4).all()
 
 
 def test_small_tip_is_felt_between_vertices(phantom_vademecum: Vademecum) -> None:
