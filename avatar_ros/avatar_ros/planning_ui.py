@@ -164,6 +164,7 @@ class PlanningNode(ManagedNode):
         self._panels.show_organ(organ)
         self._organ = organ
         self._listen_to_clouds()
+        self._requests.parameters_of_contact(tuple(MATERIAL), self._note_material)
         self._say(f"{organ.name} is shown")
 
     def _take_statistics(self, window: LoopStatistics) -> None:
@@ -228,6 +229,19 @@ class PlanningNode(ManagedNode):
         """The contact node is there, for the first time or again."""
         self._contact, self._is_to_restore = values, True
         self._view.resize_tool(self._radius())
+        self._panels.show_material(self._in_force())
+
+    def _note_material(self, values: dict[str, Any]) -> None:
+        """What the contact node has, also if another client chose it."""
+        self._contact |= values
+        self._panels.show_material(self._in_force())
+
+    def _in_force(self) -> dict[str, float]:
+        """Values of the material that are not those of the file, by coordinate."""
+        contact = self._contact
+        return {MATERIAL[key]: contact[key] for key in MATERIAL if contact.get(key)} | (
+            self._material
+        )
 
     def _restore(self) -> None:
         """What was chosen here, once the contact node has an organ again."""
@@ -317,11 +331,10 @@ class PlanningNode(ManagedNode):
         contact = self._contact
         given = self._scene or contact["scene"]
         chosen = read_scene(scene_file(given)) if given else None
-        material = {MATERIAL[key]: contact[key] for key in MATERIAL if contact.get(key)}
         return scene_in_force(
             chosen,
             organ.vademecum,
-            material | self._material,
+            self._in_force(),
             self._radius(),
             contact["cloud"],
             contact["cloud_divisor"],

@@ -58,7 +58,6 @@ class Panels:
 
     def __init__(self, server: viser.ViserServer, wishes: Wishes) -> None:
         self._server, self._gui, self._wishes = server, server.gui, wishes
-        self._quiet = False  # while the page itself sets a value
         self._times: deque[float] = deque(maxlen=round(HISTORY * 5))
         self._forces: deque[tuple[float, float]] = deque(maxlen=round(HISTORY * 5))
         self._loop: deque[tuple[float, float, float]] = deque(maxlen=60)
@@ -118,6 +117,8 @@ class Panels:
         self._wishes.nudge(axis, way)
 
     def _on_slider(self, name: str, unit: float, bounds: tuple[float, float], event: Any) -> None:
+        if event.client is None:  # nobody moved it: show_material did
+            return
         self._wishes.material(name, float(np.clip(event.target.value * unit, *bounds)))
 
     def _fill_organ(self) -> None:
@@ -211,6 +212,14 @@ class Panels:
                 )
                 slider.on_update(partial(self._on_slider, name, unit, (low, high)))
                 self._sliders[name] = slider
+
+    def show_material(self, values: dict[str, float]) -> None:
+        """What is in force, by coordinate [SI]; those of the sliders that there are."""
+        for name, value in values.items():
+            if name in self._sliders:
+                slider = self._sliders[name]
+                shown = float(np.clip(value / SLIDERS[name][1], slider.min, slider.max))
+                slider.value = round(shown, 6)
 
     def show_scale(self, top: float) -> None:
         """The colour bar up to a displacement [m]."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 import signal
-import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,32 +18,42 @@ pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 
 from avatar_ros.bench_cell import Module
 from avatar_ros.ui_organ import Organ
-from avatar_ros.ui_scene import camera_of
-from playwright.sync_api import Error, sync_playwright
 from rcl_interfaces.srv import ListParameters
 
 from avatar_core.recording import load_recording
 from avatar_core.replay import replay
 from avatar_core.storage import load_vademecum, save_vademecum
+from tests.ros.browser import (
+    CHROMIUM,
+    SLOW,
+    WINDOW,
+    choose,
+    drag,
+    force_of,
+    free_port,
+    news,
+    nodes_of_a_page,
+    open_tab,
+    opened,
+    press,
+    shots_in,
+    until,
+)
 from tests.ros.conftest import PATIENT
 from tests.ros.pages import parameter_rows
 from tests.ros.test_patient_interpolation import folder, livers
 
 __all__ = ["folder", "livers"]  # fixtures
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
     pytest.mark.ros,
     pytest.mark.long,  # a browser that draws without a graphics card takes both cores
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
 ]
 
-SIZES = ((1280, 800), (800, 600))
-SLOW = 300_000  # of what starts, compiles or builds, on a busy machine [ms]
+SIZES = (WINDOW, (800, 600))
 TABS = ("Tool", "Organ", "Patient", "Scene", "Timing")
-# Software rendering: there is no graphics card where this runs.
-OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-
+PROGRESS = re.compile(r"\n\w+: \d+%")
 # What is seen of a page's controls: name, left, top, right, bottom [px].
 CONTROLS = """() => [...document.querySelectorAll('button, input, [role=tab]')]
   .filter(e => e.checkVisibility() && e.getBoundingClientRect().width > 12)
@@ -56,126 +63,42 @@ CONTROLS = """() => [...document.querySelectorAll('button, input, [role=tab]')]
 
 @pytest.fixture(scope="module")
 def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where screenshots are kept: AVATAR_SHOTS, if given."""
-    given = os.environ.get("AVATAR_SHOTS")
-    path = Path(given) if given else tmp_path_factory.mktemp("shots")
-    path.mkdir(exist_ok=True)
-    return path
+    return shots_in(tmp_path_factory.mktemp("shots"))
 
 
 @pytest.fixture(scope="module")
 def port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+    return free_port()
 
 
 @pytest.fixture(scope="module")
 def nodes(
     own_domain: dict[str, str], folder: Path, organ: Any, port: int
 ) -> Iterator[dict[str, Module]]:
-    """A cell with a page; what a test kills, it starts again."""
     save_vademecum(organ, folder / "liver.h5")
     library = ["-p", f"library_dir:={folder}"]
-    atlas = ["-p", f"atlas:={folder / 'atlas.h5'}", "-p", "vertices:=350"]
-    running = {
-        name: Module(name, arguments, own_domain)
-        for name, arguments in (
-            ("vademecum_loader", ["--ros-args", *library, "-p", "vademecum:=liver.h5"]),
-            ("contact", PATIENT),
-            ("patient_interpolation", ["--ros-args", *library, *atlas]),
-            ("planning_ui", ["--ros-args", *library, "-p", f"port:={port}"]),
-        )
+    arguments = {
+        "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
+        "contact": PATIENT[1:],
+        "patient_interpolation": [
+            *library,
+            *("-p", f"atlas:={folder / 'atlas.h5'}", "-p", "vertices:=350"),
+        ],
+        "planning_ui": [*library, "-p", f"port:={port}"],
     }
-    yield running
-    for process in running.values():
-        process.send_signal(signal.SIGINT)
-    # `finish` is impatient where a browser shares the cores with all of them
-    codes = {name: process.wait(60.0) for name, process in running.items()}
-    assert codes == dict.fromkeys(running, 0)
+    with nodes_of_a_page(arguments, own_domain) as running:
+        yield running
 
 
 @pytest.fixture(scope="module")
 def page(nodes: dict[str, Module], port: int, shots: Path) -> Iterator[Any]:
-    """The page, with an organ and all nodes there."""
-    with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
-        page = browser.new_page(viewport={"width": SIZES[0][0], "height": SIZES[0][1]})
-        foreign: list[str] = []
-        page.on("request", lambda asked: foreign.append(asked.url))
-        for _ in range(60):
-            try:
-                page.goto(f"http://127.0.0.1:{port}")
-                break
-            except Error:  # not there yet
-                page.wait_for_timeout(1000)
-        try:
-            page.get_by_text("is shown").wait_for(timeout=SLOW)
-            page.get_by_text("All nodes answer").wait_for(timeout=SLOW)
-        finally:
-            page.screenshot(path=shots / "first.png")
-        page.wait_for_timeout(3000)  # software rendering takes its time, and says so
-        for close in page.locator(".mantine-Notification-closeButton").all():
-            close.click()
+    with opened(port, shots) as page:
         yield page
-        browser.close()
-        local = ("http://127.0.0.1", "ws://127.0.0.1", "data:", "blob:")
-        assert not [url for url in foreign if not url.startswith(local)]
-
-
-def force_of(page: Any) -> float:
-    """As the page writes it [N]."""
-    found = re.search(r"Force ([\d.]+) N", page.inner_text("body"))
-    return float(found[1]) if found else 0.0
-
-
-def until(page: Any, reached: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
-    for _ in range(round(4 * seconds)):
-        if reached():
-            return
-        page.wait_for_timeout(250)
-    raise AssertionError(f"{what}: not within {seconds:g} s; {page.inner_text('body')[:400]}")
 
 
 @pytest.fixture(scope="module")
 def shown(folder: Path, nodes: Any) -> Organ:
     return Organ.of(load_vademecum(folder / "liver.h5"))
-
-
-def screen_of(page: Any, shown: Organ, point: np.ndarray) -> tuple[float, float]:
-    """Where a point [m] is on the page, before the view was turned [px]."""
-    position, look_at, fov = camera_of(shown)
-    ahead = (look_at - position) / np.linalg.norm(look_at - position)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    up = np.cross(right, ahead)
-    box = page.locator("canvas").first.bounding_box()
-    way = point - position
-    scale = 0.5 * box["height"] / np.tan(0.5 * fov) / (way @ ahead)
-    x = box["x"] + 0.5 * box["width"] + scale * (way @ right)
-    return float(x), float(box["y"] + 0.5 * box["height"] - scale * (way @ up))
-
-
-def drag(page: Any, shown: Organ, begin: float, end: float) -> None:
-    """The tool from one height over the organ to another, with the mouse; the button stays down."""
-    x0, y0 = screen_of(page, shown, shown.above(begin))
-    x1, y1 = screen_of(page, shown, shown.above(end))
-    page.mouse.move(x0, y0)
-    page.wait_for_timeout(500)
-    page.mouse.down()
-    for share in np.linspace(0.0, 1.0, 20):
-        page.mouse.move(x0 + share * (x1 - x0), y0 + share * (y1 - y0))
-        page.wait_for_timeout(60)
-
-
-def choose(page: Any, label: str, option: str) -> None:
-    page.get_by_label(label, exact=True).click()
-    page.get_by_role("option", name=option, exact=True).click()
-
-
-def open_tab(page: Any, name: str) -> None:
-    page.get_by_role("tab", name=name, exact=True).click()
-    page.wait_for_timeout(500)
 
 
 def test_a_drag_is_felt_and_the_surface_gives_way(page: Any, shown: Organ, shots: Path) -> None:
@@ -187,7 +110,7 @@ def test_a_drag_is_felt_and_the_surface_gives_way(page: Any, shown: Organ, shots
     page.wait_for_timeout(1500)
     page.screenshot(path=shots / "drag.png")
     page.mouse.up()
-    page.get_by_role("button", name="Lift off the organ").click()
+    press(page, "Lift off the organ")
     until(page, lambda: force_of(page) == 0.0, "the organ left")
 
 
@@ -199,13 +122,13 @@ def test_keys_move_the_tool(page: Any) -> None:
         if force_of(page) > 0.05:
             break
     until(page, lambda: force_of(page) > 0.05, "a force", 5.0)
-    page.get_by_role("button", name="Lift off the organ").click()
+    press(page, "Lift off the organ")
     until(page, lambda: force_of(page) == 0.0, "the organ left")
 
 
 def test_a_recording_replays(page: Any, shown: Organ, folder: Path) -> None:
     open_tab(page, "Tool")
-    page.get_by_role("button", name="Record").click()
+    press(page, "Record")
     page.get_by_text("natural effects runs").wait_for(timeout=SLOW)
     page.wait_for_timeout(500)
     for _ in range(45):
@@ -214,9 +137,9 @@ def test_a_recording_replays(page: Any, shown: Organ, folder: Path) -> None:
         if force_of(page) > 0.3:
             break
     page.wait_for_timeout(1000)
-    page.get_by_role("button", name="Lift off the organ").click()
+    press(page, "Lift off the organ")
     page.wait_for_timeout(1500)
-    page.get_by_role("button", name="Stop and save").click()
+    press(page, "Stop and save")
     page.get_by_text("recording-").wait_for(timeout=SLOW)
     (file,) = folder.glob("recording-*.h5")
     recording = load_recording(file)
@@ -238,7 +161,7 @@ def test_effects_are_switched(page: Any, shots: Path) -> None:
     open_tab(page, "Scene")
     choose(page, "Scene", "relaxation")
     page.get_by_text("viscoelasticity").first.wait_for()
-    page.get_by_role("button", name="Switch to scene").click()
+    press(page, "Switch to scene")
     page.get_by_text("relaxation runs, with viscoelasticity").wait_for(timeout=SLOW)
     page.screenshot(path=shots / "scene.png")
 
@@ -285,16 +208,28 @@ def test_a_killed_contact_node_is_missed_and_found_again(
         if force_of(page) > 0.05:
             break
     until(page, lambda: force_of(page) > 0.05, "a force again")
-    page.get_by_role("button", name="Lift off the organ").click()
+    press(page, "Lift off the organ")
+
+
+def test_a_patient_is_not_built_to_the_end_if_nobody_wants_it(page: Any, folder: Path) -> None:
+    open_tab(page, "Patient")
+    choose(page, "Surface", "liver3.obj")
+    choose(page, "Fidelity", "solved")
+    press(page, "Build patient")
+    until(page, lambda: bool(PROGRESS.search(page.inner_text("body"))), "progress")
+    press(page, "Cancel")
+    news(page, "cancelled; no file was written")
+    assert not list(folder.glob("liver3-*.h5"))
+    choose(page, "Fidelity", "reduced")
 
 
 def test_a_new_patient_is_built_and_shown(page: Any, shots: Path) -> None:
     open_tab(page, "Patient")
     choose(page, "Surface", "liver3.obj")
-    page.get_by_role("button", name="Build patient").click()
+    press(page, "Build patient")
     until(
         page,
-        lambda: bool(re.search(r"\n\w+: \d+%", page.inner_text("body"))),
+        lambda: bool(PROGRESS.search(page.inner_text("body"))),
         "progress",
     )
     page.screenshot(path=shots / "patient.png")
@@ -302,6 +237,13 @@ def test_a_new_patient_is_built_and_shown(page: Any, shots: Path) -> None:
     open_tab(page, "Organ")
     assert page.get_by_text("liver3", exact=True).count() >= 1
     page.screenshot(path=shots / "organ.png")
+
+
+def test_a_file_of_the_library_is_loaded_and_shown(page: Any, shown: Organ) -> None:
+    open_tab(page, "Organ")
+    choose(page, "Vademecum", "liver.h5")
+    press(page, "Load vademecum")
+    page.get_by_text(shown.name, exact=True).wait_for(timeout=SLOW)
 
 
 def test_parameters_are_those_of_the_page(page: Any, lasting_probe: Any) -> None:

@@ -1,0 +1,142 @@
+"""A real browser on the planning page, and what a user does there."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from avatar_ros.bench_cell import Module
+from avatar_ros.ui_organ import Organ
+from avatar_ros.ui_scene import camera_of
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+WINDOW = (1280, 800)  # [px]
+SLOW = 300_000  # of what starts, compiles or builds, on a busy machine [ms]
+# Software rendering: there is no graphics card where this runs.
+OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+def shots_in(folder: Path) -> Path:
+    """Where screenshots are kept: AVATAR_SHOTS, if given."""
+    path = Path(os.environ.get("AVATAR_SHOTS") or folder)
+    path.mkdir(exist_ok=True)
+    return path
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+@contextmanager
+def nodes_of_a_page(
+    arguments: dict[str, list[str]], domain: dict[str, str]
+) -> Iterator[dict[str, Module]]:
+    """Nodes by name; what a test kills, it starts again, and all end well."""
+    running = {
+        name: Module(name, ["--ros-args", *words], domain) for name, words in arguments.items()
+    }
+    yield running
+    for process in running.values():
+        process.send_signal(signal.SIGINT)
+    # `finish` is impatient where a browser shares the cores with all of them
+    codes = {name: process.wait(60.0) for name, process in running.items()}
+    assert codes == dict.fromkeys(running, 0)
+
+
+@contextmanager
+def opened(port: int, shots: Path) -> Iterator[Any]:
+    """The page, with an organ and all nodes there; it may ask nothing of any other machine."""
+    from playwright.sync_api import Error, sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        page = browser.new_page(viewport={"width": WINDOW[0], "height": WINDOW[1]})
+        foreign: list[str] = []
+        page.on("request", lambda asked: foreign.append(asked.url))
+        for _ in range(60):
+            try:
+                page.goto(f"http://127.0.0.1:{port}")
+                break
+            except Error:  # not there yet
+                page.wait_for_timeout(1000)
+        try:
+            page.get_by_text("is shown").wait_for(timeout=SLOW)
+            page.get_by_text("All nodes answer").wait_for(timeout=SLOW)
+        finally:
+            page.screenshot(path=shots / "first.png")
+        page.wait_for_timeout(3000)  # software rendering takes its time, and says so
+        for close in page.locator(".mantine-Notification-closeButton").all():
+            close.click()
+        yield page
+        browser.close()
+        local = ("http://127.0.0.1", "ws://127.0.0.1", "data:", "blob:")
+        assert not [url for url in foreign if not url.startswith(local)]
+
+
+def force_of(page: Any) -> float:
+    """As the page writes it [N]."""
+    found = re.search(r"Force ([\d.]+) N", page.inner_text("body"))
+    return float(found[1]) if found else 0.0
+
+
+def until(page: Any, reached: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
+    for _ in range(round(4 * seconds)):
+        if reached():
+            return
+        page.wait_for_timeout(250)
+    raise AssertionError(f"{what}: not within {seconds:g} s; {page.inner_text('body')[:400]}")
+
+
+def screen_of(page: Any, shown: Organ, point: np.ndarray) -> tuple[float, float]:
+    """Where a point [m] is on the page, before the view was turned [px]."""
+    position, look_at, fov = camera_of(shown)
+    ahead = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    box = page.locator("canvas").first.bounding_box()
+    way = point - position
+    scale = 0.5 * box["height"] / np.tan(0.5 * fov) / (way @ ahead)
+    x = box["x"] + 0.5 * box["width"] + scale * (way @ right)
+    return float(x), float(box["y"] + 0.5 * box["height"] - scale * (way @ up))
+
+
+def drag(page: Any, shown: Organ, begin: float, end: float) -> None:
+    """The tool from one height over the organ to another, with the mouse; the button stays down."""
+    x0, y0 = screen_of(page, shown, shown.above(begin))
+    x1, y1 = screen_of(page, shown, shown.above(end))
+    page.mouse.move(x0, y0)
+    page.wait_for_timeout(500)
+    page.mouse.down()
+    for share in np.linspace(0.0, 1.0, 20):
+        page.mouse.move(x0 + share * (x1 - x0), y0 + share * (y1 - y0))
+        page.wait_for_timeout(60)
+
+
+def choose(page: Any, label: str, option: str) -> None:
+    page.get_by_label(label, exact=True).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def open_tab(page: Any, name: str) -> None:
+    page.get_by_role("tab", name=name, exact=True).click()
+    page.wait_for_timeout(500)
+
+
+def news(page: Any, text: str) -> None:
+    """Wait until the page says so."""
+    page.get_by_text(text).first.wait_for(timeout=SLOW)
+
+
+def press(page: Any, button: str) -> None:
+    page.get_by_role("button", name=button, exact=True).click()

@@ -1,0 +1,155 @@
+"""The planning page of an organ with a tumour: its sliders are felt, and it is seen through."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
+pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+
+import meshio
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import parameter_value_to_python
+
+from avatar_core.build_rule import BuildRule
+from avatar_core.coordinates import Coordinate
+from avatar_core.organ import OrganOptions, vademecum_of
+from avatar_core.phantom import phantom_liver
+from avatar_core.storage import save_vademecum
+from avatar_core.tumour import read_tumour
+from tests.ros.browser import (
+    CHROMIUM,
+    force_of,
+    free_port,
+    nodes_of_a_page,
+    open_tab,
+    opened,
+    shots_in,
+    until,
+)
+from tests.ros.conftest import PATIENT, Probe
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.long,  # an organ with coordinates is solved first
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
+]
+
+CHOSEN_BY_ANOTHER = 150e3  # Young's modulus [Pa], as the contact node is started
+BALL = 0.018  # radius of the tumour [m]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A library with a coarse phantom over Poisson's ratio and the contrast of a tumour."""
+    import pyvista
+
+    folder = tmp_path_factory.mktemp("tumour")
+    liver = phantom_liver(12e-3)
+    center = liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0])
+    ball = pyvista.Sphere(radius=BALL, center=center, theta_resolution=20, phi_resolution=20)
+    faces = ball.faces.reshape(-1, 4)[:, 1:]
+    meshio.write_points_cells(folder / "tumour.stl", 1e3 * ball.points, {"triangle": faces})
+    options = OrganOptions(
+        n_vertices=600,
+        rule=BuildRule(max_modes=20, most_oversampling=1.2),
+        coordinates=(Coordinate("poisson", 0.40, 0.49, 2), Coordinate("contrast", 0.5, 20.0, 3)),
+        tumour=read_tumour(folder / "tumour.stl"),
+        n_certified=4,
+    )
+    save_vademecum(vademecum_of(liver, options), folder / "liver.h5")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return shots_in(tmp_path_factory.mktemp("shots"))
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path, own_domain: dict[str, str], shots: Path) -> Iterator[Any]:
+    library, port = ["-p", f"library_dir:={folder}"], free_port()
+    arguments = {
+        "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
+        "contact": [*PATIENT[1:], "-p", f"material.young_modulus:={CHOSEN_BY_ANOTHER}"],
+        "planning_ui": [*library, "-p", f"port:={port}", "-p", "tumour:=tumour.stl"],
+    }
+    with nodes_of_a_page(arguments, own_domain), opened(port, shots) as page:
+        yield page
+
+
+def slider(page: Any, label: str) -> Any:
+    """The number beside a slider."""
+    return (
+        page.get_by_text(label, exact=True)
+        .locator("xpath=ancestor::*[.//input[not(@type='hidden')]][1]//input[not(@type='hidden')]")
+        .first
+    )
+
+
+def in_force(probe: Probe, name: str) -> float:
+    request = GetParameters.Request(names=[f"material.{name}"])
+    (value,) = probe.ask(GetParameters, "/contact/get_parameters", request).values
+    return float(parameter_value_to_python(value))
+
+
+def test_a_tumour_is_seen_in_the_organ(page: Any, shots: Path) -> None:
+    from PIL import Image
+
+    page.wait_for_timeout(2000)
+    page.screenshot(path=shots / "tumour.png")
+    left = np.asarray(Image.open(shots / "tumour.png").convert("RGB"))[:, :900].astype(float)
+    red, others = left[:, :, 0], left[:, :, 1:].max(axis=2)
+    assert (red > 1.5 * others).sum() > 500  # vermilion, through violet
+
+
+def test_what_another_client_chose_is_shown(page: Any) -> None:
+    open_tab(page, "Organ")
+    shown = slider(page, "Young's modulus E [kPa]")
+    until(page, lambda: shown.input_value() == f"{CHOSEN_BY_ANOTHER / 1e3:g}", "the value", 30.0)
+
+
+@pytest.mark.parametrize(
+    ("label", "name", "value", "unit"),
+    [
+        ("Young's modulus E [kPa]", "young_modulus", 300.0, 1e3),
+        ("Poisson's ratio nu [-]", "poisson_ratio", 0.42, 1.0),
+        ("Tumour, E inside / outside [-]", "contrast", 15.0, 1.0),
+    ],
+)
+def test_a_slider_is_felt(
+    page: Any, shots: Path, lasting_probe: Probe, label: str, name: str, value: float, unit: float
+) -> None:
+    pressed(page)
+    open_tab(page, "Organ")
+    before = force_of(page)
+    box = slider(page, label)
+    box.fill(f"{value:g}")
+    box.press("Enter")
+    until(
+        page,
+        lambda: abs(in_force(lasting_probe, name) / (unit * value) - 1.0) < 0.02,
+        f"{name} of the contact node",
+        30.0,
+    )
+    change = 0.2 if name == "young_modulus" else 0.005
+    until(page, lambda: abs(force_of(page) - before) > change, "another force", 30.0)
+    page.screenshot(path=shots / f"{name}.png")
+
+
+def pressed(page: Any) -> None:
+    """The tool some millimetres deep."""
+    open_tab(page, "Tool")
+    for _ in range(60):
+        if force_of(page) > 0.5:
+            return
+        page.get_by_text("press 1 mm", exact=True).click()
+        page.wait_for_timeout(300)
+    raise AssertionError("no force")
