@@ -1,0 +1,137 @@
+"""The loop keeps its figures while the planning page is open and its tool dragged."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
+pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+
+from avatar_ros.bench_cell import Module
+from avatar_ros.ui_organ import Organ
+
+from avatar_core.storage import load_vademecum, save_vademecum
+from avatar_ros import qos
+from avatar_ros.msg import LoopStatistics
+from tests.ros.browser import (
+    CHROMIUM,
+    drag,
+    draw_in_idle_time,
+    force_of,
+    free_port,
+    news,
+    nodes_of_a_page,
+    opened,
+    screen_of,
+    shots_in,
+    until,
+)
+from tests.ros.conftest import PATIENT, Probe
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.long,  # it measures time
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
+]
+
+DEEP = -0.002  # of the tip's centre over the surface, while it presses [m]
+SWING = 10.0  # of the mouse [px]
+SECONDS = 10.0  # of a measurement
+
+
+@pytest.fixture(scope="module")
+def folder(organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("timing")
+    save_vademecum(organ, folder / "liver.h5")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture(scope="module")
+def nodes(folder: Path, own_domain: dict[str, str], port: int) -> Iterator[dict[str, Module]]:
+    library = ["-p", f"library_dir:={folder}"]
+    arguments = {
+        "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
+        "contact": PATIENT[1:],
+        "planning_ui": [*library, "-p", f"port:={port}"],
+    }
+    with nodes_of_a_page(arguments, own_domain) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def page(nodes: Any, port: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with opened(port, shots_in(tmp_path_factory.mktemp("shots"))) as page:
+        yield page
+
+
+def figures(probe: Probe, meanwhile: Callable[[], None]) -> np.ndarray:
+    """Rate [Hz], share of the periods on time, and p50 of a step [s]: medians of the windows."""
+    windows: list[tuple[float, float, float]] = []
+
+    def note(window: LoopStatistics) -> None:
+        on_time = 1.0 - window.missed / max(window.periods, 1)
+        windows.append((window.rate, on_time, window.step_p50))
+
+    subscription = probe.node.create_subscription(
+        LoopStatistics, "statistics", note, qos.STATISTICS
+    )
+    end = time.monotonic() + SECONDS
+    while time.monotonic() < end:
+        meanwhile()
+        probe.spin(0.02)
+    probe.node.destroy_subscription(subscription)
+    return np.median(windows[1:-1], axis=0)
+
+
+def test_the_loop_keeps_its_figures_while_the_page_is_dragged(
+    page: Any, folder: Path, nodes: dict[str, Module], lasting_probe: Probe
+) -> None:
+    """In turns, since a machine's neighbours come and go; the tool presses all the time."""
+    shown = Organ.of(load_vademecum(folder / "liver.h5"))
+    drag(page, shown, 0.020, DEEP)
+    until(page, lambda: force_of(page) > 0.05, "a force")
+    page.mouse.up()
+    draw_in_idle_time()
+    address, found = page.url, []
+    for _ in range(3):
+        page.goto("about:blank")
+        nodes["planning_ui"].send_signal(signal.SIGSTOP)
+        without = figures(lasting_probe, lambda: None)
+        nodes["planning_ui"].send_signal(signal.SIGCONT)
+        page.goto(address)
+        news(page, "All nodes answer")
+        page.wait_for_timeout(3000)
+        found.append((without, dragged(page, shown, lasting_probe)))
+    without, beside = np.median(found, axis=0)
+    for name, (rate, on_time, step) in (("without", without), ("dragged", beside)):
+        print(f"{name}: {rate:.0f} Hz, {on_time:.2%} on time, {1e6 * step:.0f} us a step")
+    assert abs(beside[0] / without[0] - 1.0) < 0.1
+    assert beside[1] > 0.9 * without[1]
+    assert beside[2] < 1.1 * without[2]
+
+
+def dragged(page: Any, shown: Organ, probe: Probe) -> np.ndarray:
+    """Figures while the mouse swings the tool about where it presses."""
+    x, y = screen_of(page, shown, shown.above(DEEP))
+    swing = iter(SWING * np.sin(np.arange(100_000) / 5.0))
+    page.mouse.move(x, y)
+    page.mouse.down()
+    found = figures(probe, lambda: page.mouse.move(x, y + next(swing)))
+    assert force_of(page) > 0.05
+    page.mouse.move(x, y)
+    page.mouse.up()
+    return found
