@@ -400,9 +400,12 @@ class ContactNode(ManagedNode):
 
     def _say_shown(self, report: Report) -> None:
         """Of modes that were left out or taken back: a line when it changes."""
-        if report.changed:
-            say = self.get_logger().warning if report.shedding else self.get_logger().info
-            say(report.text)
+        if not report.changed:
+            return
+        if report.shedding:
+            self.get_logger().warning(report.text)
+        else:  # on a line of its own: rclpy allows a line of code but one severity
+            self.get_logger().info(report.text)
 
     def _say_fault(self, tool: str, text: str) -> None:
         """A line when a tool's fault is another than a window ago."""

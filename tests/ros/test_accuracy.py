@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,9 +14,10 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.accuracy import Accuracy
+from avatar_ros.accuracy import Accuracy, Report
 from avatar_ros.budget_requests import BudgetRequests
 from avatar_ros.budgets import Budgets
+from avatar_ros.contact import ContactNode
 from avatar_ros.handover import Answer, Change, Order
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -25,7 +28,7 @@ from avatar_core.contact import prepare
 from avatar_core.errors import AccuracyError
 from avatar_ros import qos, scenes
 from avatar_ros.msg import ContactState, LoopStatistics
-from tests.ros.conftest import START_TIMEOUT
+from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.test_cell import Hand, felt
 
 pytestmark = pytest.mark.ros
@@ -48,6 +51,14 @@ def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> 
     for _ in range(5):
         report = accuracy.after(window(0, 30e-6))
     assert not report.shedding and model.n_shown == model.n_modes
+
+
+def test_the_log_names_modes_left_out_and_taken_back(probe: Probe) -> None:
+    """At two severities, which rclpy does not let one line of code have."""
+    node = SimpleNamespace(get_logger=probe.node.get_logger)
+    said: Callable[[Any, Report], None] = ContactNode._say_shown
+    for shedding in (True, False, True):
+        said(node, Report("modes", shedding, changed=True))
 
 
 def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> None:
