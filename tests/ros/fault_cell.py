@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 import rclpy
 from avatar_ros.bench_cell import Module
 from geometry_msgs.msg import WrenchStamped
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
@@ -95,8 +95,9 @@ class Ear:
         self._thread.start()
 
     def _listen(self) -> None:
-        while self._context.ok():
-            self._executor.spin_once(timeout_sec=0.05)
+        with suppress(ExternalShutdownException):  # closed while it waited
+            while self._context.ok():
+                self._executor.spin_once(timeout_sec=0.05)
 
     def close(self) -> None:
         self._context.try_shutdown()
