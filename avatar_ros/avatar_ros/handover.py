@@ -16,9 +16,7 @@ Run as ``python -m avatar_ros.handover`` by ``Handover``, never by hand.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
-import mmap
 import os
 import signal
 import socket
@@ -35,17 +33,16 @@ from avatar_core.errors import one_line
 from avatar_ros import realtime
 from avatar_ros.budgets import Budgets, OvertakenError
 from avatar_ros.reader import Reader
+from avatar_ros.shared_arrays import map_shared, share
 
 if TYPE_CHECKING:
     from avatar_core.contact import Cloud
 
-_ALIGNMENT = 64
 _PACKET = 1 << 18  # the longest scene, quotes and all
 _SHOWN = 80  # letters of a name from elsewhere
 _LARGEST = 1 << 30  # vademecum that can be received [bytes]
 _RESTART_DELAY = 1.0  # [s]
 _STOP_TIMEOUT = 1.0  # [s]
-_SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
 
 
 @dataclass(frozen=True)
@@ -241,7 +238,7 @@ def _prepared(note: dict[str, Any], handle: int) -> Prepared:
     return Prepared(
         id=note["id"],
         name=note["name"],
-        arrays=_map(handle, note["arrays"]),
+        arrays=map_shared(handle, note["arrays"]),
         ranges=note["ranges"],
         effects=tuple(note["effects"]),
         cloud_divisor=note["cloud_divisor"],
@@ -267,47 +264,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-# --- Arrays in shared memory -----------------------------------------------------------------
-
-
-def share(arrays: dict[str, np.ndarray]) -> tuple[int, list[dict[str, Any]]]:
-    """Copy arrays into sealed anonymous shared memory; returns its handle and a table of contents.
-
-    Sealed: neither side can change or shorten it afterwards, so a fault in one cannot reach the
-    other through it.
-    """
-    contents = []
-    end = 0
-    for name, values in arrays.items():
-        start = -(-end // _ALIGNMENT) * _ALIGNMENT
-        end = start + values.nbytes
-        contents.append(
-            {"name": name, "start": start, "shape": values.shape, "dtype": values.dtype.str}
-        )
-    handle = os.memfd_create("avatar-model", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    os.ftruncate(handle, max(end, 1))
-    with mmap.mmap(handle, max(end, 1)) as memory:
-        for entry, values in zip(contents, arrays.values(), strict=True):
-            _view(memory, entry)[...] = values
-    fcntl.fcntl(handle, fcntl.F_ADD_SEALS, _SEALS)
-    return handle, contents
-
-
-def _map(handle: int, contents: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Map shared arrays, private to this process, with all pages present; closes the handle."""
-    try:
-        # Writable, but a private copy: jitted code compiled for ordinary arrays accepts it.
-        memory = mmap.mmap(handle, 0, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE)
-    finally:
-        os.close(handle)
-    realtime.bring_into_memory(np.frombuffer(memory, dtype=np.uint8))
-    return {entry["name"]: _view(memory, entry) for entry in contents}
-
-
-def _view(memory: mmap.mmap, entry: dict[str, Any]) -> np.ndarray:
-    return np.ndarray(tuple(entry["shape"]), entry["dtype"], memory, entry["start"])
 
 
 # --- The receiving process -------------------------------------------------------------------
@@ -418,7 +374,7 @@ class Receiver:
         try:
             # Compiles the step for these effects, if that was never done on this machine, from
             # arrays as the node will map them: it then finds the same types in numba's cache.
-            model = make_model(Layout.of(_map(os.dup(handle), contents)), halves=True)
+            model = make_model(Layout.of(map_shared(os.dup(handle), contents)), halves=True)
             note["curve"] = self._budgets.curve(plan, detail)
             self._send(note, handle)
         finally:

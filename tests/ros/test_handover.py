@@ -15,7 +15,8 @@ import pytest
 
 pytest.importorskip("avatar_ros.handover", reason="avatar_ros is not installed")
 
-from avatar_ros.handover import Order, _map, share
+from avatar_ros.handover import Order
+from avatar_ros.shared_arrays import map_shared, share
 
 pytestmark = pytest.mark.ros
 
@@ -32,7 +33,7 @@ def _arrays() -> dict[str, np.ndarray]:
 
 def test_arrays_arrive_as_they_were() -> None:
     sent = _arrays()
-    received = _map(*share(sent))
+    received = map_shared(*share(sent))
     for name, values in sent.items():
         np.testing.assert_array_equal(received[name], values)
         assert received[name].dtype == values.dtype
