@@ -430,7 +430,7 @@ def _never_called(message: bytes) -> None:
 
 
 def main() -> int:
-    return run(ContactNode)
+    return run(ContactNode, keeps_time=True)
 
 
 if __name__ == "__main__":

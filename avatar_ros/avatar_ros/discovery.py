@@ -1,23 +1,36 @@
-"""Who reaches a node: this machine only, unless the user says otherwise.
+"""Who reaches a node, and by which way: this machine only, unless the user says otherwise.
 
 Nothing in this project authenticates anybody. Who wants other machines to take part exports
 ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET; see msg_docs/security.md.
+
+What must keep time does without shared memory. With it, Fast DDS looks whether the port of a
+process that joins is alive (``Port::healthy_check``), now and then sleeps a third of a second until
+it is, and holds a lock meanwhile that all publishers need: the contact loop stood still in 3 of 40
+starts of another node. Over the loopback a wrench comes as soon. Large messages, as vademecums,
+need shared memory: on a crowded machine UDP loses parts of them faster than it sends them again.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import MutableMapping
+from collections.abc import Iterator, MutableMapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from avatar_core.errors import AvatarError
 
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 LOCAL = "LOCALHOST"
+BY_PROFILE = "SYSTEM_DEFAULT"  # the range is what the profile says; LOCALHOST adds shared memory
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"  # as Fast DDS 2 reads it
 _OTHER_PROFILES = "FASTDDS_DEFAULT_PROFILES_FILE"  # from Fast DDS 3 on
+TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # where no profile names them
 _PEERS = "ROS_STATIC_PEERS"
-_PROFILE = Path("share", "avatar_ros", "params", "this_machine_only.xml")  # below a prefix
+_MIDDLEWARE = "RMW_IMPLEMENTATION"
+_FAST_DDS = "rmw_fastrtps"  # of several kinds; another reads neither profile nor transports
+_PARAMS = Path("share", "avatar_ros", "params")  # below a prefix
+_LOCAL_PROFILE = "this_machine_only.xml"
+_UDP_PROFILE = "this_machine_udp.xml"
 
 
 class DiscoveryError(AvatarError):
@@ -39,11 +52,39 @@ def stay_local(environment: MutableMapping[str, str] = os.environ) -> None:
     if environment.setdefault(RANGE, LOCAL) != LOCAL or environment.get(_PEERS):
         return
     if PROFILES not in environment and _OTHER_PROFILES not in environment:
-        environment[PROFILES] = environment[_OTHER_PROFILES] = str(_profile())
+        environment[PROFILES] = environment[_OTHER_PROFILES] = str(_profile(_LOCAL_PROFILE))
 
 
-def _profile() -> Path:
+@contextmanager
+def udp_alone(environment: MutableMapping[str, str] = os.environ) -> Iterator[None]:
+    """While a node is made that must keep time; processes that it starts later are not affected.
+
+    After ``stay_local``. A profile or transports of the user's own stay as they are, and so does
+    what another middleware than Fast DDS is given.
+
+    Raises
+    ------
+    DiscoveryError
+        If the profile is not installed.
+    """
+    names = (RANGE, PROFILES, _OTHER_PROFILES, TRANSPORTS)
+    before = {name: environment[name] for name in names if name in environment}
+    if environment.get(_MIDDLEWARE, _FAST_DDS).startswith(_FAST_DDS):
+        if environment.get(PROFILES) == str(_profile(_LOCAL_PROFILE)):
+            environment[PROFILES] = environment[_OTHER_PROFILES] = str(_profile(_UDP_PROFILE))
+            environment[RANGE] = BY_PROFILE
+        else:
+            environment.setdefault(TRANSPORTS, "UDPv4")
+    try:
+        yield
+    finally:
+        for name in names:
+            environment.pop(name, None)
+        environment.update(before)
+
+
+def _profile(name: str) -> Path:
     for prefix in Path(__file__).parents:
-        if (prefix / _PROFILE).is_file():
-            return prefix / _PROFILE
-    raise DiscoveryError(f"no {_PROFILE} above {__file__}; install avatar_ros again")
+        if (prefix / _PARAMS / name).is_file():
+            return prefix / _PARAMS / name
+    raise DiscoveryError(f"no {_PARAMS / name} above {__file__}; install avatar_ros again")

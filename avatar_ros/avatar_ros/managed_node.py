@@ -8,6 +8,7 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -135,8 +136,10 @@ def spin_until(stop: StopSignal, node: Node) -> None:
         rclpy.try_shutdown()
 
 
-def run(make_node: Callable[[], ManagedNode]) -> int:
+def run(make_node: Callable[[], ManagedNode], keeps_time: bool = False) -> int:
     """Bring a node up, spin it until SIGINT or SIGTERM, take it down; returns the exit code.
+
+    keeps_time : no other process may hold up what it publishes
 
     The signal handlers of rclpy are not used: they pull the middleware away from under a loop
     that still has a last message to send.
@@ -144,8 +147,10 @@ def run(make_node: Callable[[], ManagedNode]) -> int:
     stop = StopSignal()
     try:
         discovery.stay_local()
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        return _live(make_node(), stop)
+        with discovery.udp_alone() if keeps_time else nullcontext():
+            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+            node = make_node()
+        return _live(node, stop)
     except (ParameterError, AvatarError) as error:
         print(error, file=sys.stderr)
         return 1

@@ -27,18 +27,21 @@ from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.steady_tool import SWING
 
 MOST = 5.0  # [N], the limit that the contact node is given
+_ORDINARY_GAP = 2e-3  # between two wrenches, at most [s]
 _CALM = 0.3  # of ordinary palpation, that counts as recovered [s]
 _PATIENCE = 20.0  # for it [s]
 
 
 @dataclass
 class Harm:
-    """What a fault came to; times in seconds.
+    """What a fault came to; times in seconds, of sending.
 
     recovery : from its end to ordinary palpation; infinite where it never came
     largest : force sent [N]; finite : whether all numbers sent were
-    longest_gap : between two wrenches while it lasted
-    after : largest force from 30 ms after its begin to its end, where there must be none
+    longest_gap : between two wrenches that were heard while it lasted
+    longest_period : of the loop, as it measured itself
+    silent_after : from the tool's end to the last force before its return; NaN if it went on
+    late : what the loop was kept from running meanwhile, in the first tenth of a second
     """
 
     name: str
@@ -49,19 +52,38 @@ class Harm:
     missed: int
     periods: int
     longest_gap: float
-    after: float
+    longest_period: float
+    silent_after: float
+    late: float
 
     def row(self) -> str:
-        silent = f", at most {self.after:.3g} N from 30 ms on" if np.isfinite(self.after) else ""
+        silent = (
+            f", the last force {1e3 * self.silent_after:.1f} ms after the tool's end "
+            f"(the loop lost {1e3 * self.late:.1f} ms)"
+            if np.isfinite(self.silent_after)
+            else ""
+        )
         return (
             f"{self.name}: {self.wrenches} wrenches of at most {self.largest:.2f} N{silent}, "
-            f"{self.missed} of {self.periods} periods missed, longest gap "
+            f"{self.missed} of {self.periods} periods missed, longest "
+            f"{1e3 * self.longest_period:.1f} ms, longest gap heard "
             f"{1e3 * self.longest_gap:.1f} ms, recovered in {self.recovery:.2f} s"
         )
 
 
+@dataclass(frozen=True)
+class Silence:
+    """When no tool was there [s]."""
+
+    begin: float
+    end: float
+
+
 class Ear:
-    """Hears every wrench and every window of statistics, in a thread of its own."""
+    """Hears every wrench and every window of statistics, in a thread of its own.
+
+    Times are those of sending: on a crowded machine the ear itself comes late.
+    """
 
     def __init__(self) -> None:
         self.heard: list[tuple[float, bytes]] = []
@@ -76,7 +98,7 @@ class Ear:
         self._node.create_subscription(
             WrenchStamped,
             "tool/spatial/servo_cf",
-            lambda raw: self.heard.append((time.monotonic(), raw)),
+            lambda raw, info: self.heard.append((_sent(info), raw)),
             every,
             raw=True,
         )
@@ -86,8 +108,8 @@ class Ear:
         self._node.create_subscription(
             ContactState,
             "contact_state",
-            lambda s: self.statuses.append((time.monotonic(), s.status, s.vademecum_id)),
-            qos.NEWEST,
+            lambda s, info: self.statuses.append((_sent(info), s.status, s.vademecum_id)),
+            every,
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -109,6 +131,11 @@ class Ear:
         found = [deserialize_message(raw, WrenchStamped).wrench.force for _, raw in chosen]
         times = np.array([at for at, _ in chosen])
         return times, np.array([[f.x, f.y, f.z] for f in found]).reshape(-1, 3)
+
+
+def _sent(info: dict[str, int]) -> float:
+    """By the monotonic clock [s]."""
+    return time.monotonic() - 1e-9 * (time.time_ns() - info["source_timestamp"])
 
 
 class FaultCell:
@@ -173,13 +200,15 @@ class FaultCell:
         self.ear.close()
 
     @contextmanager
-    def stopped(self, name: str, seconds: float) -> Iterator[None]:
-        """SIGSTOP for a while."""
+    def stopped(self, name: str, seconds: float) -> Iterator[float]:
+        """SIGSTOP for a while; gives when it stood still."""
         pid = self.processes[name].pid
         os.kill(pid, signal.SIGSTOP)
+        os.waitid(os.P_PID, pid, os.WSTOPPED)
+        begin = time.monotonic()
         try:
             time.sleep(seconds)
-            yield
+            yield begin
         finally:
             os.kill(pid, signal.SIGCONT)
 
@@ -207,21 +236,18 @@ class FaultCell:
                 return max(heard[0][0] - begin, 0.0) if since > begin else 0.0
         return float("inf")
 
-    def suffer(
-        self, name: str, fault: Callable[[FaultCell], Any], must_be_silent: bool = False
-    ) -> Harm:
+    def suffer(self, name: str, fault: Callable[[FaultCell], Silence | None]) -> Harm:
         """Inject a fault while the tool palpates, and see what was sent and when it is over."""
         assert np.isfinite(self.wait_until_it_palpates(time.monotonic(), 120.0)), name
         self.ear.heard.clear()
         self.ear.statuses.clear()
         self.ear.windows.clear()
         begin = time.monotonic()
-        ended = fault(self)
-        end = ended if isinstance(ended, float) else time.monotonic()
-        recovery = self.wait_until_it_palpates(end)
+        silence = fault(self)
+        recovery = self.wait_until_it_palpates(silence.end if silence else time.monotonic())
         times, forces = self.ear.forces(begin, time.monotonic())
         sizes = np.linalg.norm(forces, axis=1)
-        during = sizes[(times > begin + 0.03) & (times < end)] if must_be_silent else np.array([])
+        silent_after, late = _silent_after(silence, times, sizes)
         return Harm(
             name,
             recovery,
@@ -231,5 +257,19 @@ class FaultCell:
             sum(w.missed for w in self.ear.windows),
             sum(w.periods for w in self.ear.windows),
             float(np.diff(times).max(initial=0.0)),
-            float(during.max(initial=0.0)) if must_be_silent else float("nan"),
+            max((w.period_max for w in self.ear.windows), default=0.0),
+            silent_after,
+            late,
         )
+
+
+def _silent_after(
+    silence: Silence | None, times: np.ndarray, sizes: np.ndarray
+) -> tuple[float, float]:
+    """The fields of ``Harm`` of these names; ``sizes`` are of the forces sent at ``times``."""
+    if silence is None:
+        return float("nan"), 0.0
+    felt = times[(times > silence.begin) & (times < silence.end) & (sizes > 0.0)]
+    first = times[(times > silence.begin) & (times < silence.begin + 0.1)]
+    lost = np.clip(np.diff(first) - _ORDINARY_GAP, 0.0, None)
+    return float(felt.max(initial=silence.begin) - silence.begin), float(lost.sum())

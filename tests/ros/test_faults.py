@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,7 +26,7 @@ from rcl_interfaces.srv import SetParameters
 from avatar_core.storage import save_vademecum
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.ros.conftest import Probe
-from tests.ros.fault_cell import MOST, FaultCell, Harm
+from tests.ros.fault_cell import MOST, FaultCell, Harm, Silence
 from tests.ros.test_patient_interpolation import folder, livers
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]
@@ -32,6 +34,14 @@ __all__ = ["folder", "livers"]  # fixtures
 
 STOPPED = 2.0  # [s]
 RECOVERY = 1.0  # [s]
+JOINING = 30  # processes
+JOIN = """
+import time, rclpy
+rclpy.init()
+node = rclpy.create_node("passer_by")
+time.sleep(0.4)
+"""
+SILENT_AFTER = 30e-3  # a pose is stale, and the force gone: 20 ms and 10 ms [s]
 
 
 @pytest.fixture(scope="module")
@@ -103,22 +113,23 @@ def test_another_process_is_killed(tool: FaultCell, name: str) -> None:
 
 
 def test_the_tool_is_killed(tool: FaultCell) -> None:
-    def kill(cell: FaultCell) -> float:
+    def kill(cell: FaultCell) -> Silence:
         cell.end("tool")
+        begin = time.monotonic()
         time.sleep(1.0)
         silent = time.monotonic()
         cell.start("tool")  # takes a second or so to send its first pose
-        return cell.heard_from_tool(silent)
+        return Silence(begin, cell.heard_from_tool(silent))
 
-    harm = tool.suffer("kill -9 of the tool", kill, must_be_silent=True)
+    harm = tool.suffer("kill -9 of the tool", kill)
     accept(harm)
-    assert harm.after == 0.0
+    assert harm.silent_after <= SILENT_AFTER + harm.late
 
 
 def test_the_contact_node_is_killed(tool: FaultCell) -> None:
     """Nobody can send a zero then; once it is back, it goes on softly with what was loaded."""
 
-    def kill(cell: FaultCell) -> float:
+    def kill(cell: FaultCell) -> None:
         identity = cell.ear.statuses[-1][2] if cell.ear.statuses else ""
         cell.end("contact")
         cell.ear.statuses.clear()
@@ -126,7 +137,6 @@ def test_the_contact_node_is_killed(tool: FaultCell) -> None:
         while not (cell.ear.statuses and cell.ear.statuses[-1][2]):
             time.sleep(0.01)
         assert identity in ("", cell.ear.statuses[-1][2])
-        return time.monotonic()
 
     accept(tool.suffer("kill -9 of contact, from its first vademecum on", kill))
 
@@ -143,13 +153,13 @@ def test_another_process_is_stopped(tool: FaultCell, name: str) -> None:
 
 
 def test_the_tool_is_stopped(tool: FaultCell) -> None:
-    def stop(cell: FaultCell) -> float:
-        with cell.stopped("tool", STOPPED):
-            return time.monotonic()
+    def stop(cell: FaultCell) -> Silence:
+        with cell.stopped("tool", STOPPED) as begin:
+            return Silence(begin, time.monotonic())
 
-    harm = tool.suffer(f"SIGSTOP of the tool for {STOPPED:g} s", stop, must_be_silent=True)
+    harm = tool.suffer(f"SIGSTOP of the tool for {STOPPED:g} s", stop)
     accept(harm)
-    assert harm.after == 0.0
+    assert harm.silent_after <= SILENT_AFTER + harm.late
 
 
 def test_the_contact_node_is_stopped(tool: FaultCell) -> None:
@@ -158,6 +168,20 @@ def test_the_contact_node_is_stopped(tool: FaultCell) -> None:
             pass
 
     accept(tool.suffer(f"SIGSTOP of contact for {STOPPED:g} s", stop))
+
+
+def test_processes_join(tool: FaultCell, own_domain: dict[str, str]) -> None:
+    """Any ROS process of the same machine, with the middleware's own settings."""
+
+    def join(cell: FaultCell) -> None:
+        for _ in range(JOINING):
+            joined = subprocess.Popen([sys.executable, "-c", JOIN], cwd="/", env=own_domain)
+            assert joined.wait(30.0) == 0
+
+    harm = tool.suffer(f"{JOINING} processes join", join)
+    accept(harm)
+    # tells a loop that goes on from one that waits a third of a second for a look at them
+    assert harm.longest_period < 0.2
 
 
 # --- Files, requests, parameters ----------------------------------------------------------------

@@ -17,7 +17,15 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.discovery import LOCAL, PROFILES, RANGE, stay_local
+from avatar_ros.discovery import (
+    BY_PROFILE,
+    LOCAL,
+    PROFILES,
+    RANGE,
+    TRANSPORTS,
+    stay_local,
+    udp_alone,
+)
 from lifecycle_msgs.srv import GetState
 
 pytestmark = pytest.mark.ros
@@ -55,9 +63,36 @@ def test_a_node_stays_local_unless_told_otherwise() -> None:
     assert own == {PROFILES: "/own.xml", RANGE: LOCAL}
 
 
+def test_what_keeps_time_has_udp_alone_and_leaves_no_trace() -> None:
+    environment: dict[str, str] = {}
+    stay_local(environment)
+    before = dict(environment)
+    with udp_alone(environment):
+        assert environment[RANGE] == BY_PROFILE
+        profile = Path(environment[PROFILES]).read_text()
+        assert "127.0.0.1" in profile and "<type>SHM" not in profile
+    assert environment == before
+
+
+@pytest.mark.parametrize(
+    ("told", "added"),
+    [
+        ({RANGE: "SUBNET"}, {TRANSPORTS: "UDPv4"}),
+        ({RANGE: "SUBNET", TRANSPORTS: "LARGE_DATA"}, {}),
+        ({RANGE: LOCAL, "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, {}),
+    ],
+    ids=["subnet", "transports", "middleware"],
+)
+def test_udp_alone_leaves_what_the_user_chose(told: dict[str, str], added: dict[str, str]) -> None:
+    environment = dict(told)
+    with udp_alone(environment):
+        assert environment == told | added
+    assert environment == told
+
+
 def _plain(environment: dict[str, str]) -> dict[str, str]:
     """As a user's shell: nothing is said about who may take part."""
-    kept = {k: v for k, v in environment.items() if k not in (RANGE, PROFILES)}
+    kept = {k: v for k, v in environment.items() if k not in (RANGE, PROFILES, TRANSPORTS)}
     return {k: v for k, v in kept.items() if k != "FASTDDS_DEFAULT_PROFILES_FILE"}
 
 
@@ -83,11 +118,24 @@ def _listening(pid: int) -> set[str]:
     return {address for address, port in found if first <= port < first + 250}
 
 
-def test_a_node_receives_on_the_loopback_alone(own_domain: dict[str, str], probe: Any) -> None:
-    node = subprocess.Popen(NODE, env=_plain(own_domain), cwd="/")
+def _threads(pid: int) -> str:
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return " ".join(sorted((task / "comm").read_text().strip() for task in tasks))
+
+
+@pytest.mark.parametrize(
+    ("name", "shared_memory"), [("vademecum_loader", True), ("contact", False)]
+)
+def test_a_node_receives_on_the_loopback_alone(
+    own_domain: dict[str, str], probe: Any, name: str, shared_memory: bool
+) -> None:
+    """And the one that keeps time through no shared memory."""
+    command = [sys.executable, "-m", f"avatar_ros.{name}"]
+    node = subprocess.Popen(command, env=_plain(own_domain), cwd="/")
     try:
-        probe.ask(GetState, "vademecum_loader/get_state", GetState.Request())  # it is heard here
+        probe.ask(GetState, f"{name}/get_state", GetState.Request())  # it is heard here
         assert _listening(node.pid) == {"127.0.0.1"}
+        assert ("dds.shm" in _threads(node.pid)) == shared_memory
     finally:
         node.terminate()
         assert node.wait(10.0) == 0
