@@ -6,8 +6,8 @@ ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET; see msg_docs/security.md.
 What must keep time does without shared memory. With it, Fast DDS looks whether the port of a
 process that joins is alive (``Port::healthy_check``), now and then sleeps a third of a second until
 it is, and holds a lock meanwhile that all publishers need: the contact loop stood still in 3 of 40
-starts of another node. Over the loopback a wrench comes as soon. Large messages, as vademecums,
-need shared memory: on a crowded machine UDP loses parts of them faster than it sends them again.
+starts of another node. Over the loopback a wrench comes as soon. The other nodes keep it, for
+vademecums of 50 MB.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"  # as Fast DDS 2 reads it
 _OTHER_PROFILES = "FASTDDS_DEFAULT_PROFILES_FILE"  # from Fast DDS 3 on
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # where no profile names them
 _PEERS = "ROS_STATIC_PEERS"
-_MIDDLEWARE = "RMW_IMPLEMENTATION"
 _FAST_DDS = "rmw_fastrtps"  # of several kinds; another reads neither profile nor transports
 _PARAMS = Path("share", "avatar_ros", "params")  # below a prefix
 _LOCAL_PROFILE = "this_machine_only.xml"
@@ -56,11 +55,15 @@ def stay_local(environment: MutableMapping[str, str] = os.environ) -> None:
 
 
 @contextmanager
-def udp_alone(environment: MutableMapping[str, str] = os.environ) -> Iterator[None]:
+def udp_alone(
+    middleware: str, environment: MutableMapping[str, str] = os.environ
+) -> Iterator[None]:
     """While a node is made that must keep time; processes that it starts later are not affected.
 
     After ``stay_local``. A profile or transports of the user's own stay as they are, and so does
-    what another middleware than Fast DDS is given.
+    what another middleware than Fast DDS is given: the range LOCALHOST is all that it obeys.
+
+    middleware : identifier of the one in use, as ``rmw_fastrtps_cpp``
 
     Raises
     ------
@@ -69,11 +72,11 @@ def udp_alone(environment: MutableMapping[str, str] = os.environ) -> Iterator[No
     """
     names = (RANGE, PROFILES, _OTHER_PROFILES, TRANSPORTS)
     before = {name: environment[name] for name in names if name in environment}
-    if environment.get(_MIDDLEWARE, _FAST_DDS).startswith(_FAST_DDS):
+    if middleware.startswith(_FAST_DDS):
         if environment.get(PROFILES) == str(_profile(_LOCAL_PROFILE)):
             environment[PROFILES] = environment[_OTHER_PROFILES] = str(_profile(_UDP_PROFILE))
             environment[RANGE] = BY_PROFILE
-        else:
+        elif PROFILES not in environment and _OTHER_PROFILES not in environment:
             environment.setdefault(TRANSPORTS, "UDPv4")
     try:
         yield

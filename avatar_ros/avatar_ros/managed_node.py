@@ -15,6 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import get_rmw_implementation_identifier
 
 from avatar_core.errors import AvatarError
 from avatar_ros import discovery
@@ -147,7 +148,8 @@ def run(make_node: Callable[[], ManagedNode], keeps_time: bool = False) -> int:
     stop = StopSignal()
     try:
         discovery.stay_local()
-        with discovery.udp_alone() if keeps_time else nullcontext():
+        middleware = get_rmw_implementation_identifier()
+        with discovery.udp_alone(middleware) if keeps_time else nullcontext():
             rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
             node = make_node()
         return _live(node, stop)

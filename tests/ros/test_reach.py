@@ -30,6 +30,7 @@ from lifecycle_msgs.srv import GetState
 
 pytestmark = pytest.mark.ros
 
+FAST_DDS = "rmw_fastrtps_cpp"
 NODE = [sys.executable, "-m", "avatar_ros.vademecum_loader"]
 LISTENING = 8.0  # a peer that is answered is answered in 2 s [s]
 HEARD = """
@@ -67,7 +68,7 @@ def test_what_keeps_time_has_udp_alone_and_leaves_no_trace() -> None:
     environment: dict[str, str] = {}
     stay_local(environment)
     before = dict(environment)
-    with udp_alone(environment):
+    with udp_alone(FAST_DDS, environment):
         assert environment[RANGE] == BY_PROFILE
         profile = Path(environment[PROFILES]).read_text()
         assert "127.0.0.1" in profile and "<type>SHM" not in profile
@@ -75,19 +76,31 @@ def test_what_keeps_time_has_udp_alone_and_leaves_no_trace() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "added"),
+    ("middleware", "told", "added"),
     [
-        ({RANGE: "SUBNET"}, {TRANSPORTS: "UDPv4"}),
-        ({RANGE: "SUBNET", TRANSPORTS: "LARGE_DATA"}, {}),
-        ({RANGE: LOCAL, "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, {}),
+        (FAST_DDS, {RANGE: "SUBNET"}, {TRANSPORTS: "UDPv4"}),
+        (FAST_DDS, {RANGE: "SUBNET", TRANSPORTS: "LARGE_DATA"}, {}),
+        (FAST_DDS, {RANGE: LOCAL, PROFILES: "/own.xml"}, {}),
+        ("rmw_cyclonedds_cpp", {RANGE: LOCAL}, {}),
     ],
-    ids=["subnet", "transports", "middleware"],
+    ids=["subnet", "transports", "profile", "middleware"],
 )
-def test_udp_alone_leaves_what_the_user_chose(told: dict[str, str], added: dict[str, str]) -> None:
+def test_udp_alone_leaves_what_the_user_chose(
+    middleware: str, told: dict[str, str], added: dict[str, str]
+) -> None:
     environment = dict(told)
-    with udp_alone(environment):
+    with udp_alone(middleware, environment):
         assert environment == told | added
     assert environment == told
+
+
+@pytest.mark.parametrize("middleware", ["rmw_cyclonedds_cpp", "rmw_zenoh_cpp"])
+def test_another_middleware_stays_on_this_machine(middleware: str) -> None:
+    """It reads no profile: without the range, everybody would hear it."""
+    environment: dict[str, str] = {}
+    stay_local(environment)
+    with udp_alone(middleware, environment):
+        assert environment[RANGE] == LOCAL
 
 
 def _plain(environment: dict[str, str]) -> dict[str, str]:
