@@ -211,7 +211,8 @@ def _sweep(state, reply, several, large, friction):  # type: ignore[no-untyped-d
     """Gauss-Seidel over the tips, the normal and then the tangential force of each."""
     for sweep in range(MAX_SWEEPS):
         if several is not None and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
-            approach(state, reply, several, large, friction)
+            start = (sweep // PATIENCE) % (state.passage.shape[0] + 1)
+            approach(state, reply, several, large, friction, start)
         worst = 0.0
         for t in range(state.passage.shape[0]):
             if state.active[t]:

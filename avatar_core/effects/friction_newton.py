@@ -7,7 +7,9 @@ to tip change these shares little. The pushes sought are where each projection c
 
 D the disc of radius mu a, c_n and c_t the tip's own compliances, w its gap; that is solved in all
 directions of all tips at once (Alart & Curnier, CMAME 92:353, 1991). Far from the solution Newton's
-steps may lead away: of a few, those are kept that come nearest.
+steps may lead away: of a few, those are kept that come nearest. Of two tips in nearly one place one
+may have to give its whole push to the other, which steps from the present pushes do not find; so
+they are tried from each tip alone as well.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import numpy as np
 from avatar_core.effects.large_deformation import bend
 from avatar_core.step_code import fast, inlined
 
-STEPS = 6
+STEPS = 7
 LEAST_PIVOT = 1e-9
 
 
@@ -36,8 +38,11 @@ def displaced(state, reply, several, friction, t):  # type: ignore[no-untyped-de
 
 
 @inlined
-def approach(state, reply, several, large, friction):  # type: ignore[no-untyped-def]
-    """Bring all pushes nearer to the solution, or leave them."""
+def approach(state, reply, several, large, friction, start):  # type: ignore[no-untyped-def]
+    """Bring all pushes nearer to the solution, or leave them.
+
+    start : 0 from the present pushes, t from the t-th tip alone
+    """
     push, best, n_tools = friction.push, friction.best, state.passage.shape[0]
     least = np.inf
     for k in range(STEPS + 1):
@@ -49,7 +54,9 @@ def approach(state, reply, several, large, friction):  # type: ignore[no-untyped
             for t in range(n_tools):
                 for d in range(3):
                     best[t, d] = push[t, d]
-        if k < STEPS:
+        if k == 0 and start > 0 and state.active[start - 1]:
+            _push_alone(state, reply, friction, start - 1)
+        elif k < STEPS:
             _eliminate(friction.matrix, friction.side)
             for t in range(n_tools):
                 for d in range(3):
@@ -59,6 +66,25 @@ def approach(state, reply, several, large, friction):  # type: ignore[no-untyped
             push[t, d] = best[t, d]
         n, g = state.normal[t], push[t]
         state.force[t] = max(0.0, -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2]))
+
+
+@inlined
+def _push_alone(state, reply, friction, t):  # type: ignore[no-untyped-def]
+    """What a tip pushes if no other touches and it is dragged at its limit."""
+    n, y, c = state.normal[t], friction.asked[t], friction.compliance[t, t]
+    gap, stiff, along = state.gap[t], 0.0, 0.0
+    for i in range(3):
+        gap -= n[i] * reply.lifted[t, i]
+        stiff += n[i] * (c[i, 0] * n[0] + c[i, 1] * n[1] + c[i, 2] * n[2])
+        along += y[i] * n[i]
+    across = 0.0
+    for i in range(3):
+        across += (y[i] - along * n[i]) ** 2
+    force = max(0.0, -gap / stiff)
+    drag = friction.limit[t] / np.sqrt(across) if across > 0.0 else 0.0
+    friction.push[:] = 0.0
+    for i in range(3):
+        friction.push[t, i] = force * (drag * (y[i] - along * n[i]) - n[i])
 
 
 @inlined

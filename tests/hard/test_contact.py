@@ -265,8 +265,8 @@ def test_tools_side_by_side_with_friction_converge(mu: float, figure: Figure) ->
                 across = np.linalg.norm(push + pressed[:, None] * normal, axis=1)
                 assert (across <= mu * pressed * (1.0 + 1e-9) + 1e-12).all()
                 assert np.linalg.norm(push, axis=1).max() < 25.0
-    # neither sweeps nor Newton's steps settle some changes from stick to slip: documented, rare
-    assert lost <= 0.003 * n
+    # the solution of some changes from stick to slip is not found: documented, rare
+    assert lost <= 0.001 * n
     figure(f"mu {mu}: {lost} of {n} steps not converged")
 
 
