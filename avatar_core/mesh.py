@@ -183,9 +183,7 @@ def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
     """
     if n_vertices < 50:
         raise MeshError(f"{n_vertices} vertices are too few for an organ; ask for at least 50")
-    # A mesh of edge h holds about c V / h^3 vertices; c was fitted at ~3,000 vertices, where a
-    # third of them lie on the surface, and shifts a little with size: hence a second try.
-    edge = 0.0973 * (surface.volume * 2850.0 / n_vertices) ** (1.0 / 3.0)
+    edge = first_edge(surface.volume, n_vertices)
     for _ in range(3):
         mesh = _fill(surface, edge)
         ratio = len(mesh.vertices) / n_vertices
@@ -199,6 +197,15 @@ def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
             "remove faces inside the organ, or ask for more vertices"
         )
     return mesh
+
+
+def first_edge(volume: float, n_vertices: int) -> float:
+    """The edge [m] to try first: a mesh of edge h holds about c V / h^3 vertices.
+
+    c was fitted at some 3,000 vertices, where a third of them lie on the surface, and shifts a
+    little with size: hence a second try.
+    """
+    return float(0.0973 * (volume * 2850.0 / n_vertices) ** (1.0 / 3.0))
 
 
 def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before numpy: where tests run side by side, one thread each.
@@ -10,8 +11,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+from hypothesis import settings
 
-from avatar_core import loads
+from avatar_core import loads, mesh
 from avatar_core.build_rule import BuildRule
 from avatar_core.large_build import hyperelastic_problem, with_large_deformation
 from avatar_core.organ import OrganOptions, vademecum_of
@@ -19,7 +21,21 @@ from avatar_core.phantom import phantom_liver
 from avatar_core.surface import SurfaceMesh
 from avatar_core.vademecum import Vademecum
 
+from .recorded_meshes import recorded
+
+# The same examples in every run; `--hypothesis-profile=default` looks for new ones.
+settings.register_profile("same", deadline=None, derandomize=True)
+settings.load_profile("same")
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def same_meshes() -> Iterator[None]:
+    """The same meshes of the built-in liver in every run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mesh, "_fill", recorded(mesh._fill))
+        yield
 
 
 @pytest.fixture(scope="session")
