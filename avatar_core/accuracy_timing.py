@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from avatar_core.accuracy import AccuracyCurve, CurvePoint, Detail
-from avatar_core.contact import PERIOD, ContactModel, deform, lay_out, make_model, solve, step
+from avatar_core.contact import ContactModel, deform, make_model, solve, step
+from avatar_core.contact_layout import PERIOD, lay_out
 from avatar_core.effects.base import Effect
 from avatar_core.study import processor
 from avatar_core.tool_path import slide, starts_apart

@@ -20,6 +20,7 @@ from avatar_core.effects import several_tools as coupling
 from avatar_core.elasticity import Elasticity
 from avatar_core.loads import patch_loads
 from avatar_core.near_field import LocalBlocks
+from avatar_core.tip_compliance import assemble_own, near_along_normal
 from avatar_core.tool_path import slide, starts_apart
 from avatar_core.vademecum import Vademecum
 
@@ -187,8 +188,8 @@ def _dense_step(model, state, out, tips, reply, several, columns, compliance):  
             state.force[t] = 0.0
             continue
         _dense_column(state, t, t, compliance, state.column[t])
-        near = kernels.near_along_normal(state, t, state.column[t])
-        kernels.assemble_own(model, state, t, near)
+        near = near_along_normal(state, t, state.column[t])
+        assemble_own(model, state, t, near)
     if several is not None:
         for t in range(n_tools):
             for s in range(n_tools):

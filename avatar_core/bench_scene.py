@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avatar_core.bench import PASSES, one_pass
-from avatar_core.contact import ContactModel, lay_out, make_model, step
+from avatar_core.contact import ContactModel, make_model, step
+from avatar_core.contact_layout import lay_out
 from avatar_core.parametric import at_values
 from avatar_core.scene import Scene
 from avatar_core.tool_path import push_and_slide, starts_apart

@@ -26,7 +26,7 @@ _FADE = 0.5  # a shortened near field begins to fade at this part of its radius
 
 
 class CloudArrays(NamedTuple):
-    """The arrays of the same names in :class:`avatar_core.contact.Layout`, and where from.
+    """The arrays of the same names in :class:`avatar_core.contact_layout.Layout`, and where from.
 
     points : vertices of the mesh that are shown
     fade : factor of each block of the vademecum's near field; zero where it is left out

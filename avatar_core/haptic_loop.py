@@ -18,7 +18,7 @@ from numba import njit
 from scipy.linalg import expm
 
 from avatar_core.compact import FloatArray
-from avatar_core.contact import PERIOD
+from avatar_core.contact_layout import PERIOD
 from avatar_core.passivity import Passivity, limit
 
 FLOWN_OFF = 1.0  # [m] from the organ's surface, where a run ends

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
-from avatar_core.contact import TIP_RADIUS_RANGE, Cloud
+from avatar_core.cloud_arrays import Cloud
 from avatar_core.contact_kernels import MAX_TOOLS
+from avatar_core.contact_layout import TIP_RADIUS_RANGE
 from avatar_core.coordinates import require_known
 from avatar_core.effects import Effect
 from avatar_core.errors import CoordinateError, SceneError

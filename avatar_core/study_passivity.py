@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.compact import FloatArray
-from avatar_core.contact import PERIOD
+from avatar_core.contact_layout import PERIOD
 from avatar_core.haptic_loop import Device, Loop, expected_border, run_loop, stability_border
 from avatar_core.passivity import Passivity, make_passivity
 from avatar_core.study import Study, Value, follow

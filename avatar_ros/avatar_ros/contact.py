@@ -27,6 +27,7 @@ from sensor_msgs.msg import PointCloud2
 
 from avatar_core import contact, passivity
 from avatar_core.accuracy import AccuracyCurve, Budget
+from avatar_core.contact_layout import Layout
 from avatar_core.errors import AccuracyError, SceneError, one_line
 from avatar_ros import diagnostics, parameters, qos, realtime, scenes
 from avatar_ros.accuracy import Accuracy, Report
@@ -197,7 +198,7 @@ class ContactNode(ManagedNode):
         loop = self._loop
         if loop is None:
             return
-        model = contact.make_model(contact.Layout.of(prepared.arrays), halves=True)
+        model = contact.make_model(Layout.of(prepared.arrays), halves=True)
         replaced = loop.online
         self._ranges = prepared.ranges
         curve = AccuracyCurve.of_plain(prepared.curve) if prepared.curve else None

@@ -36,7 +36,7 @@ from avatar_ros.reader import Reader
 from avatar_ros.shared_arrays import map_shared, share
 
 if TYPE_CHECKING:
-    from avatar_core.contact import Cloud
+    from avatar_core.cloud_arrays import Cloud
 
 _PACKET = 1 << 18  # the longest scene, quotes and all
 _SHOWN = 80  # letters of a name from elsewhere
@@ -353,7 +353,8 @@ class Receiver:
 
     def _hand_over(self, vademecum: Any, order: Order, note: dict[str, Any]) -> Shown:
         """Prepare a vademecum as an order says, and send it with a note."""
-        from avatar_core.contact import Layout, make_model
+        from avatar_core.contact import make_model
+        from avatar_core.contact_layout import Layout
         from avatar_core.scene_file import parse_scene
         from avatar_ros import scenes
 

@@ -11,7 +11,8 @@ from typing import Any, get_args
 from rclpy.node import Node
 
 from avatar_core.accuracy import Budget, Quantity
-from avatar_core.contact import TIP_RADIUS_RANGE, Cloud
+from avatar_core.cloud_arrays import Cloud
+from avatar_core.contact_layout import TIP_RADIUS_RANGE
 from avatar_core.errors import SceneError
 from avatar_core.scene import Scene, Tool
 from avatar_core.scene_file import parse_scene, read_scene, write_scene

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from avatar_core import contact
+from avatar_core import contact_layout
+from avatar_core.cloud_arrays import Cloud
 from avatar_core.effects import Effect, Tumour
 from avatar_core.effects.selection import natural_effects
 from avatar_core.errors import SceneError
@@ -81,7 +82,7 @@ class Plan:
     vademecum: Vademecum
     tip_radii: tuple[float, ...]
     modes: int | None
-    cloud: contact.Cloud
+    cloud: Cloud
     effects: tuple[Effect, ...]
 
     @property
@@ -114,9 +115,9 @@ def plan(vademecum: Vademecum, order: Order, scene: Scene | None) -> Plan:
     return Plan(chosen, radii, scene.modes, scene.cloud, scene.effects)
 
 
-def lay_out(what: Plan, detail: Detail, period: float) -> contact.Layout:
+def lay_out(what: Plan, detail: Detail, period: float) -> contact_layout.Layout:
     """Constant arrays of a contact model that shows a detail."""
-    return contact.lay_out(
+    return contact_layout.lay_out(
         what.vademecum,
         what.tip_radii,
         detail.modes,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar_core.contact import Cloud
+from avatar_core.cloud_arrays import Cloud
 from avatar_core.effects import Tumour
 from avatar_core.effects.selection import natural_effects
 from avatar_core.recording import Clouds, Periods, Recording, save_recording

@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from avatar_core.cloud_kernels import BLOCK
-from avatar_core.contact import LANES, ContactModel, Layout, make_model
+from avatar_core.contact import ContactModel, make_model
 from avatar_core.contact_kernels import ModelArrays
+from avatar_core.contact_layout import LANES, Layout
 from avatar_core.effects.base import Effect
 from avatar_core.effects.selection import selected_arrays
 from avatar_core.near_field import LocalBlocks, hash_rows

@@ -21,15 +21,8 @@ from avatar_core.accuracy import (
 )
 from avatar_core.accuracy_timing import timed
 from avatar_core.certificate import measured
-from avatar_core.contact import (
-    deform,
-    estimate_error,
-    lay_out,
-    make_model,
-    prepare,
-    solve,
-    step,
-)
+from avatar_core.contact import deform, estimate_error, make_model, prepare, solve, step
+from avatar_core.contact_layout import lay_out
 from avatar_core.effects import SelfWeight
 from avatar_core.elasticity import Elasticity
 from avatar_core.errors import AccuracyError

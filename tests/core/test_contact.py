@@ -9,15 +9,7 @@ import pytest
 
 from avatar_core.build import with_rank
 from avatar_core.build_rule import BuildRule
-from avatar_core.contact import (
-    ContactModel,
-    Status,
-    deform,
-    prepare,
-    solve,
-    step,
-    stored_energy,
-)
+from avatar_core.contact import ContactModel, Status, deform, prepare, solve, step, stored_energy
 from avatar_core.errors import ContactError
 from avatar_core.tip_response import closest_weights
 from avatar_core.tool_path import inner_positions, middle_of_access, palpation, slide

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avatar_core.contact import Layout, lay_out, prepare, step
+from avatar_core.contact import prepare, step
+from avatar_core.contact_layout import Layout, lay_out
 from avatar_core.effects import (
     EFFECTS,
     Friction,

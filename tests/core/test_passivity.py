@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from avatar_core.contact import PERIOD
+from avatar_core.contact_layout import PERIOD
 from avatar_core.errors import ContactError
 from avatar_core.passivity import Passivity, limit, make_passivity, reset
 

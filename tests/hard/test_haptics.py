@@ -31,7 +31,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from avatar_core.contact import PERIOD, ContactModel, Status, step
+from avatar_core.contact import ContactModel, Status, step
+from avatar_core.contact_layout import PERIOD
 from avatar_core.haptic_loop import Device, Loop, expected_border, run_loop, stability_border
 from avatar_core.passivity import Passivity, limit, make_passivity
 from avatar_core.study_passivity import HANDS, hand_push

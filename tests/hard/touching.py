@@ -11,8 +11,9 @@ import numpy as np
 from hypothesis import strategies as st
 
 from avatar_core.build_rule import BuildRule
-from avatar_core.contact import FAR_AWAY, ContactModel, Layout, Status, make_model, prepare, step
+from avatar_core.contact import FAR_AWAY, ContactModel, Status, make_model, prepare, step
 from avatar_core.contact_kernels import ENTERED
+from avatar_core.contact_layout import Layout
 from avatar_core.effects import Effect, SeveralTools
 from avatar_core.effects.selection import Constants, selected_arrays
 from avatar_core.organ import OrganOptions, vademecum_of
