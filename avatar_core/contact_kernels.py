@@ -64,7 +64,7 @@ MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
 MIN_ACCESS = 1e-2  # below, the tip is off the accessible surface
 FULL_ACCESS = 0.99  # below, the force fades
 
-# What the step reads; `prepare` fills it once. Shapes in avatar_core.contact.ContactModel.
+# What the step reads; `prepare` fills it once. Shapes in avatar_core.contact_layout.Layout.
 ModelArrays = namedtuple(
     "ModelArrays",
     [

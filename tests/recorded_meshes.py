@@ -2,7 +2,8 @@
 
 fTetWild inserts the faces of a surface in an order of chance (``std::random_device``, which takes
 no seed), so that no two meshes of it are the same, and figures taken from a few contacts differ by
-some percent. Tests get the meshes recorded here; any other surface is filled anew.
+some percent. Tests get the meshes recorded here, each by the edge it was asked for; any other
+surface is filled anew.
 
 ``python tests/recorded_meshes.py`` records them anew, whatever comes first.
 """
@@ -12,10 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 
-from avatar_core.mesh import TetMesh, first_edge, make_mesh, tetrahedralize
+from avatar_core import mesh
+from avatar_core.mesh import TetMesh, make_mesh, tetrahedralize
 from avatar_core.phantom import phantom_liver
 from avatar_core.surface import SurfaceMesh
 
@@ -25,16 +29,23 @@ FILE = Path(__file__).parent / "data" / "phantom_meshes.npz"
 N_VERTICES = {7e-3: (700, 900), 12e-3: (300, 400, 450, 600, 700, 800)}  # by spacing [m]
 
 
+class Recorded(NamedTuple):
+    """One mesh, and the spacing of the surface and the edge that it was made for [m]."""
+
+    spacing: float
+    edge: float
+    vertices: np.ndarray
+    tets: np.ndarray
+
+
 def recorded(fill: Fill) -> Fill:
     """Look a mesh up before a surface is filled; the liver may be larger or smaller."""
 
     def look_up(surface: SurfaceMesh, edge: float) -> TetMesh:
-        for spacing, sizes in N_VERTICES.items():
-            scale = _scale(surface, spacing)
-            for n in sizes if scale else ():
-                if np.isclose(edge, first_edge(surface.volume, n), rtol=1e-6):
-                    vertices, tets = _meshes()[spacing, n]
-                    return make_mesh(scale * vertices, tets)
+        for one in _meshes():
+            scale = _scale(surface, one.spacing)
+            if scale > 0.0 and np.isclose(edge, scale * one.edge, rtol=1e-6):
+                return make_mesh(scale * one.vertices, one.tets)
         return fill(surface, edge)
 
     return look_up
@@ -56,31 +67,43 @@ def _liver(spacing: float) -> SurfaceMesh:
 
 
 @cache
-def _meshes() -> dict[tuple[float, int], tuple[np.ndarray, np.ndarray]]:
+def _meshes() -> tuple[Recorded, ...]:
     with np.load(FILE) as file:
-        return {
-            (spacing, n): (
-                file[_key(spacing, n, "vertices")],
-                file[_key(spacing, n, "tets")].astype(np.int64),
-            )
-            for spacing, sizes in N_VERTICES.items()
-            for n in sizes
-        }
-
-
-def _key(spacing: float, n_vertices: int, what: str) -> str:
-    return f"{1e3 * spacing:g}mm_{n_vertices}_{what}"
+        return tuple(
+            Recorded(spacing, edge, file[f"vertices_{i}"], file[f"tets_{i}"].astype(np.int64))
+            for i, (spacing, edge) in enumerate(file["made_for"])
+        )
 
 
 def record() -> None:
-    """Fill the liver at every spacing and size."""
-    arrays = {}
-    for spacing, sizes in N_VERTICES.items():
-        for n in sizes:
-            mesh = tetrahedralize(_liver(spacing), n)
-            arrays[_key(spacing, n, "vertices")] = mesh.vertices
-            arrays[_key(spacing, n, "tets")] = mesh.tets.astype(np.uint16)
-            print(f"{1e3 * spacing:g} mm, {n}: {len(mesh.vertices)} vertices")
+    """Fill the liver at every spacing and size, and keep each try."""
+    found = [
+        one for spacing, sizes in N_VERTICES.items() for n in sizes for one in tries(spacing, n)
+    ]
+    write(found)
+
+
+def tries(spacing: float, n_vertices: int) -> list[Recorded]:
+    """The meshes that are made on the way to so many vertices."""
+    found, fill = [], mesh._fill
+
+    def keep(surface: SurfaceMesh, edge: float) -> TetMesh:
+        made = fill(surface, edge)
+        found.append(Recorded(spacing, edge, made.vertices, made.tets))
+        return made
+
+    with patch.object(mesh, "_fill", keep):
+        tetrahedralize(_liver(spacing), n_vertices)
+    print(f"{1e3 * spacing:g} mm, {n_vertices}: {len(found[-1].vertices)} vertices")
+    return found
+
+
+def write(found: list[Recorded]) -> None:
+    """Keep meshes in the file."""
+    arrays = {"made_for": np.array([(one.spacing, one.edge) for one in found])}
+    for i, one in enumerate(found):
+        arrays[f"vertices_{i}"] = one.vertices
+        arrays[f"tets_{i}"] = one.tets.astype(np.uint16)
     FILE.parent.mkdir(exist_ok=True)
     np.savez_compressed(FILE, **arrays)
 
