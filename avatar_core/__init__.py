@@ -1,0 +1,5 @@
+"""Computational patient avatars: an organ's surface becomes a vademecum that answers a tool at 1 kHz.
+
+The rooms, in the order in which data flows and imports may run: common, geometry, fem, reduction,
+shapes, vademecum, contact, scene, offline, atlas; then studies and cli, which use all of them.
+"""

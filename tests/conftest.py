@@ -13,13 +13,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 from hypothesis import settings
 
-from avatar_core import loads, mesh
-from avatar_core.build_rule import BuildRule
-from avatar_core.large_build import hyperelastic_problem, with_large_deformation
-from avatar_core.organ import OrganOptions, vademecum_of
-from avatar_core.phantom import phantom_liver
-from avatar_core.surface import SurfaceMesh
-from avatar_core.vademecum import Vademecum
+from avatar_core.fem import patch_loads as loads
+from avatar_core.geometry import mesh
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.offline.large_deformation import hyperelastic_problem, with_large_deformation
+from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.rule import BuildRule
+from avatar_core.vademecum.model import Vademecum
 
 from .recorded_meshes import recorded
 

@@ -18,10 +18,10 @@ from unittest.mock import patch
 
 import numpy as np
 
-from avatar_core import mesh
-from avatar_core.mesh import TetMesh, make_mesh, tetrahedralize
-from avatar_core.phantom import phantom_liver
-from avatar_core.surface import SurfaceMesh
+from avatar_core.geometry import mesh
+from avatar_core.geometry.mesh import TetMesh, make_mesh, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh
 
 Fill = Callable[[SurfaceMesh, float], TetMesh]
 

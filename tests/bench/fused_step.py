@@ -1,6 +1,6 @@
 """The linear step of one frictionless tip, fused by hand into one function without a choice.
 
-What :mod:`avatar_core.contact_kernels` compiles for a scene without effects must cost no more than
+What :mod:`avatar_core.contact.kernels` compiles for a scene without effects must cost no more than
 this, and give the same: the yardstick of ``avatar bench effects``. It shares the arrays of a
 contact model and nothing of its code.
 """

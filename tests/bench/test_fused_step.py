@@ -8,12 +8,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from avatar_core.bench_fused import module_of
-from avatar_core.contact import prepare, step
-from avatar_core.organ import OrganOptions, vademecum_of
-from avatar_core.phantom import phantom_liver
-from avatar_core.tool_path import slide
-from avatar_core.vademecum import Vademecum
+from avatar_core.contact.model import prepare, step
+from avatar_core.contact.tool_path import slide
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.studies.bench.fused import module_of
+from avatar_core.vademecum.model import Vademecum
 
 TIP = 10e-3
 

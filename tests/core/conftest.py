@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core.build_rule import BuildRule
-from avatar_core.elasticity import Elasticity, Material
-from avatar_core.mesh import Regions, TetMesh, make_mesh, regions_by_rule, tetrahedralize
-from avatar_core.organ import OrganOptions, vademecum_of
-from avatar_core.phantom import phantom_liver
-from avatar_core.surface import read_surface
-from avatar_core.vademecum import Vademecum
+from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.geometry.mesh import Regions, TetMesh, make_mesh, regions_by_rule, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import read_surface
+from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.rule import BuildRule
+from avatar_core.vademecum.model import Vademecum
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 

@@ -6,8 +6,7 @@ import numpy as np
 from skfem import Basis, BilinearForm, ElementTetP1, ElementTetP2, ElementVector, MeshTet
 from skfem.helpers import dot
 
-from avatar_core.contact import ContactModel, step
-from avatar_core.effects import (
+from avatar_core.contact.effects import (
     Effect,
     Friction,
     Inertia,
@@ -16,9 +15,10 @@ from avatar_core.effects import (
     SeveralTools,
     Viscoelasticity,
 )
-from avatar_core.elasticity import Elasticity
-from avatar_core.tool_path import middle_of_access
-from avatar_core.vademecum import Vademecum
+from avatar_core.contact.model import ContactModel, step
+from avatar_core.contact.tool_path import middle_of_access
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.vademecum.model import Vademecum
 
 TIP = 10e-3
 CHOICES: dict[str, tuple[Effect, str]] = {

@@ -10,13 +10,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from avatar_core.cloud_kernels import BLOCK
-from avatar_core.contact import ContactModel, make_model
-from avatar_core.contact_kernels import ModelArrays
-from avatar_core.contact_layout import LANES, Layout
-from avatar_core.effects.base import Effect
-from avatar_core.effects.selection import selected_arrays
-from avatar_core.near_field import LocalBlocks, hash_rows
+from avatar_core.contact.cloud_kernels import BLOCK
+from avatar_core.contact.effects.base import Effect
+from avatar_core.contact.effects.selection import selected_arrays
+from avatar_core.contact.kernels import ModelArrays
+from avatar_core.contact.layout import LANES, Layout
+from avatar_core.contact.model import ContactModel, make_model
+from avatar_core.reduction.near_field import LocalBlocks, hash_rows
 
 FAR, NEAR = 3e-4, 1e-4  # [m/N]
 COMPLIANCE = FAR + NEAR

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from avatar_core.effects import (
+from avatar_core.contact.effects import (
     Viscoelasticity,
 )
 from avatar_core.errors import SceneError
-from avatar_core.scene import Tool
-from avatar_core.scene_file import parse_scene
+from avatar_core.scene.file import parse_scene
+from avatar_core.scene.model import Tool
 
 SHIPPED = sorted((Path(__file__).resolve().parents[2] / "params" / "scenes").glob("*.yaml"))
 TWO = (Tool("left"), Tool("right"))

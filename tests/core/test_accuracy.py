@@ -11,7 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avatar_core.accuracy import (
+from avatar_core.contact.effects import SelfWeight
+from avatar_core.contact.layout import lay_out
+from avatar_core.contact.model import deform, estimate_error, make_model, prepare, solve, step
+from avatar_core.contact.tool_path import palpation
+from avatar_core.errors import AccuracyError
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.offline.certify.linear import measured
+from avatar_core.offline.certify.timing import timed
+from avatar_core.studies.force_error import force_errors
+from avatar_core.vademecum.accuracy import (
     AccuracyCurve,
     Budget,
     CurvePoint,
@@ -19,17 +28,8 @@ from avatar_core.accuracy import (
     choose,
     upper_quantile,
 )
-from avatar_core.accuracy_timing import timed
-from avatar_core.certificate import measured
-from avatar_core.contact import deform, estimate_error, make_model, prepare, solve, step
-from avatar_core.contact_layout import lay_out
-from avatar_core.effects import SelfWeight
-from avatar_core.elasticity import Elasticity
-from avatar_core.errors import AccuracyError
-from avatar_core.force_error import PROMISED, ForceError, calibrated
-from avatar_core.study_force_error import force_errors
-from avatar_core.tool_path import palpation
-from avatar_core.vademecum import Vademecum
+from avatar_core.vademecum.force_error import PROMISED, ForceError, calibrated
+from avatar_core.vademecum.model import Vademecum
 
 
 def some_curve(seed: int) -> AccuracyCurve:
@@ -207,7 +207,9 @@ def test_sag_stays_when_modes_are_left_out(
         return _difference(model.out.cloud[:, 3:], sag)
 
     kept = lost(0.75)
-    monkeypatch.setattr("avatar_core.effects.self_weight.body_first", lambda vademecum: vademecum)
+    monkeypatch.setattr(
+        "avatar_core.contact.effects.self_weight.body_first", lambda vademecum: vademecum
+    )
     assert kept < 0.1 and kept < 0.5 * lost(0.75)  # in their own order the last modes hold it
 
 

@@ -7,16 +7,16 @@ import pytest
 import scipy.sparse.linalg as sla
 from skfem import Basis, ElementTetP1, ElementTetP2, ElementVector, MeshTet
 
-from avatar_core.contact import ContactModel, prepare, step
-from avatar_core.effects import (
+from avatar_core.contact.effects import (
     Inertia,
     Respiration,
     SelfWeight,
 )
-from avatar_core.effects.inertia import kinetic_energy, turned_modes
-from avatar_core.loads import patch_loads
-from avatar_core.tool_path import inner_positions, middle_of_access
-from avatar_core.vademecum import Vademecum
+from avatar_core.contact.effects.inertia import kinetic_energy, turned_modes
+from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.contact.tool_path import inner_positions, middle_of_access
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.vademecum.model import Vademecum
 from tests.core.effect_cases import (
     TIP,
     density,

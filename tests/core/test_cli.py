@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import cli, loads
-from avatar_core.mesh import tetrahedralize
-from avatar_core.phantom import phantom_liver
+from avatar_core.cli import main as cli
+from avatar_core.fem import patch_loads as loads
+from avatar_core.geometry.mesh import tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
 
 TRIANGLE = "v 0 0 0\nv 100 0 0\nv 0 100 0\n"
 
@@ -184,7 +185,7 @@ def test_ctrl_c_is_said_and_leaves_nothing(
         time.sleep(10.0)
 
     source = phantom_file(tmp_path)
-    monkeypatch.setattr("avatar_core.organ.vademecum_of", meshed_then_stopped)
+    monkeypatch.setattr("avatar_core.offline.pipeline.vademecum_of", meshed_then_stopped)
     # a shell starts what runs in the background with the signal ignored
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

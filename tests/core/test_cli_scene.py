@@ -11,15 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from avatar_core import bench_scene, cli, scene_file, storage
-from avatar_core.bench_scene import DEPTH, PUSH, StepCost, _prepared, time_scene
-from avatar_core.contact import prepare, step
-from avatar_core.effects import Respiration
-from avatar_core.scene import Scene, Tool
-from avatar_core.scene_file import read_scene, scene_path, shipped_scenes
-from avatar_core.storage import save_vademecum
-from avatar_core.tool_path import middle_of_access, push_and_slide
-from avatar_core.vademecum import Vademecum
+from avatar_core.cli import main as cli
+from avatar_core.contact.effects import Respiration
+from avatar_core.contact.model import prepare, step
+from avatar_core.contact.tool_path import middle_of_access, push_and_slide
+from avatar_core.scene import file as scene_file
+from avatar_core.scene.file import read_scene, scene_path, shipped_scenes
+from avatar_core.scene.model import Scene, Tool
+from avatar_core.studies.bench import scene as bench_scene
+from avatar_core.studies.bench.scene import DEPTH, PUSH, StepCost, _prepared, time_scene
+from avatar_core.vademecum import storage
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import save_vademecum
 
 SCENES = Path(__file__).resolve().parents[2] / "params" / "scenes"
 

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from avatar_core.confined import Confined, ConfinedError
+from avatar_core.common.confined import Confined, ConfinedError
 from avatar_core.errors import StorageError
-from avatar_core.storage import load_vademecum
+from avatar_core.vademecum.storage import load_vademecum
 
 SECONDS = 20.0
 

@@ -7,13 +7,21 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from avatar_core.build import with_rank
-from avatar_core.build_rule import BuildRule
-from avatar_core.contact import ContactModel, Status, deform, prepare, solve, step, stored_energy
+from avatar_core.contact.model import (
+    ContactModel,
+    Status,
+    deform,
+    prepare,
+    solve,
+    step,
+    stored_energy,
+)
+from avatar_core.contact.tip_response import closest_weights
+from avatar_core.contact.tool_path import inner_positions, middle_of_access, palpation, slide
 from avatar_core.errors import ContactError
-from avatar_core.tip_response import closest_weights
-from avatar_core.tool_path import inner_positions, middle_of_access, palpation, slide
-from avatar_core.vademecum import Vademecum
+from avatar_core.offline.linear import with_rank
+from avatar_core.offline.rule import BuildRule
+from avatar_core.vademecum.model import Vademecum
 
 RADIUS = 5e-3
 
@@ -39,8 +47,8 @@ def test_force_equals_full_finite_elements(
     phantom_vademecum: Vademecum, model: ContactModel
 ) -> None:
     """lambda = indentation / (n . C n), C from fresh solves, as well as the certificate says."""
-    from avatar_core.elasticity import Elasticity
-    from avatar_core.loads import patch_loads, patch_normals
+    from avatar_core.fem.elasticity import Elasticity
+    from avatar_core.fem.patch_loads import patch_loads, patch_normals
 
     v = phantom_vademecum
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
@@ -455,8 +463,8 @@ def test_solve_then_deform_is_a_step(phantom_vademecum: Vademecum, model: Contac
 
 def test_warm_up_compiles_what_a_vademecum_needs(phantom_vademecum: Vademecum) -> None:
     """After warm_up, preparing a real model compiles nothing more."""
-    from avatar_core import contact_kernels
-    from avatar_core.contact import warm_up
+    from avatar_core.contact import kernels as contact_kernels
+    from avatar_core.contact.model import warm_up
 
     warm_up(1)
     before = len(contact_kernels.contact_solve.signatures)
@@ -468,7 +476,7 @@ def test_the_step_cannot_allocate() -> None:
     """Whoever writes an array into it is told when it compiles."""
     import numba
 
-    from avatar_core.step_code import entry
+    from avatar_core.common.jit import entry
 
     @entry
     def careless(n):  # type: ignore[no-untyped-def]

@@ -8,23 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import loads
-from avatar_core.build_rule import BuildRule
-from avatar_core.certificate import certify
-from avatar_core.contact import Status, prepare, step
-from avatar_core.coordinates import Coordinate, node_values, node_weights, problem_at
-from avatar_core.effects import Tumour
-from avatar_core.elasticity import Elasticity, Inclusion, Material
+from avatar_core.contact.effects import Tumour
+from avatar_core.contact.model import Status, prepare, step
+from avatar_core.contact.tool_path import inner_positions, palpation
 from avatar_core.errors import CoordinateError, MaterialError, SceneError, SurfaceError
-from avatar_core.loads import patch_loads
-from avatar_core.organ import OrganOptions, vademecum_of
-from avatar_core.parametric import at_values
-from avatar_core.phantom import phantom_liver
-from avatar_core.storage import load_vademecum, save_vademecum
-from avatar_core.surface import SurfaceMesh
-from avatar_core.tool_path import inner_positions, palpation
-from avatar_core.tumour import share_inside
-from avatar_core.vademecum import Vademecum
+from avatar_core.fem import patch_loads as loads
+from avatar_core.fem.elasticity import Elasticity, Inclusion, Material
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tumour import share_inside
+from avatar_core.offline.certify.linear import certify
+from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.rule import BuildRule
+from avatar_core.reduction.coordinates import Coordinate, node_values, node_weights, problem_at
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 
 POISSON = Coordinate("poisson", 0.30, 0.49, 2)
 CONTRAST = Coordinate("contrast", 0.5, 10.0, 3)

@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from avatar_core.correspondence import (
+from avatar_core.errors import RegistrationError
+from avatar_core.fem.patch_loads import load_surface
+from avatar_core.geometry.level_set import signed_distance
+from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.shapes.correspondence import (
     carry_positions,
     carry_regions,
     field_map,
@@ -18,20 +23,15 @@ from avatar_core.correspondence import (
     locate,
     registered_positions,
 )
-from avatar_core.distortion import Distortion
-from avatar_core.errors import RegistrationError
-from avatar_core.level_set import signed_distance
-from avatar_core.loads import load_surface
-from avatar_core.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
-from avatar_core.registration import (
+from avatar_core.shapes.distortion import Distortion
+from avatar_core.shapes.registration import (
     Registration,
     RegistrationRule,
     Template,
     line_search,
     register,
 )
-from avatar_core.springs import sample_target
-from avatar_core.surface import SurfaceMesh, read_surface
+from avatar_core.shapes.springs import sample_target
 
 # Eq. 17 of the paper: volume gain 21 %, distortion up to 10 %
 WARP = np.array([[1.15, 0.08, -0.06], [0.0, 0.92, 0.10], [0.0, 0.0, 1.14]])

@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avatar_core.contact import prepare, step
-from avatar_core.contact_layout import Layout, lay_out
-from avatar_core.effects import (
+from avatar_core.contact.effects import (
     EFFECTS,
     Friction,
     Inertia,
@@ -17,9 +15,11 @@ from avatar_core.effects import (
     SelfWeight,
     Viscoelasticity,
 )
+from avatar_core.contact.layout import Layout, lay_out
+from avatar_core.contact.model import prepare, step
+from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
-from avatar_core.tool_path import inner_positions
-from avatar_core.vademecum import Vademecum
+from avatar_core.vademecum.model import Vademecum
 from tests.core.effect_cases import (
     CHOICES,
     TIP,
@@ -51,7 +51,7 @@ def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -
     """Its signature ends in eight times none, and its code names no function of an effect."""
     import numba
 
-    from avatar_core import contact_kernels as kernels
+    from avatar_core.contact import kernels
 
     model = prepare(phantom_vademecum, (TIP,), cloud="off", effects=())
     arguments = (model.arrays, model.state, model.out, model.tips, *model.effects)

@@ -9,11 +9,11 @@ import pytest
 from skfem import Basis, ElementTetP2, ElementVector, LinearForm, MeshTet
 from skfem.models.elasticity import linear_elasticity
 
-from avatar_core.elasticity import Elasticity, Material
 from avatar_core.errors import MaterialError
-from avatar_core.loads import patch_loads
-from avatar_core.mesh import Regions, TetMesh
-from avatar_core.stiffness import unit_stiffness
+from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.fem.stiffness import unit_stiffness
+from avatar_core.geometry.mesh import Regions, TetMesh
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 

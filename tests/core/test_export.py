@@ -9,13 +9,13 @@ import meshio
 import numpy as np
 import pytest
 
-from avatar_core import cli
+from avatar_core.cli import main as cli
+from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import LoadError
-from avatar_core.export import displacement_under, point_load
-from avatar_core.large_deformation import push
-from avatar_core.storage import save_vademecum
-from avatar_core.tool_path import middle_of_access
-from avatar_core.vademecum import Vademecum
+from avatar_core.scene.export import displacement_under, point_load
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.push import push
+from avatar_core.vademecum.storage import save_vademecum
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from avatar_core.contact.haptics.force_guard import (
+    DEVICES,
+    ENGAGEMENT,
+    RAMP,
+    SETTLING,
+    ForceGuard,
+    ForceLimits,
+)
 from avatar_core.errors import ContactError
-from avatar_core.force_guard import DEVICES, ENGAGEMENT, RAMP, SETTLING, ForceGuard, ForceLimits
 
 PERIOD = 1e-3
 LIMITS = ForceLimits(5.0, 1000.0)

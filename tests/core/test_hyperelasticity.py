@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from avatar_core.elasticity import Material
-from avatar_core.equilibrium import (
+from avatar_core.errors import AvatarError, EquilibriumError, LoadError, MaterialError
+from avatar_core.fem.elasticity import Material
+from avatar_core.fem.hyperelastic_materials import (
+    HyperelasticMaterial,
+    NeoHookean,
+    StVenantKirchhoff,
+)
+from avatar_core.fem.hyperelasticity import Hyperelasticity
+from avatar_core.fem.newton import (
     NewtonRule,
     State,
     _LoadControl,
@@ -17,11 +24,8 @@ from avatar_core.equilibrium import (
     press,
     solve,
 )
-from avatar_core.errors import AvatarError, EquilibriumError, LoadError, MaterialError
-from avatar_core.hyperelasticity import Hyperelasticity
-from avatar_core.loads import patch_loads
-from avatar_core.materials import HyperelasticMaterial, NeoHookean, StVenantKirchhoff
-from avatar_core.mesh import Regions, TetMesh
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.mesh import Regions, TetMesh
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 

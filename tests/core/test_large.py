@@ -10,32 +10,44 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import organ, storage
-from avatar_core.build_rule import silent
-from avatar_core.cli_vademecum import show_text
-from avatar_core.contact import ContactModel, Status, prepare, step
-from avatar_core.effects import Friction, LargeDeformationEffect
-from avatar_core.elasticity import Material
-from avatar_core.equilibrium import NewtonRule, solve
+from avatar_core.cli.vademecum import show_text
+from avatar_core.contact.effects import Friction, LargeDeformationEffect
+from avatar_core.contact.model import ContactModel, Status, prepare, step
+from avatar_core.contact.tool_path import inner_positions, middle_of_access
 from avatar_core.errors import MaterialError, SceneError
-from avatar_core.hyperelasticity import Hyperelasticity
-from avatar_core.large_build import (
+from avatar_core.fem.elasticity import Material
+from avatar_core.fem.hyperelasticity import Hyperelasticity
+from avatar_core.fem.newton import NewtonRule, solve
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.offline import pipeline as organ
+from avatar_core.offline.certify.combinations import (
+    COMBINATIONS,
+    CombinedRow,
+    mean_error,
+    push_errors,
+)
+from avatar_core.offline.certify.large_deformation import (
+    certify_large,
+    push_rows,
+    summary,
+    with_combinations,
+)
+from avatar_core.offline.large_deformation import (
     LargeRule,
     economised,
     hyperelastic_problem,
 )
-from avatar_core.large_certificate import certify_large, push_rows, summary, with_combinations
-from avatar_core.large_combinations import COMBINATIONS, CombinedRow, mean_error, push_errors
-from avatar_core.large_deformation import LargeCertificate, hyperelastic, powers, push, push_to
-from avatar_core.loads import patch_loads
-from avatar_core.mesh import Regions, TetMesh
-from avatar_core.organ import OrganOptions
-from avatar_core.parametric import at_values
-from avatar_core.path_series import path_series
-from avatar_core.scene import REFUSED, Scene, combinations
-from avatar_core.storage import load_vademecum, save_vademecum
-from avatar_core.tool_path import inner_positions, middle_of_access
-from avatar_core.vademecum import Vademecum
+from avatar_core.offline.pipeline import OrganOptions
+from avatar_core.offline.rule import silent
+from avatar_core.reduction.asymptotic_series import path_series
+from avatar_core.scene.model import REFUSED, Scene, combinations
+from avatar_core.vademecum import storage
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.large_deformation import LargeCertificate, hyperelastic, powers
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.push import push, push_to
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.core.test_contact import carriers, energy_slope
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
@@ -137,7 +149,7 @@ def test_a_stiffer_organ_takes_more_force_for_the_same_shape(bent: Vademecum) ->
 
 
 def test_reach_shrinks_with_the_tolerance(straight: Vademecum, bent: Vademecum) -> None:
-    from avatar_core.large_build import _follow
+    from avatar_core.offline.large_deformation import _follow
 
     problem = hyperelastic_problem(straight, "st-venant-kirchhoff")
     few = replace(

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from avatar_core.alignment import align, surface_distance, surface_points
 from avatar_core.errors import SurfaceError
-from avatar_core.level_set import (
+from avatar_core.geometry.level_set import (
     DistanceGrid,
     GridBox,
     candidate_rotations,
@@ -26,7 +25,8 @@ from avatar_core.level_set import (
     reinitialize,
     signed_distance,
 )
-from avatar_core.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.studies.alignment import align, surface_distance, surface_points
 
 RADIUS = 0.06
 
@@ -190,7 +190,7 @@ def test_narrow_band_computes_few_of_many_points(phantom, monkeypatch):
         asked.append(len(points))
         return signed_distance(points, surface)
 
-    monkeypatch.setattr("avatar_core.level_set.signed_distance", counted)
+    monkeypatch.setattr("avatar_core.geometry.level_set.signed_distance", counted)
     grid = distance_grid(phantom, 2e-3, 6e-3, band=4e-3)
     # the shell of 4 mm + 3.5 mm on both sides of 0.09 m2 is 0.17 M points of 0.9 M
     assert sum(asked) < 0.25 * grid.values.size

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from avatar_core.barycenter import (
+from avatar_core.errors import LLEError
+from avatar_core.shapes.barycenter import (
     barycenter,
     barycenter_weights,
     convex_weights,
     local_gram,
 )
-from avatar_core.errors import LLEError
-from avatar_core.lle import (
+from avatar_core.shapes.lle import (
     LLE,
     Gram,
     embed,
@@ -340,7 +340,7 @@ def test_insertion_computes_only_the_rows_it_changes(cloud, monkeypatch):
     changed = np.flatnonzero((fit(cloud, 6).neighbors[:-1] == 59).any(axis=1))
     asked: list[int] = []
     monkeypatch.setattr(
-        "avatar_core.lle._row_weights",
+        "avatar_core.shapes.lle._row_weights",
         lambda base, rows, neighbors: asked.extend(rows) or np.zeros(neighbors.shape),
     )
     base.insert(cloud[-1])

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from avatar_core.elasticity import Elasticity
 from avatar_core.errors import MeshError
-from avatar_core.loads import load_surface, patch_loads, patch_normals
-from avatar_core.mesh import Regions, TetMesh, make_mesh, regions_by_rule
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.patch_loads import load_surface, patch_loads, patch_normals
+from avatar_core.geometry.mesh import Regions, TetMesh, make_mesh, regions_by_rule
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 

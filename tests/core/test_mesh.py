@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from avatar_core.errors import MeshError
-from avatar_core.mesh import tetrahedralize
-from avatar_core.phantom import phantom_liver
-from avatar_core.surface import SurfaceMesh, read_surface
-from avatar_core.vademecum import Vademecum
+from avatar_core.geometry.mesh import tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.vademecum.model import Vademecum
 from tests.recorded_meshes import N_VERTICES
 
 

@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from avatar_core.elasticity import Elasticity, Material
-from avatar_core.errors import LLEError
-from avatar_core.loads import load_surface, patch_loads
-from avatar_core.mesh import TetMesh, regions_by_rule, tetrahedralize
-from avatar_core.patient import (
+from avatar_core.atlas.base import PatientBase, PatientError, leave_one_out
+from avatar_core.atlas.patient import (
     PatientOptions,
     PatientProblem,
     patient_problem,
     patient_vademecum,
     respond,
 )
-from avatar_core.patient_base import PatientBase, PatientError, leave_one_out
-from avatar_core.phantom import phantom_liver, population
-from avatar_core.reduced import (
+from avatar_core.atlas.transfer import combine, kriging, patient_weights
+from avatar_core.errors import LLEError
+from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.patch_loads import load_surface, patch_loads
+from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver, population
+from avatar_core.reduction.galerkin import (
     GalerkinBasis,
     ReductionRule,
     compact_response,
@@ -29,13 +30,12 @@ from avatar_core.reduced import (
     reduce,
     solve_probes,
 )
-from avatar_core.registration import (
+from avatar_core.shapes.registration import (
     Registration,
     RegistrationQuality,
     SimilarityTransform,
     Template,
 )
-from avatar_core.transfer import combine, kriging, patient_weights
 
 N_BASE = 5
 ROOMY = ReductionRule(n_start=20, n_block=6, n_probes=8, largest_share=0.6)

@@ -10,21 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import cli
-from avatar_core.atlas import Atlas
-from avatar_core.atlas_build import AtlasOptions, build_anatomy, new_atlas
-from avatar_core.atlas_response import Responder
-from avatar_core.atlas_storage import load_atlas, save_atlas
+from avatar_core.atlas.base import PatientError, base_of, numbers_of
+from avatar_core.atlas.growth import AtlasOptions, build_anatomy, new_atlas
+from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.patient import PatientOptions, patient_vademecum
+from avatar_core.atlas.response import Responder
+from avatar_core.atlas.storage import load_atlas, save_atlas
+from avatar_core.cli import main as cli
 from avatar_core.errors import RegistrationError
-from avatar_core.mesh import TetMesh, regions_by_rule
-from avatar_core.patient import PatientOptions, patient_vademecum
-from avatar_core.patient_base import PatientError, base_of, numbers_of
-from avatar_core.phantom import phantom_liver, population
-from avatar_core.reduced import ReductionRule
-from avatar_core.registration import RegistrationRule, Template
-from avatar_core.storage import load_vademecum
-from avatar_core.study_transport import transport
-from avatar_core.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.mesh import TetMesh, regions_by_rule
+from avatar_core.geometry.phantom import phantom_liver, population
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.reduction.galerkin import ReductionRule
+from avatar_core.shapes.registration import RegistrationRule, Template
+from avatar_core.studies.transport import transport
+from avatar_core.vademecum.storage import load_vademecum
 
 # rough and coarse, 1 s an anatomy; the atlas's own tests use the same rule
 ROUGH = RegistrationRule(

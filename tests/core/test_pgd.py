@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import aslinearoperator
 
-from avatar_core.affine import AffineProblem, CanonicalField, Samples
 from avatar_core.errors import ConvergenceError
-from avatar_core.pgd import (
+from avatar_core.reduction.affine import AffineProblem, CanonicalField, Samples
+from avatar_core.reduction.pgd_parametric import (
     Outcome,
     PGDRule,
     compress,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from avatar_core.elasticity import Elasticity
 from avatar_core.errors import ConvergenceError
-from avatar_core.pgd_load import EnrichmentStatus, ParametricProblem, PGDRule, solve_pgd
-from avatar_core.separated import SeparatedField
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.reduction.pgd import EnrichmentStatus, ParametricProblem, PGDRule, solve_pgd
+from avatar_core.reduction.separated import SeparatedField
 
 
 def problem_of_rank(

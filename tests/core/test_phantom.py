@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from avatar_core.errors import SurfaceError
-from avatar_core.level_set import signed_distance
-from avatar_core.phantom import (
+from avatar_core.geometry.level_set import signed_distance
+from avatar_core.geometry.phantom import (
     VISCERAL_NORMAL,
     Ellipsoid,
     half_space,
@@ -19,7 +19,12 @@ from avatar_core.phantom import (
     project,
     smooth_union,
 )
-from avatar_core.surface import keep_organ, read_surface, require_closed, require_plausible_size
+from avatar_core.geometry.surface import (
+    keep_organ,
+    read_surface,
+    require_closed,
+    require_plausible_size,
+)
 
 
 def test_phantom_passes_its_own_front_door(phantom, tmp_path):

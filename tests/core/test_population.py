@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
-from avatar_core.level_set import DistanceGrid, distance_in_box, padded_box
-from avatar_core.lle import estimate_dimension, fit
-from avatar_core.phantom import ShapeMap, population
+from avatar_core.geometry.level_set import DistanceGrid, distance_in_box, padded_box
+from avatar_core.geometry.phantom import ShapeMap, population
+from avatar_core.shapes.lle import estimate_dimension, fit
 from tests.core.test_lle import explained
 
 

@@ -11,18 +11,19 @@ import h5py
 import numpy as np
 import pytest
 
-from avatar_core import cli, contact
-from avatar_core.contact import FAR_AWAY, prepare
-from avatar_core.effects import Effect, Friction, Respiration, Viscoelasticity
-from avatar_core.effects.selection import natural_effects
+from avatar_core.cli import main as cli
+from avatar_core.contact import model as contact
+from avatar_core.contact.effects import Effect, Friction, Respiration, Viscoelasticity
+from avatar_core.contact.effects.selection import natural_effects
+from avatar_core.contact.model import FAR_AWAY, prepare
+from avatar_core.contact.tool_path import push_and_slide
 from avatar_core.errors import StorageError
-from avatar_core.recording import Clouds, Periods, Recording, load_recording, save_recording
-from avatar_core.replay import replay
-from avatar_core.scene import Scene
-from avatar_core.scene_file import write_scene
-from avatar_core.storage import load_vademecum, save_vademecum
-from avatar_core.tool_path import push_and_slide
-from avatar_core.vademecum import Vademecum
+from avatar_core.scene.file import write_scene
+from avatar_core.scene.model import Scene
+from avatar_core.scene.recording import Clouds, Periods, Recording, load_recording, save_recording
+from avatar_core.scene.replay import replay
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 
 RADIUS = 5e-3
 SAME = 1e-9  # [N], as promised; the difference is 0 in fact

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from avatar_core.coordinates import Coordinate
-from avatar_core.effects import (
+from avatar_core.contact.effects import (
     Effect,
     Friction,
     Inertia,
@@ -20,9 +19,10 @@ from avatar_core.effects import (
     Tumour,
 )
 from avatar_core.errors import SceneError
-from avatar_core.parametric import at_values
-from avatar_core.scene import REFUSED, Combination, Scene, Tool, combinations
-from avatar_core.vademecum import Vademecum
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.scene.model import REFUSED, Combination, Scene, Tool, combinations
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.model import Vademecum
 from tests.core.scene_cases import PRONY, TWO
 
 

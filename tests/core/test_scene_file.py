@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from avatar_core.effects import (
+from avatar_core.contact.effects import (
     EFFECTS,
     Friction,
     Inertia,
@@ -18,9 +18,9 @@ from avatar_core.effects import (
     Tumour,
 )
 from avatar_core.errors import SceneError
-from avatar_core.scene import Scene, Tool
-from avatar_core.scene_file import parse_scene, read_scene
-from avatar_core.yaml_lines import MAX_BYTES
+from avatar_core.scene.file import parse_scene, read_scene
+from avatar_core.scene.model import Scene, Tool
+from avatar_core.scene.yaml_lines import MAX_BYTES
 from tests.core.scene_cases import PRONY, refusal
 
 # --- YAML: what it means --------------------------------------------------------------------------

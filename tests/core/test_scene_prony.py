@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from avatar_core.errors import SceneError
-from avatar_core.scene_file import parse_scene, read_scene, write_scene
-from avatar_core.yaml_lines import MAX_BYTES
+from avatar_core.scene.file import parse_scene, read_scene, write_scene
+from avatar_core.scene.yaml_lines import MAX_BYTES
 from tests.core.scene_cases import PRONY
 
 

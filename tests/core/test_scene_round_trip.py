@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avatar_core.effects import (
+from avatar_core.contact.effects import (
     EFFECTS,
     Effect,
     Friction,
@@ -20,8 +20,8 @@ from avatar_core.effects import (
     Viscoelasticity,
 )
 from avatar_core.errors import SceneError
-from avatar_core.scene import CONFLICTS, Scene, Tool
-from avatar_core.scene_file import parse_scene, read_scene, write_scene
+from avatar_core.scene.file import parse_scene, read_scene, write_scene
+from avatar_core.scene.model import CONFLICTS, Scene, Tool
 from tests.core.scene_cases import SHIPPED
 
 

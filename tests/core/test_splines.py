@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.splines import cell_at, evaluate, in_cell, on_grid, second_derivatives
+from avatar_core.common.splines import cell_at, evaluate, in_cell, on_grid, second_derivatives
 
 ORIGIN, SPACING = np.array([0.01, -0.02, 0.03]), 3e-3
 

@@ -11,26 +11,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import (
-    cli,
-    cli_study,
-    study_accuracy_time,
-    study_coordinates,
-    study_grid,
-    study_in_silico,
-    study_leave_one_out,
-    study_passivity,
-    study_pgd,
-    study_samples,
-)
-from avatar_core.barycenter import barycenter
+from avatar_core.cli import main as cli
+from avatar_core.cli import study as cli_study
 from avatar_core.errors import SurfaceError
-from avatar_core.lle import Gram
-from avatar_core.mesh import TetMesh
-from avatar_core.phantom import phantom_liver
-from avatar_core.study import Study, mean_and_worst, write_study
-from avatar_core.study_response import carried, field_at, relative_errors, trilinear
-from avatar_core.study_shapes import paper_box, read_livers, subject_numbers
+from avatar_core.geometry.mesh import TetMesh
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.shapes.barycenter import barycenter
+from avatar_core.shapes.lle import Gram
+from avatar_core.studies import accuracy_time as study_accuracy_time
+from avatar_core.studies import coordinates as study_coordinates
+from avatar_core.studies import grid as study_grid
+from avatar_core.studies import in_silico as study_in_silico
+from avatar_core.studies import leave_one_out as study_leave_one_out
+from avatar_core.studies import passivity as study_passivity
+from avatar_core.studies import pgd as study_pgd
+from avatar_core.studies import samples as study_samples
+from avatar_core.studies.response import carried, field_at, relative_errors, trilinear
+from avatar_core.studies.shapes import paper_box, read_livers, subject_numbers
+from avatar_core.studies.study import Study, mean_and_worst, write_study
 
 COARSE = (16, 13, 14)
 

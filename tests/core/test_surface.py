@@ -11,10 +11,10 @@ import nibabel
 import numpy as np
 import pytest
 
-from avatar_core import surface as door
-from avatar_core import surface_files
 from avatar_core.errors import SurfaceError
-from avatar_core.surface import SurfaceMesh, ambiguous_fraction, axes_matrix, read_surface
+from avatar_core.geometry import surface as door
+from avatar_core.geometry import surface_files
+from avatar_core.geometry.surface import SurfaceMesh, ambiguous_fraction, axes_matrix, read_surface
 
 RADIUS = 60.0  # of the test ball [mm], an organ of 0.12 m
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from avatar_core.loads import LoadSurface
-from avatar_core.tip_field import TipField
-from avatar_core.unseen_contacts import draw_contacts
+from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.offline.certify.unseen_contacts import draw_contacts
+from avatar_core.vademecum.tip_field import TipField
 
 RADIUS = 0.03  # of the ball that is touched [m]
 LOBE = np.array([0.0, 0.0, 0.052]), 0.012  # another, over its pole: centre and radius [m]

@@ -12,13 +12,13 @@ import h5py
 import numpy as np
 import pytest
 
-from avatar_core.build import with_rank
-from avatar_core.build_rule import BuildRule
-from avatar_core.certificate import certify
-from avatar_core.elasticity import Elasticity
 from avatar_core.errors import StorageError
-from avatar_core.storage import load_vademecum, save_vademecum
-from avatar_core.vademecum import Vademecum
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.offline.certify.linear import certify
+from avatar_core.offline.linear import with_rank
+from avatar_core.offline.rule import BuildRule
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 
 
 def test_certificate_meets_the_promise_on_the_phantom(phantom_vademecum: Vademecum) -> None:
@@ -42,7 +42,7 @@ def test_certificate_sees_a_damaged_vademecum(phantom_vademecum: Vademecum) -> N
 
 def test_near_field_makes_the_loaded_positions_exact(phantom_vademecum: Vademecum) -> None:
     """Within the plateau around a load position, the displacement is the full solution."""
-    from avatar_core.loads import patch_loads
+    from avatar_core.fem.patch_loads import patch_loads
 
     v = phantom_vademecum
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
@@ -118,7 +118,7 @@ def test_full_disk_leaves_the_old_file(phantom_vademecum: Vademecum, tmp_path: P
     before = file.read_bytes()
     script = (
         "import resource, signal, sys\n"
-        "from avatar_core.storage import load_vademecum, save_vademecum\n"
+        "from avatar_core.vademecum.storage import load_vademecum, save_vademecum\n"
         "from avatar_core.errors import StorageError\n"
         "v = load_vademecum(sys.argv[1])\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"

@@ -19,9 +19,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from avatar_core.atlas_storage import save_atlas
-from avatar_core.hdf5 import UNREADABLE, checksum, root_attributes
-from avatar_core.storage import save_vademecum
+from avatar_core.atlas.storage import save_atlas
+from avatar_core.common.hdf5 import UNREADABLE, checksum, root_attributes
+from avatar_core.vademecum.storage import save_vademecum
 from tests.hard.byte_mutations import OF_BYTES, pick, some
 from tests.hard.small_files import small_atlas, small_vademecum
 

@@ -44,7 +44,7 @@ class Door:
 
 def _confined(function: Callable[[Path], Any], make: Any, check: Callable[[Any], None]) -> Door:
     """A door behind which another process reads."""
-    from avatar_core.confined import Confined
+    from avatar_core.common.confined import Confined
 
     confined = Confined(MEMORY)
     return Door(make, partial(confined.call, SECONDS, function), check, lambda: confined.pid)
@@ -65,7 +65,7 @@ def _require_vademecum(vademecum: Any) -> None:
 
 
 def _vademecum() -> Door:
-    from avatar_core.storage import load_vademecum
+    from avatar_core.vademecum.storage import load_vademecum
 
     return _confined(load_vademecum, _vademecum_bytes, _require_vademecum)
 
@@ -74,8 +74,8 @@ def _step() -> Door:
     """A vademecum that loads is also touched, by compiled code."""
     import numpy as np
 
-    from avatar_core.contact import prepare, step
-    from avatar_core.storage import load_vademecum
+    from avatar_core.contact.model import prepare, step
+    from avatar_core.vademecum.storage import load_vademecum
     from tests.hard.small_files import RADIUS, small_vademecum
 
     directions = small_vademecum().surface.normals
@@ -99,7 +99,7 @@ def _step() -> Door:
 def _atlas() -> Door:
     import numpy as np
 
-    from avatar_core.atlas_storage import load_atlas
+    from avatar_core.atlas.storage import load_atlas
     from tests.hard.file_mutations import mutant
 
     def check(atlas: Any) -> None:
@@ -117,7 +117,7 @@ def _require_surface(surface: Any) -> None:
 
 
 def _surface() -> Door:
-    from avatar_core.surface import read_surface
+    from avatar_core.geometry.surface import read_surface
     from tests.hard.mesh_mutations import mutant
 
     return _confined(read_surface, mutant, _require_surface)
@@ -125,12 +125,12 @@ def _surface() -> Door:
 
 def _loader() -> Door:
     """As load_vademecum answers a request."""
-    from avatar_ros.library import read_in_library
-    from avatar_ros.reader import Reader
+    from avatar_ros.framework import conversions
+    from avatar_ros.framework.library import read_in_library
+    from avatar_ros.framework.reader import Reader
     from std_msgs.msg import Header
 
-    from avatar_core.storage import parse_vademecum
-    from avatar_ros import conversions
+    from avatar_core.vademecum.storage import parse_vademecum
 
     reader = Reader(MEMORY // 8)
 
@@ -150,11 +150,11 @@ def _patient() -> Door:
     """As the process of interpolate_patient takes a file; every fifth as an inline mesh."""
     from types import SimpleNamespace
 
-    from avatar_ros.patient_interpolation import order_of
-    from avatar_ros.patient_surface import read_confined
-    from avatar_ros.reader import Reader
+    from avatar_ros.framework import conversions
+    from avatar_ros.framework.reader import Reader
+    from avatar_ros.nodes.patient_interpolation import order_of
+    from avatar_ros.patients.surface import read_confined
 
-    from avatar_ros import conversions
     from avatar_ros.srv import InterpolatePatient
     from tests.hard.mesh_mutations import altered_soup, mutant
 

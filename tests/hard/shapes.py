@@ -6,9 +6,9 @@ from itertools import permutations
 
 import numpy as np
 
-from avatar_core.elasticity import Elasticity
-from avatar_core.loads import patch_loads
-from avatar_core.mesh import Regions, TetMesh, make_mesh
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.mesh import Regions, TetMesh, make_mesh
 
 TOP = np.array([[0.05, 0.1, 0.05], [0.03, 0.1, 0.06]])  # of a cube
 

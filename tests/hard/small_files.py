@@ -11,24 +11,24 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from avatar_core.atlas import Atlas
-from avatar_core.atlas_anatomy import Anatomy, Response
-from avatar_core.body import BodyResponse
-from avatar_core.certificate import Certificate
-from avatar_core.coordinates import Coordinate
-from avatar_core.elasticity import Material
-from avatar_core.large_deformation import POWERS, LargeCertificate, LargeDeformation
-from avatar_core.level_set import GridBox
-from avatar_core.loads import LoadSurface
-from avatar_core.mesh import MeshQuality, Regions, TetMesh
-from avatar_core.near_field import LocalBlocks
-from avatar_core.parametric import ParametricResponse
-from avatar_core.pgd_load import EnrichmentReport, EnrichmentStatus
-from avatar_core.registration import RegistrationQuality, SimilarityTransform, Template
-from avatar_core.separated import SeparatedField
-from avatar_core.surface import SurfaceMesh
-from avatar_core.tip_field import TipField
-from avatar_core.vademecum import Convergence, Provenance, RankError, Vademecum
+from avatar_core.atlas.anatomy import Anatomy, Response
+from avatar_core.atlas.model import Atlas
+from avatar_core.fem.elasticity import Material
+from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.geometry.level_set import GridBox
+from avatar_core.geometry.mesh import MeshQuality, Regions, TetMesh
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.reduction.pgd import EnrichmentReport, EnrichmentStatus
+from avatar_core.reduction.separated import SeparatedField
+from avatar_core.shapes.registration import RegistrationQuality, SimilarityTransform, Template
+from avatar_core.vademecum.certificate import Certificate
+from avatar_core.vademecum.large_deformation import POWERS, LargeCertificate, LargeDeformation
+from avatar_core.vademecum.modal_mass import BodyResponse
+from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
+from avatar_core.vademecum.parametric import ParametricResponse
+from avatar_core.vademecum.tip_field import TipField
 
 RADIUS = 0.06  # [m]
 RANK = 3

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from avatar_core.equilibrium import NewtonRule, State, _DepthControl, _march, _Newton
 from avatar_core.errors import EquilibriumError
-from avatar_core.hyperelasticity import Hyperelasticity
-from avatar_core.materials import HyperelasticMaterial
+from avatar_core.fem.hyperelastic_materials import HyperelasticMaterial
+from avatar_core.fem.hyperelasticity import Hyperelasticity
+from avatar_core.fem.newton import NewtonRule, State, _DepthControl, _march, _Newton
 from tests.core.conftest import box_mesh, box_regions
 
 LENGTH = 0.1  # [m]

@@ -11,8 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from avatar_core.errors import SurfaceError
-from avatar_core.level_set import DistanceGrid, signed_distance
-from avatar_core.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.level_set import DistanceGrid, signed_distance
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
 
 RADIUS = 0.06  # of the ball [m]
 

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from avatar_core.contact import Status, prepare, step, stored_energy
-from avatar_core.contact_kernels import BARRED, ENTRY_DEPTH, LEAP
-from avatar_core.effects import Friction
+from avatar_core.contact.effects import Friction
+from avatar_core.contact.kernels import BARRED, ENTRY_DEPTH, LEAP
+from avatar_core.contact.model import Status, prepare, step, stored_energy
 from avatar_core.errors import ContactError
 
 from ..core.flat_organ import BALL, COMPLIANCE, at_depth, ball_organ, flat_organ

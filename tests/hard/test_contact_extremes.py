@@ -13,11 +13,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from avatar_core.contact import ContactModel, Status, step, stored_energy
-from avatar_core.contact_kernels import LEAP, MAX_DEPTH
-from avatar_core.effects import Friction, Inertia, Viscoelasticity
-from avatar_core.effects.friction import tangential
-from avatar_core.splines import evaluate
+from avatar_core.common.splines import evaluate
+from avatar_core.contact.effects import Friction, Inertia, Viscoelasticity
+from avatar_core.contact.effects.friction import tangential
+from avatar_core.contact.kernels import LEAP, MAX_DEPTH
+from avatar_core.contact.model import ContactModel, Status, step, stored_energy
 
 from ..core.flat_organ import COMPLIANCE, at_depth, flat_organ
 from ..core.flat_organ import RADIUS as FLAT_RADIUS

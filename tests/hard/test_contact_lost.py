@@ -10,9 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from avatar_core.contact import Status, make_model, step
-from avatar_core.contact_kernels import ENTRY_DEPTH, LEAP, MAX_DEPTH
-from avatar_core.effects import Friction, Viscoelasticity
+from avatar_core.contact.effects import Friction, Viscoelasticity
+from avatar_core.contact.kernels import ENTRY_DEPTH, LEAP, MAX_DEPTH
+from avatar_core.contact.model import Status, make_model, step
 
 from .touching import AWAY, RADIUS, enter, spots, touched
 

@@ -11,9 +11,9 @@ import scipy.linalg
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from avatar_core.elasticity import Elasticity, Element, Inclusion, Material
-from avatar_core.loads import patch_loads
-from avatar_core.mesh import TetMesh, make_mesh, quality
+from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.mesh import TetMesh, make_mesh, quality
 
 from .shapes import TOP, block, compliance, cube, nodes_of, regions_of, shell_octant
 

@@ -11,17 +11,20 @@ import scipy.linalg
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from avatar_core import certificate, tip_field, unseen_contacts
-from avatar_core.build import build_vademecum
-from avatar_core.build_rule import BuildRule
-from avatar_core.certificate import Certificate, certify
-from avatar_core.elasticity import Elasticity, Element, Material
 from avatar_core.errors import MaterialError, MeshError
-from avatar_core.loads import load_surface, patch_loads
-from avatar_core.mesh import TetMesh, make_mesh, quality, tetrahedralize
-from avatar_core.organ import OrganOptions
-from avatar_core.phantom import phantom_liver
-from avatar_core.vademecum import Provenance
+from avatar_core.fem.elasticity import Elasticity, Element, Material
+from avatar_core.fem.patch_loads import load_surface, patch_loads
+from avatar_core.geometry.mesh import TetMesh, make_mesh, quality, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.offline.certify import linear as certificate
+from avatar_core.offline.certify import unseen_contacts
+from avatar_core.offline.certify.linear import certify
+from avatar_core.offline.linear import build_vademecum
+from avatar_core.offline.pipeline import OrganOptions
+from avatar_core.offline.rule import BuildRule
+from avatar_core.vademecum import tip_field
+from avatar_core.vademecum.certificate import Certificate
+from avatar_core.vademecum.model import Provenance
 
 from .shapes import TOP, block, compliance, cube, nodes_of, regions_of
 

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from avatar_core.contact import ContactModel, Status, step
-from avatar_core.effects import Friction, Viscoelasticity
+from avatar_core.contact.effects import Friction, Viscoelasticity
+from avatar_core.contact.model import ContactModel, Status, step
 
 from .touching import AWAY, RADIUS, Spot, spots, touched
 

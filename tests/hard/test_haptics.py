@@ -31,11 +31,17 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from avatar_core.contact import ContactModel, Status, step
-from avatar_core.contact_layout import PERIOD
-from avatar_core.haptic_loop import Device, Loop, expected_border, run_loop, stability_border
-from avatar_core.passivity import Passivity, limit, make_passivity
-from avatar_core.study_passivity import HANDS, hand_push
+from avatar_core.contact.haptics.haptic_loop import (
+    Device,
+    Loop,
+    expected_border,
+    run_loop,
+    stability_border,
+)
+from avatar_core.contact.haptics.passivity import Passivity, limit, make_passivity
+from avatar_core.contact.layout import PERIOD
+from avatar_core.contact.model import ContactModel, Status, step
+from avatar_core.studies.passivity import HANDS, hand_push
 
 from ..core.flat_organ import BALL, RADIUS, ball_organ, flat_organ
 

@@ -13,11 +13,11 @@ import h5py
 import numpy as np
 import pytest
 
-from avatar_core.atlas_storage import load_atlas
+from avatar_core.atlas.storage import load_atlas
+from avatar_core.common.files import FileError, content_of, opened
 from avatar_core.errors import AvatarError, StorageError
-from avatar_core.files import FileError, content_of, opened
-from avatar_core.storage import is_vademecum, load_vademecum, parse_vademecum
-from avatar_core.surface import read_surface
+from avatar_core.geometry.surface import read_surface
+from avatar_core.vademecum.storage import is_vademecum, load_vademecum, parse_vademecum
 from tests.hard.file_mutations import pristine, sealed
 from tests.hard.mesh_mutations import SUFFIXES, encode
 from tests.hard.mesh_mutations import pristine as ball

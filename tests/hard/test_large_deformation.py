@@ -10,17 +10,21 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from avatar_core.contact import Status, prepare, step
-from avatar_core.contact_kernels import MAX_DEPTH
-from avatar_core.elasticity import Material
-from avatar_core.equilibrium import NewtonRule, State, _LoadControl, _LostError, press, solve
+from avatar_core.contact.kernels import MAX_DEPTH
+from avatar_core.contact.model import Status, prepare, step
+from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import EquilibriumError
-from avatar_core.hyperelasticity import Hyperelasticity
-from avatar_core.loads import patch_loads, patch_normals
-from avatar_core.materials import HyperelasticMaterial, NeoHookean, StVenantKirchhoff
-from avatar_core.mesh import TetMesh, make_mesh
-from avatar_core.tool_path import middle_of_access
-from avatar_core.vademecum import Vademecum
+from avatar_core.fem.elasticity import Material
+from avatar_core.fem.hyperelastic_materials import (
+    HyperelasticMaterial,
+    NeoHookean,
+    StVenantKirchhoff,
+)
+from avatar_core.fem.hyperelasticity import Hyperelasticity
+from avatar_core.fem.newton import NewtonRule, State, _LoadControl, _LostError, press, solve
+from avatar_core.fem.patch_loads import patch_loads, patch_normals
+from avatar_core.geometry.mesh import TetMesh, make_mesh
+from avatar_core.vademecum.model import Vademecum
 from tests.core.conftest import box_mesh, box_regions
 from tests.hard.soft_box import (
     LENGTH,

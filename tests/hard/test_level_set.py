@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
-from avatar_core.level_set import distance_grid, isosurface, signed_distance
-from avatar_core.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.level_set import distance_grid, isosurface, signed_distance
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
 
 from .surfaces import (
     DEPTH,

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from avatar_core.errors import SurfaceError
-from avatar_core.level_set import (
+from avatar_core.geometry.level_set import (
     DistanceGrid,
     GridBox,
     distance_grid,
@@ -19,7 +19,7 @@ from avatar_core.level_set import (
     reinitialize,
     signed_distance,
 )
-from avatar_core.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
 
 from .surfaces import (
     RADIUS,

@@ -20,23 +20,23 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from avatar_core.barycenter import (
+from avatar_core.errors import LLEError
+from avatar_core.geometry.level_set import distance_in_box, padded_box
+from avatar_core.geometry.phantom import phantom_liver, population
+from avatar_core.shapes.barycenter import (
     DEFAULT_REGULARIZATION,
     Barycenter,
     barycenter,
     barycenter_weights,
     convex_weights,
 )
-from avatar_core.errors import LLEError
-from avatar_core.level_set import distance_in_box, padded_box
-from avatar_core.lle import LLE, embed, estimate_dimension, fit
-from avatar_core.phantom import phantom_liver, population
+from avatar_core.shapes.lle import LLE, embed, estimate_dimension, fit
 
 Figure = Callable[[str], None]
 
 EPS = float(np.finfo(float).eps)
 NEAR = 1e-5  # a hundredth of a millimetre [m]
-TRUSTED = 5e-11  # what rounding may do to the weights of a base, `avatar_core.lle`
+TRUSTED = 5e-11  # what rounding may do to the weights of a base, `avatar_core.shapes.lle`
 
 
 @pytest.fixture(scope="module")

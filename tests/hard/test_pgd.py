@@ -13,18 +13,19 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.sparse.linalg import aslinearoperator
 
-from avatar_core import pgd, pgd_load
-from avatar_core.affine import AffineProblem, CanonicalField, Samples
-from avatar_core.affine_elasticity import affine_problem, gauss_nodes
-from avatar_core.build_rule import BuildRule
-from avatar_core.coordinates import Coordinate, problem_at
-from avatar_core.elasticity import Elasticity, Inclusion, Material
 from avatar_core.errors import ConvergenceError, CoordinateError
-from avatar_core.loads import load_surface, patch_loads
-from avatar_core.parametric import at_values
-from avatar_core.parametric_build import build_parametric_vademecum
-from avatar_core.pgd_hadamard import solve_hadamard
-from avatar_core.vademecum import Provenance, Vademecum
+from avatar_core.fem.elasticity import Elasticity, Inclusion, Material
+from avatar_core.fem.patch_loads import load_surface, patch_loads
+from avatar_core.offline.parametric import build_parametric_vademecum
+from avatar_core.offline.rule import BuildRule
+from avatar_core.reduction import pgd as pgd_load
+from avatar_core.reduction import pgd_parametric as pgd
+from avatar_core.reduction.affine import AffineProblem, CanonicalField, Samples
+from avatar_core.reduction.affine_elasticity import affine_problem, gauss_nodes
+from avatar_core.reduction.coordinates import Coordinate, problem_at
+from avatar_core.reduction.pgd_hadamard import solve_hadamard
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.model import Provenance, Vademecum
 
 from .shapes import cube, regions_of
 

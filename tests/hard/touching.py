@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from hypothesis import strategies as st
 
-from avatar_core.build_rule import BuildRule
-from avatar_core.contact import FAR_AWAY, ContactModel, Status, make_model, prepare, step
-from avatar_core.contact_kernels import ENTERED
-from avatar_core.contact_layout import Layout
-from avatar_core.effects import Effect, SeveralTools
-from avatar_core.effects.selection import Constants, selected_arrays
-from avatar_core.organ import OrganOptions, vademecum_of
-from avatar_core.phantom import phantom_liver
-from avatar_core.tool_path import access, inner_positions
-from avatar_core.vademecum import Vademecum
+from avatar_core.contact.effects import Effect, SeveralTools
+from avatar_core.contact.effects.selection import Constants, selected_arrays
+from avatar_core.contact.kernels import ENTERED
+from avatar_core.contact.layout import Layout
+from avatar_core.contact.model import FAR_AWAY, ContactModel, Status, make_model, prepare, step
+from avatar_core.contact.tool_path import access, inner_positions
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.rule import BuildRule
+from avatar_core.vademecum.model import Vademecum
 
 RADIUS = 5e-3  # of the tips [m]
 DEEP = (6e-3, 12e-3, 18e-3)  # where places have access, too [m]

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from avatar_ros.bench_cell import Module
-from avatar_ros.ui_organ import Organ
-from avatar_ros.ui_scene import camera_of
+from avatar_ros.bench.cell import Module
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.view import camera_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WINDOW = (1280, 800)  # [px]

@@ -26,7 +26,7 @@ def main(prefix: Path) -> int:
         place = Path(str(package.__file__)).resolve()
         assert place.is_relative_to(prefix.resolve()), f"{place} is not what colcon installed"
     assert Path(get_package_prefix("avatar_ros")).resolve() == prefix.resolve()
-    from avatar_ros.bench_cell import isolated_environment
+    from avatar_ros.bench.cell import isolated_environment
 
     os.environ.update(isolated_environment())
     with tempfile.TemporaryDirectory() as library:
@@ -48,10 +48,10 @@ def main(prefix: Path) -> int:
 
 
 def _build(library: Path) -> None:
-    from avatar_core.build_rule import BuildRule
-    from avatar_core.organ import OrganOptions, vademecum_of
-    from avatar_core.phantom import phantom_liver
-    from avatar_core.storage import save_vademecum
+    from avatar_core.geometry.phantom import phantom_liver
+    from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+    from avatar_core.offline.rule import BuildRule
+    from avatar_core.vademecum.storage import save_vademecum
 
     options = OrganOptions(n_vertices=600, rule=BuildRule(max_modes=10), n_certified=4)
     save_vademecum(vademecum_of(phantom_liver(12e-3), options), library / "liver.h5")
@@ -60,8 +60,8 @@ def _build(library: Path) -> None:
 def _state() -> str:
     """The first state of the contact node in which it has the vademecum."""
     import rclpy
+    from avatar_ros.framework import qos
 
-    from avatar_ros import qos
     from avatar_ros.msg import ContactState
 
     rclpy.init()

@@ -114,7 +114,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def own_domain() -> dict[str, str]:
     """No other cell on this machine or network hears these tests, nor they it."""
-    from avatar_ros.bench_cell import isolated_environment
+    from avatar_ros.bench.cell import isolated_environment
 
     environment = isolated_environment()
     os.environ.update(environment)
@@ -124,9 +124,9 @@ def own_domain() -> dict[str, str]:
 @pytest.fixture(scope="session")
 def organ() -> Any:
     """A coarse phantom's vademecum: what matters here is not how exact it is."""
-    from avatar_core.build_rule import BuildRule
-    from avatar_core.organ import OrganOptions, vademecum_of
-    from avatar_core.phantom import phantom_liver
+    from avatar_core.geometry.phantom import phantom_liver
+    from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+    from avatar_core.offline.rule import BuildRule
 
     rule = BuildRule(max_modes=30)
     return vademecum_of(
@@ -137,7 +137,7 @@ def organ() -> Any:
 @pytest.fixture(scope="session")
 def library(organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Good and bad files, and a way out."""
-    from avatar_core.storage import save_vademecum
+    from avatar_core.vademecum.storage import save_vademecum
 
     folder = tmp_path_factory.mktemp("library")
     outside = tmp_path_factory.mktemp("outside")
@@ -172,7 +172,7 @@ def lasting_probe(own_domain: dict[str, str]) -> Iterator[Probe]:
 @pytest.fixture(scope="module")
 def cell(own_domain: dict[str, str], library: Path) -> Iterator[dict[str, Any]]:
     """Loader and contact node, as a user starts them, for one module of tests."""
-    from avatar_ros.bench_cell import Module
+    from avatar_ros.bench.cell import Module
 
     files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
     processes = {
@@ -187,7 +187,7 @@ def cell(own_domain: dict[str, str], library: Path) -> Iterator[dict[str, Any]]:
 @pytest.fixture(scope="session")
 def touch(organ: Any) -> tuple[np.ndarray, np.ndarray]:
     """A tip 4 mm deep in the middle of the accessible surface, and the outward normal there."""
-    from avatar_core.tool_path import middle_of_access
+    from avatar_core.contact.tool_path import middle_of_access
 
     j = middle_of_access(organ)
     normal = organ.surface.normals[j]

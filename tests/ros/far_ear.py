@@ -12,9 +12,9 @@ import math
 import time
 
 import rclpy
+from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 
-from avatar_ros import qos
 from avatar_ros.msg import ContactState
 
 

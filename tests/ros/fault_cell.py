@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from avatar_ros.bench_cell import Module
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
-from avatar_ros import qos
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.steady_tool import SWING
 

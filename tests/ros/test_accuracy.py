@@ -14,19 +14,21 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.accuracy import Accuracy, Report
-from avatar_ros.budget_requests import BudgetRequests
-from avatar_ros.budgets import Budgets
-from avatar_ros.contact import ContactNode
-from avatar_ros.handover import Answer, Change, Order
+from avatar_ros.framework import qos
+from avatar_ros.loop.shown_modes import Accuracy, Report
+from avatar_ros.nodes.contact import ContactNode
+from avatar_ros.prepare import scenes
+from avatar_ros.prepare.budget_requests import BudgetRequests
+from avatar_ros.prepare.budgets import Budgets
+from avatar_ros.prepare.handover import Answer
+from avatar_ros.prepare.orders import Change, Order
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 
-from avatar_core.accuracy import Budget, Detail
-from avatar_core.contact import prepare
+from avatar_core.contact.model import prepare
 from avatar_core.errors import AccuracyError
-from avatar_ros import qos, scenes
+from avatar_core.vademecum.accuracy import Budget, Detail
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.test_cell import Hand, felt

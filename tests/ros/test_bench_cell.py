@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.bench_cell import CellError, run_cell
-from avatar_ros.footprint import Footprint, Growth
+from avatar_ros.bench.cell import CellError, run_cell
+from avatar_ros.bench.footprint import Footprint, Growth
 
 pytestmark = pytest.mark.ros
 

@@ -12,11 +12,11 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
+from avatar_ros.framework import qos
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 
-from avatar_ros import qos
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumInfo
 from avatar_ros.srv import LoadVademecum
 
@@ -224,7 +224,7 @@ def test_a_bad_file_is_refused(cell: Any, probe: Any, name: str, reason: str) ->
 
 
 def test_a_good_file_is_loaded(cell: Any, probe: Any, organ: Any, library: Path) -> None:
-    from avatar_core.storage import load_vademecum
+    from avatar_core.vademecum.storage import load_vademecum
 
     answer = probe.call(LoadVademecum, "load_vademecum", LoadVademecum.Request(name="liver.h5"))
     assert (answer.success, answer.message) == (True, "")

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.conversions import (
+from avatar_ros.framework.conversions import (
     CloudTemplate,
     PoseReader,
     PoseTemplate,

@@ -23,7 +23,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
-from avatar_core.storage import save_vademecum
+from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.ros.conftest import Probe
 from tests.ros.fault_cell import MOST, FaultCell, Harm, Silence

@@ -16,14 +16,14 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.contact_loop import Online
-from avatar_ros.safety import Safety
-from avatar_ros.tool import Tool
+from avatar_ros.loop.contact_loop import Online
+from avatar_ros.loop.safety import Safety
+from avatar_ros.loop.tool import Tool
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 
-from avatar_core.contact import prepare
-from avatar_core.force_guard import ENGAGEMENT, SETTLING, ForceGuard, ForceLimits
+from avatar_core.contact.haptics.force_guard import ENGAGEMENT, SETTLING, ForceGuard, ForceLimits
+from avatar_core.contact.model import prepare
 from avatar_ros.msg import ContactState
 from tests.ros.test_poses import OK, Bench, bench, pose
 

@@ -13,10 +13,10 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-pytest.importorskip("avatar_ros.handover", reason="avatar_ros is not installed")
+pytest.importorskip("avatar_ros.prepare.handover", reason="avatar_ros is not installed")
 
-from avatar_ros.handover import Order
-from avatar_ros.shared_arrays import map_shared, share
+from avatar_ros.prepare.orders import Order
+from avatar_ros.prepare.shared_arrays import map_shared, share
 
 pytestmark = pytest.mark.ros
 
@@ -59,7 +59,7 @@ def test_the_receiving_process_ends_with_the_node(own_domain: dict[str, str]) ->
     ours.send(json.dumps(asdict(order)).encode())
     with theirs:
         process = subprocess.Popen(
-            [sys.executable, "-m", "avatar_ros.handover"],
+            [sys.executable, "-m", "avatar_ros.prepare.receiver"],
             stdin=theirs.fileno(),
             env=own_domain,
             cwd="/",

@@ -13,20 +13,21 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.handover import Order, Receiver
-from avatar_ros.library import (
+from avatar_ros.framework import conversions, library
+from avatar_ros.framework.library import (
     RefusedError,
     file_name,
     find_in_library,
     read_in_library,
 )
-from avatar_ros.patient_builder import BuildError
-from avatar_ros.patient_interpolation import order_of
-from avatar_ros.patient_process import require_replaceable
-from avatar_ros.reader import Reader
+from avatar_ros.framework.reader import Reader
+from avatar_ros.nodes.patient_interpolation import order_of
+from avatar_ros.patients.builder import BuildError
+from avatar_ros.patients.worker import require_replaceable
+from avatar_ros.prepare.orders import Order
+from avatar_ros.prepare.receiver import Receiver
 
 from avatar_core.errors import one_line
-from avatar_ros import conversions, library
 from avatar_ros.msg import VademecumFile
 from avatar_ros.srv import InterpolatePatient
 

@@ -12,12 +12,12 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.bench_cell import Module
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
-from avatar_ros import qos
 from avatar_ros.msg import ContactState
 
 pytestmark = pytest.mark.ros
@@ -123,7 +123,7 @@ def test_a_wrong_parameter_ends_the_node(
 def test_a_broken_vademecum_from_elsewhere_is_refused(
     own_domain: dict[str, str], probe: Any
 ) -> None:
-    from avatar_ros.conversions import vademecum_file
+    from avatar_ros.framework.conversions import vademecum_file
 
     from avatar_ros.msg import VademecumFile
 

@@ -13,16 +13,16 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 import rclpy
-from avatar_ros.contact_loop import BLEND, ContactLoop, Online
-from avatar_ros.conversions import WrenchTemplate, small_turn, stamp_bytes
-from avatar_ros.parameters import ContactSettings
-from avatar_ros.tool import OK
+from avatar_ros.framework.conversions import WrenchTemplate, small_turn, stamp_bytes
+from avatar_ros.loop.contact_loop import BLEND, ContactLoop, Online
+from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.tool import OK
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
-from avatar_core.contact import prepare
-from avatar_core.effects import Friction, Viscoelasticity
+from avatar_core.contact.effects import Friction, Viscoelasticity
+from avatar_core.contact.model import prepare
 from tests.ros.through import Through
 
 pytestmark = pytest.mark.ros

@@ -13,18 +13,18 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.bench_cell import Module
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
-from avatar_core.build_rule import BuildRule
-from avatar_core.coordinates import Coordinate
-from avatar_core.organ import OrganOptions, vademecum_of
-from avatar_core.phantom import phantom_liver
-from avatar_core.storage import save_vademecum
-from avatar_core.tool_path import middle_of_access
-from avatar_ros import qos
+from avatar_core.contact.tool_path import middle_of_access
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.rule import BuildRule
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import PATIENT
 from tests.ros.test_cell import Hand, _force, felt

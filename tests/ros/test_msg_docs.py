@@ -10,13 +10,13 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.bench_cell import Module
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.duration import Infinite
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from avatar_ros import qos
 from avatar_ros.msg import ContactState
 from tests.ros.pages import (
     PAGES,

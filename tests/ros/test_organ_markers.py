@@ -15,11 +15,11 @@ import yaml
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.bench_cell import Module
-from avatar_ros.colours import colours, table, top_for
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from avatar_ros.ui.colours import colours, table, top_for
 from visualization_msgs.msg import Marker
 
-from avatar_ros import qos
 from tests.ros.test_cell import Hand, _wait_for_model
 
 pytestmark = pytest.mark.ros

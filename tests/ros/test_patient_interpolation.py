@@ -18,8 +18,9 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.action", reason="avatar_ros is not installed")
 
 from action_msgs.msg import GoalStatus
-from avatar_ros.bench_cell import Module
-from avatar_ros.conversions import surface_mesh
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from avatar_ros.framework.conversions import surface_mesh
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
@@ -27,16 +28,15 @@ from rclpy.action import ActionClient, get_action_server_names_and_types_by_node
 from rclpy.parameter import parameter_value_to_python
 from shape_msgs.msg import Mesh
 
-from avatar_core.atlas_build import AtlasOptions, SurfaceFile, create_atlas
-from avatar_core.atlas_response import Responder
-from avatar_core.atlas_storage import load_atlas, save_atlas
-from avatar_core.atlas_workers import Workers
-from avatar_core.mesh import regions_by_rule, tetrahedralize
-from avatar_core.phantom import phantom_liver, population
-from avatar_core.registration import RegistrationRule, Template
-from avatar_core.storage import load_vademecum
-from avatar_core.surface import SurfaceMesh
-from avatar_ros import qos
+from avatar_core.atlas.growth import AtlasOptions, SurfaceFile, create_atlas
+from avatar_core.atlas.response import Responder
+from avatar_core.atlas.storage import load_atlas, save_atlas
+from avatar_core.atlas.workers import Workers
+from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver, population
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.registration import RegistrationRule, Template
+from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.action import BuildPatient
 from avatar_ros.msg import ContactState
 from avatar_ros.srv import InterpolatePatient, LoadVademecum

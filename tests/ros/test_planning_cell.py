@@ -16,9 +16,9 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.cell import commands
+from avatar_ros.framework import qos
+from avatar_ros.nodes.cell import commands
 
-from avatar_ros import qos
 from avatar_ros.msg import ContactState
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.pages import ROOT
@@ -28,7 +28,11 @@ pytestmark = pytest.mark.ros
 
 @contextmanager
 def started(arguments: list[str], domain: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-c", "from avatar_core.cli import main; raise SystemExit(main())"]
+    command = [
+        sys.executable,
+        "-c",
+        "from avatar_core.cli.main import main; raise SystemExit(main())",
+    ]
     process = subprocess.Popen(
         [*command, "cell", *arguments], cwd="/", env=domain, stderr=subprocess.PIPE, text=True
     )

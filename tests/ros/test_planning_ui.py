@@ -16,13 +16,13 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
 pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 
-from avatar_ros.bench_cell import Module
-from avatar_ros.ui_organ import Organ
+from avatar_ros.bench.cell import Module
+from avatar_ros.ui.organ import Organ
 from rcl_interfaces.srv import ListParameters
 
-from avatar_core.recording import load_recording
-from avatar_core.replay import replay
-from avatar_core.storage import load_vademecum, save_vademecum
+from avatar_core.scene.recording import load_recording
+from avatar_core.scene.replay import replay
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.ros.browser import (
     CHROMIUM,
     SLOW,

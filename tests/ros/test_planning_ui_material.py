@@ -18,12 +18,12 @@ import meshio
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 
-from avatar_core.build_rule import BuildRule
-from avatar_core.coordinates import Coordinate
-from avatar_core.organ import OrganOptions, vademecum_of
-from avatar_core.phantom import phantom_liver
-from avatar_core.storage import save_vademecum
-from avatar_core.tumour import read_tumour
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.tumour import read_tumour
+from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.rule import BuildRule
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.vademecum.storage import save_vademecum
 from tests.ros.browser import (
     CHROMIUM,
     force_of,

@@ -16,11 +16,11 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
 pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 
-from avatar_ros.bench_cell import Module
-from avatar_ros.ui_organ import Organ
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from avatar_ros.ui.organ import Organ
 
-from avatar_core.storage import load_vademecum, save_vademecum
-from avatar_ros import qos
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from avatar_ros.msg import LoopStatistics
 from tests.ros.browser import (
     CHROMIUM,

@@ -20,18 +20,23 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 import rclpy
-from avatar_ros.contact_loop import ContactLoop, Online
-from avatar_ros.conversions import PoseReader, StateTemplate, stamp_bytes, stamp_nanoseconds
-from avatar_ros.loop_statistics import statistics
-from avatar_ros.parameters import ContactSettings
-from avatar_ros.safety import Safety
-from avatar_ros.tool import Tool
+from avatar_ros.framework.conversions import (
+    PoseReader,
+    StateTemplate,
+    stamp_bytes,
+    stamp_nanoseconds,
+)
+from avatar_ros.loop import contact_loop
+from avatar_ros.loop.contact_loop import ContactLoop, Online
+from avatar_ros.loop.safety import Safety
+from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.statistics import statistics
+from avatar_ros.loop.tool import Tool
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
-from avatar_core.contact import prepare
-from avatar_ros import contact_loop
+from avatar_core.contact.model import prepare
 from avatar_ros.msg import ContactState
 from tests.ros.through import Through
 

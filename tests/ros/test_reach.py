@@ -17,7 +17,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.discovery import (
+from avatar_ros.framework.discovery import (
     BY_PROFILE,
     LOCAL,
     PROFILES,
@@ -31,7 +31,7 @@ from lifecycle_msgs.srv import GetState
 pytestmark = pytest.mark.ros
 
 FAST_DDS = "rmw_fastrtps_cpp"
-NODE = [sys.executable, "-m", "avatar_ros.vademecum_loader"]
+NODE = [sys.executable, "-m", "avatar_ros.nodes.vademecum_loader"]
 LISTENING = 8.0  # a peer that is answered is answered in 2 s [s]
 HEARD = """
 import time, rclpy

@@ -16,15 +16,15 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.declared import ParameterError
-from avatar_ros.kept_state import KeptState
+from avatar_ros.framework import qos
+from avatar_ros.framework.kept_state import KeptState
+from avatar_ros.framework.parameters import ParameterError
 from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import parameter_value_to_python
 
-from avatar_core.storage import save_vademecum
-from avatar_ros import qos
+from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumInfo
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.ros.conftest import START_TIMEOUT, Probe

@@ -15,19 +15,19 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.bench_cell import Module
-from avatar_ros.budgets import Budgets
-from avatar_ros.handover import Order
-from avatar_ros.scenes import lay_out, plan, shipped_scene
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from avatar_ros.prepare.budgets import Budgets
+from avatar_ros.prepare.orders import Order
+from avatar_ros.prepare.scenes import lay_out, plan, shipped_scene
 from geometry_msgs.msg import Quaternion, WrenchStamped
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from avatar_core.errors import AvatarError
-from avatar_core.scene_file import read_scene
-from avatar_core.yaml_lines import MAX_BYTES
-from avatar_ros import qos
+from avatar_core.scene.file import read_scene
+from avatar_core.scene.yaml_lines import MAX_BYTES
 from avatar_ros.msg import ContactState
 from avatar_ros.srv import LoadScene
 from tests.ros.conftest import START_TIMEOUT

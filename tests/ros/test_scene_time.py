@@ -12,9 +12,9 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.bench_cell import Module
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
 
-from avatar_ros import qos
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import PATIENT
 from tests.ros.test_scene import Palpation

@@ -18,12 +18,13 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.bench_cell import Module
-from avatar_ros.conversions import vademecum_file
-from avatar_ros.handover import Order, Receiver
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from avatar_ros.framework.conversions import vademecum_file
+from avatar_ros.prepare.orders import Order
+from avatar_ros.prepare.receiver import Receiver
 
-from avatar_core.storage import load_vademecum, save_vademecum
-from avatar_ros import qos
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from avatar_ros.msg import ContactState, LoopStatistics
 from avatar_ros.srv import LoadVademecum
 from tests.ros.conftest import PATIENT

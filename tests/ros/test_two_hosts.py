@@ -24,7 +24,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_core.storage import save_vademecum
+from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]
@@ -155,8 +155,8 @@ def test_a_vademecum_crosses_and_a_dead_link_costs_no_more_than_itself(
 ) -> None:
     library = tmp_path / "library"
     files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
-    hosts.run("planning", "-m", "avatar_ros.vademecum_loader", "--ros-args", *files)
-    hosts.run("haptic", "-m", "avatar_ros.contact")
+    hosts.run("planning", "-m", "avatar_ros.nodes.vademecum_loader", "--ros-args", *files)
+    hosts.run("haptic", "-m", "avatar_ros.nodes.contact")
     ear = Ear(hosts.run("haptic", str(HERE / "far_ear.py")))
     place = [f"{x:.9g}" for x in (*(touch[0] + 4e-3 * touch[1]), *touch[1])]
     hosts.run("planning", str(HERE / "steady_tool.py"), *place)

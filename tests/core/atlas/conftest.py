@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import pytest
 
-from avatar_core import atlas_build
-from avatar_core.atlas import Atlas
-from avatar_core.atlas_anatomy import Anatomy
-from avatar_core.atlas_build import (
+from avatar_core.atlas import growth as atlas_build
+from avatar_core.atlas.anatomy import Anatomy
+from avatar_core.atlas.growth import (
     build_anatomy,
     new_atlas,
 )
-from avatar_core.mesh import TetMesh, regions_by_rule
-from avatar_core.phantom import phantom_liver, population
-from avatar_core.registration import RegistrationRule, Template
-from avatar_core.surface import SurfaceMesh
+from avatar_core.atlas.model import Atlas
+from avatar_core.geometry.mesh import TetMesh, regions_by_rule
+from avatar_core.geometry.phantom import phantom_liver, population
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.registration import RegistrationRule, Template
 from tests.core.atlas.rough import OPTIONS, N
 
 

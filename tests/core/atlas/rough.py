@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar_core.atlas import Atlas
-from avatar_core.atlas_build import (
+from avatar_core.atlas.growth import (
     AtlasOptions,
 )
-from avatar_core.atlas_workers import Workers
-from avatar_core.registration import RegistrationRule
-from avatar_core.surface import SurfaceMesh
+from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.workers import Workers
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.registration import RegistrationRule
 
 # a rough registration, 0.3 s instead of 6 s: what an atlas does with it is the same
 ROUGH = RegistrationRule(

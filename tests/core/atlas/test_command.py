@@ -12,14 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import atlas_build, cli
-from avatar_core.atlas import Atlas
-from avatar_core.atlas_build import (
+from avatar_core.atlas import growth as atlas_build
+from avatar_core.atlas.growth import (
     AtlasOptions,
 )
-from avatar_core.atlas_storage import save_atlas
-from avatar_core.registration import RegistrationRule, Template
-from avatar_core.surface import SurfaceMesh
+from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.storage import save_atlas
+from avatar_core.cli import main as cli
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.registration import RegistrationRule, Template
 from tests.core.atlas.rough import ROUGH, write_obj
 
 

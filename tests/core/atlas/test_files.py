@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 import pytest
 
-from avatar_core.atlas import Atlas
-from avatar_core.atlas_storage import load_atlas, save_atlas
+from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.storage import load_atlas, save_atlas
 from avatar_core.errors import AvatarError, StorageError
 
 
@@ -69,7 +69,7 @@ def test_arrays_that_do_not_fit_are_refused(
     key: str,
     spoil: Callable[[np.ndarray], np.ndarray],
 ) -> None:
-    from avatar_core import hdf5
+    from avatar_core.common import hdf5
 
     encoded = hdf5.encoded
 

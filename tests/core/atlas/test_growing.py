@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core.atlas import Atlas, box_around
-from avatar_core.atlas_anatomy import Anatomy, AtlasError, Response
-from avatar_core.atlas_build import (
+from avatar_core.atlas.anatomy import Anatomy, AtlasError, Response
+from avatar_core.atlas.growth import (
     build_anatomy,
     create_atlas,
     extend_atlas,
     new_atlas,
 )
-from avatar_core.atlas_storage import load_atlas, save_atlas
-from avatar_core.elasticity import Material
+from avatar_core.atlas.model import Atlas, box_around
+from avatar_core.atlas.storage import load_atlas, save_atlas
 from avatar_core.errors import LLEError
-from avatar_core.registration import Template
-from avatar_core.surface import SurfaceMesh
+from avatar_core.fem.elasticity import Material
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.registration import Template
 from tests.core.atlas.rough import ALONE, OPTIONS, N, same
 
 # --- growing ----------------------------------------------------------------------------------

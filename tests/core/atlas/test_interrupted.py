@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from avatar_core import atlas_build
-from avatar_core.atlas import Atlas
-from avatar_core.atlas_anatomy import Anatomy, AtlasError
-from avatar_core.atlas_build import (
+from avatar_core.atlas import growth as atlas_build
+from avatar_core.atlas.anatomy import Anatomy, AtlasError
+from avatar_core.atlas.checkpoint import parts_of
+from avatar_core.atlas.growth import (
     Recipe,
     SurfaceFile,
     create_atlas,
@@ -22,11 +22,11 @@ from avatar_core.atlas_build import (
     new_atlas,
     part_keys,
 )
-from avatar_core.atlas_parts import parts_of
-from avatar_core.atlas_storage import load_atlas, save_atlas
+from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.storage import load_atlas, save_atlas
 from avatar_core.errors import StorageError
-from avatar_core.registration import Template
-from avatar_core.surface import SurfaceMesh
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.registration import Template
 from tests.core.atlas.rough import ALONE, OPTIONS, ROUGH, StopError, same, stop_after, write_obj
 
 
@@ -135,7 +135,7 @@ def test_killed_in_the_middle_of_a_write(atlas: Atlas, tmp_path: Path) -> None:
     before = file.read_bytes()
     script = (
         "import os, signal, sys\n"
-        "from avatar_core.atlas_storage import load_atlas, save_atlas\n"
+        "from avatar_core.atlas.storage import load_atlas, save_atlas\n"
         "os.fsync = lambda handle: os.kill(os.getpid(), signal.SIGKILL)\n"
         "atlas = load_atlas(sys.argv[1])\n"
         "save_atlas(atlas.with_anatomies(atlas.anatomies[:1]), sys.argv[1])\n"

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core import atlas_build
-from avatar_core.atlas_anatomy import Anatomy, AtlasError
-from avatar_core.atlas_build import (
+from avatar_core.atlas import growth as atlas_build
+from avatar_core.atlas.anatomy import Anatomy, AtlasError
+from avatar_core.atlas.growth import (
     SurfaceFile,
     create_atlas,
 )
-from avatar_core.atlas_storage import load_atlas
-from avatar_core.atlas_workers import Workers
-from avatar_core.registration import RegistrationRule, Template
-from avatar_core.surface import SurfaceMesh
+from avatar_core.atlas.storage import load_atlas
+from avatar_core.atlas.workers import Workers
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.registration import RegistrationRule, Template
 from tests.core.atlas.rough import ALONE, OPTIONS, write_obj
 
 # --- bad surfaces -----------------------------------------------------------------------------

@@ -1,0 +1,101 @@
+"""One organ of an atlas, and what can be said of two of them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avatar_core.errors import AvatarError
+from avatar_core.fem.elasticity import Element, Material
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.reduction.compact_response import CompactResponse
+from avatar_core.shapes.registration import RegistrationQuality, SimilarityTransform
+
+FloatArray = NDArray[np.float64]
+
+
+class AtlasError(AvatarError):
+    """An atlas cannot take, or does not hold, what was asked."""
+
+
+@dataclass(frozen=True, eq=False)
+class Response(CompactResponse):
+    """The response of one anatomy on the registered template, in the anatomy's own RAS axes.
+
+    material, element, patch_radius [m] : what it was computed with
+    """
+
+    material: Material
+    element: Element
+    patch_radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """One organ of an atlas.
+
+    name : unique in the atlas
+    surface : SurfaceMesh, in its own place, with unit, axes and hash of its file
+    volume : [m3]
+    alignment : SimilarityTransform from the template to the organ
+    distances : ndarray, shape (n_points,), signed distance on the atlas's box [m]
+    registered : ndarray, shape (n_template_vertices, 3), the template on the organ [m]
+    quality : RegistrationQuality; converged : whether the registration met its tolerance
+    response : Response, or None if none was computed
+    """
+
+    name: str
+    surface: SurfaceMesh
+    volume: float
+    alignment: SimilarityTransform
+    distances: FloatArray
+    registered: FloatArray
+    quality: RegistrationQuality
+    converged: bool
+    response: Response | None = None
+
+
+@dataclass(frozen=True)
+class Duplicate:
+    """A member that is an earlier one once more; it counts in no barycenter.
+
+    name, of : of the member and of the earlier one
+    same_file : whether their files have the same bytes; otherwise their distances are equal
+    """
+
+    name: str
+    of: str
+    same_file: bool
+
+    def __str__(self) -> str:
+        how = "is the same file as" if self.same_file else "has the same shape as"
+        return f"{self.name} {how} {self.of}: kept, but not counted again"
+
+
+def free_name(name: str, taken: Collection[str]) -> str:
+    """The name, with a number if it is taken."""
+    if name not in taken:
+        return name
+    number = 2
+    while f"{name}-{number}" in taken:
+        number += 1
+    return f"{name}-{number}"
+
+
+def require_shapes(anatomy: Anatomy, n_points: int, n_vertices: int) -> None:
+    """Raise AtlasError unless the arrays fit the box, the template and one another."""
+    response = anatomy.response
+    fits = anatomy.distances.shape == (n_points,) and anatomy.registered.shape == (n_vertices, 3)
+    if response is not None:
+        rank = response.space.shape[-1]
+        fits = fits and response.space.shape == (3 * n_vertices, rank)
+        fits = fits and response.load.ndim == 2 and response.load.shape[1] == rank
+        fits = fits and response.missing.shape == (len(response.load) // 3, 3, 3)
+    if not fits:
+        raise AtlasError(
+            f"{anatomy.name}: its arrays do not fit the atlas's box and template; build it with "
+            "this atlas"
+        )

@@ -1,0 +1,96 @@
+"""Anatomies that an unfinished build has finished, one file each, beside the atlas."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from avatar_core.atlas.anatomy import Anatomy, AtlasError
+from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.storage import load_anatomy, load_atlas, save_anatomy, save_atlas
+from avatar_core.errors import StorageError
+
+EMPTY = "empty-"  # begins the name of an atlas without members
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The folder ``ATLAS.h5.parts``; keys say what went into a part."""
+
+    folder: Path
+
+    def load(self, key: str | None) -> Anatomy | None:
+        """A part, None if there is none that can be read."""
+        with suppress(StorageError):
+            return load_anatomy(self._file(key)) if key and self._file(key).exists() else None
+        return None
+
+    def save(self, key: str | None, anatomy: Anatomy) -> None:
+        """Keep a part; without a key it is not kept."""
+        if key:
+            save_anatomy(anatomy, self._file(key))
+
+    def load_empty(self, key: str) -> Atlas | None:
+        """The atlas without members that the build began with, None if it did not."""
+        with suppress(StorageError):
+            return load_atlas(self._file(EMPTY + key))
+        return None
+
+    def save_empty(self, key: str, atlas: Atlas) -> None:
+        """Keep the atlas without members: its mesh would not come out the same again."""
+        save_atlas(atlas, self._file(EMPTY + key))
+
+    def clear(self, keys: Iterable[str | None] | None = None) -> None:
+        """Remove some parts, or all."""
+        chosen = self.folder.iterdir() if keys is None else (self._file(k) for k in keys if k)
+        for file in list(chosen):
+            file.unlink(missing_ok=True)
+
+    def _file(self, key: str | None) -> Path:
+        return self.folder / f"{key}.h5"
+
+
+@contextmanager
+def parts_of(path: Path) -> Iterator[Parts]:
+    """The parts of the atlas at a path, for one build at a time; gone afterwards if empty.
+
+    Raises AtlasError if another build has them, StorageError if there can be no folder.
+    """
+    folder = path.with_name(f"{path.name}.parts")
+    try:
+        folder.mkdir(exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise StorageError(
+            f"cannot make {folder} ({error.strerror}); create its folder first, or choose another"
+        ) from error
+    try:
+        _lock(handle, path)
+        try:
+            yield Parts(folder)
+        finally:
+            _tidy(folder)
+    finally:
+        os.close(handle)
+
+
+def _tidy(folder: Path) -> None:
+    """Remove the folder unless it holds anatomies; a dot begins what a killed write left."""
+    rest = list(folder.iterdir())
+    if all(file.name.startswith((EMPTY, ".")) for file in rest):
+        for file in rest:
+            file.unlink(missing_ok=True)
+        folder.rmdir()
+
+
+def _lock(handle: int, path: Path) -> None:
+    """Held until the handle is closed, by the system if need be."""
+    import fcntl
+
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise AtlasError(f"another build is at work on {path}; wait until it is done") from error

@@ -1,0 +1,302 @@
+"""Building an atlas from surfaces: on all cores or a cluster, and going on where it stopped.
+
+Each finished anatomy is saved at once in the folder ``ATLAS.h5.parts`` under a name made of what
+went into it; the atlas itself is written in the end, in one step, and the folder removed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from avatar_core.atlas.anatomy import Anatomy, AtlasError, Response
+from avatar_core.atlas.checkpoint import Parts, parts_of
+from avatar_core.atlas.model import LARGEST_ORGAN, SPACING, Atlas, anatomy_of, box_around
+from avatar_core.atlas.storage import ATLAS_SCHEMA, load_atlas, save_atlas
+from avatar_core.atlas.workers import Workers
+from avatar_core.errors import AvatarError
+from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.surface_files import content_of
+from avatar_core.shapes.registration import Registration, RegistrationRule, Template, register
+
+Axes = str | tuple[tuple[float, ...], ...]
+Respond = Callable[[Registration], Response]
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class SurfaceFile:
+    """A surface that is read where it is worked on; see `read_surface`."""
+
+    path: Path
+    unit: str = "mm"
+    axes: Axes = "RAS"
+    label: int | None = None
+
+    @property
+    def name(self) -> str:
+        """What the surface will be called."""
+        return self.path.name.split(".")[0]
+
+    def read(self) -> SurfaceMesh:
+        """The surface; SurfaceError if it is none."""
+        return read_surface(self.path, self.unit, self.axes, self.label)
+
+
+Source = SurfaceFile | SurfaceMesh
+
+
+@dataclass(frozen=True)
+class AtlasOptions:
+    """What is fixed when an atlas is created.
+
+    template_vertices : of the template's mesh, about; the template is the built-in liver
+    largest : organ that the box holds, along x, y, z [m]
+    spacing : of the box's grid [m]
+    rule : of the registrations
+    """
+
+    template_vertices: int = 2500
+    largest: tuple[float, float, float] = LARGEST_ORGAN
+    spacing: float = SPACING
+    rule: RegistrationRule = field(default_factory=RegistrationRule)
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A surface that did not become a member, and why in one line."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """What became of a build.
+
+    atlas : with the new members; not on disk if there are none
+    added : names of the new members; skipped : surfaces that are not among them
+    resumed : how many of the new members an interrupted build had left
+    notices : duplicates among the new members, one line each
+    """
+
+    atlas: Atlas
+    added: tuple[str, ...]
+    skipped: tuple[Skipped, ...]
+    resumed: int
+    notices: tuple[str, ...]
+
+
+def new_atlas(template: Template, options: AtlasOptions | None = None) -> Atlas:
+    """An atlas without members.
+
+    Raises AtlasError if the box or the spacing is unreasonable.
+    """
+    options = options or AtlasOptions()
+    return Atlas(template, box_around(template, options.largest, options.spacing), options.rule)
+
+
+def default_template(n_vertices: int = 2500) -> Template:
+    """The built-in liver as a template, with clamp and accessible region by the anatomical rule."""
+    mesh = tetrahedralize(phantom_liver(), n_vertices)
+    return Template("phantom", mesh, regions_by_rule(mesh))
+
+
+def create_atlas(
+    path: str | Path,
+    sources: Sequence[Source],
+    options: AtlasOptions | None = None,
+    *,
+    template: Template | None = None,
+    workers: Workers | None = None,
+    respond: Respond | None = None,
+    progress: Progress | None = None,
+) -> Growth:
+    """Build an atlas; nothing is written to the path if no surface can be used.
+
+    template : None for the built-in liver with ``options.template_vertices``
+    respond : also computes a Response from each registration; must be picklable
+    progress : called with (surfaces done, surfaces, name) after each surface
+
+    Raises AtlasError if the file exists or another build is at work on it, StorageError if it
+    cannot be written.
+    """
+    path = Path(path)
+    with parts_of(path) as parts:
+        if path.exists():
+            raise AtlasError(f"{path} exists; grow it by 'avatar atlas add', or remove it first")
+        empty = _empty_atlas(parts, options or AtlasOptions(), template)
+        growth, _ = _grow(empty, sources, parts, workers or Workers(), respond, progress)
+        if growth.added:
+            save_atlas(growth.atlas, path)
+            parts.clear()  # what is left was for other templates
+    return growth
+
+
+def extend_atlas(
+    path: str | Path,
+    sources: Sequence[Source],
+    *,
+    workers: Workers | None = None,
+    respond: Respond | None = None,
+    progress: Progress | None = None,
+) -> Growth:
+    """Add surfaces to an atlas on disk, which stays as it is until all are done.
+
+    Arguments as of `create_atlas`. Raises StorageError if there is no atlas at the path or it
+    cannot be written, AtlasError if another build is at work on it.
+    """
+    path = Path(path)
+    if not path.is_file():
+        load_atlas(path)  # which says what is missing
+    with parts_of(path) as parts:
+        atlas = load_atlas(path)
+        growth, keys = _grow(atlas, sources, parts, workers or Workers(), respond, progress)
+        if growth.added:
+            save_atlas(growth.atlas, path)
+            parts.clear(keys)
+    return growth
+
+
+def _empty_atlas(parts: Parts, options: AtlasOptions, template: Template | None) -> Atlas:
+    """The one an interrupted build began with, or a new one."""
+    if template is not None:
+        return new_atlas(template, options)
+    asked = json.dumps(asdict(options), sort_keys=True)
+    key = hashlib.sha256(asked.encode()).hexdigest()[:32]
+    atlas = parts.load_empty(key)
+    if atlas is None:
+        atlas = new_atlas(default_template(options.template_vertices), options)
+        parts.save_empty(key, atlas)
+    return atlas
+
+
+def _grow(
+    atlas: Atlas,
+    sources: Sequence[Source],
+    parts: Parts,
+    workers: Workers,
+    respond: Respond | None,
+    progress: Progress | None,
+) -> tuple[Growth, list[str | None]]:
+    """What becomes of the surfaces, and the keys under which their parts are kept."""
+    recipe = Recipe(atlas.without_anatomies(), respond)
+    keys = part_keys(recipe, sources)
+    results: dict[int, Anatomy | Skipped] = {}
+
+    def keep(number: int, result: Anatomy | Skipped) -> None:
+        results[number] = result
+        if progress is not None:
+            progress(len(results), len(sources), sources[number].name)
+
+    for number, key in enumerate(keys):
+        part = parts.load(key)
+        if part is not None:
+            keep(number, part)
+    resumed = len(results)
+    numbers = [number for number in range(len(sources)) if number not in results]
+    todo: list[Source | Skipped] = [sources[number] for number in numbers]
+    if workers.scheduler is not None:  # its workers may not see this machine's files
+        todo = [_read_here(source) for source in todo]
+    for i, result in workers.map(recipe, todo):
+        number = numbers[i]
+        if isinstance(result, Exception):
+            result = Skipped(sources[number].name, _in_one_line(result))
+        if isinstance(result, Anatomy):
+            parts.save(keys[number], result)
+        keep(number, result)
+    return _growth(atlas, [results[i] for i in range(len(sources))], resumed), keys
+
+
+def _growth(atlas: Atlas, results: Sequence[Anatomy | Skipped], resumed: int) -> Growth:
+    """In the order of the surfaces, whatever the order in which they were done."""
+    grown = atlas.with_anatomies(one for one in results if isinstance(one, Anatomy))
+    added = grown.names[len(atlas) :]
+    notices = tuple(str(one) for one in grown.duplicates if one.name in added) if added else ()
+    skipped = tuple(one for one in results if isinstance(one, Skipped))
+    return Growth(grown, added, skipped, resumed, notices)
+
+
+# --- one anatomy ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """What all anatomies of a build have in common: an atlas without members, and a response."""
+
+    atlas: Atlas
+    respond: Respond | None = None
+
+    def __call__(self, source: Source | Skipped) -> Anatomy | Skipped:
+        """An anatomy, or why there is none: one bad organ must not cost the others."""
+        if isinstance(source, Skipped):
+            return source
+        try:
+            return build_anatomy(self.atlas, source, self.respond)
+        except AvatarError as error:
+            return Skipped(source.name, str(error))
+        except Exception as error:  # a singular matrix, memory that ran out
+            return Skipped(source.name, _in_one_line(error))
+
+
+def build_anatomy(atlas: Atlas, source: Source, respond: Respond | None = None) -> Anatomy:
+    """Read, register and measure one organ.
+
+    Raises
+    ------
+    AvatarError
+        Of the stage that refused, with the remedy.
+    """
+    surface = source.read() if isinstance(source, SurfaceFile) else source
+    atlas.require_room(surface)
+    registration = register(atlas.template, surface, atlas.rule)
+    anatomy = anatomy_of(atlas, surface, registration)
+    return replace(anatomy, response=respond(registration)) if respond else anatomy
+
+
+def part_keys(recipe: Recipe, sources: Sequence[Source]) -> list[str | None]:
+    """Hashes of all that goes into each anatomy, None for a file that cannot be read."""
+    atlas, mesh = recipe.atlas, recipe.atlas.template.mesh
+    common = hashlib.sha256()
+    for array in (mesh.vertices, mesh.tets, atlas.template.regions.accessible):
+        common.update(np.ascontiguousarray(array).tobytes())
+    settings = (ATLAS_SCHEMA, asdict(atlas.box), asdict(atlas.rule))
+    common.update(json.dumps(settings).encode())
+    common.update(pickle.dumps(recipe.respond))
+    return [_part_key(common.digest(), source) for source in sources]
+
+
+def _part_key(common: bytes, source: Source) -> str | None:
+    digest = hashlib.sha256(common)
+    digest.update(source.name.encode())
+    if isinstance(source, SurfaceFile):
+        try:
+            digest.update(content_of(source.path))
+        except AvatarError:
+            return None  # reading it again will say why
+        digest.update(repr((source.unit, source.axes, source.label)).encode())
+    else:
+        digest.update(source.vertices.tobytes())
+        digest.update(source.faces.tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _read_here(source: Source | Skipped) -> Source | Skipped:
+    if not isinstance(source, SurfaceFile):
+        return source
+    try:
+        return source.read()
+    except AvatarError as error:
+        return Skipped(source.name, str(error))
+
+
+def _in_one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

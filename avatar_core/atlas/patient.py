@@ -1,0 +1,475 @@
+"""A new patient's vademecum from a base of anatomies, at three fidelities.
+
+``interpolated`` combines the neighbours' responses (Eq. 18); ``reduced`` lets their load functions
+span a Galerkin space on the patient's own mesh and enriches it; ``solved`` is the full build. All
+share the patient's mesh, and the clamp and accessible region carried over from the template, so
+that they differ by nothing but the response.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from avatar_core.atlas.base import PatientBase, PatientError
+from avatar_core.atlas.transfer import (
+    Weighting,
+    by_component,
+    carried,
+    carried_by_place,
+    combine,
+    patient_weights,
+)
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads, patch_normals
+from avatar_core.geometry.mesh import Regions, TetMesh, tetrahedralize
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.offline.certify.linear import certify
+from avatar_core.offline.linear import build_vademecum, with_rank
+from avatar_core.offline.rule import BuildRule
+from avatar_core.reduction.compact_response import CompactResponse
+from avatar_core.reduction.galerkin import (
+    ErrorEstimate,
+    ReducedResponse,
+    ReductionRule,
+    missing_blocks,
+    reduce,
+)
+from avatar_core.reduction.near_field import LocalBlocks, near_pairs
+from avatar_core.reduction.separated import SeparatedField
+from avatar_core.shapes.barycenter import Barycenter
+from avatar_core.shapes.correspondence import carry_regions, load_map, registered_positions
+from avatar_core.shapes.registration import Registration, register
+from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
+from avatar_core.vademecum.tip_field import make_tip_field
+
+Fidelity = Literal["interpolated", "reduced", "solved"]
+Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
+
+_CERTIFIED = {"interpolated": 24, "reduced": 24, "solved": 200}  # each is a fine solution
+MISSING_SUPPORT = 2.0  # reach of interpolated missing compliance, in patch radii
+_FAR_HULL = 0.5  # hull distance over the neighbours' mean distance that is worth a warning
+
+
+def _silent(stage: str, fraction: float, error: float) -> None:
+    """Report nothing."""
+
+
+@dataclass(frozen=True)
+class PatientOptions:
+    """How a patient's vademecum is made.
+
+    n_vertices : of the patient's own mesh, about
+    weighting : of the neighbours; ``n_neighbors`` None for all (10 on the grid)
+    tolerance : mean relative L2 error of displacement that ``reduced`` and ``solved`` aim at
+    max_modes : far-field modes of the vademecum, the rest becomes near field
+    n_certified : unseen loads of the certificate, 0 for none; None for 24, or 200 of ``solved``
+    leave_out : anatomies of the base that do not count, such as other scans of the patient
+    """
+
+    n_vertices: int = 2850
+    weighting: Weighting = "kriging"
+    n_neighbors: int | None = None
+    tolerance: float = 0.03
+    max_modes: int = 100
+    n_certified: int | None = None
+    leave_out: tuple[int, ...] = ()
+    build: BuildRule = field(default_factory=BuildRule)
+    reduction: ReductionRule = field(default_factory=ReductionRule)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.tolerance < 1.0:
+            raise PatientError(f"tolerance {self.tolerance:g}; choose between 0 and 1")
+
+
+@dataclass(frozen=True)
+class StageSeconds:
+    """CPU seconds (user + system) of this process by stage."""
+
+    registration: float
+    mesh: float
+    response: float
+    certificate: float
+
+    @property
+    def total(self) -> float:
+        """From the surface on."""
+        return self.registration + self.mesh + self.response + self.certificate
+
+
+@dataclass(frozen=True, eq=False)
+class Patient:
+    """A patient's vademecum and where it comes from.
+
+    vademecum : Vademecum
+    fidelity : how it was made; a member of the base may have brought its own
+    neighbours : names, nearest first; weights : ndarray, shape (n,)
+    barycenter : Barycenter, with sum |w| and hull distance
+    estimates : ErrorEstimate of each enrichment (``reduced`` only), the last one holds
+    solutions : fine solutions that the response took
+    notices : one line each
+    seconds : StageSeconds
+    """
+
+    vademecum: Vademecum
+    fidelity: Fidelity
+    neighbours: tuple[str, ...]
+    weights: np.ndarray
+    barycenter: Barycenter
+    estimates: tuple[ErrorEstimate, ...]
+    solutions: int
+    notices: tuple[str, ...]
+    seconds: StageSeconds
+
+
+@dataclass(frozen=True, eq=False)
+class PatientProblem:
+    """A patient's own mesh, with clamp and loads carried over from the template.
+
+    surface : of the patient; registration : of the template to it
+    mesh, regions, loads, elasticity : the patient's
+    """
+
+    surface: SurfaceMesh
+    registration: Registration
+    mesh: TetMesh
+    regions: Regions
+    loads: LoadSurface
+    elasticity: Elasticity
+
+
+def patient_problem(
+    surface: SurfaceMesh, base: PatientBase, registration: Registration, mesh: TetMesh
+) -> PatientProblem:
+    """Carry clamp, accessible region and patch radius of the base to a patient's mesh.
+
+    Raises
+    ------
+    RegistrationError, MeshError
+        If the mesh lies elsewhere, or is too coarse for the regions or the patch.
+    """
+    regions = carry_regions(registration, mesh)
+    loads = load_surface(mesh, regions, base.loads.patch_radius)
+    elasticity = Elasticity(mesh, base.material, regions.clamped)
+    return PatientProblem(surface, registration, mesh, regions, loads, elasticity)
+
+
+def member_problem(
+    surface: SurfaceMesh, base: PatientBase, member: int, registration: Registration
+) -> PatientProblem:
+    """An anatomy of the base on the registered template, where its own response was computed."""
+    template = base.template
+    mesh = TetMesh(np.asarray(base.vertices[member], float), template.mesh.tets)
+    own = replace(registration, mesh=mesh)
+    loads = replace(base.loads, centers=registered_positions(own, base.loads))
+    loads = replace(loads, normals=patch_normals(mesh, loads.centers, loads.patch_radius))
+    elasticity = Elasticity(mesh, base.material, template.regions.clamped)
+    return PatientProblem(surface, own, mesh, template.regions, loads, elasticity)
+
+
+def patient_vademecum(
+    surface: SurfaceMesh,
+    base: PatientBase,
+    fidelity: Fidelity = "reduced",
+    options: PatientOptions | None = None,
+    progress: Progress = _silent,
+) -> Patient:
+    """Register, mesh, respond and certify a new patient.
+
+    Raises
+    ------
+    PatientError
+        For an unknown fidelity or weighting.
+    AvatarError
+        Of the stage that refused, with the remedy.
+    """
+    require_fidelity(fidelity)
+    options = options or PatientOptions()
+    clock: dict[str, float] = {}
+    progress("registration", 0.0, np.nan)
+    with _timed(clock, "registration"):
+        known = base.registrations.get(surface.source_sha256)
+        registration = known or register(base.template, surface, base.rule)
+    weights = patient_weights(
+        base, registration, surface, options.weighting, options.n_neighbors, options.leave_out
+    )
+    progress("mesh", 0.0, np.nan)
+    with _timed(clock, "mesh"):
+        if weights.member is not None and fidelity == "interpolated":
+            problem = member_problem(surface, base, weights.member, registration)
+        else:
+            mesh = tetrahedralize(surface, options.n_vertices)
+            problem = patient_problem(surface, base, registration, mesh)
+    return respond(problem, base, weights, fidelity, options, progress, clock)
+
+
+def respond(
+    problem: PatientProblem,
+    base: PatientBase,
+    weights: Barycenter,
+    fidelity: Fidelity,
+    options: PatientOptions,
+    progress: Progress = _silent,
+    clock: dict[str, float] | None = None,
+) -> Patient:
+    """The vademecum of a patient that is registered and meshed; see :func:`patient_vademecum`."""
+    require_fidelity(fidelity)
+    clock = {} if clock is None else clock
+    estimates: tuple[ErrorEstimate, ...] = ()
+    solutions = 0
+    with _timed(clock, "response"):
+        progress("response", 0.0, np.nan)
+        if fidelity == "interpolated":
+            vademecum = interpolated(problem, base, weights, options)
+        elif fidelity == "reduced":
+            vademecum, estimates = reduced(problem, base, weights, options, progress)
+            solutions = estimates[-1].solutions
+        else:
+            vademecum = solved(problem, options, progress)
+            solutions = 3 * problem.loads.n_positions
+    count = _CERTIFIED[fidelity] if options.n_certified is None else options.n_certified
+    with _timed(clock, "certificate"):
+        if count:
+            vademecum = certified(vademecum, problem, count, progress)
+    if vademecum.certificate is not None:
+        spent = replace(vademecum.certificate, build_cpu_seconds=sum(clock.values()))
+        vademecum = vademecum.with_certificate(spent)
+    progress("certify", 1.0, _mean_error(vademecum))
+    return _patient(vademecum, fidelity, base, weights, estimates, solutions, clock)
+
+
+def require_fidelity(fidelity: str) -> None:
+    """Raise PatientError unless the fidelity is known."""
+    if fidelity not in get_args(Fidelity):
+        raise PatientError(
+            f"unknown fidelity {fidelity!r}; choose one of {', '.join(get_args(Fidelity))}"
+        )
+
+
+# --- three fidelities -------------------------------------------------------------------------
+
+
+def interpolated(
+    problem: PatientProblem, base: PatientBase, weights: Barycenter, options: PatientOptions
+) -> Vademecum:
+    """Eq. 18: no equation of the patient is solved.
+
+    ``lle-grid`` combines at common places as the paper does, the others nodewise on the template.
+    The near field is that of the modes alone; the contact compliance gets what the base knows to
+    be missing under each patch.
+    """
+    response = interpolated_response(problem, base, weights, options)
+    support = MISSING_SUPPORT * problem.loads.patch_radius
+    convergence = Convergence(converged=False, tolerance=float("nan"))
+    return _assembled(problem, response, support, convergence, options)
+
+
+def interpolated_response(
+    problem: PatientProblem, base: PatientBase, weights: Barycenter, options: PatientOptions
+) -> CompactResponse:
+    """The combined response at the patient's vertices and load positions."""
+    registration, elasticity, loads = problem.registration, problem.elasticity, problem.loads
+    if weights.member is not None and problem.mesh is registration.mesh:
+        return base.responses[weights.member]
+    if options.weighting == "lle-grid":
+        return carried_by_place(base, weights, registration, elasticity, loads, options.max_modes)
+    combined = combine(base.responses, weights, options.max_modes)
+    return carried(combined, registration, base.loads, elasticity, loads)
+
+
+def reduced(
+    problem: PatientProblem,
+    base: PatientBase,
+    weights: Barycenter,
+    options: PatientOptions,
+    progress: Progress = _silent,
+) -> tuple[Vademecum, tuple[ErrorEstimate, ...]]:
+    """The vademecum of :func:`reduced_response`, and the estimates on the way."""
+    found = reduced_response(problem, base, weights, options, progress)
+    return vademecum_of_reduced(problem, found, options), found.history
+
+
+def reduced_response(
+    problem: PatientProblem,
+    base: PatientBase,
+    weights: Barycenter,
+    options: PatientOptions,
+    progress: Progress = _silent,
+) -> ReducedResponse:
+    """Galerkin projection on the patient's own mesh; see :mod:`avatar_core.reduction.galerkin`."""
+    combined = combine(base.responses, weights, options.reduction.n_start)
+    positions = load_map(problem.registration, base.loads, problem.loads.centers)
+    functions = by_component(positions, combined.load.astype(float))
+    loads = patch_loads(
+        problem.elasticity, problem.loads.centers, problem.loads.patch_radius
+    ).tocsr()
+    return reduce(
+        problem.elasticity,
+        loads,
+        problem.loads,
+        functions / np.linalg.norm(functions, axis=0),
+        options.tolerance,
+        options.reduction,
+        lambda fraction, estimate: progress("response", fraction, estimate.mean),
+    )
+
+
+def vademecum_of_reduced(
+    problem: PatientProblem, found: ReducedResponse, options: PatientOptions
+) -> Vademecum:
+    """What contact needs around a response: modes by worth, near field, distance and access."""
+    convergence = Convergence(
+        found.converged,
+        options.tolerance,
+        rank_errors=tuple(RankError(e.rank, e.mean, e.worst) for e in found.history),
+    )
+    return _assembled(problem, found.response, found.support, convergence, options)
+
+
+def solved(
+    problem: PatientProblem, options: PatientOptions, progress: Progress = _silent
+) -> Vademecum:
+    """Full finite elements for every load position."""
+    return build_vademecum(
+        problem.surface.name,
+        problem.elasticity,
+        problem.regions,
+        problem.loads,
+        replace(options.build, max_modes=options.max_modes),
+        _provenance(problem),
+        lambda stage, fraction, error: progress(f"response: {stage}", fraction, error),
+    )
+
+
+# --- assembly ---------------------------------------------------------------------------------
+
+
+def certified(
+    vademecum: Vademecum, problem: PatientProblem, n_loads: int, progress: Progress = _silent
+) -> Vademecum:
+    """The vademecum with its errors on unseen loads against full finite elements."""
+    return vademecum.with_certificate(
+        certify(
+            vademecum,
+            problem.elasticity,
+            n_loads,
+            progress=lambda done: progress("certify", done / n_loads, np.nan),
+        )
+    )
+
+
+def _assembled(
+    problem: PatientProblem,
+    response: CompactResponse,
+    support: float,
+    convergence: Convergence,
+    options: PatientOptions,
+) -> Vademecum:
+    """A vademecum of a compact response: its best modes far, the others near their load."""
+    rule, loads = options.build, problem.loads
+    radius = loads.patch_radius
+    far = _by_worth(response, problem.mesh)
+    whole = Vademecum(
+        name=problem.surface.name,
+        mesh=problem.mesh,
+        regions=problem.regions,
+        material=problem.elasticity.material,
+        element=problem.elasticity.element,
+        surface=loads,
+        far=far,
+        near=_no_blocks(loads, problem.mesh, rule.near_outer * radius),
+        contact_near=missing_blocks(
+            response.missing, support, loads, rule.contact_support * radius
+        ),
+        tip_field=make_tip_field(problem.mesh, problem.regions, radius),
+        convergence=convergence,
+        provenance=_provenance(problem),
+    )
+    return with_rank(whole, options.max_modes, rule)
+
+
+def _by_worth(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
+    """Modes rotated so that the first are worth most in displacement; Y Y^T does not change."""
+    field_ = SeparatedField(np.asarray(response.space, float), np.asarray(response.load, float))
+    size = np.maximum((field_.load**2).sum(axis=1), 1e-300)
+    sorted_ = field_.sorted_by_worth(np.repeat(mesh.vertex_volumes, 3), 1.0 / size)
+    return SeparatedField(sorted_.space.astype(np.float32), sorted_.load.astype(np.float32))
+
+
+def _no_blocks(loads: LoadSurface, mesh: TetMesh, reach: float) -> LocalBlocks:
+    pairs = near_pairs(loads.centers, mesh.vertices, reach)
+    return LocalBlocks(pairs.start, pairs.target, np.zeros((len(pairs.target), 3, 3), np.float32))
+
+
+def _provenance(problem: PatientProblem) -> Provenance:
+    surface = problem.surface
+    return Provenance(
+        source=surface.name,
+        source_sha256=surface.source_sha256,
+        unit=surface.unit,
+        axes=surface.axes_name,
+        parameters=(f"template={problem.registration.template.name}",),
+        notices=surface.notices,
+    )
+
+
+def _patient(
+    vademecum: Vademecum,
+    fidelity: Fidelity,
+    base: PatientBase,
+    weights: Barycenter,
+    estimates: tuple[ErrorEstimate, ...],
+    solutions: int,
+    clock: dict[str, float],
+) -> Patient:
+    return Patient(
+        vademecum=vademecum,
+        fidelity=fidelity,
+        neighbours=tuple(base.names[j] for j in weights.neighbors),
+        weights=weights.weights,
+        barycenter=weights,
+        estimates=estimates,
+        solutions=solutions,
+        notices=weights.notices + _warnings(base, weights, fidelity, vademecum),
+        seconds=StageSeconds(
+            *(clock.get(name, 0.0) for name in ("registration", "mesh", "response", "certificate"))
+        ),
+    )
+
+
+def _warnings(
+    base: PatientBase, weights: Barycenter, fidelity: Fidelity, vademecum: Vademecum
+) -> tuple[str, ...]:
+    """What the reader should know: member, distance from the base, what was not reached."""
+    if weights.member is not None:
+        return (f"the patient is {base.names[weights.member]} of the base",)
+    lines = []
+    away = weights.hull_distance / float(weights.distances.mean())
+    if away > _FAR_HULL:
+        lines.append(
+            f"the patient lies {away:.2g} of its mean distance to the neighbours outside their "
+            "hull; trust 'interpolated' less, or add anatomies like it"
+        )
+    if fidelity == "reduced" and not vademecum.convergence.converged:
+        last = vademecum.convergence.rank_errors[-1]
+        lines.append(
+            f"the tolerance was not reached: estimated error {last.mean:.2g} mean, "
+            f"{last.worst:.2g} worst; choose 'solved'"
+        )
+    return tuple(lines)
+
+
+def _mean_error(vademecum: Vademecum) -> float:
+    return float("nan") if vademecum.certificate is None else vademecum.certificate.l2_mean
+
+
+@contextmanager
+def _timed(clock: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.process_time()
+    yield
+    clock[stage] = clock.get(stage, 0.0) + time.process_time() - start

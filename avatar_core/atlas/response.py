@@ -1,0 +1,41 @@
+"""The response of an anatomy, computed once on the registered template when it joins an atlas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from avatar_core.atlas.anatomy import Response
+from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.patch_loads import load_surface, patch_loads
+from avatar_core.reduction.galerkin import compact_response
+from avatar_core.shapes.correspondence import registered_positions
+from avatar_core.shapes.registration import Registration
+
+
+@dataclass(frozen=True)
+class Responder:
+    """Computes responses; can be sent to other processes.
+
+    material : of all anatomies
+    rank : modes kept of each
+    """
+
+    material: Material = field(default_factory=Material)
+    rank: int = 120
+
+    def __call__(self, registration: Registration) -> Response:
+        """Patches of the template's radius at its load positions on the registered organ."""
+        template = registration.template
+        loads = load_surface(template.mesh, template.regions)
+        centers = registered_positions(registration, loads)
+        elasticity = Elasticity(registration.mesh, self.material, template.regions.clamped)
+        patches = patch_loads(elasticity, centers, loads.patch_radius).tocsr()
+        found = compact_response(elasticity, patches, self.rank)
+        return Response(
+            found.space,
+            found.load,
+            found.missing,
+            self.material,
+            elasticity.element,
+            loads.patch_radius,
+        )

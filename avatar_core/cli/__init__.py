@@ -1,0 +1,3 @@
+"""The ``avatar`` command, one file a subcommand. Arguments come in; text, files and pictures go
+out, and errors of the core become one line and an exit code. Nothing is computed here.
+"""

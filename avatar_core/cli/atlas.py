@@ -1,0 +1,265 @@
+"""The ``avatar atlas`` command: create, add, show."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from avatar_core.errors import AvatarError
+
+if TYPE_CHECKING:
+    from avatar_core.atlas.growth import Growth, Source
+    from avatar_core.atlas.model import Atlas
+
+SUFFIXES = (".obj", ".stl", ".ply", ".vtk", ".off", ".nii", ".nii.gz")
+
+EXIT_STOPPED = 130
+
+atlas = typer.Typer(help="A base of anatomies for new patients.", no_args_is_help=True)
+
+File = Annotated[Path, typer.Argument(metavar="ATLAS.h5", help="the atlas")]
+Surfaces = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="SURFACE...",
+        help="OBJ, STL, PLY, VTK, OFF or label maps, folders of them, or 'phantom'",
+    ),
+]
+Unit = Annotated[str, typer.Option(help="unit of the files: mm, cm or m")]
+Axes = Annotated[
+    str, typer.Option(help="axes of the files: RAS, LPS, or 16 numbers of a 4x4 matrix to RAS")
+]
+Label = Annotated[int | None, typer.Option(help="label of the organ in label maps")]
+Jobs = Annotated[int | None, typer.Option(help="processes on this machine; default one a CPU")]
+ShapesOnly = Annotated[
+    bool, typer.Option("--shapes-only", help="leave out the mechanical responses")
+]
+Scheduler = Annotated[
+    str | None, typer.Option(help="address of a Dask scheduler to use instead, tcp://HOST:PORT")
+]
+
+
+@atlas.command()
+def create(
+    file: File,
+    surfaces: Surfaces,
+    unit: Unit = "mm",
+    axes: Axes = "RAS",
+    label: Label = None,
+    template_vertices: Annotated[
+        int, typer.Option(help="vertices of the template's mesh, about")
+    ] = 2500,
+    spacing: Annotated[float, typer.Option(help="of the grid [m]")] = 0.009,
+    box: Annotated[
+        tuple[float, float, float],
+        typer.Option(help="largest organ the atlas shall hold, along x, y, z [m]"),
+    ] = (0.33, 0.26, 0.26),
+    shapes_only: ShapesOnly = False,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Build an atlas. Interrupted, it goes on when called again; bad surfaces are skipped.
+
+    Exit code 1 if no surface can be used, and then nothing is written.
+    """
+    from avatar_core.atlas.growth import AtlasOptions, create_atlas
+    from avatar_core.atlas.response import Responder
+    from avatar_core.atlas.workers import Workers
+
+    sources = _sources(surfaces, unit, axes, label)
+    options = AtlasOptions(template_vertices, box, spacing)
+    with _bar(len(sources)) as progress:
+        growth = create_atlas(
+            file,
+            sources,
+            options,
+            workers=Workers(jobs, scheduler),
+            respond=None if shapes_only else Responder(),
+            progress=progress,
+        )
+    _report(file, growth)
+
+
+@atlas.command()
+def add(
+    file: File,
+    surfaces: Surfaces,
+    unit: Unit = "mm",
+    axes: Axes = "RAS",
+    label: Label = None,
+    shapes_only: ShapesOnly = False,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Add surfaces to an atlas; what it holds is not computed again.
+
+    The old file stays until the new one is complete. Exit code 1 if no surface can be used.
+    """
+    from avatar_core.atlas.growth import extend_atlas
+    from avatar_core.atlas.response import Responder
+    from avatar_core.atlas.workers import Workers
+
+    sources = _sources(surfaces, unit, axes, label)
+    with _bar(len(sources)) as progress:
+        growth = extend_atlas(
+            file,
+            sources,
+            workers=Workers(jobs, scheduler),
+            respond=None if shapes_only else Responder(),
+            progress=progress,
+        )
+    _report(file, growth)
+
+
+@atlas.command()
+def show(
+    file: File,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+) -> None:
+    """Say what an atlas holds."""
+    from avatar_core.atlas.storage import load_atlas
+
+    loaded = load_atlas(file)
+    if as_json:
+        print(json.dumps(summary(loaded, file.stat().st_size), indent=2))
+    else:
+        _show_text(file, loaded)
+
+
+def summary(atlas: Atlas, nbytes: int) -> dict[str, Any]:
+    """What ``avatar atlas show --json`` prints; lengths in metres, volumes in m3."""
+    copies = {one.name: one.of for one in atlas.duplicates}
+    quality = atlas.rule.tolerance
+    return {
+        "n_anatomies": len(atlas),
+        "n_duplicates": len(copies),
+        "bytes": nbytes,
+        "template": {"name": atlas.template.name, "n_vertices": len(atlas.template.mesh.vertices)},
+        "box": {
+            "origin": list(atlas.box.origin),
+            "spacing": atlas.box.spacing,
+            "shape": list(atlas.box.shape),
+            "n_points": len(atlas.gram.origin),
+        },
+        "registration_tolerance": quality,
+        "anatomies": [
+            {
+                "name": one.name,
+                "source_sha256": one.surface.source_sha256,
+                "unit": one.surface.unit,
+                "axes": one.surface.axes_name,
+                "n_vertices": len(one.surface.vertices),
+                "volume": one.volume,
+                "scale": one.alignment.scale,
+                "angle_degrees": one.alignment.angle,
+                "mean_distance": one.quality.mean_distance,
+                "reverse_mean_distance": one.quality.reverse_mean_distance,
+                "least_jacobian": one.quality.least_jacobian,
+                "converged": one.converged,
+                "duplicate_of": copies.get(one.name),
+                "response_rank": one.response.load.shape[1] if one.response else None,
+                "notices": list(one.surface.notices),
+            }
+            for one in atlas.anatomies
+        ],
+    }
+
+
+def _show_text(file: Path, atlas: Atlas) -> None:
+    about = summary(atlas, file.stat().st_size)
+    box = about["box"]
+    print(
+        f"{file.name}: {len(atlas)} anatomies ({about['n_duplicates']} duplicates), "
+        f"{about['bytes'] / 1e6:.1f} MB"
+    )
+    print(f"  template {about['template']['name']}, {about['template']['n_vertices']} vertices")
+    print(
+        f"  grid {' x '.join(map(str, box['shape']))} points, {box['spacing'] * 1e3:g} mm apart, "
+        f"{' x '.join(f'{side * 1e3:.0f}' for side in atlas.box.upper - atlas.box.origin)} mm"
+    )
+    print(f"  {'name':24s} {'ml':>6s} {'scale':>6s} {'turn':>6s} {'off by':>8s}  response")
+    for one in about["anatomies"]:
+        marks = [] if one["converged"] else ["registration not converged"]
+        marks += [f"duplicate of {one['duplicate_of']}"] if one["duplicate_of"] else []
+        rank = one["response_rank"]
+        print(
+            f"  {one['name']:24s} {one['volume'] * 1e6:6.0f} {one['scale']:6.3f} "
+            f"{one['angle_degrees']:4.0f}\N{DEGREE SIGN} {one['mean_distance'] * 1e3:7.2f}mm  "
+            f"{'-' if rank is None else f'{rank} modes':8s}  {', '.join(marks)}".rstrip()
+        )
+
+
+def _report(file: Path, growth: Growth) -> None:
+    """What was added and what was not; an error if nothing was."""
+    for one in growth.skipped:
+        print(f"skipped: {one.name}: {one.reason.removeprefix(f'{one.name}: ')}", file=sys.stderr)
+    for notice in growth.notices:
+        print(f"notice: {notice}", file=sys.stderr)
+    n_sources = len(growth.added) + len(growth.skipped)
+    if not growth.added:
+        raise AvatarError(f"none of {n_sources} surface(s) can be used; nothing was written")
+    resumed = f", {growth.resumed} of them from an interrupted build" if growth.resumed else ""
+    print(
+        f"{file}: {len(growth.added)} of {n_sources} added{resumed}, {len(growth.skipped)} "
+        f"skipped; {len(growth.atlas)} anatomies"
+    )
+
+
+def _sources(surfaces: Sequence[str], unit: str, axes: str, label: int | None) -> list[Source]:
+    """The surfaces named, those of a folder in the order of their names."""
+    from avatar_core.atlas.growth import SurfaceFile
+    from avatar_core.cli.vademecum import parsed_axes
+    from avatar_core.geometry.phantom import phantom_liver
+    from avatar_core.geometry.surface import METRES, axes_matrix
+
+    parsed = parsed_axes(axes)
+    axes_matrix(parsed)  # what is wrong for all is no reason to skip each
+    if unit not in METRES:
+        raise AvatarError(f"--unit is '{unit}'; use one of {', '.join(METRES)}")
+    frozen = parsed if isinstance(parsed, str) else tuple(map(tuple, parsed))
+    sources: list[Source] = []
+    for name in surfaces:
+        if name == "phantom":
+            sources.append(phantom_liver())
+        else:
+            sources += [SurfaceFile(path, unit, frozen, label) for path in _files(Path(name))]
+    return sources
+
+
+def _files(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    found = sorted(one for one in path.iterdir() if one.name.lower().endswith(SUFFIXES))
+    if not found:
+        raise AvatarError(f"no surface in {path}; it should hold files of {', '.join(SUFFIXES)}")
+    return found
+
+
+@contextmanager
+def _bar(total: int) -> Iterator[Callable[[int, int, str], None]]:
+    """A progress bar over the surfaces."""
+    from tqdm import tqdm
+
+    with tqdm(
+        total=total,
+        bar_format="{desc:16.16s} {n_fmt}/{total_fmt} |{bar}| {elapsed}<{remaining}",
+        file=sys.stderr,
+        disable=None,
+    ) as bar:
+
+        def advance(done: int, _: int, name: str) -> None:
+            bar.set_description_str(name, refresh=False)
+            bar.update(done - bar.n)
+
+        try:
+            yield advance
+        except KeyboardInterrupt:
+            bar.close()
+            print("avatar: the same command goes on with what is done", file=sys.stderr)
+            raise typer.Exit(EXIT_STOPPED) from None

@@ -1,0 +1,183 @@
+"""``avatar bench step | effects | cell``: what this machine can hold."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from avatar_core.cli.vademecum import (
+    Axes,
+    BuildBar,
+    Label,
+    Surface,
+    Unit,
+    Vertices,
+    finite,
+    read_organ,
+    require,
+)
+from avatar_core.errors import AvatarError
+
+if TYPE_CHECKING:
+    from avatar_core.studies.bench.effects import EffectRow
+    from avatar_core.studies.bench.methods import StepRow
+
+bench = typer.Typer(help="Does this machine hold 1 kHz?", no_args_is_help=True)
+
+Json = Annotated[Path | None, typer.Option("-o", "--output", help="write the table as JSON")]
+
+
+@bench.command("step")
+def bench_step(
+    surface: Surface = "phantom",
+    unit: Unit = "mm",
+    axes: Axes = "RAS",
+    label: Label = None,
+    small: Annotated[int, typer.Option(help="vertices of the small mesh, about")] = 2850,
+    large: Annotated[int, typer.Option(help="vertices of the large mesh (P1); 0: none")] = 20000,
+    output: Json = None,
+) -> None:
+    """Time the contact step beside a dense table and a direct solve (minutes to build)."""
+    from avatar_core.studies.bench.methods import load_average
+    from avatar_core.studies.bench.step import run_step_bench
+
+    organ = read_organ(surface, unit, axes, label)
+    with BuildBar() as progress:
+        rows, summary = run_step_bench(organ, small, large, progress)
+    print(
+        f"load average {load_average():.2f}; 10 mm spheres sliding 5 mm deep, field at all vertices"
+    )
+    print(_step_table(rows))
+    for key, value in summary.items():
+        print(f"{key:22s} {value:10.1f}")
+    if output is not None:
+        document = {"name": "step", "summary": summary, "rows": [asdict(row) for row in rows]}
+        output.write_text(json.dumps(finite(document), indent=2))
+
+
+@bench.command("effects")
+def bench_effects(
+    surface: Surface = "phantom",
+    unit: Unit = "mm",
+    axes: Axes = "RAS",
+    label: Label = None,
+    vertices: Vertices = 2850,
+    modes: Annotated[int, typer.Option(help="of the far field")] = 50,
+    fused: Annotated[
+        Path, typer.Option(help="file with the linear step fused by hand, in a checkout")
+    ] = Path("tests/bench/fused_step.py"),
+    output: Json = None,
+) -> None:
+    """Time the step bare, with each effect alone, and with everything (minutes to build)."""
+    from avatar_core.studies.bench.effects import build_for_effects, run_effects_bench
+    from avatar_core.studies.bench.methods import load_average
+
+    require(modes >= 36, f"--modes is {modes}; inertia and self_weight need at least 36")
+    organ = read_organ(surface, unit, axes, label)
+    with BuildBar(large=True) as progress:
+        vademecum = build_for_effects(organ, vertices, modes, progress)
+    yardstick = fused if fused.is_file() else None
+    if yardstick is None:
+        print(f"notice: no {fused} here, so nothing to compare the bare step with", file=sys.stderr)
+
+    def announce(scene: str) -> None:
+        print(f"compiling and timing: {scene}", file=sys.stderr, flush=True)
+
+    rows, summary = run_effects_bench(vademecum, yardstick, announce)
+    print(
+        f"load average {load_average():.2f}; {vertices} vertices, {modes} modes; 10 mm spheres "
+        "sliding 5 mm deep, field at all vertices at every step"
+    )
+    print(_effects_table(rows))
+    for key, value in summary.items():
+        print(f"{key:22s} {value:10.3f}")
+    if output is not None:
+        document = {"name": "effects", "summary": summary, "rows": [asdict(row) for row in rows]}
+        output.write_text(json.dumps(finite(document), indent=2))
+
+
+def _effects_table(rows: list[EffectRow]) -> str:
+    lines = [f"{'scene':20s}{'tools':>6s}{'p50 us':>9s}{'p99 us':>9s}{'x bare':>8s}{'MB':>8s}"]
+    lines += [
+        f"{r.scene:20s}{r.tools:6d}{r.p50_us:9.1f}{r.p99_us:9.1f}{r.ratio:8.2f}{r.bytes / 1e6:8.1f}"
+        for r in rows
+    ]
+    return "\n".join(lines)
+
+
+@bench.command("cell")
+def bench_cell(
+    surface: Surface = "phantom",
+    seconds: Annotated[float, typer.Option(help="of each run [s]")] = 60.0,
+    vertices: Vertices = 2850,
+    changes: Annotated[
+        float, typer.Option(help="times a second that the material is changed meanwhile [Hz]")
+    ] = 0.0,
+    output: Json = None,
+) -> None:
+    """Time the whole ROS 2 cell: tool, contact and cloud subscriber as separate processes.
+
+    Says, too, whether one of them takes more and more memory, files or threads: a soak, with
+    --seconds 600.
+    """
+    import tempfile
+
+    from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+    from avatar_core.vademecum.storage import save_vademecum
+
+    require_ros()
+    with tempfile.TemporaryDirectory(prefix="avatar_bench_") as folder:
+        file = Path(surface)
+        if file.suffix != ".h5":
+            with BuildBar() as progress:
+                built = vademecum_of(
+                    read_organ(surface, "mm", "RAS", None),
+                    OrganOptions(n_vertices=vertices),
+                    progress,
+                )
+            file = Path(folder) / "bench.h5"
+            save_vademecum(built, file)
+        run_cell(file, seconds, output, changes)
+
+
+def require_ros() -> None:
+    """Refuse before anything is built where the cell could not be started."""
+    missing = [name for name in ("avatar_ros", "rclpy") if find_spec(name) is None]
+    if missing:
+        raise AvatarError(
+            f"ROS 2 is not installed here (no {missing[0]}); install avatar without AVATAR_NO_ROS "
+            "on Linux x86_64: pip install ."
+        )
+
+
+def run_cell(
+    vademecum: Path, seconds: float, output: Path | None = None, changes: float = 0.0
+) -> None:
+    """Measure the cell in a process of its own, which prints its table or one line of error."""
+    command = [sys.executable, "-m", "avatar_ros.bench.cell", str(vademecum), f"{seconds:g}"]
+    command += ["--changes", f"{changes:g}"]
+    command += ["--output", str(output)] if output is not None else []
+    sys.stdout.flush()  # what was said before comes first in a file too
+    code = subprocess.run(command, check=False).returncode
+    if code != 0:
+        raise typer.Exit(code)
+
+
+def _step_table(rows: list[StepRow]) -> str:
+    lines = [
+        f"{'method':22s} {'vertices':>8s} {'modes':>5s} {'tools':>5s} {'contacts':>8s} "
+        f"{'p50 us':>8s} {'p99 us':>8s} {'MB':>8s}"
+    ]
+    lines += [
+        f"{r.method:22s} {r.vertices:8d} {r.modes or '-':>5} {r.tools:5d} "
+        f"{r.contacts_mean:8.1f} {r.p50_us:8.1f} {r.p99_us:8.1f} {r.bytes / 1e6:8.1f}"
+        for r in rows
+    ]
+    return "\n".join(lines)

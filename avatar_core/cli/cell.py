@@ -1,0 +1,111 @@
+"""``avatar cell``: the nodes of a planning cell, without the launch package."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avatar_core.cli.bench import require_ros
+from avatar_core.errors import AvatarError
+
+_AGAIN = 1.0  # until a cell that does not end is told again [s]
+
+Host = Annotated[
+    str, typer.Option(help="address that the page is served on; 0.0.0.0: any, without a password")
+]
+Port = Annotated[int, typer.Option(help="of the page; the next free one if it is taken")]
+
+
+def cell(
+    params: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="YAML for all nodes, as params/planning_cell.yaml"
+        ),
+    ] = None,
+    library_dir: Annotated[
+        Path | None, typer.Option(exists=True, file_okay=False, help="of the vademecums")
+    ] = None,
+    vademecum: Annotated[str, typer.Option(help="file in it to load")] = "",
+    atlas: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="for the node that makes patients"),
+    ] = None,
+    scene: Annotated[str, typer.Option(help="effects to simulate")] = "",
+    state_dir: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="where nodes keep their state, if any"),
+    ] = None,
+    ui: Annotated[bool, typer.Option("--ui", help="serve the planning page, too")] = False,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
+) -> None:
+    """Run loader, contact node and, with an atlas, the node that makes patients, until Ctrl-C.
+
+    Options go before what the file says. Does what `ros2 launch avatar_ros
+    planning_cell.launch.py` does; all end when one of them does.
+    """
+    require_ros()
+    page = {"host": host, "port": str(port)} if ui else {}
+    given = {
+        "params": params and params.resolve(),
+        "library_dir": library_dir and library_dir.resolve(),
+        "vademecum": vademecum,
+        "atlas": atlas and atlas.resolve(),
+        "scene": scene,
+        "state_dir": state_dir and state_dir.resolve(),
+        **page,
+    }
+    command = [sys.executable, "-m", "avatar_ros.nodes.cell"]
+    for name, value in given.items():
+        command += [f"--{name}", str(value)] if value else []
+    if ui:
+        require_ui()
+        command.append("--ui")
+    sys.stdout.flush()
+    os.chdir("/")  # -m would let a checkout here stand before what is installed
+    os.execv(sys.executable, command)  # signals are for the cell
+
+
+def require_ui() -> None:
+    """Refuse where the planning page could not be served."""
+    if find_spec("viser") is None:
+        raise AvatarError("the planning page needs viser; install it with pip install '.[ui]'")
+
+
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def run_page(vademecum: Path, host: str, port: int) -> None:
+    """Serve the planning page with the cell that it shows, until Ctrl-C."""
+    given = {
+        "library_dir": str(vademecum.parent),
+        "vademecum": vademecum.name,
+        "host": host,
+        "port": str(port),
+    }
+    command = [sys.executable, "-m", "avatar_ros.nodes.cell", "--ui"]
+    command += [word for name, value in given.items() for word in (f"--{name}", value)]
+    sys.stdout.flush()
+    told = False
+    # Deaf until it listens for itself: half started, it would end with a traceback.
+    with subprocess.Popen(command, cwd="/", preexec_fn=_ignore_interrupts) as process:
+        while process.poll() is None:
+            try:
+                if told:  # a terminal told it as well; told twice, it ends once
+                    process.send_signal(signal.SIGINT)
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(_AGAIN)
+            except KeyboardInterrupt:
+                told = True
+    if process.returncode != 0:
+        raise typer.Exit(process.returncode)

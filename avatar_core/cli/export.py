@@ -1,0 +1,52 @@
+"""``avatar export``: a vademecum as a mesh that ParaView opens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avatar_core.cli.vademecum import require
+
+
+def export(
+    file: Annotated[Path, typer.Argument(help="a vademecum (.h5)")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="mesh to write (.vtu or .xdmf)")],
+    at: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="where the load acts [m]; default the middle of the accessible surface"),
+    ] = None,
+    force: Annotated[
+        str, typer.Option(help="inward along the normal, or three numbers as 0,-1,0.5 [N]")
+    ] = "1",
+    modes: Annotated[int, typer.Option(help="modes of the far field to write")] = 10,
+) -> None:
+    """Write the organ at rest, its first modes and its displacement under a load."""
+    from avatar_core.scene.export import organ_mesh, point_load, write_mesh
+    from avatar_core.vademecum.storage import load_vademecum
+
+    require(modes >= 0, f"--modes is {modes}; ask for 0 or more")
+    newtons = _newtons(force)
+    vademecum = load_vademecum(file)
+    load = point_load(vademecum, at, newtons)
+    mesh = organ_mesh(vademecum, load, modes)
+    write_mesh(mesh, output)
+    moved = ((mesh.point_data["displacement"] ** 2).sum(axis=1) ** 0.5).max()
+    x, y, z = load.point
+    n_modes = sum(name.startswith("mode_") for name in mesh.point_data)
+    print(
+        f"{output}: {len(mesh.points)} vertices, {n_modes} modes; "
+        f"{(load.force @ load.force) ** 0.5:g} N at ({x:.4f}, {y:.4f}, {z:.4f}) m move it by "
+        f"{1e3 * moved:.2f} mm at most"
+    )
+
+
+def _newtons(text: str) -> list[float]:
+    """One number or three."""
+    try:
+        numbers = [float(number) for number in text.replace(",", " ").split()]
+    except ValueError:
+        numbers = []
+    require(len(numbers) in (1, 3), f"--force is '{text}'; give one number or three, as 0,-1,0.5")
+    return numbers

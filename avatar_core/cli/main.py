@@ -1,0 +1,119 @@
+"""The ``avatar`` command."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from avatar_core.cli.atlas import atlas
+from avatar_core.cli.bench import bench, require_ros, run_cell
+from avatar_core.cli.cell import Host, Port, cell, require_ui, run_page
+from avatar_core.cli.export import export
+from avatar_core.cli.patient import patient
+from avatar_core.cli.replay import replay
+from avatar_core.cli.scene import scene
+from avatar_core.cli.study import study
+from avatar_core.cli.vademecum import (
+    BuildBar,
+    Vertices,
+    show,
+    show_text,
+    vademecum,
+)
+from avatar_core.errors import AvatarError
+
+if TYPE_CHECKING:
+    pass
+
+EXIT_STOPPED = 130  # by Ctrl-C, as shells count it
+
+app = typer.Typer(
+    help="Computational patient avatars: an organ's mechanical response, computed once, "
+    "answered at 1 kHz.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.add_typer(bench, name="bench")
+app.add_typer(atlas, name="atlas")
+app.add_typer(scene, name="scene")
+app.command()(vademecum)
+app.command()(show)
+app.command()(export)
+app.command()(patient)
+app.command()(replay)
+app.command()(study)
+app.command()(cell)
+
+
+def main() -> int:
+    """Entry point: errors of the user become one line and exit code 1."""
+    try:
+        code = app(standalone_mode=False)
+    except AvatarError as error:
+        print(f"avatar: {error}", file=sys.stderr)
+        return 1
+    except Exception as error:
+        return _usage(error)
+    if code == EXIT_STOPPED:
+        print("avatar: stopped; nothing was left half written", file=sys.stderr)
+    return code if isinstance(code, int) else 0
+
+
+def _usage(error: Exception) -> int:
+    """Show a usage error of the command line; anything else is a bug and is raised."""
+    show = getattr(error, "show", None)
+    if show is None:
+        raise error
+    show()
+    return int(getattr(error, "exit_code", 2))
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="picture to draw")] = Path(
+        "avatar_demo.png"
+    ),
+    seconds: Annotated[float, typer.Option(help="of palpation over ROS 2 [s]")] = 10.0,
+    vertices: Vertices = 1200,
+    ui: Annotated[
+        bool, typer.Option("--ui", help="a page for the browser instead of script and picture")
+    ] = False,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
+) -> None:
+    """Phantom -> vademecum -> ROS 2 nodes at 1 kHz under a scripted tool -> table, picture."""
+    import tempfile
+
+    from avatar_core.cli.picture import palpation_picture
+    from avatar_core.geometry.phantom import phantom_liver
+    from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+    from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+
+    require_ros()
+    if ui:
+        require_ui()
+    print("1. a liver that the code generates becomes a vademecum")
+    with BuildBar() as progress:
+        built = vademecum_of(phantom_liver(), OrganOptions(n_vertices=vertices), progress)
+    with tempfile.TemporaryDirectory(prefix="avatar_demo_") as folder:
+        file = Path(folder) / "phantom.h5"
+        save_vademecum(built, file)
+        v = load_vademecum(file)
+        show_text(v)
+        if ui:
+            print(f"2. the cell, and its page on http://{host}:{port} (open it; Ctrl-C ends both)")
+            run_page(file, host, port)
+            return
+        print(f"2. loader, contact and tool as real ROS 2 processes for {seconds:g} s")
+        run_cell(file, seconds)
+    print("3. the picture")
+    palpation_picture(v, output)
+    print(f"   {output}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,145 @@
+"""``avatar patient``: a new patient's vademecum from an atlas."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from avatar_core.cli.vademecum import (
+    EXIT_NOT_CONVERGED,
+    Axes,
+    Label,
+    Surface,
+    Unit,
+    Vertices,
+    read_organ,
+    require,
+    show_text,
+)
+
+if TYPE_CHECKING:
+    from avatar_core.atlas.patient import Patient
+
+WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
+
+
+def patient(
+    surface: Surface,
+    atlas: Annotated[Path, typer.Option(help="base of anatomies (.h5), of 'avatar atlas create'")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="vademecum to write (.h5)")],
+    fidelity: Annotated[
+        str,
+        typer.Option(
+            help="interpolated: the neighbours' responses, seconds; reduced: they span a Galerkin "
+            "space on the patient's own mesh; solved: full finite elements"
+        ),
+    ] = "reduced",
+    tolerance: Annotated[
+        float, typer.Option(help="mean relative displacement error that 'reduced' aims at [-]")
+    ] = 0.03,
+    weighting: Annotated[
+        str, typer.Option(help="of the neighbours: kriging, lle-template or lle-grid (the paper)")
+    ] = "kriging",
+    neighbors: Annotated[
+        int | None, typer.Option(help="anatomies that take part; default all, 10 for lle-grid")
+    ] = None,
+    leave_out: Annotated[
+        list[str] | None, typer.Option(help="anatomy that does not count; may be repeated")
+    ] = None,
+    unit: Unit = "mm",
+    axes: Axes = "RAS",
+    label: Label = None,
+    vertices: Vertices = 2850,
+    modes: Annotated[int, typer.Option(help="far-field modes at most")] = 100,
+    certify: Annotated[
+        int | None, typer.Option(help="unseen loads of the certificate; default by fidelity")
+    ] = None,
+) -> None:
+    """Find a patient among known anatomies. Exit code 3: complete, but not converged."""
+    from avatar_core.atlas.base import base_of, numbers_of
+    from avatar_core.atlas.patient import PatientOptions, patient_vademecum, require_fidelity
+    from avatar_core.atlas.storage import load_atlas
+    from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+
+    require_fidelity(fidelity)
+    require(weighting in WEIGHTINGS, f"--weighting is {weighting}; choose {', '.join(WEIGHTINGS)}")
+    require(modes >= 1, f"--modes is {modes}; ask for at least 1")
+    require(neighbors is None or neighbors >= 1, f"--neighbors is {neighbors}; ask for at least 1")
+    require(output.parent.is_dir(), f"folder {output.parent} does not exist; create it first")
+    base = base_of(load_atlas(atlas))
+    options = PatientOptions(
+        n_vertices=vertices,
+        weighting=weighting,  # type: ignore[arg-type]
+        n_neighbors=neighbors,
+        tolerance=tolerance,
+        max_modes=modes,
+        n_certified=certify,
+        leave_out=numbers_of(base, leave_out or ()),
+    )
+    organ = read_organ(surface, unit, axes, label)
+    for notice in organ.notices:
+        print(f"notice: {notice}", file=sys.stderr)
+    with _StageBar() as progress:
+        found = patient_vademecum(organ, base, fidelity, options, progress)  # type: ignore[arg-type]
+    save_vademecum(found.vademecum, output)
+    show_text(load_vademecum(output))
+    _show_origin(found)
+    if fidelity != "interpolated" and not found.vademecum.convergence.converged:
+        print(
+            "avatar: not converged; the file is complete and marked; choose --fidelity solved or "
+            "a larger --tolerance",
+            file=sys.stderr,
+        )
+        raise typer.Exit(EXIT_NOT_CONVERGED)
+
+
+def _show_origin(found: Patient) -> None:
+    """Neighbours, weights and time; warnings to standard error."""
+    nearest = ", ".join(
+        f"{name} {weight:+.3f}"
+        for name, weight in zip(found.neighbours[:5], found.weights[:5], strict=True)
+    )
+    more = f" and {len(found.weights) - 5} more" if len(found.weights) > 5 else ""
+    print(f"  from {nearest}{more}; sum |w| {found.barycenter.absolute_sum:.2f}")
+    if found.estimates:
+        last = found.estimates[-1]
+        print(
+            f"  estimated error over all loads {last.mean:.2%} mean, {last.worst:.2%} worst, "
+            f"{last.solutions} fine solutions"
+        )
+    s = found.seconds
+    print(
+        f"  CPU time: registration {s.registration:.1f} s, mesh {s.mesh:.1f} s, response "
+        f"{s.response:.1f} s, certificate {s.certificate:.1f} s"
+    )
+    for notice in found.notices:
+        print(f"notice: {notice}", file=sys.stderr)
+
+
+class _StageBar:
+    """One line for the stages of a patient, with the current error where there is one."""
+
+    def __enter__(self) -> _StageBar:
+        from tqdm import tqdm
+
+        self._bar = tqdm(
+            total=1.0,
+            bar_format="{desc:36s} {percentage:3.0f}% |{bar}| {elapsed}",
+            file=sys.stderr,
+            disable=None,
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def __call__(self, stage: str, fraction: float, error: float) -> None:
+        """Stage ``stage`` is done to ``fraction``; NaN: no error is known."""
+        text = stage if math.isnan(error) else f"{stage}, error {error:.1%}"
+        self._bar.set_description_str(text, refresh=False)
+        self._bar.n = min(fraction, 1.0)
+        self._bar.refresh()

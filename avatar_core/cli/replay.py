@@ -1,0 +1,47 @@
+"""``avatar replay``: a recording of the planning page, computed once more."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avatar_core.errors import AvatarError
+
+
+def replay(
+    file: Annotated[Path, typer.Argument(help="a recording (.h5) of the planning page")],
+    vademecum: Annotated[Path, typer.Option(help="that it was made with (.h5)")],
+    tolerance: Annotated[
+        float, typer.Option(help="largest difference of a force that passes [N]")
+    ] = 1e-9,
+) -> None:
+    """Step through a recorded path again and compare the forces with those recorded."""
+    from avatar_core.scene.recording import load_recording
+    from avatar_core.scene.replay import replay as replayed
+    from avatar_core.scene.replay import why_not
+    from avatar_core.vademecum.storage import load_vademecum
+
+    recording = load_recording(file)
+    found = replayed(recording, load_vademecum(vademecum))
+    periods = recording.periods
+    size = (periods.force**2).sum(axis=2) ** 0.5
+    print(
+        f"{recording.vademecum_name} ({recording.vademecum_id[:12]}): {len(periods)} periods, "
+        f"{int(periods.lost.sum())} lost, in {recording.seconds:.1f} s (nominally "
+        f"{recording.rate:g} Hz), {len(recording.clouds.period)} clouds"
+    )
+    print(f"  largest force {size.max():.3f} N, in contact {(size > 0).any(axis=1).mean():.0%}")
+    difference = found.difference(recording)
+    if math.isnan(difference):
+        raise AvatarError(f"{file}: nothing can be compared: {why_not(recording)}")
+    print(
+        f"  {int(found.known.sum())} periods can be compared: largest difference {difference:.2e} N"
+    )
+    if difference > tolerance:
+        raise AvatarError(
+            f"{file}: forces differ by {difference:.2e} N, above {tolerance:g} N; replay with the "
+            "version of avatar, and on the kind of processor, that recorded"
+        )

@@ -1,0 +1,185 @@
+"""``avatar scene check`` and ``avatar scene list``: what a scene is, and what it costs."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from avatar_core.errors import SceneError
+
+if TYPE_CHECKING:
+    from avatar_core.contact.effects import Effect
+    from avatar_core.scene.model import Scene
+    from avatar_core.vademecum.model import Vademecum
+
+scene = typer.Typer(
+    help="A scene names organ, tools, outputs and effects; what it does not name does not run.",
+    no_args_is_help=True,
+)
+
+
+@scene.command("list")
+def list_scenes() -> None:
+    """The scenes that come with avatar."""
+    from avatar_core.scene.file import read_scene, shipped_scenes
+
+    shipped = shipped_scenes()
+    if not shipped:
+        raise SceneError(
+            "the scenes that come with avatar are not where it is installed; write one"
+        )
+    for name, path in shipped.items():
+        one = read_scene(path)
+        print(f"{name:17s} {one.text}")
+        print(f"{'':17s} effects: {', '.join(e.name for e in one.effects) or 'none'}")
+
+
+@scene.command()
+def check(
+    file: Annotated[str, typer.Argument(help="YAML, or the name of a shipped scene")],
+    vademecum: Annotated[
+        Path | None, typer.Option(help="vademecum (.h5) that it is to run on; steps are timed")
+    ] = None,
+) -> None:
+    """Say what a scene is, how well its effects go together, and what a step of it costs."""
+    from avatar_core.scene.file import read_scene, scene_path
+    from avatar_core.vademecum.storage import load_vademecum
+
+    path = scene_path(file)
+    one = read_scene(path)
+    v = None if vademecum is None else load_vademecum(vademecum)
+    print(f"{one.name}{f': {one.text}' if one.text else ''}")
+    print(f"  {path}")
+    print(f"  organ: {_organ(one, vademecum)}; {_material(one)}")
+    for tool in one.tools:
+        print(f"  tool {tool.name}: tip radius {tool.tip_radius:g} m")
+    print(f"  outputs: {_outputs(one)}")
+    print("  effects" if one.effects else "  effects: none")
+    for effect in one.effects:
+        _show_effect(effect)
+    _show_combinations(one, v)
+    if v is None:
+        print("  cost of a step: needs an organ; give --vademecum FILE.h5")
+        return
+    one.require(v)
+    _show_cost(one, v)
+
+
+def _organ(one: Scene, given: Path | None) -> str:
+    if given is not None:
+        return str(given)
+    return f"{one.vademecum}, in the library" if one.vademecum else "whichever is loaded"
+
+
+def _material(one: Scene) -> str:
+    chosen = [
+        f"{name} {value:g}{unit}"
+        for name, value, unit in (
+            ("E", one.young_modulus, " Pa"),
+            ("nu", one.poisson_ratio, ""),
+        )
+        if value is not None
+    ]
+    return ", ".join(chosen) or "its own material"
+
+
+def _outputs(one: Scene) -> str:
+    if one.cloud == "off":
+        return "forces and contacts every step, no cloud"
+    every = "every step" if one.cloud_divisor == 1 else f"every {one.cloud_divisor} steps"
+    modes = "all modes" if one.modes is None else f"{one.modes} modes"
+    return f"forces and contacts every step, cloud of the {one.cloud} {every} with {modes}"
+
+
+def _show_effect(effect: Effect) -> None:
+    """Its line, then every number with unit and meaning."""
+    print(f"    {effect.name:18s} {effect.text}")
+    for field in fields(effect):
+        meant = field.metadata["quantity"]
+        value = _number(getattr(effect, field.name), meant.unit)
+        print(f"      {field.name:16s} {value:15s} {meant.text}")
+
+
+def _number(value: Any, unit: str) -> str:
+    if value is None:
+        return "the file's"
+    several = value if isinstance(value, tuple) else (value,)
+    text = ", ".join(f"{number:g}" for number in several)
+    return text if unit == "-" else f"{text} {unit}"
+
+
+def _show_combinations(one: Scene, v: Vademecum | None) -> None:
+    """How effects go together, and what it costs in accuracy."""
+    from avatar_core.scene.model import combinations
+
+    found = combinations(one, v)
+    if found:
+        hint = "" if v else "; how wrong that is, a vademecum says: --vademecum FILE.h5"
+        print(f"  combined (the others superpose){hint}")
+    elif len(one.effects) > 1:
+        print("  combined: all superpose")
+    for pair in found:
+        print(f"    {' with '.join(pair.effects)}: {pair.how}")
+        if v is not None:
+            measured = "not measured in this file"
+            if pair.error is not None:
+                measured = f"{pair.error:.1%} wrong in the mean"
+            print(f"      {measured}")
+
+
+def _show_cost(one: Scene, v: Vademecum) -> None:
+    """Times of this machine, now."""
+    from avatar_core.studies.bench.methods import load_average
+    from avatar_core.studies.bench.scene import DEPTH, PUSH, time_scene
+
+    rows = time_scene(v, one, _waiting)
+    print(
+        f"  cost of a step here and now (load average {load_average():.2f}): a push of "
+        f"{PUSH * 1e3:g} mm and a slide {DEPTH * 1e3:g} mm deep;\n"
+        "  of the steps in which all tools touch, each with its cloud; numba keeps what it compiled"
+    )
+    print(
+        f"    {'':22s} {'p50 us':>8s} {'p99 us':>8s} {'steps':>7s} {'model MB':>9s} "
+        f"{'laid out s':>10s} {'compiled s':>10s}"
+    )
+    names = {"bare": "bare: one tool, alone", "scene": "this scene"}
+    for row in rows:
+        print(
+            f"    {names[row.name]:22s} {row.p50_us:8.1f} {row.p99_us:8.1f} {row.n_steps:7d} "
+            f"{row.bytes / 1e6:9.1f} {row.layout_seconds:10.2f} {row.compile_seconds:10.2f}"
+        )
+    if not one.effects:
+        print("    (without effects, this scene is the bare step)")
+
+
+@contextmanager
+def _waiting(text: str) -> Iterator[None]:
+    """A line that counts the seconds on a terminal, and stands elsewhere."""
+    if not sys.stderr.isatty():
+        print(f"{text} ...", file=sys.stderr, flush=True)
+        yield
+        return
+    done, start = threading.Event(), time.monotonic()
+
+    def count() -> None:
+        while not done.is_set():
+            seconds = time.monotonic() - start
+            print(f"\r{text} ... {seconds:3.0f} s", end="", file=sys.stderr, flush=True)
+            done.wait(0.5)
+
+    clock = threading.Thread(target=count, daemon=True)
+    clock.start()
+    try:
+        yield
+    finally:
+        done.set()
+        clock.join()
+        print("\r\033[K", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,64 @@
+"""``avatar study NAME``: the paper's experiments and ours, one table, JSON and picture each."""
+
+from __future__ import annotations
+
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avatar_core.errors import StorageError
+
+STUDIES = {
+    "grid": "avatar_core.studies.grid",
+    "in-silico": "avatar_core.studies.in_silico",
+    "samples": "avatar_core.studies.samples",
+    "leave-one-out": "avatar_core.studies.leave_one_out",
+    "transport": "avatar_core.studies.transport",
+    "pgd": "avatar_core.studies.pgd",
+    "coordinates": "avatar_core.studies.coordinates",
+    "accuracy-time": "avatar_core.studies.accuracy_time",
+    "passivity": "avatar_core.studies.passivity",
+}
+USAGE = 2
+
+
+def study(
+    name: Annotated[str, typer.Argument(help=f"one of {', '.join(STUDIES)}")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="folder for NAME.json and NAME.png")
+    ],
+    surfaces: Annotated[
+        Path | None,
+        typer.Option(help="folder of liver surfaces [mm]; default ../shared/data/livers"),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="small form, minutes")] = False,
+) -> None:
+    """Repeat one of the paper's experiments: its figure beside ours, as table, JSON, picture."""
+    from avatar_core.studies.study import write_study
+
+    if name not in STUDIES:
+        print(f"avatar: no study '{name}'; choose one of {', '.join(STUDIES)}", file=sys.stderr)
+        raise typer.Exit(USAGE)
+    _require_folder(output)
+    run = import_module(STUDIES[name]).run
+    start = time.perf_counter()
+    found = run(surfaces, quick, output)
+    seconds = time.perf_counter() - start
+    for notice in found.notices:
+        print(f"notice: {notice}", file=sys.stderr)
+    print(found.table())
+    print(found.sentence)
+    record, picture = write_study(found, output, seconds)
+    print(f"{record}\n{picture}  ({seconds:.0f} s)")
+
+
+def _require_folder(output: Path) -> None:
+    """Fail before the hours, not after them."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot write into {output} ({error}); give another folder") from error

@@ -1,0 +1,400 @@
+"""``avatar vademecum`` and ``avatar show``, and what commands that build share."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import typer
+
+from avatar_core.errors import AvatarError
+
+if TYPE_CHECKING:
+    from avatar_core.geometry.surface import SurfaceMesh
+    from avatar_core.offline.rule import Progress
+    from avatar_core.vademecum.accuracy import AccuracyCurve, CurvePoint
+    from avatar_core.vademecum.model import Vademecum
+
+EXIT_NOT_CONVERGED = 3
+
+Surface = Annotated[
+    str,
+    typer.Argument(
+        help="OBJ, STL, PLY, VTK, OFF or label map (.nii, .nii.gz); 'phantom' is the built-in liver"
+    ),
+]
+Unit = Annotated[str, typer.Option(help="unit of the file: mm, cm or m")]
+Axes = Annotated[
+    str, typer.Option(help="axes of the file: RAS, LPS, or 16 numbers of a 4x4 matrix to RAS")
+]
+Label = Annotated[int | None, typer.Option(help="label of the organ in a label map")]
+Vertices = Annotated[int, typer.Option(help="number of mesh vertices, about")]
+
+
+def vademecum(
+    surface: Surface,
+    output: Annotated[Path, typer.Option("-o", "--output", help="vademecum to write (.h5)")],
+    unit: Unit = "mm",
+    axes: Axes = "RAS",
+    label: Label = None,
+    vertices: Vertices = 2850,
+    young: Annotated[float, typer.Option(help="Young's modulus [Pa]")] = 0.17e6,
+    poisson: Annotated[float, typer.Option(help="Poisson's ratio, 0 to below 0.5 [-]")] = 0.48,
+    patch_radius: Annotated[
+        float | None,
+        typer.Option(help="radius of a tool's load patch [m]; default max(12 mm, 1.2 edges)"),
+    ] = None,
+    modes: Annotated[
+        int | None, typer.Option(help="far-field modes at most; default 100, 200 for large pushes")
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="mean relative displacement error over the build's loads [-]; default 0.045, 0.02 "
+            "for large pushes"
+        ),
+    ] = None,
+    groups: Annotated[
+        Path | None,
+        typer.Option(help=".npz with points 'clamped' and 'accessible' [m], instead of the rule"),
+    ] = None,
+    element: Annotated[
+        str | None, typer.Option(help="P1, P2 or Taylor-Hood; default by Poisson's ratio")
+    ] = None,
+    coordinate: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="keep a property of the material free, as poisson=0.40:0.49 or contrast=0.5:20 "
+            "(of the tumour); may be repeated"
+        ),
+    ] = None,
+    tumour: Annotated[
+        Path | None, typer.Option(help="surface of the tumour, in unit and axes of the organ")
+    ] = None,
+    contrast: Annotated[
+        float, typer.Option(help="Young's modulus inside the tumour over that outside [-]")
+    ] = 1.0,
+    material: Annotated[
+        str,
+        typer.Option(
+            help="linear, neo-hookean or st-venant-kirchhoff; the last two keep the force's "
+            "magnitude as a coordinate, for large pushes"
+        ),
+    ] = "linear",
+    max_push: Annotated[float, typer.Option(help="depth of a large push aimed at [m]")] = 20e-3,
+    pushed: Annotated[
+        int,
+        typer.Option(
+            help="unseen sites to certify large pushes at, some 15 s each; two of them also "
+            "together with other effects, some 90 s each"
+        ),
+    ] = 12,
+    certify: Annotated[int, typer.Option(help="unseen loads of the certificate")] = 200,
+    seed: Annotated[int, typer.Option(help="of the unseen loads")] = 0,
+    mesh_error: Annotated[
+        bool, typer.Option("--mesh-error", help="also measure the mesh's own error (slow)")
+    ] = False,
+) -> None:
+    """Build the certified vademecum of an organ. Exit code 3: complete, but not converged."""
+    from avatar_core.fem.elasticity import Material
+    from avatar_core.geometry.tumour import read_tumour
+    from avatar_core.offline.large_deformation import LINEAR_RULE, LargeRule
+    from avatar_core.offline.pipeline import OrganOptions, orientation_warning, vademecum_of
+    from avatar_core.offline.rule import BuildRule
+    from avatar_core.reduction.coordinates import Coordinate
+    from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+
+    rule = BuildRule() if material == "linear" else LINEAR_RULE
+    rule = replace(rule, max_modes=modes or rule.max_modes, tolerance=tolerance or rule.tolerance)
+    require(modes is None or modes >= 1, f"--modes is {modes}; ask for at least 1")
+    require(
+        tolerance is None or 0 < tolerance < 1,
+        f"--tolerance is {tolerance}; it must lie between 0 and 1",
+    )
+    require(certify >= 1, f"--certify is {certify}; ask for at least 1 load")
+    require(
+        element in (None, "P1", "P2", "Taylor-Hood"),
+        f"--element is {element}; choose P1, P2 or Taylor-Hood",
+    )
+    require(
+        material in ("linear", "neo-hookean", "st-venant-kirchhoff"),
+        f"--material is {material}; choose linear, neo-hookean or st-venant-kirchhoff",
+    )
+    require(0 < max_push <= 0.05, f"--max-push is {max_push} m; choose up to 0.05 (20e-3: 20 mm)")
+    require(pushed >= 0, f"--pushed is {pushed}; ask for 0 or more sites")
+    require(output.parent.is_dir(), f"folder {output.parent} does not exist; create it first")
+    coordinates = tuple(Coordinate.parse(text) for text in coordinate or ())
+    options = OrganOptions(
+        n_vertices=vertices,
+        material=Material(young, poisson),
+        coordinates=coordinates,
+        tumour=None if tumour is None else read_tumour(tumour, unit, parsed_axes(axes)),
+        contrast=contrast,
+        large=None if material == "linear" else material,  # type: ignore[arg-type]
+        large_rule=LargeRule(max_push=max_push),
+        n_pushed=pushed,
+        element=element,  # type: ignore[arg-type]
+        patch_radius=patch_radius,
+        groups=groups,
+        rule=rule,
+        n_certified=certify,
+        seed=seed,
+        with_mesh_error=mesh_error,
+    )
+    organ = read_organ(surface, unit, axes, label)
+    for notice in organ.notices:
+        print(f"notice: {notice}", file=sys.stderr)
+    warning = orientation_warning(organ)
+    if warning:
+        print(f"warning: {warning}", file=sys.stderr)
+    with BuildBar(material != "linear") as progress:
+        built = _timed(vademecum_of(organ, options, progress), progress)
+    save_vademecum(built, output)
+    show_text(load_vademecum(output))
+    if not built.convergence.converged:
+        best = built.convergence.rank_errors[-1]
+        print(
+            f"avatar: not converged: {best.rank} modes leave {best.mean:.1%} mean, "
+            f"{best.worst:.1%} worst; the file is complete and marked; raise --modes or "
+            "--tolerance",
+            file=sys.stderr,
+        )
+        raise typer.Exit(EXIT_NOT_CONVERGED)
+
+
+def _timed(built: Vademecum, progress: Progress) -> Vademecum:
+    """The vademecum with the steps of its accuracy curve timed on this machine."""
+    from avatar_core.offline.certify.timing import timed
+
+    certificate = built.certificate
+    assert certificate is not None and certificate.curve is not None
+    curve = timed(
+        built, certificate.curve, progress=lambda share: progress("time", share, math.nan)
+    )
+    return built.with_certificate(replace(certificate, curve=curve))
+
+
+def show(
+    file: Annotated[Path, typer.Argument(help="a vademecum (.h5)")],
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+) -> None:
+    """Say what a vademecum is, how wrong it may be, and what it cost."""
+    from avatar_core.vademecum.storage import load_vademecum
+
+    v = load_vademecum(file)
+    if not as_json:
+        show_text(v)
+        return
+    curve = v.certificate.curve if v.certificate else None
+    certificate = asdict(replace(v.certificate, curve=None)) if v.certificate else {}
+    certificate |= {"bytes": v.nbytes}
+    print(
+        json.dumps(
+            finite(
+                {
+                    **asdict(v.info()),
+                    "element": v.element,
+                    "contrast": v.contrast,
+                    "coordinates": [
+                        asdict(one) for one in (v.parametric.coordinates if v.parametric else ())
+                    ],
+                    "certificate": certificate,
+                    "large": _large_summary(v),
+                    "accuracy": curve.plain() if curve else None,
+                    "provenance": asdict(v.provenance),
+                    "rank_errors": [asdict(error) for error in v.convergence.rank_errors],
+                }
+            ),
+            indent=2,
+        )
+    )
+
+
+def _large_summary(v: Vademecum) -> dict[str, Any] | None:
+    """What ``avatar show --json`` says of large deformation."""
+    if v.large is None:
+        return None
+    certificate = asdict(v.large.certificate) if v.large.certificate else None
+    return {"material": v.large.material, "bytes": v.large.nbytes, "certificate": certificate}
+
+
+def read_organ(surface: str, unit: str, axes: str, label: int | None) -> SurfaceMesh:
+    """A surface from a file, or the built-in liver."""
+    from avatar_core.geometry.phantom import phantom_liver
+    from avatar_core.geometry.surface import read_surface
+
+    if surface == "phantom":
+        return phantom_liver()
+    return read_surface(surface, unit, parsed_axes(axes), label)
+
+
+def parsed_axes(axes: str) -> Any:
+    """A name of axes, or the 4x4 matrix that 16 numbers are."""
+    numbers = axes.replace(",", " ").split()
+    if len(numbers) != 16:
+        return axes
+    try:
+        values = [float(number) for number in numbers]
+    except ValueError as error:
+        raise AvatarError(f"--axes holds no 4x4 matrix ({error}); give 16 numbers") from error
+    return [values[4 * row : 4 * row + 4] for row in range(4)]
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise AvatarError with the message unless the condition holds."""
+    if not condition:
+        raise AvatarError(message)
+
+
+def show_text(v: Vademecum) -> None:
+    """What ``avatar show`` prints."""
+    info, c = v.info(), v.certificate
+    print(f"{info.name}  (from {info.source}, {v.provenance.unit}, axes {info.axes})")
+    print(
+        f"  {info.n_vertices} vertices ({info.n_surface_vertices} on the surface), "
+        f"{info.volume * 1e6:.0f} ml, {v.element}, E {info.young_modulus:g} Pa, "
+        f"nu {info.poisson_ratio:g}"
+    )
+    print(
+        f"  {info.n_load_positions} load positions, patch radius {info.patch_radius * 1e3:.1f} mm, "
+        f"{info.n_modes} modes, {info.bytes / 1e6:.1f} MB"
+    )
+    if v.contrast is not None:
+        print(f"  tumour: Young's modulus {v.contrast:g} times that of the organ")
+    for one in v.parametric.coordinates if v.parametric else ():
+        print(f"  coordinate {one.name}: {one.low:g} to {one.high:g} ({one.n_nodes} nodes)")
+    if c is None:
+        print("  no certificate")
+        return
+    where = " and values" if v.parametric else ""
+    print(f"  errors on {c.n_loads} unseen loads{where} x 3 directions    mean     worst")
+    for name, mean, worst in (
+        ("displacement, L2", c.l2_mean, c.l2_worst),
+        ("contact compliance", c.contact_mean, c.contact_worst),
+        ("force of an indentation", c.force_mean, c.force_worst),
+        ("the same, felt by a sliding tip", c.felt_mean, c.felt_worst),
+    ):
+        print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
+    _show_large(v)
+    if c.curve is not None:
+        _show_curve(c.curve)
+    print(f"  built in {c.build_cpu_seconds:.0f} s of CPU time", end="")
+    tolerance = v.convergence.tolerance
+    state = "converged" if info.converged else "NOT CONVERGED"
+    print(", interpolated" if math.isnan(tolerance) else f", {state} (tolerance {tolerance:.1%})")
+    if not math.isnan(c.mesh_l2):
+        print(f"  mesh refined once: displacement {c.mesh_l2:.1%}, contact {c.mesh_contact:.1%}")
+
+
+def _show_curve(curve: AccuracyCurve) -> None:
+    """Fewer modes beside all of them, and the force beside both."""
+    from avatar_core.vademecum.accuracy import Detail
+
+    row = curve.like(Detail(1, "surface")).points
+    where = f", timed on {curve.machine}" if curve.machine else ", not timed"
+    print(f"  error that 95 % of touches keep, surface shown at every step{where}")
+    for point in row[::2] if len(row) > 4 else row:
+        _show_point(point)
+    if row[-1] not in row[::2]:
+        _show_point(row[-1])
+    print(f"    {'force, with any number of modes':38s} {row[-1].force:8.2%}")
+
+
+def _show_point(point: CurvePoint) -> None:
+    spent = (
+        "" if math.isnan(point.p50) else f"  {1e6 * point.p50:5.0f} us (p99 {1e6 * point.p99:.0f})"
+    )
+    print(f"    {f'{point.detail.modes} modes':38s} {point.l2:8.2%}{spent}")
+
+
+def _show_large(v: Vademecum) -> None:
+    if v.large is None:
+        return
+    reach = v.large.reach * 1e3
+    print(
+        f"  large deformation, {v.large.material}: {v.large.space.shape[1]} modes, linear depth up "
+        f"to {reach.max():.0f} mm (half of the positions {sorted(reach)[len(reach) // 2]:.0f}, the "
+        f"least {reach.min():.0f})"
+    )
+    c = v.large.certificate
+    if c is None:
+        return
+    print(f"  errors on {c.n_pushes} unseen pushes to {c.depth * 1e3:.0f} mm      mean     worst")
+    for name, mean, worst in (
+        ("displacement, L2", c.l2_mean, c.l2_worst),
+        ("force at equal depth", c.contact_mean, c.contact_worst),
+    ):
+        print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
+    print(f"    the linear vademecum: {c.linear_l2_mean:.1%}, {c.linear_contact_mean:.1%}")
+    print("    the force, with another effect added linearly")
+    for name, mean in (
+        ("30 degrees off the normal", c.oblique_contact_mean),
+        ("two tools 40 mm apart", c.two_tools_contact_mean),
+        ("an organ under its weight", c.gravity_contact_mean),
+    ):
+        print(f"      {name:36s} {'not measured' if math.isnan(mean) else f'{mean:8.2%}'}")
+    if c.n_lost:
+        print(
+            f"    at {c.n_lost} of {c.n_sites} sites full finite elements lost equilibrium before "
+            "the stored range ends"
+        )
+
+
+def finite(value: Any) -> Any:
+    """JSON has no NaN: null instead."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+class BuildBar:
+    """One progress bar over the stages of a build."""
+
+    _LINEAR: ClassVar = {"mesh": 0.1, "solve": 0.35, "modes": 0.3, "certify": 0.15, "time": 0.1}
+    _LARGE: ClassVar = {
+        "mesh": 0.02,
+        "solve": 0.05,
+        "modes": 0.05,
+        "certify": 0.03,
+        "large": 0.3,
+        "push": 0.5,
+        "time": 0.05,
+    }
+
+    def __init__(self, large: bool = False) -> None:
+        self._share = self._LARGE if large else self._LINEAR
+
+    def __enter__(self) -> BuildBar:
+        from tqdm import tqdm
+
+        self._bar = tqdm(
+            total=1.0,
+            bar_format="{desc:22s} {percentage:3.0f}% |{bar}| {elapsed}",
+            file=sys.stderr,
+            disable=None,
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def __call__(self, stage: str, fraction: float, error: float) -> None:
+        """Stage ``stage`` is done to ``fraction``; NaN: no error is known."""
+        before = 0.0
+        for name, share in self._share.items():
+            if name == stage:
+                break
+            before += share
+        share = self._share.get(stage, 0.0)
+        text = stage if math.isnan(error) else f"{stage}, error {error:.1%}"
+        self._bar.set_description_str(text, refresh=False)
+        self._bar.n = min(1.0, before + share * min(fraction, 1.0))
+        self._bar.refresh()

@@ -1,0 +1,177 @@
+"""Calls that may end badly, in a process of their own: there, files of others are read.
+
+The libraries behind HDF5, VTK and NIfTI are large. Some damaged files end them (a segmentation
+fault of HDF5 2.0), hang them or make them ask for all memory there is; no check of ours comes
+before that. A process that has a limit of time and of memory may die of it, and another is started.
+
+This guards against accidents and nuisances. It is no wall: what comes back is a pickle, and the
+process has the rights of its user.
+
+Run as ``python -m avatar_core.common.confined MAX_BYTES`` by ``Confined``, never by hand.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from avatar_core.errors import AvatarError, one_line
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+MAX_BYTES = 2 << 30
+RETURNED, RAISED, FAILED = "returned", "raised", "failed"  # with a value, our error, a line
+_START_SECONDS = 60.0  # to import what is called, on a machine that has much else to do
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA")  # whose threads would count as memory
+
+
+class ConfinedError(AvatarError):
+    """A call ended its process, took too long or too much memory, or failed in its own way."""
+
+
+class Confined:
+    """A process that calls functions for this one.
+
+    It is started when it is first needed, and again after a call that ended it. Calls come from any
+    thread, one at a time.
+
+    Parameters
+    ----------
+    max_bytes : address space, beyond that of the process before its first call [bytes]
+    """
+
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        self._max_bytes = max_bytes
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._line: Connection | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process, if there is one."""
+        return self._process.pid if self._process else None
+
+    def call(
+        self, seconds: float, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """``function(*args, **kwargs)``; all of them can be pickled.
+
+        Parameters
+        ----------
+        seconds : that it may take; what it imports while it is loaded does not count [s]
+
+        Raises
+        ------
+        AvatarError
+            That the function raises.
+        ConfinedError
+            If it raises anything else, ends the process or takes longer.
+        """
+        with self._lock:
+            try:
+                self._exchange(_START_SECONDS, function)
+                outcome, value = self._exchange(seconds, (args, kwargs))
+            except TimeoutError:
+                self._stop()
+                raise ConfinedError(f"it takes longer than {seconds:.0f} s to read") from None
+            except (EOFError, OSError) as error:
+                raise ConfinedError(f"reading it ends the process ({self._stop()})") from error
+        if outcome == FAILED:
+            raise ConfinedError(value)
+        if outcome == RAISED:
+            raise value
+        return value
+
+    def close(self) -> None:
+        """End the process, if there is one."""
+        with self._lock:
+            self._stop()
+
+    def _exchange(self, seconds: float, order: Any) -> Any:
+        if self._line is None:
+            self._start()
+        assert self._line is not None
+        self._line.send(order)
+        if not self._line.poll(seconds):
+            raise TimeoutError
+        return self._line.recv()
+
+    def _start(self) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "avatar_core.common.confined", str(self._max_bytes)],
+                stdin=theirs.fileno(),
+                stdout=subprocess.DEVNULL,  # libraries talk there; the error that is raised counts
+                stderr=subprocess.DEVNULL,
+                env=os.environ | {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES},
+                cwd="/",  # -m would let whatever lies where this process was started stand first
+                start_new_session=True,  # Ctrl-C is for this process, which then ends that one
+            )
+        self._line = Connection(ours.detach())
+
+    def _stop(self) -> str:
+        """End the process; returns how it ended."""
+        process, line = self._process, self._line
+        self._process = self._line = None
+        if process is None:
+            return "it was not started"
+        if line is not None:
+            with contextlib.suppress(OSError):
+                line.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.1)  # of itself, if a call ended it
+        process.kill()
+        code = process.wait()
+        return signal.strsignal(-code) or f"signal {-code}" if code < 0 else f"exit code {code}"
+
+
+# --- the process ------------------------------------------------------------------------------
+
+
+def _serve(line: Connection) -> None:
+    while True:
+        function = line.recv()
+        line.send(None)
+        args, kwargs = line.recv()
+        line.send(_called(function, args, kwargs))
+
+
+def _called(function: Callable[..., Any], args: Any, kwargs: Any) -> tuple[str, Any]:
+    try:
+        return RETURNED, function(*args, **kwargs)
+    except AvatarError as error:
+        with contextlib.suppress(Exception):
+            pickle.loads(pickle.dumps(error))
+            return RAISED, error
+        return FAILED, str(error)
+    except Exception as error:
+        return FAILED, one_line(error, 120)
+
+
+def main(max_bytes: int) -> int:
+    """Call what is asked for, until the line is closed."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + max_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    line = Connection(os.dup(sys.stdin.fileno()))
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        _serve(line)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(int(sys.argv[1])))

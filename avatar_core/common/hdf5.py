@@ -1,0 +1,177 @@
+"""HDF5 files that appear complete or not at all, and tell whether they were altered since.
+
+Nothing outside a file is followed, and what it claims to hold is weighed against its size before it
+is read. That leaves the HDF5 library itself, which some damaged files end or hang; who reads files
+of others does so in a process of its own, :mod:`avatar_core.common.confined`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import tempfile
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+from typing import BinaryIO
+
+import h5py
+import numpy as np
+
+from avatar_core.errors import StorageError, one_line
+
+Arrays = dict[str, np.ndarray]
+Attributes = dict[str, str]
+
+# What h5py raises of files that are damaged in one way or another.
+UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, ArithmeticError)
+
+
+def replace_file(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> None:
+    """Put arrays and attributes, with their checksum, in the place of a file in one step.
+
+    Raises
+    ------
+    StorageError
+        If the folder does not exist or the disk is full; what was at the path is then unharmed.
+    """
+    if not path.parent.is_dir():
+        raise StorageError(f"folder {path.parent} does not exist; create it first")
+    content = encoded(arrays, attributes)
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise StorageError(
+            f"cannot write {path} ({one_line(error, 120)}); "
+            "free disk space or choose another folder"
+        ) from error
+
+
+def encoded(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> memoryview:
+    """The HDF5 file in memory: on a full disk, HDF5 itself would crash."""
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        for key, value in attributes.items():
+            file.attrs[key] = value
+        for key, array in arrays.items():
+            file.create_dataset(key, data=array)
+        file.attrs["checksum"] = checksum(arrays, attributes)
+    return content.getbuffer()
+
+
+def checksum(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
+    """SHA-256 of names, types, shapes and values."""
+    digest = hashlib.sha256()
+    for key in sorted(attributes):
+        digest.update(f"{key}={attributes[key]};".encode())
+    for key in sorted(arrays):
+        array = np.ascontiguousarray(arrays[key])
+        digest.update(f"{key}:{array.dtype.str}:{array.shape};".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def verified(
+    source: BinaryIO,
+    origin: str,
+    what: str,
+    attributes_of: Callable[[Attributes, str], Attributes],
+    keys_of: Callable[[Collection[str]], Iterable[str]],
+) -> tuple[Attributes, Arrays]:
+    """Attributes and arrays of a file that are as they were written.
+
+    Parameters
+    ----------
+    source : the file
+    origin, what : what messages call the file, and what it should be
+    attributes_of : of those that the file has, those that count; raises StorageError
+    keys_of : of the arrays that the file has, those that count
+
+    Raises
+    ------
+    StorageError
+        For a truncated, altered or foreign file.
+    """
+    try:
+        size = source.seek(0, os.SEEK_END)
+        with h5py.File(source, "r") as file:
+            held = root_attributes(file)
+            attributes = attributes_of(held, origin)
+            arrays = _arrays(file, keys_of, size)
+            stated = held["checksum"]
+    except StorageError:
+        raise
+    except UNREADABLE as error:
+        why = f"{error} is missing" if isinstance(error, KeyError) else one_line(error, 120)
+        raise StorageError(
+            f"{origin} is no readable {what} ({why}); it may be truncated: build or copy it again"
+        ) from error
+    if stated != checksum(arrays, attributes):
+        raise StorageError(f"{origin} was altered or damaged (checksum); build it again")
+    return attributes, arrays
+
+
+def root_attributes(file: h5py.File) -> Attributes:
+    """Attributes of a file that are text."""
+    values = dict(file.attrs)
+    return {key: value for key, value in values.items() if isinstance(value, str)}
+
+
+def _arrays(
+    file: h5py.File, keys_of: Callable[[Collection[str]], Iterable[str]], size: int
+) -> Arrays:
+    datasets: dict[str, h5py.Dataset] = {}
+
+    def collect(key: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset):
+            datasets[key] = item
+
+    file.visititems(collect)  # which follows no link to a name or to another file
+    keys = list(keys_of(datasets))
+    claimed = 0
+    for key in keys:
+        if key not in datasets:
+            raise ValueError(f"'{key}' is missing or only a link")
+        _require_plain(key, datasets[key])
+        claimed += datasets[key].nbytes
+        if claimed > size:
+            raise ValueError(f"'{key}' claims more data than the file holds")
+    return {key: _array(key, datasets[key]) for key in keys}
+
+
+def _require_plain(key: str, dataset: h5py.Dataset) -> None:
+    if dataset.is_virtual or dataset.external:
+        raise ValueError(f"'{key}' points outside the file")
+    dtype = dataset.dtype
+    plain = np.can_cast(dtype, np.int64) or (dtype.kind == "f" and dtype.itemsize in (4, 8))
+    if not (plain and dtype.isnative):
+        raise ValueError(f"'{key}' is no array of plain numbers")
+
+
+def _array(key: str, dataset: h5py.Dataset) -> np.ndarray:
+    array: np.ndarray = dataset[...]
+    if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
+        raise ValueError(f"'{key}' holds truth values that are neither 0 nor 1")
+    return array
+
+
+def require_schema(attributes: Attributes, newest: str, origin: str) -> None:
+    """Raise StorageError unless this version of the project reads a file's schema."""
+    schema = attributes["schema"]
+    major, _, minor = schema.partition(".")
+    if not (major.isdecimal() and minor.isdecimal() and len(schema) < 10):
+        raise StorageError(f"{origin} has no schema; build it again")
+    if int(major) > int(newest.partition(".")[0]):
+        raise StorageError(
+            f"{origin} has schema {schema}, this version reads up to {newest}; upgrade avatar"
+        )

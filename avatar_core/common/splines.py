@@ -1,0 +1,122 @@
+"""Uniform quadratic B-splines over a grid: values, first and second derivatives at a point.
+
+f(p) = sum_ijk v_ijk B_i(x) B_j(y) B_k(z) over the 27 samples around p (de Boor, A Practical Guide
+to Splines). The sum smooths the samples a little; it is once continuously differentiable and its
+second derivatives are bounded. Several fields on one grid share the weights of a *cell*.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avatar_core.common.jit import entry, fast, inlined
+
+
+@inlined
+def on_grid(shape, origin, spacing, p):  # type: ignore[no-untyped-def]
+    """Whether all 27 samples around p exist (never for a p that is not finite)."""
+    for d in range(3):
+        middle = np.floor((p[d] - origin[d]) / spacing + 0.5)
+        if not 1.0 <= middle < shape[d] - 1.0:
+            return False
+    return True
+
+
+@inlined
+def cell_at(origin, spacing, p):  # type: ignore[no-untyped-def]
+    """Where a p that is :func:`on_grid` lies.
+
+    Returns
+    -------
+    first : three indices of the first sample
+    weights, slopes : three triples each, B and dB/dp along x, y and z [-, 1/m]
+    """
+    scale = 1.0 / spacing
+    x, y, z = (p[0] - origin[0]) * scale, (p[1] - origin[1]) * scale, (p[2] - origin[2]) * scale
+    i, j, k = int(x + 0.5), int(y + 0.5), int(z + 0.5)
+    x, y, z = x - i, y - j, z - k
+    weights = (_weights(x), _weights(y), _weights(z))
+    slopes = (_slopes(x, scale), _slopes(y, scale), _slopes(z, scale))
+    return (i - 1, j - 1, k - 1), weights, slopes
+
+
+@fast
+def _weights(t):  # type: ignore[no-untyped-def]
+    """At t in [-1/2, 1/2) from the middle sample."""
+    return (0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2)
+
+
+@fast
+def _slopes(t, scale):  # type: ignore[no-untyped-def]
+    return ((t - 0.5) * scale, -2.0 * t * scale, (t + 0.5) * scale)
+
+
+@fast
+def in_cell(values, cell, gradient):  # type: ignore[no-untyped-def]
+    """Value of a sampled field; its gradient [1/m] into ``gradient``."""
+    (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
+    value = g0 = g1 = g2 = 0.0
+    for i in range(3):
+        plane = along_y = along_z = 0.0
+        for j in range(3):
+            v0, v1, v2 = _line(values, nx + i, ny + j, nz)
+            line = wz[0] * v0 + wz[1] * v1 + wz[2] * v2
+            plane += wy[j] * line
+            along_y += dy[j] * line
+            along_z += wy[j] * (dz[0] * v0 + dz[1] * v1 + dz[2] * v2)
+        value += wx[i] * plane
+        g0 += dx[i] * plane
+        g1 += wx[i] * along_y
+        g2 += wx[i] * along_z
+    gradient[0], gradient[1], gradient[2] = g0, g1, g2
+    return value
+
+
+@inlined
+def value_in_cell(values, cell):  # type: ignore[no-untyped-def]
+    """Value of a sampled field; NaN where a sample is."""
+    (nx, ny, nz), (wx, wy, wz), _ = cell
+    value = 0.0
+    for i in range(3):
+        for j in range(3):
+            v0, v1, v2 = _line(values, nx + i, ny + j, nz)
+            value += wx[i] * wy[j] * (wz[0] * v0 + wz[1] * v1 + wz[2] * v2)
+    return value
+
+
+@fast
+def second_derivatives(values, cell, spacing, hessian):  # type: ignore[no-untyped-def]
+    """Second derivatives [1/m^2] of a sampled field, into (3, 3)."""
+    (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
+    end = 1.0 / (spacing * spacing)
+    curve = (end, -2.0 * end, end)
+    h00 = h11 = h22 = h01 = h02 = h12 = 0.0
+    for i in range(3):
+        for j in range(3):
+            v0, v1, v2 = _line(values, nx + i, ny + j, nz)
+            line = wz[0] * v0 + wz[1] * v1 + wz[2] * v2
+            slope = dz[0] * v0 + dz[1] * v1 + dz[2] * v2
+            h00 += curve[i] * wy[j] * line
+            h11 += wx[i] * curve[j] * line
+            h22 += wx[i] * wy[j] * (curve[0] * v0 + curve[1] * v1 + curve[2] * v2)
+            h01 += dx[i] * dy[j] * line
+            h02 += dx[i] * wy[j] * slope
+            h12 += wx[i] * dy[j] * slope
+    hessian[0, 0], hessian[1, 1], hessian[2, 2] = h00, h11, h22
+    hessian[0, 1] = hessian[1, 0] = h01
+    hessian[0, 2] = hessian[2, 0] = h02
+    hessian[1, 2] = hessian[2, 1] = h12
+
+
+@fast
+def _line(values, i, j, k):  # type: ignore[no-untyped-def]
+    return values[i, j, k], values[i, j, k + 1], values[i, j, k + 2]
+
+
+@entry
+def evaluate(values, origin, spacing, p, gradient, outside):  # type: ignore[no-untyped-def]
+    """Value of a sampled field at p, its gradient into ``gradient``; off the grid ``outside``."""
+    if not on_grid(values.shape, origin, spacing, p):
+        gradient[0] = gradient[1] = gradient[2] = 0.0
+        return outside
+    return in_cell(values, cell_at(origin, spacing, p), gradient)

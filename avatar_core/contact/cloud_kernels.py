@@ -1,0 +1,169 @@
+"""The compiled part of the contact step that deforms the cloud: far field by modes, near by blocks.
+
+    u(x) = - sum_t lambda_t a_t [ sum_k X_k(x) Y_k . f_t  +  sum_j w_j N_j(x) n_t ]
+
+with f_t = w(p_t) n_t as in :mod:`avatar_core.contact.kernels`, N_j the exact near field of load
+position j, and for large deformation the terms of :mod:`avatar_core.vademecum.large_deformation`.
+Effects are
+arguments, None where a scene does without, as in :mod:`avatar_core.contact.kernels`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avatar_core.common.jit import fast, inlined
+from avatar_core.contact.cloud import BLOCK
+from avatar_core.contact.effects.large_deformation import (
+    add_amplitudes,
+    add_near_row,
+    powers_of_depth,
+)
+from avatar_core.contact.effects.respiration import move_cloud
+from avatar_core.contact.effects.viscoelasticity import least_shown
+
+LEAST_WEIGHT = 0.02  # what each load position leaves of its near field to the others
+
+
+@fast
+def deform(model, state, out, reply, large, friction, memory, motion):  # type: ignore[no-untyped-def]
+    """The cloud under the forces of a period."""
+    if reply is None and out.n_contacts[0] == 0:
+        state.field[:] = np.float32(0.0)
+    else:
+        _amplitudes(state, reply, large)
+        _far_field(model, state, large)
+        for t in range(state.passage.shape[0]):
+            if state.force[t] > 0.0:
+                _near_field(model, state, large, friction, memory, t)
+        if memory is not None:
+            _near_trail(model, state, memory)
+    write_cloud(model.rest, state.field, out.cloud)
+    if motion is not None:
+        move_cloud(motion, out.cloud)
+
+
+@fast
+def write_cloud(rest, field, cloud):  # type: ignore[no-untyped-def]
+    """Deformed position and displacement of every point (n_points, 6)."""
+    n_points = cloud.shape[0]
+    flat_rest, flat_cloud = rest.reshape(6 * n_points), cloud.reshape(6 * n_points)
+    for v in range(n_points):
+        for d in range(6):
+            flat_cloud[6 * v + d] = flat_rest[6 * v + d] + field[3 * v + d % 3]
+
+
+@fast
+def _amplitudes(state, reply, large):  # type: ignore[no-untyped-def]
+    """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards. Then the bent ones."""
+    amplitude = state.amplitude
+    n_modes = amplitude.shape[0]
+    amplitude[:] = np.float32(0.0)
+    if large is not None:
+        n_modes -= large.load.shape[2]
+    if reply is not None:
+        for k in range(n_modes):
+            amplitude[k] = np.float32(reply.total[k])
+    for t in range(state.passage.shape[0]):
+        if state.force[t] <= 0.0:
+            continue
+        if reply is None:
+            force = np.float32(state.force[t] * state.scale[t])
+            for k in range(n_modes):
+                amplitude[k] -= force * state.mode[t, k]
+        if large is not None:
+            add_amplitudes(state, large, t, amplitude)
+
+
+@fast
+def _far_field(model, state, large):  # type: ignore[no-untyped-def]
+    """sum_k X_k a_k over the modes that are shown, four at a time, and those of large deformation.
+
+    Modes may be stored as fractions of their peak.
+    """
+    amplitude, scale = state.amplitude, model.space_scale
+    shown = min(state.shown[0], scale.shape[0])
+    for b in range(model.space.shape[0]):
+        u = state.field[b * BLOCK : (b + 1) * BLOCK]
+        x = model.space[b]
+        for i in range(BLOCK):
+            u[i] = np.float32(0.0)
+        for k in range(0, shown - 3, 4):
+            a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
+            a2, a3 = amplitude[k + 2] * scale[k + 2], amplitude[k + 3] * scale[k + 3]
+            for i in range(BLOCK):
+                u[i] += x[k, i] * a0 + x[k + 1, i] * a1 + x[k + 2, i] * a2 + x[k + 3, i] * a3
+        for k in range(shown - shown % 4, shown):
+            a = amplitude[k] * scale[k]
+            for i in range(BLOCK):
+                u[i] += x[k, i] * a
+        if large is not None:
+            _add_modes(amplitude, scale, x, u, scale.shape[0] - large.load.shape[2])
+
+
+@fast
+def _add_modes(amplitude, scale, x, u, first):  # type: ignore[no-untyped-def]
+    """The same for all modes from the first; as a function, the bare step would be 6 % slower."""
+    end = scale.shape[0]
+    for k in range(first, end - 3, 4):
+        a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
+        a2, a3 = amplitude[k + 2] * scale[k + 2], amplitude[k + 3] * scale[k + 3]
+        for i in range(BLOCK):
+            u[i] += x[k, i] * a0 + x[k + 1, i] * a1 + x[k + 2, i] * a2 + x[k + 3, i] * a3
+    for k in range(end - (end - first) % 4, end):
+        a = amplitude[k] * scale[k]
+        for i in range(BLOCK):
+            u[i] += x[k, i] * a
+
+
+@fast
+def _near_field(model, state, large, friction, memory, t):  # type: ignore[no-untyped-def]
+    """The exact remainder around the load positions that carry the force of a tip."""
+    kept = 0.0
+    for i in range(state.n_nodes[t]):
+        kept += _shrunk(state.weight[t, i, 0])
+    n, scale = state.normal[t], state.scale[t] / kept
+    f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
+    if friction is not None:
+        f0, f1, f2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
+    second = third = 0.0
+    if large is not None:
+        second, third = powers_of_depth(state, large, t)
+    for i in range(state.n_nodes[t]):
+        w = _shrunk(state.weight[t, i, 0])
+        if w != 0.0:
+            j, part = state.nodes[t, i], w * scale
+            if memory is None:
+                _add_row(model, state, j, part * f0, part * f1, part * f2)
+            if large is not None:
+                add_near_row(model, state, large, j, w / kept, second, third)
+
+
+@fast
+def _near_trail(model, state, memory):  # type: ignore[no-untyped-def]
+    """The same around what a relaxing organ remembers, the weakest of it faded out."""
+    least = least_shown(memory)
+    for m in range(memory.count[0]):
+        e = memory.trail_elastic[m]
+        size = np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
+        if size > least:
+            part = (size - least) / size
+            _add_row(model, state, memory.place[m], part * e[0], part * e[1], part * e[2])
+
+
+@inlined
+def _shrunk(w):  # type: ignore[no-untyped-def]
+    """A weight moved towards zero, so that a load position that leaves does so without a jump."""
+    if w > 0.0:
+        return max(w - LEAST_WEIGHT, 0.0)
+    return min(w + LEAST_WEIGHT, 0.0)
+
+
+@fast
+def _add_row(model, state, j, x, y, z):  # type: ignore[no-untyped-def]
+    u, f0, f1, f2 = state.field, np.float32(x), np.float32(y), np.float32(z)
+    for e in range(model.near_start[j], model.near_start[j + 1]):
+        v = 3 * model.near_target[e]
+        block = model.near_block[e]
+        for d in range(3):
+            u[v + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2

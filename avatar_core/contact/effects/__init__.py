@@ -1,0 +1,45 @@
+"""The effects that a scene may call for: one file each, and nothing of it runs unless it is called.
+
+Each has two halves. Offline, a frozen dataclass that is checked and turned into the arrays the step
+needs; online, compiled functions on these arrays. The step takes one argument for each effect;
+where it is None, numba compiles the step without it: no branch, no array.
+"""
+
+from __future__ import annotations
+
+from avatar_core.contact.effects.base import Effect
+from avatar_core.contact.effects.friction import Friction
+from avatar_core.contact.effects.inertia import Inertia
+from avatar_core.contact.effects.large_deformation import LargeDeformationEffect
+from avatar_core.contact.effects.respiration import Respiration
+from avatar_core.contact.effects.self_weight import SelfWeight
+from avatar_core.contact.effects.several_tools import SeveralTools
+from avatar_core.contact.effects.tumour import Tumour
+from avatar_core.contact.effects.viscoelasticity import Viscoelasticity
+
+EFFECTS: dict[str, type[Effect]] = {
+    effect.name: effect
+    for effect in (
+        LargeDeformationEffect,
+        Friction,
+        Viscoelasticity,
+        Inertia,
+        SelfWeight,
+        Respiration,
+        Tumour,
+        SeveralTools,
+    )
+}
+
+__all__ = [
+    "EFFECTS",
+    "Effect",
+    "Friction",
+    "Inertia",
+    "LargeDeformationEffect",
+    "Respiration",
+    "SelfWeight",
+    "SeveralTools",
+    "Tumour",
+    "Viscoelasticity",
+]

@@ -1,0 +1,381 @@
+"""Coulomb friction with stick and slip, coupled with the normal contact through the organ.
+
+A tip that touches holds a point s_a of the organ's surface, its *anchor*. While it sticks, that
+point goes with the tip's own contact point c = p - r n: the displacement of the patch is
+
+    U = y + n (gap - n . y),    y = c - s_a,
+
+and the force on the tissue g = C^-1 U has a normal part lambda = -n . g >= 0 and a tangential one
+tau, |tau| <= mu_s lambda. Where it would be more, the anchor slides until |tau| = mu_k lambda,
+along tau: of all slips the one that dissipates most (Moreau). Both parts are found together, tip
+after tip, by projection (Alart & Curnier, CMAME 92:353, 1991). The rest is the elastic energy
+W(p, s_a), whose derivative at a fixed anchor is the force, so that of the work done on a closed
+path nothing is left but mu_k lambda |slip| >= 0. What a turn of the tool does to c is ``spin``.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from avatar_core.common.jit import fast, inlined
+from avatar_core.common.quantities import quantity
+from avatar_core.contact.effects.base import Effect
+from avatar_core.contact.effects.friction_newton import approach, displaced
+from avatar_core.contact.effects.large_deformation import bend
+from avatar_core.errors import SceneError
+from avatar_core.reduction.near_field import find_block
+
+
+@dataclass(frozen=True)
+class Friction(Effect):
+    """Coulomb friction with stick and slip."""
+
+    name: ClassVar[str] = "friction"
+    text: ClassVar[str] = "tips stick and slip: |F_t| <= mu F_n"
+
+    static: float = quantity("-", 0.0, 1.0, "mu_s, friction over normal force before slip", 0.4)
+    kinetic: float = quantity("-", 0.0, 1.0, "mu_k, friction over normal force in slip", 0.3)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kinetic > self.static:
+            raise SceneError(
+                f"friction: kinetic is {self.kinetic}, above static {self.static}; slip cannot "
+                "take more force than its start"
+            )
+
+
+MAX_SWEEPS = 1000
+PATIENCE = 8  # sweeps before Newton's steps are worth their time,
+MAX_NEWTON = 64  # and after which they have not helped
+GAP_TOLERANCE = 1e-9  # [m]
+NONE, STICKS, SLIPS = range(3)  # what a tip did in the last period
+
+FrictionArrays = namedtuple("FrictionArrays", ["coefficients"])
+StickSlip = namedtuple(
+    "StickSlip",
+    [
+        "coefficients",  # (2,) mu_s, mu_k
+        "spin",  # (T, 3) turn of the tool in this period [rad]; used up by it
+        "anchor",  # (T, 3) s_a [m]
+        "motion",  # (T,) NONE, STICKS, SLIPS
+        "limit",  # (T,) mu in force
+        "push",  # (T, 3) g, force on the tissue [N]
+        "mode",  # (T, 3, k) Y^T w for forces along x, y, z
+        "near",  # (T, T, 3, 3) near part of w . C w
+        "compliance",  # (T, T, 3, 3) C
+        "asked",  # (T, 3) c - s_a
+        "slipped",  # (T,) way of the anchor in this period [m]
+        "matrix",  # (3T, 3T) of Newton's steps
+        "side",  # (3T,) [N]
+        "best",  # (T, 3) push nearest to the solution among them [N]
+    ],
+)
+
+
+def friction_arrays(effect: Friction) -> FrictionArrays:
+    """What the step needs of the effect."""
+    return FrictionArrays(np.array([effect.static, effect.kinetic]))
+
+
+def make_stick_slip(arrays: FrictionArrays, n_tools: int, n_modes: int) -> StickSlip:
+    """No tip touches."""
+    return StickSlip(
+        *arrays,
+        spin=np.zeros((n_tools, 3)),
+        anchor=np.zeros((n_tools, 3)),
+        motion=np.zeros(n_tools, np.int64),
+        limit=np.zeros(n_tools),
+        push=np.zeros((n_tools, 3)),
+        mode=np.zeros((n_tools, 3, n_modes), np.float32),
+        near=np.zeros((n_tools, n_tools, 3, 3)),
+        compliance=np.zeros((n_tools, n_tools, 3, 3)),
+        asked=np.zeros((n_tools, 3)),
+        slipped=np.zeros(n_tools),
+        matrix=np.zeros((3 * n_tools, 3 * n_tools)),
+        side=np.zeros(3 * n_tools),
+        best=np.zeros((n_tools, 3)),
+    )
+
+
+@fast
+def gather(model, state, friction, t):  # type: ignore[no-untyped-def]
+    """How forces along x, y and z drive the modes, and the near part of the tip's compliance."""
+    mode = friction.mode[t]
+    mode[:] = np.float32(0.0)
+    for i in range(state.n_nodes[t]):
+        w, load = np.float32(state.weight[t, i, 0]), model.load[state.nodes[t, i]]
+        for d in range(3):
+            for k in range(mode.shape[1]):
+                mode[d, k] += w * load[d, k]
+    _near_between(model, state, friction, t, t)
+
+
+@fast
+def _near_between(model, state, friction, t, s):  # type: ignore[no-untyped-def]
+    """sum_ij w_i B_ij w_j: displacement of the first tip's patch by forces of the second."""
+    near = friction.near[t, s]
+    near[:] = 0.0
+    for i in range(state.n_nodes[s]):
+        j, w = state.nodes[s, i], state.weight[s, i, 0]
+        for q in range(state.n_nodes[t]):
+            e = find_block(model.contact_start, model.contact_slot, j, state.nodes[t, q])
+            if e >= 0:
+                share, b = w * state.weight[t, q, 0], model.contact_block[e]
+                for c in range(3):
+                    for d in range(3):
+                        near[c, d] += share * b[c, d]
+
+
+@fast
+def _assemble(model, state, reply, several, friction):  # type: ignore[no-untyped-def]
+    """C between all tips that touch, three by three."""
+    for t in range(state.passage.shape[0]):
+        for s in range(t + 1):
+            if not (state.active[t] and state.active[s]):
+                continue
+            if s != t:
+                friction.near[t, s] = 0.0
+                if several is not None and several.near[s, t]:
+                    _near_between(model, state, friction, t, s)
+            scale = state.scale[t] * state.scale[s]
+            for c in range(3):
+                for d in range(3):
+                    far = 0.0
+                    one, other = friction.mode[t, c], friction.mode[s, d]
+                    for k in range(reply.gain.shape[0]):
+                        far += reply.gain[k] * one[k] * other[k]
+                    value = scale * (far + reply.near_gain[0] * friction.near[t, s, c, d])
+                    friction.compliance[t, s, c, d] = value
+                    if s != t:
+                        friction.compliance[s, t, d, c] = value
+        if state.active[t]:
+            fade = model.softness[0] * (1.0 / state.access[t] - 1.0)
+            for d in range(3):
+                friction.compliance[t, t, d, d] += fade
+
+
+@inlined
+def solve(model, state, tips, reply, several, large, friction):  # type: ignore[no-untyped-def]
+    """Stick where friction can hold the tip, slip where it cannot."""
+    _assemble(model, state, reply, several, friction)
+    mu_s, mu_k = friction.coefficients[0], friction.coefficients[1]
+    for t in range(state.passage.shape[0]):
+        if not state.active[t]:
+            friction.motion[t] = NONE
+            friction.push[t] = 0.0
+            continue
+        if state.force[t] <= 0.0:  # none before, or it was taken from a tip that leapt
+            friction.motion[t] = NONE
+            friction.push[t] = 0.0
+        _ask(model, state, friction, tips, t)
+        friction.limit[t] = 0.0  # a new contact starts without friction
+        if friction.motion[t] == STICKS:
+            friction.limit[t] = mu_s
+        elif friction.motion[t] == SLIPS:
+            friction.limit[t] = mu_k
+    converged = _sweep(state, reply, several, large, friction)
+    again = False
+    for t in range(state.passage.shape[0]):
+        if state.active[t] and friction.motion[t] == STICKS and not _holds(state, friction, t):
+            friction.limit[t] = mu_k
+            again = True
+    if again:
+        converged = _sweep(state, reply, several, large, friction)
+    for t in range(state.passage.shape[0]):
+        if state.active[t]:
+            _settle(state, reply, several, friction, t)
+    return converged
+
+
+@inlined
+def _ask(model, state, friction, tips, t):  # type: ignore[no-untyped-def]
+    """y = c - s_a; a turn of the tool takes the anchor's partner along."""
+    n, r, spin = state.normal[t], model.tip_radius[t], friction.spin[t]
+    if friction.motion[t] != NONE:
+        a = friction.anchor[t]
+        a[0] += r * (spin[1] * n[2] - spin[2] * n[1])
+        a[1] += r * (spin[2] * n[0] - spin[0] * n[2])
+        a[2] += r * (spin[0] * n[1] - spin[1] * n[0])
+    for d in range(3):
+        spin[d] = 0.0
+        friction.asked[t, d] = tips[t, d] - r * n[d] - friction.anchor[t, d]
+
+
+@inlined
+def _sweep(state, reply, several, large, friction):  # type: ignore[no-untyped-def]
+    """Gauss-Seidel over the tips, the normal and then the tangential force of each."""
+    for sweep in range(MAX_SWEEPS):
+        if several is not None and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
+            start = (sweep // PATIENCE) % (state.passage.shape[0] + 1)
+            approach(state, reply, several, large, friction, start)
+        worst = 0.0
+        for t in range(state.passage.shape[0]):
+            if state.active[t]:
+                worst = max(worst, _press(state, reply, several, large, friction, t))
+                worst = max(worst, _drag(state, reply, several, friction, t))
+        if worst < GAP_TOLERANCE:
+            return True
+    return False
+
+
+@fast
+def _press(state, reply, several, large, friction, t):  # type: ignore[no-untyped-def]
+    """0 <= lambda  perp  gap - n . U + h >= 0."""
+    n, c = state.normal[t], friction.compliance[t, t]
+    u0, u1, u2 = displaced(state, reply, several, friction, t)
+    gap = state.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2)
+    stiff = 0.0
+    for i in range(3):
+        for j in range(3):
+            stiff += n[i] * c[i, j] * n[j]
+    g = friction.push[t]
+    force = -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
+    state.force[t] = max(0.0, force)
+    if large is not None:
+        bend(state, large, t)
+        gap += large.bent[t, 0]
+        stiff += large.bent[t, 1] * state.self_compliance[t]
+    change = max(0.0, force - gap / stiff) - force
+    for d in range(3):
+        g[d] -= n[d] * change
+    state.force[t] = force + change
+    return abs(change) * stiff
+
+
+@fast
+def _drag(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
+    """tau <- tau + (what is asked - U) / stiffness, not beyond mu lambda."""
+    n, c, g, y = state.normal[t], friction.compliance[t, t], friction.push[t], friction.asked[t]
+    u0, u1, u2 = displaced(state, reply, several, friction, t)
+    x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
+    along = x0 * n[0] + x1 * n[1] + x2 * n[2]
+    across = c[0, 0] + c[1, 1] + c[2, 2]
+    for i in range(3):
+        for j in range(3):
+            across -= n[i] * c[i, j] * n[j]
+    across *= 0.5
+    normal = g[0] * n[0] + g[1] * n[1] + g[2] * n[2]
+    t0 = g[0] - normal * n[0] + (x0 - along * n[0]) / across
+    t1 = g[1] - normal * n[1] + (x1 - along * n[1]) / across
+    t2 = g[2] - normal * n[2] + (x2 - along * n[2]) / across
+    size, most = np.sqrt(t0 * t0 + t1 * t1 + t2 * t2), friction.limit[t] * state.force[t]
+    if size > most:
+        part = most / size
+        t0, t1, t2 = part * t0, part * t1, part * t2
+    change = abs(t0 + normal * n[0] - g[0])
+    change = max(change, abs(t1 + normal * n[1] - g[1]), abs(t2 + normal * n[2] - g[2]))
+    g[0], g[1], g[2] = t0 + normal * n[0], t1 + normal * n[1], t2 + normal * n[2]
+    return change * across
+
+
+@fast
+def tangential(state, friction, t):  # type: ignore[no-untyped-def]
+    """|tau|."""
+    n, g = state.normal[t], friction.push[t]
+    along = g[0] * n[0] + g[1] * n[1] + g[2] * n[2]
+    return np.sqrt(max(0.0, g[0] * g[0] + g[1] * g[1] + g[2] * g[2] - along * along))
+
+
+@inlined
+def _holds(state, friction, t):  # type: ignore[no-untyped-def]
+    """Whether friction stays below its limit."""
+    return tangential(state, friction, t) < (1.0 - 1e-9) * friction.limit[t] * state.force[t]
+
+
+@fast
+def _settle(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
+    """Let the anchor slide to where the tissue under the tip is; note what the tip does."""
+    friction.slipped[t] = 0.0
+    if state.force[t] <= 0.0:
+        friction.motion[t] = NONE
+        friction.push[t] = 0.0
+        return
+    if friction.motion[t] != NONE and _holds(state, friction, t):
+        friction.motion[t] = STICKS
+        return
+    n, y = state.normal[t], friction.asked[t]
+    u0, u1, u2 = displaced(state, reply, several, friction, t)
+    x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
+    if friction.motion[t] != NONE:
+        along = x0 * n[0] + x1 * n[1] + x2 * n[2]
+        x0, x1, x2 = x0 - along * n[0], x1 - along * n[1], x2 - along * n[2]
+    a = friction.anchor[t]
+    a[0], a[1], a[2] = a[0] + x0, a[1] + x1, a[2] + x2
+    y[0], y[1], y[2] = y[0] - x0, y[1] - x1, y[2] - x2
+    if friction.motion[t] == NONE:
+        friction.motion[t] = STICKS
+    else:
+        friction.motion[t] = SLIPS
+        friction.slipped[t] = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+
+
+@fast
+def drive(state, friction, t, total):  # type: ignore[no-untyped-def]
+    """Y^T of the loads of a tip, added."""
+    a, g, mode = state.scale[t], friction.push[t], friction.mode[t]
+    for k in range(total.shape[0]):
+        total[k] += a * (g[0] * mode[0, k] + g[1] * mode[1, k] + g[2] * mode[2, k])
+
+
+@fast
+def add_near(model, state, reply, several, friction, t):  # type: ignore[no-untyped-def]
+    """Near displacement at the nodes of a tip by the pushes of all, into ``joint``."""
+    for s in range(state.passage.shape[0]):
+        if state.force[s] <= 0.0:
+            continue
+        if s != t and (several is None or not several.near[s, t]):
+            continue
+        share, g = state.scale[s] * reply.near_gain[0], friction.push[s]
+        for i in range(state.n_nodes[s]):
+            w = share * state.weight[s, i, 0]
+            w0, w1, w2 = np.float32(w * g[0]), np.float32(w * g[1]), np.float32(w * g[2])
+            for q in range(state.n_nodes[t]):
+                e = find_block(
+                    model.contact_start, model.contact_slot, state.nodes[s, i], state.nodes[t, q]
+                )
+                if e < 0:
+                    continue
+                b = model.contact_block[e]
+                for d in range(3):
+                    reply.joint[q, d] += b[d, 0] * w0 + b[d, 1] * w1 + b[d, 2] * w2
+
+
+@fast
+def asked(model, state, reply, large, friction, t, d):  # type: ignore[no-untyped-def]
+    """g . d(target)/dp_d of U = y + n (gap - n . y), y = p - r n - s_a."""
+    n, g, y, r = state.normal[t], friction.push[t], friction.asked[t], model.tip_radius[t]
+    gap = state.gap[t]
+    if large is not None:
+        bend(state, large, t)
+        gap += large.bent[t, 0]
+    gap -= n[0] * y[0] + n[1] * y[1] + n[2] * y[2]
+    slope = state.slope[t, d]
+    value = pulled = 0.0
+    for i in range(3):
+        turn = reply.turning[i, d]
+        step = (1.0 if i == d else 0.0) - r * turn  # dy_i / dp_d
+        value += g[i] * (step + turn * gap)
+        slope -= turn * y[i] + n[i] * step
+        pulled += g[i] * n[i]
+    return value + pulled * slope
+
+
+@fast
+def squared(friction, t):  # type: ignore[no-untyped-def]
+    """|g|^2."""
+    g = friction.push[t]
+    return g[0] * g[0] + g[1] * g[1] + g[2] * g[2]
+
+
+@fast
+def write_torque(model, state, friction, out, t):  # type: ignore[no-untyped-def]
+    """Moment about the tip's centre of the force at its contact point, -r n x F."""
+    n, r, f = state.normal[t], model.tip_radius[t], out.force[t]
+    out.torque[t, 0] = -r * (n[1] * f[2] - n[2] * f[1])
+    out.torque[t, 1] = -r * (n[2] * f[0] - n[0] * f[2])
+    out.torque[t, 2] = -r * (n[0] * f[1] - n[1] * f[0])

@@ -1,0 +1,179 @@
+"""Contact with friction of tips side by side, by Newton's method on the projections.
+
+Tips that are close share their forces by small differences of their compliance, and sweeps from tip
+to tip change these shares little. The pushes sought are where each projection changes nothing,
+
+    g_t = - n a + P_D(z),    a = max(0, lambda - w / c_n),    z = tau + (y - U)_t / c_t,
+
+D the disc of radius mu a, c_n and c_t the tip's own compliances, w its gap; that is solved in all
+directions of all tips at once (Alart & Curnier, CMAME 92:353, 1991). Far from the solution Newton's
+steps may lead away: of a few, those are kept that come nearest. Of two tips in nearly one place one
+may have to give its whole push to the other, which steps from the present pushes do not find; so
+they are tried from each tip alone as well.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avatar_core.common.jit import fast, inlined
+from avatar_core.contact.effects.large_deformation import bend
+
+STEPS = 7
+LEAST_PIVOT = 1e-9
+
+
+@fast
+def displaced(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
+    """U of a tip's patch under the present pushes and all that is there without them."""
+    u0, u1, u2 = reply.lifted[t, 0], reply.lifted[t, 1], reply.lifted[t, 2]
+    for s in range(state.passage.shape[0]):
+        if s != t and (several is None or not state.active[s]):
+            continue
+        c, g = friction.compliance[t, s], friction.push[s]
+        u0 += c[0, 0] * g[0] + c[0, 1] * g[1] + c[0, 2] * g[2]
+        u1 += c[1, 0] * g[0] + c[1, 1] * g[1] + c[1, 2] * g[2]
+        u2 += c[2, 0] * g[0] + c[2, 1] * g[1] + c[2, 2] * g[2]
+    return u0, u1, u2
+
+
+@inlined
+def approach(state, reply, several, large, friction, start):  # type: ignore[no-untyped-def]
+    """Bring all pushes nearer to the solution, or leave them.
+
+    start : 0 from the present pushes, t from the t-th tip alone
+    """
+    push, best, n_tools = friction.push, friction.best, state.passage.shape[0]
+    least = np.inf
+    for k in range(STEPS + 1):
+        size = 0.0
+        for t in range(n_tools):
+            size += _linearise(state, reply, several, large, friction, t)
+        if size < least:
+            least = size
+            for t in range(n_tools):
+                for d in range(3):
+                    best[t, d] = push[t, d]
+        if k == 0 and start > 0 and state.active[start - 1]:
+            _push_alone(state, reply, friction, start - 1)
+        elif k < STEPS:
+            _eliminate(friction.matrix, friction.side)
+            for t in range(n_tools):
+                for d in range(3):
+                    push[t, d] += friction.side[3 * t + d]
+    for t in range(n_tools):
+        for d in range(3):
+            push[t, d] = best[t, d]
+        n, g = state.normal[t], push[t]
+        state.force[t] = max(0.0, -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2]))
+
+
+@inlined
+def _push_alone(state, reply, friction, t):  # type: ignore[no-untyped-def]
+    """What a tip pushes if no other touches and it is dragged at its limit."""
+    n, y, c = state.normal[t], friction.asked[t], friction.compliance[t, t]
+    gap, stiff, along = state.gap[t], 0.0, 0.0
+    for i in range(3):
+        gap -= n[i] * reply.lifted[t, i]
+        stiff += n[i] * (c[i, 0] * n[0] + c[i, 1] * n[1] + c[i, 2] * n[2])
+        along += y[i] * n[i]
+    across = 0.0
+    for i in range(3):
+        across += (y[i] - along * n[i]) ** 2
+    force = max(0.0, -gap / stiff)
+    drag = friction.limit[t] / np.sqrt(across) if across > 0.0 else 0.0
+    friction.push[:] = 0.0
+    for i in range(3):
+        friction.push[t, i] = force * (drag * (y[i] - along * n[i]) - n[i])
+
+
+@inlined
+def _linearise(state, reply, several, large, friction, t):  # type: ignore[no-untyped-def]
+    """A tip's rows of Newton's system; returns the square of what it is off [N^2]."""
+    matrix, side, n_tools = friction.matrix, friction.side, state.passage.shape[0]
+    for i in range(3):
+        side[3 * t + i] = 0.0
+        for column in range(3 * n_tools):
+            matrix[3 * t + i, column] = 1.0 if column == 3 * t + i else 0.0
+    if not state.active[t]:
+        return 0.0
+    n, g, y, c = state.normal[t], friction.push[t], friction.asked[t], friction.compliance[t, t]
+    normal = 0.0
+    for i in range(3):
+        normal += n[i] * (c[i, 0] * n[0] + c[i, 1] * n[1] + c[i, 2] * n[2])
+    across = 0.5 * (c[0, 0] + c[1, 1] + c[2, 2] - normal)
+    u0, u1, u2 = displaced(state, reply, several, friction, t)
+    force = -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
+    w, bending = state.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2), 0.0
+    if large is not None:
+        state.force[t] = max(0.0, force)
+        bend(state, large, t)
+        w += large.bent[t, 0]
+        bending = large.bent[t, 1] * state.self_compliance[t]
+    pressed = force - w / (normal + bending)
+    x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
+    along = x0 * n[0] + x1 * n[1] + x2 * n[2]
+    z0 = g[0] + force * n[0] + (x0 - along * n[0]) / across
+    z1 = g[1] + force * n[1] + (x1 - along * n[1]) / across
+    z2 = g[2] + force * n[2] + (x2 - along * n[2]) / across
+    size, most = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2), friction.limit[t] * max(0.0, pressed)
+    part, limit = 1.0, 0.0  # of dz and of da, in what is kept of z
+    e0 = e1 = e2 = 0.0
+    if size > most:
+        part, limit = most / size, friction.limit[t]
+        e0, e1, e2 = z0 / size, z1 / size, z2 / size
+    if pressed <= 0.0:
+        pressed = part = limit = 0.0
+    kept = (part * z0, part * z1, part * z2)
+    e, square = (e0, e1, e2), 0.0
+    for i in range(3):
+        off = -n[i] * max(0.0, pressed) + kept[i] - g[i]
+        side[3 * t + i] = off
+        square += off * off
+    if pressed <= 0.0:
+        return square
+    for s in range(n_tools):
+        if not state.active[s]:
+            continue
+        for d in range(3):
+            own = 1.0 if s == t else 0.0
+            b = friction.compliance[t, s]
+            lifted = n[0] * b[0, d] + n[1] * b[1, d] + n[2] * b[2, d]
+            a = lifted / (normal + bending) - own * n[d] * (1.0 - bending / (normal + bending))
+            slid = 0.0  # e . dz
+            for i in range(3):
+                dz = own * ((1.0 if i == d else 0.0) - n[i] * n[d])
+                slid += e[i] * (dz - (b[i, d] - n[i] * lifted) / across)
+            for i in range(3):
+                dz = own * ((1.0 if i == d else 0.0) - n[i] * n[d])
+                dz -= (b[i, d] - n[i] * lifted) / across
+                new = -n[i] * a + e[i] * limit * a + part * (dz - e[i] * slid)
+                matrix[3 * t + i, 3 * s + d] -= new
+    return square
+
+
+@inlined
+def _eliminate(a, b):  # type: ignore[no-untyped-def]
+    """a x = b by Gauss with row exchange; x in place of b. Pivots that vanish get a small one."""
+    n = b.shape[0]
+    for k in range(n):
+        p = k
+        for i in range(k + 1, n):
+            if abs(a[i, k]) > abs(a[p, k]):
+                p = i
+        if p != k:
+            for j in range(k, n):
+                a[k, j], a[p, j] = a[p, j], a[k, j]
+            b[k], b[p] = b[p], b[k]
+        if abs(a[k, k]) < LEAST_PIVOT:
+            a[k, k] = LEAST_PIVOT
+        for i in range(k + 1, n):
+            f = a[i, k] / a[k, k]
+            if f != 0.0:
+                for j in range(k + 1, n):
+                    a[i, j] -= f * a[k, j]
+                b[i] -= f * b[k]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            b[k] -= a[k, j] * b[j]
+        b[k] /= a[k, k]

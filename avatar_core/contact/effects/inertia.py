@@ -1,0 +1,121 @@
+"""Inertia: the organ's mass in its own modes, for fast pulls and for what happens after release.
+
+The modes are orthonormal in the energy; turned so that the mass rho X^T M X is diagonal too (m_k,
+with the frequencies 1 / sqrt(m_k)), each is an oscillator of its own,
+
+    m_k q'' + d_k q' + R_k(q) = Y_k . f,        R = q, or what viscoelasticity makes of it,
+
+advanced by the midpoint rule,
+
+    2 m (v_mid - v) / dt + (R + R_new) / 2 + d v_mid = Y . f,     q_new = q + dt v_mid,
+
+which conserves energy but for d v_mid^2 dt (Simo & Tarnow, ZAMP 43:757, 1992). The loads f of the
+period keep the tips from lying inside at its end: on a tip at rest they do no work but
+-lambda gap <= 0, so that no contact gains energy. The near field has no mass.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from avatar_core.common.jit import fast
+from avatar_core.common.quantities import quantity
+from avatar_core.contact.effects.base import Effect, require_body
+from avatar_core.contact.effects.self_weight import WeightArrays
+from avatar_core.reduction.separated import SeparatedField
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum.model import Vademecum
+
+
+@dataclass(frozen=True)
+class Inertia(Effect):
+    """The organ's own mass: it swings when it is let go."""
+
+    name: ClassVar[str] = "inertia"
+    text: ClassVar[str] = "the organ has mass and swings"
+
+    density: float = quantity("kg/m^3", 100.0, 5000.0, "of the organ", 1060.0)
+    damping: float = quantity("-", 0.0, 2.0, "of every mode, over its critical damping", 0.1)
+
+    def require(self, vademecum: Vademecum) -> None:
+        require_body(vademecum, self.name)
+
+
+InertiaArrays = namedtuple("InertiaArrays", ["mass", "drag", "timing"])
+Swing = namedtuple(
+    "Swing",
+    [
+        "mass",  # (k,) m_k [s^2]
+        "drag",  # (k,) d_k [s]
+        "timing",  # (1,) dt [s]
+        "modes",  # (k,) q
+        "speed",  # (k,) q'
+    ],
+)
+
+
+def turned_modes(vademecum: Vademecum, density: float) -> tuple[Vademecum, np.ndarray]:
+    """The vademecum in modes of free vibration, slowest first, and their masses (k,) [s^2]."""
+    far, body = vademecum.far, vademecum.body
+    assert body is not None  # `require` has seen it
+    values, turn = np.linalg.eigh(body.mass)
+    values, turn = density * np.maximum(values[::-1], 0.0), turn[:, ::-1]
+    single = turn.astype(far.space.dtype)
+    turned = SeparatedField(far.space @ single, far.load @ single)
+    return replace(vademecum, far=turned, body=body.mixed(turn)), values
+
+
+def inertia_arrays(effect: Inertia, mass: np.ndarray, period: float) -> InertiaArrays:
+    """Coefficients of the oscillators."""
+    return InertiaArrays(mass, 2.0 * effect.damping * np.sqrt(mass), np.array([period]))
+
+
+def make_swing(arrays: InertiaArrays, n_modes: int, weight: WeightArrays | None) -> Swing:
+    """At rest, hanging where there is gravity."""
+    still = np.zeros(n_modes) if weight is None else weight.amplitude.copy()
+    padding = n_modes - len(arrays.mass)
+    mass, drag = np.pad(arrays.mass, (0, padding)), np.pad(arrays.drag, (0, padding))
+    return Swing(mass, drag, arrays.timing, still, np.zeros(n_modes))
+
+
+@fast
+def expect(reply, inertia, memory, weight):  # type: ignore[no-untyped-def]
+    """Modes at the end of the period without any load of a tool, and what a load adds."""
+    dt = inertia.timing[0]
+    for k in range(reply.free.shape[0]):
+        m, q, v = inertia.mass[k], inertia.modes[k], inertia.speed[k]
+        stiff, before, after = 1.0, q, q  # dR/dq of the period, R now, R at its end if q stays
+        if memory is not None:
+            stiff = 1.0 / memory.gain[0]
+            before, after = memory.rest[0] * memory.elastic[k], 0.0
+            for i in range(memory.decay.shape[0]):
+                before += memory.past[i, k]
+            after = memory.held[k] + stiff * memory.elastic[k]
+        elif weight is not None:  # R counts from where the organ hangs
+            before -= weight.amplitude[k]
+            after -= weight.amplitude[k]
+        whole = 2.0 * m / dt + 0.5 * stiff * dt + inertia.drag[k]
+        middle = (2.0 * m * v / dt - 0.5 * (before + after)) / whole
+        reply.free[k] = q + dt * middle
+        reply.gain[k] = dt / whole
+
+
+@fast
+def advance(reply, inertia):  # type: ignore[no-untyped-def]
+    """Complete the period."""
+    dt = inertia.timing[0]
+    for k in range(reply.total.shape[0]):
+        new = reply.total[k]
+        speed = 2.0 * (new - inertia.modes[k]) / dt - inertia.speed[k]
+        inertia.speed[k] = speed if abs(speed) > 1e-30 else 0.0
+        inertia.modes[k] = new if abs(new) > 1e-30 else 0.0
+
+
+def kinetic_energy(inertia: Swing) -> float:
+    """sum_k m_k v_k^2 / 2 [J]."""
+    return float(0.5 * inertia.mass @ inertia.speed**2)

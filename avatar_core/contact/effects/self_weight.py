@@ -1,0 +1,65 @@
+"""Gravity: the organ sags under its own weight, as one more load that was computed beforehand.
+
+The modes X are orthonormal in the energy, so that Galerkin's answer to a body force rho g is
+X^T M 1 rho g, M the mass of a unit density: one amplitude each. What relaxes has relaxed.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from avatar_core.common.quantities import quantity
+from avatar_core.contact.effects.base import Effect, direction, require_body
+from avatar_core.reduction.separated import SeparatedField
+from avatar_core.vademecum.modal_mass import N_BODY, BodyResponse
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum.model import Vademecum
+
+
+@dataclass(frozen=True)
+class SelfWeight(Effect):
+    """The organ hangs under its own weight."""
+
+    name: ClassVar[str] = "self_weight"
+    text: ClassVar[str] = "the organ sags under gravity"
+
+    density: float = quantity("kg/m^3", 100.0, 5000.0, "of the organ", 1060.0)
+    gravity: float = quantity("m/s^2", 0.0, 100.0, "acceleration", 9.81)
+    direction: tuple[float, ...] = quantity(
+        "-", -1e3, 1e3, "of gravity in the organ's frame (supine, RAS: 0 -1 0)", (0.0, -1.0, 0.0)
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "direction", direction(self.direction, self.name, "direction"))
+
+    def require(self, vademecum: Vademecum) -> None:
+        require_body(vademecum, self.name)
+
+
+def body_first(vademecum: Vademecum) -> Vademecum:
+    """The vademecum with the body's own functions, which are its last modes, before the others."""
+    far, body = vademecum.far, vademecum.body
+    assert body is not None  # `require` has seen it
+    order = np.roll(np.arange(far.rank), N_BODY)
+    turned = BodyResponse(body.mass[np.ix_(order, order)], body.weight[order])
+    far = SeparatedField(far.space[:, order], far.load[:, order])
+    return replace(vademecum, far=far, body=turned)
+
+
+WeightArrays = namedtuple("WeightArrays", ["amplitude"])  # (k,) of the modes, the organ hanging
+
+
+def weight_arrays(effect: SelfWeight, vademecum: Vademecum, softened: float) -> WeightArrays:
+    """Amplitudes of the modes.
+
+    softened : Young's modulus of a touch over that after a long time
+    """
+    assert vademecum.body is not None  # `require` has seen it
+    force = effect.density * effect.gravity * np.array(effect.direction)
+    return WeightArrays(softened * (vademecum.body.weight @ force))

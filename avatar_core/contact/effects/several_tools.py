@@ -1,0 +1,252 @@
+"""Several tools in contact at once, coupled through the compliance of the organ.
+
+    gap_t + sum_t' C_tt' lambda_t' >= 0,    C_tt' = a_t a_t' f_t . C f_t'
+
+with the far field between all tips and the near field between tips that are close. Action equals
+reaction because C is symmetric.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from avatar_core.common.jit import fast, inlined
+from avatar_core.contact.effects.base import Effect
+from avatar_core.contact.effects.large_deformation import bend
+from avatar_core.reduction.near_field import find_block
+
+MAX_EXCHANGES = 4  # for each tool, of the tips that are held
+INSIDE = 1e-9  # [m] deeper inside, a tip has to be held
+LEAST_PIVOT = 1e-8  # of a tip's own compliance
+
+
+@dataclass(frozen=True)
+class SeveralTools(Effect):
+    """More than one tool touches at once, coupled through the organ."""
+
+    name: ClassVar[str] = "several_tools"
+    text: ClassVar[str] = "tools feel each other through the organ"
+
+
+SeveralArrays = namedtuple("SeveralArrays", ["reach"])  # (1,) of the near field [m]
+Several = namedtuple(
+    "Several",
+    [
+        "reach",  # (1,) of the near field [m]
+        "column",  # (T, T, MAX_STENCIL, 3) near displacement at the nodes of the second tip by a
+        # unit normal force of the first
+        "near",  # (T, T) whether it is any
+        "extent",  # (T,) radius of a tip's nodes [m]
+        "matrix",  # (T, T) C, with what large deformation adds
+        "factor",  # (T, T) its Cholesky factor
+        "asked",  # (T,) the gap without any force [m]
+        "trial",  # (T,) forces that close the gaps of the tips that are held [N]
+        "held",  # (T,)
+    ],
+)
+
+
+def make_several(arrays: SeveralArrays, n_tools: int, n_nodes: int) -> Several:
+    """With scratch for the pairs of tools."""
+    return Several(
+        *arrays,
+        np.zeros((n_tools, n_tools, n_nodes, 3), np.float32),
+        np.zeros((n_tools, n_tools), np.bool_),
+        np.zeros(n_tools),
+        np.zeros((n_tools, n_tools)),
+        np.zeros((n_tools, n_tools)),
+        np.zeros(n_tools),
+        np.zeros(n_tools),
+        np.zeros(n_tools, np.bool_),
+    )
+
+
+@inlined
+def connect(model, state, several, friction):  # type: ignore[no-untyped-def]
+    """Near fields between all pairs of tips that touch; with friction, whether there are any."""
+    n_tools = state.passage.shape[0]
+    for t in range(n_tools):
+        if state.active[t]:
+            _measure_extent(model, state, several, t)
+    for t in range(n_tools):
+        for s in range(t):
+            several.near[t, s] = several.near[s, t] = False
+            if state.active[t] and state.active[s]:
+                near = _are_near(state, several, t, s)
+                several.near[t, s] = several.near[s, t] = near
+                if friction is None and near:
+                    _connect_pair(model, state, several, t, s)
+
+
+@fast
+def _measure_extent(model, state, several, t):  # type: ignore[no-untyped-def]
+    farthest = 0.0
+    for i in range(state.n_nodes[t]):
+        j, squared = state.nodes[t, i], 0.0
+        for d in range(3):
+            squared += (model.position[j, d] - state.point[t, d]) ** 2
+        farthest = max(farthest, squared)
+    several.extent[t] = np.sqrt(farthest)
+
+
+@fast
+def _are_near(state, several, t, s):  # type: ignore[no-untyped-def]
+    apart = 0.0
+    for d in range(3):
+        apart += (state.point[s, d] - state.point[t, d]) ** 2
+    return np.sqrt(apart) < several.reach[0] + several.extent[t] + several.extent[s]
+
+
+@fast
+def _connect_pair(model, state, several, t, s):  # type: ignore[no-untyped-def]
+    """By Maxwell and Betti the block from m to j is that from j to m transposed."""
+    there, back = several.column[t, s], several.column[s, t]
+    there[: state.n_nodes[s]] = np.float32(0.0)
+    back[: state.n_nodes[t]] = np.float32(0.0)
+    n, m, zero = state.normal[t], state.normal[s], np.float32(0.0)
+    for i in range(state.n_nodes[t]):
+        j, w = state.nodes[t, i], state.weight[t, i, 0]
+        w0, w1, w2 = np.float32(w * n[0]), np.float32(w * n[1]), np.float32(w * n[2])
+        u0 = u1 = u2 = zero
+        for q in range(state.n_nodes[s]):
+            e = find_block(model.contact_start, model.contact_slot, j, state.nodes[s, q])
+            if e < 0:
+                continue
+            b = model.contact_block[e]
+            there[q, 0] += b[0, 0] * w0 + b[0, 1] * w1 + b[0, 2] * w2
+            there[q, 1] += b[1, 0] * w0 + b[1, 1] * w1 + b[1, 2] * w2
+            there[q, 2] += b[2, 0] * w0 + b[2, 1] * w1 + b[2, 2] * w2
+            w = state.weight[s, q, 0]
+            v0, v1, v2 = np.float32(w * m[0]), np.float32(w * m[1]), np.float32(w * m[2])
+            u0 += b[0, 0] * v0 + b[1, 0] * v1 + b[2, 0] * v2
+            u1 += b[0, 1] * v0 + b[1, 1] * v1 + b[2, 1] * v2
+            u2 += b[0, 2] * v0 + b[1, 2] * v1 + b[2, 2] * v2
+        back[i, 0] += u0
+        back[i, 1] += u1
+        back[i, 2] += u2
+
+
+@fast
+def assemble(state, reply, several):  # type: ignore[no-untyped-def]
+    """Compliance between the tips."""
+    for t in range(state.passage.shape[0]):
+        for s in range(t):
+            if not (state.active[t] and state.active[s]):
+                continue
+            value = 0.0
+            for k in range(state.mode.shape[1]):
+                value += reply.gain[k] * state.mode[t, k] * state.mode[s, k]
+            if several.near[s, t]:
+                n = state.normal[t]
+                near = 0.0
+                for i in range(state.n_nodes[t]):
+                    u = several.column[s, t, i]
+                    near += state.weight[t, i, 0] * (n[0] * u[0] + n[1] * u[1] + n[2] * u[2])
+                value += reply.near_gain[0] * near
+            state.gram[t, s] = state.gram[s, t] = value
+            value *= state.scale[t] * state.scale[s]
+            state.compliance[t, s] = state.compliance[s, t] = value
+
+
+@inlined
+def share(state, reply, several, large):  # type: ignore[no-untyped-def]
+    """The forces that solve the contact, by exchange of the tips that are held.
+
+    Nonnegative least squares in the energy (Lawson & Hanson, Solving Least Squares Problems,
+    Sec. 23.3): solve for the tips that are held; where one would be pulled, go as far as none is
+    and let it go; else hold the one that is inside deepest. Forces stay >= 0 and the energy falls,
+    however close the tips are. Of large deformation it is one step of Newton's.
+    """
+    _linearise(state, reply, several, large)
+    n_tools, force, trial, held = state.passage.shape[0], state.force, several.trial, several.held
+    for _ in range(MAX_EXCHANGES * n_tools):
+        _close_gaps(several)
+        part, pulled = 1.0, -1
+        for t in range(n_tools):
+            if held[t] and trial[t] < 0.0 and force[t] <= part * (force[t] - trial[t]):
+                part, pulled = force[t] / (force[t] - trial[t]), t
+        for t in range(n_tools):
+            if held[t]:
+                force[t] += part * (trial[t] - force[t])
+        if pulled >= 0:
+            force[pulled], held[pulled] = 0.0, False
+            continue
+        least, deepest = -INSIDE, -1
+        for t in range(n_tools):
+            if state.active[t] and not held[t]:
+                gap = several.asked[t]
+                for s in range(n_tools):
+                    if held[s]:
+                        gap += several.matrix[t, s] * force[s]
+                if gap < least:
+                    least, deepest = gap, t
+        if deepest < 0:
+            return
+        held[deepest] = True
+
+
+@inlined
+def _linearise(state, reply, several, large):  # type: ignore[no-untyped-def]
+    """Gap without forces and compliance, about the present forces; who has one is held."""
+    for t in range(state.passage.shape[0]):
+        several.held[t] = False
+        if not state.active[t]:
+            continue
+        several.held[t] = state.force[t] > 0.0
+        for s in range(state.passage.shape[0]):
+            several.matrix[t, s] = state.compliance[t, s]
+        several.asked[t] = state.gap[t] - reply.lift[t]
+        if large is not None:
+            bend(state, large, t)
+            stiff = large.bent[t, 1] * state.self_compliance[t]
+            several.matrix[t, t] += stiff
+            several.asked[t] += large.bent[t, 0] - stiff * state.force[t]
+
+
+@inlined
+def _close_gaps(several):  # type: ignore[no-untyped-def]
+    """matrix trial = - asked among the tips that are held, by Cholesky.
+
+    Of two tips in one place the second has no pivot: it gets a small one, and what is left of its
+    gap goes to the force of whoever is deeper.
+    """
+    held, c, root, x = several.held, several.matrix, several.factor, several.trial
+    for t in range(held.shape[0]):
+        if not held[t]:
+            continue
+        x[t] = -several.asked[t]
+        for s in range(t + 1):
+            if not held[s]:
+                continue
+            value = c[t, s]
+            for k in range(s):
+                if held[k]:
+                    value -= root[t, k] * root[s, k]
+            if s < t:
+                root[t, s] = value / root[s, s]
+                x[t] -= root[t, s] * x[s]
+            else:
+                root[t, t] = np.sqrt(max(value, LEAST_PIVOT * c[t, t]))
+        x[t] /= root[t, t]
+    for t in range(held.shape[0] - 1, -1, -1):
+        if held[t]:
+            for k in range(t + 1, held.shape[0]):
+                if held[k]:
+                    x[t] -= root[k, t] * x[k]
+            x[t] /= root[t, t]
+
+
+@fast
+def add_near(state, reply, several, t):  # type: ignore[no-untyped-def]
+    """Near displacement at the nodes of a tip by the others' normal forces, into ``joint``."""
+    for s in range(state.passage.shape[0]):
+        if s == t or state.force[s] <= 0.0 or not several.near[s, t]:
+            continue
+        force = -state.force[s] * state.scale[s] * reply.near_gain[0]
+        for i in range(state.n_nodes[t]):
+            for d in range(3):
+                reply.joint[i, d] += force * several.column[s, t, i, d]

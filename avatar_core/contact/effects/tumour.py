@@ -1,0 +1,63 @@
+"""A tumour: another stiffness inside a second surface, chosen before the step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from avatar_core.common.quantities import quantity
+from avatar_core.contact.effects.base import Effect
+from avatar_core.errors import SceneError
+from avatar_core.vademecum.at_values import at_values
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum.model import Vademecum
+
+
+@dataclass(frozen=True)
+class Tumour(Effect):
+    """The tumour is stiffer, or softer, than the organ around it."""
+
+    name: ClassVar[str] = "tumour"
+    text: ClassVar[str] = "the tumour has a stiffness of its own"
+
+    contrast: float | None = quantity(
+        "-",
+        0.01,
+        100.0,
+        "Young's modulus inside over that outside; by default the file's own",
+        None,
+    )
+
+    def require(self, vademecum: Vademecum) -> None:
+        coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
+        ranges = [(c.low, c.high) for c in coordinates if c.name == "contrast"]
+        if not ranges and vademecum.contrast is None:
+            raise SceneError(
+                "tumour: the vademecum has none; build one with 'avatar vademecum SURFACE "
+                "--tumour FILE --coordinate contrast=0.5:20'"
+            )
+        own = vademecum.contrast or 1.0
+        low, high = ranges[0] if ranges else (own, own)
+        if self.contrast is not None and not low <= self.contrast <= high:
+            raise SceneError(
+                f"tumour: contrast is {self.contrast:g}, the vademecum holds {low:g} to {high:g}; "
+                "build one with another --coordinate contrast=LOW:HIGH"
+            )
+
+
+def at_contrast(vademecum: Vademecum, effect: Tumour | None) -> Vademecum:
+    """The vademecum with the contrast of a scene, or without a tumour where it can do without.
+
+    A tumour is a choice of the material: the step itself does not know of it.
+    """
+    coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
+    ranges = [(c.low, c.high) for c in coordinates if c.name == "contrast"]
+    contrast = 1.0 if effect is None else effect.contrast
+    if (
+        contrast is None
+        or contrast == vademecum.contrast
+        or not any(low <= contrast <= high for low, high in ranges)
+    ):
+        return vademecum
+    return at_values(vademecum, {"contrast": contrast})

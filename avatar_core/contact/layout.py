@@ -1,0 +1,195 @@
+"""What a step reads and never changes: a vademecum, tools and effects laid out in flat arrays.
+
+``vademecum -> lay_out -> Layout``; :mod:`avatar_core.contact.model` puts state and compiled code to
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+
+from avatar_core.contact import kernels
+from avatar_core.contact.cloud import cloud_arrays
+from avatar_core.contact.effects.base import Effect
+from avatar_core.contact.effects.large_deformation import LargeArrays, LargeDeformationEffect
+from avatar_core.contact.effects.selection import (
+    ARRAYS,
+    Constants,
+    find,
+    in_its_modes,
+    natural_effects,
+    selected_arrays,
+)
+from avatar_core.contact.effects.several_tools import SeveralTools
+from avatar_core.contact.kernels import ModelArrays
+from avatar_core.contact.tip_response import make_tip_response, sampled_at_tip
+from avatar_core.errors import ContactError, SceneError
+from avatar_core.reduction.near_field import LocalBlocks, hash_rows
+from avatar_core.vademecum.accuracy import Cloud, Precision
+from avatar_core.vademecum.certificate import Certificate
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum.model import Vademecum
+
+LANES = 32  # single numbers that a vectorised loop takes at once
+TIP_RADIUS_RANGE = (2e-3, 20e-3)  # [m]
+PERIOD = 1e-3  # of the steps [s]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The constant arrays of a step: of the organ and its tools, and of the chosen effects.
+
+    arrays : ModelArrays
+        distance, access, origin, spacing: the tip field; row, carrier, share,
+        self_compliance: the tip response on its grid; force_error, relative, on it too;
+        position (n_positions, 3) [m]; load (n_positions, 3, rank and zeros) and the contact_*
+        blocks, found by their hash tables: compliance [m/N]; softness (1,), added where access
+        fades [m/N];
+        space (n_blocks, rank, BLOCK) int16, modes of the displacement of the cloud, in parts of
+        space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 6), the cloud without
+        displacement [m]; tip_radius (n_tools,) [m]
+    effects : Constants, None for each effect that was not chosen
+    """
+
+    arrays: Any
+    effects: Constants
+
+    def flat(self) -> dict[str, np.ndarray]:
+        """All arrays by name, as "distance" or "friction.coefficients"."""
+        out = dict(self.arrays._asdict())
+        for name, chosen in self.effects._asdict().items():
+            if chosen is not None:
+                out |= {f"{name}.{key}": array for key, array in chosen._asdict().items()}
+        return out
+
+    @staticmethod
+    def of(arrays: dict[str, np.ndarray]) -> Layout:
+        """The inverse of :meth:`flat`."""
+        chosen: dict[str, Any] = {}
+        for name, kind in ARRAYS.items():
+            own = [f"{name}.{key}" for key in kind._fields]
+            chosen[name] = kind(*(arrays[key] for key in own)) if own[0] in arrays else None
+        return Layout(
+            ModelArrays(*(arrays[key] for key in ModelArrays._fields)), Constants(**chosen)
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all of it [bytes]."""
+        return int(sum(array.nbytes for array in self.flat().values()))
+
+
+def lay_out(
+    vademecum: Vademecum,
+    tip_radii: tuple[float, ...] = (5e-3,),
+    modes: int | None = None,
+    cloud: Cloud = "surface",
+    effects: Sequence[Effect] | None = None,
+    period: float = PERIOD,
+    precision: Precision = "int16",
+    near: float = 1.0,
+) -> Layout:
+    """The constant arrays of a contact model; see :func:`avatar_core.contact.model.prepare`."""
+    _check(vademecum, tip_radii, modes, cloud, precision, near)
+    if effects is None:
+        effects = natural_effects(vademecum, len(tip_radii))
+    for effect in effects:
+        effect.require(vademecum)
+    if len(tip_radii) > 1 and find(effects, SeveralTools) is None:
+        raise SceneError(
+            f"{len(tip_radii)} tools without several_tools; add it to the effects, or name one tool"
+        )
+    vademecum, mass = in_its_modes(vademecum, effects)
+    surface, mesh = vademecum.surface, vademecum.mesh
+    contact = vademecum.contact_near
+    contact_start, contact_slot = hash_rows(contact)
+    load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
+    response = make_tip_response(
+        surface, vademecum.tip_field, load, contact, kernels.MAX_DEPTH, max(tip_radii)
+    )
+    bends = find(effects, LargeDeformationEffect) is not None
+    bent = vademecum.large if bends else None
+    shown = cloud_arrays(vademecum, modes, cloud, precision, near, bent.space if bent else None)
+    large = None
+    if bent is not None:
+        values = np.vstack([bent.depth, bent.reach])
+        grid = sampled_at_tip(surface, vademecum.tip_field, response, values)
+        kept = shown.fade > 0.0
+        fade = shown.fade[kept, None].astype(bent.near.dtype)
+        # in rows whether or not blocks were left out: one layout, one compilation
+        large = LargeArrays(grid, bent.load, np.ascontiguousarray(bent.near[:, kept] * fade))
+    arrays = ModelArrays(
+        *vademecum.tip_field,
+        row=response.row,
+        carrier=response.carrier,
+        share=response.share,
+        self_compliance=response.self_compliance,
+        force_error=_force_error(vademecum, response.smoothing, bends),
+        position=np.ascontiguousarray(surface.centers),
+        load=_padded(load),
+        contact_start=contact_start,
+        contact_slot=contact_slot,
+        contact_block=contact.block,
+        softness=np.array([float((load**2).sum(axis=(1, 2)).mean() / 3.0)]),
+        space=shown.space,
+        space_scale=shown.space_scale,
+        near_start=shown.near.start,
+        near_target=shown.near.target,
+        near_block=shown.near.block,
+        rest=np.pad(mesh.vertices[shown.points], ((0, 0), (0, 3))).astype(np.float32),
+        tip_radius=np.array(tip_radii, float),
+    )
+    reach = _reach(contact, surface.centers)
+    return Layout(arrays, selected_arrays(vademecum, effects, mass, large, reach, period))
+
+
+def _force_error(vademecum: Vademecum, smoothing: np.ndarray, bends: bool) -> np.ndarray:
+    """The relative error of the force on the grid of the tip field; NaN if it is not known."""
+    certificate = vademecum.certificate or Certificate.unknown()
+    bending = 0.0
+    if bends and vademecum.large is not None:
+        pushed = vademecum.large.certificate
+        bending = pushed.contact_mean if pushed else float("nan")
+    return certificate.force_error.relative(smoothing, bending)
+
+
+def _reach(near: LocalBlocks, centers: np.ndarray) -> float:
+    """Longest distance between the two positions of a block [m]."""
+    distance = np.linalg.norm(centers[near.position] - centers[near.target], axis=1)
+    return float(distance.max(initial=0.0)) * (1.0 + 1e-9)
+
+
+def _padded(load: np.ndarray) -> np.ndarray:
+    """Zeros up to a multiple of the modes that a compiled loop takes at once."""
+    return np.pad(load, ((0, 0), (0, 0), (0, -load.shape[2] % LANES)))
+
+
+def _check(
+    vademecum: Vademecum,
+    tip_radii: tuple[float, ...],
+    modes: int | None,
+    cloud: str,
+    precision: str,
+    near: float,
+) -> None:
+    low, high = TIP_RADIUS_RANGE
+    if not 1 <= len(tip_radii) <= kernels.MAX_TOOLS:
+        raise ContactError(f"{len(tip_radii)} tools; give 1 to {kernels.MAX_TOOLS} tip radii")
+    for radius in tip_radii:
+        if not low <= radius <= high:
+            raise ContactError(f"tip radius {radius:g} m; it must lie in {low:g} to {high:g} m")
+    if modes is not None and not 1 <= modes <= vademecum.far.rank:
+        raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {vademecum.far.rank}")
+    for name, value, known in (
+        ("cloud", cloud, get_args(Cloud)),
+        ("precision", precision, get_args(Precision)),
+    ):
+        if value not in known:
+            raise ContactError(f"{name} '{value}' is unknown; choose {', '.join(known)}")
+    if not 0.0 <= near <= 1.0:
+        raise ContactError(f"near is {near:g}; give a part of the near field's radius, 0 to 1")

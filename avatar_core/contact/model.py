@@ -1,0 +1,359 @@
+"""Contact between spherical tool tips and an organ at 1 kHz: offline ``prepare``, online ``step``.
+
+``prepare`` allocates, compiles and may fail; ``step`` does none of it and returns a status.
+The compiled code is in :mod:`avatar_core.contact.kernels`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numba
+import numpy as np
+
+from avatar_core.contact import kernels
+from avatar_core.contact.cloud import BLOCK
+from avatar_core.contact.effects.base import Effect
+from avatar_core.contact.effects.selection import (
+    NO_EFFECTS,
+    Selection,
+    for_cloud,
+    online,
+)
+from avatar_core.contact.effects.several_tools import SeveralArrays
+from avatar_core.contact.kernels import ModelArrays, Out, State
+from avatar_core.contact.layout import PERIOD, Layout, lay_out
+from avatar_core.contact.tip_response import MAX_STENCIL
+from avatar_core.vademecum.accuracy import Cloud, Precision
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum.model import Vademecum
+
+FAR_AWAY = 1e3  # where a tool without a pose is, for the step [m]
+
+
+class Status(IntEnum):
+    """What a step came to; the numbers of avatar_ros/msg/ContactState."""
+
+    OK = kernels.OK
+    NO_MODEL = kernels.NO_MODEL
+    NO_POSE = kernels.NO_POSE
+    STALE_POSE = kernels.STALE_POSE
+    INVALID_POSE = kernels.INVALID_POSE
+    NOT_CONVERGED = kernels.NOT_CONVERGED
+    TOO_MANY_CONTACTS = kernels.TOO_MANY
+    OUT_OF_RANGE = kernels.OUT_OF_RANGE
+    UNKNOWN_FRAME = kernels.UNKNOWN_FRAME
+    EXTRAPOLATED = kernels.EXTRAPOLATED
+
+
+class Compiled(NamedTuple):
+    """The halves of a step or the whole, compiled for the types of one model.
+
+    Called without numba's look-up of the types, which takes 4 us for as many arrays.
+    """
+
+    solve: Callable[..., int] | None
+    deform: Callable[..., None] | None
+    step: Callable[..., int] | None
+
+
+@dataclass(frozen=True)
+class ContactModel:
+    """Everything a step reads and writes.
+
+    layout : Layout, constant
+    state : State, forces kept for the next period, and scratch
+    effects : Selection, state and scratch of the chosen effects, None for the others
+    out : Out
+        force, torque (n_tools, 3) [N, N m], of the organ on each tool about its tip (a
+        frictionless sphere has no torque about its centre); status (n_tools,), of each;
+        cloud (n_points, 6) float32, deformed position and displacement [m];
+        force_error (n_tools,), that one contact in ten exceeds [N], by :func:`estimate_error`;
+        n_contacts (1,), then contact_tool, contact_position, contact_normal (organ to tool),
+        contact_force (on the tool), contact_penetration of the active contacts
+    tips : ndarray, shape (n_tools, 3), sphere centres of the present step [m]
+    compiled : Compiled
+    """
+
+    layout: Layout
+    state: Any
+    effects: Selection
+    out: Any
+    tips: np.ndarray
+    compiled: Compiled
+
+    @property
+    def arrays(self) -> Any:
+        """Constant arrays of the organ and its tools."""
+        return self.layout.arrays
+
+    @property
+    def n_tools(self) -> int:
+        """Number of tools."""
+        return len(self.arrays.tip_radius)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the constant arrays [bytes]."""
+        return self.layout.nbytes
+
+    @property
+    def n_modes(self) -> int:
+        """Modes of the far field that the cloud can show."""
+        return _n_far(self.layout)
+
+    @property
+    def n_shown(self) -> int:
+        """Modes of the far field that the cloud shows."""
+        return int(self.state.shown[0])
+
+    def show(self, modes: int) -> None:
+        """Show the displacement with fewer modes, or with all again, from the next step on.
+
+        The force does not change: the contact compliance keeps all modes and the near field.
+        """
+        self.state.shown[0] = min(max(modes, 0), self.n_modes)
+
+    def resume(self, before: ContactModel) -> None:
+        """Go on where another model of the same organ and tools is: tips in contact stay so."""
+        for name in ("passage", "seen", "active", "force"):
+            getattr(self.state, name)[:] = getattr(before.state, name)
+        mine, theirs = self.effects, before.effects
+        if mine.friction is not None and theirs.friction is not None:
+            for name in ("anchor", "motion", "push"):
+                getattr(mine.friction, name)[:] = getattr(theirs.friction, name)
+        if mine.motion is not None and theirs.motion is not None:
+            mine.motion.clock[:] = theirs.motion.clock
+
+    def reset(self) -> None:
+        """Forget all contacts and all that has passed: the organ is at rest."""
+        self.state.passage[:] = kernels.OUTSIDE
+        self.state.force[:] = 0.0
+        fresh = _online(self.layout)
+        for mine, new in zip(self.effects, fresh, strict=True):
+            pairs: Any = zip(mine or (), new or (), strict=True)
+            for array, clean in pairs:
+                if array is not clean:  # constants are the same in both
+                    array[...] = clean
+
+
+def prepare(
+    vademecum: Vademecum,
+    tip_radii: tuple[float, ...] = (5e-3,),
+    modes: int | None = None,
+    cloud: Cloud = "surface",
+    effects: Sequence[Effect] | None = None,
+    period: float = PERIOD,
+    halves: bool = False,
+    precision: Precision = "int16",
+    near: float = 1.0,
+) -> ContactModel:
+    """Lay out a vademecum for the step, and compile the step for the effects.
+
+    Parameters
+    ----------
+    vademecum : Vademecum
+    tip_radii : radius of each tool's spherical tip, 2 to 20 mm [m]
+    modes : far-field modes of the *displacement*; None for all. Fewer modes leave the force
+        exact, since the contact compliance keeps all of them.
+    cloud : "surface" or "volume" vertices, or "off"
+    effects : what is simulated; by default what the vademecum and the tools call for
+    period : of the steps [s], for effects that know time
+    halves : to call :func:`solve` and :func:`deform` instead of :func:`step`
+    precision : of the displacement's modes
+    near : radius of the displacement's near field over the vademecum's own, 0 to 1
+
+    Raises
+    ------
+    ContactError, SceneError
+        For radii, modes or clouds out of range; for effects that the vademecum cannot serve.
+    """
+    layout = lay_out(vademecum, tip_radii, modes, cloud, effects, period, precision, near)
+    return make_model(layout, halves)
+
+
+def make_model(layout: Layout, halves: bool = False) -> ContactModel:
+    """Allocate state and outputs around the constant arrays, and run the step once.
+
+    halves : compile :func:`solve` and :func:`deform` instead of :func:`step`
+    """
+    arrays = layout.arrays
+    n_tools, n_modes = len(arrays.tip_radius), arrays.load.shape[2]
+    single = np.float32
+    n_far = _n_far(layout)
+    state = State(
+        passage=np.zeros(n_tools, np.int64),
+        seen=np.zeros((n_tools, 3)),
+        force=np.zeros(n_tools),
+        active=np.zeros(n_tools, np.bool_),
+        gap=np.zeros(n_tools),
+        slope=np.zeros((n_tools, 3)),
+        steepness=np.ones(n_tools),
+        normal=np.zeros((n_tools, 3)),
+        access=np.zeros(n_tools),
+        access_slope=np.zeros((n_tools, 3)),
+        point=np.zeros((n_tools, 3)),
+        local=np.full(len(arrays.position), -1, np.int64),
+        nodes=np.zeros((n_tools, MAX_STENCIL), np.int64),
+        n_nodes=np.zeros(n_tools, np.int64),
+        weight=np.zeros((n_tools, MAX_STENCIL, 4)),
+        mode=np.zeros((n_tools, n_modes), single),
+        column=np.zeros((n_tools, MAX_STENCIL, 3), single),
+        self_compliance=np.ones(n_tools),
+        self_slope=np.zeros((n_tools, 3)),
+        gram=np.ones((n_tools, n_tools)),
+        scale=np.ones(n_tools),
+        compliance=np.zeros((n_tools, n_tools)),
+        shown=np.array([n_far], np.int64),
+        amplitude=np.zeros(len(arrays.space_scale), single),
+        field=np.zeros(arrays.space.shape[0] * BLOCK, single),
+    )
+    out = Out(
+        force=np.zeros((n_tools, 3)),
+        torque=np.zeros((n_tools, 3)),
+        force_error=np.zeros(n_tools),
+        status=np.zeros(n_tools, np.int64),
+        cloud=np.zeros((len(arrays.rest), 6), np.float32),
+        n_contacts=np.zeros(1, np.int64),
+        contact_tool=np.zeros(n_tools, np.int64),
+        contact_position=np.zeros((n_tools, 3)),
+        contact_normal=np.zeros((n_tools, 3)),
+        contact_force=np.zeros((n_tools, 3)),
+        contact_penetration=np.zeros(n_tools),
+    )
+    far_away = np.full((n_tools, 3), FAR_AWAY)
+    effects = _online(layout)
+    kernels.force_error(arrays, out, far_away)
+    if halves:
+        first = _compiled(kernels.contact_solve, arrays, state, out, far_away, *effects)
+        second = _compiled(kernels.contact_deform, arrays, state, out, *for_cloud(effects))
+        compiled = Compiled(first, second, None)
+    else:
+        whole = _compiled(kernels.contact_step, arrays, state, out, far_away, *effects)
+        compiled = Compiled(None, None, whole)
+    model = ContactModel(layout, state, effects, out, far_away, compiled)
+    model.reset()
+    return model
+
+
+def _n_far(layout: Layout) -> int:
+    """Modes of the far field that the cloud can show."""
+    large = layout.effects.large
+    return len(layout.arrays.space_scale) - (0 if large is None else large.load.shape[2])
+
+
+def _online(layout: Layout) -> Selection:
+    n_positions, _, n_modes = layout.arrays.load.shape
+    return online(layout.effects, len(layout.arrays.tip_radius), n_modes, n_positions)
+
+
+def _compiled(kernel: Any, *arguments: Any) -> Any:
+    """A kernel compiled for the types of some arguments, with which it runs once."""
+    kernel(*arguments)
+    return kernel.get_overload(tuple(numba.typeof(argument) for argument in arguments))
+
+
+def step(model: ContactModel, tips: np.ndarray) -> int:
+    """Advance one period; real-time safe: allocates no array of size, never raises or logs.
+
+    Parameters
+    ----------
+    model : ContactModel, whose ``out`` is filled
+    tips : ndarray, shape (n_tools, 3), sphere centres [m]
+
+    Returns
+    -------
+    int
+        The worst :class:`Status` of the tools; ``out.status`` has each. INVALID_POSE: not
+        finite; OUT_OF_RANGE: off the accessible surface, too deep, or not come in through the
+        surface. The tools concerned have no force or a fading one, the others are served.
+    """
+    model.tips[:] = tips
+    assert model.compiled.step is not None
+    return model.compiled.step(
+        model.layout.arrays, model.state, model.out, model.tips, *model.effects
+    )
+
+
+def solve(model: ContactModel, tips: np.ndarray) -> int:
+    """The first half of :func:`step`: forces and contacts, so that they can leave at once."""
+    model.tips[:] = tips
+    assert model.compiled.solve is not None
+    return model.compiled.solve(
+        model.layout.arrays, model.state, model.out, model.tips, *model.effects
+    )
+
+
+def deform(model: ContactModel) -> None:
+    """The second half of :func:`step`: the cloud under the forces of :func:`solve`."""
+    assert model.compiled.deform is not None
+    model.compiled.deform(model.layout.arrays, model.state, model.out, *for_cloud(model.effects))
+
+
+def estimate_error(model: ContactModel) -> None:
+    """How wrong the forces of the last step may be, into ``out.force_error`` [N].
+
+    One contact in ten exceeds it; see :mod:`avatar_core.vademecum.force_error`. NaN where the
+    vademecum was not measured. Real-time safe, and apart from the step, so that forces can leave
+    before.
+    """
+    kernels.force_error(model.layout.arrays, model.out, model.tips)
+
+
+def warm_up(n_tools: int = 1) -> None:
+    """Compile the halves of a step, or read them from numba's cache, before there is a model."""
+    single, double = np.float32, np.float64
+    n, rank, points = 1, 1, 1
+    blocks = (np.zeros(n + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, 3, 3), single))
+    arrays = ModelArrays(
+        distance=np.full((8, 8, 8), 1.0, single),
+        access=np.zeros((8, 8, 8), single),
+        origin=np.zeros(3, double),
+        spacing=np.ones(1, double),
+        row=np.full((8, 8, 8), -1, np.int32),
+        carrier=np.zeros((0, 6), np.int32),
+        share=np.zeros((0, 6), single),
+        self_compliance=np.full((8, 8, 8), 1.0, single),
+        force_error=np.zeros((8, 8, 8), single),
+        position=np.zeros((n, 3), double),
+        load=np.zeros((n, 3, rank), single),
+        contact_start=np.array([0, 2], np.int64),
+        contact_slot=np.full((2, 2), -1, np.int32),
+        contact_block=np.zeros((0, 3, 3), single),
+        softness=np.ones(1, double),
+        space=np.zeros((1, rank, BLOCK), np.int16),
+        space_scale=np.zeros(rank, single),
+        near_start=blocks[0],
+        near_target=blocks[1],
+        near_block=blocks[2],
+        rest=np.zeros((points, 6), single),
+        tip_radius=np.full(n_tools, 5e-3, double),
+    )
+    several = SeveralArrays(np.ones(1)) if n_tools > 1 else None
+    make_model(Layout(arrays, NO_EFFECTS._replace(several=several)), halves=True)
+
+
+def stored_energy(model: ContactModel) -> float:
+    """Energy of the organ: elastic lambda . C lambda / 2, of bending, of the swing [J].
+
+    Not with viscoelasticity, which stores and loses it at once.
+    """
+    state, effects = model.state, model.effects
+    active = np.flatnonzero(state.force > 0.0)
+    if effects.friction is not None:
+        push, compliance = effects.friction.push, effects.friction.compliance
+        energy = 0.5 * sum(
+            float(push[t] @ compliance[t, s] @ push[s]) for t in active for s in active
+        )
+    else:
+        force = state.force[active]
+        energy = 0.5 * force @ state.compliance[np.ix_(active, active)] @ force
+    if effects.large is not None:
+        for t in active:
+            h, _, whole, _ = effects.large.bent[t]
+            energy += h * state.force[t] - whole / state.self_compliance[t]
+    return float(energy)

@@ -1,0 +1,203 @@
+"""How the organ answers a tip anywhere near it: smooth weights and a smooth compliance.
+
+On the faces, the response is interpolated in s by the six-node triangles of the load positions,
+exact at each of them. Neither that interpolation nor the closest point s(p) is smooth: edges and
+folds would be felt as jumps. What a moving tip needs is therefore sampled on the grid of the tip
+field and evaluated by the same B-splines B_q(p), twice differentiable almost everywhere:
+
+    w_j(p)   = sum_q B_q(p) w_j(s(x_q))         share of load position j, sum_j w_j = 1
+    gamma(p) = sum_q B_q(p) [K gamma_0](x_q)    gamma_0 = n . C(s, s) n at s = s(x_q)
+
+with n = grad phi / |grad phi| the normal that a tip presses along and K the kernel of the tip
+field, over a fifth of the patch radius. gamma is the compliance that one tip feels; between tips t
+and t' it is
+
+    C_tt' = a_t a_t' f_t . C f_t',    f_t = w(p_t) n(p_t),    a_t^2 = gamma(p_t) / (f_t . C f_t),
+
+a scaled Gram matrix, positive definite as C is, with the diagonal gamma.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+
+import igl
+import numpy as np
+from numba import njit
+
+from avatar_core.common.jit import fast
+from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.vademecum.tip_field import TipField, smoothed
+
+SMOOTHING = 0.2  # standard deviation of K, in patch radii
+MAX_STENCIL = 128  # load positions that carry one tip, at most
+
+# row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
+# 6) int32 load positions and share (n_rows, 3 or 6) float32, their weights;
+# self_compliance, smoothing (nx, ny, nz) float32, gamma [m/N] and what smoothing changed of it,
+# K |gamma_0 / gamma - 1|
+TipResponse = namedtuple("TipResponse", ["row", "carrier", "share", "self_compliance", "smoothing"])
+
+
+def make_tip_response(
+    surface: LoadSurface,
+    field: TipField,
+    load: np.ndarray,
+    near: LocalBlocks,
+    depth: float,
+    height: float,
+) -> TipResponse:
+    """Sample weights and self-compliance at the grid points that a tip may need.
+
+    Parameters
+    ----------
+    surface, field : of the organ
+    load : ndarray, shape (n_positions, 3, rank), far factor of the contact compliance
+    near : LocalBlocks, its near part [m/N]
+    depth, height : farthest tip centre below and above the surface [m]
+    """
+    spacing = float(field.spacing[0])
+    margin = 3.0 * spacing  # half the splines' support, along its diagonal
+    shell = (field.distance > -depth - margin) & (field.distance < height + margin)
+    shell &= _dilated(field.access > 0.0)
+    points = field.origin + spacing * np.argwhere(shell)
+    carrier, share = closest_weights(surface, points)
+    normal = _normals(field)[shell]
+    compliance = np.zeros(shell.shape)
+    compliance[shell] = _self_compliance(
+        carrier, share, normal, load, near.start, near.target, near.block
+    )
+    deviation = SMOOTHING * surface.patch_radius / spacing
+    smooth = smoothed(compliance, deviation, shell)
+    change = np.zeros(shell.shape)
+    change[shell] = np.abs(compliance[shell] / smooth[shell] - 1.0)
+    row = np.full(shell.shape, -1, np.int32)
+    row[shell] = np.arange(len(points), dtype=np.int32)
+    return TipResponse(
+        row,
+        carrier.astype(np.int32),
+        share.astype(np.float32),
+        smooth.astype(np.float32),
+        smoothed(change, deviation, shell).astype(np.float32),
+    )
+
+
+def _normals(field: TipField) -> np.ndarray:
+    """grad phi / |grad phi| at the grid points, shape (nx, ny, nz, 3)."""
+    spacing = float(field.spacing[0])
+    slope = np.stack(np.gradient(field.distance.astype(float), spacing), axis=-1)
+    return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-3)
+
+
+def sampled_at_tip(
+    surface: LoadSurface, field: TipField, response: TipResponse, values: np.ndarray
+) -> np.ndarray:
+    """Values at the load positions (n, n_positions), carried to the grid as gamma is.
+
+    Returns
+    -------
+    ndarray float32, shape (n, nx, ny, nz)
+    """
+    shell = response.row >= 0
+    deviation = SMOOTHING * surface.patch_radius / float(field.spacing[0])
+    out = np.zeros((len(values), *shell.shape), np.float32)
+    for k, value in enumerate(values):
+        grid = np.zeros(shell.shape)
+        grid[shell] = (response.share * value[response.carrier]).sum(axis=1)
+        out[k] = smoothed(grid, deviation, shell)
+    return out
+
+
+def closest_weights(surface: LoadSurface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Load positions and their weights at the accessible points closest to some points (n, 3)."""
+    _, face, closest = igl.point_mesh_squared_distance(points, surface.centers, surface.corners)
+    corners = [np.ascontiguousarray(surface.centers[surface.corners[face, i]]) for i in range(3)]
+    barycentric = igl.barycentric_coordinates(np.ascontiguousarray(closest), *corners)
+    return surface.weights(face, np.clip(barycentric, 0.0, 1.0))
+
+
+def _dilated(mask: np.ndarray, steps: int = 3) -> np.ndarray:
+    """The mask and all grid points within some steps, diagonals included."""
+    for axis in range(3):
+        source = np.moveaxis(mask, axis, 0)
+        grown = source.copy()
+        for k in range(1, steps + 1):
+            grown[k:] |= source[:-k]
+            grown[:-k] |= source[k:]
+        mask = np.moveaxis(grown, 0, axis)
+    return mask
+
+
+@njit(cache=True, fastmath=True)
+def _self_compliance(carrier, share, normal, load, start, target, block):  # type: ignore[no-untyped-def]
+    """n_s . C(s, s) n_s at every sample, C interpolated from both sides."""
+    out = np.zeros(len(carrier))
+    rank, n_carriers = load.shape[2], carrier.shape[1]
+    mode = np.empty(rank)
+    for q in range(len(carrier)):
+        n0, n1, n2 = normal[q, 0], normal[q, 1], normal[q, 2]
+        mode[:] = 0.0
+        for i in range(n_carriers):
+            w = share[q, i]
+            y = load[carrier[q, i]]
+            for k in range(rank):
+                mode[k] += w * (n0 * y[0, k] + n1 * y[1, k] + n2 * y[2, k])
+        value = 0.0
+        for k in range(rank):
+            value += mode[k] * mode[k]
+        for i in range(n_carriers):
+            j = carrier[q, i]
+            for e in range(start[j], start[j + 1]):
+                for m in range(n_carriers):
+                    if target[e] == carrier[q, m]:
+                        b = block[e]
+                        value += (share[q, i] * share[q, m]) * (
+                            n0 * (b[0, 0] * n0 + b[0, 1] * n1 + b[0, 2] * n2)
+                            + n1 * (b[1, 0] * n0 + b[1, 1] * n1 + b[1, 2] * n2)
+                            + n2 * (b[2, 0] * n0 + b[2, 1] * n1 + b[2, 2] * n2)
+                        )
+        out[q] = value
+    return out
+
+
+@fast
+def gather(model, state, t, cell, reply):  # type: ignore[no-untyped-def]
+    """Weights of tip t in a cell of the grid, and where there is a ``reply`` their gradient.
+
+    Of ``state`` it fills ``nodes[t]``, the load positions that carry the tip, their number
+    ``n_nodes[t]`` and ``weight[t]``: w, dw/dx, dw/dy, dw/dz of each. ``local`` is scratch.
+    """
+    (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
+    nodes, weight, n = state.nodes[t], state.weight[t], 0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                row = model.row[nx + i, ny + j, nz + k]
+                if row < 0:
+                    continue
+                b = wx[i] * wy[j] * wz[k]
+                if reply is not None:
+                    b0, b1 = dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k]
+                    b2 = wx[i] * wy[j] * dz[k]
+                for e in range(model.carrier.shape[1]):
+                    share = model.share[row, e]
+                    if share == 0.0:
+                        continue
+                    carrier = model.carrier[row, e]
+                    q = state.local[carrier]
+                    if q < 0:
+                        if n == nodes.shape[0]:
+                            continue
+                        q = n
+                        state.local[carrier], nodes[q] = q, carrier
+                        weight[q] = 0.0
+                        n += 1
+                    weight[q, 0] += b * share
+                    if reply is not None:
+                        weight[q, 1] += b0 * share
+                        weight[q, 2] += b1 * share
+                        weight[q, 3] += b2 * share
+    for q in range(n):
+        state.local[nodes[q]] = -1
+    state.n_nodes[t] = n

@@ -1,0 +1,396 @@
+"""Small-strain elasticity on tetrahedra, solved on an element that does not lock.
+
+The weak form (paper Eq. 4 without the load coordinate): find u in H1_0 with
+
+    int_Omega 2 mu eps(u):eps(v) + lambda div(u) div(v) dx = int_Gamma t . v da   for all v.
+
+Quadratic tetrahedra (P2) serve up to nu = 0.49. Above, the Taylor-Hood pair (P2 displacement, P1
+pressure) replaces lambda div(u) by a pressure p with int (div u - p / lambda) q dx = 0.
+Linear tetrahedra (P1) lock at the nu of liver (compliance 0.72 of the true one at 0.48): they
+are there for timing very large meshes, never as a default.
+
+With an inclusion, a tumour say, Young's modulus is (1 + (c - 1) chi) E, with the contrast c and the
+share chi of each tetrahedron that lies inside. The stiffness is then affine in mu, lambda, c mu
+and c lambda, of which the coordinates of a vademecum make use.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import rslab
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+from skfem import (
+    Basis,
+    BilinearForm,
+    ElementTetP1,
+    ElementTetP2,
+    ElementVector,
+    MeshTet,
+)
+from skfem.helpers import div
+
+from avatar_core.errors import ConvergenceError, MaterialError, MeshError
+from avatar_core.fem.stiffness import unit_stiffness
+from avatar_core.geometry.mesh import TetMesh, make_mesh
+
+Element = Literal["P1", "P2", "Taylor-Hood"]
+
+# P2 stays within 2 % of Taylor-Hood up to here and locks beyond.
+POISSON_RATIO_P2 = 0.49
+
+
+@dataclass(frozen=True)
+class Material:
+    """Isotropic linear elastic material; the defaults are the liver of the paper, Sec. 3.1.
+
+    young_modulus : E > 0 [Pa]
+    poisson_ratio : 0 <= nu < 0.5
+    """
+
+    young_modulus: float = 0.17e6
+    poisson_ratio: float = 0.48
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.young_modulus) and self.young_modulus > 0):
+            raise MaterialError(
+                f"Young's modulus is {self.young_modulus} Pa; it must be positive (liver: 0.17e6)"
+            )
+        if not 0 <= self.poisson_ratio < 0.5:
+            raise MaterialError(
+                f"Poisson's ratio is {self.poisson_ratio}; it must lie in [0, 0.5): an "
+                "incompressible organ is approached by 0.4999"
+            )
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        """Lame parameters (lambda, mu) [Pa]."""
+        young, nu = self.young_modulus, self.poisson_ratio
+        return young * nu / ((1 + nu) * (1 - 2 * nu)), young / (2 * (1 + nu))
+
+    @property
+    def element(self) -> Element:
+        """The element that does not lock at this Poisson's ratio."""
+        return "P2" if self.poisson_ratio <= POISSON_RATIO_P2 else "Taylor-Hood"
+
+
+def factors_at(material: Material, contrast: float | None) -> np.ndarray:
+    """theta_q of K = sum_q theta_q K_q: mu, lambda, and c mu, c lambda with an inclusion."""
+    lam, mu = material.lame
+    theta = np.array([mu, lam])
+    return theta if contrast is None else np.concatenate([theta, contrast * theta])
+
+
+@dataclass(frozen=True, eq=False)
+class Inclusion:
+    """A part of the organ with another stiffness and the same Poisson's ratio.
+
+    share : ndarray, shape (n_tets,), volume fraction of each tetrahedron inside, chi
+    contrast : Young's modulus inside over that outside, c > 0
+    """
+
+    share: np.ndarray
+    contrast: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.contrast) and self.contrast > 0):
+            raise MaterialError(
+                f"the contrast is {self.contrast}; it is a ratio of Young's moduli and positive"
+            )
+
+
+@BilinearForm
+def divergence(u, q, w):  # type: ignore[no-untyped-def]
+    """q div(u), the coupling of displacement and pressure."""
+    return q * div(u)
+
+
+@BilinearForm
+def pressure_mass(p, q, w):  # type: ignore[no-untyped-def]
+    """p q."""
+    return p * q
+
+
+@BilinearForm
+def scalar_mass(u, v, w):  # type: ignore[no-untyped-def]
+    """u v, one component."""
+    return u * v
+
+
+class _Terms:
+    """The constant matrices that a stiffness is made of, shared by all values of the material.
+
+    share : ndarray, shape (n_tets,), of an inclusion in each tetrahedron, or None
+    """
+
+    def __init__(self, mesh: MeshTet, element: Element, share: np.ndarray | None) -> None:
+        self._mesh, self._element, self._share = mesh, element, share
+        self._shape = ElementTetP1() if element == "P1" else ElementTetP2()
+        self._basis = Basis(mesh, self._shape, intorder=2)
+        self.n_nodes = self._basis.N
+
+    @cached_property
+    def unit_stiffness(self) -> tuple[sp.csr_matrix, ...]:
+        """K_q of :attr:`Elasticity.factors` (P1 and P2; the first for Taylor-Hood too)."""
+        node = np.argsort(self.nodes_first(self._basis))[self._basis.element_dofs.T]
+        if self._share is None:
+            return unit_stiffness(self._basis, node)
+        outside = unit_stiffness(self._basis, node, 1.0 - self._share)
+        return outside + unit_stiffness(self._basis, node, self._share)
+
+    @cached_property
+    def mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
+        """Shear stiffness for mu = 1, divergence and pressure mass of the Taylor-Hood pair."""
+        pressure = Basis(self._mesh, ElementTetP1(), intorder=2)
+        displacement = Basis(self._mesh, ElementVector(self._shape), intorder=2)
+        coupling = divergence.assemble(displacement, pressure).tocsr()
+        coupling = coupling[:, self.nodes_first(displacement)]
+        return self.unit_stiffness[0], coupling, pressure_mass.assemble(pressure).tocsr()
+
+    @cached_property
+    def mass(self) -> sp.csr_matrix:
+        """int N_a N_b dx, shape (n_nodes, n_nodes)."""
+        matrix = scalar_mass.assemble(Basis(self._mesh, self._shape, intorder=4)).tocsr()
+        order = self.nodes_first(self._basis)
+        return matrix[order][:, order]
+
+    @cached_property
+    def pressure_factor(self) -> rslab.Ldlt:
+        """The factorized pressure mass."""
+        return rslab.ldlt(sp.csc_matrix(self.mixed[2]))
+
+    def nodes_first(self, basis: Basis) -> np.ndarray:
+        """scikit-fem's number of each degree of freedom, in our order."""
+        dofs = basis.nodal_dofs.T
+        if self._element != "P1":
+            dofs = np.concatenate([dofs, basis.edge_dofs.T])
+        return np.ascontiguousarray(dofs).ravel()
+
+
+class Elasticity:
+    """The discrete elastic problem of one mesh, material and clamp.
+
+    Displacements are vectors of ``3 n_nodes`` values, ``3 node + component``; nodes are the mesh
+    vertices in their order, then (P2, Taylor-Hood) the edge midpoints.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    material : Material
+    clamped : ndarray of bool, shape (n_faces,), over ``mesh.boundary_faces``; all False leaves
+        the organ free: then only :attr:`stiffness` can be used.
+    element : "P1", "P2", "Taylor-Hood" or None for ``material.element``
+    inclusion : Inclusion or None; not with Taylor-Hood
+
+    Raises
+    ------
+    MaterialError
+        For an inclusion in a nearly incompressible organ.
+    """
+
+    def __init__(
+        self,
+        mesh: TetMesh,
+        material: Material,
+        clamped: np.ndarray,
+        element: Element | None = None,
+        inclusion: Inclusion | None = None,
+    ) -> None:
+        self.mesh, self.material, self.inclusion = mesh, material, inclusion
+        self._clamped_faces = clamped
+        self.element: Element = element or material.element
+        if inclusion is not None and self.element == "Taylor-Hood":
+            raise MaterialError(
+                f"an inclusion with Poisson's ratio above {POISSON_RATIO_P2} is not supported; "
+                f"take at most {POISSON_RATIO_P2}"
+            )
+        self._skfem_mesh = MeshTet(
+            np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
+        )
+        self._terms = _Terms(self._skfem_mesh, self.element, inclusion.share if inclusion else None)
+        self.n_nodes = self._terms.n_nodes
+        self.clamped_nodes = np.unique(self.face_nodes[clamped])
+
+    def refined(self) -> Elasticity:
+        """The same problem with every tetrahedron split into eight; vertices keep their numbers."""
+        fine = self._skfem_mesh.refined(1)
+        tets = fine.t.T.copy()
+        turned = TetMesh(fine.p.T, tets).tet_volumes < 0
+        tets[turned] = tets[turned][:, [0, 2, 1, 3]]
+        mesh = make_mesh(fine.p.T, tets)
+        clamped_at = self.mesh.vertices[self.mesh.boundary_faces]
+        parent = cKDTree(clamped_at.mean(axis=1))
+        center = mesh.vertices[mesh.boundary_faces].mean(axis=1)
+        # a quarter's centroid lies nearest to its own parent's or in the parent's plane
+        candidates = parent.query(center, k=4)[1]
+        inside = np.array(
+            [
+                [_contains(clamped_at[face], point) for face in row]
+                for row, point in zip(candidates, center, strict=True)
+            ]
+        )
+        owner = candidates[np.arange(len(center)), inside.argmax(axis=1)]
+        inclusion = self.inclusion
+        if inclusion is not None:
+            within = self._skfem_mesh.element_finder()
+            parent_tet = within(*mesh.vertices[mesh.tets].mean(axis=1).T)
+            inclusion = replace(inclusion, share=inclusion.share[parent_tet])
+        return Elasticity(mesh, self.material, self._clamped_faces[owner], self.element, inclusion)
+
+    def at(self, material: Material, contrast: float | None = None) -> Elasticity:
+        """The same problem with other values on the same element; what can be shared is."""
+        other = copy(self)
+        other.material = material
+        if self.inclusion is not None and contrast is not None:
+            other.inclusion = replace(self.inclusion, contrast=contrast)
+        for name in ("stiffness", "_factor"):
+            other.__dict__.pop(name, None)
+        return other
+
+    @cached_property
+    def face_nodes(self) -> np.ndarray:
+        """Nodes of each boundary face: 3 (P1) or 6 (corners, then edges 01, 12, 20) columns."""
+        faces = self.mesh.boundary_faces
+        if self.element == "P1":
+            return faces
+        n_vertices = len(self.mesh.vertices)
+        edges = np.sort(self._skfem_mesh.edges, axis=0).astype(np.int64)
+        key = edges[0] * n_vertices + edges[1]
+        order = np.argsort(key)
+        pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
+        found = np.searchsorted(key[order], pairs[..., 0] * n_vertices + pairs[..., 1])
+        return np.concatenate([faces, n_vertices + order[found]], axis=1)
+
+    @property
+    def factors(self) -> np.ndarray:
+        """theta_q at this problem's material, :func:`factors_at`."""
+        return factors_at(self.material, self.inclusion.contrast if self.inclusion else None)
+
+    @cached_property
+    def stiffness(self) -> sp.csr_matrix:
+        """K without boundary conditions, shape (3 n_nodes, 3 n_nodes) [N/m] (P1 and P2)."""
+        terms = zip(self.factors, self._terms.unit_stiffness, strict=True)
+        return sum(theta * matrix for theta, matrix in terms).tocsr()
+
+    def apply_terms(self, displacement: np.ndarray) -> tuple[np.ndarray, ...]:
+        """K_q u for each of :attr:`factors`, shape (3 n_nodes, n) [m^2]."""
+        return tuple(self.apply_term(q, displacement) for q in range(len(self.factors)))
+
+    def apply_term(self, q: int, displacement: np.ndarray) -> np.ndarray:
+        """K_q u, shape (3 n_nodes, n) [m^2]."""
+        if self.element != "Taylor-Hood":
+            return np.asarray(self._terms.unit_stiffness[q] @ displacement)
+        shear, coupling, _ = self._terms.mixed
+        if q == 0:
+            return np.asarray(shear @ displacement)
+        change = np.asfortranarray(coupling @ displacement)
+        return np.asarray(coupling.T @ self._terms.pressure_factor.solve_many(change))
+
+    @cached_property
+    def _free(self) -> np.ndarray:
+        free = np.ones((self.n_nodes, 3), bool)
+        free[self.clamped_nodes] = False
+        return np.flatnonzero(free)
+
+    @cached_property
+    def _factor(self) -> rslab.Ldlt:
+        if len(self.clamped_nodes) == 0:
+            raise MaterialError("an organ without a clamp has no equilibrium; clamp some faces")
+        self._require_all_held()
+        free = self._free
+        if self.element == "Taylor-Hood":
+            shear, coupling, mass = self._terms.mixed
+            coupling = coupling[:, free]
+            lam, mu = self.material.lame
+            shear = mu * shear[free][:, free]
+            system = sp.bmat([[shear, -coupling.T], [-coupling, -mass / lam]])
+        else:
+            system = self.stiffness[free][:, free]
+        return rslab.ldlt(sp.csc_matrix(system))
+
+    def _require_all_held(self) -> None:
+        """Raise MeshError if a part of the organ can move off without resistance.
+
+        The factorization of such a system need not fail, nor a load on the other parts show it.
+        """
+        mesh, held = self.mesh, self.mesh.boundary_faces[self._clamped_faces]
+        n_pieces = int(mesh.pieces.max()) + 1
+        loose = [
+            k
+            for k in range(n_pieces if n_pieces > 1 else 0)
+            if not np.isin(held, mesh.tets[mesh.pieces == k]).all(axis=1).any()
+        ]
+        if loose:
+            raise MeshError(
+                f"{len(loose)} of {n_pieces} pieces that hang together by faces are not clamped; "
+                "clamp a face of each or remove them"
+            )
+
+    @property
+    def mass(self) -> sp.csr_matrix:
+        """Consistent mass of one component for a unit density, (n_nodes, n_nodes) [m^3]."""
+        return self._terms.mass
+
+    @property
+    def factor_bytes(self) -> int:
+        """Memory of the factorization [bytes]."""
+        return 12 * int(self._factor.factor_nnz)  # a value and its share of an index
+
+    def solve(self, loads: np.ndarray | sp.spmatrix) -> np.ndarray:
+        """Displacements u = K^-1 f under nodal forces, zero at the clamp.
+
+        Parameters
+        ----------
+        loads : ndarray or sparse, shape (3 n_nodes, n) [N]
+
+        Returns
+        -------
+        ndarray, shape (3 n_nodes, n) [m]
+
+        Raises
+        ------
+        MaterialError, MeshError
+            For an organ, or a piece of it, without a clamp.
+        ConvergenceError
+            If the factorization failed and the solution does not balance the load.
+        """
+        dense = loads.toarray() if sp.issparse(loads) else loads  # type: ignore[union-attr]
+        loads = np.asarray(dense, float)
+        free = self._free
+        right = np.zeros((self._factor.n, loads.shape[1]), order="F")
+        right[: len(free)] = loads[free]
+        solution = self._factor.solve_many(right)
+        displacement = np.zeros(loads.shape)
+        displacement[free] = solution[: len(free)]
+        imbalance = np.abs(self.apply(displacement[:, :1])[free] - loads[free, :1]).max()
+        if not imbalance <= 1e-6 * np.abs(loads[:, :1]).max():
+            raise ConvergenceError(
+                f"the linear solution leaves {imbalance:.1e} N out of balance; "
+                "check the mesh for slivers"
+            )
+        return displacement
+
+    def apply(self, displacement: np.ndarray) -> np.ndarray:
+        """Internal forces K u, shape (3 n_nodes, n) [N]; reactions appear at the clamp."""
+        if self.element != "Taylor-Hood":
+            return self.stiffness @ displacement
+        terms = zip(self.factors, self.apply_terms(displacement), strict=True)
+        return np.asarray(sum(theta * force for theta, force in terms))
+
+    def at_vertices(self, displacement: np.ndarray) -> np.ndarray:
+        """The vertex part of nodal displacements, shape (3 n_vertices, n)."""
+        return displacement[: 3 * len(self.mesh.vertices)]
+
+
+def _contains(triangle: np.ndarray, point: np.ndarray) -> bool:
+    """Whether a point of the triangle's plane lies in it, with a little slack."""
+    edges = (triangle[1] - triangle[0], triangle[2] - triangle[0])
+    weight = np.linalg.lstsq(np.stack(edges, axis=1), point - triangle[0], rcond=None)[0]
+    gap = point - triangle[0] - weight @ np.stack(edges)
+    on_plane = np.linalg.norm(gap) < 1e-6 * np.linalg.norm(edges[0])
+    return bool(on_plane and weight.min() > -1e-6 and weight.sum() < 1 + 1e-6)

@@ -1,0 +1,269 @@
+"""Large pushes together with other effects: how wrong it is to add what does not superpose.
+
+Only the answer of a tip to itself bends; oblique forces, other tips and preloads are added
+linearly. Each is compared with full nonlinear finite elements under the same motion of the patch:
+
+    oblique   30 degrees off the normal
+    two tools 40 mm apart, pushed to the same depth together
+    gravity   the organ hangs under its own weight before it is pushed
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import EquilibriumError
+from avatar_core.fem.hyperelasticity import Hyperelasticity
+from avatar_core.fem.newton import NewtonRule, State, press
+from avatar_core.fem.patch_loads import patch_loads, patch_normals
+from avatar_core.vademecum.large_deformation import powers
+from avatar_core.vademecum.model import Vademecum
+
+COMBINATIONS = ("oblique", "two tools", "gravity")
+SHARES = (0.25, 0.5, 0.75)  # of the depth aimed at: 5, 10 and 15 mm of 20
+OBLIQUE = np.radians(30.0)
+APART = 40e-3  # [m]
+DENSITY, GRAVITY = 1060.0, 9.81  # of liver [kg/m^3], [m/s^2]
+
+
+@dataclass(frozen=True)
+class CombinedRow:
+    """One push: the error of its forces at equal depth.
+
+    site : accessible face whose centroid is pushed; depth [m]
+    contact : |F - F_FE| / |F_FE|; linear_contact : the same of the linear vademecum
+    within : the push lies in the stored range
+    """
+
+    combination: str
+    site: int
+    depth: float
+    contact: float
+    linear_contact: float
+    within: bool
+
+
+def push_errors(
+    vademecum: Vademecum,
+    problem: Hyperelasticity,
+    depths: Sequence[float],
+    n_sites: int,
+    seed: int = 0,
+    beyond: bool = False,
+    progress: Callable[[float], None] = lambda share: None,
+) -> list[CombinedRow]:
+    """Errors of every combination, site and depth that has an equilibrium.
+
+    depths : increasing [m]
+    beyond : also where the vademecum says that a push leaves its stored range
+    progress : called with the share that is done
+    """
+    rng = np.random.default_rng(seed)
+    surface = vademecum.surface
+    rows: list[CombinedRow] = []
+    done, whole = 0, n_sites * len(COMBINATIONS)
+
+    def pushed(share: float) -> None:
+        progress((done + share) / whole)
+
+    for triangle in rng.permutation(len(surface.corners))[:n_sites]:
+        for name, combined in _at_site(vademecum, problem, int(triangle), rng).items():
+            some = [depth for depth in depths if beyond or combined.reaches(depth)]
+            states = _states(problem, combined, some, pushed)
+            rows += [_row(name, int(triangle), combined, state) for state in states]
+            done += 1
+            progress(done / whole)
+    return rows
+
+
+def mean_error(rows: Sequence[CombinedRow], combination: str) -> float:
+    """Of the pushes within the stored range [-]; NaN: there are none."""
+    found = [row.contact for row in rows if row.combination == combination and row.within]
+    return float(np.mean(found)) if found else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class _Bend:
+    """h(a) = sum_k beta_k a^k of a tip, tangential beyond its reach."""
+
+    depth: FloatArray  # (2,) beta_k
+    reach: float
+
+    def __call__(self, a: float) -> float:
+        return float(powers(max(a, 0.0), self.reach) @ self.depth)
+
+
+@dataclass(frozen=True, eq=False)
+class _Combined:
+    """Forces f that move their patches to d n = C f + s h(s gamma f), m of them.
+
+    loads : ndarray, shape (3 n_nodes, m), unit loads; motion : ndarray, shape (m,), n
+    preload : ndarray, shape (3 n_nodes,), or None
+    compliance : ndarray, shape (m, m), C
+    own : ndarray, shape (m,), gamma, of each tip along its normal; bends : h of each
+    share : s, of the force that is normal
+    """
+
+    loads: FloatArray
+    motion: FloatArray
+    compliance: FloatArray
+    own: FloatArray
+    bends: tuple[_Bend, ...]
+    share: float = 1.0
+    preload: FloatArray | None = None
+
+    def bent(self, force: FloatArray) -> FloatArray:
+        """d n."""
+        a = self.share * self.own * force
+        added = [bend(x) for bend, x in zip(self.bends, a, strict=True)]
+        return self.compliance @ force + self.share * np.array(added)
+
+    def forces(self, depth: float) -> FloatArray:
+        """Those that reach a depth, by Newton's method from the linear ones [N]."""
+        goal = depth * self.motion
+        force = self.linear_forces(depth)
+        for _ in range(30):
+            left = goal - self.bent(force)
+            if np.abs(left).max() < 1e-9 * goal.max():
+                break
+            step = 1e-5 * np.abs(force).max()
+            ahead = [self.bent(force + step * e) for e in np.eye(len(goal))]
+            slope = (np.stack(ahead, axis=1) - self.bent(force)[:, None]) / step
+            force = force + np.linalg.solve(slope, left)
+        return force
+
+    def linear_forces(self, depth: float) -> FloatArray:
+        """The same of the linear vademecum."""
+        return np.linalg.solve(self.compliance, depth * self.motion)
+
+    def reaches(self, depth: float) -> bool:
+        """Whether no tip goes beyond its reach."""
+        a = self.share * self.own * self.forces(depth)
+        return all(x <= bend.reach for bend, x in zip(self.bends, a, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class _Site:
+    """One face's centroid: its place in the vademecum and its loads."""
+
+    positions: np.ndarray
+    weights: FloatArray
+    inward: FloatArray
+    loads: FloatArray  # (3 n_nodes, 3)
+
+    def compliance(self, vademecum: Vademecum, other: _Site) -> FloatArray:
+        """C(s, s')."""
+        return vademecum.compliance(self.positions, self.weights, other.positions, other.weights)
+
+    def bend(self, vademecum: Vademecum) -> _Bend:
+        """How its depth bends."""
+        large = vademecum.large
+        assert large is not None
+        reach = float(large.reach[self.positions].min())
+        return _Bend(large.depth[:, self.positions] @ self.weights, reach)
+
+
+def _at_site(
+    v: Vademecum, problem: Hyperelasticity, triangle: int, rng: np.random.Generator
+) -> dict[str, _Combined]:
+    """All combinations at one face, by name."""
+    site = _site(v, problem, triangle)
+    partner = _site(v, problem, _at_distance(v, triangle))
+    found = (
+        _oblique(v, site, rng.uniform(0.0, 2.0 * np.pi)),
+        _two_tools(v, site, partner),
+        _gravity(v, problem, site),
+    )
+    return dict(zip(COMBINATIONS, found, strict=True))
+
+
+def _oblique(v: Vademecum, site: _Site, angle: float) -> _Combined:
+    """A force 30 degrees off the inward normal moves its patch along itself."""
+    across = np.linalg.svd(site.inward[None])[2][1:]
+    sideways = np.cos(angle) * across[0] + np.sin(angle) * across[1]
+    along = np.cos(OBLIQUE) * site.inward + np.sin(OBLIQUE) * sideways
+    own = site.compliance(v, site)
+    return _Combined(
+        loads=(site.loads @ along)[:, None],
+        motion=np.ones(1),
+        compliance=np.array([[along @ own @ along]]),
+        own=np.array([site.inward @ own @ site.inward]),
+        bends=(site.bend(v),),
+        share=float(np.cos(OBLIQUE)),
+    )
+
+
+def _two_tools(v: Vademecum, one: _Site, other: _Site) -> _Combined:
+    """Two patches pushed along their normals to one depth."""
+    sites = (one, other)
+    compliance = np.array(
+        [[a.inward @ a.compliance(v, b) @ b.inward for b in sites] for a in sites]
+    )
+    return _Combined(
+        loads=np.stack([site.loads @ site.inward for site in sites], axis=1),
+        motion=np.ones(2),
+        compliance=compliance,
+        own=np.diag(compliance),
+        bends=(one.bend(v), other.bend(v)),
+    )
+
+
+def _gravity(v: Vademecum, problem: Hyperelasticity, site: _Site) -> _Combined:
+    """A push along the normal of an organ that already hangs from its clamp (to -y: supine)."""
+    weight = np.zeros((problem.n_nodes, 3))
+    weight[: len(v.mesh.vertices), 1] = -DENSITY * GRAVITY * v.mesh.vertex_volumes
+    gamma = np.array([[site.inward @ site.compliance(v, site) @ site.inward]])
+    return _Combined(
+        loads=(site.loads @ site.inward)[:, None],
+        motion=np.ones(1),
+        compliance=gamma,
+        own=gamma[0],
+        bends=(site.bend(v),),
+        preload=weight.ravel(),
+    )
+
+
+def _states(
+    problem: Hyperelasticity,
+    combined: _Combined,
+    depths: Sequence[float],
+    progress: Callable[[float], None],
+) -> Iterator[State]:
+    """Full equilibria at the depths, until there is none."""
+    if not depths:
+        return
+    rule = NewtonRule(exact_stability=False)
+    c = combined
+    try:
+        yield from press(problem, c.loads, c.motion, depths, rule, c.preload, progress)
+    except EquilibriumError:
+        return
+
+
+def _row(name: str, site: int, combined: _Combined, state: State) -> CombinedRow:
+    """The vademecum beside a full equilibrium."""
+    depth, truth = float(state.depth), state.force
+    bent, linear = (
+        float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+        for found in (combined.forces(depth), combined.linear_forces(depth))
+    )
+    return CombinedRow(name, site, depth, bent, linear, combined.reaches(depth))
+
+
+def _site(v: Vademecum, problem: Hyperelasticity, triangle: int) -> _Site:
+    surface = v.surface
+    center = surface.centroids[[triangle]]
+    positions, weights = surface.weights(np.array([triangle]), np.full((1, 3), 1.0 / 3.0))
+    loads = patch_loads(problem.linear, center, surface.patch_radius).toarray()
+    normal = patch_normals(v.mesh, center, surface.patch_radius)[0]
+    return _Site(positions[0], weights[0], -normal, loads)
+
+
+def _at_distance(v: Vademecum, triangle: int) -> int:
+    """The face whose centroid lies closest to 40 mm away."""
+    distance = np.linalg.norm(v.surface.centroids - v.surface.centroids[triangle], axis=1)
+    return int(np.abs(distance - APART).argmin())

@@ -1,0 +1,163 @@
+"""How wrong a vademecum with large deformation is, on pushes that it has never seen.
+
+The truth is the full nonlinear finite element solution on the same mesh, by Newton's method, for
+patches centred at face centroids, pushed along the inward normal to depths that no part of the
+build knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import EquilibriumError
+from avatar_core.fem.hyperelasticity import Hyperelasticity
+from avatar_core.fem.newton import NewtonRule, press
+from avatar_core.fem.patch_loads import patch_loads, patch_normals
+from avatar_core.offline.certify.combinations import CombinedRow, mean_error
+from avatar_core.vademecum.large_deformation import LargeCertificate
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.push import push_to
+
+
+@dataclass(frozen=True)
+class LargeRow:
+    """One push: errors at equal depth.
+
+    triangle : accessible face whose centroid is pushed; depth [m]
+    l2 : |u - u_FE| / |u_FE|, mass-weighted; contact : |F / F_FE - 1|
+    linear_l2, linear_contact : the same of the linear vademecum
+    within : the push lies in the stored range
+    """
+
+    triangle: int
+    depth: float
+    l2: float
+    contact: float
+    linear_l2: float
+    linear_contact: float
+    within: bool
+
+
+def certify_large(
+    vademecum: Vademecum,
+    problem: Hyperelasticity,
+    n_sites: int = 12,
+    max_push: float = 20e-3,
+    seed: int = 0,
+    progress: Callable[[float, float], None] = lambda share, error: None,
+) -> tuple[LargeCertificate, tuple[LargeRow, ...]]:
+    """Push at random centroids to the depths 1/4, 1/2, 3/4 and 1 of what is stored there.
+
+    progress : called with the share that is done and the mean error so far
+
+    Random factors of 0.9 to 1 keep the depths from being round.
+    """
+    surface = vademecum.surface
+    rng = np.random.default_rng(seed)
+    sites = rng.permutation(len(surface.corners))[:n_sites]
+    rows: list[LargeRow] = []
+    n_lost = 0
+    error = np.nan
+    for done, triangle in enumerate(sites):
+        depths = max_push * np.array([0.25, 0.5, 0.75, 1.0]) * rng.uniform(0.9, 1.0, 4)
+
+        def pushed(share: float, done: int = done, error: float = error) -> None:
+            progress((done + share) / len(sites), error)
+
+        found, lost = push_rows(vademecum, problem, int(triangle), depths, progress=pushed)
+        rows += found
+        n_lost += lost
+        error = float(np.mean([row.l2 for row in rows] or [np.nan]))
+        progress((done + 1) / len(sites), error)
+    return summary(vademecum, rows, len(sites), n_lost), tuple(rows)
+
+
+def with_combinations(
+    certificate: LargeCertificate, rows: Sequence[CombinedRow]
+) -> LargeCertificate:
+    """The certificate with the figures of pushes together with other effects."""
+    return replace(
+        certificate,
+        oblique_contact_mean=mean_error(rows, "oblique"),
+        two_tools_contact_mean=mean_error(rows, "two tools"),
+        gravity_contact_mean=mean_error(rows, "gravity"),
+    )
+
+
+def push_rows(
+    vademecum: Vademecum,
+    problem: Hyperelasticity,
+    triangle: int,
+    depths: FloatArray,
+    barycentric: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3),
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[list[LargeRow], bool]:
+    """Errors at a point of one face; whether equilibrium was lost within the stored range.
+
+    barycentric : of the point; the centroid by default
+    progress : called with the share of the last depth that is reached
+    """
+    surface = vademecum.surface
+    place = np.array([barycentric])
+    center = place @ surface.centers[surface.corners[triangle]]
+    normal = patch_normals(vademecum.mesh, center, surface.patch_radius)[0]
+    load = patch_loads(problem.linear, center, surface.patch_radius) @ -normal
+    positions, weights = (x[0] for x in surface.weights(np.array([triangle]), place))
+    linear = replace(vademecum, large=None)
+    rows: list[LargeRow] = []
+    rule = NewtonRule(exact_stability=False)
+    try:
+        for state in press(problem, load, np.ones(1), list(depths), rule, progress=progress):
+            truth = state.displacement[: 3 * len(vademecum.mesh.vertices)]
+            force, found = push_to(vademecum, positions, weights, state.depth)
+            plain, straight = push_to(linear, positions, weights, state.depth)
+            rows.append(
+                LargeRow(
+                    triangle,
+                    state.depth,
+                    _l2(vademecum, found.displacement, truth),
+                    abs(force / float(state.force[0]) - 1.0),
+                    _l2(vademecum, straight.displacement, truth),
+                    abs(plain / float(state.force[0]) - 1.0),
+                    found.within,
+                )
+            )
+    except EquilibriumError:
+        next_depth = depths[len(rows)]
+        return rows, push_to(vademecum, positions, weights, float(next_depth))[1].within
+    return rows, False
+
+
+def summary(
+    vademecum: Vademecum, rows: list[LargeRow], n_sites: int, n_lost: int
+) -> LargeCertificate:
+    """Means and worst over the pushes within the stored range."""
+    assert vademecum.large is not None
+    inside = [row for row in rows if row.within]
+
+    def values(name: str) -> FloatArray:
+        return np.array([getattr(row, name) for row in inside] or [np.nan])
+
+    return LargeCertificate(
+        l2_mean=float(values("l2").mean()),
+        l2_worst=float(values("l2").max()),
+        contact_mean=float(values("contact").mean()),
+        contact_worst=float(values("contact").max()),
+        linear_l2_mean=float(values("linear_l2").mean()),
+        linear_contact_mean=float(values("linear_contact").mean()),
+        n_sites=n_sites,
+        n_pushes=len(inside),
+        n_lost=n_lost,
+        depth=float(values("depth").max()),
+        reach_median=float(np.median(vademecum.large.reach)),
+        reach_least=float(vademecum.large.reach.min()),
+    )
+
+
+def _l2(vademecum: Vademecum, found: FloatArray, truth: FloatArray) -> float:
+    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)
+    return float(np.sqrt(mass @ (found - truth) ** 2 / (mass @ truth**2)))

@@ -1,0 +1,214 @@
+"""How wrong a vademecum is, on loads that it has never seen, and what it cost.
+
+The truth is the full finite element solution on the same mesh. Loads are patches centred at face
+centroids, which no part of the build uses, in three directions; what a tip feels is measured
+anywhere on the faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avatar_core.common.splines import evaluate
+from avatar_core.contact.tip_response import make_tip_response
+from avatar_core.fem.patch_loads import patch_loads, patch_normals
+from avatar_core.offline.certify.accuracy_curve import DisplayErrors, curve_of
+from avatar_core.offline.certify.unseen_contacts import HEIGHTS, draw_contacts
+from avatar_core.vademecum.certificate import Certificate
+from avatar_core.vademecum.force_error import calibrated
+
+if TYPE_CHECKING:
+    from avatar_core.fem.elasticity import Elasticity
+    from avatar_core.fem.patch_loads import LoadSurface
+    from avatar_core.vademecum.model import Vademecum
+
+_BATCH = 40  # load positions solved at once
+
+
+def certify(
+    vademecum: Vademecum,
+    elasticity: Elasticity,
+    n_loads: int = 200,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> Certificate:
+    """Measure a vademecum against full finite elements on unseen loads.
+
+    Parameters
+    ----------
+    vademecum : Vademecum
+    elasticity : Elasticity, the problem it was built from
+    n_loads : unseen positions (all face centroids where the organ has fewer)
+    seed : of the random choice
+    progress : called with the number of positions done so far
+    """
+    errors = measured(vademecum, elasticity, n_loads, seed, progress)
+    return certificate_of(vademecum, [errors], seed)
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenErrors:
+    """Relative errors, a row for each unseen load; see :class:`Certificate`.
+
+    l2 (n, 3); contact, force, felt (n,); smoothing (n,), what smoothing changed of the compliance
+    that is felt; shown (n_details, 3 n), of the displacement as it would be shown; vertex_contact
+    (m,), at load positions of the build
+    """
+
+    l2: np.ndarray
+    contact: np.ndarray
+    force: np.ndarray
+    felt: np.ndarray
+    smoothing: np.ndarray
+    shown: np.ndarray
+    vertex_contact: np.ndarray
+
+
+def measured(
+    vademecum: Vademecum,
+    elasticity: Elasticity,
+    n_loads: int,
+    seed: int,
+    progress: Callable[[int], None] | None = None,
+) -> UnseenErrors:
+    """The errors that :func:`certify` sums up."""
+    surface = vademecum.surface
+    rng = np.random.default_rng(seed)
+    chosen = rng.permutation(len(surface.corners))[:n_loads]
+    normals = patch_normals(elasticity.mesh, surface.centroids, surface.patch_radius)
+    display = DisplayErrors(vademecum)
+    l2, shown, contact, force = [], [], [], []
+    for batch in np.array_split(chosen, max(1, len(chosen) // _BATCH)):
+        truth, compliance = _reference(elasticity, surface.centroids[batch], vademecum)
+        for k, triangle in enumerate(batch):
+            n, exact = normals[triangle], compliance[k]
+            here = _at_centroid(surface, triangle)
+            l2.append(_l2(vademecum, vademecum.displacement(*here), truth[k]))
+            shown.append(display(*here, truth[k]))
+            estimate = vademecum.compliance(*here)
+            contact.append(_frobenius(estimate, exact))
+            force.append(abs((n @ exact @ n) / (n @ estimate @ n) - 1.0))
+        if progress is not None:
+            progress(len(l2))
+    felt, smoothing = _felt(vademecum, elasticity, len(chosen), seed)
+    return UnseenErrors(
+        np.array(l2),
+        np.array(contact),
+        np.array(force),
+        felt,
+        smoothing,
+        np.concatenate(shown, axis=1),
+        _vertex_contact(vademecum, elasticity, rng),
+    )
+
+
+def _felt(
+    vademecum: Vademecum, elasticity: Elasticity, n: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Error of the force on tips anywhere, and what smoothing changed of the compliance, (n,)."""
+    contacts = draw_contacts(vademecum, n, seed)
+    surface, field = vademecum.surface, vademecum.tip_field
+    load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
+    response = make_tip_response(surface, field, load, vademecum.contact_near, 0.0, HEIGHTS[1])
+    slope = np.zeros(3)
+    felt, smoothing = (
+        np.array(
+            [evaluate(grid, field.origin, field.spacing[0], p, slope, np.nan) for p in contacts.tip]
+        )
+        for grid in (response.self_compliance, response.smoothing)
+    )
+    return np.abs(contacts.true_compliance(surface, elasticity) / felt - 1.0), smoothing
+
+
+def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: int) -> Certificate:
+    """One certificate of all errors: at one choice of the coordinates, or at several."""
+
+    def all_of(name: str) -> np.ndarray:
+        return np.concatenate(
+            [getattr(part, name) for part in parts], axis=-1 if name == "shown" else 0
+        )
+
+    l2, contact, force, felt = (all_of(name) for name in ("l2", "contact", "force", "felt"))
+    return Certificate(
+        l2_mean=float(l2.mean()),
+        l2_worst=float(l2.max()),
+        contact_mean=float(contact.mean()),
+        contact_worst=float(contact.max()),
+        force_mean=float(force.mean()),
+        force_worst=float(force.max()),
+        felt_mean=float(felt.mean()),
+        felt_worst=float(felt.max()),
+        vertex_contact_worst=float(all_of("vertex_contact").max()),
+        n_loads=len(contact),
+        seed=seed,
+        modes=vademecum.far.rank,
+        force_error=calibrated(all_of("smoothing"), felt),
+        curve=curve_of(vademecum, all_of("shown"), felt),
+    )
+
+
+def _at_centroid(surface: LoadSurface, triangle: int) -> tuple[np.ndarray, np.ndarray]:
+    """Load positions and weights at the centroid of an accessible face."""
+    positions, weights = surface.weights(np.array([triangle]), np.full((1, 3), 1.0 / 3.0))
+    return positions[0], weights[0]
+
+
+def _reference(
+    elasticity: Elasticity, centers: np.ndarray, vademecum: Vademecum
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertex displacements (n, 3 n_vertices, 3) and patch compliances (n, 3, 3)."""
+    loads = patch_loads(elasticity, centers, vademecum.surface.patch_radius)
+    solution = elasticity.solve(loads)
+    vertex = elasticity.at_vertices(solution).reshape(-1, len(centers), 3).transpose(1, 0, 2)
+    average = (loads.T @ solution).reshape(len(centers), 3, len(centers), 3)
+    own = np.arange(len(centers))
+    return vertex, average[own, :, own, :]
+
+
+def _l2(vademecum: Vademecum, estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Relative mass-weighted error of each direction, shape (3,)."""
+    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)[:, None]
+    return np.sqrt((mass * (estimate - truth) ** 2).sum(axis=0) / (mass * truth**2).sum(axis=0))
+
+
+def _frobenius(estimate: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
+
+
+def _vertex_contact(
+    vademecum: Vademecum, elasticity: Elasticity, rng: np.random.Generator
+) -> np.ndarray:
+    surface = vademecum.surface
+    some = rng.permutation(len(surface.vertices))[:_BATCH]
+    _, compliance = _reference(elasticity, surface.centers[some], vademecum)
+    return np.array(
+        [
+            _frobenius(vademecum.compliance(np.array([i]), np.ones(1)), compliance[k])
+            for k, i in enumerate(some)
+        ]
+    )
+
+
+def mesh_error(
+    vademecum: Vademecum, elasticity: Elasticity, n_loads: int = 8
+) -> tuple[float, float]:
+    """Mean change of the reference itself when every tetrahedron is split into eight.
+
+    Returns
+    -------
+    l2, contact : relative changes of displacement at the vertices and of the patch compliance
+    """
+    refined = elasticity.refined()
+    surface = vademecum.surface
+    chosen = np.random.default_rng(0).permutation(len(surface.corners))[:n_loads]
+    where = surface.centroids[chosen]
+    coarse, coarse_compliance = _reference(elasticity, where, vademecum)
+    fine, fine_compliance = _reference(refined, where, vademecum)
+    fine = fine[:, : coarse.shape[1]]  # refinement appends its vertices
+    l2 = [_l2(vademecum, coarse[k], fine[k]) for k in range(len(chosen))]
+    contact = [_frobenius(coarse_compliance[k], fine_compliance[k]) for k in range(len(chosen))]
+    return float(np.mean(l2)), float(np.mean(contact))

@@ -1,0 +1,92 @@
+"""Contacts that no part of a build has seen: tips anywhere over the accessible faces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import igl
+import numpy as np
+
+from avatar_core.common.splines import evaluate
+from avatar_core.fem.patch_loads import LoadSurface, patch_loads
+
+if TYPE_CHECKING:
+    from avatar_core.fem.elasticity import Elasticity
+    from avatar_core.vademecum.model import Vademecum
+    from avatar_core.vademecum.tip_field import TipField
+
+HEIGHTS = (0.0, 6e-3)  # of a tip's centre above the surface, pressed in or just touching [m]
+_OPEN = 0.999  # access from which a tip may touch without the force fading
+_WAY = np.linspace(1 / 3, 7 / 3, 8)  # heights above a tip in which it comes in [HEIGHTS[1]]
+_BATCH = 40  # patches solved at once
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenContacts:
+    """Tips and what they touch, each (n, 3).
+
+    tip : centre of the sphere [m]; place : closest point of the faces [m]; normal : that the step
+    presses along
+    """
+
+    tip: np.ndarray
+    place: np.ndarray
+    normal: np.ndarray
+
+    def true_compliance(self, surface: LoadSurface, elasticity: Elasticity) -> np.ndarray:
+        """n . C n of full finite elements, for patches at the places (n,) [m/N]."""
+        out = np.empty(len(self.tip))
+        for batch in np.array_split(np.arange(len(out)), -(-len(out) // _BATCH)):
+            loads = patch_loads(elasticity, self.place[batch], surface.patch_radius)
+            average = (loads.T @ elasticity.solve(loads)).reshape(len(batch), 3, len(batch), 3)
+            n, own = self.normal[batch], np.arange(len(batch))
+            out[batch] = np.einsum("ia,iab,ib->i", n, average[own, :, own], n)
+        return out
+
+
+def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
+    """Tips above points that are drawn evenly over the accessible faces.
+
+    Each can come in along its normal: no other lobe of the organ hangs over it.
+    """
+    surface, field = vademecum.surface, vademecum.tip_field
+    rng = np.random.default_rng(seed)
+    corner = surface.centers[surface.corners]
+    area = np.linalg.norm(
+        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
+    )
+    tips, normals = np.empty((n, 3)), np.empty((n, 3))
+    found = 0
+    while found < n:
+        face = rng.choice(len(corner), p=area / area.sum())
+        point = rng.dirichlet(np.ones(3)) @ corner[face]
+        tip = point + rng.uniform(*HEIGHTS) * surface.face_normals[face]
+        gradient = np.zeros(3)
+        if _at(field, field.access, tip, gradient) < _OPEN:
+            continue
+        _at(field, field.distance, tip, gradient)
+        normal = gradient / np.linalg.norm(gradient)
+        if _is_barred(field, tip, normal):
+            continue
+        tips[found], normals[found] = tip, normal
+        found += 1
+    place = igl.point_mesh_squared_distance(tips, surface.centers, surface.corners)[2]
+    return UnseenContacts(tips, np.ascontiguousarray(place), normals)
+
+
+def _is_barred(field: TipField, tip: np.ndarray, normal: np.ndarray) -> bool:
+    """Whether the organ itself is in the way of a tip along its normal."""
+    way = tip + HEIGHTS[1] * np.outer(_WAY, normal)
+    slope = np.zeros(3)
+    return min(_at(field, field.distance, p, slope, outside=np.inf) for p in way) <= 0.0
+
+
+def _at(
+    field: TipField,
+    values: np.ndarray,
+    point: np.ndarray,
+    gradient: np.ndarray,
+    outside: float = 0.0,
+) -> float:
+    return float(evaluate(values, field.origin, field.spacing[0], point, gradient, outside))

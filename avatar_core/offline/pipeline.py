@@ -1,0 +1,228 @@
+"""From a surface to a certified vademecum in one call: what ``avatar vademecum`` does."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from avatar_core.errors import CoordinateError, MaterialError, MeshError
+from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
+from avatar_core.fem.patch_loads import load_surface
+from avatar_core.geometry.level_set import orientation_offset
+from avatar_core.geometry.mesh import (
+    Regions,
+    TetMesh,
+    regions_by_rule,
+    regions_from_groups,
+    tetrahedralize,
+)
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tumour import share_inside
+from avatar_core.offline.certify.combinations import COMBINATIONS, SHARES, push_errors
+from avatar_core.offline.certify.large_deformation import certify_large, with_combinations
+from avatar_core.offline.certify.linear import certify, mesh_error
+from avatar_core.offline.large_deformation import (
+    LargeRule,
+    hyperelastic_problem,
+    with_large_deformation,
+)
+from avatar_core.offline.linear import build_vademecum
+from avatar_core.offline.parametric import build_parametric_vademecum, certify_range
+from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.vademecum.large_deformation import LargeMaterial
+from avatar_core.vademecum.model import Provenance, Vademecum
+
+COMBINED_SITES = 2  # at which large pushes are certified together with other effects
+_RECORDED = ("avatar", "numpy", "scipy", "scikit-fem", "libigl", "pytetwild", "rslab", "h5py")
+
+
+@dataclass(frozen=True)
+class OrganOptions:
+    """How an organ becomes a vademecum; the defaults are the paper's liver.
+
+    n_vertices : of the mesh, about
+    material : Material
+    element : None for the one that does not lock at the material's Poisson's ratio
+    patch_radius : of the tool's traction [m]; None for max(12 mm, 1.2 x surface edge)
+    groups : file of node groups for clamp and accessible region; None for the anatomical rule
+    rule : BuildRule
+    coordinates : of the material, that stay free in the vademecum;
+        :mod:`avatar_core.reduction.coordinates`
+    tumour : surface inside the organ, with another stiffness; ``contrast`` of Young's moduli
+    large : material of large strains, with which the load's magnitude becomes a coordinate up to
+        the depth ``large_rule.max_push``; None for small strains
+    n_pushed : unseen sites at which large deformation is certified, four nonlinear solutions each;
+        at the first ``COMBINED_SITES`` together with other effects too, nine more each
+    n_certified : unseen load positions of the certificate; ``seed`` draws them
+    with_mesh_error : also solve on the same mesh refined once (slow)
+
+    Raises
+    ------
+    CoordinateError, MaterialError, MeshError
+        For what cannot be had together, and for a file that is not there, before any work.
+    """
+
+    n_vertices: int = 2850
+    material: Material = field(default_factory=Material)
+    element: Element | None = None
+    patch_radius: float | None = None
+    groups: Path | None = None
+    rule: BuildRule = field(default_factory=BuildRule)
+    coordinates: tuple[Coordinate, ...] = ()
+    tumour: SurfaceMesh | None = None
+    contrast: float = 1.0
+    large: LargeMaterial | None = None
+    large_rule: LargeRule = field(default_factory=LargeRule)
+    n_pushed: int = 12
+    n_certified: int = 200
+    seed: int = 0
+    with_mesh_error: bool = False
+
+    def __post_init__(self) -> None:
+        names = [c.name for c in self.coordinates]
+        if len(set(names)) < len(names):
+            raise CoordinateError(f"a coordinate is given twice: {', '.join(names)}")
+        if "contrast" in names and self.tumour is None:
+            raise CoordinateError(
+                "the contrast is that of a tumour; give its surface with --tumour"
+            )
+        if self.large and (self.coordinates or self.tumour):
+            raise CoordinateError(
+                "large deformation is not combined with a tumour or coordinates of the material; "
+                "build two vademecums"
+            )
+        if self.large and (self.element or self.material.element) != "P2":
+            raise MaterialError(
+                f"large deformation is solved on the element P2 up to Poisson's ratio "
+                f"{POISSON_RATIO_P2}; take at most that, and no other --element"
+            )
+        if self.patch_radius is not None and not 1e-3 <= self.patch_radius <= 0.1:
+            raise MeshError(
+                f"a patch of radius {self.patch_radius:g} m is no tool's; give 1e-3 to 0.1 "
+                "(12e-3: 12 mm)"
+            )
+        if self.groups is not None and not self.groups.is_file():
+            raise MeshError(f"cannot read node groups from {self.groups}: there is no such file")
+
+
+def vademecum_of(
+    surface: SurfaceMesh, options: OrganOptions | None = None, progress: Progress = silent
+) -> Vademecum:
+    """Mesh, solve, separate and certify one organ.
+
+    Raises
+    ------
+    AvatarError
+        Of the stage that refused, with the remedy.
+    """
+    options = options or OrganOptions()
+    progress("mesh", 0.0, NO_ERROR)
+    mesh = tetrahedralize(surface, options.n_vertices)
+    progress("mesh", 1.0, NO_ERROR)
+    regions = regions_from_groups(mesh, options.groups) if options.groups else regions_by_rule(mesh)
+    elasticity = _elasticity(mesh, regions, options)
+    loads = load_surface(mesh, regions, options.patch_radius)
+    common = (surface.name, elasticity, regions, loads)
+    provenance = _provenance(surface, options)
+
+    def count(done: int) -> None:
+        progress("certify", done / options.n_certified, NO_ERROR)
+
+    if options.coordinates:
+        vademecum = build_parametric_vademecum(
+            *common, options.coordinates, options.rule, provenance, progress
+        )
+        certificate = certify_range(vademecum, elasticity, options.n_certified, options.seed, count)
+    else:
+        vademecum = build_vademecum(*common, options.rule, provenance, progress)
+        certificate = certify(vademecum, elasticity, options.n_certified, options.seed, count)
+    if options.large:
+        vademecum = _with_large(vademecum, options, progress)
+    if options.with_mesh_error:
+        progress("mesh error", 0.0, NO_ERROR)
+        l2, contact = mesh_error(vademecum, elasticity)
+        certificate = replace(certificate, mesh_l2=l2, mesh_contact=contact)
+    progress("certify", 1.0, certificate.l2_mean)
+    return vademecum.with_certificate(replace(certificate, build_cpu_seconds=cpu_seconds()))
+
+
+def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress) -> Vademecum:
+    """The vademecum with the load's magnitude as a coordinate, certified."""
+    assert options.large is not None
+    problem = hyperelastic_problem(vademecum, options.large)
+    vademecum = with_large_deformation(
+        vademecum, problem, options.large, options.large_rule, options.rule, progress
+    )
+    if options.n_pushed == 0:
+        return vademecum
+    n_combined = min(COMBINED_SITES, options.n_pushed)
+    # a combination takes about as long as two sites: it loses equilibrium sooner
+    alone = options.n_pushed / (options.n_pushed + 2 * n_combined * len(COMBINATIONS))
+    certificate, _ = certify_large(
+        vademecum,
+        problem,
+        options.n_pushed,
+        options.large_rule.max_push,
+        options.seed,
+        lambda share, error: progress("push", alone * share, error),
+    )
+    rows = push_errors(
+        vademecum,
+        problem,
+        [share * options.large_rule.max_push for share in SHARES],
+        n_combined,
+        options.seed,
+        progress=lambda share: progress("push", alone + (1.0 - alone) * share, certificate.l2_mean),
+    )
+    return vademecum.with_large_certificate(with_combinations(certificate, rows))
+
+
+def _elasticity(mesh: TetMesh, regions: Regions, options: OrganOptions) -> Elasticity:
+    """The elastic problem, on one element that serves the whole range of Poisson's ratio."""
+    ratios = [c.high for c in options.coordinates if c.name == "poisson"]
+    stiffest = replace(options.material, poisson_ratio=max(ratios)) if ratios else options.material
+    inclusion = None
+    if options.tumour is not None:
+        inclusion = Inclusion(share_inside(mesh, options.tumour), options.contrast)
+    return Elasticity(
+        mesh, options.material, regions.clamped, options.element or stiffest.element, inclusion
+    )
+
+
+def orientation_warning(surface: SurfaceMesh) -> str | None:
+    """A warning if the surface lies more than 45 degrees off the phantom, naming the option."""
+    return orientation_offset(surface, phantom_liver()).warning
+
+
+def cpu_seconds() -> float:
+    """User + system time of this process and its children so far [s]."""
+    return sum(os.times()[:4])
+
+
+def _provenance(surface: SurfaceMesh, options: OrganOptions) -> Provenance:
+    parameters = {**vars(options), **asdict(options.rule), **asdict(options.material)}
+    parameters |= asdict(options.large_rule) if options.large else {}
+    for name in ("rule", "material", "large_rule"):
+        del parameters[name]
+    parameters["coordinates"] = " ".join(map(str, options.coordinates)) or None
+    parameters["tumour"] = options.tumour and options.tumour.name
+    return Provenance(
+        source=surface.name,
+        source_sha256=surface.source_sha256,
+        unit=surface.unit,
+        axes=surface.axes_name,
+        versions=tuple(f"{name} {_version(name)}" for name in _RECORDED),
+        parameters=tuple(f"{name}={value}" for name, value in sorted(parameters.items())),
+        notices=surface.notices,
+    )
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,158 @@
+"""The extra coordinates of a vademecum u(x, s, p): named ranges chosen before, values after.
+
+Both coordinates enter the stiffness through affine factors of constant matrices
+(:attr:`avatar_core.fem.elasticity.Elasticity.factors`), so that everything that depends on them is
+a small problem. Responses are computed at a few nodes in each range; between them, weights are
+those of (multi)linear interpolation in
+
+    poisson   -log(1 - 2 nu), in which the response varies evenly towards incompressibility
+    contrast   log c
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from avatar_core.errors import CoordinateError
+from avatar_core.fem.elasticity import Elasticity
+
+# Between nodes no farther apart, in the scales above, interpolation adds nothing to the error that
+# can be measured (`avatar study coordinates`).
+_SPACING = {"poisson": 2.4, "contrast": 1.9}
+_LIMITS = {"poisson": (0.0, 0.4999), "contrast": (0.01, 100.0)}
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A parameter of the organ that may be chosen when the vademecum is used.
+
+    name : "poisson" (Poisson's ratio) or "contrast" (Young's modulus inside the tumour over that
+        outside)
+    low, high : its range
+    n_nodes : at which the organ is solved, both ends included; 0: as many as the range calls for
+
+    Raises
+    ------
+    CoordinateError
+        For an unknown name or a range that is empty or impossible.
+    """
+
+    name: str
+    low: float
+    high: float
+    n_nodes: int = 0
+
+    def __post_init__(self) -> None:
+        if self.name not in _LIMITS:
+            raise CoordinateError(f"coordinate '{self.name}' is unknown; there are {_known()}")
+        least, most = _LIMITS[self.name]
+        if not least <= self.low < self.high <= most:
+            raise CoordinateError(
+                f"coordinate {self.name}={self.low:g}:{self.high:g}: give LOW:HIGH with "
+                f"{least:g} <= LOW < HIGH <= {most:g}"
+            )
+        span = self._scaled(self.high) - self._scaled(self.low)
+        if span == 0.0:  # neighbours whose logarithms round to one number
+            raise CoordinateError(
+                f"coordinate {self.name}={self.low!r}:{self.high!r}: the range is empty to "
+                "rounding; give a wider one"
+            )
+        if self.n_nodes == 0:
+            object.__setattr__(self, "n_nodes", 1 + math.ceil(span / _SPACING[self.name]))
+        if self.n_nodes < 2:
+            raise CoordinateError(f"coordinate {self.name}: give at least 2 nodes")
+
+    @classmethod
+    def parse(cls, text: str) -> Coordinate:
+        """``NAME=LOW:HIGH`` or ``NAME=LOW:HIGH:NODES``, as on the command line."""
+        name, _, span = text.partition("=")
+        try:
+            low, high, *nodes = span.split(":")
+            (n_nodes,) = nodes or ["0"]
+            return cls(name.strip(), float(low), float(high), int(n_nodes))
+        except ValueError as error:
+            raise CoordinateError(
+                f"coordinate '{text}': write NAME=LOW:HIGH, for example poisson=0.40:0.49"
+            ) from error
+
+    def __str__(self) -> str:
+        return f"{self.name}={self.low:g}:{self.high:g}:{self.n_nodes}"
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """Values at which responses are computed, ascending, shape (n_nodes,)."""
+        return np.array([self.value_at(t) for t in np.linspace(0.0, 1.0, self.n_nodes)])
+
+    def value_at(self, fraction: float) -> float:
+        """The value at a fraction of the range, 0 to 1, in the coordinate's own scale."""
+        low, high = self._scaled(self.low), self._scaled(self.high)
+        value = self._unscaled(low + fraction * (high - low))
+        return float(np.clip(value, self.low, self.high))  # not even rounding leaves the range
+
+    def fraction(self, value: float) -> float:
+        """Where a value lies in the range, 0 to 1, in the coordinate's own scale."""
+        low, high = self._scaled(self.low), self._scaled(self.high)
+        return (self._scaled(value) - low) / (high - low)
+
+    def weights(self, value: float) -> np.ndarray:
+        """Weights of the nodes at a value: at least 0, summing to 1, at most two not 0.
+
+        Raises
+        ------
+        CoordinateError
+            For a value out of range.
+        """
+        if not self.low <= value <= self.high:
+            raise CoordinateError(
+                f"{self.name} is {value:g}; this vademecum holds {self.low:g} to {self.high:g}"
+            )
+        place = self.fraction(value) * (self.n_nodes - 1)
+        return np.maximum(0.0, 1.0 - np.abs(np.arange(self.n_nodes) - place))
+
+    def _scaled(self, value: float) -> float:
+        return -math.log1p(-2.0 * value) if self.name == "poisson" else math.log(value)
+
+    def _unscaled(self, scaled: float) -> float:
+        return 0.5 * -math.expm1(-scaled) if self.name == "poisson" else math.exp(scaled)
+
+
+def node_values(coordinates: Sequence[Coordinate]) -> list[dict[str, float]]:
+    """The values at every node of the grid that several coordinates span."""
+    grids = product(*(coordinate.nodes for coordinate in coordinates))
+    names = [coordinate.name for coordinate in coordinates]
+    return [dict(zip(names, map(float, values), strict=True)) for values in grids]
+
+
+def node_weights(coordinates: Sequence[Coordinate], values: Mapping[str, float]) -> np.ndarray:
+    """Weights of :func:`node_values` at some values, shape (n_nodes,)."""
+    weights = np.ones(1)
+    for coordinate in coordinates:
+        weights = np.outer(weights, coordinate.weights(values[coordinate.name])).ravel()
+    return weights
+
+
+def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]) -> None:
+    """Raise CoordinateError if a value is given for a coordinate that is not there."""
+    names = [coordinate.name for coordinate in coordinates]
+    for name in values:
+        if name not in names:
+            raise CoordinateError(
+                f"this vademecum has no coordinate '{name}' but {', '.join(names) or 'none'}; "
+                f"build it with --coordinate {name}=LOW:HIGH"
+            )
+
+
+def _known() -> str:
+    return ", ".join(_LIMITS)
+
+
+def problem_at(elasticity: Elasticity, values: Mapping[str, float]) -> Elasticity:
+    """The elastic problem at values of the coordinates; what is not given keeps its value."""
+    poisson = values.get("poisson", elasticity.material.poisson_ratio)
+    material = replace(elasticity.material, poisson_ratio=poisson)
+    return elasticity.at(material, values.get("contrast"))

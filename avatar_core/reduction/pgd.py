@@ -1,0 +1,246 @@
+"""Proper Generalized Decomposition over load position (paper Sec. 2.1).
+
+For K u(s) = f(s) with u(x, s) = sum_k X_k(x) Y_k(s), each enrichment R(x) S(s) minimizes the
+weighted energy of what is left (paper Eqs. 7-14, with one scalar S per load instead of the
+entry-wise product, to which it collapses when each load has one direction):
+
+    S known:  K R = sum_s w(s) S(s) r(s) / sum_s w(s) S(s)^2        (Eq. 14)
+    R known:  S(s) = R . r(s) / (R . K R)                           (Eq. 11)
+
+with the residual r = f - K u^m. Space functions are kept K-orthonormal, so that the Galerkin
+update of *all* load functions is Y_k(s) = X_k . f(s), the residual energy is known exactly, and
+alternating directions are a power iteration for the next eigenvector of the residual's energy.
+Eigenvalues lie close together, so a single pair converges slowly: ``block`` pairs are sought at
+once (a subspace iteration, each pair normalized against the others). ``block = 1`` is the paper's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+import scipy.sparse as sp
+
+from avatar_core.errors import ConvergenceError
+from avatar_core.fem.elasticity import Elasticity
+
+# An enrichment that captures less of the total energy than this is made of rounding errors.
+_ROUNDING = 1e-13
+
+
+class EnrichmentStatus(Enum):
+    """How an enrichment ended."""
+
+    CONVERGED = "converged"
+    SWEEP_LIMIT = "sweep limit"  # accepted: the mode still lowers the energy, less than it could
+    EXHAUSTED = "exhausted"  # the residual is rounding; nothing was added
+
+
+@dataclass(frozen=True)
+class EnrichmentReport:
+    """One greedy enrichment: its status, the sweeps it took and what was left after it.
+
+    modes : pairs added
+    change : relative change of the energy that R S captures, in the last sweep
+    energy_error : sqrt(residual energy / total energy) after the enrichment
+    """
+
+    status: EnrichmentStatus
+    modes: int
+    sweeps: int
+    change: float
+    energy_error: float
+
+
+@dataclass(frozen=True)
+class PGDRule:
+    """When to stop.
+
+    max_modes : pairs at most
+    tolerance : stop when the relative energy error is below
+    block : pairs sought at once
+    max_sweeps : alternating directions per enrichment at most
+    sweep_tolerance : an enrichment has converged when the energy it captures changes less
+    """
+
+    max_modes: int
+    tolerance: float
+    block: int = 10
+    max_sweeps: int = 5
+    sweep_tolerance: float = 2e-2
+
+
+@dataclass(frozen=True)
+class PGDSolution:
+    """K-orthonormal space functions, their load functions, and the history that led there.
+
+    space : ndarray, shape (3 n_nodes, rank)
+    load : ndarray, shape (n_loads, rank)
+    """
+
+    space: np.ndarray
+    load: np.ndarray
+    history: tuple[EnrichmentReport, ...]
+
+    @property
+    def converged(self) -> bool:
+        """Every enrichment that was made reached its own sweep tolerance."""
+        return all(report.status is not EnrichmentStatus.SWEEP_LIMIT for report in self.history)
+
+
+class _Expansion:
+    """The growing K-orthonormal expansion and the energy that it leaves to each load."""
+
+    def __init__(self, problem: ParametricProblem, capacity: int) -> None:
+        self.problem = problem
+        n_dofs, n_loads = problem.loads.shape
+        self._space = np.zeros((n_dofs, capacity), order="F")
+        self._load = np.zeros((n_loads, capacity), order="F")
+        self.rank = 0
+        self.energy = problem.energy.copy()  # of each load, f . K^-1 f - sum_k Y_k^2
+
+    @property
+    def space(self) -> np.ndarray:
+        return self._space[:, : self.rank]
+
+    @property
+    def load(self) -> np.ndarray:
+        return self._load[:, : self.rank]
+
+    @property
+    def error(self) -> float:
+        """Relative weighted energy error."""
+        weights, total = self.problem.weights, self.problem.energy
+        left = weights @ np.maximum(self.energy, 0.0)
+        return float(np.sqrt(left / (weights @ total)))
+
+    def append(self, space: np.ndarray) -> int:
+        """Make space functions K-orthonormal and add them; the number of those that were new."""
+        for _ in range(2):  # once more for rounding
+            dual = self.problem.elasticity.apply(space)
+            space = space - self.space @ (self.space.T @ dual)
+        value, vector = np.linalg.eigh(space.T @ self.problem.elasticity.apply(space))
+        new = value > 1e-18 * value.max()
+        space = space @ (vector[:, new] / np.sqrt(value[new]))
+        load = self.problem.loads.T @ space
+        columns = slice(self.rank, self.rank + space.shape[1])
+        self._space[:, columns], self._load[:, columns] = space, load
+        self.energy -= (load**2).sum(axis=1)
+        self.rank += space.shape[1]
+        return int(space.shape[1])
+
+
+@dataclass(frozen=True)
+class ParametricProblem:
+    """K u(s) = f(s) for all loads s, with the weight of each load in the norm over s.
+
+    elasticity : Elasticity, solves with and applies K
+    loads : sparse, shape (3 n_nodes, n_loads)
+    weights : ndarray, shape (n_loads,), positive
+    energy : ndarray, shape (n_loads,), f(s) . K^-1 f(s) [J], the patch compliance
+    """
+
+    elasticity: Elasticity
+    loads: sp.csr_matrix
+    weights: np.ndarray
+    energy: np.ndarray
+
+
+def solve_pgd(
+    problem: ParametricProblem,
+    rule: PGDRule,
+    progress: Callable[[int], None] = lambda rank: None,
+    reweigh: Callable[[np.ndarray, np.ndarray], np.ndarray | None] | None = None,
+) -> PGDSolution:
+    """Greedy enrichment with alternating directions until the rule stops it.
+
+    Parameters
+    ----------
+    problem : ParametricProblem
+    rule : PGDRule
+    progress : called with the rank after every enrichment
+    reweigh : called with the new space and load functions; returns the weights of the loads for
+        the next enrichment, so that the norm can follow the error that matters, or None to stop
+        because that error is small enough
+
+    Raises
+    ------
+    ConvergenceError
+        If the right-hand side is zero, so that no relative error exists.
+    """
+    if not problem.weights @ problem.energy > 0:
+        raise ConvergenceError("all loads are zero: there is nothing to separate")
+    expansion = _Expansion(problem, rule.max_modes)
+    history: list[EnrichmentReport] = []
+    while expansion.rank < rule.max_modes and expansion.error > rule.tolerance:
+        report = _enrich(expansion, rule)
+        history.append(report)
+        progress(expansion.rank)
+        if reweigh is not None:
+            new = slice(expansion.rank - report.modes, expansion.rank)
+            weights = reweigh(expansion.space[:, new], expansion.load[:, new])
+            if weights is None:
+                break
+            expansion.problem = replace(expansion.problem, weights=weights)
+        if report.status is EnrichmentStatus.EXHAUSTED:
+            break
+    return PGDSolution(expansion.space.copy(), expansion.load.copy(), tuple(history))
+
+
+def _enrich(expansion: _Expansion, rule: PGDRule) -> EnrichmentReport:
+    """One enrichment: start at random loads with energy left, alternate, keep the result."""
+    problem = expansion.problem
+    rounding = _ROUNDING * float(problem.weights @ problem.energy)
+    load = _start(expansion, min(rule.block, rule.max_modes - expansion.rank))
+    status, change, captured, sweeps = EnrichmentStatus.SWEEP_LIMIT, np.inf, 0.0, 0
+    while sweeps < rule.max_sweeps and status is EnrichmentStatus.SWEEP_LIMIT:
+        space, load = _sweep(expansion, load)
+        sweeps += 1
+        before, captured = captured, float(problem.weights @ (load**2).sum(axis=1))
+        if captured <= rounding:
+            return EnrichmentReport(EnrichmentStatus.EXHAUSTED, 0, sweeps, 0.0, expansion.error)
+        change = abs(captured - before) / captured
+        if change <= rule.sweep_tolerance:
+            status = EnrichmentStatus.CONVERGED
+    modes = expansion.append(_above_rounding(space, load, problem.weights, rounding))
+    return EnrichmentReport(status, modes, sweeps, change, expansion.error)
+
+
+def _above_rounding(
+    space: np.ndarray, load: np.ndarray, weights: np.ndarray, rounding: float
+) -> np.ndarray:
+    """The combinations of a block's pairs that capture more energy than rounding does.
+
+    A block may ask for more than is left; what it then holds beside that is noise.
+    """
+    energy, mixing = np.linalg.eigh(load.T @ (weights[:, None] * load))
+    if energy[0] > rounding:
+        return space
+    return space @ mixing[:, energy > min(rounding, 0.5 * energy[-1])]
+
+
+def _start(expansion: _Expansion, block: int) -> np.ndarray:
+    """Random load functions, larger where more energy is left."""
+    rng = np.random.default_rng(expansion.rank)
+    left = np.sqrt(np.maximum(expansion.energy, 0.0))
+    return left[:, None] * rng.standard_normal((len(left), block))
+
+
+def _sweep(expansion: _Expansion, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Alternating directions: R from S (Eq. 14), K-orthonormal within the block, S from R (11).
+
+    K R = sum_s w S r(s) is solved as R = K^-1 sum_s w S f(s) - sum_k X_k (Y_k . w S), and its
+    energy R . K R equals (F^T R) . w S, so that no product with K is needed.
+    """
+    problem = expansion.problem
+    weighted = problem.weights[:, None] * load
+    weighted /= np.linalg.norm(weighted, axis=0) + 1e-300
+    space = problem.elasticity.solve(problem.loads @ weighted)
+    space -= expansion.space @ (expansion.load.T @ weighted)
+    work = problem.loads.T @ space
+    value, vector = np.linalg.eigh((work.T @ weighted + weighted.T @ work) / 2.0)
+    new = value > 1e-14 * value.max()
+    scale = vector[:, new] / np.sqrt(value[new])
+    return space @ scale, work @ scale

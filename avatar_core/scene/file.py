@@ -1,0 +1,257 @@
+"""Scenes as YAML: read with the line of every mistake, written so that they read back equal.
+
+Names, types, ranges and units are those of the dataclasses: a new effect needs nothing here.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+import yaml
+from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from avatar_core.common.quantities import check_line, is_whole, lies_in
+from avatar_core.contact.effects import EFFECTS, Effect, Viscoelasticity
+from avatar_core.errors import SceneError
+from avatar_core.scene.model import Scene, Tool
+from avatar_core.scene.prony import parse_prony
+from avatar_core.scene.yaml_lines import (
+    Entries,
+    below,
+    checked,
+    compose,
+    entries_of,
+    is_nothing,
+    nothing_at,
+    placed_at,
+    read_text,
+    refused,
+    shown,
+)
+
+# Which fields of a Scene stand below which key; name, text, tools and effects stand by themselves.
+SECTIONS = {
+    "organ": ("vademecum",),
+    "material": ("young_modulus", "poisson_ratio"),
+    "outputs": ("cloud", "cloud_divisor", "modes"),
+}
+SHIPPED = Path("params") / "scenes"  # in the project; installed below share/avatar_ros
+_KEYS = ("name", "text", "organ", "material", "tools", "outputs", "effects")
+
+
+def shipped_scenes() -> dict[str, Path]:
+    """Files of the scenes that come with the project, by bare name; sorted.
+
+    They lie beside the code, in its repository, or below the prefix that it is installed in.
+    """
+    package = Path(__file__).resolve().parent
+    installed = [prefix / "share" / "avatar_ros" / SHIPPED for prefix in package.parents]
+    for folder in (package.parent / SHIPPED, *installed):
+        if folder.is_dir():
+            return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {}
+
+
+def scene_path(name: str) -> Path:
+    """The file of a scene: a path, or the bare name of a shipped one.
+
+    Raises
+    ------
+    SceneError
+        Naming the shipped scenes, for a bare name that none of them has.
+    """
+    path, shipped = Path(name), shipped_scenes()
+    if path.is_file() or path.name != name or path.suffix:
+        return path
+    if name not in shipped:
+        raise SceneError(
+            f"there is no scene '{name}'; give a file or one of {', '.join(shipped) or 'none'}"
+        )
+    return shipped[name]
+
+
+def read_scene(path: str | Path) -> Scene:
+    """Read a scene; see :func:`parse_scene`. A file of Prony terms is looked for beside it."""
+    path = Path(path)
+    return parse_scene(read_text(path), str(path), path.parent)
+
+
+def parse_scene(text: str, source: str, folder: Path | None = None) -> Scene:
+    """The scene that YAML text describes; a key with nothing after it keeps its default.
+
+    Parameters
+    ----------
+    text : YAML
+    source : its name in error messages
+    folder : where files that it names may lie; None: it may name none
+
+    Raises
+    ------
+    SceneError
+        One line: source, line, key, value, and what is allowed.
+    """
+    root = compose(text, source)
+    entries = entries_of(root, "", _KEYS)
+    values: dict[str, Any] = {}
+    for key, (_, node) in entries.items():
+        if is_nothing(node):
+            continue
+        if key in SECTIONS:
+            values |= _fields(Scene, entries_of(node, key, SECTIONS[key]), key)
+        elif key == "tools":
+            values[key] = _tools(node)
+        elif key == "effects":
+            values[key] = _effects(node, folder)
+        else:
+            values[key] = _value(node, key, Scene, key)
+    with placed_at(entries["tools"][0] if "tools" in entries else root):
+        return Scene(**values)
+
+
+def write_scene(scene: Scene) -> str:
+    """YAML text that :func:`parse_scene` reads as an equal scene, without a file beside it."""
+    document: dict[str, Any] = {"name": scene.name, "text": scene.text}
+    for section, keys in SECTIONS.items():
+        values = {key: getattr(scene, key) for key in keys}
+        document[section] = {key: _plain(v) for key, v in values.items() if v is not None}
+    document["tools"] = [_plain_fields(tool) for tool in scene.tools]
+    document["effects"] = {effect.name: _plain_fields(effect) for effect in scene.effects}
+    return yaml.safe_dump(
+        document, sort_keys=False, allow_unicode=True, default_flow_style=None, width=math.inf
+    )
+
+
+def _plain_fields(one: Any) -> dict[str, Any]:
+    return {field.name: _plain(getattr(one, field.name)) for field in fields(one)}
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of numpy are numbers, but YAML does not know them."""
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return float(value) if isinstance(value, float) else value
+
+
+def _fields(owner: type, entries: Entries, path: str) -> dict[str, Any]:
+    """Values of fields of a dataclass; those with nothing are left out."""
+    return {
+        key: _value(node, below(path, key), owner, key)
+        for key, (_, node) in entries.items()
+        if not is_nothing(node)
+    }
+
+
+def _value(node: Node, path: str, owner: type, key: str) -> Any:
+    """A node as the type of a field says."""
+    kind = get_type_hints(owner)[key]
+    if kind is str:
+        return _line(node, path)
+    if get_origin(kind) is not None and isinstance(get_args(kind)[0], str):
+        return _choice(node, path, get_args(kind))
+    (allowed,) = (f.metadata["quantity"] for f in fields(owner) if f.name == key)
+    if get_origin(kind) is not tuple:
+        return _number(node, path, allowed, is_whole(owner, key))
+    if not isinstance(node, SequenceNode):
+        raise refused(node, f"{path} is {shown(node)}; write a list of numbers in {allowed}")
+    return tuple(_number(item, f"{path}[{i}]", allowed, False) for i, item in enumerate(node.value))
+
+
+def _number(node: Node, path: str, allowed: Any, whole: bool) -> float:
+    """A number, also as 20e-3, which is a word to YAML 1.1; quotes make a word of any number."""
+    value = math.nan
+    is_number = isinstance(node, ScalarNode) and node.style is None
+    try:
+        value = float(node.value) if is_number else value
+    except ValueError:
+        is_number = False
+    if whole and value.is_integer():
+        value = int(value)
+    if not lies_in(value, allowed, whole):
+        kind = "be a whole number in" if whole else "lie in" if is_number else "be a number in"
+        raise refused(node, f"{path} is {shown(node)}; it must {kind} {allowed}")
+    return value
+
+
+def _line(node: Node, path: str) -> str:
+    if not isinstance(node, ScalarNode):
+        raise refused(node, f"{path} is {shown(node)}; write one line of text")
+    text = node.value.rstrip("\n")  # as of > and |
+    with placed_at(node):
+        check_line(path, text)
+    return text
+
+
+def _choice(node: Node, path: str, choices: Sequence[str]) -> str:
+    """One of several words; as written, since YAML 1.1 takes off for false."""
+    if not isinstance(node, ScalarNode) or node.value not in choices:
+        raise refused(node, f"{path} is {shown(node)}; it must be one of {', '.join(choices)}")
+    return node.value
+
+
+def _tools(node: Node) -> tuple[Tool, ...]:
+    known = [field.name for field in fields(Tool)]
+    if not isinstance(node, SequenceNode):
+        raise refused(node, f"tools is {shown(node)}; write a list of {{{': , '.join(known)}: }}")
+    return tuple(_tool(item, f"tools[{i}]", known) for i, item in enumerate(node.value))
+
+
+def _tool(node: Node, path: str, known: Sequence[str]) -> Tool:
+    values = _fields(Tool, entries_of(node, path, known), path)
+    with placed_at(node):
+        return Tool(**values)
+
+
+def _effects(node: Node, folder: Path | None) -> tuple[Effect, ...]:
+    """From a mapping, or a list of names and of mappings of one key."""
+    if isinstance(node, SequenceNode):
+        pairs = [_named(item) for item in node.value]
+    elif isinstance(node, MappingNode):
+        pairs = node.value
+    else:
+        raise refused(node, f"effects is {shown(node)}; write a list: [{', '.join(EFFECTS)}]")
+    entries = checked(pairs, "effects", tuple(EFFECTS))
+    return tuple(_effect(name, *entry, folder) for name, entry in entries.items())
+
+
+def _named(item: Node) -> tuple[Node, Node]:
+    if isinstance(item, MappingNode) and len(item.value) == 1:
+        return item.value[0]
+    if isinstance(item, ScalarNode):
+        return item, nothing_at(item)
+    raise refused(item, f"effects holds {shown(item)}; write a name, or 'name: settings'")
+
+
+def _effect(name: str, key: Node, node: Node, folder: Path | None) -> Effect:
+    kind = EFFECTS[name]
+    known = [field.name for field in fields(kind)]
+    if kind is Viscoelasticity:
+        known.append("file")
+    entries = {} if is_nothing(node) else entries_of(node, name, known)
+    file_key, file = entries.pop("file", (key, nothing_at(key)))
+    values = _fields(kind, entries, name)
+    if not is_nothing(file):
+        if values:
+            raise refused(file_key, f"{name} has file and {', '.join(values)}; leave one out")
+        values = _prony_beside(file, f"{name}.file", folder)
+    for field in fields(kind):
+        if field.default is MISSING and field.name not in values:
+            allowed = field.metadata["quantity"]
+            raise refused(key, f"{name}.{field.name} is missing; give numbers in {allowed}")
+    with placed_at(key):
+        return kind(**values)
+
+
+def _prony_beside(node: Node, path: str, folder: Path | None) -> dict[str, tuple[float, ...]]:
+    name = _line(node, path)
+    if folder is None:
+        raise refused(node, f"{path} is '{name}', but this scene is no file; give g and tau")
+    file = Path(os.path.realpath(folder / name))  # links may not lead out either
+    if not file.is_relative_to(os.path.realpath(folder)):
+        raise refused(node, f"{path} is '{name}'; it must lie in the folder of the scene")
+    with placed_at(node):
+        return parse_prony(read_text(file), file.name)

@@ -1,0 +1,213 @@
+"""A scene: organ, tools, outputs, and the effects that run. What it does not name does not run.
+
+:mod:`avatar_core.scene.file` reads and writes scenes as YAML.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, get_args
+
+from avatar_core.common.quantities import check_line, check_numbers, quantity
+from avatar_core.contact.effects import Effect
+from avatar_core.contact.kernels import MAX_TOOLS
+from avatar_core.contact.layout import TIP_RADIUS_RANGE
+from avatar_core.errors import CoordinateError, SceneError
+from avatar_core.reduction.coordinates import require_known
+from avatar_core.vademecum.accuracy import Cloud
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum.model import Vademecum
+
+REFUSED = 0.15  # mean error of a combination of effects above which a scene is refused [-]
+
+# Effects that cannot run together, and why.
+CONFLICTS = (
+    (
+        "large_deformation",
+        "tumour",
+        "large pushes are computed for one material; leave one of the two out",
+    ),
+)
+
+# Part of the names of topics, so that ROS 2 decides what it may hold.
+_TOOL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A tool with a spherical tip.
+
+    Raises
+    ------
+    SceneError
+        For a name that cannot be part of a topic's, or a radius out of range.
+    """
+
+    name: str = "tool"
+    tip_radius: float = quantity("m", *TIP_RADIUS_RANGE, "of the spherical tip", 5e-3)
+
+    def __post_init__(self) -> None:
+        check_line("tools.name", self.name)
+        if not _TOOL_NAME.fullmatch(self.name) or "__" in self.name:
+            raise SceneError(
+                f"tools.name is '{self.name}'; give a name for ROS topics: letters, digits, single "
+                "_ and / between, a letter first"
+            )
+        check_numbers(self, f"{self.name}.")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is simulated, in SI units.
+
+    vademecum : file in the library's folder; "" is whichever is loaded
+    young_modulus, poisson_ratio, modes : None leaves them to the vademecum
+    cloud : which vertices are sent
+    effects : each at most once, in any order
+
+    Raises
+    ------
+    SceneError
+        For a value out of range, or what contradicts itself.
+    """
+
+    name: str = "palpation"
+    text: str = ""
+    vademecum: str = ""
+    young_modulus: float | None = quantity("Pa", 1.0, 1e8, "of the organ", None)
+    poisson_ratio: float | None = quantity("-", 0.0, 0.4999, "of the organ", None)
+    tools: tuple[Tool, ...] = (Tool(),)
+    cloud: Cloud = "surface"
+    cloud_divisor: int = quantity("-", 1, 1000, "the cloud is sent every so many steps", 1)
+    modes: int | None = quantity("-", 1, 100_000, "of the far field, for the cloud", None)
+    effects: tuple[Effect, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        for key in ("name", "text", "vademecum"):
+            check_line(key, getattr(self, key))
+        if self.cloud not in get_args(Cloud):
+            raise SceneError(f"cloud is '{self.cloud}'; choose {', '.join(get_args(Cloud))}")
+        self._check_effects()
+        self._check_tools()
+
+    def _check_effects(self) -> None:
+        name = _first_twice([effect.name for effect in self.effects])
+        if name is not None:
+            raise SceneError(f"effects: {name} is named twice; name it once")
+        for one, other, reason in CONFLICTS:
+            if self.effect(one) is not None and self.effect(other) is not None:
+                raise SceneError(f"effects: {one} and {other} exclude each other: {reason}")
+
+    def _check_tools(self) -> None:
+        n_tools = len(self.tools)
+        if not 1 <= n_tools <= MAX_TOOLS:
+            raise SceneError(f"tools: there are {n_tools}; give 1 to {MAX_TOOLS}")
+        name = _first_twice([tool.name for tool in self.tools])
+        if name is not None:
+            raise SceneError(f"tools: two are called '{name}'; give each its own name")
+        if n_tools > 1 and self.effect("several_tools") is None:
+            raise SceneError(
+                f"tools: {n_tools} tools without several_tools: add it to effects, or name one tool"
+            )
+
+    def effect(self, name: str) -> Effect | None:
+        """The effect of a name, if the scene has it."""
+        return next((effect for effect in self.effects if effect.name == name), None)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Material values that the scene chooses; see :func:`avatar_core.vademecum.at_values.at_values`.
+
+        The contrast is that of the effect ``tumour``.
+        """
+        chosen = {"young": self.young_modulus, "poisson": self.poisson_ratio}
+        return {name: value for name, value in chosen.items() if value is not None}
+
+    def require(self, vademecum: Vademecum) -> None:
+        """Refuse a vademecum that lacks what the scene needs, or answers it too wrongly.
+
+        Raises
+        ------
+        SceneError
+            Naming what is missing, or the error of a combination of effects above ``REFUSED``.
+        """
+        for effect in self.effects:
+            effect.require(vademecum)
+        if self.poisson_ratio is not None:
+            _require_poisson(vademecum, self.poisson_ratio)
+        for one in combinations(self, vademecum):
+            if one.error is not None and one.error > REFUSED:
+                raise SceneError(
+                    f"{' with '.join(one.effects)}: {one.how}, which is {one.error:.0%} wrong in "
+                    f"the mean for this organ, above {REFUSED:.0%}; leave one of the two out"
+                )
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Two effects that share the response, and how they are put together.
+
+    error : of that, in the mean over unseen cases [-]; None: not measured
+    """
+
+    effects: tuple[str, str]
+    how: str
+    error: float | None
+
+
+# With large deformation: the other effect, how both combine, and the figure of the certificate.
+_WITH_LARGE = (
+    ("friction", "forces off the normal are added linearly", "oblique_contact_mean"),
+    ("several_tools", "the way from tip to tip stays linear", "two_tools_contact_mean"),
+    ("self_weight", "the sag is added linearly", "gravity_contact_mean"),
+    (
+        "viscoelasticity",
+        "quasi-linear: the relaxation acts on the elastic force (Fung, Biomechanics, 1993)",
+        None,
+    ),
+    ("inertia", "bending follows at once; only the linear part has mass", None),
+)
+
+
+def combinations(scene: Scene, vademecum: Vademecum | None) -> tuple[Combination, ...]:
+    """The effects of a scene that share the response, all by pairs; without an organ, no figures.
+
+    Only large deformation does not superpose. Several tools count where there are several.
+    """
+    chosen = {effect.name for effect in scene.effects}
+    if len(scene.tools) == 1:
+        chosen.discard("several_tools")
+    if "large_deformation" not in chosen:
+        return ()
+    certificate = vademecum.large.certificate if vademecum and vademecum.large else None
+    return tuple(
+        Combination(("large_deformation", other), how, _figure(certificate, key))
+        for other, how, key in _WITH_LARGE
+        if other in chosen
+    )
+
+
+def _figure(certificate: Any, key: str | None) -> float | None:
+    """A figure of a certificate; None where it was not measured, as in files of older versions."""
+    value = getattr(certificate, key, None) if key else None
+    return None if value is None or math.isnan(value) else float(value)
+
+
+def _require_poisson(vademecum: Vademecum, value: float) -> None:
+    coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
+    try:
+        require_known(coordinates, {"poisson": value})
+        for coordinate in coordinates:
+            if coordinate.name == "poisson":
+                coordinate.weights(value)  # refuses a value out of range
+    except CoordinateError as error:
+        raise SceneError(f"material.poisson_ratio: {error}") from error
+
+
+def _first_twice(names: Sequence[str]) -> str | None:
+    return next((name for i, name in enumerate(names) if name in names[:i]), None)

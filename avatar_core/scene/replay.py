@@ -1,0 +1,119 @@
+"""A recording once more: the same tips through the same step, and whether the forces are the same.
+
+What a step answers depends on the tips of this period and on what the model remembers: whether a
+tip came in through the surface, the last force to start from, held points of friction, relaxation,
+swing, breath. A period is *known* when all of that is in the recording:
+
+- without effects, or with friction, large deformation, self-weight and several tools, a model
+  forgets everything as soon as no tip touches: from the first such period on, and again after
+  periods that were lost;
+- with viscoelasticity or inertia, only in a recording from rest, up to the first lost period;
+- with respiration never, since the phase of the breath is not recorded.
+
+Known periods are the same to the bit on the machine that recorded them. Compared is what the organ
+answers, before the force guard, whose state (limits, ramps, engagement) is not recorded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar_core.contact import model as contact
+from avatar_core.contact.model import Status, prepare
+from avatar_core.errors import StorageError
+from avatar_core.scene.file import parse_scene
+from avatar_core.scene.model import Scene
+from avatar_core.scene.recording import Periods, Recording
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.model import Vademecum
+
+_REMEMBER_FOR_EVER = ("viscoelasticity", "inertia")
+_RECORDED_NOWHERE = "respiration"
+_MAY_BE_INSIDE = (int(Status.OUT_OF_RANGE), int(Status.INVALID_POSE))
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """What the organ answers to the recorded tips.
+
+    force : ndarray, shape (n, n_tools, 3) [N]
+    known : ndarray of bool, shape (n,), where it has to be what was recorded
+    """
+
+    force: np.ndarray
+    known: np.ndarray
+
+    def difference(self, recording: Recording) -> float:
+        """Largest difference of a force in known periods [N]; NaN where none is known."""
+        if not self.known.any():
+            return float("nan")
+        gap = self.force[self.known] - recording.periods.force[self.known]
+        return float(np.linalg.norm(gap, axis=2).max())
+
+
+def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
+    """Step a new model through all tips of a recording.
+
+    Raises
+    ------
+    StorageError
+        If the recording is of another vademecum.
+    SceneError, ContactError, CoordinateError
+        If the scene in it does not fit the vademecum.
+    """
+    if vademecum.id != recording.vademecum_id:
+        raise StorageError(
+            f"the recording is of {recording.vademecum_name!r} ({recording.vademecum_id[:12]}), "
+            f"this is {vademecum.name!r} ({vademecum.id[:12]}); give the file it was made with"
+        )
+    scene = parse_scene(recording.scene, "scene of the recording")
+    periods = recording.periods
+    if len(scene.tools) != periods.tip.shape[1]:
+        raise StorageError(
+            f"the recording has {periods.tip.shape[1]} tools, its scene {len(scene.tools)}; "
+            "record again"
+        )
+    model = prepare(
+        at_values(vademecum, scene.values),
+        tuple(tool.tip_radius for tool in scene.tools),
+        cloud="off",
+        effects=scene.effects,
+        period=1.0 / recording.rate,
+        halves=True,
+    )
+    force = np.empty(periods.force.shape)
+    friction = model.effects.friction
+    for k in range(len(periods)):
+        if friction is not None:
+            friction.spin[:] = periods.turn[k]
+        contact.solve(model, periods.tip[k])
+        force[k] = model.out.force
+    return Replayed(force, known_periods(periods, scene, recording.from_rest))
+
+
+def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray:
+    """Whether all that the model remembers is in the recording, shape (n,)."""
+    names = {effect.name for effect in scene.effects}
+    known = np.zeros(len(periods), bool)
+    if _RECORDED_NOWHERE in names:
+        return known
+    forgets = not names & set(_REMEMBER_FOR_EVER)
+    inside = periods.force.any(axis=2) | np.isin(periods.status, _MAY_BE_INSIDE)
+    free, lost = np.logical_not(inside.any(axis=1)), periods.lost > 0
+    sure = from_rest
+    for k in range(len(periods)):
+        sure = (sure and not lost[k]) or bool(forgets and free[k])
+        known[k] = sure
+    return known
+
+
+def why_not(recording: Recording) -> str:
+    """Why no period of a recording is known, and what to do."""
+    names = {effect.name for effect in parse_scene(recording.scene, "scene").effects}
+    if _RECORDED_NOWHERE in names:
+        return "the phase of the breath is not recorded; record without respiration"
+    if names & set(_REMEMBER_FOR_EVER):
+        return "what the organ remembers from before is not recorded; start with the tool off it"
+    return "the tool was never off the organ; start with the tool off it"

@@ -1,0 +1,386 @@
+"""Locally linear embedding: a base of shapes that grows one by one, and its flat map.
+
+The embedding follows Eq. 16 of Gonzalez, Cueto & Chinesta (2015) with M = (I - W)^T (I - W): the
+last term of the matrix printed there has the wrong sign (Roweis & Saul 2000, Science 290:2323).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigh
+
+from avatar_core.errors import LLEError
+from avatar_core.shapes.barycenter import (
+    DEFAULT_REGULARIZATION,
+    SAME,
+    Barycenter,
+    Vectors,
+    barycenter,
+    barycenter_weights,
+    checked_vector,
+    convex_weights,
+    local_gram,
+    require_regularization,
+    truncation,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+BLOCK = 8192  # values at a time in the Gram matrix: stays in cache, and threads seldom meet
+ROUNDING = 4 * float(np.finfo(float).eps)  # of an inner product, relative to the lengths
+TRUSTED = 5e-11  # weights that rounding may move by more than this are solved from differences
+LOCAL_VARIANCE = 0.99  # local principal components up to this part of the variance are counted
+
+
+@dataclass(frozen=True, eq=False)
+class Gram:
+    """Inner products of a base about a fixed origin, from which all distances follow.
+
+    origin : ndarray, shape (D,), the mean when the base was begun: inner products about it are
+        small, so that their rounding is too; it stays while the base grows
+    products : ndarray, shape (n, n), G_ij = (X_i - o) . (X_j - o)
+    """
+
+    origin: FloatArray
+    products: FloatArray
+
+    @classmethod
+    def of(cls, vectors: Vectors) -> Gram:
+        """All products of n vectors of shape (D,), summed over blocks of values."""
+        n, length = len(vectors), len(vectors[0])
+        origin, products = np.empty(length), np.zeros((n, n))
+        for start in range(0, length, BLOCK):
+            part = slice(start, start + BLOCK)
+            block = np.stack([vector[part] for vector in vectors])
+            origin[part] = block.mean(axis=0)
+            block -= origin[part]
+            products += block @ block.T
+        return cls(origin, products)
+
+    @property
+    def squared_lengths(self) -> FloatArray:
+        """|X_i - o|^2, shape (n,)."""
+        return np.diag(self.products)
+
+    def squared_distances(self, rows: IntArray) -> FloatArray:
+        """|X_i - X_j|^2 for some i and all j, shape (len(rows), n)."""
+        lengths = self.squared_lengths
+        return np.maximum(lengths[rows, None] + lengths - 2 * self.products[rows], 0.0)
+
+    def grown(self, vectors: Vectors, point: FloatArray) -> Gram:
+        """With one more row, of a point that follows the vectors."""
+        shifted = point - self.origin
+        row = np.array([(vector - self.origin) @ shifted for vector in vectors])
+        corner = np.array([[shifted @ shifted]])
+        return Gram(self.origin, np.block([[self.products, row[:, None]], [row[None, :], corner]]))
+
+
+@dataclass(frozen=True, eq=False)
+class LLE:
+    """A base of shapes with the weights of each in terms of the others; grows one by one.
+
+    vectors : n arrays of shape (D,)
+    gram : their inner products
+    same_as : ndarray of int, shape (n,), the first member equal to it, mostly itself
+    neighbors : ndarray of int, shape (n, k), nearest first, without itself and its equals
+    weights : ndarray, shape (n, k); a later equal of a member has weight 1 on that member
+    n_neighbors, regularization, convex : what was asked; see `barycenter`
+    """
+
+    vectors: tuple[FloatArray, ...]
+    gram: Gram
+    same_as: IntArray
+    neighbors: IntArray
+    weights: FloatArray
+    n_neighbors: int
+    regularization: float
+    convex: bool
+
+    def __len__(self) -> int:
+        return len(self.vectors)
+
+    @property
+    def repeated(self) -> tuple[int, ...]:
+        """Members equal to an earlier one; they are nobody's neighbours."""
+        return tuple(int(i) for i in np.flatnonzero(self.same_as != np.arange(len(self))))
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What was changed of the request, one line each."""
+        different = len(self) - len(self.repeated)
+        notices = [f"member {i} equals member {self.same_as[i]}" for i in self.repeated]
+        if self.n_neighbors >= different:
+            notices.append(truncation(self.n_neighbors, different - 1))
+        return tuple(notices)
+
+    @cached_property
+    def weight_matrix(self) -> FloatArray:
+        """W, rows sum to one, shape (n, n)."""
+        matrix = np.zeros((len(self), len(self)))
+        np.add.at(matrix, (np.arange(len(self))[:, None], self.neighbors), self.weights)
+        return matrix
+
+    def barycenter(self, point: ArrayLike, leave_out: Collection[int] = ()) -> Barycenter:
+        """Weights of a new point, with the base's settings; equal members count once."""
+        return barycenter(
+            self.vectors,
+            point,
+            self.n_neighbors,
+            regularization=self.regularization,
+            convex=self.convex,
+            leave_out={*leave_out, *self.repeated},
+        )
+
+    def insert(self, point: ArrayLike) -> LLE:
+        """The base with one more member: one row of the Gram matrix, and new weights only where
+        the newcomer is among the neighbours. Equal to `fit` on all vectors up to rounding.
+
+        Raises LLEError if the point does not fit the base.
+        """
+        x = checked_vector(point, self.vectors)
+        n = len(self)
+        gram = self.gram.grown(self.vectors, x)
+        same_as = np.append(self.same_as, _first_equal(gram, n, self.same_as))
+        grown = replace(self, vectors=(*self.vectors, x), gram=gram, same_as=same_as)
+        if _n_used(self.n_neighbors, same_as) != _n_used(self.n_neighbors, self.same_as):
+            return _with_rows(grown, np.arange(n + 1))
+        squared = gram.squared_distances(np.arange(n))
+        nearer = squared[:, n] < squared[np.arange(n), self.neighbors[:, -1]]
+        pad = np.zeros((1, self.neighbors.shape[1]))
+        grown = replace(
+            grown,
+            neighbors=np.vstack([self.neighbors, pad.astype(np.int64)]),
+            weights=np.vstack([self.weights, pad]),
+        )
+        return _with_rows(grown, np.append(np.flatnonzero(nearer), n))
+
+
+def fit(
+    vectors: Sequence[ArrayLike] | FloatArray,
+    n_neighbors: int,
+    *,
+    regularization: float = DEFAULT_REGULARIZATION,
+    convex: bool = False,
+    gram: Gram | None = None,
+) -> LLE:
+    """Weights of every member of a base in terms of its neighbours (Eq. 15).
+
+    vectors : n arrays of shape (D,), not copied; an array of shape (n, D) will do
+    gram : their inner products, if known
+
+    Raises LLEError if the base is empty, k <= 0, a value is not finite or lengths differ.
+    """
+    rows = tuple(np.asarray(v, dtype=np.float64) for v in vectors)
+    if not rows:
+        raise LLEError("lle: the base is empty; add at least one anatomy")
+    if n_neighbors <= 0:
+        raise LLEError(f"lle: {n_neighbors} neighbours asked for; choose at least 1")
+    require_regularization(regularization)
+    if any(row.shape != rows[0].shape or row.ndim != 1 for row in rows):
+        raise LLEError("lle: the vectors differ in length; compute all on one grid")
+    gram = Gram.of(rows) if gram is None else gram
+    if gram.products.shape != (len(rows), len(rows)) or gram.origin.shape != rows[0].shape:
+        raise LLEError(
+            f"lle: the Gram matrix of {len(gram.products)} vectors of {len(gram.origin)} values "
+            f"does not fit {len(rows)} of {len(rows[0])}; compute it again"
+        )
+    if not np.isfinite(gram.products).all():
+        bad = next((i for i, row in enumerate(rows) if not np.isfinite(row).all()), 0)
+        raise LLEError(f"lle: vector {bad} is NaN or infinite; compute its distances again")
+    same_as = np.zeros(1, dtype=np.int64)
+    for i in range(1, len(rows)):
+        same_as = np.append(same_as, _first_equal(gram, i, same_as))
+    empty = (np.zeros((len(rows), 0), dtype=np.int64), np.zeros((len(rows), 0)))
+    base = LLE(rows, gram, same_as, *empty, n_neighbors, regularization, convex)
+    return _with_rows(base, np.arange(len(rows)))
+
+
+def _first_equal(gram: Gram, i: int, same_as: IntArray) -> int:
+    """First member equal to member i, itself if there is none before it.
+
+    same_as : of the members before it
+    """
+    lengths = np.maximum(gram.squared_lengths[:i], gram.squared_lengths[i])
+    # the origin of equal vectors is rounded, and then their lengths about it are rounding too
+    noise = ROUNDING**2 * (gram.origin @ gram.origin)
+    squared = gram.squared_distances(np.array([i]))[0, :i]
+    hits = np.flatnonzero((squared <= SAME**2 * lengths + noise) & (same_as == np.arange(i)))
+    return int(hits[0]) if len(hits) else i
+
+
+def _n_used(n_neighbors: int, same_as: IntArray) -> int:
+    """Neighbours each member has: k, or all others that differ from it."""
+    return min(n_neighbors, np.count_nonzero(same_as == np.arange(len(same_as))) - 1)
+
+
+def _with_rows(base: LLE, rows: IntArray) -> LLE:
+    """The base with neighbours and weights of these rows computed anew."""
+    n, n_used = len(base), _n_used(base.n_neighbors, base.same_as)
+    k = max(n_used, 1)  # a column for the sake of equals, even if all are
+    fits = base.neighbors.shape == (n, k)
+    neighbors = base.neighbors.copy() if fits else np.zeros((n, k), dtype=np.int64)
+    weights = base.weights.copy() if fits else np.zeros((n, k))
+    is_first = base.same_as[rows] == rows
+    again, first = rows[~is_first], rows[is_first]
+    neighbors[again] = base.same_as[again, None]
+    weights[again] = np.eye(1, k)
+    if n_used > 0:
+        neighbors[first] = _nearest(base, first, k)
+        weights[first] = _row_weights(base, first, neighbors[first])
+    return replace(base, neighbors=neighbors, weights=weights)
+
+
+def _nearest(base: LLE, rows: IntArray, k: int) -> IntArray:
+    """The k nearest others that are equal to none before them; ties by number."""
+    squared = base.gram.squared_distances(rows)
+    squared[:, list(base.repeated)] = np.inf
+    squared[np.arange(len(rows)), rows] = np.inf
+    return np.argsort(squared, axis=1, kind="stable")[:, :k]
+
+
+def _row_weights(base: LLE, rows: IntArray, neighbors: IntArray) -> FloatArray:
+    """Weights of members from the Gram matrix, from differences where that loses digits."""
+    products, lengths = base.gram.products, base.gram.squared_lengths
+    cross = products[rows[:, None], neighbors]
+    local = products[neighbors[:, :, None], neighbors[:, None, :]]
+    local = local - cross[:, :, None] - cross[:, None, :] + lengths[rows, None, None]
+    for i in _imprecise(local, np.maximum(lengths[rows], lengths[neighbors].max(axis=1)), base):
+        local[i] = local_gram(base.vectors[rows[i]], [base.vectors[j] for j in neighbors[i]])
+    if base.convex:
+        return np.array([convex_weights(one) for one in local])
+    return barycenter_weights(local, base.regularization)
+
+
+def _imprecise(local: FloatArray, lengths: FloatArray, base: LLE) -> IntArray:
+    """Neighbourhoods in which rounding of the Gram matrix moves the weights beyond TRUSTED.
+
+    Rounding eps |X|^2 over the least eigenvalue, which is r tr(C) at least. (Computed from
+    differences, the matrix has the same bits whether the base was grown or fitted at once.)
+    """
+    ridge = base.regularization * np.trace(local, axis1=1, axis2=2)
+    rounding = ROUNDING * lengths
+    suspects = np.flatnonzero(rounding > TRUSTED * ridge)
+    least = np.maximum(np.linalg.eigvalsh(local[suspects])[:, 0], 0.0) + ridge[suspects]
+    return suspects[rounding[suspects] > TRUSTED * least]
+
+
+# --- embedding --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Embedding:
+    """Low-dimensional map of a base.
+
+    coordinates : ndarray Y, shape (n, d), zero mean, Y^T Y = n I
+    eigenvalues : ndarray, the lowest of M without the zero of the constant vector, ascending
+    """
+
+    coordinates: FloatArray
+    eigenvalues: FloatArray
+
+    def of(self, point: Barycenter) -> FloatArray:
+        """Out of sample: sum_j w_j Y_j, shape (d,)."""
+        return point.weights @ self.coordinates[point.neighbors]
+
+
+@dataclass(frozen=True, eq=False)
+class Dimension:
+    """How many parameters the shapes of a base seem to depend on.
+
+    from_gap : number of lowest eigenvalues of M before the largest ratio of neighbouring ones
+    gap : that ratio; near 1 nothing stands out and the number means nothing
+    from_local_pca : principal components for 99 % of the variance of a neighbourhood, median
+    eigenvalues : ndarray, the lowest of M, ascending
+    local_variances : ndarray, shape (k - 1,), mean part of the variance, descending
+    """
+
+    from_gap: int
+    gap: float
+    from_local_pca: int
+    eigenvalues: FloatArray
+    local_variances: FloatArray
+
+    @property
+    def agree(self) -> bool:
+        """Whether both estimates are the same."""
+        return self.from_gap == self.from_local_pca
+
+
+def spectrum(base: LLE, n_values: int) -> tuple[FloatArray, FloatArray]:
+    """Lowest eigenvalues and eigenvectors of M = (I - W)^T (I - W) (Eq. 16), constant left out.
+
+    Returns ndarrays of shape (n_values,) and (n, n_values).
+
+    Raises LLEError if the base has not more members than values.
+    """
+    n, n_different = len(base), len(base) - len(base.repeated)
+    if not 1 <= n_values < n_different:
+        raise LLEError(
+            f"lle: {n_values} dimension(s) of {n_different} different anatomies; choose 1 to "
+            "fewer than there are anatomies, or add some"
+        )
+    rest = np.eye(n) - base.weight_matrix
+    matrix = rest.T @ rest
+    # the constant is an eigenvector for zero: lifted, it cannot mix with other tiny ones
+    matrix += np.trace(matrix) / n
+    values, vectors = eigh(matrix, subset_by_index=[0, n_values - 1])
+    return np.maximum(values, 0.0), vectors
+
+
+def embed(base: LLE, n_components: int) -> Embedding:
+    """Coordinates that the weights reconstruct best (Eq. 16): min |Y - W Y|^2, Y^T Y = n I.
+
+    Raises LLEError if there are not more different anatomies than components.
+    """
+    values, vectors = spectrum(base, n_components)
+    return Embedding(vectors * np.sqrt(len(base)), values)
+
+
+def estimate_dimension(base: LLE, n_values: int = 20) -> Dimension:
+    """Dimension from the gap in the spectrum of M (Polito & Perona 2001) and from local PCA.
+
+    Neither can exceed the number of neighbours less one.
+
+    Raises LLEError if there are fewer than 2 neighbours or 4 different anatomies.
+    """
+    k = base.neighbors.shape[1]
+    n_different = len(base) - len(base.repeated)
+    if k < 2 or n_different < 4:
+        raise LLEError(
+            f"lle: no dimension from {n_different} different anatomies and {k} neighbour(s); "
+            "give at least 4 and 2"
+        )
+    values, _ = spectrum(base, min(n_values, n_different - 1))
+    floor = np.finfo(float).eps * len(base)  # rounding of M, whose entries are about one
+    ratios = np.maximum(values[1:], floor) / np.maximum(values[:-1], floor)
+    ratios = ratios[: max(k - 1, 1)]
+    best = int(np.argmax(ratios))
+    variances = local_variances(base)
+    needed = np.count_nonzero(np.cumsum(variances, axis=1) < LOCAL_VARIANCE, axis=1) + 1
+    return Dimension(
+        from_gap=best + 1,
+        gap=float(ratios[best]),
+        from_local_pca=int(np.median(needed)),
+        eigenvalues=values,
+        local_variances=variances.mean(axis=0),
+    )
+
+
+def local_variances(base: LLE) -> FloatArray:
+    """Variance along the principal axes of each neighbourhood, parts of one, descending.
+
+    Returns ndarray, shape (members that differ, k - 1).
+    """
+    members = np.flatnonzero(base.same_as == np.arange(len(base)))
+    near = base.neighbors[members]
+    local = base.gram.products[near[:, :, None], near[:, None, :]]
+    local = local - local.mean(axis=1, keepdims=True)
+    local = local - local.mean(axis=2, keepdims=True)
+    values = np.maximum(np.linalg.eigvalsh(local)[:, :0:-1], 0.0)
+    return values / values.sum(axis=1, keepdims=True)

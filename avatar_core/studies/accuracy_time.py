@@ -1,0 +1,382 @@
+"""What accuracy costs in time, online and offline, with the rivals in the same run.
+
+Online: every detail that a step can show the displacement with, timed here and judged on loads that
+neither the build nor the certificate drew. Offline: the mesh, the grid of a level set, who writes a
+shape, and how a patient is made. And whether promises were kept: errors, times, and the error that
+goes with each force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.offline.certify.linear import measured
+from avatar_core.offline.certify.timing import timed
+from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.studies.force_error import ForceErrors, force_errors
+from avatar_core.studies.offline_cost import grid_rows, mesh_rows, patient_rows, shape_rows
+from avatar_core.studies.online_cost import (
+    budget_rows,
+    cost_of_effects,
+    curve_rows,
+    fastest_within,
+    promises,
+    rival_rows,
+)
+from avatar_core.studies.report import Panel, write_report
+from avatar_core.studies.shapes import read_liver
+from avatar_core.studies.study import Parts, Study, Value
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+JND = 0.07  # of force, that a hand just notices (Jones, Brain 2000; Pang et al. 1991)
+PERIOD_US = 1000.0
+PAPER: dict[str, Value] = {"modes_for_10_percent": "11", "rate_hz": "1000, without a table"}
+FRESH = 1001  # seed of loads that no certificate draws
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Vertices, unseen loads of the certificate and fresh ones, contacts; the offline sweeps."""
+
+    n_vertices: int = 2850
+    n_certified: int = 200
+    n_fresh: int = 100
+    n_contacts: int = 1000
+    meshes: tuple[int, ...] = (1200, 1800, 2600)
+    spacings: tuple[float, ...] = (20e-3, 10e-3, 5e-3, 2.5e-3)
+    n_livers: int = 32
+    n_base: int = 6
+    n_patient: int = 600
+
+
+FULL = Plan()
+QUICK = Plan(1200, 60, 40, 150, (1200,), (20e-3, 10e-3), 16, 3, 350)
+
+
+def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
+    """The study on LiTS-4, or the first liver of a folder; the report goes into ``folder``."""
+    return study(surfaces, QUICK if quick else FULL, folder)
+
+
+def study(surfaces: Path | None, plan: Plan, folder: Path) -> Study:
+    """All sweeps, the promises, and the page."""
+    surface = read_liver(surfaces, "LiTS-4")
+    with Parts(6) as parts:
+        options = OrganOptions(n_vertices=plan.n_vertices, n_certified=plan.n_certified)
+        vademecum = vademecum_of(surface, options, parts.part("build"))
+        certificate = vademecum.certificate
+        assert certificate is not None and certificate.curve is not None
+        v = vademecum
+        elasticity = Elasticity(v.mesh, v.material, v.regions.clamped, v.element)
+        parts.part("timing")
+        curve = timed(vademecum, certificate.curve)
+        again = timed(vademecum, certificate.curve)
+        parts.part("fresh loads")
+        fresh = measured(vademecum, elasticity, plan.n_fresh, FRESH)
+        kept = promises(curve, fresh, again)
+        contacts = force_errors(vademecum, elasticity, plan.n_contacts, FRESH)
+        parts.part("rivals")
+        rows = curve_rows(curve) + budget_rows(curve)
+        rows += rival_rows(vademecum, elasticity, curve, plan.n_fresh // 2, FRESH)
+        rows += cost_of_effects(vademecum)
+        parts.part("mesh and grid")
+        rows += mesh_rows(surface, plan.meshes)
+        rows += grid_rows(surface, plan.spacings)
+        parts.part("shapes and patients")
+        rows += shape_rows(surfaces, plan.n_livers)
+        rows += patient_rows(plan.n_base, plan.n_patient)
+    summary: dict[str, float] = {
+        "promise_kept_fraction": kept.errors_kept,
+        "points_kept_fraction": kept.points_kept,
+        "time_promise_kept_fraction": kept.times_kept,
+        "force_error_coverage": contacts.coverage,
+        "force_error_overestimate": contacts.overestimate,
+        "budgets_as_enumerated": float(np.mean([r["as_enumerated"] for r in _of(rows, "choose")])),
+        "front_points": sum(bool(row.get("front")) for row in rows),
+        "l2_95": _best(rows)["error"],
+        "force_95": float(np.quantile(contacts.error / contacts.force, 0.95)),
+        "step_p50_us": _best(rows)["p50_us"],
+        "step_p99_us": _best(rows)["p99_us"],
+        "vertices": len(v.mesh.vertices),
+    }
+    panels = _panels(rows, contacts, summary)
+    sentence = _sentence(rows, summary, surface.name)
+    write_report(folder, "accuracy-time", sentence, summary, panels, rows)
+    return Study(
+        name="accuracy-time",
+        sentence=sentence,
+        summary=summary,
+        rows=tuple(rows),
+        paper=PAPER,
+        draw=partial(_overview, panels),
+        notices=(
+            *short_table(rows),
+            f"the page with all plots: {folder / 'accuracy-time.html'}",
+        ),
+    )
+
+
+def short_table(rows: list[dict[str, Value]]) -> tuple[str, ...]:
+    """The README's table: fastest steps within some errors, rivals, budgets; all vertices shown."""
+    volume = [row for row in rows if row.get("cloud") == "volume"]
+    lines = ["| 95 % of loads within | step p50 / p99 [us] | by | MB |", "|---|---|---|---|"]
+    for error in (0.05, 0.06, 0.10, 0.20, 0.40):
+        found = fastest_within(volume, error)
+        if found is not None:
+            lines.append(_line(f"{error:.0%}", found, str(found["setting"])))
+        else:
+            lines.append(f"| {error:.0%} | refused: no detail of this vademecum is so exact | | |")
+    for name in ("dense table", "direct solve"):
+        (row,) = (row for row in volume if row["method"] == name)
+        lines.append(_line(f"{row['error']:.1%}", row, name))
+    lines += [
+        f"{row['tolerance']:.0%} in {row['deadline_us']:.0f} us: {row['setting']}"
+        for row in _of(rows, "choose")
+    ]
+    return tuple(lines)
+
+
+def _line(error: str, row: dict[str, Any], by: str) -> str:
+    return (
+        f"| {error} | {row['p50_us']:.0f} / {row['p99_us']:.0f} | {by} | {row['bytes'] / 1e6:.1f} |"
+    )
+
+
+def _best(rows: list[dict[str, Value]]) -> dict[str, Any]:
+    """All modes in 16 bits, all vertices: what a scene shows unless told otherwise."""
+    found = [r for r in rows if r.get("cloud") == "volume" and r.get("precision") == "int16"]
+    return min((r for r in found if r["method"] == "vademecum"), key=lambda r: r["error"])
+
+
+def _sentence(rows: list[dict[str, Value]], summary: dict[str, float], name: str) -> str:
+    return (
+        f"{name}: a step that shows all {summary['vertices']:.0f} vertices takes "
+        f"{summary['step_p50_us']:.0f} us and is within {summary['l2_95']:.1%} for 95 % of unseen "
+        f"touches, its force within {summary['force_95']:.1%}; promised errors held for "
+        f"{summary['promise_kept_fraction']:.1%} of fresh loads, the error said with a force "
+        f"covered {summary['force_error_coverage']:.1%} of contacts"
+    )
+
+
+# --- Plots -----------------------------------------------------------------------------------
+
+_COLOURS = {"int8": "#0072B2", "int16": "#009E73", "float32": "#CC79A7"}  # Okabe and Ito
+_MARKS = {0.0: "v", 0.5: "s", 1.0: "o"}
+_QUANTITIES = {"mesh": "mesh, when refined (time of a build)", "grid": "grid (time of a level set)"}
+
+
+def _panels(
+    rows: list[dict[str, Value]], contacts: ForceErrors, summary: dict[str, float]
+) -> tuple[Panel, ...]:
+    return (
+        Panel("online", _online_sentence(rows), partial(_online, rows, "volume")),
+        Panel(
+            "surface",
+            "The same for the vertices of the surface alone, which is what a display needs.",
+            partial(_online, rows, "surface"),
+        ),
+        Panel(
+            "force",
+            f"The error said with each force against its true error, for unseen contacts: "
+            f"{summary['force_error_coverage']:.1%} lie above the line, with a median of "
+            f"{summary['force_error_overestimate']:.1f} times the true error.",
+            partial(_force, contacts),
+        ),
+        Panel(
+            "effects",
+            "Time of a step with one effect each: what a scene does not name costs nothing.",
+            partial(_effects, rows),
+        ),
+        Panel("offline", _offline_sentence(rows), partial(_offline, rows, ("mesh", "grid"))),
+        Panel("shapes", _shape_sentence(rows), partial(_offline, rows, ("shape",))),
+        Panel("patients", _patient_sentence(rows), partial(_offline, rows, ("patient",))),
+    )
+
+
+def _online_sentence(rows: list[dict[str, Value]]) -> str:
+    volume = [row for row in rows if row.get("cloud") == "volume"]
+    front = [row for row in volume if row["front"]]
+    of_bytes = sum(row.get("precision") == "int8" for row in front)
+    best, (table,) = _best(rows), _of(volume, "dense table")
+    return (
+        "Error of the displacement that a step shows against its time, all vertices: fewer modes "
+        f"are faster and worse. {of_bytes} of the {len(front)} points on the front (line) keep "
+        f"their modes in int8. The dense table is within {table['error']:.1%} instead of "
+        f"{best['error']:.1%}, takes {_ratio(table, best, 'p50_us'):.1f} times as long and "
+        f"{_ratio(table, best, 'bytes'):.0f} times the memory; modes without a near field, the "
+        "best there are (SVD), stay behind."
+    )
+
+
+def _offline_sentence(rows: list[dict[str, Value]]) -> str:
+    meshes = [row for row in rows if row["stage"] == "mesh"]
+    finest = min((row for row in rows if row["stage"] == "grid"), key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
+    least, most = _ends([float(row["error"]) for row in meshes])  # type: ignore[arg-type]
+    own = _ends([float(row["vademecum_error"]) for row in meshes])  # type: ignore[arg-type]
+    return (
+        "Error of the displacement against CPU time offline. Refining the mesh changes the answer "
+        f"by {least:.1%} to {most:.1%}; on the same mesh the vademecum is {own[0]:.1%} to "
+        f"{own[1]:.1%} wrong, whatever its size. Kept on the grid of a level set and read back, "
+        f"displacements are {finest['error']:.1%} wrong at {finest['setting']}."
+    )
+
+
+def _shape_sentence(rows: list[dict[str, Value]]) -> str:
+    shapes = sorted((r for r in rows if r["stage"] == "shape"), key=lambda r: r["error"])  # type: ignore[arg-type,return-value]
+    (nearest,) = _of(shapes, "nearest neighbour")
+    return (
+        "Who writes a liver by the others, each left out: 1 - Dice, and the time of the weights. "
+        f"Nearest of all comes {shapes[0]['setting']} ({shapes[0]['error']:.1%}); the nearest "
+        f"neighbour alone is {nearest['error']:.1%} off."
+    )
+
+
+def _patient_sentence(rows: list[dict[str, Value]]) -> str:
+    patients = [row for row in rows if row["stage"] == "patient"]
+    least, most = _ends([float(r["error"]) for r in _of(patients, "interpolated")])  # type: ignore[arg-type]
+    (reduced,), (solved,) = _of(patients, "reduced"), _of(patients, "solved")
+    return (
+        "How a new patient's vademecum is made from a base of bent phantoms (displacement; time of "
+        f"the response alone): interpolated {least:.1%} to {most:.1%} wrong, with few or all "
+        f"neighbours; reduced {reduced['error']:.1%}; all loads solved {solved['error']:.1%}, "
+        "which is what a vademecum of so many modes leaves."
+    )
+
+
+def _ends(values: list[float]) -> tuple[float, float]:
+    return min(values), max(values)
+
+
+def _ratio(one: dict[str, Any], other: dict[str, Any], key: str) -> float:
+    return float(one[key]) / float(other[key])
+
+
+def _online(rows: list[dict[str, Value]], cloud: str, axes: Axes) -> None:
+    mine = [r for r in rows if r.get("cloud") == cloud]
+    for precision, colour in _COLOURS.items():
+        for near, mark in _MARKS.items():
+            some = [
+                r
+                for r in mine
+                if r["method"] == "vademecum" and (r["precision"], r["near"]) == (precision, near)
+            ]
+            label = f"{precision}, near field to {near:g} of its radius"
+            _scatter(axes, some, "p50_us", label, marker=mark, s=22, c=colour, alpha=0.8)
+    front = sorted((r for r in mine if r["front"]), key=lambda r: r["p50_us"])  # type: ignore[arg-type,return-value]
+    axes.plot(_numbers(front, "p50_us"), _numbers(front, "error"), "k-", lw=1, label="front")
+    best = [r for r in mine if r["method"] == "SVD optimum"]
+    axes.plot(_numbers(best, "p50_us"), _numbers(best, "error"), "x--", c="#D55E00", lw=1)
+    if best:
+        axes.plot([], [], "x--", c="#D55E00", label="SVD optimum, no near field")
+    _scatter(axes, _of(mine, "dense table"), "p50_us", "dense table", marker="D", s=60, c="#E69F00")
+    for row in _of(mine, "direct solve"):
+        axes.axvline(row["p50_us"], color="#56B4E9", ls="-.", label="direct solve (exact)")  # type: ignore[arg-type]
+    axes.set_ylim(bottom=3e-3)
+    axes.plot(PERIOD_US, 0.10, "*", ms=14, c="#999999", mec="k", label="paper: 11 modes, 1 kHz")
+    axes.axvline(PERIOD_US, color="#888888", ls=":")
+    axes.text(PERIOD_US, axes.get_ylim()[0], " 1 ms", va="bottom", color="#555555")
+    axes.axhline(JND, color="#888888", ls=":")
+    axes.text(
+        0.99,
+        JND,
+        "7 %: just noticed of a force",
+        transform=axes.get_yaxis_transform(),
+        ha="right",
+        va="bottom",
+        color="#555555",
+    )
+    _logarithmic(axes, "time of a step, median [us]", "error that 95 % of fresh loads keep [-]")
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.set_title(f"{cloud}: error against time online")
+
+
+def _force(contacts: ForceErrors, axes: Axes) -> None:
+    error, estimate = contacts.error / contacts.force, contacts.estimate / contacts.force
+    axes.scatter(error, estimate, s=6, c="#0072B2", alpha=0.5, label="unseen contacts")
+    ends = np.array([1e-4, 1.0])
+    axes.plot(ends, ends, "k-", lw=1, label="said = true")
+    axes.plot(ends, 3 * ends, "k:", lw=1, label="said = 3 x true")
+    axes.axhline(JND, color="#888888", ls=":")
+    axes.text(1.1e-4, JND, "7 %: just noticed", va="bottom", color="#555555")
+    axes.set_xlim(1e-4, 1.0)
+    _logarithmic(axes, "true error of the force [-]", "error said with the force [-]")
+    axes.set_title("the error that goes with the force")
+
+
+def _effects(rows: list[dict[str, Value]], axes: Axes) -> None:
+    mine = [r for r in rows if r["stage"] == "effects"]
+    names = [str(r["method"]) for r in mine]
+    axes.barh(names, _numbers(mine, "p99_us"), color="#56B4E9", label="p99")
+    axes.barh(names, _numbers(mine, "p50_us"), color="#0072B2", label="median")
+    axes.invert_yaxis()
+    axes.set_xlabel("time of a step [us]; the period is 1000 us")
+    axes.legend(loc="lower right", fontsize=8)
+    axes.set_title("what each effect costs")
+
+
+def _offline(rows: list[dict[str, Value]], stages: tuple[str, ...], axes: Axes) -> None:
+    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+    mine = [r for r in rows if r["stage"] in stages]
+    for colour, (stage, method) in zip(
+        colours, dict.fromkeys((r["stage"], r["method"]) for r in mine), strict=False
+    ):
+        some = [r for r in mine if (r["stage"], r["method"]) == (stage, method)]
+        some.sort(key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
+        seconds, errors = _numbers(some, "cpu_seconds"), _numbers(some, "error")
+        label = method if len(stages) == 1 else _QUANTITIES[str(stage)]
+        axes.plot(seconds, errors, "o-" if len(some) > 1 else "o", c=colour, label=label)
+        for k, row in enumerate(some):
+            axes.annotate(
+                str(row["setting"]).split(", ")[-1],
+                (seconds[k], errors[k]),
+                xytext=(-4 if k % 2 else 4, 4),  # neighbours beside each other stay readable
+                ha="right" if k % 2 else "left",
+                textcoords="offset points",
+                fontsize=7,
+            )
+        if stage == "mesh":
+            own = _numbers(some, "vademecum_error")
+            axes.plot(seconds, own, "s--", c=colour, label="vademecum, on the same mesh")
+    axes.margins(x=0.15)
+    _logarithmic(axes, "CPU time [s]", "error [-]")
+    axes.set_title(" and ".join(stages))
+
+
+def _numbers(rows: list[dict[str, Value]], key: str) -> list[float]:
+    return [float(row[key]) for row in rows]  # type: ignore[arg-type]
+
+
+def _of(rows: list[dict[str, Value]], method: str) -> list[dict[str, Value]]:
+    return [row for row in rows if row["method"] == method]
+
+
+def _scatter(
+    axes: Axes, rows: list[dict[str, Value]], key: str, label: str | None, **style: Any
+) -> None:
+    if rows:
+        axes.scatter(_numbers(rows, key), _numbers(rows, "error"), label=label, **style)
+
+
+def _logarithmic(axes: Axes, x: str, y: str) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(True, which="both", lw=0.3)
+    axes.legend(fontsize=7)
+
+
+def _overview(panels: tuple[Panel, ...], figure: Figure) -> None:
+    for axes, panel in zip(
+        np.ravel(figure.subplots(1, 3)), (panels[0], panels[2], panels[3]), strict=True
+    ):
+        panel.draw(axes)

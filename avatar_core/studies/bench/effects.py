@@ -1,0 +1,163 @@
+"""``avatar bench effects``: what each effect of a scene costs in a step, all in one run.
+
+Every effect stands alone against the bare scene, in alternating slides so that both see the same
+machine; the bare scene stands against a linear step that was fused by hand into one function
+(:mod:`avatar_core.studies.bench.fused`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from avatar_core.contact.effects import (
+    Effect,
+    Friction,
+    Inertia,
+    LargeDeformationEffect,
+    Respiration,
+    SelfWeight,
+    SeveralTools,
+    Viscoelasticity,
+)
+from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.patch_loads import load_surface
+from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.offline.large_deformation import (
+    LargeRule,
+    hyperelastic_problem,
+    with_large_deformation,
+)
+from avatar_core.offline.linear import build_vademecum
+from avatar_core.offline.rule import BuildRule, Progress
+from avatar_core.studies.bench.fused import fused_ratios
+from avatar_core.studies.bench.methods import SPHERE, one_pass, tool_paths
+from avatar_core.vademecum.model import Provenance, Vademecum
+
+ROUNDS = 7  # pairs of slides; other processes disturb some of them
+N_STEPS = 1500
+
+# One tool each, but where there must be two; the breath is too small to lift the organ off the tip.
+Case = tuple[str, int, tuple[Effect, ...]]  # name, tools, effects
+CASES: tuple[Case, ...] = (
+    ("large_deformation", 1, (LargeDeformationEffect(),)),
+    ("friction", 1, (Friction(),)),
+    ("viscoelasticity", 1, (Viscoelasticity((0.3, 0.25), (0.5, 8.0)),)),
+    ("inertia", 1, (Inertia(),)),
+    ("self_weight", 1, (SelfWeight(gravity=1.0),)),
+    ("respiration", 1, (Respiration(amplitude=1e-3),)),
+    ("several_tools", 2, (SeveralTools(),)),
+)
+EVERYTHING = tuple(effect for _, _, effects in CASES for effect in effects)
+
+
+@dataclass(frozen=True)
+class EffectRow:
+    """Step times of one scene.
+
+    p50_us, p99_us : medians over the rounds [us]; ratio : of p50 to the bare scene's in the same
+        rounds, their median
+    contacts_mean : active contacts in the steps that were timed
+    bytes : constant arrays of the model
+    """
+
+    scene: str
+    tools: int
+    contacts_mean: float
+    p50_us: float
+    p99_us: float
+    ratio: float
+    bytes: int
+
+
+def build_for_effects(
+    surface: SurfaceMesh, n_vertices: int, modes: int, progress: Progress
+) -> Vademecum:
+    """A vademecum of exactly so many modes that serves all effects (minutes)."""
+    rule = BuildRule(
+        tolerance=1e-9, max_modes=modes, oversampling=1.2, most_oversampling=1.2, near_growth=1.0
+    )
+    mesh = tetrahedralize(surface, n_vertices)
+    regions = regions_by_rule(mesh)
+    elasticity = Elasticity(mesh, Material(), regions.clamped)
+    loads = load_surface(mesh, regions)
+    provenance = Provenance(surface.name, surface.source_sha256)
+    linear = build_vademecum(surface.name, elasticity, regions, loads, rule, provenance, progress)
+    problem = hyperelastic_problem(linear, "neo-hookean")
+    return with_large_deformation(linear, problem, "neo-hookean", LargeRule(), rule, progress)
+
+
+def run_effects_bench(
+    vademecum: Vademecum, fused: Path | None, progress: Callable[[str], None]
+) -> tuple[list[EffectRow], dict[str, float]]:
+    """Rows and summary.
+
+    Parameters
+    ----------
+    fused : file with the step fused by hand; None leaves ``bare_ratio`` out
+    """
+    rows = effect_rows(vademecum, (*CASES, ("everything", 2, EVERYTHING)), progress)
+    summary = {
+        "worst_single_ratio": max(row.ratio for row in rows[1:-1]),
+        "everything_p99_us": rows[-1].p99_us,
+    }
+    if fused is not None:
+        progress("fused by hand")
+        linear = replace(vademecum, large=None)
+        ratios = fused_ratios(linear, tool_paths(linear, 1, N_STEPS), fused)
+        spread = {"bare_ratio_least": min(ratios), "bare_ratio_most": max(ratios)}
+        summary = {"bare_ratio": float(np.median(ratios)), **spread, **summary}
+    return rows, summary
+
+
+def effect_rows(
+    vademecum: Vademecum, cases: Sequence[Case], progress: Callable[[str], None] = lambda name: None
+) -> list[EffectRow]:
+    """The bare scene, then each case against it."""
+    progress("bare")
+    bare, path = _bare(vademecum)
+    rows = [_row("bare", bare, bare, path[1], path[1])]
+    for name, n_tools, effects in cases:
+        progress(name)
+        model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume", effects=effects)
+        rows.append(_row(name, model, bare, path[n_tools], path[1]))
+    return rows
+
+
+def _bare(vademecum: Vademecum) -> tuple[ContactModel, dict[int, np.ndarray]]:
+    """The scene without effects, and slides of one and two tools."""
+    linear = replace(vademecum, large=None)
+    bare = prepare(linear, (SPHERE,), cloud="volume", effects=())
+    return bare, {n: tool_paths(linear, n, N_STEPS) for n in (1, 2)}
+
+
+def _row(
+    name: str, model: ContactModel, bare: ContactModel, path: np.ndarray, bare_path: np.ndarray
+) -> EffectRow:
+    own, ratio, contacts = [], [], []
+    for _ in range(ROUNDS):
+        micro, touching = _slide(model, path)
+        contacts.append(touching.mean())
+        own.append((np.median(micro), np.quantile(micro, 0.99)))
+        ratio.append(own[-1][0] / np.median(_slide(bare, bare_path)[0]))
+    p50, p99 = np.median(own, axis=0)
+    return EffectRow(
+        name,
+        model.n_tools,
+        float(np.mean(contacts)),
+        float(p50),
+        float(p99),
+        float(np.median(ratio)),
+        model.nbytes,
+    )
+
+
+def _slide(model: ContactModel, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times [us] and contacts of one slide over an organ at rest."""
+    model.reset()
+    return one_pass(model, path, lambda tips: step(model, tips))

@@ -1,0 +1,226 @@
+"""Does this machine hold 1 kHz? Step times beside the honest rivals, in one run.
+
+Rivals: the dense table (all columns stored, same contact solve) and a prefactored direct solve.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from avatar_core.contact import kernels
+from avatar_core.contact.cloud_kernels import write_cloud
+from avatar_core.contact.effects import several_tools as coupling
+from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.contact.tip_compliance import assemble_own, near_along_normal
+from avatar_core.contact.tool_path import slide, starts_apart
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.vademecum.model import Vademecum
+
+SPHERE, DEPTH = 10e-3, 5e-3  # [m] the benchmark's tip and how deep it slides
+PASSES = 5  # slides that are timed; other processes disturb some of them
+MAX_TABLE_BYTES = 2_000_000_000
+
+Clock = Callable[[], float]  # in seconds
+
+
+@dataclass(frozen=True)
+class StepRow:
+    """Step times of one method.
+
+    p50_us, p99_us : of the whole step, contact and full field, medians over five slides [us]; NaN
+        if it does not fit
+    contacts_mean, contacts_min : active contacts in the steps that were timed
+    """
+
+    method: str
+    vertices: int
+    modes: int
+    tools: int
+    contacts_mean: float
+    contacts_min: int
+    p50_us: float
+    p99_us: float
+    bytes: int
+
+
+def time_steps(vademecum: Vademecum, n_tools: int) -> StepRow:
+    """Slide ``n_tools`` spheres of 10 mm, 5 mm deep, with the field at all vertices."""
+    model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume")
+    rank = vademecum.far.rank
+    return _timed("vademecum", vademecum, model, rank, n_tools, lambda tips: step(model, tips))
+
+
+def time_dense_table(
+    vademecum: Vademecum, n_tools: int, clock: Clock = time.perf_counter
+) -> StepRow:
+    """The same contacts and field from stored columns."""
+    n_v, n_s = len(vademecum.mesh.vertices), vademecum.surface.n_positions
+    size = 4 * 9 * n_s * (n_v + n_s)
+    if size > MAX_TABLE_BYTES:
+        nan = float("nan")
+        return StepRow("dense table", n_v, 0, n_tools, nan, 0, nan, nan, size)
+    model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume")
+    load = vademecum.far.load.reshape(n_s, 3, -1)
+    columns = _dense(vademecum.far.space, load, vademecum.near, n_v).reshape(n_s, 3, 3 * n_v)
+    compliance = _dense(vademecum.far.load, load, vademecum.contact_near, n_s)
+
+    def dense(tips: np.ndarray) -> None:
+        e = model.effects
+        _dense_step(
+            model.arrays, model.state, model.out, tips, e.reply, e.several, columns, compliance
+        )
+
+    row = _timed("dense table", vademecum, model, 0, n_tools, dense, clock)
+    return StepRow(**{**row.__dict__, "bytes": columns.nbytes + compliance.nbytes})
+
+
+def time_direct(
+    elasticity: Elasticity, vademecum: Vademecum, n: int = 40, clock: Clock = time.perf_counter
+) -> StepRow:
+    """One back-substitution with the stored factor per step, one contact."""
+    surface = vademecum.surface
+    loads = patch_loads(elasticity, surface.centers[:n], surface.patch_radius).toarray()
+    elasticity.solve(loads[:, :1])
+    times = []
+    for k in range(n):
+        start = clock()
+        elasticity.solve(loads[:, 3 * k : 3 * k + 1])
+        times.append(clock() - start)
+    micro = np.array(times) * 1e6
+    return StepRow(
+        f"direct solve ({elasticity.element})",
+        len(vademecum.mesh.vertices),
+        0,
+        1,
+        1.0,
+        1,
+        float(np.median(micro)),
+        float(np.quantile(micro, 0.99)),
+        elasticity.factor_bytes,
+    )
+
+
+def load_average() -> float:
+    """Processes that compete for the machine, one-minute mean."""
+    return os.getloadavg()[0]
+
+
+def _timed(
+    method: str,
+    vademecum: Vademecum,
+    model: ContactModel,
+    modes: int,
+    n_tools: int,
+    call: Callable[[np.ndarray], object],
+    clock: Clock = time.perf_counter,
+) -> StepRow:
+    tips = tool_paths(vademecum, n_tools)
+    passes = [one_pass(model, tips, call, clock) for _ in range(PASSES)]
+    contacts = np.concatenate([contacts for _, contacts in passes])
+    return StepRow(
+        method,
+        len(vademecum.mesh.vertices),
+        modes,
+        n_tools,
+        float(contacts.mean()),
+        int(contacts.min()),
+        float(np.median([np.median(micro) for micro, _ in passes])),
+        float(np.median([np.quantile(micro, 0.99) for micro, _ in passes])),
+        model.nbytes,
+    )
+
+
+def one_pass(
+    model: ContactModel,
+    tips: np.ndarray,
+    call: Callable[[np.ndarray], object],
+    clock: Clock = time.perf_counter,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times [us] and contacts of the steps of one path in which all tools touch.
+
+    tips : ndarray, shape (n, n_tools, 3) [m]
+    clock : of the wall, or of the processor [s]
+    """
+    times = np.empty(len(tips))
+    contacts = np.empty(len(tips), int)
+    for k in range(len(tips)):
+        start = clock()
+        call(tips[k])
+        times[k] = clock() - start
+        contacts[k] = model.out.n_contacts[0]
+    kept = (np.arange(len(tips)) >= 200) & (contacts >= tips.shape[1])  # caches are warm by then
+    return times[kept] * 1e6, contacts[kept]
+
+
+def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000) -> np.ndarray:
+    """Slides that start far apart, shape (n, n_tools, 3)."""
+    starts = starts_apart(vademecum, n_tools)
+    paths = [slide(vademecum, SPHERE, DEPTH, n * 1e-4, position=start) for start in starts]
+    return np.ascontiguousarray(np.stack(paths, axis=1))
+
+
+def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: int) -> np.ndarray:
+    """All columns, shape (n_positions, 3, n_targets, 3): direction, target, component."""
+    n, _, rank = load.shape
+    dense = (load.reshape(-1, rank) @ space.T).reshape(n, 3, n_targets, 3)
+    for j in range(n):
+        row = slice(near.start[j], near.start[j + 1])
+        dense[j][:, near.target[row]] += near.block[row].transpose(2, 0, 1)
+    return np.ascontiguousarray(dense, dtype=np.float32)
+
+
+@njit(cache=True, fastmath=True)
+def _dense_step(model, state, out, tips, reply, several, columns, compliance):  # type: ignore[no-untyped-def]
+    """:func:`contact_kernels.contact_step` with stored columns instead of modes."""
+    n_tools = tips.shape[0]
+    for t in range(n_tools):
+        kernels.locate(model, state, t, tips[t], reply)
+        state.mode[t] = np.float32(0.0)
+        if not state.active[t]:
+            state.force[t] = 0.0
+            continue
+        _dense_column(state, t, t, compliance, state.column[t])
+        near = near_along_normal(state, t, state.column[t])
+        assemble_own(model, state, t, near)
+    if several is not None:
+        for t in range(n_tools):
+            for s in range(n_tools):
+                several.near[t, s] = s != t
+                if s != t and state.active[t] and state.active[s]:
+                    _dense_column(state, t, s, compliance, several.column[t, s])
+    if several is not None:
+        coupling.assemble(state, reply, several)
+        kernels.solve_together(state, reply, several, None)
+    else:
+        kernels.solve_alone(state, reply)
+    kernels.write_forces(model, state, out, tips, reply, several, None, None, None)
+    u = state.field[: 3 * out.cloud.shape[0]]
+    u[:] = np.float32(0.0)
+    for t in range(n_tools):
+        for i in range(state.n_nodes[t] if state.force[t] > 0.0 else 0):
+            force = -state.weight[t, i, 0] * state.scale[t] * state.force[t]
+            for c in range(3):
+                row, f = columns[state.nodes[t, i], c], np.float32(force * state.normal[t, c])
+                for k in range(u.shape[0]):
+                    u[k] += f * row[k]
+    write_cloud(model.rest, u, out.cloud)
+
+
+@njit(cache=True, fastmath=True)
+def _dense_column(state, t, s, compliance, column):  # type: ignore[no-untyped-def]
+    column[: state.n_nodes[s]] = 0.0
+    for i in range(state.n_nodes[t]):
+        for c in range(3):
+            row = compliance[state.nodes[t, i], c]
+            f = state.weight[t, i, 0] * state.normal[t, c]
+            for q in range(state.n_nodes[s]):
+                for d in range(3):
+                    column[q, d] += f * row[state.nodes[s, q], d]

@@ -1,0 +1,134 @@
+"""What a step of a scene costs on this machine, beside the bare step of the same vademecum."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avatar_core.contact.layout import lay_out
+from avatar_core.contact.model import ContactModel, make_model, step
+from avatar_core.contact.tool_path import push_and_slide, starts_apart
+from avatar_core.scene.model import Scene
+from avatar_core.studies.bench.methods import PASSES, one_pass
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.model import Vademecum
+
+PUSH, DEPTH = 10e-3, 5e-3  # [m] how deep the tools push, and slide
+STEPS = 3600  # of one pass
+
+Waiting = Callable[[str], AbstractContextManager[object]]
+
+
+@dataclass(frozen=True)
+class StepCost:
+    """One compiled step.
+
+    p50_us, p99_us : of the whole step, forces and cloud, medians over the passes [us]; NaN if the
+        tools never touch at once
+    n_steps : timed, those in which all tools touch
+    bytes : of the model
+    layout_seconds, compile_seconds : what it takes to prepare; numba keeps what it has compiled
+    """
+
+    name: str
+    p50_us: float
+    p99_us: float
+    n_steps: int
+    bytes: int
+    layout_seconds: float
+    compile_seconds: float
+
+
+def time_scene(
+    vademecum: Vademecum, scene: Scene, waiting: Waiting = lambda text: nullcontext()
+) -> tuple[StepCost, ...]:
+    """The bare step, of the first tool without any effect, and the scene's own, pass by pass.
+
+    The tools push 10 mm deep, then slide 5 mm deep; with a breath they follow the organ.
+
+    Parameters
+    ----------
+    vademecum : Vademecum, of which ``scene.require`` has approved
+    scene : Scene; one that is bare is timed once
+    waiting : entered with a text for what takes long
+    """
+    bare = replace(scene, tools=scene.tools[:1], effects=())
+    chosen = {"bare": bare, "scene": scene}
+    if not scene.effects:
+        del chosen["scene"]
+    prepared = []
+    for name, one in chosen.items():
+        with waiting(f"preparing and compiling the step, {name}"):
+            prepared.append(_prepared(vademecum, one, name))
+    with waiting("timing"):
+        passes = [[ready.timed() for ready in prepared] for _ in range(PASSES)]
+    return tuple(
+        ready.cost(times) for ready, times in zip(prepared, zip(*passes, strict=True), strict=True)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """A model and the ways of its tools, shape (n, n_tools, 3)."""
+
+    name: str
+    model: ContactModel
+    tips: np.ndarray
+    layout_seconds: float
+    compile_seconds: float
+
+    def timed(self) -> np.ndarray:
+        """Times of one pass from rest [us]."""
+        self.model.reset()
+        return one_pass(self.model, self.tips, lambda tips: step(self.model, tips))[0]
+
+    def cost(self, times: Sequence[np.ndarray]) -> StepCost:
+        """The medians over the passes."""
+        touched = [micro for micro in times if len(micro)]
+        p50, p99 = (
+            float(np.median([np.quantile(micro, q) for micro in touched] or [np.nan]))
+            for q in (0.5, 0.99)
+        )
+        return StepCost(
+            self.name,
+            p50,
+            p99,
+            sum(map(len, times)),
+            self.model.nbytes,
+            self.layout_seconds,
+            self.compile_seconds,
+        )
+
+
+def _prepared(vademecum: Vademecum, scene: Scene, name: str) -> _Prepared:
+    start = time.perf_counter()
+    radii = tuple(tool.tip_radius for tool in scene.tools)
+    chosen = at_values(vademecum, scene.values)
+    layout = lay_out(chosen, radii, scene.modes, scene.cloud, scene.effects)
+    laid_out = time.perf_counter()
+    model = make_model(layout)
+    compiled = time.perf_counter()
+    starts = starts_apart(vademecum, len(radii))
+    paths = [
+        push_and_slide(vademecum, radius, PUSH, DEPTH, STEPS, at)
+        for radius, at in zip(radii, starts, strict=True)
+    ]
+    tips = _followed(model, np.ascontiguousarray(np.stack(paths, axis=1)))
+    return _Prepared(name, model, tips, laid_out - start, compiled - laid_out)
+
+
+def _followed(model: ContactModel, tips: np.ndarray) -> np.ndarray:
+    """The same ways on an organ that breathes: where it is in each period, from rest."""
+    motion = model.effects.motion
+    if motion is None:
+        return tips
+    model.reset()
+    out = tips.copy()
+    for k in range(len(tips)):
+        step(model, tips[k])
+        out[k] += motion.shift
+    return out

@@ -1,0 +1,424 @@
+"""What each extra coordinate costs and how wrong it is: Poisson's ratio, tumour, large pushes.
+
+All errors are on loads at face centroids and on values that no build has seen, against full finite
+elements on the same mesh. Beside the default (one space basis and a small Galerkin system for every
+value) stands the canonical PGD in all coordinates at once, by Galerkin's and by the minimal
+residual's weak form, both without a near field, as the default has one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
+from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
+from avatar_core.geometry.mesh import Regions, regions_by_rule, tetrahedralize
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.tumour import read_tumour, share_inside
+from avatar_core.offline.certify.combinations import COMBINATIONS, push_errors
+from avatar_core.offline.certify.large_deformation import certify_large
+from avatar_core.offline.large_deformation import (
+    LINEAR_RULE,
+    LargeRule,
+    hyperelastic_problem,
+    with_large_deformation,
+)
+from avatar_core.offline.linear import build_vademecum, with_rank
+from avatar_core.offline.parametric import build_parametric_vademecum, certify_range
+from avatar_core.offline.rule import BuildRule, Progress
+from avatar_core.reduction.affine import AffineProblem, Samples
+from avatar_core.reduction.affine_elasticity import affine_problem
+from avatar_core.reduction.coordinates import Coordinate, problem_at
+from avatar_core.reduction.pgd_parametric import PGDRule, minimal_residual, solve_pgd
+from avatar_core.studies.bench.methods import time_steps
+from avatar_core.studies.shapes import DEFAULT_FOLDER, read_liver
+from avatar_core.studies.study import Parts, Study, Value
+from avatar_core.studies.unseen import canonical_at, errors, unseen
+from avatar_core.vademecum.large_deformation import LargeMaterial
+from avatar_core.vademecum.model import Provenance, Vademecum
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PAPER: dict[str, Value] = {"large_build_cpu_seconds": "3 to 4 days"}
+TUMOUR_FOLDER = DEFAULT_FOLDER.parent / "tumour"
+TUMOUR_AXES = "LPS"  # as they lie against the phantom; the files do not say
+RANKS = (10, 25, 50, 100)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Vertices of the meshes and of those that the canonical forms are compared on; unseen loads.
+
+    n_canonical : products at most; n_pushed : sites of large pushes; n_combined : of combinations
+    """
+
+    n_vertices: int = 2850
+    n_vertices_canonical: int = 1000
+    n_loads: int = 160
+    n_canonical: int = 60
+    n_pushed: int = 12
+    n_combined: int = 4
+
+
+FULL = Plan()
+QUICK = Plan(1000, 700, 48, 20, 3, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Organ:
+    """A meshed organ, ready for a build."""
+
+    name: str
+    regions: Regions
+    loads: LoadSurface
+    elasticity: Elasticity
+
+
+def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
+    """The study: LiTS-4 and LiTS-23, and the liver with real tumours if it is there."""
+    one, other = read_liver(surfaces, "LiTS-4"), read_liver(surfaces, "LiTS-23")
+    return study(one, other, QUICK if quick else FULL)
+
+
+def study(one: SurfaceMesh, other: SurfaceMesh, plan: Plan) -> Study:
+    """All coordinates on the first organ, Poisson's ratio on both."""
+    poisson = (Coordinate("poisson", 0.40, 0.49),)
+    incompressible = (Coordinate("poisson", 0.40, 0.499),)
+    rows: list[dict[str, Value]] = []
+    with Parts(8) as parts:
+        for surface in (one, other) if one.name != other.name else (one,):
+            progress = parts.part(f"Poisson's ratio, {surface.name}")
+            organ = _organ(surface, plan.n_vertices)
+            rows += _parametric(organ, "poisson", poisson, plan, progress)
+        progress = parts.part("towards incompressibility")
+        organ = _organ(one, plan.n_vertices, "Taylor-Hood")
+        rows += _parametric(organ, "incompressible", incompressible, plan, progress)
+        rows += _tumour_rows(plan, parts.part("tumour"))
+        for name, coordinates, element in (
+            ("poisson", poisson, "P2"),
+            ("incompressible", incompressible, "Taylor-Hood"),
+        ):
+            progress = parts.part(f"canonical PGD, {name}")
+            small = _organ(one, plan.n_vertices_canonical, element)  # type: ignore[arg-type]
+            rows += _canonical(small, name, coordinates, plan, progress)
+        large = _organ(one, plan.n_vertices)
+        rows += _large(large, "neo-hookean", plan, parts.part("neo-Hookean"))
+        rows += _large(large, "st-venant-kirchhoff", plan, parts.part("St Venant-Kirchhoff"))
+    summary = _summary(rows)
+    return Study(
+        name="coordinates",
+        sentence=_sentence(summary),
+        summary=summary,
+        rows=tuple(rows),
+        paper=PAPER,
+        draw=lambda figure: _draw(figure, rows),
+        notices=(f"{one.name} and {other.name}",),
+    )
+
+
+def _organ(
+    surface: SurfaceMesh,
+    n_vertices: int,
+    element: Element | None = None,
+    tumour: Path | None = None,
+) -> Organ:
+    mesh = tetrahedralize(surface, n_vertices)
+    regions = regions_by_rule(mesh)
+    inclusion = None
+    if tumour is not None:
+        inclusion = Inclusion(share_inside(mesh, read_tumour(tumour, axes=TUMOUR_AXES)), 1.0)
+    material = Material()
+    elasticity = Elasticity(mesh, material, regions.clamped, element, inclusion)
+    return Organ(surface.name, regions, load_surface(mesh, regions), elasticity)
+
+
+# --- coordinates of the material ----------------------------------------------------------------
+
+
+def _parametric(
+    organ: Organ,
+    name: str,
+    coordinates: tuple[Coordinate, ...],
+    plan: Plan,
+    progress: Progress,
+) -> list[dict[str, Value]]:
+    """Errors of the default against modes, and the time of its build."""
+    start = time.process_time()
+    vademecum = build_parametric_vademecum(
+        organ.name,
+        organ.elasticity,
+        organ.regions,
+        organ.loads,
+        coordinates,
+        BuildRule(),
+        Provenance(organ.name, ""),
+        progress,
+    )
+    seconds = time.process_time() - start
+    assert vademecum.parametric is not None
+    rows = []
+    for rank in RANKS:
+        fewer = replace(vademecum, parametric=replace(vademecum.parametric, rank=rank))
+        n_loads = plan.n_loads if rank == RANKS[-1] else plan.n_loads // 2
+        c = certify_range(fewer, organ.elasticity, n_loads, seed=1)
+        found = {
+            "l2_mean": c.l2_mean,
+            "l2_worst": c.l2_worst,
+            "contact_mean": c.contact_mean,
+            "contact_worst": c.contact_worst,
+        }
+        rows.append(_row(name, organ, "default", rank, found, seconds))
+    return rows
+
+
+def _tumour_rows(plan: Plan, progress: Progress) -> list[dict[str, Value]]:
+    """Poisson's ratio and the contrast of real tumours together."""
+    liver, tumour = TUMOUR_FOLDER / "liver.vtk", TUMOUR_FOLDER / "liver_tumours.vtk"
+    if not liver.is_file():
+        return []
+    organ = _organ(read_surface(liver, axes=TUMOUR_AXES), plan.n_vertices, tumour=tumour)
+    coordinates = (Coordinate("poisson", 0.40, 0.49), Coordinate("contrast", 0.5, 20.0))
+    return _parametric(organ, "tumour", coordinates, plan, progress)
+
+
+def _canonical(
+    organ: Organ,
+    name: str,
+    coordinates: tuple[Coordinate, ...],
+    plan: Plan,
+    progress: Progress,
+) -> list[dict[str, Value]]:
+    """The canonical forms and the default's far field on one small mesh."""
+    elasticity, surface = organ.elasticity, organ.loads
+    middle = problem_at(elasticity, {c.name: c.value_at(0.5) for c in coordinates})
+    loads = patch_loads(middle, surface.centers, surface.patch_radius)
+    norm = _norms(middle, loads)
+    problem = affine_problem(middle, loads, coordinates, 1.0 / norm**2)
+    cases = unseen(elasticity, surface, coordinates, 4, max(4, plan.n_loads // 8))
+    rows = _parametric(organ, f"{name}, small mesh", coordinates, plan, progress)
+    for method, form in (("canonical, Galerkin", problem), ("canonical, minimal residual", None)):
+        start = time.process_time()
+        rule = PGDRule(
+            plan.n_canonical, 1e-4, max_sweeps=4, sweep_tolerance=0.1, solve_tolerance=1e-2
+        )
+
+        def enriched(rank: int, residual: float, method: str = method) -> None:
+            progress(method, rank / plan.n_canonical, residual)
+
+        affine = minimal_residual(problem) if form is None else form
+        found = solve_pgd(affine, rule, progress=enriched)
+        seconds = time.process_time() - start
+        for rank in sorted({r for r in RANKS if r < found.field.rank} | {found.field.rank}):
+            some = canonical_at(found.field.truncate(rank), coordinates)
+            row = _row(f"{name}, small mesh", organ, method, rank, errors(cases, some), seconds)
+            rows.append({**row, "outcome": found.outcome.value, **_estimates(problem, found, rank)})
+    return rows
+
+
+def _estimates(problem: AffineProblem, found, rank: int) -> dict[str, float]:  # type: ignore[no-untyped-def]
+    """The residual-based estimates, of the whole field only."""
+    if rank < found.field.rank:
+        return {}
+    reference = np.ones(len(problem.terms))
+    for factors in problem.factors:
+        reference = reference * factors[:, factors.shape[1] // 2]
+    estimate = Samples(problem, 24, seed=2).estimate(found.field, reference)
+    return {
+        "estimated_residual": estimate.residual,
+        "estimated_contact": estimate.contact,
+        "bound_contact": estimate.contact_bound,
+    }
+
+
+def _norms(elasticity: Elasticity, loads) -> np.ndarray:  # type: ignore[no-untyped-def]
+    mass = np.repeat(elasticity.mesh.vertex_volumes, 3)[:, None]
+    out = np.empty(loads.shape[1])
+    by_column = loads.tocsc()
+    for first in range(0, loads.shape[1], 300):
+        block = slice(first, min(first + 300, loads.shape[1]))
+        solution = elasticity.at_vertices(elasticity.solve(by_column[:, block]))
+        out[block] = np.sqrt((mass * solution**2).sum(axis=0))
+    return out
+
+
+def _row(
+    name: str, organ: Organ, method: str, modes: int, found: dict[str, float], seconds: float
+) -> dict[str, Value]:
+    return {
+        "coordinate": name,
+        "organ": organ.name,
+        "method": method,
+        "modes": modes,
+        **found,
+        "build_cpu_seconds": seconds,
+    }
+
+
+# --- large deformation --------------------------------------------------------------------------
+
+
+def _large(
+    organ: Organ, material: LargeMaterial, plan: Plan, progress: Progress
+) -> list[dict[str, Value]]:
+    """One material: its summary, every push, and combinations of neo-Hookean ones."""
+    start = time.process_time()
+    linear = build_vademecum(
+        organ.name,
+        organ.elasticity,
+        organ.regions,
+        organ.loads,
+        LINEAR_RULE,
+        Provenance("", ""),
+        progress,
+    )
+    problem = hyperelastic_problem(linear, material)
+    bent = with_large_deformation(linear, problem, material, LargeRule(), LINEAR_RULE, progress)
+    seconds = time.process_time() - start
+
+    def pushed(share: float, error: float) -> None:
+        progress("push", share, error)
+
+    certificate, found = certify_large(bent, problem, plan.n_pushed, seed=1, progress=pushed)
+    summary: dict[str, Value] = {
+        "coordinate": f"large, {material}",
+        "organ": organ.name,
+        "method": "default",
+        "modes": bent.large.space.shape[1] if bent.large else 0,
+        "build_cpu_seconds": seconds,
+        **vars(certificate),
+    }
+    rows: list[dict[str, Value]] = [summary]
+    rows += [{"coordinate": f"push, {material}", **vars(row)} for row in found]
+    if material == "neo-hookean":
+        summary["step_over_linear"] = _pace(linear, bent)
+        depths = (5e-3, 10e-3, 15e-3)
+
+        def combined(share: float) -> None:
+            progress("combine", share, certificate.l2_mean)
+
+        together = push_errors(bent, problem, depths, plan.n_combined, 2, True, combined)
+        rows += [{"coordinate": "combination", **vars(row)} for row in together]
+    return rows
+
+
+def _pace(linear: Vademecum, bent: Vademecum, modes: int = 50) -> float:
+    """Time of a step with large deformation over that without, the same linear modes; medians."""
+    rule = BuildRule()
+    times = [time_steps(with_rank(one, modes, rule), 1).p50_us for one in (linear, bent)]
+    return times[1] / times[0]
+
+
+# --- summary ------------------------------------------------------------------------------------
+
+
+def _summary(rows: Sequence[dict[str, Value]]) -> dict[str, float]:
+    """The study's keys; worst of both livers where there are two."""
+    summary: dict[str, float] = {}
+    for name in ("poisson", "incompressible", "tumour"):
+        best = [row for row in rows if (row["coordinate"], row.get("modes")) == (name, RANKS[-1])]
+        for key, source in (("mean", "l2_mean"), ("worst", "l2_worst"), ("contact_mean",) * 2):
+            values = [float(row[source]) for row in best]  # type: ignore[arg-type]
+            summary[f"{name}_{key}"] = max(values, default=float("nan"))
+        seconds = [float(row["build_cpu_seconds"]) for row in best]  # type: ignore[arg-type]
+        summary[f"{name}_build_cpu_seconds"] = max(seconds, default=float("nan"))
+    summary |= _canonical_summary(rows)
+    for name, key in (("neo-hookean", "large"), ("st-venant-kirchhoff", "stvk")):
+        (row,) = (row for row in rows if row["coordinate"] == f"large, {name}")
+        for ours, theirs in (
+            ("mean", "l2_mean"),
+            ("worst", "l2_worst"),
+            ("contact_mean", "contact_mean"),
+            ("depth", "depth"),
+            ("build_cpu_seconds", "build_cpu_seconds"),
+        ):
+            summary[f"{key}_{ours}"] = float(row[theirs])  # type: ignore[arg-type]
+        if "step_over_linear" in row:
+            summary["large_step_over_linear"] = float(row["step_over_linear"])  # type: ignore[arg-type]
+    deep = [
+        row
+        for row in rows
+        if row["coordinate"] == "push, neo-hookean"
+        and row["within"]
+        and 0.0125 < float(row["depth"]) < 0.0175  # type: ignore[arg-type]
+    ]
+    ratio = [float(row["linear_l2"]) / float(row["l2"]) for row in deep]  # type: ignore[arg-type]
+    summary["linear_over_large_15mm"] = float(np.mean(ratio)) if ratio else float("nan")
+    for name in COMBINATIONS:
+        found = [row for row in rows if row.get("combination") == name]
+        for key in ("contact", "linear_contact"):
+            values = [float(row[key]) for row in found]  # type: ignore[arg-type]
+            mean = float(np.mean(values)) if values else float("nan")
+            summary[f"{name.replace(' ', '_')}_{key}_mean"] = mean
+    return summary
+
+
+def _canonical_summary(rows: Sequence[dict[str, Value]]) -> dict[str, float]:
+    out = {}
+    for name in ("poisson", "incompressible"):
+        for method, key in (
+            ("default", "default"),
+            ("canonical, Galerkin", "canonical"),
+            ("canonical, minimal residual", "minimal_residual"),
+        ):
+            found = [
+                row
+                for row in rows
+                if row["coordinate"] == f"{name}, small mesh" and row["method"] == method
+            ]
+            most = max(found, key=lambda row: int(row["modes"]))  # type: ignore[arg-type]
+            out[f"{name}_{key}_small_mesh_mean"] = float(most["l2_mean"])  # type: ignore[arg-type]
+    return out
+
+
+def _sentence(summary: dict[str, float]) -> str:
+    return (
+        f"Unseen loads and values: Poisson's ratio 0.40 to 0.49 {summary['poisson_mean']:.1%}, to "
+        f"0.499 {summary['incompressible_mean']:.1%}, with a tumour's contrast "
+        f"{summary['tumour_mean']:.1%}; neo-Hookean pushes {summary['large_mean']:.1%} (linear "
+        f"{summary['linear_over_large_15mm']:.1f} times as wrong at 15 mm). Canonical PGD "
+        f"on a small mesh: {summary['poisson_canonical_small_mesh_mean']:.0%} and "
+        f"{summary['incompressible_canonical_small_mesh_mean']:.0%}."
+    )
+
+
+def _draw(figure: Figure, rows: Sequence[dict[str, Value]]) -> None:
+    left, middle, right = figure.subplots(1, 3)
+    _draw_modes(
+        left, [row for row in rows if row["coordinate"] in ("poisson", "incompressible", "tumour")]
+    )
+    _draw_modes(middle, [row for row in rows if "small mesh" in str(row["coordinate"])])
+    left.set_title("default, paper size", fontsize=9)
+    middle.set_title("canonical PGD beside the default, small mesh", fontsize=9)
+    pushes = [row for row in rows if row["coordinate"] == "push, neo-hookean"]
+    for key, text, colour in (
+        ("linear_l2", "linear", "tab:gray"),
+        ("l2", "with magnitude", "crimson"),
+    ):
+        depth = [1e3 * float(row["depth"]) for row in pushes]  # type: ignore[arg-type]
+        right.semilogy(depth, [float(row[key]) for row in pushes], ".", color=colour, label=text)  # type: ignore[arg-type]
+    right.set(xlabel="depth of the push [mm]", ylabel="relative L2 error of displacement [-]")
+    right.set_title("neo-Hookean pushes, unseen", fontsize=9)
+    right.legend(fontsize=7)
+    right.grid(which="both", alpha=0.3)
+
+
+def _draw_modes(axis, rows: Sequence[dict[str, Value]]) -> None:  # type: ignore[no-untyped-def]
+    series = sorted({(str(r["coordinate"]), str(r["organ"]), str(r["method"])) for r in rows})
+    for name, organ, method in series:
+        some = [
+            r for r in rows if (r["coordinate"], r["organ"], r["method"]) == (name, organ, method)
+        ]
+        label = f"{name.removesuffix(', small mesh')}, {organ}: {method}"
+        axis.semilogy(
+            [r["modes"] for r in some], [r["l2_mean"] for r in some], "o-", ms=3, label=label
+        )
+    axis.set(xlabel="modes", ylabel="mean relative L2 error [-]")
+    axis.grid(which="both", alpha=0.3)
+    axis.legend(fontsize=6, loc="upper right")

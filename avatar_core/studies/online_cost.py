@@ -1,0 +1,240 @@
+"""Online accuracy against time: every detail of the curve, and its rivals, in one run.
+
+Errors are those that 95 % of fresh loads keep; times are whole steps on this machine.
+
+    vademecum      far field by PGD, exact near field, as a step shows it
+    SVD optimum    the best basis for 150 solved loads, judged on others; no near field
+    dense table    exact columns at the load positions, interpolated between them
+    direct solve   back-substitution with the stored factor; its error is zero by definition
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar_core.contact.effects import LargeDeformationEffect
+from avatar_core.errors import AccuracyError
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.offline.certify.linear import UnseenErrors
+from avatar_core.studies.bench.effects import CASES, effect_rows
+from avatar_core.studies.bench.methods import StepRow, time_dense_table, time_direct
+from avatar_core.studies.study import Value
+from avatar_core.vademecum.accuracy import (
+    CONTENT,
+    AccuracyCurve,
+    Budget,
+    CurvePoint,
+    Detail,
+    choose,
+    upper_quantile,
+)
+from avatar_core.vademecum.model import Vademecum
+
+ON_TIME = 1.3  # times the promised p99 that a fresh p99 may be
+N_SNAPSHOTS = 150  # loads, three directions each
+_BATCH = 40
+TOLERANCES, DEADLINES = (0.01, 0.05, 0.20), (100e-6, 1e-3)  # [-], [s]
+
+
+@dataclass(frozen=True, eq=False)
+class Promises:
+    """What was promised, and what fresh loads and fresh timings came to.
+
+    errors_kept : part of the pairs of a point and a fresh load within the promised error
+    points_kept : part of the points that 95 % of the fresh loads keep
+    times_kept : part of the points whose fresh p99 is within 1.3 of the promised one
+    """
+
+    errors_kept: float
+    points_kept: float
+    times_kept: float
+
+
+def promises(curve: AccuracyCurve, fresh: UnseenErrors, again: AccuracyCurve) -> Promises:
+    """Compare a curve with errors on fresh loads and with times taken later."""
+    shown = [point for point in curve.points if point.detail.cloud != "off"]
+    promised = np.array([point.l2 for point in shown])
+    kept = fresh.shown <= promised[:, None]
+    before = np.array([point.p99 for point in curve.points])
+    after = np.array([point.p99 for point in again.points])
+    return Promises(
+        float(kept.mean()),
+        float(np.mean(kept.mean(axis=1) >= CONTENT)),
+        float(np.mean(after <= ON_TIME * before)),
+    )
+
+
+def curve_rows(curve: AccuracyCurve) -> list[dict[str, Value]]:
+    """The points of a curve; on the front: none of the same cloud is both faster and better."""
+    front = {id(p) for cloud in ("surface", "volume") for p in curve.of(cloud).front()}
+    return [_row("vademecum", p, id(p) in front) for p in curve.points if p.detail.cloud != "off"]
+
+
+def budget_rows(curve: AccuracyCurve) -> list[dict[str, Value]]:
+    """What is chosen for some budgets, all vertices shown, and whether going through all agrees."""
+    points = curve.of("volume")
+    rows: list[dict[str, Value]] = []
+    for tolerance in TOLERANCES:
+        for deadline in DEADLINES:
+            found: CurvePoint | None = None
+            try:
+                found = choose(points, Budget(tolerance, deadline))
+                setting = str(found.detail)
+            except AccuracyError as error:
+                setting = f"refused: {error}"
+            met = [p for p in points.points if p.l2 <= tolerance and p.p99 <= deadline]
+            rows.append(
+                {
+                    "stage": "budget",
+                    "method": "choose",
+                    "setting": setting,
+                    "tolerance": tolerance,
+                    "deadline_us": 1e6 * deadline,
+                    "p50_us": 1e6 * found.p50 if found else None,
+                    "as_enumerated": found == min(met, key=lambda p: p.p50, default=None),
+                }
+            )
+    return rows
+
+
+def _row(method: str, point: CurvePoint, front: bool = False) -> dict[str, Value]:
+    detail = point.detail
+    return {
+        "stage": "online",
+        "method": method,
+        "setting": str(detail),
+        "cloud": detail.cloud,
+        "modes": detail.modes,
+        "precision": detail.precision,
+        "near": detail.near,
+        "error": point.l2,
+        "force_error": point.force,
+        "p50_us": 1e6 * point.p50,
+        "p99_us": 1e6 * point.p99,
+        "bytes": point.nbytes,
+        "front": front,
+    }
+
+
+def rival_rows(
+    vademecum: Vademecum, elasticity: Elasticity, curve: AccuracyCurve, n_loads: int, seed: int
+) -> list[dict[str, Value]]:
+    """The rivals with all vertices shown, on fresh loads, by the processor's time as the curve."""
+    surface = vademecum.surface
+    drawn = np.random.default_rng(seed).permutation(len(surface.corners))
+    chosen, others = drawn[:n_loads], drawn[n_loads : n_loads + N_SNAPSHOTS]
+    truth = _solutions(elasticity, surface.centroids[chosen], surface.patch_radius)
+    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)[:, None]
+    errors = _table_errors(vademecum, elasticity, chosen, truth, mass)
+    table = upper_quantile(errors, n_independent=n_loads)
+    return [
+        *_optimum_rows(
+            curve,
+            _solutions(elasticity, surface.centroids[others], surface.patch_radius),
+            truth,
+            mass,
+        ),
+        _rival("dense table", table, time_dense_table(vademecum, 1, time.thread_time)),
+        # which works in several threads: the time of all of them
+        _rival("direct solve", 0.0, time_direct(elasticity, vademecum, clock=time.process_time)),
+    ]
+
+
+def _rival(method: str, error: float, timing: StepRow) -> dict[str, Value]:
+    return {
+        "stage": "online",
+        "method": method,
+        "setting": timing.method,
+        "cloud": "volume",
+        "error": error,
+        "p50_us": timing.p50_us,
+        "p99_us": timing.p99_us,
+        "bytes": timing.bytes,
+        "front": False,
+    }
+
+
+def _solutions(elasticity: Elasticity, centers: np.ndarray, radius: float) -> np.ndarray:
+    """Full solutions for unit forces in x, y, z, shape (3 n_vertices, 3 n), load by load."""
+    parts = [
+        elasticity.at_vertices(elasticity.solve(patch_loads(elasticity, centers[batch], radius)))
+        for batch in np.array_split(np.arange(len(centers)), -(-len(centers) // _BATCH))
+    ]
+    return np.hstack(parts)
+
+
+def _table_errors(
+    vademecum: Vademecum,
+    elasticity: Elasticity,
+    faces: np.ndarray,
+    truth: np.ndarray,
+    mass: np.ndarray,
+) -> np.ndarray:
+    """Of exact columns at the load positions, interpolated to the centroids of some faces."""
+    surface = vademecum.surface
+    middle = np.full((len(faces), 3), 1.0 / 3.0)
+    positions, weights = surface.weights(faces, middle)
+    needed, index = np.unique(positions, return_inverse=True)
+    columns = _solutions(elasticity, surface.centers[needed], surface.patch_radius)
+    columns = columns.reshape(len(columns), len(needed), 3)
+    rows = zip(index.reshape(positions.shape), weights, strict=True)
+    found = np.stack([np.einsum("vid,i->vd", columns[:, row], w) for row, w in rows], axis=1)
+    return _relative(found.reshape(truth.shape), truth, mass)
+
+
+def _relative(found: np.ndarray, truth: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    return np.sqrt((mass * (found - truth) ** 2).sum(axis=0) / (mass * truth**2).sum(axis=0))
+
+
+def _optimum_rows(
+    curve: AccuracyCurve, snapshots: np.ndarray, truth: np.ndarray, mass: np.ndarray
+) -> list[dict[str, Value]]:
+    """The best n modes for the snapshots, on other loads; as fast as ours without near field."""
+
+    def scaled_of(field: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sqrt(mass) * field / np.sqrt((mass * field**2).sum(axis=0)))
+
+    basis = np.linalg.svd(scaled_of(snapshots), full_matrices=False)[0]
+    scaled = scaled_of(truth)
+    rows = []
+    for point in curve.like(Detail(1, "volume", "int16", 0.0)).points:
+        best = basis[:, : point.detail.modes]
+        left = np.linalg.norm(scaled - best @ (best.T @ scaled), axis=0)
+        fast = CurvePoint(
+            point.detail,
+            upper_quantile(left, n_independent=truth.shape[1] // 3),
+            float("nan"),
+            point.nbytes,
+            point.p50,
+            point.p99,
+        )
+        rows.append(_row("SVD optimum", fast))
+    return rows
+
+
+def cost_of_effects(vademecum: Vademecum) -> list[dict[str, Value]]:
+    """Times of a step with each effect alone that a linear vademecum serves, surface and volume."""
+    cases = [case for case in CASES if not isinstance(case[2][0], LargeDeformationEffect)]
+    return [
+        {
+            "stage": "effects",
+            "method": row.scene,
+            "setting": f"{row.tools} tool" + ("s" if row.tools > 1 else ""),
+            "p50_us": row.p50_us,
+            "p99_us": row.p99_us,
+            "ratio": row.ratio,
+            "bytes": row.bytes,
+        }
+        for row in effect_rows(vademecum, cases)
+    ]
+
+
+def fastest_within(rows: Sequence[dict[str, Value]], error: float) -> dict[str, Value] | None:
+    """The fastest row of a vademecum within an error."""
+    found = [row for row in rows if row["method"] == "vademecum" and row["error"] <= error]  # type: ignore[operator]
+    return min(found, key=lambda row: row["p50_us"], default=None)  # type: ignore[arg-type,return-value]

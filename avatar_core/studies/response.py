@@ -1,0 +1,105 @@
+"""Finite element answers of an organ, and fields carried through a grid.
+
+The paper keeps displacements u(x, s) at the points of one grid common to all organs. Carried there
+and back, u(x) ~ sum_c t_c(x) sum_k l_k(x_c) u_k: barycentric coordinates l of the mesh at the grid
+points x_c (beyond the surface those of its closest point), then trilinear weights t.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import igl
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.mesh import TetMesh
+from avatar_core.shapes.correspondence import locate
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+def respond(mesh: TetMesh, clamped: BoolArray, centers: FloatArray, radius: float) -> FloatArray:
+    """Displacements under unit patch loads along x, y, z at each centre, material of the paper.
+
+    clamped : ndarray of bool, shape (n_faces,), over mesh.boundary_faces
+    centers : ndarray, shape (n, 3) [m]; radius : of the patches [m]
+
+    Returns ndarray, shape (n_vertices, 3, 3 n) [m/N].
+    """
+    elasticity = Elasticity(mesh, Material(), clamped)
+    solution = elasticity.solve(patch_loads(elasticity, centers, radius))
+    return elasticity.at_vertices(solution).reshape(len(mesh.vertices), 3, -1)
+
+
+def relative_errors(found: FloatArray, wanted: FloatArray, mesh: TetMesh) -> FloatArray:
+    """|u - u_ref| / |u_ref| in L2 over the organ for each load, shape (n_loads,).
+
+    found, wanted : ndarray, shape (n_vertices, 3, n_loads), at the vertices of the mesh
+    """
+    mass = mesh.vertex_volumes
+    off = np.einsum("v,vcl->l", mass, (found - wanted) ** 2)
+    return np.sqrt(off / np.einsum("v,vcl->l", mass, wanted**2))
+
+
+def carried(matrix: sp.csr_matrix, field: FloatArray) -> FloatArray:
+    """A sparse map of shape (n, n_vertices) applied to a field of shape (n_vertices, 3, m)."""
+    return (matrix @ field.reshape(len(field), -1)).reshape(matrix.shape[0], *field.shape[1:])
+
+
+def field_at(mesh: TetMesh, points: FloatArray) -> sp.csr_matrix:
+    """Interpolation from the vertices of a mesh to points, shape (n, n_vertices).
+
+    Beyond the surface the value of its closest point; rows sum to one.
+    """
+    tet, weight = locate(mesh, points)
+    inside, outside = np.flatnonzero(tet >= 0), np.flatnonzero(tet < 0)
+    rows = np.concatenate([np.repeat(inside, 4), np.repeat(outside, 3)])
+    faces, face_weight = _closest(mesh, points[outside])
+    columns = np.concatenate([mesh.tets[tet[inside]].ravel(), faces.ravel()])
+    values = np.concatenate([weight[inside].ravel(), face_weight.ravel()])
+    return sp.csr_matrix((values, (rows, columns)), shape=(len(points), len(mesh.vertices)))
+
+
+def nearest_face(mesh: TetMesh, points: FloatArray) -> NDArray[np.int64]:
+    """Number of the boundary face closest to each point, shape (n,)."""
+    faces = mesh.boundary_faces.astype(np.int64)
+    return igl.point_mesh_squared_distance(np.ascontiguousarray(points), mesh.vertices, faces)[1]
+
+
+def trilinear(
+    points: FloatArray, origin: FloatArray, spacing: float
+) -> tuple[FloatArray, sp.csr_matrix]:
+    """The points of an endless grid around some points, and the interpolation from them.
+
+    Only these are needed, however fine the grid.
+
+    Returns corners, ndarray, shape (m, 3) [m], and a sparse matrix, shape (n, m).
+    """
+    place = (points - origin) / spacing
+    cell = np.floor(place).astype(np.int64)
+    part = place - cell
+    offsets = np.array(list(product((0, 1), repeat=3)))
+    index = (cell[:, None] + offsets).reshape(-1, 3)
+    weight = np.prod(np.where(offsets, part[:, None], 1.0 - part[:, None]), axis=2)
+    corners, column = np.unique(index, axis=0, return_inverse=True)
+    row = np.repeat(np.arange(len(points)), len(offsets))
+    matrix = sp.csr_matrix((weight.ravel(), (row, column.ravel())), (len(points), len(corners)))
+    return origin + spacing * corners, matrix
+
+
+def _closest(mesh: TetMesh, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+    """Closest boundary faces, shape (n, 3), and barycentric coordinates there, shape (n, 3)."""
+    faces = mesh.boundary_faces.astype(np.int64)
+    if len(points) == 0:
+        return faces[:0], np.zeros((0, 3))
+    _, face, nearest = igl.point_mesh_squared_distance(
+        np.ascontiguousarray(points), mesh.vertices, faces
+    )
+    a, b, c = (np.ascontiguousarray(mesh.vertices[faces[face, k]]) for k in range(3))
+    weight = np.clip(igl.barycentric_coordinates(nearest, a, b, c), 0.0, 1.0)
+    return faces[face], weight / weight.sum(axis=1, keepdims=True)

@@ -1,0 +1,181 @@
+"""What every study returns, writes and prints: the paper's figure beside ours, on which machine."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from avatar_core.common.machine import processor
+from avatar_core.offline.rule import Progress
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Value = float | int | str | bool | None
+Item = TypeVar("Item")
+
+PACKAGES = ("avatar", "numpy", "scipy", "libigl", "scikit-fem", "rslab", "scikit-learn")
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """One of the paper's experiments, repeated.
+
+    name : of the files it is written to
+    sentence : what was found, for the picture
+    summary : flat; errors are fractions, times seconds, a length says its unit in its name
+    rows : flat, one a measurement
+    paper : the paper's values, under the summary's keys where they can be compared
+    draw : draws the picture
+    notices : what was skipped or done otherwise than asked, one line each
+    """
+
+    name: str
+    sentence: str
+    summary: Mapping[str, float]
+    rows: tuple[Mapping[str, Value], ...]
+    paper: Mapping[str, Value]
+    draw: Callable[[Figure], None]
+    notices: tuple[str, ...] = ()
+
+    def table(self) -> str:
+        """The summary with the paper's values beside it."""
+        width = max(len(key) for key in self.summary)
+        lines = [f"{'':{width}s} {'paper':>24s} {'here':>12s}"]
+        for key, value in self.summary.items():
+            lines.append(f"{key:{width}s} {_text(self.paper.get(key)):>24s} {_text(value):>12s}")
+        return "\n".join(lines)
+
+
+def write_study(study: Study, folder: Path, seconds: float) -> tuple[Path, Path]:
+    """Write ``NAME.json`` and ``NAME.png``; the folder is made if it does not exist."""
+    folder.mkdir(parents=True, exist_ok=True)
+    document = {
+        "name": study.name,
+        "sentence": study.sentence,
+        "summary": dict(study.summary),
+        "rows": [dict(row) for row in study.rows],
+        "paper": dict(study.paper),
+        "notices": list(study.notices),
+        "machine": machine(),
+        "seconds": seconds,
+    }
+    record, picture = folder / f"{study.name}.json", folder / f"{study.name}.png"
+    record.write_text(json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+    _draw(study, picture)
+    return record, picture
+
+
+def machine() -> dict[str, Value]:
+    """Processor, cores, load and versions."""
+    found: dict[str, Value] = {
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "load_average": os.getloadavg()[0],
+        "system": platform.platform(),
+        "python": platform.python_version(),
+    }
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def follow(items: Iterable[Item], text: str) -> Iterator[Item]:
+    """Iterate behind a progress bar, shown on a terminal only."""
+    from tqdm import tqdm
+
+    yield from tqdm(items, desc=f"{text:28s}", file=sys.stderr, disable=None, leave=False)
+
+
+class Parts:
+    """A progress bar over the long parts of a study, and the stage that one is in.
+
+    A part is begun by :meth:`part`, which gives what its builds report to.
+    """
+
+    def __init__(self, n_parts: int) -> None:
+        self._n_parts, self._begun = n_parts, 0
+
+    def __enter__(self) -> Parts:
+        from tqdm import tqdm
+
+        self._bar = tqdm(total=self._n_parts, file=sys.stderr, disable=None, leave=False)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def part(self, name: str) -> Progress:
+        """Begin a part; the one before is done."""
+        self._bar.update(1 if self._begun else 0)
+        self._begun += 1
+        self._bar.set_description_str(name)
+
+        def progress(stage: str, fraction: float, error: float) -> None:
+            known = "" if math.isnan(error) else f", error {error:.1%}"
+            self._bar.set_description_str(f"{name}: {stage} {fraction:.0%}{known}")
+
+        return progress
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[tuple[str, ...]]:
+    """Limit linear algebra to one thread, the same for every method; yields notices."""
+    try:
+        from threadpoolctl import threadpool_limits
+    except ImportError:
+        yield ("threadpoolctl is not installed: BLAS threads are as OMP_NUM_THREADS says",)
+        return
+    with threadpool_limits(limits=1):
+        yield ()
+
+
+def mean_and_worst(key: str, values: Iterable[float]) -> dict[str, float]:
+    """``key`` with the mean and ``key_worst`` with the largest, NaN of nothing."""
+    found = [float(value) for value in values]
+    if not found:
+        return {key: math.nan, f"{key}_worst": math.nan}
+    return {key: sum(found) / len(found), f"{key}_worst": max(found)}
+
+
+def _draw(study: Study, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(11.0, 4.8), layout="constrained")
+    study.draw(figure)
+    figure.suptitle(textwrap.fill(study.sentence, 130), fontsize=10)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _text(value: Value) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    """numpy scalars become Python's; JSON has no NaN: null instead."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

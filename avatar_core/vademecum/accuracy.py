@@ -1,0 +1,216 @@
+"""Accuracy against time: what a step may cost, how wrong it may be, and which choice gives both.
+
+A :class:`Detail` says how finely a step shows the displacement. An :class:`AccuracyCurve` holds the
+measured error and time of many, and :func:`choose` picks among them for a :class:`Budget`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from avatar_core.errors import AccuracyError
+
+Quantity = Literal["l2", "force"]
+Cloud = Literal["surface", "volume", "off"]
+Precision = Literal["float32", "int16", "int8"]
+
+CONTENT = 0.95  # part of the loads that a promised error holds for
+_CONFIDENCE = 0.95  # that it does, over draws of the loads that were measured
+
+
+@dataclass(frozen=True)
+class Detail:
+    """How finely a step shows the displacement.
+
+    modes : of the far field
+    cloud : vertices that are shown
+    precision : in which the modes are stored
+    near : radius of the near field over the vademecum's own
+    """
+
+    modes: int
+    cloud: Cloud = "surface"
+    precision: Precision = "int16"
+    near: float = 1.0
+
+    def __str__(self) -> str:
+        near = "" if self.near == 1.0 else f", near field to {self.near:g} of its radius"
+        return f"{self.modes} modes in {self.precision}, cloud {self.cloud}{near}"
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """What a detail was measured to give.
+
+    l2, force : relative error that 95 % of unseen loads stay below, of the displacement of the
+        cloud and of the normal force; l2 is NaN where nothing is shown
+    p50, p99 : time that a step takes of the processor [s]; NaN before it was timed
+    nbytes : of what the step reads to show the displacement
+    """
+
+    detail: Detail
+    l2: float
+    force: float
+    nbytes: int
+    p50: float = float("nan")
+    p99: float = float("nan")
+
+    def error(self, quantity: Quantity) -> float:
+        """The promised error of a quantity."""
+        return self.l2 if quantity == "l2" else self.force
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What is asked of a step.
+
+    tolerance : on the relative error of ``quantity``, which 95 % of the loads keep
+    deadline : on the time that a step takes of the processor, which 99 % keep [s]
+
+    Raises
+    ------
+    AccuracyError
+        For what no step can have.
+    """
+
+    tolerance: float
+    deadline: float
+    quantity: Quantity = "l2"
+
+    def __post_init__(self) -> None:
+        if self.quantity not in get_args(Quantity):
+            raise AccuracyError(
+                f"quantity is '{self.quantity}'; give {', '.join(get_args(Quantity))}"
+            )
+        for name, value in (("tolerance", self.tolerance), ("deadline", self.deadline)):
+            if not value > 0.0:  # NaN is refused, infinity is no limit
+                raise AccuracyError(f"{name} is {value:g}; give a number above 0")
+
+    def holds(self, point: CurvePoint) -> bool:
+        """Whether a point meets both."""
+        return point.error(self.quantity) <= self.tolerance and point.p99 <= self.deadline
+
+
+@dataclass(frozen=True)
+class AccuracyCurve:
+    """Measured error and time of many details of one vademecum.
+
+    n_errors : unseen loads and directions behind each error; machine : where it was timed
+    """
+
+    points: tuple[CurvePoint, ...]
+    n_errors: int
+    machine: str = ""
+
+    def of(self, cloud: Cloud) -> AccuracyCurve:
+        """The points of one cloud."""
+        return self._where(lambda point: point.detail.cloud == cloud)
+
+    def like(self, detail: Detail) -> AccuracyCurve:
+        """The points that differ from a detail in the number of modes alone, fewest first."""
+        same = self._where(lambda p: replace(p.detail, modes=detail.modes) == detail)
+        return replace(same, points=tuple(sorted(same.points, key=lambda p: p.detail.modes)))
+
+    def front(self, quantity: Quantity = "l2") -> tuple[CurvePoint, ...]:
+        """Points that none other beats in time and error (Pareto), fastest first."""
+        best, front = np.inf, []
+        for point in sorted(self.points, key=lambda p: (p.p50, p.error(quantity))):
+            if point.error(quantity) < best:
+                best = point.error(quantity)
+                front.append(point)
+        return tuple(front)
+
+    def _where(self, condition: Callable[[CurvePoint], bool]) -> AccuracyCurve:
+        return replace(self, points=tuple(filter(condition, self.points)))
+
+    def plain(self) -> dict[str, Any]:
+        """As columns of numbers and text, for a file."""
+        columns: dict[str, Any] = {
+            name: [getattr(point.detail, name) for point in self.points] for name in _names(Detail)
+        }
+        for name in _names(CurvePoint)[1:]:
+            columns[name] = [getattr(point, name) for point in self.points]
+        return columns | {"n_errors": self.n_errors, "machine": self.machine}
+
+    @staticmethod
+    def of_plain(stored: dict[str, Any]) -> AccuracyCurve:
+        """The inverse of :meth:`plain`."""
+
+        def rows(names: tuple[str, ...]) -> Iterable[tuple[Any, ...]]:
+            return zip(*(stored[name] for name in names), strict=True)
+
+        pairs = zip(rows(_names(Detail)), rows(_names(CurvePoint)[1:]), strict=True)
+        points = tuple(CurvePoint(Detail(*detail), *values) for detail, values in pairs)
+        return AccuracyCurve(points, stored["n_errors"], stored["machine"])
+
+
+def _names(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
+
+
+def choose(curve: AccuracyCurve, budget: Budget) -> CurvePoint:
+    """The fastest point that meets a budget; of equally fast ones the most accurate.
+
+    A looser tolerance is therefore never slower, and a longer deadline never changes what is
+    chosen, unless nothing met the shorter one.
+
+    Raises
+    ------
+    AccuracyError
+        Where none does, with the two points that come closest, one on either side.
+    """
+    feasible = [point for point in curve.points if budget.holds(point)]
+    if feasible:
+        return min(feasible, key=lambda point: (point.p50, point.error(budget.quantity)))
+    raise AccuracyError(_refusal(curve, budget))
+
+
+def _refusal(curve: AccuracyCurve, budget: Budget) -> str:
+    asked = f"no step is within {budget.tolerance:.3g} of {budget.quantity} in "
+    asked += "any time" if np.isinf(budget.deadline) else f"{budget.deadline * 1e6:.0f} us"
+    quantity = budget.quantity
+    exact = [p for p in curve.points if p.error(quantity) <= budget.tolerance]
+    fast = [p for p in curve.points if p.p99 <= budget.deadline and not np.isnan(p.error(quantity))]
+    near = [
+        *_first(exact, lambda p: p.p99),
+        *_first(fast, lambda p: p.error(quantity)),
+    ] or list(_first(curve.points, lambda p: p.error(quantity)))
+    nearest = " or ".join(
+        f"{p.error(quantity):.3g} in {p.p99 * 1e6:.0f} us ({p.detail})" for p in near
+    )
+    return f"{asked}; nearest: {nearest or 'nothing was measured'}"
+
+
+def _first(
+    points: Iterable[CurvePoint], key: Callable[[CurvePoint], float]
+) -> tuple[CurvePoint, ...]:
+    known = [point for point in points if not np.isnan(key(point))]
+    return (min(known, key=key),) if known else ()
+
+
+def upper_quantile(
+    values: np.ndarray, content: float = CONTENT, n_independent: int | None = None
+) -> float:
+    """A bound that holds for a part ``content`` of what the values were drawn from.
+
+    Distribution-free tolerance bound (Wilks, Annals of Mathematical Statistics 12, 1941): the
+    smallest order statistic x_(r) with P[B >= r] <= 1 - confidence, B binomial of n and
+    ``content``; the largest value where the sample is too small for the confidence. Where only
+    some of the values are independent, r / n is that of so many: the three directions of a load
+    are wrong together.
+
+    n_independent : of the values; None for all
+    """
+    from scipy.stats import binom
+
+    ordered = np.sort(np.asarray(values, float).ravel())
+    if len(ordered) == 0:
+        return float("nan")
+    n = n_independent or len(ordered)
+    rank = min(int(binom.ppf(_CONFIDENCE, n, content)) + 1, n)
+    return float(ordered[math.ceil(rank / n * len(ordered)) - 1])

@@ -1,0 +1,50 @@
+"""What a vademecum says of its own errors; :mod:`avatar_core.offline.certify` measures it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from avatar_core.vademecum.accuracy import AccuracyCurve
+from avatar_core.vademecum.force_error import ForceError
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Relative errors (fractions) on unseen loads, mean and worst, and the cost.
+
+    l2 : |u - u_FE| / |u_FE| over all vertices, mass-weighted, each load and direction
+    contact : |C - C_FE|_F / |C_FE|_F of the 3 x 3 compliance of the loaded patch
+    force : |F / F_FE - 1| of the normal force for an imposed normal indentation
+    felt : the same as a tip feels it anywhere on the accessible faces, through the compliance that
+        the contact step smooths so that no edge of the mesh is felt
+    vertex_contact_worst : contact error at load positions of the build, on fresh solves
+    n_loads : unseen load positions; ``seed`` draws them
+    build_cpu_seconds : user + system time of everything, meshing and this certificate included
+    mesh_l2, mesh_contact : change of the reference when the mesh is refined once (NaN: not asked)
+    force_error : how wrong the force at a place may be, calibrated on the same loads
+    curve : the same errors for displacements that are shown less finely, and what a step takes
+    """
+
+    l2_mean: float
+    l2_worst: float
+    contact_mean: float
+    contact_worst: float
+    force_mean: float
+    force_worst: float
+    felt_mean: float
+    felt_worst: float
+    vertex_contact_worst: float
+    n_loads: int
+    seed: int
+    modes: int
+    build_cpu_seconds: float = float("nan")
+    mesh_l2: float = float("nan")
+    mesh_contact: float = float("nan")
+    force_error: ForceError = field(default_factory=ForceError)
+    curve: AccuracyCurve | None = None
+
+    @classmethod
+    def unknown(cls) -> Certificate:
+        """A certificate that promises nothing."""
+        nan = float("nan")
+        return cls(nan, nan, nan, nan, nan, nan, nan, nan, nan, 0, 0, 0)

@@ -1,0 +1,116 @@
+"""Load magnitude as a coordinate: what large deformation adds to the linear response.
+
+A tip presses with a force f along the inward normal. With the linear depth a = gamma(s) f of its
+patch, gamma = n . C(s, s) n, the organ moves by
+
+    u(x, s, a) = a u_1(x, s) / gamma(s) + sum_k a^k V_k(x, s),      k = 2, 3
+    d(s, a)    = a + sum_k beta_k(s) a^k,
+
+u_1 the linear vademecum, d the depth that is really reached. V_k and beta_k are the terms of the
+asymptotic-numerical series (:mod:`avatar_core.reduction.asymptotic_series`), separated like the
+linear response: low rank far away, exact near the patch. They hold up to a_max(s); beyond, both
+continue tangentially. As stress is proportional to Young's modulus, V_k and beta_k do not depend on
+it.
+
+Only the response of a tip to itself bends: the way from one tip to another, and a force across the
+normal, stay linear. What that costs is measured by :mod:`avatar_core.offline.certify.combinations`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import MaterialError
+from avatar_core.fem.elasticity import Material
+from avatar_core.fem.hyperelastic_materials import (
+    HyperelasticMaterial,
+    NeoHookean,
+    StVenantKirchhoff,
+)
+
+POWERS = (2, 3)
+
+LargeMaterial = Literal["neo-hookean", "st-venant-kirchhoff"]
+
+
+@dataclass(frozen=True)
+class LargeCertificate:
+    """Errors over all pushes within the stored range.
+
+    n_sites, n_pushes : that could be compared; n_lost : sites where equilibrium was lost before
+        the range ended
+    depth : the deepest push compared [m]
+    oblique_contact_mean, two_tools_contact_mean, gravity_contact_mean : of the force, where other
+        effects are added (:mod:`avatar_core.offline.certify.combinations`); NaN: not measured
+    """
+
+    l2_mean: float
+    l2_worst: float
+    contact_mean: float
+    contact_worst: float
+    linear_l2_mean: float
+    linear_contact_mean: float
+    n_sites: int
+    n_pushes: int
+    n_lost: int
+    depth: float
+    reach_median: float
+    reach_least: float
+    oblique_contact_mean: float = float("nan")
+    two_tools_contact_mean: float = float("nan")
+    gravity_contact_mean: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class LargeDeformation:
+    """The terms of second and third order; k counts them.
+
+    material : of the large strains; its small ones are those of the vademecum
+    space : ndarray, shape (3 n_vertices, n), X'
+    load : ndarray, shape (2, n_positions, n): far part of V_k is X' load[k]^T [m^(1-k)]
+    near : ndarray, shape (2, n_blocks, 3), the rest of V_k in the pattern of ``vademecum.near``
+    depth : ndarray, shape (2, n_positions), beta_k [m^(1-k)]
+    reach : ndarray, shape (n_positions,), a_max [m]
+    certificate : LargeCertificate or None
+    """
+
+    material: LargeMaterial
+    space: FloatArray
+    load: FloatArray
+    near: FloatArray
+    depth: FloatArray
+    reach: FloatArray
+    certificate: LargeCertificate | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held [bytes]."""
+        arrays = (self.space, self.load, self.near, self.depth, self.reach)
+        return int(sum(array.nbytes for array in arrays))
+
+
+def hyperelastic(name: str, linear: Material) -> HyperelasticMaterial:
+    """The material of a name, continuing a linear one.
+
+    Raises
+    ------
+    MaterialError
+        For an unknown name.
+    """
+    known: dict[str, type[NeoHookean | StVenantKirchhoff]] = {
+        "neo-hookean": NeoHookean,
+        "st-venant-kirchhoff": StVenantKirchhoff,
+    }
+    if name not in known:
+        raise MaterialError(f"material '{name}' is unknown; choose {' or '.join(known)}")
+    return known[name](linear)
+
+
+def powers(a: float, reach: float) -> FloatArray:
+    """a^k up to the reach and tangentially beyond, k = 2, 3."""
+    inside = min(a, reach)
+    return np.array([inside**k + k * inside ** (k - 1) * (a - inside) for k in POWERS])

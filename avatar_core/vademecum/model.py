@@ -1,0 +1,218 @@
+"""The computational vademecum: an organ's response to a touch anywhere, ready to be looked up.
+
+u(x, s) = far field (separated, low rank) + near field (exact, sparse). The contact compliance
+C(s, s'), the patch-averaged displacement at s per patch force at s', is the Galerkin one of the
+same modes, Y Y^T, plus the exact remainder tapered to the neighbourhood: symmetric positive
+definite by construction, exact at the load positions themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from avatar_core.fem.elasticity import Element, Material
+from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.reduction.pgd import EnrichmentReport
+from avatar_core.reduction.separated import SeparatedField
+from avatar_core.vademecum.certificate import Certificate
+from avatar_core.vademecum.large_deformation import LargeCertificate, LargeDeformation
+from avatar_core.vademecum.modal_mass import BodyResponse
+from avatar_core.vademecum.parametric import ParametricResponse
+from avatar_core.vademecum.tip_field import TipField
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a vademecum comes from: enough to build it again.
+
+    source : file name of the surface, ``source_sha256`` its hash
+    unit, axes : as applied at the door
+    versions : "package version" of everything that took part
+    parameters : "name=value" of the build
+    notices : what the reader of the surface had to say
+    """
+
+    source: str
+    source_sha256: str
+    unit: str = "m"
+    axes: str = "RAS"
+    versions: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class RankError:
+    """Relative L2 error over the build's own loads with the first ``rank`` modes."""
+
+    rank: int
+    mean: float
+    worst: float
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How the modes were found.
+
+    converged : the tolerance was met within the mode limit
+    tolerance : asked for, mean relative L2 error over the build's own loads
+    enrichments : one report each
+    rank_errors : error against number of modes, near field included
+    """
+
+    converged: bool
+    tolerance: float
+    enrichments: tuple[EnrichmentReport, ...] = ()
+    rank_errors: tuple[RankError, ...] = ()
+
+
+@dataclass(frozen=True)
+class VademecumInfo:
+    """What is announced of a vademecum; the fields of avatar_ros/msg/VademecumInfo."""
+
+    id: str
+    name: str
+    source: str
+    schema_version: str
+    axes: str
+    n_vertices: int
+    n_surface_vertices: int
+    n_load_positions: int
+    n_modes: int
+    bytes: int
+    young_modulus: float
+    poisson_ratio: float
+    patch_radius: float
+    volume: float
+    converged: bool
+    l2_mean: float
+    l2_worst: float
+    contact_mean: float
+    contact_worst: float
+    force_mean: float
+    force_worst: float
+    build_cpu_seconds: float
+
+
+SCHEMA_VERSION = "2.2"
+
+
+@dataclass(frozen=True)
+class Vademecum:
+    """An organ's precomputed mechanical response.
+
+    far : SeparatedField, space (3 n_vertices, rank) [m], load (3 n_positions, rank); the load
+        factor is also the far part Y Y^T of the contact compliance [m/N]
+    near : LocalBlocks, exact remainder at mesh vertices [m/N]
+    contact_near : LocalBlocks, tapered remainder of the contact compliance at load positions,
+        symmetric [m/N]
+    tip_field : TipField, smooth distance and access that a tool tip feels
+    parametric : ParametricResponse or None, the coordinates of the material: all fields above
+        are those of one choice of their values (:func:`avatar_core.vademecum.at_values.at_values`)
+    contrast : Young's modulus inside the tumour over that outside; None without a tumour
+    large : LargeDeformation or None, the load's magnitude as a coordinate
+    body : BodyResponse or None, mass and weight as the far modes see them
+    """
+
+    name: str
+    mesh: TetMesh
+    regions: Regions
+    material: Material
+    element: Element
+    surface: LoadSurface
+    far: SeparatedField
+    near: LocalBlocks
+    contact_near: LocalBlocks
+    tip_field: TipField
+    convergence: Convergence
+    provenance: Provenance
+    certificate: Certificate | None = None
+    parametric: ParametricResponse | None = None
+    contrast: float | None = None
+    large: LargeDeformation | None = None
+    body: BodyResponse | None = None
+    id: str = field(default="", compare=False)
+    nbytes: int = field(default=0, compare=False)
+
+    def displacement(
+        self, positions: np.ndarray, weights: np.ndarray, rank: int | None = None
+    ) -> np.ndarray:
+        """Displacement of all vertices under unit forces in x, y, z, shape (3 n_vertices, 3).
+
+        Parameters
+        ----------
+        positions, weights : ndarray, shape (n,), a point of the surface as interpolated by
+            :meth:`avatar_core.fem.patch_loads.LoadSurface.weights`
+        rank : int or None, modes to use; the near field belongs to all of them
+        """
+        far = self.far if rank is None else self.far.truncate(rank)
+        load = np.einsum("i,idk->dk", weights, far.load.reshape(-1, 3, far.rank)[positions])
+        near = self.near.combined(positions, weights, len(self.mesh.vertices))
+        return far.space @ load.T + near
+
+    def compliance(
+        self,
+        positions: np.ndarray,
+        weights: np.ndarray,
+        other_positions: np.ndarray | None = None,
+        other_weights: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Contact compliance between two surface points (the same by default), (3, 3) [m/N]."""
+        if other_positions is None or other_weights is None:
+            other_positions, other_weights = positions, weights
+        load = self.far.load.reshape(-1, 3, self.far.rank)
+        left = np.einsum("i,idk->dk", weights, load[positions])
+        right = np.einsum("i,idk->dk", other_weights, load[other_positions])
+        near = self.contact_near.combined(other_positions, other_weights, len(load))
+        return left @ right.T + np.einsum("i,iab->ab", weights, near.reshape(-1, 3, 3)[positions])
+
+    def with_certificate(self, certificate: Certificate) -> Vademecum:
+        """The same vademecum carrying how wrong it may be."""
+        return replace(self, certificate=certificate)
+
+    def with_large_certificate(self, certificate: LargeCertificate) -> Vademecum:
+        """The same vademecum carrying how wrong its large deformation may be."""
+        assert self.large is not None
+        return replace(self, large=replace(self.large, certificate=certificate))
+
+    @property
+    def surface_vertices(self) -> np.ndarray:
+        """Rest positions of the boundary vertices, shape (n, 3) float32 [m]."""
+        return self.mesh.vertices[self.mesh.surface_vertices].astype(np.float32)
+
+    @property
+    def surface_faces(self) -> np.ndarray:
+        """Boundary triangles over :attr:`surface_vertices`, shape (m, 3)."""
+        return np.searchsorted(self.mesh.surface_vertices, self.mesh.boundary_faces)
+
+    def info(self) -> VademecumInfo:
+        """The announcement."""
+        c = self.certificate or Certificate.unknown()
+        return VademecumInfo(
+            id=self.id,
+            name=self.name,
+            source=self.provenance.source,
+            schema_version=SCHEMA_VERSION,
+            axes=self.provenance.axes,
+            n_vertices=len(self.mesh.vertices),
+            n_surface_vertices=len(self.mesh.surface_vertices),
+            n_load_positions=self.surface.n_positions,
+            n_modes=self.far.rank,
+            bytes=self.nbytes,
+            young_modulus=self.material.young_modulus,
+            poisson_ratio=self.material.poisson_ratio,
+            patch_radius=self.surface.patch_radius,
+            volume=self.mesh.volume,
+            converged=self.convergence.converged,
+            l2_mean=c.l2_mean,
+            l2_worst=c.l2_worst,
+            contact_mean=c.contact_mean,
+            contact_worst=c.contact_worst,
+            force_mean=c.force_mean,
+            force_worst=c.force_worst,
+            build_cpu_seconds=c.build_cpu_seconds,
+        )

@@ -1,0 +1,158 @@
+"""The arrays of a vademecum file, and what holds of them before compiled code may use them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Mapping
+
+import numpy as np
+
+from avatar_core.common.array_shapes import Shapes, require_indices, require_shapes
+from avatar_core.errors import StorageError
+from avatar_core.geometry.mesh import TetMesh
+
+Arrays = Mapping[str, np.ndarray]
+
+LARGEST_LENGTH = 10.0  # of any coordinate or distance of an organ [m]
+_SPACINGS = (1e-4, 0.1)  # of the tip field [m]
+_PATCH_RADII = (1e-4, 0.1)  # [m]
+
+# Keys are attribute paths of a Vademecum; see array_shapes for the notation.
+_LINEAR: Shapes = {
+    "mesh/vertices": "f: vertices 3",
+    "mesh/tets": "i: tets 4",
+    "regions/clamped": "b: faces",
+    "regions/accessible": "b: faces",
+    "surface/centers": "f: positions 3",
+    "surface/normals": "f: positions 3",
+    "surface/corners": "i: triangles 3",
+    "surface/vertices": "i: corners",
+    "surface/patch_radius": "f:",
+    "far/space": "f: 3*vertices rank",
+    "far/load": "f: 3*positions rank",
+    "near/start": "i: rows",
+    "near/target": "i: blocks",
+    "near/block": "f: blocks 3 3",
+    "contact_near/start": "i: rows",
+    "contact_near/target": "i: contact_blocks",
+    "contact_near/block": "f: contact_blocks 3 3",
+    "tip_field/distance": "f: nx ny nz",
+    "tip_field/access": "f: nx ny nz",
+    "tip_field/origin": "f: 3",
+    "tip_field/spacing": "f: 1",
+}
+_PARAMETRIC: Shapes = {
+    "parametric/basis/space": "f: 3*vertices basis",
+    "parametric/basis/load": "f: 3*positions basis",
+    "parametric/operators": "f: terms basis basis",
+    "parametric/rank": "i:",
+    "parametric/young_modulus": "f:",
+    "parametric/near": "f: nodes blocks 3 3",
+    "parametric/contact_near": "f: nodes contact_blocks 3 3",
+}
+_BODY: Shapes = {"body/mass": "f: rank rank", "body/weight": "f: rank 3"}
+_PARAMETRIC_BODY: Shapes = {
+    "parametric/body/mass": "f: basis basis",
+    "parametric/body/weight": "f: basis 3",
+}
+_LARGE: Shapes = {
+    "large/space": "f: 3*vertices large",
+    "large/load": "f: 2 positions large",
+    "large/near": "f: 2 blocks 3",
+    "large/depth": "f: 2 positions",
+    "large/reach": "f: positions",
+}
+BODY_KEYS = tuple(_BODY)
+PARAMETRIC_KEYS = tuple(_PARAMETRIC)
+PARAMETRIC_BODY_KEYS = tuple(_PARAMETRIC_BODY)
+LARGE_KEYS = tuple(_LARGE)
+
+# Each is there as a whole or not at all, by its first key.
+_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE)
+
+
+def shapes_of(held: Container[str]) -> dict[str, str]:
+    """Shapes of the arrays of a vademecum that has some keys."""
+    shapes = dict(_LINEAR)
+    for part in _PARTS:
+        if next(iter(part)) in held:
+            shapes |= part
+    return shapes
+
+
+def require_sound(arrays: Arrays) -> None:
+    """Check shapes, indices and lengths, so that compiled code cannot go astray.
+
+    Raises
+    ------
+    StorageError
+        Naming the array that does not fit.
+    """
+    sizes = require_shapes(arrays, shapes_of(arrays))
+    if min(sizes[name] for name in ("vertices", "tets", "positions", "triangles", "rank")) < 1:
+        raise StorageError("the organ has no elements, load positions or modes; build it again")
+    _require_mesh(arrays, sizes)
+    _require_surface(arrays, sizes)
+    _require_rows(arrays, "near", sizes["positions"], sizes["vertices"])
+    _require_rows(arrays, "contact_near", sizes["positions"], sizes["positions"])
+    _require_tip_field(arrays)
+    if "basis" in sizes:
+        _require_range("parametric/rank", float(arrays["parametric/rank"]), (1, sizes["basis"]))
+    if "large/reach" in arrays and arrays["large/reach"].min() < 0.0:
+        raise StorageError("'large/reach' is negative; build the file again")
+
+
+def _require_mesh(arrays: Arrays, sizes: Mapping[str, int]) -> None:
+    _require_lengths(arrays, "mesh/vertices")
+    require_indices("mesh/tets", arrays["mesh/tets"], sizes["vertices"])
+    mesh = TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"])
+    if len(mesh.boundary_faces) != sizes["faces"]:
+        raise StorageError("'regions' are not those of the mesh; build the file again")
+
+
+def _require_surface(arrays: Arrays, sizes: Mapping[str, int]) -> None:
+    _require_lengths(arrays, "surface/centers")
+    _require_range("surface/patch_radius", float(arrays["surface/patch_radius"]), _PATCH_RADII)
+    require_indices("surface/vertices", arrays["surface/vertices"], sizes["vertices"])
+    corners, n_corners = arrays["surface/corners"], sizes["corners"]
+    require_indices("surface/corners", corners, n_corners)
+    if sizes["positions"] == n_corners:
+        return
+    edges = np.unique(np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    if sizes["positions"] != n_corners + len(edges):
+        raise StorageError(
+            "'surface/centers' are neither the corners nor these and all edge midpoints; build the "
+            "file again"
+        )
+
+
+def _require_rows(arrays: Arrays, name: str, n_rows: int, n_targets: int) -> None:
+    """Compressed rows: ascending, from the first block to the last."""
+    start, target = arrays[f"{name}/start"], arrays[f"{name}/target"]
+    require_indices(f"{name}/target", target, n_targets)
+    require_indices(f"{name}/start", start, len(target) + 1)
+    rises = len(start) == n_rows + 1 and bool((start[1:] >= start[:-1]).all())
+    if not rises or start[0] != 0 or start[-1] != len(target):
+        raise StorageError(f"'{name}/start' does not fit its blocks; build the file again")
+
+
+def _require_tip_field(arrays: Arrays) -> None:
+    for key in ("tip_field/distance", "tip_field/origin"):
+        _require_lengths(arrays, key)
+    _require_range("tip_field/spacing", float(arrays["tip_field/spacing"][0]), _SPACINGS)
+    if min(arrays["tip_field/distance"].shape) < 3:
+        raise StorageError("'tip_field' has fewer than 3 samples along an axis; build it again")
+
+
+def _require_lengths(arrays: Arrays, key: str) -> None:
+    if np.abs(arrays[key]).max(initial=0.0) > LARGEST_LENGTH:
+        raise StorageError(
+            f"'{key}' has lengths above {LARGEST_LENGTH:g} m, as no organ; build the file again"
+        )
+
+
+def _require_range(key: str, value: float, bounds: tuple[float, float]) -> None:
+    if not (math.isfinite(value) and bounds[0] <= value <= bounds[1]):
+        raise StorageError(
+            f"'{key}' is {value:g}, not {bounds[0]:g} to {bounds[1]:g}; build the file again"
+        )

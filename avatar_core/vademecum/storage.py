@@ -1,0 +1,328 @@
+"""Vademecums on disk: HDF5 with schema version and checksum.
+
+Layout (schema 2.2), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
+in sorted order and over the JSON attributes), and the JSON attributes ``material``,
+``provenance``, ``convergence``, ``certificate``, and from schema 2.2 ``accuracy``, its curve.
+Datasets:
+
+    mesh/vertices (n_v, 3) [m]          mesh/tets (n_t, 4)
+    regions/clamped, regions/accessible over the boundary faces
+    surface/centers, surface/normals (n_s, 3) [m]   surface/corners (n_f, 3)
+    surface/vertices                     surface/patch_radius [m]
+    far/space (3 n_v, k) [m]             far/load (3 n_s, k)
+    near/start, near/target, near/block [m/N]
+    contact_near/start, contact_near/target, contact_near/block [m/N]
+    tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
+
+A vademecum with coordinates of the material (from schema 2.0) has
+the JSON attributes ``coordinates``, ``contrast``, and
+
+    parametric/basis/space (3 n_v, n)    parametric/basis/load (3 n_s, n)
+    parametric/operators (n_terms, n, n) parametric/rank, parametric/young_modulus [Pa]
+    parametric/near, parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N]
+
+one that knows the organ's mass (from schema 2.1) body/mass (rank, rank) and body/weight (rank, 3),
+and the same under parametric/body for that basis; one with large deformation the JSON attribute
+``large`` (material, certificate) and, for k = 2, 3,
+
+    large/space (3 n_v, n)               large/load (2, n_s, n) [m^(1-k)]
+    large/near (2, n_blocks, 3) [m^(1-k)], in the pattern of near/
+    large/depth (2, n_s) [m^(1-k)]       large/reach (n_s,) [m]
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import h5py
+import numpy as np
+
+from avatar_core.common.dataclass_json import of_plain, parsed, require_name
+from avatar_core.common.files import FileError, opened
+from avatar_core.common.hdf5 import (
+    UNREADABLE,
+    replace_file,
+    require_schema,
+    root_attributes,
+    verified,
+)
+from avatar_core.errors import AvatarError, StorageError
+from avatar_core.fem.elasticity import Element, Material
+from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.reduction.separated import SeparatedField
+from avatar_core.vademecum.accuracy import AccuracyCurve, Cloud, Precision
+from avatar_core.vademecum.certificate import Certificate
+from avatar_core.vademecum.large_deformation import (
+    LargeCertificate,
+    LargeDeformation,
+    LargeMaterial,
+)
+from avatar_core.vademecum.modal_mass import BodyResponse
+from avatar_core.vademecum.model import SCHEMA_VERSION, Convergence, Provenance, Vademecum
+from avatar_core.vademecum.parametric import ParametricResponse
+from avatar_core.vademecum.schema import (
+    BODY_KEYS,
+    LARGE_KEYS,
+    PARAMETRIC_BODY_KEYS,
+    PARAMETRIC_KEYS,
+    require_sound,
+    shapes_of,
+)
+from avatar_core.vademecum.tip_field import TipField
+
+FORMAT = "avatar vademecum"
+MAX_FILE_BYTES = 4 << 30
+
+_JSON = ("material", "provenance", "convergence", "certificate")
+_JSON_LATER = ("coordinates", "contrast", "large", "accuracy")  # from schema 2.0, the last 2.2
+
+
+def save_vademecum(vademecum: Vademecum, path: str | Path) -> None:
+    """Write a vademecum; the file appears complete or not at all.
+
+    Raises
+    ------
+    StorageError
+        If the folder does not exist or the disk is full; nothing is left behind.
+    """
+    replace_file(Path(path), _arrays(vademecum), _attributes(vademecum))
+
+
+def load_vademecum(path: str | Path) -> Vademecum:
+    """Read and verify a vademecum.
+
+    Sizes are checked before anything is allocated, the checksum before anything is used.
+
+    Raises
+    ------
+    StorageError
+        For a missing, truncated, altered, foreign or newer file.
+    """
+    path = Path(path)
+    try:
+        with opened(path, MAX_FILE_BYTES) as source:
+            return _read(source, str(path))
+    except FileError as error:
+        raise StorageError(
+            f"no vademecum at {path} ({error}); build one with 'avatar vademecum'"
+        ) from error
+
+
+def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
+    """Read and verify a vademecum in memory; see :func:`load_vademecum`.
+
+    Parameters
+    ----------
+    content : the bytes of a vademecum file
+    origin : what messages call it
+    """
+    if len(content) > MAX_FILE_BYTES:
+        raise StorageError(f"{origin} has {len(content) >> 20} MiB, more than a vademecum may have")
+    return _read(io.BytesIO(content), origin)
+
+
+def is_vademecum(path: str | Path) -> bool:
+    """Whether a path is an ordinary file that calls itself a vademecum; nothing else is read."""
+    try:
+        with opened(Path(path), MAX_FILE_BYTES) as source, h5py.File(source, "r") as file:
+            return root_attributes(file).get("format") == FORMAT
+    except (FileError, *UNREADABLE):
+        return False
+
+
+def _read(source: BinaryIO, origin: str) -> Vademecum:
+    attributes, arrays = verified(source, origin, "vademecum", _attributes_of, shapes_of)
+    try:
+        vademecum = _assemble(arrays, attributes)
+    except AvatarError as error:
+        raise StorageError(f"{origin}: {error}") from error
+    return replace(vademecum, id=_digest(source), nbytes=source.tell())
+
+
+def file_id(path: str | Path) -> str:
+    """SHA-256 of the file, the id under which a vademecum is announced."""
+    with Path(path).open("rb") as file:
+        return _digest(file)
+
+
+def _digest(source: BinaryIO) -> str:
+    digest = hashlib.sha256()
+    source.seek(0)
+    while block := source.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()
+
+
+def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:
+    """The attributes that count, of a file that is a vademecum and not too new."""
+    if held.get("format") != FORMAT:
+        raise StorageError(f"{origin} is HDF5 but no vademecum; build one with 'avatar vademecum'")
+    require_schema(held, SCHEMA_VERSION, origin)
+    keys = ("format", "schema", "name", "element", *_JSON)
+    return {key: held[key] for key in (*keys, *_JSON_LATER) if key in held or key in keys}
+
+
+def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
+    """Every dataset; the keys are attribute paths of the vademecum."""
+    arrays = {}
+    held = PARAMETRIC_KEYS[:1] * bool(v.parametric) + LARGE_KEYS[:1] * bool(v.large)
+    held += BODY_KEYS[:1] * bool(v.body)
+    held += PARAMETRIC_BODY_KEYS[:1] * bool(v.parametric and v.parametric.body)
+    for key in shapes_of(held):
+        value: Any = v
+        for attribute in key.split("/"):
+            value = getattr(value, attribute)
+        arrays[key] = np.asarray(value)
+    return arrays
+
+
+def _attributes(v: Vademecum) -> dict[str, str]:
+    curve = v.certificate.curve if v.certificate else None
+    convergence = asdict(v.convergence)
+    for report in convergence["enrichments"]:
+        report["status"] = report["status"].value
+    coordinates = [asdict(c) for c in v.parametric.coordinates] if v.parametric else []
+    return {
+        "format": FORMAT,
+        "schema": SCHEMA_VERSION,
+        "name": v.name,
+        "element": v.element,
+        "material": json.dumps(asdict(v.material)),
+        "provenance": json.dumps(asdict(v.provenance)),
+        "convergence": json.dumps(convergence),
+        "certificate": json.dumps(_certificate_attribute(v.certificate)),
+        "accuracy": json.dumps(curve.plain() if curve else None),
+        "coordinates": json.dumps(coordinates),
+        "contrast": json.dumps(v.contrast),
+        "large": json.dumps(_large_attribute(v.large)),
+    }
+
+
+def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vademecum:
+    """The vademecum of arrays and attributes from elsewhere; all are checked first."""
+    require_sound(arrays)
+    plain = {key: parsed(attributes.get(key, "null"), key) for key in (*_JSON, *_JSON_LATER)}
+
+    def blocks(name: str) -> LocalBlocks:
+        return LocalBlocks(*(arrays[f"{name}/{k}"] for k in ("start", "target", "block")))
+
+    return Vademecum(
+        name=require_name(attributes["name"], "name"),
+        mesh=TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"]),
+        regions=Regions(arrays["regions/clamped"], arrays["regions/accessible"]),
+        material=of_plain(Material, plain["material"], "material"),
+        element=of_plain(Element, attributes["element"], "element"),  # type: ignore[arg-type]
+        surface=LoadSurface(
+            arrays["surface/centers"],
+            arrays["surface/normals"],
+            arrays["surface/corners"],
+            arrays["surface/vertices"],
+            float(arrays["surface/patch_radius"]),
+        ),
+        far=SeparatedField(arrays["far/space"], arrays["far/load"]),
+        near=blocks("near"),
+        contact_near=blocks("contact_near"),
+        tip_field=TipField(*(arrays[f"tip_field/{name}"] for name in TipField._fields)),
+        convergence=of_plain(Convergence, plain["convergence"], "convergence"),
+        provenance=of_plain(Provenance, plain["provenance"], "provenance"),
+        certificate=_certificate(plain["certificate"], plain["accuracy"]),
+        parametric=_parametric(arrays, plain["coordinates"]),
+        contrast=_contrast(plain["contrast"]),
+        large=_large(arrays, plain["large"]),
+        body=_body(arrays, BODY_KEYS),
+    )
+
+
+def _body(arrays: dict[str, np.ndarray], keys: tuple[str, ...]) -> BodyResponse | None:
+    return BodyResponse(*(arrays[key] for key in keys)) if keys[0] in arrays else None
+
+
+def _contrast(stored: Any) -> float | None:
+    contrast = of_plain(float | None, stored, "contrast")  # type: ignore[arg-type]
+    if contrast is not None and not (math.isfinite(contrast) and contrast > 0.0):
+        raise StorageError(f"'contrast' is {contrast:g}, not above 0; build the file again")
+    return contrast
+
+
+def _certificate_attribute(certificate: Certificate | None) -> dict[str, Any] | None:
+    return asdict(replace(certificate, curve=None)) if certificate else None
+
+
+def _certificate(stored: Any, curve: Any) -> Certificate | None:
+    certificate = of_plain(Certificate | None, stored, "certificate")  # type: ignore[arg-type]
+    if certificate is None or curve is None:
+        return certificate
+    columns = asdict(of_plain(_Curve, curve, "accuracy"))
+    if len({len(column) for column in columns.values() if isinstance(column, tuple)}) != 1:
+        raise StorageError("'accuracy' has columns of several lengths; build the file again")
+    return replace(certificate, curve=AccuracyCurve.of_plain(columns))
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """What AccuracyCurve.plain() gives."""
+
+    modes: tuple[int, ...]
+    cloud: tuple[Cloud, ...]
+    precision: tuple[Precision, ...]
+    near: tuple[float, ...]
+    l2: tuple[float, ...]
+    force: tuple[float, ...]
+    nbytes: tuple[int, ...]
+    p50: tuple[float, ...]
+    p99: tuple[float, ...]
+    n_errors: int
+    machine: str
+
+
+@dataclass(frozen=True)
+class _Large:
+    """What is stored of large deformation beside its arrays."""
+
+    material: LargeMaterial
+    certificate: LargeCertificate | None
+
+
+def _large_attribute(large: LargeDeformation | None) -> dict[str, Any] | None:
+    if large is None:
+        return None
+    certificate = asdict(large.certificate) if large.certificate else None
+    return {"material": large.material, "certificate": certificate}
+
+
+def _large(arrays: dict[str, np.ndarray], stored: Any) -> LargeDeformation | None:
+    if LARGE_KEYS[0] not in arrays:
+        return None
+    said = of_plain(_Large, stored, "large")
+    space, load, near, depth, reach = (arrays[key] for key in LARGE_KEYS)
+    return LargeDeformation(said.material, space, load, near, depth, reach, said.certificate)
+
+
+def _parametric(arrays: dict[str, np.ndarray], stored: Any) -> ParametricResponse | None:
+    if PARAMETRIC_KEYS[0] not in arrays:
+        return None
+    part = {key.removeprefix("parametric/"): arrays[key] for key in PARAMETRIC_KEYS}
+    coordinates = of_plain(tuple[Coordinate, ...], stored, "coordinates")
+    n_nodes = math.prod(coordinate.n_nodes for coordinate in coordinates)
+    if not coordinates or n_nodes != len(part["near"]):
+        raise StorageError("'coordinates' do not fit 'parametric/near'; build the file again")
+    return ParametricResponse(
+        coordinates=coordinates,
+        basis=SeparatedField(part["basis/space"], part["basis/load"]),
+        operators=part["operators"],
+        near=part["near"],
+        contact_near=part["contact_near"],
+        rank=int(part["rank"]),
+        young_modulus=Material(float(part["young_modulus"])).young_modulus,
+        body=_body(arrays, PARAMETRIC_BODY_KEYS),
+    )

@@ -1,0 +1,282 @@
+"""Does this machine hold 1 kHz? Measures a whole cell of real processes over real DDS.
+
+Loader, contact node, a palpating tool, a cloud viewer, on request a slider of the material, and
+beside them a loop that only sleeps:
+what it misses, the machine misses. Of every process it says what memory, files and threads it has
+at the begin and at the end: ten minutes of it are a soak. ``avatar bench cell`` and ``avatar demo``
+run it as ``python -m avatar_ros.bench.cell VADEMECUM SECONDS``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar_core.errors import AvatarError
+from avatar_ros.bench import footprint
+from avatar_ros.bench.footprint import Growth, footprints
+from avatar_ros.bench.report import CellMeasurement, CellReport, Times
+from avatar_ros.bench.scripted_tool import READY, Felt
+from avatar_ros.framework import realtime
+
+PERIOD = 1e-3  # [s]
+ON_TIME = 1.5e-3  # longest period that is on time [s]
+PRIORITY = 80  # of contact node, tool and sleeping loop in the real-time mode
+_START_TIMEOUT = 120.0  # compilation included [s]
+_WARM = 0.1  # part of a run, before what the processes have is noted for the first time
+_LAST = 1.5  # before its end, when the tool is still there, it is noted again [s]
+_STOP_TIMEOUT = 2.0  # a node ends within [s]
+_DOMAINS = range(1, 102)  # of DDS, those that work on every platform
+
+
+class CellError(AvatarError):
+    """A process of the measured cell did not do its part."""
+
+
+def run_cell(
+    vademecum_path: str | Path,
+    seconds: float = 60.0,
+    output_json: str | Path | None = None,
+    real_time: bool = True,
+    ordinary: bool = True,
+    tip_radius: float = 0.005,
+    changes: float = 0.0,
+) -> CellReport:
+    """Measure a cell with real-time priority and without, ``seconds`` each.
+
+    changes : of the material [Hz]
+
+    Raises
+    ------
+    CellError : a process failed; the message holds its last line
+    """
+    path = Path(vademecum_path).resolve()
+    if not path.is_file():
+        raise CellError(f"{path}: no such file; build one with 'avatar vademecum'")
+    granted = real_time and _priority_is_granted()
+    report = CellReport(
+        machine=f"{platform.machine()} {platform.release()}",
+        cores=len(os.sched_getaffinity(0)),
+        vademecum=path.name,
+        real_time=_measure(path, seconds, PRIORITY, tip_radius, changes) if granted else None,
+        ordinary=_measure(path, seconds, 0, tip_radius, changes) if ordinary else None,
+    )
+    if output_json is not None:
+        report.save(Path(output_json))
+    return report
+
+
+def _priority_is_granted() -> bool:
+    question = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({PRIORITY}))"
+    return (
+        subprocess.run([sys.executable, "-c", question], stderr=subprocess.DEVNULL).returncode == 0
+    )
+
+
+def _measure(
+    path: Path, seconds: float, priority: int, tip_radius: float, changes: float
+) -> CellMeasurement:
+    load = os.getloadavg()[0]
+    with (
+        tempfile.TemporaryDirectory(prefix="avatar-bench-") as folder,
+        cell(path, tip_radius, priority) as (environment, processes),
+    ):
+        felt_file, view_file = Path(folder, "felt.npz"), Path(folder, "view.json")
+        count_file = Path(folder, "count.json")
+        viewer = Module("cloud_viewer", [str(view_file)], environment)
+        arguments = [str(path), "--tip-radius", str(tip_radius), "--output", str(felt_file)]
+        arguments += ["--seconds", str(seconds), "--priority", str(priority)]
+        arguments += ["--timeout", str(_START_TIMEOUT)]
+        tool = Module("scripted_tool", arguments, environment)
+        slider = None
+        try:
+            assert tool.stdout is not None
+            if tool.stdout.readline().strip() != READY:
+                tool.wait(_STOP_TIMEOUT)
+                raise CellError(f"the tool did not start: {tool.last_words()}")
+            if changes > 0.0:
+                of_slider = [str(path), str(changes), str(count_file)]
+                slider = Module("material_slider", of_slider, environment)
+            floor = Module("realtime", [str(seconds), str(priority)], environment)
+            grown = _growths(seconds, processes | {"cloud_viewer": viewer, "scripted_tool": tool})
+            bare, _ = floor.communicate(timeout=seconds + _START_TIMEOUT)
+            if tool.wait(timeout=seconds + _START_TIMEOUT) != 0:
+                raise CellError(f"the tool failed: {tool.last_words()}")
+        finally:
+            tool.finish()
+            viewer.finish()
+            code = 0 if slider is None else slider.finish()
+        if slider is not None and code != 0:
+            raise CellError(f"the slider failed: {slider.last_words()}")
+        accepted = 0 if slider is None else json.loads(count_file.read_text())["accepted"]
+        felt = Felt.load(felt_file)
+        view = json.loads(view_file.read_text())
+        return _evaluate(felt, view, json.loads(bare), load, accepted, grown)
+
+
+def _growths(seconds: float, processes: dict[str, Module]) -> tuple[Growth, ...]:
+    """Of all processes over a run that begins now; returns shortly before its end."""
+    begin = time.monotonic()
+    pids = {name: process.pid for name, process in processes.items()}
+    helpers = footprint.children(pids["contact"])
+    pids |= {f"contact's helper {k}": pid for k, pid in enumerate(sorted(helpers), 1)}
+    time.sleep(_WARM * seconds)
+    try:
+        first = footprints(pids)
+        time.sleep(max(0.0, begin + seconds - _LAST - time.monotonic()))
+        return footprint.growths(first, footprints(pids))
+    except OSError:  # one ended, and who looks after it will say so
+        return ()
+
+
+def _evaluate(
+    felt: Felt,
+    view: dict[str, Any],
+    bare: dict[str, Any],
+    load: float,
+    accepted: int,
+    grown: tuple[Growth, ...],
+) -> CellMeasurement:
+    windows = [
+        w
+        for w in view["statistics"]
+        if felt.begin <= w["received"] - w["window"] and w["received"] <= felt.end
+    ]
+    if not windows:
+        raise CellError("no statistics from the contact node: measure for 3 s or longer")
+    periods = sum(w["periods"] for w in windows)
+    duration = float(felt.end - felt.begin)
+    clouds = [n for at, n in view["clouds"].items() if felt.begin < int(at) < felt.end - 1.0]
+    floor = np.array(bare["periods"])
+    at_tool = np.diff(felt.arrivals)
+    answered = felt.latencies[np.isfinite(felt.latencies)]
+    return CellMeasurement(
+        priority=int(felt.priority),
+        load_average=load,
+        seconds=duration,
+        rate_hz=periods / sum(w["window"] for w in windows),
+        on_time_fraction=1.0 - sum(w["missed"] for w in windows) / periods,
+        period_max_ms=1e3 * max(w["period_max"] for w in windows),
+        rate_at_tool_hz=len(felt.arrivals) / duration,
+        on_time_at_tool_fraction=float(np.mean(at_tool <= ON_TIME)),
+        latency=Times.of(answered),
+        answered_fraction=len(answered) / len(felt.latencies),
+        compute_p99_ms=1e3 * max(w["compute_p99"] for w in windows),
+        floor=Times.of(floor),
+        floor_on_time_fraction=float(np.mean(floor <= ON_TIME)),
+        cloud_hz=float(np.mean(clouds)) if clouds else 0.0,
+        cloud_bytes=view["cloud_bytes"],
+        material_changes=accepted,
+        force_max_n=float(np.nanmax(np.linalg.norm(felt.forces, axis=1))),
+        growths=grown,
+        felt=felt,
+    )
+
+
+# --- Processes -------------------------------------------------------------------------------
+
+
+def isolated_environment() -> dict[str, str]:
+    """An environment with a DDS domain of its own, on this machine only."""
+    environment = realtime.single_threaded_libraries(dict(os.environ))
+    return environment | {
+        "ROS_DOMAIN_ID": str(_DOMAINS[(os.getpid() * 37 + time.monotonic_ns()) % len(_DOMAINS)]),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+@contextmanager
+def cell(
+    vademecum: Path, tip_radius: float = 0.005, priority: int = 0
+) -> Iterator[tuple[dict[str, str], dict[str, Module]]]:
+    """Loader and contact node as processes; gives the environment to join them, and them.
+
+    Raises
+    ------
+    CellError : one of them failed, or did not end in time
+    """
+    environment = isolated_environment()
+    files = ["-p", f"library_dir:={vademecum.parent}", "-p", f"vademecum:={vademecum.name}"]
+    loader = Module("vademecum_loader", ["--ros-args", *files], environment)
+    numbers = ["-p", f"tip_radius:={float(tip_radius)}", "-p", f"realtime.priority:={priority}"]
+    contact = Module("contact", ["--ros-args", *numbers], environment)
+    try:
+        yield environment, {"vademecum_loader": loader, "contact": contact}
+        for name, process in (("vademecum_loader", loader), ("contact", contact)):
+            if process.poll() is not None:
+                raise CellError(f"{name} ended by itself: {process.last_words()}")
+    finally:
+        codes = [process.finish() for process in (contact, loader)]
+    if any(codes):
+        raise CellError(f"contact and loader ended with codes {codes} instead of 0")
+
+
+class Module(subprocess.Popen[str]):
+    """A Python module as a process; what it says on standard error is kept."""
+
+    def __init__(self, name: str, arguments: list[str], environment: dict[str, str]) -> None:
+        self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115, closed with the object
+        super().__init__(
+            [sys.executable, "-m", f"avatar_ros.{name}", *arguments],
+            cwd="/",  # -m would let a checkout there stand before what is installed
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=self._said,
+            text=True,
+        )
+
+    def said(self) -> str:
+        """All of standard error so far; where the process writes next is left alone."""
+        number = self._said.fileno()
+        return os.pread(number, os.fstat(number).st_size, 0).decode(errors="replace")
+
+    def last_words(self) -> str:
+        """The last line of standard error."""
+        lines = [line.strip() for line in self.said().splitlines() if line.strip()]
+        return lines[-1] if lines else f"it said nothing, exit code {self.poll()}"
+
+    def finish(self) -> int:
+        """End it as Ctrl-C would; returns its exit code."""
+        if self.poll() is None:
+            self.send_signal(signal.SIGINT)
+        try:
+            return self.wait(_STOP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return self.wait()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m avatar_ros.bench.cell")
+    parser.add_argument("vademecum", type=Path)
+    parser.add_argument("seconds", type=float, help="of each run [s]")
+    parser.add_argument("--changes", type=float, default=0.0, help="of the material [Hz]")
+    parser.add_argument("--output", type=Path, help="write all figures as JSON")
+    chosen = parser.parse_args()
+    try:
+        report = run_cell(chosen.vademecum, chosen.seconds, chosen.output, changes=chosen.changes)
+    except AvatarError as error:
+        print(f"avatar: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130  # by Ctrl-C, as shells count it
+    print(report.table(), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

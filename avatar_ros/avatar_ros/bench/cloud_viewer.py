@@ -1,0 +1,54 @@
+"""The third process of a measured cell: takes every cloud, and keeps the loop's statistics.
+
+Run as ``python -m avatar_ros.bench.cloud_viewer FILE.json``; the file is written at SIGINT or
+SIGTERM.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import PointCloud2
+
+from avatar_ros.framework import qos, realtime
+from avatar_ros.framework.managed_node import StopSignal, spin_until
+from avatar_ros.msg import LoopStatistics
+
+
+def main() -> int:
+    output = Path(sys.argv[1])
+    stop = StopSignal()
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("cloud_viewer", enable_rosout=False, start_parameter_services=False)
+    clouds: Counter[int] = Counter()  # by second: a list of all would grow as a leak does
+    n_bytes = [0]
+    statistics: list[dict[str, Any]] = []
+
+    def view(cloud: bytes) -> None:
+        clouds[int(time.monotonic())] += 1
+        n_bytes[0] = len(cloud)
+
+    def note(message: LoopStatistics) -> None:
+        numbers = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
+        del numbers["header"]
+        statistics.append({"received": time.monotonic(), **numbers})
+
+    node.create_subscription(PointCloud2, "deformation", view, qos.NEWEST, raw=True)
+    node.create_subscription(LoopStatistics, "statistics", note, qos.STATISTICS)
+    realtime.calm_interpreter()
+    spin_until(stop, node)
+    output.write_text(
+        json.dumps({"clouds": clouds, "cloud_bytes": n_bytes[0], "statistics": statistics})
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

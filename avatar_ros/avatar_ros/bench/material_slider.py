@@ -1,0 +1,75 @@
+"""A slider of a planning page that somebody drags: the material changes while the tool moves.
+
+Run as ``python -m avatar_ros.bench.material_slider FILE.h5 RATE COUNT.json``: sets Young's modulus
+and every coordinate that the vademecum has to random values, RATE times a second, until SIGINT or
+SIGTERM; then writes how many changes were accepted.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import load_vademecum
+from avatar_ros.framework import realtime
+from avatar_ros.framework.managed_node import StopSignal, spin_until
+from avatar_ros.loop.settings import MATERIAL
+
+_YOUNG = (0.5, 2.0)  # times that of the vademecum
+
+
+def main() -> int:
+    vademecum, rate = load_vademecum(sys.argv[1]), float(sys.argv[2])
+    ranges = _ranges(vademecum)
+    rng = np.random.default_rng(0)
+    stop = StopSignal()
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("material_slider", enable_rosout=False, start_parameter_services=False)
+    client = node.create_client(SetParameters, "contact/set_parameters")
+    accepted = [0]
+
+    def count(answer: Future) -> None:
+        accepted[0] += all(result.successful for result in answer.result().results)
+
+    def change() -> None:
+        if not client.service_is_ready():
+            return
+        named = [
+            Parameter(
+                name=name,
+                value=ParameterValue(
+                    type=ParameterType.PARAMETER_DOUBLE, double_value=rng.uniform(low, high)
+                ),
+            )
+            for name, (low, high) in ranges.items()
+        ]
+        request = SetParameters.Request(parameters=named)
+        client.call_async(request).add_done_callback(count)
+
+    node.create_timer(1.0 / rate, change)
+    realtime.calm_interpreter()
+    spin_until(stop, node)
+    Path(sys.argv[3]).write_text(json.dumps({"accepted": accepted[0]}))
+    return 0
+
+
+def _ranges(vademecum: Vademecum) -> dict[str, tuple[float, float]]:
+    """By name of the contact node's parameter."""
+    own = vademecum.material.young_modulus
+    ranges = {"young": (_YOUNG[0] * own, _YOUNG[1] * own)}
+    if vademecum.parametric is not None:
+        ranges |= {c.name: (c.low, c.high) for c in vademecum.parametric.coordinates}
+    return {name: ranges[key] for name, key in MATERIAL.items() if key in ranges}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

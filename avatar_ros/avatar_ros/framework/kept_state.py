@@ -1,0 +1,80 @@
+"""What was changed while a node ran, kept in a file: started again, it goes on with that.
+
+It holds for a node that is started with the same values as the last time. With others, somebody
+chose anew, and nothing of it is used.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rclpy.node import Node
+
+from avatar_ros.framework.parameters import Parameter, ParameterError
+
+STATE_DIR = Parameter(
+    "state_dir",
+    "",
+    "directory where what is changed while the node runs is kept for its next start; empty: none",
+)
+
+
+class KeptState:
+    """The file of one node; without a directory, nothing is kept and nothing comes back.
+
+    started : what the node is started with, by name; values as JSON has them
+    tell : takes one line on a file that cannot be used; the node goes on
+
+    Raises
+    ------
+    ParameterError : the directory is none, or cannot be written to
+    """
+
+    def __init__(self, node: Node, started: dict[str, Any]) -> None:
+        self._started = started
+        self._tell: Callable[[str], object] = node.get_logger().error
+        self._path: Path | None = None
+        self._written = ""
+        folder = os.path.expanduser(node.get_parameter(STATE_DIR.name).value)
+        if not folder:
+            return
+        if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
+            raise ParameterError(
+                f"parameter state_dir: {folder} is no directory that can be written to"
+            )
+        name = node.get_fully_qualified_name().strip("/").replace("/", ".")
+        self._path = Path(folder).resolve() / f"{name}.json"
+
+    def kept(self) -> dict[str, Any]:
+        """What had been changed, unless the node is started with other values now."""
+        if self._path is None or not self._path.exists():
+            return {}
+        try:
+            stored = json.loads(self._path.read_text())
+            return dict(stored["changed"]) if stored["started"] == self._started else {}
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            self._tell(
+                f"{self._path} not used ({type(error).__name__}); remove it, the node goes on with "
+                "its parameters"
+            )
+            return {}
+
+    def keep(self, now: dict[str, Any]) -> None:
+        """Write what differs from the start, whole or not at all; nothing where nothing is new."""
+        if self._path is None:
+            return
+        changed = {name: value for name, value in now.items() if value != self._started[name]}
+        text = json.dumps({"started": self._started, "changed": changed}, indent=1)
+        if text == self._written:
+            return
+        part = self._path.with_name(f".{self._path.name}.{os.getpid()}")
+        try:
+            part.write_text(text + "\n")
+            part.replace(self._path)
+            self._written = text
+        except OSError as error:
+            self._tell(f"state_dir: {self._path} not written ({error.strerror}); free some space")

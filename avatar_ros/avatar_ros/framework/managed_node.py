@@ -1,0 +1,180 @@
+"""What every node of the cell shares: managed transitions, start, signals, exit code."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+import traceback
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import nullcontext
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import get_rmw_implementation_identifier
+
+from avatar_core.errors import AvatarError
+from avatar_ros.framework import discovery
+from avatar_ros.framework.parameters import Parameter, ParameterError, declare
+from avatar_ros.framework.ports import Ports
+
+_SIGNAL_LATENCY = 0.1  # longest until a signal is noticed [s]
+_LAST_ANSWERS = 1.0  # for what is still to be answered when the node ends [s]
+
+
+class ManagedNode(LifecycleNode, ABC):
+    """A lifecycle node whose transitions may raise, and that says why it refused one.
+
+    A subclass gives ``configure``, ``activate``, ``deactivate``, ``clean_up``; the last two may
+    be called in any state. Parameters are declared here, so that a wrong value is refused
+    before anything starts.
+
+    refusal : why the last transition failed
+    ports : makes publishers and subscriptions
+    """
+
+    def __init__(self, name: str, declared: tuple[Parameter, ...]) -> None:
+        super().__init__(name)
+        self.refusal = ""
+        self.ports = Ports(self)
+        declare(self, declared)
+
+    @abstractmethod
+    def configure(self) -> None:
+        """Do all that may fail."""
+
+    @abstractmethod
+    def activate(self) -> None:
+        """Start to serve."""
+
+    @abstractmethod
+    def deactivate(self) -> None:
+        """Stop serving."""
+
+    @abstractmethod
+    def clean_up(self) -> None:
+        """Give back what ``configure`` took."""
+
+    @property
+    def failure(self) -> str:
+        """Why the node cannot go on, else empty."""
+        return ""
+
+    @property
+    def owes_answers(self) -> bool:
+        """Whether a request is still to be answered, for which the node is kept a moment."""
+        return False
+
+    def bring_up(self) -> bool:
+        """Configure and activate; false if the node refused."""
+        return all(
+            trigger() == TransitionCallbackReturn.SUCCESS
+            for trigger in (self.trigger_configure, self.trigger_activate)
+        )
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self.configure, self.clean_up)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self.activate, self.deactivate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self.deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self.clean_up)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.deactivate()
+        return self._attempt(self.clean_up)
+
+    def _attempt(
+        self, transition: Callable[[], None], undo: Callable[[], None] | None = None
+    ) -> TransitionCallbackReturn:
+        try:
+            transition()
+            return TransitionCallbackReturn.SUCCESS
+        except (ParameterError, AvatarError, OSError) as error:
+            self.refusal = str(error)
+        except Exception as error:  # rclpy would drop it
+            self.refusal = f"{type(error).__name__}: {error}"
+            traceback.print_exc()
+        self.get_logger().error(self.refusal)
+        if undo is not None:
+            undo()
+        return TransitionCallbackReturn.FAILURE
+
+
+class StopSignal:
+    """True once SIGINT or SIGTERM came."""
+
+    def __init__(self) -> None:
+        self._came = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    def _note(self, *_: object) -> None:
+        self._came = True
+
+    def __bool__(self) -> bool:
+        return self._came
+
+
+def spin_until(stop: StopSignal, node: Node) -> None:
+    """Serve a plain node until the signal came, then take it and rclpy down."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stop:
+            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def run(make_node: Callable[[], ManagedNode], keeps_time: bool = False) -> int:
+    """Bring a node up, spin it until SIGINT or SIGTERM, take it down; returns the exit code.
+
+    keeps_time : no other process may hold up what it publishes
+
+    The signal handlers of rclpy are not used: they pull the middleware away from under a loop
+    that still has a last message to send.
+    """
+    stop = StopSignal()
+    try:
+        discovery.stay_local()
+        middleware = get_rmw_implementation_identifier()
+        with discovery.udp_alone(middleware) if keeps_time else nullcontext():
+            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+            node = make_node()
+        return _live(node, stop)
+    except (ParameterError, AvatarError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    finally:
+        rclpy.try_shutdown()
+
+
+def _live(node: ManagedNode, stop: StopSignal) -> int:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        if node.get_parameter("autostart").value and not node.bring_up():
+            return 1  # the reason was logged
+        while not stop and not node.failure:
+            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+        if node.failure:
+            node.get_logger().fatal(node.failure)
+        return 1 if node.failure else 0
+    finally:
+        node.trigger_shutdown()
+        end = time.monotonic() + _LAST_ANSWERS
+        while node.owes_answers and time.monotonic() < end:
+            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+        executor.shutdown(timeout_sec=_LAST_ANSWERS)  # without, it waits for ever for what is open
+        node.destroy_node()

@@ -1,0 +1,82 @@
+"""Parameters of nodes, each declared once with type, default, range and meaning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+
+
+class ParameterError(ValueError):
+    """A parameter has a value that the node cannot work with; the message says what it takes."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a node.
+
+    range : smallest and largest value of a number
+    any_type : the type may differ from the default's; checked where it is read
+    """
+
+    name: str
+    default: Any
+    description: str
+    range: tuple[float, float] | None = None
+    read_only: bool = True
+    any_type: bool = False
+
+    def descriptor(self) -> ParameterDescriptor:
+        descriptor = ParameterDescriptor(
+            description=self.description, read_only=self.read_only, dynamic_typing=self.any_type
+        )
+        if self.range is not None and isinstance(self.default, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=self.range[0], to_value=self.range[1])
+            ]
+        elif self.range is not None:
+            low, high = (int(bound) for bound in self.range)
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+        return descriptor
+
+    def wanted(self) -> str:
+        kind = "a number with a decimal point" if isinstance(self.default, float) else "a value"
+        bounds = f" from {self.range[0]:g} to {self.range[1]:g}" if self.range else ""
+        return f"{kind}{bounds} like {self.default!r}"
+
+
+def declare(node: Node, parameters: tuple[Parameter, ...]) -> None:
+    """Declare all, with the values given by files and command line.
+
+    Raises
+    ------
+    ParameterError : a given value has the wrong type or lies out of range
+    """
+    for parameter in parameters:
+        try:
+            node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            raise ParameterError(
+                f"parameter {parameter.name}: give {parameter.wanted()} ({parameter.description})"
+            ) from error
+
+
+def values(node: Node, parameters: tuple[Parameter, ...]) -> dict[str, Any]:
+    """The values of declared parameters, by name."""
+    return {p.name: node.get_parameter(p.name).value for p in parameters}
+
+
+def frame(name: str) -> str:
+    """A name that is not empty; raises ParameterError otherwise."""
+    if not name:
+        raise ParameterError("parameter frame_id: give the name of the organ's frame")
+    return name
+
+
+AUTOSTART = Parameter(
+    "autostart", True, "configure and activate at start; false: wait for lifecycle transitions"
+)
+FRAME_ID = Parameter("frame_id", "organ", "frame of the organ; poses in other frames are refused")

@@ -1,0 +1,163 @@
+"""Publishers and subscriptions whose quality of service parameters may change.
+
+The parameters are those of rclpy, ``qos_overrides.TOPIC.publisher.POLICY`` or ``.subscription.``;
+:class:`avatar_ros.framework.qos.Quality` says which values pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.node import Node
+from rclpy.qos import (
+    QoSCompatibility,
+    QoSPolicyKind,
+    QoSProfile,
+    qos_check_compatible,
+    qos_policy_name_from_kind,
+)
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+
+from avatar_ros.framework.parameters import ParameterError
+from avatar_ros.framework.qos import Quality
+
+POLICIES = (
+    QoSPolicyKind.RELIABILITY,
+    QoSPolicyKind.DURABILITY,
+    QoSPolicyKind.DEPTH,
+    QoSPolicyKind.DEADLINE,
+)
+
+
+_MOST_TOLD = 100  # lines; then diagnostics alone tell
+
+
+class Ports:
+    """Makes those of a node, and tells of ends elsewhere that do not match them.
+
+    Raises
+    ------
+    ParameterError : an override has a value that does not pass
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._suspects: dict[tuple[str, str], QoSProfile] = {}  # that once had an end not matching
+        self._silent: set[str] = set()  # topics whose events nobody hears: always suspect
+        self._told: set[str] = set()
+
+    def publisher(self, kind: type, topic: str, quality: Quality) -> Any:
+        profile, name = quality.fresh(), self._node.resolve_topic_name(topic)
+        return self._made(
+            lambda options: self._node.create_publisher(
+                kind,
+                topic,
+                profile,
+                event_callbacks=PublisherEventCallbacks(
+                    incompatible_qos=lambda event: self._tell("publisher", name, profile, event)
+                ),
+                qos_overriding_options=options,
+            ),
+            f"qos_overrides.{name}.publisher",
+            profile,
+            quality,
+        )
+
+    def subscription(
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        quality: Quality,
+        silent: bool = False,
+        **how: Any,
+    ) -> Any:
+        """``how`` goes on to rclpy; ``silent``: its events are not waited for."""
+        profile, name = quality.fresh(), self._node.resolve_topic_name(topic)
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=lambda event: self._tell("subscription", name, profile, event)
+        )
+        if silent:
+            events = SubscriptionEventCallbacks(use_default_callbacks=False)
+            self._suspects["subscription", name] = profile
+            self._silent.add(name)
+        return self._made(
+            lambda options: self._node.create_subscription(
+                kind,
+                topic,
+                callback,
+                profile,
+                event_callbacks=events,
+                qos_overriding_options=options,
+                **how,
+            ),
+            f"qos_overrides.{name}.subscription",
+            profile,
+            quality,
+        )
+
+    def mismatches(self) -> list[str]:
+        """Who, of those known now, gets or sends nothing for its quality of service; a line each.
+
+        Looks at nothing where there never was one, unless it is silent.
+        """
+        found = []
+        for (side, topic), own in list(self._suspects.items()):
+            publishes = side == "publisher"
+            look = self._node.get_subscriptions_info_by_topic
+            if not publishes:
+                look = self._node.get_publishers_info_by_topic
+            for end in look(topic):
+                pair = (own, end.qos_profile) if publishes else (end.qos_profile, own)
+                compatible, reason = qos_check_compatible(*pair)
+                if compatible == QoSCompatibility.ERROR:
+                    cause = " ".join(reason.removeprefix("ERROR: ").split()).rstrip(";")
+                    found.append(f"{topic}: not matched with {end.node_name} ({cause})")
+                    if topic in self._silent:
+                        self._tell_once(topic, end.node_name, cause)
+        return found
+
+    def _made(
+        self,
+        make: Callable[[QoSOverridingOptions], Any],
+        prefix: str,
+        profile: QoSProfile,
+        quality: Quality,
+    ) -> Any:
+        def judge(given: QoSProfile) -> SetParametersResult:
+            reason = quality.refusal(given)
+            return SetParametersResult(successful=not reason, reason=reason)
+
+        try:
+            return make(QoSOverridingOptions(POLICIES, callback=judge))
+        except InvalidQosOverridesError as error:
+            raise ParameterError(f"parameter {prefix}.{quality.refusal(profile)}") from error
+        except (InvalidParameterTypeException, RuntimeError, ValueError) as error:
+            text = " ".join(str(error).split())
+            raise ParameterError(
+                f"parameter {prefix}.*: {text}; give reliability and durability as words, depth "
+                "and deadline [ns] as whole numbers"
+            ) from error
+
+    def _tell_once(self, topic: str, name: str, cause: str) -> None:
+        line = (
+            f"{topic}: {name} is not heard here ({cause}); change its policy, or "
+            f"qos_overrides.{topic}.subscription.* of this node"
+        )
+        if line not in self._told and len(self._told) < _MOST_TOLD:
+            self._told.add(line)
+            self._node.get_logger().warning(line)
+
+    def _tell(self, side: str, topic: str, profile: QoSProfile, event: Any) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind).split(".")[-1].lower()
+        self._suspects[side, topic] = profile
+        what = "gets nothing from here" if side == "publisher" else "is not heard here"
+        other = "subscription" if side == "publisher" else "publisher"
+        self._node.get_logger().warning(
+            f"{topic}: a {other} of other {policy} {what}; change its {policy}, or "
+            f"qos_overrides.{topic}.{side}.{policy} of this node"
+        )

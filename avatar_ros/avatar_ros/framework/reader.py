@@ -1,0 +1,55 @@
+"""Files of others, read in a process that may die of them: the node goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+from avatar_core.common.confined import Confined, ConfinedError
+from avatar_ros.framework.library import RefusedError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_OWN = 1 << 30  # address space of the process and its libraries [bytes]
+_SECONDS = 4.0  # for any file, and so much for its size:
+_SLOWEST = 20e6  # [byte/s]
+
+
+class Reader:
+    """Reads files of at most ``max_bytes``, which may be in memory four times meanwhile."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self._confined = Confined(_OWN + 4 * max_bytes)
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process that reads, if there is one."""
+        return self._confined.pid
+
+    def read(
+        self,
+        name: str,
+        n_bytes: int,
+        function: Callable[P, R],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> R:
+        """``function(*args, **kwargs)``, which reads ``n_bytes`` of the file ``name``.
+
+        Raises
+        ------
+        AvatarError
+            That the function raises.
+        RefusedError
+            If it ends its process, or takes much longer or more memory than such a file needs.
+        """
+        seconds = _SECONDS + n_bytes / _SLOWEST
+        try:
+            return self._confined.call(seconds, function, *args, **kwargs)
+        except ConfinedError as error:
+            raise RefusedError(f"{name}: damaged, {error}; make it again") from error
+
+    def close(self) -> None:
+        """End the process."""
+        self._confined.close()

@@ -1,0 +1,164 @@
+"""What the operating system does for a loop that must keep time: priority, core, memory, clock."""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import gc
+import json
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+# Calls through ctypes release Python's global lock, so other threads run while one sleeps here.
+_libc = ctypes.CDLL(ctypes.util.find_library("c") or "libc.so.6", use_errno=True)
+
+_CLOCK_MONOTONIC = 1
+_TIMER_ABSTIME = 1
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_MADV_POPULATE_READ = 22
+_PR_SET_PDEATHSIG = 1
+_PR_SET_TIMERSLACK = 29
+_THREAD_SWITCH_INTERVAL = 1e-4  # longest another Python thread may keep the lock from the loop [s]
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+@dataclass(frozen=True)
+class Privileges:
+    """What was granted, and for all that was refused one line that says how to get it.
+
+    priority : of SCHED_FIFO, 0 without
+    cpu : core the loop is bound to, -1 for any
+    memory_locked : pages of the process stay in memory
+    """
+
+    priority: int
+    cpu: int
+    memory_locked: bool
+    refusals: tuple[str, ...] = ()
+
+
+def claim(priority: int, cpu: int = -1, lock_memory: bool = True) -> Privileges:
+    """Take SCHED_FIFO for every thread of this process, and lock its memory.
+
+    All threads, because a thread of lower priority that holds Python's global lock, or carries
+    the middleware's messages, would hold up the loop. ``cpu`` is checked here and taken by
+    ``bind_thread``. Priority 0 asks for nothing and is granted.
+    """
+    refusals: list[str] = []
+    granted = 0
+    locked = False
+    if priority > 0:
+        try:
+            for thread in _threads():
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+            granted = priority
+        except PermissionError:
+            refusals.append(
+                f"SCHED_FIFO {priority} not permitted, the loop shares the processor with"
+                " everything else: run as root, or add 'USER - rtprio 98' to"
+                " /etc/security/limits.conf, or give the container CAP_SYS_NICE"
+            )
+        if lock_memory:
+            if _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) == 0:
+                locked = True
+            else:
+                refusals.append(
+                    f"memory not locked ({os.strerror(ctypes.get_errno())}): raise 'memlock' in"
+                    " /etc/security/limits.conf, or set realtime.lock_memory to false"
+                )
+    available = os.sched_getaffinity(0)
+    if cpu >= 0 and cpu not in available:
+        refusals.append(f"no core {cpu} here, the loop runs on any: choose of {sorted(available)}")
+        cpu = -1
+    return Privileges(granted, cpu, locked, tuple(refusals))
+
+
+def bind_thread(cpu: int) -> None:
+    """Bind the calling thread to one core (-1: leave it) and let its timers fire on time."""
+    if cpu >= 0:
+        os.sched_setaffinity(0, {cpu})
+    _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)  # else 50 us are added without SCHED_FIFO
+
+
+def release() -> None:
+    """Back to ordinary scheduling, at low priority: for a helper started by a real-time process."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    os.nice(10)
+
+
+def calm_interpreter() -> None:
+    """No garbage collection on its own account, and quick hand-over of the global lock.
+
+    Whoever calls this calls ``gc.collect()`` from time to time outside the loop; what exists now
+    is never looked at again, so that takes well below a millisecond.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    sys.setswitchinterval(_THREAD_SWITCH_INTERVAL)
+
+
+def single_threaded_libraries(environment: dict[str, str]) -> dict[str, str]:
+    """``environment`` with numerical libraries told not to start threads of their own."""
+    names = ("OMP", "OPENBLAS", "MKL", "NUMBA")
+    return environment | {f"{name}_NUM_THREADS": "1" for name in names}
+
+
+def sleep_until(deadline: int) -> None:
+    """Sleep until ``time.monotonic_ns()`` reaches ``deadline`` [ns]; at once if it has passed."""
+    when = _Timespec(deadline // 1_000_000_000, deadline % 1_000_000_000)
+    while _libc.clock_nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(when), None) != 0:
+        pass  # interrupted by a signal
+
+
+def wake_up_periods(seconds: float, period: float = 1e-3) -> np.ndarray:
+    """Periods of a loop that only sleeps: what this machine can keep at all, shape (n,) [s]."""
+    step = round(period * 1e9)
+    wakes = np.empty(max(2, round(seconds / period)), dtype=np.int64)
+    start = time.monotonic_ns()
+    for i in range(len(wakes)):
+        sleep_until(start + (i + 1) * step)
+        wakes[i] = time.monotonic_ns()
+    return np.diff(wakes) * 1e-9
+
+
+def bring_into_memory(pages: np.ndarray) -> None:
+    """Map every page of ``pages`` now, without holding the global lock, not at first use."""
+    page = os.sysconf("SC_PAGESIZE")
+    start = pages.ctypes.data // page * page
+    length = ctypes.c_size_t(pages.ctypes.data + pages.nbytes - start)
+    if _libc.madvise(ctypes.c_void_p(start), length, _MADV_POPULATE_READ) != 0:
+        pages.view(np.uint8)[::page].max()  # kernels before 5.14
+
+
+def die_with_parent(signal_number: int) -> None:
+    """Have the kernel send this process a signal when the thread that started it ends."""
+    _libc.prctl(_PR_SET_PDEATHSIG, int(signal_number), 0, 0, 0)
+
+
+def _threads() -> list[int]:
+    return [int(task.name) for task in Path("/proc/self/task").iterdir()]
+
+
+def main() -> int:
+    """Print this machine's wake-up periods as JSON: ``-m ...realtime SECONDS PRIORITY``."""
+    seconds, priority = float(sys.argv[1]), int(sys.argv[2])
+    granted = claim(priority)
+    bind_thread(-1)
+    calm_interpreter()
+    periods = wake_up_periods(seconds)
+    print(json.dumps({"priority": granted.priority, "periods": periods.tolist()}))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,334 @@
+"""The loop of the contact node: a thread that waits for a pose, steps, publishes; nothing else.
+
+It never waits for anything but poses, and never raises but once, when it ends. The node exchanges
+two references, whole: the model in use and the record of times.
+
+A model that replaces another is faded in over ``BLEND`` seconds, during which the loop steps both:
+what is published changes per period by its share of the difference, beside what motion does.
+
+What the organ answers goes through a guard (:mod:`avatar_core.contact.haptics.force_guard`) to each
+tool: limits, a ramp to none on a fault, a soft return. To stop is a fault as well.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rclpy.callback_groups import CallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+
+from avatar_core.contact import model as contact
+from avatar_core.contact.haptics import passivity
+from avatar_core.contact.haptics.force_guard import ForceGuard
+from avatar_ros.framework import realtime
+from avatar_ros.framework.conversions import (
+    NO_STAMP,
+    CloudTemplate,
+    StateTemplate,
+    stamp_nanoseconds,
+)
+from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.shown_modes import Accuracy
+from avatar_ros.loop.statistics import Record
+from avatar_ros.loop.tool import FAR_AWAY, OK, Tool
+from avatar_ros.msg import ContactState
+
+NO_MODEL = int(ContactState.STATUS_NO_MODEL)
+ENGAGING = int(ContactState.STATUS_ENGAGING)
+INACTIVE = int(ContactState.STATUS_INACTIVE)
+
+BLEND = 0.1  # [s]
+_PATIENCE = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own
+_SHORTEST = 0.5  # periods between two answers to poses, however fast they come
+_NO_ERROR = float("nan")  # of a force that no model gave
+
+
+class OwnThread(CallbackGroup):
+    """For subscriptions that the loop takes from itself: no executor ever touches them.
+
+    Nor their events: one that waits for these is woken by every pose, and holds up the loop.
+    """
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+class Online:
+    """A contact model and the messages that have its size: exchanged as one.
+
+    effects : that are in it, by name
+    accuracy : what it promises with fewer and more modes, and which it shows
+    """
+
+    def __init__(
+        self,
+        vademecum_id: str,
+        model: Any,
+        settings: ContactSettings,
+        effects: tuple[str, ...] = (),
+        accuracy: Accuracy | None = None,
+    ) -> None:
+        self.id = vademecum_id
+        self.model = model
+        self.effects = effects
+        self.accuracy = accuracy
+        self.cloud: CloudTemplate | None = None
+        if model is not None and len(model.out.cloud) > 0:
+            self.cloud = CloudTemplate(settings.frame_id, len(model.out.cloud))
+        capacity = 1 if model is None else len(model.out.contact_tool)
+        self.states = [
+            StateTemplate(settings.frame_id, tool, vademecum_id, capacity)
+            for tool in settings.tools
+        ]
+
+
+@dataclass
+class Outlets:
+    """Publishers of what concerns all tools."""
+
+    state: Any
+    deformation: Any
+    statistics: Any
+    diagnostics: Any
+
+
+class ContactLoop:
+    """Answers every pose at once, and keeps its period when none comes.
+
+    online : what is simulated; exchange it when ``is_changing`` is false, for a smooth change
+    record : where times go; exchange it at any time
+    failure : what ended the loop before ``stop``, else empty
+    guards : of the force on each tool
+    energies : of the loop and hold, by tool; None where nothing keeps account
+    """
+
+    def __init__(
+        self,
+        settings: ContactSettings,
+        tools: list[Tool],
+        outlets: Outlets,
+        context: Any,
+    ) -> None:
+        self.settings = settings
+        self.online = Online("", None, settings)
+        self.record = Record(time.monotonic_ns())
+        self.failure = ""
+        period = 1.0 / settings.rate
+        self.guards = [ForceGuard(settings.safety.limits) for _ in tools]
+        self.energies = settings.safety.observer(len(tools), period)
+        self._tools = tools
+        self._forces = np.zeros((len(tools), 3))
+        self._outlets = outlets
+        self._tips = np.full((len(tools), 3), FAR_AWAY)
+        self._turns = np.zeros((len(tools), 3))
+        self._used = self.online  # of the last step
+        self._leaving: Any = None  # the model that it replaces, while both are stepped
+        self._part = 1.0  # of the model in use, in what is published
+        self._part_per_step = 1.0 / max(1, round(BLEND * settings.rate))
+        self._wait_set = _rclpy.WaitSet(len(tools), 0, 0, 0, 0, 0, context.handle)
+        self._period = round(1e9 / settings.rate)
+        self._running = False
+        self._stopping = False
+        self._thread: threading.Thread | None = None
+        self._step_start = 0  # of the last step [ns]
+        self._due = 0  # the next step, if no pose comes before [ns]
+        self._answered = 0  # start of the last step that had a new pose [ns]
+        self._cycle = 0
+
+    @property
+    def is_changing(self) -> bool:
+        """Whether the loop still steps a model that was replaced, or is yet to see the new one."""
+        changing = self._leaving is not None or self._used is not self.online
+        return self._running and not self.failure and changing
+
+    def start(self, cpu: int = -1) -> None:
+        self._running, self._stopping = True, False
+        self._used, self._leaving = self.online, None
+        self._thread = threading.Thread(target=self._run, args=(cpu,), name="contact loop")
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Returns when all forces have faded out and the last step is over, within 20 ms."""
+        self._stopping = True
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._running = False
+
+    def _run(self, cpu: int) -> None:
+        try:
+            with ExitStack() as in_use:
+                for port in self._ports():
+                    in_use.enter_context(port.handle)  # not destroyed under the loop
+                in_use.enter_context(self._wait_set)
+                realtime.bind_thread(cpu)
+                self._step_start = self._due = time.monotonic_ns()
+                while not (self._stopping and all(guard.silent for guard in self.guards)):
+                    self._wait()
+                    self._step()
+        except Exception as error:
+            self.failure = f"the contact loop ended: {type(error).__name__}: {error}"
+            with suppress(Exception):
+                self._let_go()
+
+    def _ports(self) -> list[Any]:
+        of_tools = [port for tool in self._tools for port in (tool.subscription, tool.publisher)]
+        return [*of_tools, self._outlets.state, self._outlets.deformation]
+
+    def _wait(self) -> None:
+        """Until a pose came, or until this period must not wait any longer."""
+        realtime.sleep_until(self._answered + round(_SHORTEST * self._period))
+        wait_set = self._wait_set
+        wait_set.clear_entities()
+        for tool in self._tools:
+            wait_set.add_subscription(tool.subscription.handle)
+        wait_set.wait(max(0, self._due - time.monotonic_ns()))
+
+    def _step(self) -> None:
+        start = time.monotonic_ns()
+        settings, online, record = self.settings, self.online, self.record
+        timeout = round(settings.pose_timeout * 1e9)
+        if online is not self._used:
+            self._begin_change(online)
+        fresh, answered = False, NO_STAMP
+        for tool, tip, turn in zip(self._tools, self._tips, self._turns, strict=True):
+            if tool.take(start, timeout, tip, turn, settings.safety.leap):
+                fresh, answered = True, tool.stamp
+        record.note_period(start - self._step_start)
+        self._step_start = start
+        self._due = self._next_due(start, fresh)
+        if fresh:
+            self._answered = start
+            record.note_age(time.time_ns() - stamp_nanoseconds(answered))
+        model, leaving = online.model, self._leaving
+        busy = 0
+        if model is not None:
+            self._solve(model)
+            busy = time.monotonic_ns() - start
+        if leaving is not None:
+            self._solve(leaving)
+            self._part = min(1.0, self._part + self._part_per_step)
+            _fade_in(model.out.force, leaving.out.force, self._part)
+            _fade_in(model.out.torque, leaving.out.torque, self._part)
+        self._publish_wrenches(start * 1e-9, model)
+        record.note_step(time.monotonic_ns() - start)
+        if model is not None:
+            contact.estimate_error(model)
+        for i, tool in enumerate(self._tools):
+            self._publish_state(i, tool, online)
+        self._cycle += 1
+        if online.cloud is not None and self._cycle % settings.cloud_divisor == 0:
+            begin = time.monotonic_ns()
+            contact.deform(model)
+            record.note_model(busy + time.monotonic_ns() - begin)
+            if leaving is not None and len(leaving.out.cloud) == len(model.out.cloud):
+                contact.deform(leaving)
+                _fade_in(model.out.cloud, leaving.out.cloud, self._part)
+            online.cloud.points[:] = model.out.cloud
+            stamp = self._tools[0].stamp
+            self._outlets.deformation.handle.publish_raw(online.cloud.serialise(stamp))
+        if self._part == 1.0:
+            self._leaving = None  # whoever exchanged the model frees it, outside the loop
+
+    def _begin_change(self, online: Online) -> None:
+        """Go on with another model; the one before fades out, on the same organ in its contacts."""
+        leaving = self._used.model
+        if leaving is not None:
+            self._part = 0.0
+            if online.id == self._used.id:
+                online.model.resume(leaving)
+        self._leaving, self._used = leaving, online
+
+    def _solve(self, model: Any) -> None:
+        if model.effects.friction is not None:
+            model.effects.friction.spin[:] = self._turns
+        contact.solve(model, self._tips)
+
+    def _next_due(self, start: int, fresh: bool) -> int:
+        """When to step even without a pose: later if one is expected, else in a fixed rhythm."""
+        if fresh:
+            return start + round(_PATIENCE * self._period)
+        due = self._due + self._period
+        return due if due > start else start + self._period
+
+    def _publish_wrenches(self, now: float, model: Any) -> None:
+        """What the organ answers, as far as it is safe; none without a model or a pose."""
+        limits, energies = self.settings.safety.limits, self.energies
+        self._forces[:] = 0.0 if model is None else model.out.force
+        if energies is not None:
+            passivity.limit(energies, self._tips, self._forces)
+            if model is not None and self.settings.safety.passivity == "observe":
+                self._forces[:] = model.out.force
+        for i, (tool, guard) in enumerate(zip(self._tools, self.guards, strict=True)):
+            wrench = tool.wrench
+            wrench.force[:] = self._forces[i]
+            wrench.torque[:] = 0.0 if model is None else model.out.torque[i]
+            guard.limits = limits
+            guard.update(now, tool.status == OK and not self._stopping, wrench.force, wrench.torque)
+            if energies is not None:
+                energies.held[i, -1] = wrench.force
+            tool.answer()
+
+    def _let_go(self) -> None:
+        """After a failure: a last wrench of zero to every tool."""
+        for tool in self._tools:
+            tool.wrench.force[:] = 0.0
+            tool.wrench.torque[:] = 0.0
+            tool.answer()
+
+    def _publish_state(self, i: int, tool: Tool, online: Online) -> None:
+        template = online.states[i]
+        guard = self.guards[i]
+        status = tool.status
+        if self._stopping:
+            status = INACTIVE
+        elif online.model is None:
+            status = NO_MODEL
+        elif status == OK:
+            status = int(online.model.out.status[i])
+            if status == OK and not guard.engaged:
+                status = ENGAGING
+        n, error = 0, _NO_ERROR
+        if online.model is not None:
+            n, error = (
+                _write_contacts(template, online.model.out, i),
+                online.model.out.force_error[i],
+            )
+        self._outlets.state.handle.publish_raw(
+            template.serialise(tool.stamp, status, n, error, guard.share)
+        )
+
+
+def _fade_in(new: np.ndarray, old: np.ndarray, part: float) -> None:
+    """``new`` becomes part of itself and the rest of ``old``, which is used up: no array is made.
+
+    Both are written anew by the next step.
+    """
+    new *= part
+    old *= 1.0 - part
+    new += old
+
+
+def _write_contacts(template: StateTemplate, out: Any, tool: int) -> int:
+    """Copy a tool's contacts into its message; returns their number."""
+    total = int(out.n_contacts[0])
+    if total == 0:
+        return 0
+    mine = np.flatnonzero(out.contact_tool[:total] == tool)
+    rows = template.contacts[: len(mine)]
+    rows[:, 0:3] = out.contact_position[mine]
+    rows[:, 3:6] = out.contact_normal[mine]
+    rows[:, 6:9] = out.contact_force[mine]
+    rows[:, 9] = out.contact_penetration[mine]
+    return len(mine)

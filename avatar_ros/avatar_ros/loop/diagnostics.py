@@ -1,0 +1,216 @@
+"""What an operator should know of the contact node, for `/diagnostics`: levels, texts, numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from avatar_core.contact.haptics.force_guard import ForceGuard
+from avatar_core.contact.haptics.passivity import Passivity
+from avatar_ros.framework.parameters import Parameter
+from avatar_ros.loop.tool import Tool
+from avatar_ros.msg import ContactState, LoopStatistics
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+def _threshold(name: str, warn: float, error: float, what: str) -> tuple[Parameter, Parameter]:
+    return (
+        Parameter(f"diagnostics.{name}.warn", warn, f"{what}: warning", (0.0, 1e6), False),
+        Parameter(f"diagnostics.{name}.error", error, f"{what}: error", (0.0, 1e6), False),
+    )
+
+
+# The first two as ros2_control's controller manager has them.
+THRESHOLDS = (
+    *_threshold("periodicity.mean_error", 5.0, 10.0, "rate off the nominal one [Hz]"),
+    *_threshold("execution_time.mean", 1000.0, 2000.0, "mean time of a step with messages [us]"),
+    *_threshold("missed", 0.01, 0.05, "share of periods longer than 1.5 nominal ones"),
+)
+
+_REASONS = {
+    ContactState.STATUS_OK: ("sound", ""),
+    ContactState.STATUS_NO_POSE: ("no pose yet", "start the tool's driver"),
+    ContactState.STATUS_STALE_POSE: (
+        "its poses ceased",
+        "look at the driver and the network, or give a longer pose_timeout",
+    ),
+    ContactState.STATUS_INVALID_POSE: (
+        "a pose is not finite, has stamp 0, or is not a rotation",
+        "look at the driver",
+    ),
+    ContactState.STATUS_UNKNOWN_FRAME: (
+        "its poses are in another frame",
+        "give tool_frame and tool_transform, or publish in the organ's frame",
+    ),
+    ContactState.STATUS_LEAP: (
+        "its pose leapt",
+        "look at the driver, or give a larger safety.leap",
+    ),
+    ContactState.STATUS_SEVERAL_PUBLISHERS: (
+        "more than one node sends its poses",
+        "stop all but one",
+    ),
+    ContactState.STATUS_LOST_TOOL: ("no node sends its poses any more", "start its driver again"),
+}
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Of one tool in a window: how often each status was entered, and what it has now."""
+
+    counts: dict[int, int]
+    status: int
+
+    @property
+    def text(self) -> str:
+        """One line with cause and remedy; empty without a fault."""
+        status = self.status
+        if status == ContactState.STATUS_OK and self.counts:
+            status = max(self.counts, key=lambda key: self.counts[key])
+        if status == ContactState.STATUS_OK:
+            return ""
+        cause, remedy = _REASONS.get(status, (f"status {status}", "see contact_state"))
+        return f"no force: {cause}; {remedy}"
+
+
+class FaultCounter:
+    """How many faults each tool had since it was last asked."""
+
+    def __init__(self, tools: Sequence[Tool]) -> None:
+        self._tools = tools
+        self._seen = [tool.faults.copy() for tool in tools]
+
+    def window(self) -> list[Faults]:
+        """One for each tool."""
+        found = []
+        for i, tool in enumerate(self._tools):
+            now = tool.faults.copy()
+            new = now - self._seen[i]
+            self._seen[i] = now
+            counts = {int(k): int(new[k]) for k in np.flatnonzero(new) if k != 0}
+            found.append(Faults(counts, tool.status))
+        return found
+
+
+def loop_status(
+    name: str, window: LoopStatistics, nominal: float, limits: dict[str, float]
+) -> DiagnosticStatus:
+    """Of the loop's rate and its step; ``limits`` are the parameters ``THRESHOLDS``."""
+    missed = window.missed / max(window.periods, 1)
+    measured = {
+        "periodicity.mean_error": abs(window.rate - nominal),
+        "execution_time.mean": 1e6 * window.compute_mean,
+        "missed": missed,
+    }
+    level, broken = OK, []
+    for key, value in measured.items():
+        if value > limits[f"diagnostics.{key}.error"]:
+            level = ERROR
+        elif value > limits[f"diagnostics.{key}.warn"]:
+            level = max(level, WARN)
+        else:
+            continue
+        broken.append(key)
+    text = f"{window.rate:.1f} Hz of {nominal:g}, {missed:.2%} of the periods missed"
+    if broken:
+        text += (
+            f": beyond the threshold of {', '.join(broken)}; give the loop realtime.priority and "
+            "realtime.cpu, or the machine less to do"
+        )
+    return _status(
+        f"{name}: loop",
+        level,
+        text,
+        {
+            "rate [Hz]": window.rate,
+            "periods": window.periods,
+            "missed": window.missed,
+            "period mean [us]": 1e6 / window.rate if window.rate else float("nan"),
+            "period p99 [us]": 1e6 * window.period_p99,
+            "period max [us]": 1e6 * window.period_max,
+            "execution mean [us]": 1e6 * window.compute_mean,
+            "execution p99 [us]": 1e6 * window.compute_p99,
+            "execution max [us]": 1e6 * window.compute_max,
+            "pose age p50 [us]": 1e6 * window.pose_age_p50,
+            "pose age p99 [us]": 1e6 * window.pose_age_p99,
+        },
+    )
+
+
+def tool_status(
+    name: str,
+    tool_name: str,
+    tool: Tool,
+    guard: ForceGuard,
+    faults: Faults,
+    energies: Passivity | None,
+    i: int,
+) -> DiagnosticStatus:
+    """Of one tool: faults of the window, what is let through, and energies if they are watched."""
+    values: dict[str, Any] = {
+        "publishers of poses": tool.publishers,
+        "share of the force sent": guard.share,
+        "limited": guard.limited,
+        "largest force [N]": guard.limits.force,
+        "largest slew [N/s]": guard.limits.slew,
+    }
+    values |= {f"status {key} entered": count for key, count in faults.counts.items()}
+    if energies is not None:
+        values["energy put in by the tool [mJ]"] = 1e3 * float(energies.energy[i])
+        values["energy made by hold and delay [mJ]"] = 1e3 * float(energies.created[i])
+    text, level = faults.text, WARN
+    if not text and guard.limited:
+        text = f"force limited to {guard.limits.force:g} N and {guard.limits.slew:g} N/s"
+    elif not text:
+        text, level = "poses sound, force sent whole", OK
+    return _status(f"{name}: {tool_name}", level, text, values)
+
+
+def vademecum_status(name: str, identity: str, promise: str) -> DiagnosticStatus:
+    """Of what is loaded, and what it promises."""
+    if not identity:
+        return _status(f"{name}: vademecum", WARN, "none: no force; load one", {})
+    return _status(f"{name}: vademecum", OK, promise, {"id": identity})
+
+
+def qos_status(name: str, mismatches: list[str]) -> DiagnosticStatus:
+    """Of ends elsewhere that get or send nothing; ``mismatches`` are one line each."""
+    text = "; ".join(mismatches)
+    if not text:
+        return _status(f"{name}: quality of service", OK, "no other end was found not to match", {})
+    return _status(
+        f"{name}: quality of service",
+        WARN,
+        f"{text}: change theirs, or qos_overrides.* here",
+        {"ends not matched": len(mismatches)},
+    )
+
+
+def accuracy_status(name: str, text: str, shedding: bool, window: LoopStatistics) -> Any:
+    """Of what is shown, promised and held."""
+    return _status(
+        f"{name}: accuracy",
+        WARN if shedding else OK,
+        text,
+        {
+            "modes shown": window.modes_shown,
+            "modes": window.modes,
+            "displacement within, promised": window.promised_l2,
+            "force within, promised": window.promised_force,
+            "step p99 promised [us]": 1e6 * window.promised_step_p99,
+            "step p99 held [us]": 1e6 * window.step_p99,
+        },
+    )
+
+
+def _status(name: str, level: bytes, text: str, values: dict[str, Any]) -> DiagnosticStatus:
+    shown = [
+        KeyValue(key=key, value=f"{value:.6g}" if isinstance(value, float) else str(value))
+        for key, value in values.items()
+    ]
+    return DiagnosticStatus(name=name, level=level, message=text, hardware_id="", values=shown)

@@ -1,0 +1,168 @@
+"""The parameters of the contact node, and the settings that its loop works by."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+from avatar_core.contact.layout import TIP_RADIUS_RANGE
+from avatar_core.vademecum.accuracy import Budget, Cloud, Quantity
+from avatar_ros.framework.kept_state import STATE_DIR
+from avatar_ros.framework.parameters import AUTOSTART, FRAME_ID, Parameter, ParameterError
+from avatar_ros.loop.diagnostics import THRESHOLDS
+from avatar_ros.loop.safety import SAFETY, Safety
+
+CONTACT = (
+    AUTOSTART,
+    FRAME_ID,
+    Parameter("tools", ["tool"], "names of the tools; each has its topics below NAME/"),
+    Parameter(
+        "tip_radius",
+        0.005,
+        f"radius of the spherical tool tips [m], {TIP_RADIUS_RANGE[0]:g} to "
+        f"{TIP_RADIUS_RANGE[1]:g}; one number or one per tool",
+        any_type=True,
+    ),
+    Parameter(
+        "scene",
+        "",
+        "scene in params/scenes, or the path of one (with a /); its tips, cloud and modes go "
+        "before those here; empty: the natural effects of the vademecum",
+    ),
+    Parameter("rate", 1000.0, "steps per second [Hz]", range=(100.0, 2000.0)),
+    Parameter("cloud", "surface", "vertices in deformation: surface, volume or off"),
+    Parameter(
+        "cloud_divisor",
+        1,
+        "deformation is published every so many steps",
+        range=(1, 1000),
+        read_only=False,
+    ),
+    Parameter("modes", 0, "modes of the far field in use; 0: all", range=(0, 100_000)),
+    Parameter(
+        "pose_timeout",
+        0.02,
+        "age of the last pose, by the time it came in, from which force is zero [s]",
+        range=(0.002, 1.0),
+        read_only=False,
+    ),
+    Parameter(
+        "material.young_modulus",
+        0.0,
+        "Young's modulus of the organ [Pa]; 0: that of the vademecum",
+        range=(0.0, 1e8),
+        read_only=False,
+    ),
+    Parameter(
+        "material.poisson_ratio",
+        0.0,
+        "Poisson's ratio, if it is a coordinate of the vademecum; 0: that of the vademecum",
+        range=(0.0, 0.4999),
+        read_only=False,
+    ),
+    Parameter(
+        "material.contrast",
+        0.0,
+        "Young's modulus of the tumour over that of the organ, if it is a coordinate; 0: that of "
+        "the vademecum",
+        range=(0.0, 100.0),
+        read_only=False,
+    ),
+    Parameter(
+        "accuracy.tolerance",
+        0.0,
+        "relative error that 95 % of touches must keep; 0: as exact as the vademecum is",
+        range=(0.0, 1.0),
+        read_only=False,
+    ),
+    Parameter(
+        "accuracy.quantity",
+        "l2",
+        "whose error that is: l2 (displacement) or force",
+        read_only=False,
+    ),
+    Parameter(
+        "accuracy.deadline",
+        0.0,
+        "processor time that 99 % of steps must keep, forces and deformation [s]; 0: none",
+        range=(0.0, 0.01),
+        read_only=False,
+    ),
+    Parameter("realtime.priority", 0, "SCHED_FIFO priority asked for; 0: ordinary", range=(0, 98)),
+    Parameter("realtime.cpu", -1, "core the loop is bound to; -1: any", range=(-1, 1023)),
+    Parameter("realtime.lock_memory", True, "keep the process in memory; needs a priority"),
+    *SAFETY,
+    *THRESHOLDS,
+    STATE_DIR,
+)
+# Of the contact node: what a node that is started again goes on with, and the scene.
+CHANGEABLE = tuple(p.name for p in CONTACT if not p.read_only)
+
+
+# Names that the core gives to what these parameters choose.
+MATERIAL = {
+    "material.young_modulus": "young",
+    "material.poisson_ratio": "poisson",
+    "material.contrast": "contrast",
+}
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """Parameters of the contact node; rates [Hz], times [s], radii [m].
+
+    scene : YAML, checked; empty for the natural effects of the vademecum
+    material : values chosen, by name of the coordinate; the others are those of the vademecum
+    budget : of error and time; None for none
+    """
+
+    tools: tuple[str, ...]
+    tip_radii: tuple[float, ...]
+    scene: str
+    rate: float
+    cloud: Cloud
+    cloud_divisor: int
+    modes: int | None
+    frame_id: str
+    pose_timeout: float
+    material: dict[str, float]
+    budget: Budget | None
+    priority: int
+    cpu: int
+    lock_memory: bool
+    safety: Safety = field(default_factory=Safety)
+
+
+def chosen_material(value: dict[str, Any]) -> dict[str, float]:
+    """The values of the material that are not left to the vademecum."""
+    return {name: value[key] for key, name in MATERIAL.items() if value[key] != 0.0}
+
+
+def chosen_budget(value: dict[str, Any]) -> Budget | None:
+    """What accuracy.* asks for; None if nothing.
+
+    Raises
+    ------
+    ParameterError : naming the parameter and what it takes
+    """
+    if value["accuracy.quantity"] not in get_args(Quantity):
+        raise ParameterError(f"parameter accuracy.quantity: give {' or '.join(get_args(Quantity))}")
+    tolerance, deadline = value["accuracy.tolerance"], value["accuracy.deadline"]
+    if tolerance == 0.0 and deadline == 0.0:
+        return None
+    return Budget(tolerance or math.inf, deadline or math.inf, value["accuracy.quantity"])
+
+
+def of_budget(budget: Budget | None) -> dict[str, Any]:
+    """The inverse of :func:`chosen_budget`."""
+    if budget is None:
+        return {"accuracy.tolerance": 0.0, "accuracy.deadline": 0.0}
+    finite = {
+        "accuracy.tolerance": budget.tolerance,
+        "accuracy.deadline": budget.deadline,
+    }
+    return {
+        "accuracy.quantity": budget.quantity,
+        **{name: 0.0 if math.isinf(value) else value for name, value in finite.items()},
+    }

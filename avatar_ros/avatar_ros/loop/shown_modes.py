@@ -1,0 +1,97 @@
+"""What the model in use promises of error and time, and how many of its modes are shown."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from avatar_core.contact.haptics.shedding import Shedder
+from avatar_core.offline.certify.accuracy_curve import mode_levels
+from avatar_core.vademecum.accuracy import AccuracyCurve, CurvePoint
+from avatar_ros.msg import LoopStatistics
+
+_NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class Report:
+    """One line on what is shown, for logs and diagnostics.
+
+    shedding : fewer modes are shown than there would be time for on a quiet machine
+    changed : since the window before
+    """
+
+    text: str
+    shedding: bool
+    changed: bool
+
+
+class Accuracy:
+    """Of one model in use; belongs to the node, which calls it once a window.
+
+    Parameters
+    ----------
+    model : ContactModel
+    curve : points that differ in modes alone; None where none was measured
+    deadline : of a step [s]; infinity for none
+    """
+
+    def __init__(self, model: Any, curve: AccuracyCurve | None, deadline: float) -> None:
+        self._model = model
+        self._points: dict[int, CurvePoint] = {}
+        if curve is not None:
+            self._points = {p.detail.modes: p for p in curve.points}
+        levels = list(self._points) or list(mode_levels(model.n_modes))
+        self._shedder = Shedder(
+            [*(n for n in levels if n < model.n_modes), model.n_modes], deadline
+        )
+
+    @property
+    def promise(self) -> str:
+        """What is promised while nothing is shed, in words."""
+        point = self._points.get(self._model.n_modes)
+        text = f"{self._model.n_modes} modes"
+        if point is not None:
+            text += (
+                f", displacement within {point.l2:.1%} and force within {point.force:.1%} for 95 % "
+                "of touches"
+            )
+            if not math.isnan(point.p99):
+                text += f", steps of {point.p99 * 1e6:.0f} us"
+        return text
+
+    def learn(self, curve: AccuracyCurve) -> None:
+        """Promise the times of the same points, timed on this machine since."""
+        self._points = {p.detail.modes: p for p in curve.points}
+
+    def keep(self, deadline: float) -> None:
+        """Shed by another deadline from now on [s]."""
+        self._shedder.deadline = deadline
+
+    def after(self, statistics: LoopStatistics) -> Report:
+        """Choose the modes for the next window, and write into a window's statistics what it had.
+
+        The change is a single number that the loop reads at its next step.
+        """
+        before = self._model.n_shown
+        self._describe(statistics, before)
+        missed = statistics.missed / max(statistics.periods, 1)
+        modes = self._shedder.update(missed, statistics.step_p99)
+        self._model.show(modes)
+        text = f"{modes} of {self._model.n_modes} modes shown"
+        if self._shedder.is_shedding:
+            text += (
+                f": {missed:.1%} of the periods missed, 99 % of steps within "
+                f"{statistics.step_p99 * 1e6:.0f} us; the force keeps all modes"
+            )
+        return Report(text, self._shedder.is_shedding, modes != before)
+
+    def _describe(self, statistics: LoopStatistics, shown: int) -> None:
+        measured = [n for n in self._points if n <= shown]
+        point = self._points[max(measured)] if measured else None  # more modes are not worse
+        statistics.modes_shown, statistics.modes = shown, self._model.n_modes
+        statistics.promised_l2 = point.l2 if point else _NAN
+        statistics.promised_force = point.force if point else _NAN
+        exact = self._points.get(shown)
+        statistics.promised_step_p99 = exact.p99 if exact else _NAN

@@ -1,0 +1,151 @@
+"""One tool of the contact loop: its poses, checked, and the force that goes back to it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+
+from avatar_ros.framework.conversions import NO_STAMP, PoseReader, WrenchTemplate, small_turn
+from avatar_ros.loop.safety import Safety
+from avatar_ros.msg import ContactState
+
+OK = int(ContactState.STATUS_OK)
+NO_POSE = int(ContactState.STATUS_NO_POSE)
+STALE_POSE = int(ContactState.STATUS_STALE_POSE)
+INVALID_POSE = int(ContactState.STATUS_INVALID_POSE)
+LEAP = int(ContactState.STATUS_LEAP)
+SEVERAL_PUBLISHERS = int(ContactState.STATUS_SEVERAL_PUBLISHERS)
+LOST_TOOL = int(ContactState.STATUS_LOST_TOOL)
+
+FAR_AWAY = 1e3  # where a tool without a pose is, for the step [m]
+_UNKNOWN = float("nan")  # and one whose last pose was broken: it may go on where it was
+_LEAP_INTERVAL = 2e-3  # between two poses, for which a leap is given [s]
+_TURNS = 500_000_000  # within which poses of several publishers take turns [ns]
+_NO_NUMBER = 2**64 - 1  # where the middleware does not count
+_N_STATUS = 32
+
+
+class Tool:
+    """One tool's subscription, publisher and last pose.
+
+    Poses come in the frame of the tool, ``tip`` and ``turn`` of the step are in the organ's.
+
+    status : OK with a usable pose, otherwise why not
+    stamp : of the last valid pose, eight bytes; zero before the first
+    publishers : of its poses that are known, as the node last counted; a killed one stays a while
+    faults : how often each status was entered, by its number, since the node started
+    """
+
+    def __init__(
+        self, subscription: Any, publisher: Any, frame_id: str, safety: Safety | None = None
+    ) -> None:
+        safety = safety or Safety()
+        frame = safety.frame or frame_id
+        self.subscription = subscription
+        self.publisher = publisher
+        self.wrench = WrenchTemplate(frame)
+        self.status = NO_POSE
+        self.stamp = NO_STAMP
+        self.publishers = 1
+        self.faults = np.zeros(_N_STATUS, np.int64)
+        self._reader = PoseReader(frame)
+        self._rotation = _rotation(safety.transform[3:])  # of the tool's frame in the organ's
+        self._is_turned = not np.array_equal(self._rotation, np.eye(3))
+        self._origin = np.array(safety.transform[:3])
+        self._turned = np.zeros(3)
+        self._last = np.full(3, FAR_AWAY)  # valid position, in the tool's frame [m]
+        self._received = 0  # [ns]
+        self._number = -1  # of the last message, as its publisher counts
+        self._went_back = -_TURNS  # when the numbers last did [ns]
+        self._several_until = 0  # [ns]
+        self._orientation: tuple[float, float, float, float] | None = None  # of the last valid pose
+
+    def take(
+        self, now: int, timeout: int, tip: np.ndarray, turn: np.ndarray, leap: float = math.inf
+    ) -> bool:
+        """Take the newest pose, if any, and place ``tip``; true if a usable one came.
+
+        ``turn`` is what it turned since the last valid one [rad]; zero after a gap.
+
+        now, timeout : [ns]; leap : way in 2 ms, in proportion for longer, that is a fault [m]
+        """
+        turn[:] = 0.0
+        taken = self.subscription.handle.take_message(PoseStamped, True)
+        status = self._judge(taken, now, timeout, leap)
+        if status != self.status:
+            self.faults[status] += 1
+            self.status = status
+        if status != OK:
+            self._orientation = None
+            tip[:] = _UNKNOWN if status == INVALID_POSE else FAR_AWAY
+            return False
+        if taken is None:
+            return False
+        self._place(tip, turn)
+        return True
+
+    def answer(self) -> None:
+        """Send the wrench, in the tool's frame; its force and torque are in the organ's."""
+        if self._is_turned:
+            for part in (self.wrench.force, self.wrench.torque):
+                np.dot(part, self._rotation, out=self._turned)  # R^T v
+                part[:] = self._turned
+        self.publisher.handle.publish_raw(self.wrench.serialise(self.stamp))
+
+    def _judge(self, taken: Any, now: int, timeout: int, leap: float) -> int:
+        """The status after a message, or none."""
+        if taken is None:
+            if self.status == NO_POSE or now - self._received <= timeout:
+                return self.status
+            return STALE_POSE if self.publishers else LOST_TOOL
+        status = self._reader.read(taken[0])
+        if self._comes_from_several(taken[1], now):
+            status = SEVERAL_PUBLISHERS
+        if status != OK:
+            return status
+        interval = max((now - self._received) * 1e-9, _LEAP_INTERVAL)
+        leapt = math.dist(self._reader.position, self._last) * _LEAP_INTERVAL > leap * interval
+        late = now - self._received > timeout
+        self._last[:] = self._reader.position
+        self._received = now
+        self.stamp = self._reader.stamp
+        if late:  # of a pose that was good, only if the loop itself stood still meanwhile
+            return STALE_POSE if self.status == OK else OK
+        return LEAP if leapt and self.status in (OK, LEAP, INVALID_POSE) else OK
+
+    def _comes_from_several(self, info: Any, now: int) -> bool:
+        """Whether the numbers of the messages went back twice lately: once is a restart."""
+        number = info["publication_sequence_number"] if info else None
+        if number is not None and number != _NO_NUMBER:
+            if number <= self._number:
+                if now - self._went_back < _TURNS:
+                    self._several_until = now + _TURNS
+                self._went_back = now
+            self._number = number
+        return now < self._several_until
+
+    def _place(self, tip: np.ndarray, turn: np.ndarray) -> None:
+        tip[:] = self._last
+        if self._orientation is not None:
+            turn[:] = small_turn(self._orientation, self._reader.orientation)
+        if self._is_turned:
+            for part in (tip, turn):
+                np.dot(self._rotation, part, out=self._turned)
+                part[:] = self._turned
+        tip += self._origin
+        self._orientation = self._reader.orientation
+
+
+def _rotation(quaternion: tuple[float, ...]) -> np.ndarray:
+    """The matrix of a unit quaternion x, y, z, w."""
+    i, j, k, w = np.array(quaternion) / math.hypot(*quaternion)
+    return np.array(
+        [
+            [1 - 2 * (j * j + k * k), 2 * (i * j - k * w), 2 * (i * k + j * w)],
+            [2 * (i * j + k * w), 1 - 2 * (i * i + k * k), 2 * (j * k - i * w)],
+            [2 * (i * k - j * w), 2 * (j * k + i * w), 1 - 2 * (i * i + j * j)],
+        ]
+    )

@@ -1,0 +1,3 @@
+"""The nodes that ``ros2 run`` starts, one file each, and the planning cell that starts them
+together. Topics, services and parameters are documented in msg_docs/.
+"""

@@ -1,0 +1,450 @@
+"""The contact node: poses of tools in; force on each tool and deformation of the organ out.
+
+Three threads of control, each in its place:
+
+- the loop (:mod:`avatar_ros.loop.contact_loop`, a thread): waits for a pose, steps, publishes.
+- the node (``ContactNode``, the main thread): parameters, transitions, statistics.
+- the handover (a process, and a thread that maps what it sends): brings a vademecum in, and
+  prepares it anew for another scene, material or budget.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import threading
+import time
+from dataclasses import asdict, replace
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.parameter import Parameter
+from rclpy.task import Future
+from sensor_msgs.msg import PointCloud2
+
+from avatar_core.contact import model as contact
+from avatar_core.contact.haptics import passivity
+from avatar_core.contact.layout import Layout
+from avatar_core.errors import AccuracyError, SceneError, one_line
+from avatar_core.vademecum.accuracy import AccuracyCurve, Budget
+from avatar_ros.framework import qos, realtime
+from avatar_ros.framework.kept_state import KeptState
+from avatar_ros.framework.managed_node import ManagedNode, run
+from avatar_ros.framework.parameters import ParameterError
+from avatar_ros.loop import diagnostics
+from avatar_ros.loop.contact_loop import BLEND, ContactLoop, Online, Outlets, OwnThread
+from avatar_ros.loop.safety import SAFETY, chosen_safety
+from avatar_ros.loop.settings import (
+    CHANGEABLE,
+    CONTACT,
+    MATERIAL,
+    ContactSettings,
+    chosen_budget,
+    of_budget,
+)
+from avatar_ros.loop.shown_modes import Accuracy, Report
+from avatar_ros.loop.statistics import Record, statistics
+from avatar_ros.loop.tool import Tool
+from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_ros.nodes.contact_parameters import read_contact
+from avatar_ros.prepare import scenes
+from avatar_ros.prepare.budget_requests import BudgetRequests
+from avatar_ros.prepare.handover import OVERTAKEN, Handover
+from avatar_ros.prepare.orders import Change, Order, Prepared
+from avatar_ros.srv import LoadScene
+
+_STATISTICS_PERIOD = 1.0  # [s]
+_COUNT_PERIOD = 0.1  # from one count of the tools' publishers to the next [s]
+_BUDGET = ("accuracy.tolerance", "accuracy.quantity", "accuracy.deadline")
+_GRACE = 0.1  # a replaced model is kept for so long after the last step that uses it [s]
+
+
+class ContactNode(ManagedNode):
+    """Parameters, transitions, statistics; the work is done by ``ContactLoop``."""
+
+    def __init__(self) -> None:
+        self._loop: ContactLoop | None = None
+        self._handover: Handover | None = None
+        self._budget: BudgetRequests | None = None
+        self._tools: list[Tool] = []
+        self._outlets: Outlets | None = None
+        self._timers: list[Any] = []
+        self._faults: diagnostics.FaultCounter | None = None
+        self._said: dict[str, str] = {}  # of each tool's faults, last
+        self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
+        self._n_awaited = 0
+        self._changing = threading.RLock()
+        super().__init__("contact", CONTACT)
+        self._state = KeptState(self, self._values((*CHANGEABLE, "scene"), []))
+        self._scene = self._go_on(self._state.kept())  # YAML, in place of the parameter's
+        # As long as the node, and beside everything else: an answer may take a minute.
+        self.create_service(
+            LoadScene, "load_scene", self._load_scene, callback_group=ReentrantCallbackGroup()
+        )
+        self.add_on_set_parameters_callback(self._change_parameters)
+        self.add_post_set_parameters_callback(lambda changes: self._keep_state())
+
+    @property
+    def failure(self) -> str:
+        return "" if self._loop is None else self._loop.failure
+
+    @property
+    def owes_answers(self) -> bool:
+        return self._n_awaited > 0
+
+    def configure(self) -> None:
+        settings = self._settings()
+        if settings.scene:
+            self._say_divisor(settings.cloud_divisor)
+        contact.warm_up(len(settings.tools))
+        if settings.safety.passivity != "off":
+            passivity.warm_up()
+        own, period = OwnThread(), 1.0 / settings.rate
+        self._tools = [
+            Tool(
+                self.ports.subscription(
+                    PoseStamped,
+                    f"{name}/measured_cp",
+                    _never_called,
+                    qos.poses(period),
+                    silent=True,
+                    callback_group=own,
+                    raw=True,
+                ),
+                self.ports.publisher(
+                    WrenchStamped, f"{name}/spatial/servo_cf", qos.wrenches(period)
+                ),
+                settings.frame_id,
+                settings.safety,
+            )
+            for name in settings.tools
+        ]
+        self._outlets = Outlets(
+            self.ports.publisher(
+                ContactState, "contact_state", qos.states(len(self._tools), period)
+            ),
+            self.ports.publisher(PointCloud2, "deformation", qos.clouds(period)),
+            self.ports.publisher(LoopStatistics, "statistics", qos.reports(_STATISTICS_PERIOD)),
+            self.ports.publisher(DiagnosticArray, "/diagnostics", qos.reports(_STATISTICS_PERIOD)),
+        )
+        self._loop = ContactLoop(settings, self._tools, self._outlets, self.context)
+        order = Order(
+            topic=self.resolve_topic_name("vademecum"),
+            node_name=f"_{self.get_name()}_handover",
+            namespace=self.get_namespace(),
+            tip_radii=settings.tip_radii,
+            modes=settings.modes,
+            cloud=settings.cloud,
+            period=period,
+            material=settings.material,
+            scene=settings.scene,
+            budget=asdict(settings.budget) if settings.budget else {},
+        )
+        self._handover = Handover(
+            order, self._take_model, self._take_times, self.get_logger().error
+        )
+        self._budget = BudgetRequests(
+            settings.budget, self._handover.ask, self._keep_budget, self._refuse_budget
+        )
+        self._keep_state()
+
+    def _settings(self) -> ContactSettings:
+        """Of parameters and kept scene; without that where it does not fit any more."""
+        try:
+            return read_contact(self, self._scene)
+        except ParameterError as error:
+            if not self._scene:
+                raise
+            self.get_logger().error(f"the scene that was kept is not used: {error}")
+            self._scene = ""
+            return read_contact(self)
+
+    def activate(self) -> None:
+        assert self._loop is not None
+        settings = self._loop.settings
+        granted = realtime.claim(settings.priority, settings.cpu, settings.lock_memory)
+        for refusal in granted.refusals:
+            self.get_logger().warning(refusal)
+        realtime.calm_interpreter()
+        self._loop.record = Record(time.monotonic_ns())
+        self._loop.start(granted.cpu)
+        self._faults = diagnostics.FaultCounter(self._tools)
+        self._timers = [
+            self.create_timer(_STATISTICS_PERIOD, self._publish_statistics),
+            self.create_timer(_COUNT_PERIOD, self._count_publishers),
+        ]
+        limits = settings.safety.limits
+        self.get_logger().info(
+            f"forces of at most {limits.force:g} N and {limits.slew:g} N/s "
+            f"({self.get_parameter('safety.device').value}; safety.device, safety.max_*)"
+        )
+
+    def deactivate(self) -> None:
+        for timer in self._timers:
+            self.destroy_timer(timer)
+        self._timers = []
+        if self._loop is not None:
+            self._loop.stop()
+
+    def clean_up(self) -> None:
+        if self._handover is not None:
+            self._handover.stop()
+            self._handover = self._budget = None
+            self._scene = ""
+        self._loop = None
+        for tool in self._tools:
+            self.destroy_subscription(tool.subscription)
+            self.destroy_publisher(tool.publisher)
+        for publisher in vars(self._outlets).values() if self._outlets else ():
+            self.destroy_publisher(publisher)
+        self._tools, self._outlets = [], None
+
+    def _take_model(self, prepared: Prepared) -> None:
+        """In the handover's thread: put a model into use between two steps.
+
+        Returns when it has replaced the one before entirely.
+        """
+        loop = self._loop
+        if loop is None:
+            return
+        model = contact.make_model(Layout.of(prepared.arrays), halves=True)
+        replaced = loop.online
+        self._ranges = prepared.ranges
+        curve = AccuracyCurve.of_plain(prepared.curve) if prepared.curve else None
+        kept = self._budget.kept if self._budget is not None else None
+        accuracy = Accuracy(model, curve, _deadline(kept))
+        loop.online = Online(prepared.id, model, loop.settings, prepared.effects, accuracy)
+        what = ", ".join(prepared.effects) or "no effects"
+        self.get_logger().info(
+            f"vademecum {prepared.name!r} ({prepared.id[:12]}) in use, with {what}; "
+            f"{accuracy.promise}"
+        )
+        while loop.is_changing:
+            time.sleep(BLEND / 4)
+        time.sleep(_GRACE)
+        del replaced  # frees its memory here, not in the loop
+
+    def _take_times(self, curve: dict[str, Any]) -> None:
+        """In the handover's thread: promise the times of the model in use, measured since."""
+        loop = self._loop
+        if loop is not None and loop.online.accuracy is not None:
+            loop.online.accuracy.learn(AccuracyCurve.of_plain(curve))
+            self.get_logger().info(f"timed here: {loop.online.accuracy.promise}")
+
+    async def _load_scene(
+        self, request: LoadScene.Request, response: LoadScene.Response
+    ) -> LoadScene.Response:
+        try:
+            prepared = await self._in_use(scenes.change_of(request))
+            if prepared.cloud_divisor is not None:
+                self._say_divisor(prepared.cloud_divisor)
+            self._scene = self._handover.scene if self._handover is not None else ""
+            self._keep_state()
+            response.success = True
+        except Exception as error:  # a service always answers; the text decides what is raised
+            response.message = one_line(error)
+            self.get_logger().error(f"load_scene: {response.message}")
+        if self._loop is not None:
+            response.effects = list(self._loop.online.effects)
+        return response
+
+    def _go_on(self, kept: dict[str, Any]) -> str:
+        """Set parameters that were kept; the scene, if one was."""
+        scene = str(kept.pop("scene", ""))
+        for result in self.set_parameters([Parameter(n, value=v) for n, v in kept.items()]):
+            if not result.successful:
+                self.get_logger().error(f"a value that was kept is not used: {result.reason}")
+        if scene or kept:
+            named = [*sorted(kept), *(["the scene"] if scene else [])]
+            self.get_logger().info(f"goes on with {', '.join(named)} of the last run (state_dir)")
+        return scene
+
+    def _keep_state(self) -> None:
+        """For the next start: what is in force, of a budget the one that was granted."""
+        with self._changing:
+            if self._budget is None:
+                return
+            now = self._values(CHANGEABLE, [])
+            now |= of_budget(self._budget.kept)
+            now["scene"] = self._scene or self.get_parameter("scene").value
+            self._state.keep(now)
+
+    def _say_divisor(self, divisor: int) -> None:
+        """A scene's own is in force from now on, and free to change."""
+        self.set_parameters([Parameter("cloud_divisor", value=divisor)])
+
+    async def _in_use(self, change: Change) -> Prepared:
+        """Wait until a change of the model is in use, while the executor goes on.
+
+        Raises
+        ------
+        SceneError : it was refused
+        """
+        executor, handover = self.executor, self._handover
+        assert executor is not None  # which runs this
+        if handover is None or not self._timers:
+            raise SceneError("the node is inactive; activate it first")
+        done = Future(executor=executor)
+
+        def answer(prepared: Prepared | None, refusal: str) -> None:
+            if prepared is None:
+                done.set_exception(SceneError(refusal))
+            else:
+                done.set_result(prepared)
+            executor.wake()
+
+        self._n_awaited += 1
+        try:
+            handover.ask(change, answer)
+            return await done
+        finally:
+            self._n_awaited -= 1
+
+    def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        """Type and range were checked; those that may change take effect with the next step.
+
+        A change of the material takes some tenths of a second, in the handover's process. Called
+        by the executor, and in the handover's thread where a refused budget is put back.
+        """
+        with self._changing:
+            return self._change(changes)
+
+    def _change(self, changes: list[Parameter]) -> SetParametersResult:
+        loop = self._loop
+        if loop is None:
+            return SetParametersResult(successful=True)
+        settings = loop.settings
+        try:
+            budget = chosen_budget(self._values(_BUDGET, changes))
+            safety = chosen_safety(self._values(tuple(p.name for p in SAFETY), changes))
+        except (AccuracyError, ParameterError) as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        material = dict(settings.material)
+        for change in changes:
+            name = MATERIAL.get(change.name)
+            if name is None:
+                continue
+            refusal = self._refusal_of(name, change.value)
+            if refusal:
+                return SetParametersResult(successful=False, reason=refusal)
+            material.pop(name, None)
+            if change.value != 0.0:
+                material[name] = change.value
+        changed = {p.name: p.value for p in changes if hasattr(loop.settings, p.name)}
+        if material != settings.material and self._handover is not None:
+            self._handover.ask({"material": material}, self._note_material)
+        if self._budget is not None:
+            self._budget.ask(budget)
+        loop.settings = replace(settings, **changed, material=material, safety=safety)
+        return SetParametersResult(successful=True)
+
+    def _values(self, names: tuple[str, ...], changes: list[Parameter]) -> dict[str, Any]:
+        """Of some parameters, after changes."""
+        value = {name: self.get_parameter(name).value for name in names}
+        return value | {p.name: p.value for p in changes if p.name in value}
+
+    def _keep_budget(self, budget: Budget | None) -> None:
+        loop = self._loop
+        if loop is not None and loop.online.accuracy is not None:
+            loop.online.accuracy.keep(_deadline(budget))
+        self._keep_state()
+
+    def _refuse_budget(self, kept: Budget | None, refusal: str) -> None:
+        self.get_logger().error(f"budget refused: {refusal}")
+        values = of_budget(kept)
+        self.set_parameters([Parameter(name, value=value) for name, value in values.items()])
+
+    def _note_material(self, prepared: Prepared | None, refusal: str) -> None:
+        if refusal and refusal != OVERTAKEN:
+            self.get_logger().error(f"material refused: {refusal}")
+
+    def _refusal_of(self, name: str, value: float) -> str:
+        """Why the vademecum in use does not have a value of the material; empty if it has."""
+        if value == 0.0 or name == "young" or self._ranges is None:
+            return ""
+        if name not in self._ranges:
+            return f"the vademecum has no coordinate {name}; build it with --coordinate {name}=..."
+        low, high = self._ranges[name]
+        return "" if low <= value <= high else f"the vademecum holds {low:g} to {high:g}"
+
+    def _publish_statistics(self) -> None:
+        loop, outlets = self._loop, self._outlets
+        if loop is None or outlets is None:
+            return
+        end = time.monotonic_ns()
+        record, loop.record = loop.record, Record(end)
+        message = statistics(record, end, loop.settings.rate)
+        message.header.stamp = self.get_clock().now().to_msg()
+        accuracy = loop.online.accuracy
+        report = accuracy.after(message) if accuracy is not None else None
+        outlets.statistics.publish(message)
+        self._publish_diagnostics(loop, message, report)
+        gc.collect()
+
+    def _publish_diagnostics(
+        self, loop: ContactLoop, window: LoopStatistics, report: Report | None
+    ) -> None:
+        assert self._outlets is not None and self._faults is not None
+        name, online = self.get_name(), loop.online
+        limits = {p.name: self.get_parameter(p.name).value for p in diagnostics.THRESHOLDS}
+        promise = online.accuracy.promise if online.accuracy is not None else ""
+        statuses = [
+            diagnostics.loop_status(name, window, loop.settings.rate, limits),
+            diagnostics.vademecum_status(name, online.id, promise),
+            diagnostics.qos_status(name, self.ports.mismatches()),
+        ]
+        if report is not None:
+            self._say_shown(report)
+            statuses.append(diagnostics.accuracy_status(name, report.text, report.shedding, window))
+        for i, faults in enumerate(self._faults.window()):
+            tool_name = loop.settings.tools[i]
+            self._say_fault(tool_name, faults.text)
+            statuses.append(
+                diagnostics.tool_status(
+                    name, tool_name, self._tools[i], loop.guards[i], faults, loop.energies, i
+                )
+            )
+        message = DiagnosticArray(status=statuses)
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._outlets.diagnostics.publish(message)
+
+    def _say_shown(self, report: Report) -> None:
+        """Of modes that were left out or taken back: a line when it changes."""
+        if not report.changed:
+            return
+        if report.shedding:
+            self.get_logger().warning(report.text)
+        else:  # on a line of its own: rclpy allows a line of code but one severity
+            self.get_logger().info(report.text)
+
+    def _say_fault(self, tool: str, text: str) -> None:
+        """A line when a tool's fault is another than a window ago."""
+        if text != self._said.get(tool, ""):
+            self._said[tool] = text
+            if text:
+                self.get_logger().warning(f"{tool}: {text}")
+            else:
+                self.get_logger().info(f"{tool}: poses are sound again")
+
+    def _count_publishers(self) -> None:
+        for tool in self._tools:
+            tool.publishers = tool.subscription.get_publisher_count()
+
+
+def _deadline(budget: Budget | None) -> float:
+    return budget.deadline if budget else math.inf
+
+
+def _never_called(message: bytes) -> None:
+    """The loop takes poses itself."""
+
+
+def main() -> int:
+    return run(ContactNode, keeps_time=True)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,101 @@
+"""Reading the contact node's parameters, checked against one another and against the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, get_args
+
+from rclpy.node import Node
+
+from avatar_core.contact.layout import TIP_RADIUS_RANGE
+from avatar_core.errors import SceneError
+from avatar_core.scene.file import parse_scene, read_scene, write_scene
+from avatar_core.scene.model import Scene, Tool
+from avatar_core.vademecum.accuracy import Cloud
+from avatar_ros.framework.parameters import ParameterError, frame, values
+from avatar_ros.loop.safety import chosen_safety
+from avatar_ros.loop.settings import CONTACT, ContactSettings, chosen_budget, chosen_material
+from avatar_ros.prepare import scenes
+
+CLOUDS = get_args(Cloud)
+
+
+def read_contact(node: Node, kept_scene: str = "") -> ContactSettings:
+    """The contact node's parameters, checked against one another.
+
+    kept_scene : YAML, which goes before the parameter ``scene``
+
+    Raises
+    ------
+    ParameterError : naming the parameter and what it takes
+    """
+    value = values(node, CONTACT)
+    tools = tuple(value["tools"])
+    if not tools or len(set(tools)) != len(tools):
+        raise ParameterError("parameter tools: give at least one name, each once")
+    for tool in tools:
+        try:
+            Tool(tool)
+        except SceneError as error:
+            raise ParameterError(
+                f"parameter tools: {tool!r} cannot be part of a topic's name"
+            ) from error
+    if value["cloud"] not in CLOUDS:
+        raise ParameterError(f"parameter cloud: give one of {', '.join(CLOUDS)}")
+    settings = ContactSettings(
+        tools=tools,
+        tip_radii=_tip_radii(value["tip_radius"], len(tools)),
+        scene="",
+        rate=value["rate"],
+        cloud=value["cloud"],
+        cloud_divisor=value["cloud_divisor"],
+        modes=value["modes"] or None,
+        frame_id=frame(value["frame_id"]),
+        pose_timeout=value["pose_timeout"],
+        material=chosen_material(value),
+        budget=chosen_budget(value),
+        priority=value["realtime.priority"],
+        cpu=value["realtime.cpu"],
+        lock_memory=value["realtime.lock_memory"],
+        safety=chosen_safety(value),
+    )
+    if kept_scene:
+        kept = _with_scene(settings, lambda: parse_scene(kept_scene, "kept"))
+        return replace(kept, cloud_divisor=settings.cloud_divisor)  # may have changed since
+    if value["scene"]:
+        return _with_scene(settings, lambda: read_scene(scenes.scene_file(value["scene"])))
+    return settings
+
+
+def _with_scene(settings: ContactSettings, read: Callable[[], Scene]) -> ContactSettings:
+    """Settings with what a scene says of tips and outputs."""
+    try:
+        scene = read()
+        scenes.require_tools(scene, len(settings.tools))
+    except SceneError as error:
+        raise ParameterError(f"parameter scene: {error}") from error
+    return replace(
+        settings,
+        tip_radii=tuple(tool.tip_radius for tool in scene.tools),
+        scene=write_scene(scene),
+        cloud=scene.cloud,
+        cloud_divisor=scene.cloud_divisor,
+        modes=scene.modes,
+    )
+
+
+def _tip_radii(value: Any, n_tools: int) -> tuple[float, ...]:
+    numbers = [value] if isinstance(value, int | float) else value
+    low, high = TIP_RADIUS_RANGE
+    try:
+        radii = [float(number) for number in numbers]
+    except (TypeError, ValueError):
+        radii = []
+    if len(radii) == 1:
+        radii *= n_tools
+    if len(radii) != n_tools or not all(low <= radius <= high for radius in radii):
+        raise ParameterError(
+            f"parameter tip_radius: give one number or {n_tools}, from {low:g} to {high:g} m"
+        )
+    return tuple(radii)

@@ -1,0 +1,124 @@
+"""The organ for RViz and Foxglove: its surface at rest and, at display rate, deformed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from shape_msgs.msg import Mesh
+from visualization_msgs.msg import Marker
+
+from avatar_ros.framework import qos
+from avatar_ros.framework.conversions import NO_STAMP, mesh_arrays
+from avatar_ros.framework.managed_node import ManagedNode, run
+from avatar_ros.framework.parameters import AUTOSTART, Parameter
+from avatar_ros.msg import VademecumInfo
+from avatar_ros.ui.colours import colours
+from avatar_ros.ui.display import NewestCloud, TriangleTemplate
+
+_REST_SHADE = (0.6, 0.6, 0.6, 0.25)  # grey, seen through
+
+ORGAN_MARKERS = (
+    AUTOSTART,
+    Parameter("rate", 30.0, "of organ_deformed, at most [Hz]", range=(0.1, 100.0)),
+    Parameter(
+        "full_scale",
+        0.01,
+        "displacement that has the last colour [m]",
+        range=(1e-4, 1.0),
+        read_only=False,
+    ),
+)
+
+
+class MarkersNode(ManagedNode):
+    """Subscribes what the loader and the contact node send; publishes two markers."""
+
+    def __init__(self) -> None:
+        self._subscriptions_of_loader: list[Any] = []
+        self._publishers_of_mine: list[Any] = []
+        self._frame = ""
+        self._surface: Mesh | None = None
+        self._faces = np.zeros(0, np.int64)
+        self._template: TriangleTemplate | None = None
+        self._cloud: NewestCloud | None = None
+        self._timer: Any = None
+        super().__init__("organ_markers", ORGAN_MARKERS)
+
+    def configure(self) -> None:
+        self._publishers_of_mine = [
+            self.create_publisher(Marker, "organ_rest", qos.LATCHED),
+            self.create_publisher(Marker, "organ_deformed", qos.COMMAND),
+        ]
+        self._subscriptions_of_loader = [
+            self.create_subscription(
+                VademecumInfo, "vademecum_info", self._take_frame, qos.LATCHED
+            ),
+            self.create_subscription(Mesh, "rest_surface", self._take_surface, qos.LATCHED),
+        ]
+
+    def activate(self) -> None:
+        rate = self.get_parameter("rate").value
+        self._timer = self.create_timer(1.0 / rate, self._show)
+
+    def deactivate(self) -> None:
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+            self._timer = None
+
+    def clean_up(self) -> None:
+        for subscription in self._subscriptions_of_loader:
+            self.destroy_subscription(subscription)
+        for publisher in self._publishers_of_mine:
+            self.destroy_publisher(publisher)
+        self._subscriptions_of_loader, self._publishers_of_mine = [], []
+        self._forget()
+
+    def _forget(self) -> None:
+        if self._cloud is not None:
+            self._cloud.close()
+        self._cloud = self._template = None
+
+    def _take_frame(self, info: VademecumInfo) -> None:
+        self._frame = info.header.frame_id
+        self._lay_out()
+
+    def _take_surface(self, surface: Mesh) -> None:
+        self._surface = surface
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        """Both messages have come, in either order: the surface itself has no frame."""
+        if not self._frame or self._surface is None:
+            return
+        self._forget()
+        vertices, faces = mesh_arrays(self._surface)
+        self._faces = faces.reshape(-1)
+        rest = TriangleTemplate(self._frame, "organ at rest", len(faces))
+        rest.corners[:] = vertices[self._faces]
+        rest.colours[:] = _REST_SHADE
+        self._publishers_of_mine[0].publish(rest.serialise(NO_STAMP))
+        self._template = TriangleTemplate(self._frame, "organ", len(faces))
+        self._template.colours[:, 3] = 1.0
+        self._cloud = NewestCloud(self, self._frame, len(vertices))
+
+    def _show(self) -> None:
+        template, publisher = self._template, self._publishers_of_mine[1]
+        if template is None or self._cloud is None:
+            return
+        taken = self._cloud.take()
+        if taken is None or publisher.get_subscription_count() == 0:
+            return
+        stamp, points = taken
+        top = self.get_parameter("full_scale").value
+        template.corners[:] = points[self._faces, :3]
+        template.colours[:, :3] = colours(points[:, 3:], top)[self._faces]
+        publisher.publish(template.serialise(stamp))
+
+
+def main() -> int:
+    return run(MarkersNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

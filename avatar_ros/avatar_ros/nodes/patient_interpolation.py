@@ -1,0 +1,244 @@
+"""Makes a new patient's vademecum from an atlas and puts it into the library of the loader."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.task import Future
+
+from avatar_core.errors import one_line
+from avatar_ros.action import BuildPatient
+from avatar_ros.framework import conversions
+from avatar_ros.framework.library import RefusedError, file_name, find_in_library
+from avatar_ros.framework.managed_node import ManagedNode, run
+from avatar_ros.framework.parameters import ParameterError
+from avatar_ros.patients.builder import (
+    Built,
+    BusyError,
+    CancelledError,
+    Order,
+    PatientBuilder,
+    Stage,
+)
+from avatar_ros.patients.settings import (
+    PATIENT_INTERPOLATION,
+    InterpolationSettings,
+    read_interpolation,
+)
+from avatar_ros.srv import InterpolatePatient
+
+_DEFAULT_FIDELITY = "interpolated"
+
+
+def order_of(request: Any, settings: InterpolationSettings) -> Order:
+    """What a request or a goal asks for, as far as that shows without the atlas.
+
+    Raises
+    ------
+    RefusedError : naming the field and what it takes
+    """
+    mesh = request.mesh
+    inline = bool(len(mesh.vertices) or len(mesh.triangles))
+    if bool(request.surface) == inline:
+        raise RefusedError(
+            "give either surface, a file in library_dir, or mesh"
+            + (", not both" if inline else "; both are empty")
+        )
+    if request.neighbors < 0:
+        raise RefusedError(f"neighbors is {request.neighbors}; give 1 or more, or 0 for all")
+    if not (request.tolerance == 0.0 or 0.0 < request.tolerance < 1.0):
+        raise RefusedError(
+            f"tolerance is {request.tolerance:g}; give a fraction between 0 and 1, or 0 for the "
+            "default"
+        )
+    fidelity = request.fidelity or _DEFAULT_FIDELITY
+    stem = "mesh" if inline else Path(request.surface).name.split(".")[0] or "surface"
+    output = file_name(request.name or f"{stem}-{fidelity}")
+    surface, vertices, faces = "", None, None
+    if inline:
+        _require_metres(request, settings.max_bytes)
+        vertices, faces = conversions.mesh_arrays(mesh)
+    else:
+        surface = str(find_in_library(request.surface, settings.library_dir, settings.max_bytes))
+    return Order(
+        surface=surface,
+        vertices=vertices,
+        faces=faces,
+        unit=request.unit or "mm",
+        axes=request.axes or "RAS",
+        leave_out=tuple(request.leave_out),
+        neighbors=request.neighbors,
+        fidelity=fidelity,
+        tolerance=request.tolerance,
+        name=output.removesuffix(".h5"),
+        output=str(Path(settings.library_dir).resolve() / output),
+    )
+
+
+def _require_metres(request: Any, max_bytes: int) -> None:
+    """Raise RefusedError unless an inline mesh is in metres, in the organ's axes, not too large."""
+    if request.unit not in ("", "m") or request.axes not in ("", "RAS"):
+        raise RefusedError("unit and axes are those of a file; a mesh is given in m and RAS")
+    size = 24 * len(request.mesh.vertices) + 12 * len(request.mesh.triangles)
+    if size > max_bytes:
+        raise RefusedError(f"mesh: {size / 1e6:.0f} MB; raise max_megabytes to take it")
+
+
+class PatientInterpolationNode(ManagedNode):
+    """Builds one patient at a time, asked for by the service or the action.
+
+    Both are there as long as the node, and refuse while it is inactive. A thread of its own waits
+    for the patient; what is said to others is said from the executor's.
+    """
+
+    def __init__(self) -> None:
+        self._settings: InterpolationSettings | None = None
+        self._builder: PatientBuilder | None = None
+        self._active = False
+        self._n_awaited = 0
+        super().__init__("patient_interpolation", PATIENT_INTERPOLATION)
+        group = ReentrantCallbackGroup()
+        self.create_service(
+            InterpolatePatient, "interpolate_patient", self._answer, callback_group=group
+        )
+        self._action = ActionServer(
+            self,
+            BuildPatient,
+            "build_patient",
+            self._pursue,
+            cancel_callback=lambda goal: CancelResponse.ACCEPT,
+            callback_group=group,
+        )
+
+    def configure(self) -> None:
+        settings = read_interpolation(self)
+        if not os.path.isdir(settings.library_dir):
+            raise ParameterError(f"parameter library_dir: {settings.library_dir} is no directory")
+        if not os.access(settings.library_dir, os.W_OK):
+            raise ParameterError(
+                f"parameter library_dir: {settings.library_dir} cannot be written to"
+            )
+        self._settings = settings
+        self._builder = PatientBuilder(settings.rules, settings.threads)
+        self.get_logger().info(f"{settings.rules.atlas}: {self._builder.n_anatomies} anatomies")
+
+    def activate(self) -> None:
+        self._active = True
+
+    def deactivate(self) -> None:
+        self._active = False
+        if self._builder is not None:
+            self._builder.cancel()
+
+    def clean_up(self) -> None:
+        if self._builder is not None:
+            self._builder.stop()
+            self._builder = None
+
+    @property
+    def owes_answers(self) -> bool:
+        return self._n_awaited > 0
+
+    def build(
+        self,
+        request: Any,
+        on_stage: Callable[[Stage], None] = lambda stage: None,
+        cancelled: Callable[[], bool] = lambda: False,
+    ) -> Built:
+        """Build what a request or a goal asks for.
+
+        Raises
+        ------
+        AvatarError, OSError : no file was written
+        """
+        if self._settings is None or self._builder is None or not self._active:
+            raise RefusedError("the node is inactive; activate it first")
+        self._builder.require_idle()  # before a large mesh is looked at
+        order = order_of(request, self._settings)
+        built = self._builder.build(order, on_stage, cancelled)
+        self.get_logger().info(
+            f"wrote {built.file} ({built.vademecum_id[:12]}), {order.fidelity}, in "
+            f"{built.seconds:.1f} s"
+        )
+        return built
+
+    async def _answer(
+        self, request: InterpolatePatient.Request, response: InterpolatePatient.Response
+    ) -> InterpolatePatient.Response:
+        try:
+            _fill(response, await self._beside(lambda: self.build(request)))
+        except Exception as error:  # a service always answers; the surface decides what is raised
+            self._refuse("interpolate_patient", response, error)
+        return response
+
+    async def _pursue(self, goal: Any) -> BuildPatient.Result:
+        result = BuildPatient.Result()
+
+        def tell(stage: Stage) -> None:
+            goal.publish_feedback(BuildPatient.Feedback(**asdict(stage)))
+
+        def work() -> Built:
+            return self.build(goal.request, tell, lambda: goal.is_cancel_requested)
+
+        try:
+            _fill(result, await self._beside(work))
+            goal.succeed()
+        except Exception as error:  # as above
+            self._refuse("build_patient", result, error)
+            if isinstance(error, CancelledError) and goal.is_cancel_requested:
+                goal.canceled()
+            else:
+                goal.abort()
+        return result
+
+    async def _beside(self, work: Callable[[], Built]) -> Built:
+        """Wait for some work in a thread of its own while the executor goes on."""
+        executor = self.executor
+        assert executor is not None  # which runs this
+        done = Future(executor=executor)
+
+        def run() -> None:
+            try:
+                done.set_result(work())
+            except Exception as error:
+                done.set_exception(error)
+            executor.wake()
+
+        self._n_awaited += 1
+        try:
+            threading.Thread(target=run, name="patient", daemon=True).start()
+            return await done
+        finally:
+            self._n_awaited -= 1
+
+    def _refuse(self, what: str, answer: Any, error: Exception) -> None:
+        answer.success = False
+        answer.message = one_line(error)
+        answer.displacement_error = math.nan
+        text = f"{what}: {answer.message}"
+        if isinstance(error, BusyError | CancelledError):
+            self.get_logger().warning(text)
+        else:  # each on a line of its own: rclpy allows a line of code but one severity
+            self.get_logger().error(text)
+
+
+def _fill(answer: Any, built: Built) -> None:
+    for name, value in asdict(built).items():
+        setattr(answer, name, value)
+    answer.success = True
+
+
+def main() -> int:
+    return run(PatientInterpolationNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,375 @@
+"""The planning page: an organ in the browser, pressed with the mouse, felt at 1 kHz.
+
+Needs the extra ``ui``. The page is served by viser; poses are sent, and answers noted, by a process
+of its own (:mod:`avatar_ros.ui.tool_driver`), and clouds are looked at 30 times a second, so that
+neither the page nor its users ever hold up the contact loop.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+try:
+    import viser
+except ImportError as error:
+    raise SystemExit("planning_ui: viser is missing; pip install 'avatar[ui]'") from error
+
+from avatar_core.errors import AvatarError
+from avatar_core.geometry.tumour import read_tumour
+from avatar_core.scene.file import read_scene, shipped_scenes
+from avatar_core.scene.model import Scene
+from avatar_core.vademecum.storage import parse_vademecum
+from avatar_ros.framework import qos
+from avatar_ros.framework.managed_node import ManagedNode, run
+from avatar_ros.framework.parameters import AUTOSTART, Parameter, ParameterError, values
+from avatar_ros.framework.reader import Reader
+from avatar_ros.loop.settings import MATERIAL
+from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
+from avatar_ros.prepare.scenes import scene_file
+from avatar_ros.ui.display import RATE, NewestCloud
+from avatar_ros.ui.library import Library
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.panels import Panels, Wishes
+from avatar_ros.ui.recorder import Recorder, scene_in_force
+from avatar_ros.ui.requests import Requests
+from avatar_ros.ui.texts import frame_text, scene_texts, warnings
+from avatar_ros.ui.tool_memory import HandLine, HandProcess
+from avatar_ros.ui.view import OrganView
+
+FRAME = "organ"
+_SLOW = 6  # frames from one point of the plots to the next
+_LOOK = 30  # frames from one look at library and nodes to the next
+_SILENCE = 1.0  # after which the contact node does not answer [s]
+_OF_CONTACT = ("tip_radius", "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
+
+PLANNING_UI = (
+    AUTOSTART,
+    Parameter("host", "127.0.0.1", "address to listen on; 0.0.0.0: any, without a password"),
+    Parameter("port", 8080, "to listen on; the next free one if it is taken", range=(1, 65535)),
+    Parameter("library_dir", ".", "of the loader too; recordings are written there"),
+    Parameter("tool", "tool", "name of the tool that is moved, of those of contact"),
+    Parameter("tumour", "", "its surface in library_dir, shown in the organ; empty: none"),
+)
+
+
+class PlanningNode(ManagedNode):
+    """Serves the page, and passes between it and the cell."""
+
+    def __init__(self) -> None:
+        self._server: viser.ViserServer | None = None
+        self._line = HandLine.make()
+        self._hand = HandProcess(self._line)
+        self._recorder = Recorder(self._line)
+        self._reader = Reader(1 << 30)
+        self._organ: Organ | None = None
+        self._cloud: NewestCloud | None = None
+        self._material: dict[str, float] = {}  # chosen here, by coordinate
+        self._scene = ""  # chosen here, by name
+        self._contact: dict[str, Any] = {}  # parameters of the contact node
+        self._was_missing, self._is_to_restore = True, False
+        self._frame, self._frame_id = 0, FRAME
+        self._began = time.monotonic()
+        self._subscriptions_of_mine: list[Any] = []
+        self._timer: Any = None
+        super().__init__("planning_ui", PLANNING_UI)
+
+    # --- Transitions -------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        value = values(self, PLANNING_UI)
+        folder = Path(value["library_dir"]).expanduser()
+        if not folder.is_dir():
+            raise ParameterError(f"parameter library_dir: {folder} is not a directory")
+        self._library = Library(folder.resolve())
+        self._tumour = value["tumour"]
+        self._tool = value["tool"]
+        server = viser.ViserServer(value["host"], value["port"], verbose=False)
+        self._server = server
+        self._requests = Requests(self)
+        self._view = OrganView(server, self._drag)
+        self._panels = Panels(
+            server,
+            Wishes(
+                vademecum=lambda name: self._requests.load_vademecum(name, self._say),
+                material=self._choose_material,
+                scene=self._choose_scene,
+                build=self._build,
+                cancel=self._requests.cancel_patient,
+                nudge=self._nudge,
+                lift=self._lift,
+                record=self._record,
+            ),
+        )
+        self._panels.offer_scenes(scene_texts())
+        self._subscriptions_of_mine = [
+            self.create_subscription(
+                VademecumInfo, "vademecum_info", self._take_frame, qos.LATCHED
+            ),
+            self.create_subscription(VademecumFile, "vademecum", self._take_organ, qos.LATCHED),
+            self.create_subscription(
+                LoopStatistics, "statistics", self._take_statistics, qos.STATISTICS
+            ),
+        ]
+        self.get_logger().info(f"planning page at http://{value['host']}:{server.get_port()}")
+
+    def activate(self) -> None:
+        self._timer = self.create_timer(1.0 / RATE, self._show)
+
+    def deactivate(self) -> None:
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+            self._timer = None
+        self._recorder.drop()
+        self._hand.end()
+
+    def clean_up(self) -> None:
+        for subscription in self._subscriptions_of_mine:
+            self.destroy_subscription(subscription)
+        self._subscriptions_of_mine = []
+        if self._cloud is not None:
+            self._cloud.close()
+            self._cloud = None
+        if self._server is not None:
+            self._requests.close()
+            self._reader.close()
+            self._server.stop()
+            self._server = None
+
+    # --- From the cell -----------------------------------------------------------------------
+
+    def _take_frame(self, info: VademecumInfo) -> None:
+        if info.header.frame_id != self._frame_id:
+            self._frame_id = info.header.frame_id
+            self._hand.end()  # started again with the new one
+            self._listen_to_clouds()
+
+    def _listen_to_clouds(self) -> None:
+        if self._cloud is not None:
+            self._cloud.close()
+            self._cloud = None
+        if self._organ is not None:
+            self._cloud = NewestCloud(self, self._frame_id, len(self._organ.vertices))
+
+    def _take_organ(self, message: VademecumFile) -> None:
+        if self._organ is not None and self._organ.id == message.id:
+            return
+        try:
+            data = bytes(message.data)
+            name = "the vademecum that was announced"
+            organ = Organ.of(self._reader.read(name, len(data), parse_vademecum, data, name))
+            tumour = read_tumour(self._library.folder / self._tumour) if self._tumour else None
+        except AvatarError as error:
+            self._say(str(error))
+            return
+        self._stop_recording("the organ changed")
+        self._material = {}
+        radius = self._radius()
+        self._line.live["target"][0] = organ.above(4.0 * radius)
+        self._view.show(organ, tumour, radius)
+        self._panels.show_organ(organ)
+        self._organ = organ
+        self._listen_to_clouds()
+        self._requests.parameters_of_contact(tuple(MATERIAL), self._note_material)
+        self._say(f"{organ.name} is shown")
+
+    def _take_statistics(self, window: LoopStatistics) -> None:
+        now = time.monotonic() - self._began
+        self._panels.show_loop(now, window.step_p99, window.missed / max(window.window, 1e-3))
+
+    def _radius(self) -> float:
+        """Of the tool's tip [m]."""
+        if self._scene:
+            return read_scene(shipped_scenes()[self._scene]).tools[0].tip_radius
+        given = self._contact.get("tip_radius", 0.005)
+        return float(given if isinstance(given, float) else given[0])
+
+    def _show(self) -> None:
+        """One frame of the page."""
+        live, organ = self._line.live[0], self._organ
+        self._frame += 1
+        if self._frame % _LOOK == 1:
+            self._look_around()
+        if organ is None or self._cloud is None:
+            return
+        taken = self._cloud.take()
+        largest = 0.0
+        if taken is not None:
+            largest = self._view.move(taken[1])
+            if self._recorder.is_on:
+                self._recorder.note_cloud(taken[1][:, 3:])
+        force = live["force"] if self._answers() else np.zeros(3)
+        self._view.place_tool(live["tip"].copy(), force)
+        if self._frame % _SLOW == 0:
+            size = float(np.linalg.norm(force))
+            error = float(live["error"]) if np.isfinite(live["error"]) else 0.0
+            n_kept = self._recorder.n_periods if self._recorder.is_on else None
+            self._panels.readout.content = frame_text(size, error, largest, n_kept)
+            self._panels.show_scale(self._view.top)
+            self._panels.show_force(time.monotonic() - self._began, size, error)
+
+    def _answers(self) -> bool:
+        """Whether the contact node answered lately."""
+        silence = time.monotonic_ns() - int(self._line.live["heard"][0])
+        return silence < _SILENCE * 1e9
+
+    def _look_around(self) -> None:
+        """Who is there, what the library holds, and whether the hand lives."""
+        missing = self._requests.missing
+        status = int(self._line.live["status"][0]) if self._answers() else None
+        self._panels.warnings.content = warnings(missing, self._organ is not None, status)
+        self._panels.offer(*self._library.offer())
+        if self._organ is not None:
+            self._hand.keep(self._tool, self._frame_id)
+        if "contact" in missing:
+            if not self._was_missing:
+                self._stop_recording("the contact node ended")
+            self._was_missing = True
+        elif self._was_missing:
+            self._was_missing = False
+            self._requests.parameters_of_contact((*_OF_CONTACT, *MATERIAL), self._meet_contact)
+        elif self._is_to_restore and status not in (None, ContactState.STATUS_NO_MODEL):
+            self._restore()
+
+    def _meet_contact(self, values: dict[str, Any]) -> None:
+        """The contact node is there, for the first time or again."""
+        self._contact, self._is_to_restore = values, True
+        self._view.resize_tool(self._radius())
+        self._panels.show_material(self._in_force())
+
+    def _note_material(self, values: dict[str, Any]) -> None:
+        """What the contact node has, also if another client chose it."""
+        self._contact |= values
+        self._panels.show_material(self._in_force())
+
+    def _in_force(self) -> dict[str, float]:
+        """Values of the material that are not those of the file, by coordinate."""
+        contact = self._contact
+        return {MATERIAL[key]: contact[key] for key in MATERIAL if contact.get(key)} | (
+            self._material
+        )
+
+    def _restore(self) -> None:
+        """What was chosen here, once the contact node has an organ again."""
+        self._is_to_restore = False
+        if self._scene:
+            self._choose_scene(self._scene)
+        if self._material:
+            self._requests.set_material(dict(self._material), self._say)
+
+    # --- From the page -----------------------------------------------------------------------
+
+    def _say(self, text: str) -> None:
+        if self._server is not None:
+            self._panels.news.content = text
+
+    def _drag(self, target: np.ndarray) -> None:
+        if np.isfinite(target).all():
+            self._line.live["target"][0] = target
+
+    def _nudge(self, axis: Any, way: float) -> None:
+        target = self._line.live["target"][0].copy()
+        if axis is None and self._organ is not None:
+            axis = self._organ.outward(target)
+        if axis is not None:
+            self._drag(target + way * np.asarray(axis))
+
+    def _lift(self) -> None:
+        if self._organ is not None:
+            target = self._line.live["target"][0].copy()
+            self._drag(target + 0.03 * self._organ.outward(target))
+
+    def _choose_material(self, name: str, value: float) -> None:
+        self._stop_recording("the material changed")
+        self._material[name] = value
+        self._requests.set_material({name: value}, self._say)
+
+    def _choose_scene(self, name: str) -> None:
+        self._stop_recording("the scene changed")
+
+        def note(switched: bool) -> None:
+            if switched:
+                self._scene = name
+                self._view.resize_tool(self._radius())
+
+        self._requests.load_scene(name, self._say, then=note)
+
+    def _build(self, surface: str, fidelity: str, tolerance: float) -> None:
+        def load(file: str) -> None:
+            if file:
+                self._panels.show_progress("done", 1.0, float("nan"))
+                self._requests.load_vademecum(file, self._say)
+
+        self._requests.build_patient(
+            surface, fidelity, tolerance, self._panels.show_progress, self._say, load
+        )
+
+    # --- Recordings --------------------------------------------------------------------------
+
+    def _record(self, on: bool) -> None:
+        if not on:
+            self._stop_recording("")
+            return
+        organ = self._organ
+        if organ is None or not self._answers():
+            self._say("nothing to record: there is no organ, or the contact node does not answer")
+            return
+        if len(self._contact.get("tools", ())) != 1:
+            self._say("a recording holds one tool; start the contact node with one")
+            return
+        if self._line.live["touches"][0]:
+            self._say("lift the tool off the organ first: a recording starts at rest")
+            return
+        scene = self._scene_in_force(organ)
+        text = self._recorder.open(organ.vademecum, scene, float(self._contact["rate"]))
+        self._panels.show_recording(True)
+
+        def begin(switched: bool) -> None:
+            if switched:
+                self._recorder.begin()
+            else:
+                self._recorder.drop()
+                self._panels.show_recording(False)
+
+        self._requests.load_scene(scene.name, self._say, yaml=text, then=begin)
+
+    def _scene_in_force(self, organ: Organ) -> Scene:
+        contact = self._contact
+        given = self._scene or contact["scene"]
+        chosen = read_scene(scene_file(given)) if given else None
+        return scene_in_force(
+            chosen,
+            organ.vademecum,
+            self._in_force(),
+            self._radius(),
+            contact["cloud"],
+            contact["cloud_divisor"],
+        )
+
+    def _stop_recording(self, why: str) -> None:
+        if not self._recorder.is_on:
+            return
+        self._panels.show_recording(False)
+        try:
+            saved = self._recorder.save(self._library.folder)
+        except AvatarError as error:
+            self._say(str(error))
+            return
+        because = f", since {why}" if why else ""
+        if saved is None:
+            self._say(f"nothing was recorded{because}")
+            return
+        path, recording = saved
+        lost = int(recording.periods.lost.sum())
+        self._say(f"recorded {recording.seconds:.1f} s ({lost} periods lost){because}: {path.name}")
+
+
+def main() -> int:
+    return run(PlanningNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

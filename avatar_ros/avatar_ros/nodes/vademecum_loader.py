@@ -1,0 +1,158 @@
+"""The loader: verifies a vademecum file and announces it, whole, to whoever needs it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.node import Node
+from shape_msgs.msg import Mesh
+from std_msgs.msg import Header
+
+from avatar_core.errors import AvatarError, one_line
+from avatar_core.vademecum import storage
+from avatar_ros.framework import conversions, qos
+from avatar_ros.framework.kept_state import STATE_DIR, KeptState
+from avatar_ros.framework.library import read_in_library
+from avatar_ros.framework.managed_node import ManagedNode, run
+from avatar_ros.framework.parameters import (
+    AUTOSTART,
+    FRAME_ID,
+    Parameter,
+    ParameterError,
+    frame,
+    values,
+)
+from avatar_ros.framework.reader import Reader
+from avatar_ros.msg import VademecumFile, VademecumInfo
+from avatar_ros.srv import LoadVademecum
+
+VADEMECUM_LOADER = (
+    AUTOSTART,
+    FRAME_ID,
+    Parameter("library_dir", ".", "directory of the vademecums; nothing outside it is read"),
+    Parameter("vademecum", "", "file in library_dir to load at start; empty: none"),
+    Parameter("max_megabytes", 1024, "largest file that is read [MB]", range=(1, 65536)),
+    STATE_DIR,
+)
+
+
+@dataclass(frozen=True)
+class LoaderSettings:
+    library_dir: str
+    vademecum: str
+    frame_id: str
+    max_bytes: int
+
+
+def read_loader(node: Node) -> LoaderSettings:
+    value = values(node, VADEMECUM_LOADER)
+    return LoaderSettings(
+        library_dir=os.path.expanduser(value["library_dir"]),
+        vademecum=value["vademecum"],
+        frame_id=frame(value["frame_id"]),
+        max_bytes=value["max_megabytes"] * 1_000_000,
+    )
+
+
+class LoaderNode(ManagedNode):
+    """Announces one vademecum at a time; a refused file leaves the one before in place."""
+
+    def __init__(self) -> None:
+        self._settings: LoaderSettings | None = None
+        self._reader: Reader | None = None
+        self._outlets: dict[type, Any] = {}
+        self._service: Any = None
+        super().__init__("vademecum_loader", VADEMECUM_LOADER)
+        started = self.get_parameter("vademecum").value
+        self._state = KeptState(self, {"vademecum": started})
+
+    def configure(self) -> None:
+        self._settings = read_loader(self)
+        if not os.path.isdir(self._settings.library_dir):
+            raise ParameterError(
+                f"parameter library_dir: {self._settings.library_dir} is not a directory"
+            )
+        self._reader = Reader(self._settings.max_bytes)
+        self._outlets = {
+            kind: self.ports.publisher(kind, topic, qos.ONCE)
+            for kind, topic in (
+                (VademecumInfo, "vademecum_info"),
+                (Mesh, "rest_surface"),
+                (VademecumFile, "vademecum"),
+            )
+        }
+
+    def activate(self) -> None:
+        assert self._settings is not None
+        self._load_first(self._settings.vademecum)
+        self._service = self.create_service(LoadVademecum, "load_vademecum", self._answer)
+
+    def deactivate(self) -> None:
+        if self._service is not None:
+            self.destroy_service(self._service)
+            self._service = None
+
+    def clean_up(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = None
+        for publisher in self._outlets.values():
+            self.destroy_publisher(publisher)
+        self._outlets = {}
+
+    def _load_first(self, name: str) -> None:
+        """What was loaded last, else the parameter's."""
+        kept = self._state.kept().get("vademecum", name)
+        if kept != name:
+            try:
+                self.load(kept)
+                return
+            except (AvatarError, OSError) as error:
+                self.get_logger().error(f"not loaded again: {error}")
+        if name:
+            self.load(name)
+
+    def load(self, name: str) -> VademecumInfo:
+        """Verify a file of the library and announce it.
+
+        Raises
+        ------
+        AvatarError : the file is refused; nothing was announced
+        """
+        assert self._settings is not None and self._reader is not None
+        data = read_in_library(name, self._settings.library_dir, self._settings.max_bytes)
+        vademecum = self._reader.read(name, len(data), storage.parse_vademecum, data, name)
+        header = Header(frame_id=self._settings.frame_id, stamp=self.get_clock().now().to_msg())
+        info = conversions.vademecum_info(vademecum.info(), header)
+        surface = conversions.surface_mesh(vademecum.surface_vertices, vademecum.surface_faces)
+        self._outlets[VademecumInfo].publish(info)
+        self._outlets[Mesh].publish(surface)
+        self._outlets[VademecumFile].publish(
+            conversions.vademecum_file(vademecum.id, vademecum.name, data)
+        )
+        self.get_logger().info(
+            f"announced {vademecum.name!r} ({vademecum.id[:12]}), {len(data) / 1e6:.1f} MB"
+        )
+        return info
+
+    def _answer(
+        self, request: LoadVademecum.Request, response: LoadVademecum.Response
+    ) -> LoadVademecum.Response:
+        try:
+            response.info = self.load(request.name)
+            self._state.keep({"vademecum": request.name})
+            response.success = True
+        except Exception as error:  # a service always answers; the file decides what is raised
+            response.message = one_line(error)
+            self.get_logger().error(f"load_vademecum: {response.message}")
+        return response
+
+
+def main() -> int:
+    return run(LoaderNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

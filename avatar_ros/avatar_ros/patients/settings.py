@@ -1,0 +1,66 @@
+"""The parameters of the patient_interpolation node, and the settings that they come to."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+from rclpy.node import Node
+
+from avatar_ros.framework.parameters import AUTOSTART, Parameter, ParameterError, values
+from avatar_ros.patients.builder import Rules
+
+WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
+
+PATIENT_INTERPOLATION = (
+    AUTOSTART,
+    Parameter("atlas", "", "base of anatomies with responses (.h5), of 'avatar atlas create'"),
+    Parameter("library_dir", ".", "directory of surfaces and results; nothing outside is touched"),
+    Parameter("max_megabytes", 256, "largest surface file or mesh that is read [MB]", (1, 1999)),
+    Parameter("vertices", 2850, "of a patient's own mesh, about", range=(100, 50_000)),
+    Parameter("modes", 100, "far-field modes at most", range=(1, 1000)),
+    Parameter("weighting", "kriging", "of the neighbours: kriging, lle-template or lle-grid"),
+    Parameter(
+        "certify",
+        -1,
+        "unseen loads of the certificate; -1: 24, or 200 of solved",
+        range=(-1, 10_000),
+    ),
+    Parameter("threads", 1, "of the numerical libraries", range=(1, 64)),
+)
+
+
+@dataclass(frozen=True)
+class InterpolationSettings:
+    """Parameters of the patient_interpolation node."""
+
+    rules: Rules
+    library_dir: str
+    max_bytes: int
+    threads: int
+
+
+def read_interpolation(node: Node) -> InterpolationSettings:
+    """The patient_interpolation node's parameters.
+
+    Raises
+    ------
+    ParameterError : naming the parameter and what it takes
+    """
+    value = values(node, PATIENT_INTERPOLATION)
+    if not value["atlas"]:
+        raise ParameterError("parameter atlas: give the file of an atlas, of 'avatar atlas create'")
+    if value["weighting"] not in WEIGHTINGS:
+        raise ParameterError(f"parameter weighting: give one of {', '.join(WEIGHTINGS)}")
+    return InterpolationSettings(
+        rules=Rules(
+            atlas=os.path.abspath(os.path.expanduser(value["atlas"])),
+            n_vertices=value["vertices"],
+            max_modes=value["modes"],
+            weighting=value["weighting"],
+            n_certified=value["certify"],
+        ),
+        library_dir=os.path.expanduser(value["library_dir"]),
+        max_bytes=value["max_megabytes"] * 1_000_000,
+        threads=value["threads"],
+    )

@@ -1,0 +1,109 @@
+"""What programs that show the organ need: the newest cloud when they ask, triangles as a message.
+
+Nothing here is called back: a cloud that nobody looks at costs no time, so that a viewer takes
+30 of the 1,000 that come a second.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Point, Vector3
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker
+
+from avatar_ros.framework import qos
+from avatar_ros.framework.conversions import (
+    NO_STAMP,
+    POINT_BYTES,
+    CloudTemplate,
+    LayoutError,
+    StampedTemplate,
+    find_bytes,
+    find_number,
+)
+from avatar_ros.loop.contact_loop import OwnThread
+
+RATE = 30.0  # as fast as eyes need [Hz]
+
+
+class NewestCloud:
+    """Subscribes `deformation` and hands out the newest cloud, once."""
+
+    def __init__(self, node: Node, frame_id: str, n_points: int) -> None:
+        template = CloudTemplate(frame_id, n_points)
+        self._length = len(template.serialise(NO_STAMP))
+        self._start, self._stamp, self._n_points = template.start, template.stamp_start, n_points
+        self._node = node
+        self._subscription = node.create_subscription(
+            PointCloud2,
+            "deformation",
+            _never_called,
+            qos.NEWEST,
+            callback_group=OwnThread(),
+            raw=True,
+        )
+
+    def take(self) -> tuple[bytes, np.ndarray] | None:
+        """Stamp and points (n_points, 6) float32 of a cloud of this organ [m]; None without."""
+        with self._subscription.handle:
+            taken = self._subscription.handle.take_message(PointCloud2, True)
+        if taken is None or not 0 <= len(taken[0]) - self._length < POINT_BYTES:
+            return None  # the middleware may add some bytes at the end
+        raw = bytes(taken[0])
+        points = np.frombuffer(raw, np.float32, 6 * self._n_points, self._start)
+        return raw[self._stamp : self._stamp + len(NO_STAMP)], points.reshape(-1, 6)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._node.destroy_subscription(self._subscription)
+
+
+class TriangleTemplate(StampedTemplate):
+    """A serialised Marker of triangles; each time only stamp, corners and colours are written.
+
+    corners : view, shape (3 n_triangles, 3) float64 [m]
+    colours : view, shape (3 n_triangles, 4) float32, red, green, blue, opacity, 0 to 1
+    """
+
+    def __init__(self, frame_id: str, name: str, n_triangles: int) -> None:
+        n = 3 * n_triangles
+        points = [Point() for _ in range(n)]
+        shades = [ColorRGBA() for _ in range(n)]
+        message = Marker(
+            header=Header(frame_id=frame_id),
+            ns=name,
+            type=Marker.TRIANGLE_LIST,
+            action=Marker.ADD,
+            scale=Vector3(x=1.0, y=1.0, z=1.0),
+            color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0),
+            points=points,
+            colors=shades,
+        )
+        message.pose.orientation.w = 1.0
+        start = find_number(message, lambda x: setattr(points[0], "x", x))
+        last = find_number(message, lambda x: setattr(points[-1], "z", x))
+        first_shade, last_shade = (_find_colour(message, shades[k]) for k in (0, -1))
+        if last != start + 24 * n - 8 or last_shade != first_shade + 16 * (n - 1):
+            raise LayoutError("triangles are not numbers in a row: use rmw_fastrtps_cpp")
+        super().__init__(message)
+        self.corners = self._numbers(start, 3 * n).reshape(n, 3)
+        self.colours = np.frombuffer(self._buffer, np.float32, 4 * n, first_shade).reshape(n, 4)
+
+
+def _find_colour(message: Marker, shade: ColorRGBA) -> int:
+    """Byte offset of one of the message's colours."""
+    marks = (0.123456, 0.345678, 0.567891, 0.789123)
+    shade.r, shade.g, shade.b, shade.a = marks
+    start = find_bytes(struct.pack("=4f", *marks), serialize_message(message))
+    shade.r, shade.g, shade.b, shade.a = 0.0, 0.0, 0.0, 0.0
+    return start
+
+
+def _never_called(message: Any) -> None:
+    """Clouds are taken, not delivered."""

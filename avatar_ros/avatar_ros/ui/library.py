@@ -1,0 +1,36 @@
+"""The files that the planning page offers: vademecums and surfaces of a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+
+from avatar_core.vademecum import storage
+
+SURFACES = (".obj", ".stl", ".ply", ".vtk", ".off")
+
+
+class Library:
+    """A folder, looked at from time to time; a file is opened once for each time it changes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._known: dict[tuple[str, int], bool] = {}
+
+    def offer(self) -> tuple[list[str], list[str]]:
+        """Names of the vademecums and of the surfaces, sorted."""
+        files = sorted(path for path in self.folder.iterdir() if path.is_file())
+        vademecums = [path.name for path in files if path.suffix == ".h5" and self._is_one(path)]
+        surfaces = [path.name for path in files if path.suffix.lower() in SURFACES]
+        return vademecums, surfaces
+
+    def _is_one(self, path: Path) -> bool:
+        key = (path.name, path.stat().st_mtime_ns)
+        if key not in self._known:
+            try:
+                with h5py.File(path, "r") as file:
+                    self._known[key] = str(file.attrs.get("format", "")) == storage.FORMAT
+            except OSError:
+                self._known[key] = False
+        return self._known[key]

@@ -1,0 +1,84 @@
+"""What the planning page shows of a vademecum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar_core.contact.tool_path import middle_of_access
+from avatar_core.vademecum.model import Vademecum
+
+YOUNG_RANGE = (0.25, 4.0)  # of the slider, times that of the vademecum
+
+
+@dataclass(frozen=True, eq=False)
+class Organ:
+    """An organ at rest.
+
+    vertices : ndarray, shape (n, 3) float32 [m]; faces : (m, 3)
+    clamped : ndarray of bool, shape (m,)
+    centre : of the box around it [m]; size : the longest side of that [m]
+    start, normal : a point in the middle of the accessible surface [m], and the normal there
+    ranges : of the material's coordinates by the core's name: lowest, highest, in force
+    """
+
+    id: str
+    name: str
+    vademecum: Vademecum
+    vertices: np.ndarray
+    faces: np.ndarray
+    clamped: np.ndarray
+    centre: np.ndarray
+    size: float
+    start: np.ndarray
+    normal: np.ndarray
+    ranges: dict[str, tuple[float, float, float]]
+
+    @staticmethod
+    def of(v: Vademecum) -> Organ:
+        """That of a vademecum."""
+        vertices = v.surface_vertices
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        j = middle_of_access(v)
+        young = v.material.young_modulus
+        ranges = {"young": (YOUNG_RANGE[0] * young, YOUNG_RANGE[1] * young, young)}
+        here = {"poisson": v.material.poisson_ratio, "contrast": v.contrast or 1.0}
+        for c in v.parametric.coordinates if v.parametric else ():
+            ranges[c.name] = (c.low, c.high, here[c.name])
+        return Organ(
+            id=v.id,
+            name=v.name,
+            vademecum=v,
+            vertices=vertices,
+            faces=v.surface_faces,
+            clamped=v.regions.clamped,
+            centre=0.5 * (low + high),
+            size=float((high - low).max()),
+            start=v.surface.centers[j],
+            normal=v.surface.normals[j] / np.linalg.norm(v.surface.normals[j]),
+            ranges=ranges,
+        )
+
+    def above(self, height: float) -> np.ndarray:
+        """A point over the middle of the accessible surface [m]."""
+        return np.asarray(self.start + height * self.normal)
+
+    def outward(self, point: np.ndarray) -> np.ndarray:
+        """The outward normal of the accessible surface nearest to a point."""
+        surface = self.vademecum.surface
+        j = int(np.argmin(np.linalg.norm(surface.centers - point, axis=1)))
+        return np.asarray(surface.normals[j] / np.linalg.norm(surface.normals[j]))
+
+    def says(self) -> str:
+        """What it is and how wrong it may be, in a line or two."""
+        info = self.vademecum.info()
+        errors = (
+            f"Errors certified: displacement {info.l2_mean:.1%} (worst {info.l2_worst:.1%}), "
+            f"force {info.force_mean:.1%} (worst {info.force_worst:.1%})."
+        )
+        return (
+            f"**{self.name}**, {info.volume * 1e6:.0f} ml, E {info.young_modulus / 1e3:.0f} kPa, "
+            f"nu {info.poisson_ratio:.3g}. "
+            + (errors if np.isfinite(info.l2_mean) else "Errors: not measured.")
+        )

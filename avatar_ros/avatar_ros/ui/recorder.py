@@ -1,0 +1,144 @@
+"""Keeps what the tool does and feels, and how the organ looks, until it is saved."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from avatar_core.contact.effects import Tumour
+from avatar_core.contact.effects.selection import natural_effects
+from avatar_core.scene.file import write_scene
+from avatar_core.scene.model import Scene, Tool
+from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
+from avatar_core.vademecum.accuracy import Cloud
+from avatar_core.vademecum.model import Vademecum
+from avatar_ros.ui.tool_memory import HandLine
+
+
+def scene_in_force(
+    chosen: Scene | None,
+    vademecum: Vademecum,
+    material: dict[str, float],
+    tip_radius: float,
+    cloud: Cloud = "surface",
+    cloud_divisor: int = 1,
+) -> Scene:
+    """The scene that does what runs now, its material included: for one tool.
+
+    chosen : None for the natural effects of the vademecum, with the other three
+    material : values by coordinate that go before those of the scene
+    """
+    scene = chosen or Scene(
+        name="natural effects",
+        tools=(Tool(tip_radius=tip_radius),),
+        cloud=cloud,
+        cloud_divisor=cloud_divisor,
+        effects=natural_effects(vademecum, 1),
+    )
+    effects = scene.effects
+    if "contrast" in material:
+        others = (effect for effect in effects if not isinstance(effect, Tumour))
+        effects = (*others, Tumour(material["contrast"]))
+    return replace(
+        scene,
+        effects=effects,
+        young_modulus=material.get("young", scene.young_modulus),
+        poisson_ratio=material.get("poisson", scene.poisson_ratio),
+    )
+
+
+class Recorder:
+    """One recording at a time, from ``open`` over ``begin`` to ``save``.
+
+    is_on : periods are kept
+    """
+
+    def __init__(self, line: HandLine) -> None:
+        self._line = line
+        self._clouds: list[np.ndarray] = []
+        self._after: list[int] = []
+        self._begin = -1
+        self._about: tuple[str, str, str, float] = ("", "", "", 0.0)
+
+    @property
+    def is_on(self) -> bool:
+        return bool(self._line.live["recording"][0])
+
+    @property
+    def n_periods(self) -> int:
+        """Kept so far."""
+        return int(self._line.live["n_rows"][0]) - max(self._begin, 0)
+
+    def open(self, vademecum: Vademecum, scene: Scene, rate: float) -> str:
+        """Keep periods from now on, before a new model comes; returns the scene's text."""
+        text = write_scene(scene)
+        self._about = (vademecum.id, vademecum.name, text, rate)
+        self._clouds, self._after, self._begin = [], [], -1
+        self._line.live["n_rows"][0] = 0
+        self._line.live["recording"][0] = 1
+        return text
+
+    def begin(self) -> None:
+        """The new model is in use: what was kept before does not count."""
+        self._begin = int(self._line.live["n_rows"][0])
+
+    def note_cloud(self, displacement: np.ndarray) -> None:
+        """A cloud that was shown, (n_points, 3) [m]."""
+        n = int(self._line.live["n_rows"][0])
+        if self._begin >= 0 and n > self._begin:
+            self._clouds.append(displacement.astype(np.float32))
+            self._after.append(int(self._line.rows["number"][n - 1]))
+
+    def drop(self) -> None:
+        """Keep nothing."""
+        self._line.live["recording"][0] = 0
+        self._begin = -1
+
+    def save(self, folder: Path) -> tuple[Path, Recording] | None:
+        """Stop and write a file named by the time; None if nothing was kept.
+
+        Raises
+        ------
+        StorageError : it could not be written
+        """
+        begin = self._begin
+        self.drop()
+        rows = self._line.recorded()
+        if begin < 0 or len(rows) <= begin:
+            return None
+        identity, name, scene, rate = self._about
+        kept, before = rows[begin:], rows[:begin]
+        size = self._clouds[0].shape if self._clouds else (0, 3)
+        same = [i for i, cloud in enumerate(self._clouds) if cloud.shape == size]
+        recording = Recording(
+            vademecum_id=identity,
+            vademecum_name=name,
+            scene=scene,
+            rate=rate,
+            from_rest=not before["force"].any(),
+            periods=_periods(kept),
+            clouds=Clouds(
+                np.array([self._after[i] for i in same], np.int64),
+                np.array([self._clouds[i] for i in same], np.float32).reshape(-1, *size),
+            ),
+        )
+        path = folder / time.strftime("recording-%Y%m%d-%H%M%S.h5")
+        save_recording(recording, path)
+        return path, recording
+
+
+def _periods(rows: np.ndarray) -> Periods:
+    """Of one tool."""
+    return Periods(
+        number=rows["number"].copy(),
+        stamp=rows["stamp"].copy(),
+        tip=rows["tip"][:, None].copy(),
+        turn=np.zeros((len(rows), 1, 3)),  # the page's tool does not turn
+        status=rows["status"][:, None].astype(np.uint8),
+        force=rows["force"][:, None].copy(),
+        error=rows["error"][:, None].copy(),
+        share=rows["share"][:, None].copy(),
+    )

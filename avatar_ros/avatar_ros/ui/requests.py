@@ -1,0 +1,174 @@
+"""What the planning page asks of the other nodes; answers come as a line of text.
+
+Every request returns at once and says in one line what came of it, also that a node is not there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+
+from avatar_ros.action import BuildPatient
+from avatar_ros.loop.settings import MATERIAL
+from avatar_ros.srv import LoadScene, LoadVademecum
+
+# How to start what is not there.
+START = {
+    "contact": "the contact node is not running, so there is no force: "
+    "start it with `ros2 run avatar_ros contact`",
+    "vademecum_loader": "the loader is not running, so no organ can be chosen: "
+    "start it with `ros2 run avatar_ros vademecum_loader`",
+    "patient_interpolation": "the node that builds patients is not running: "
+    "start it with an atlas, `avatar cell --atlas FILE.h5`",
+}
+_PARAMETERS = {name: key for key, name in MATERIAL.items()}  # of the contact node, by coordinate
+
+Say = Callable[[str], None]
+Progress = Callable[[str, float, float], None]
+
+
+class Requests:
+    """Clients of the cell's services and of its action."""
+
+    def __init__(self, node: Node) -> None:
+        self._load_vademecum = node.create_client(LoadVademecum, "load_vademecum")
+        self._load_scene = node.create_client(LoadScene, "load_scene")
+        self._set = node.create_client(SetParameters, "contact/set_parameters")
+        self._get = node.create_client(GetParameters, "contact/get_parameters")
+        self._build = ActionClient(node, BuildPatient, "build_patient")
+        self._goal: Any = None
+        self._waiting: dict[str, float] = {}  # values of the material not sent yet
+        self._setting = False
+
+    def close(self) -> None:
+        """Give back what the middleware keeps for the action."""
+        self._build.destroy()
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Nodes whose services are not there."""
+        ready = {
+            "vademecum_loader": self._load_vademecum.service_is_ready(),
+            "contact": self._load_scene.service_is_ready(),
+            "patient_interpolation": self._build.server_is_ready(),
+        }
+        return tuple(name for name, is_ready in ready.items() if not is_ready)
+
+    def load_vademecum(self, name: str, say: Say) -> None:
+        """Have the loader announce a file of its library."""
+        if not self._load_vademecum.service_is_ready():
+            say(START["vademecum_loader"])
+            return
+        say(f"loading {name} ...")
+        future = self._load_vademecum.call_async(LoadVademecum.Request(name=name))
+        future.add_done_callback(lambda done: say(_outcome(done, f"{name} loaded")))
+
+    def load_scene(
+        self, name: str, say: Say, yaml: str = "", then: Callable[[bool], None] = lambda _: None
+    ) -> None:
+        """Switch the scene, by name or by its text; ``then`` is told whether it was."""
+        if not self._load_scene.service_is_ready():
+            say(START["contact"])
+            then(False)
+            return
+        say(f"switching to {name}; effects that never ran here take half a minute ...")
+        request = LoadScene.Request(yaml=yaml) if yaml else LoadScene.Request(name=name)
+
+        def answered(done: Any) -> None:
+            answer = done.result()
+            effects = ", ".join(answer.effects) if answer is not None else ""
+            say(_outcome(done, f"{name} runs, with {effects or 'no effects'}"))
+            then(answer is not None and answer.success)
+
+        self._load_scene.call_async(request).add_done_callback(answered)
+
+    def set_material(self, values: dict[str, float], say: Say) -> None:
+        """Values by coordinate, the newest only while an earlier one is on its way."""
+        self._waiting |= values
+        if self._setting or not self._waiting:
+            return
+        if not self._set.service_is_ready():
+            say(START["contact"])
+            return
+        chosen, self._waiting, self._setting = self._waiting, {}, True
+        parameters = [_double(_PARAMETERS[name], value) for name, value in chosen.items()]
+
+        def answered(done: Any) -> None:
+            self._setting = False
+            results = done.result().results if done.result() is not None else []
+            refusals = [result.reason for result in results if not result.successful]
+            say("; ".join(refusals) if refusals else "")
+            self.set_material({}, say)
+
+        request = SetParameters.Request(parameters=parameters)
+        self._set.call_async(request).add_done_callback(answered)
+
+    def parameters_of_contact(
+        self, names: Sequence[str], then: Callable[[dict[str, Any]], None]
+    ) -> None:
+        """Values of parameters of the contact node; nothing happens where it is not there."""
+        if not self._get.service_is_ready():
+            return
+
+        def answered(done: Any) -> None:
+            if done.result() is not None:
+                values = [parameter_value_to_python(value) for value in done.result().values]
+                then(dict(zip(names, values, strict=False)))
+
+        self._get.call_async(GetParameters.Request(names=list(names))).add_done_callback(answered)
+
+    def build_patient(
+        self,
+        surface: str,
+        fidelity: str,
+        tolerance: float,
+        progress: Progress,
+        say: Say,
+        then: Callable[[str], None],
+    ) -> None:
+        """Build a patient; ``then`` gets the name of the file, empty if there is none."""
+        if not self._build.server_is_ready():
+            say(START["patient_interpolation"])
+            then("")
+            return
+        goal = BuildPatient.Goal(surface=surface, fidelity=fidelity, tolerance=tolerance)
+
+        def note(message: Any) -> None:
+            told = message.feedback
+            progress(told.stage, told.fraction, told.error)
+
+        def finished(done: Any) -> None:
+            self._goal = None
+            result = done.result().result
+            for_all = f"{result.file} built in {result.seconds:.0f} s"
+            say(for_all if result.success else result.message)
+            then(result.file if result.success else "")
+
+        def accepted(done: Any) -> None:
+            self._goal = done.result()
+            self._goal.get_result_async().add_done_callback(finished)
+
+        self._build.send_goal_async(goal, note).add_done_callback(accepted)
+
+    def cancel_patient(self) -> None:
+        """Stop building, if something is built."""
+        if self._goal is not None:
+            self._goal.cancel_goal_async()
+
+
+def _double(name: str, value: float) -> Parameter:
+    held = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+    return Parameter(name=name, value=held)
+
+
+def _outcome(done: Any, good: str) -> str:
+    answer = done.result()
+    if answer is None:
+        return "no answer; try again"
+    return good if answer.success else answer.message

@@ -1,0 +1,148 @@
+"""Moves the tool of the planning page: 1,000 poses a second towards where the mouse dragged it.
+
+A process of its own, since a page is served in bursts. Every state that the contact node answers is
+noted, and on request kept, with the pose that the step used.
+
+Run as ``python -m avatar_ros.ui.tool_driver TOOL FRAME`` by ``planning_ui``, never by hand; the
+memory that both share comes as standard input.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
+
+from avatar_ros.framework import qos, realtime
+from avatar_ros.framework.conversions import PoseTemplate, stamp_bytes
+from avatar_ros.framework.managed_node import StopSignal
+from avatar_ros.loop.contact_loop import OwnThread
+from avatar_ros.loop.tool import FAR_AWAY
+from avatar_ros.msg import ContactState
+from avatar_ros.ui.tool_memory import N_ROWS, HandLine
+
+PERIOD = 1_000_000  # [ns]
+_SHARE = 0.04  # of the way to the target that is left, in a period: 25 ms behind the mouse
+_FASTEST = 0.5e-3  # a period [m]
+_N_SENT = 4096  # poses that a state may answer
+_LATE = 20 * PERIOD  # from which the rhythm starts anew
+# A state of one of these had the pose of its stamp, one of INVALID_POSE none, others far away.
+_PLACED = frozenset(
+    int(status)
+    for status in (
+        ContactState.STATUS_OK,
+        ContactState.STATUS_NOT_CONVERGED,
+        ContactState.STATUS_TOO_MANY_CONTACTS,
+        ContactState.STATUS_OUT_OF_RANGE,
+        ContactState.STATUS_EXTRAPOLATED,
+        ContactState.STATUS_ENGAGING,
+    )
+)
+# Read deeper than what is sent: a period that was lost cannot be replayed.
+_STATES = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class Hand:
+    """Publishes the tool's poses and listens to what is answered."""
+
+    def __init__(self, node: Any, tool: str, frame_id: str, line: HandLine) -> None:
+        self._tool = tool
+        self._live, self._rows = line.live, line.rows
+        self._publisher = node.create_publisher(PoseStamped, f"{tool}/measured_cp", qos.NEWEST)
+        self._states = node.create_subscription(
+            ContactState,
+            "contact_state",
+            lambda _: None,
+            _STATES,
+            callback_group=OwnThread(),
+            raw=True,
+        )
+        self._pose = PoseTemplate(frame_id)
+        self._tip = self._live["target"][0].copy()
+        self._sent = np.full((_N_SENT, 3), np.nan)
+        self._first = 0  # stamp of pose 0 [ns]
+
+    def run(self, stop: StopSignal) -> None:
+        """Until the signal."""
+        offset = time.time_ns() - time.monotonic_ns()
+        tick = time.monotonic_ns() + PERIOD
+        self._first = tick + offset
+        while not stop:
+            realtime.sleep_until(tick)
+            self._move()
+            number = (tick + offset - self._first) // PERIOD
+            self._sent[number % _N_SENT] = self._tip
+            self._pose.position[:] = self._tip
+            self._publisher.handle.publish_raw(self._pose.serialise(stamp_bytes(tick + offset)))
+            self._live["tip"][0] = self._tip
+            self._live["n_poses"][0] += 1
+            while (taken := self._states.handle.take_message(ContactState, True)) is not None:
+                self._note(deserialize_message(taken[0], ContactState), taken[1])
+            behind = time.monotonic_ns() - tick
+            tick += PERIOD * (1 + (behind // PERIOD if behind > _LATE else 0))
+
+    def _move(self) -> None:
+        way = self._live["target"][0] - self._tip
+        step = _SHARE * way
+        length = float(np.sqrt(step @ step))
+        self._tip += step if length <= _FASTEST else step * (_FASTEST / length)
+
+    def _note(self, state: Any, info: Any) -> None:
+        if state.tool != self._tool:
+            return
+        live = self._live
+        force = np.zeros(3)
+        for contact in state.contacts:
+            force += (contact.force.x, contact.force.y, contact.force.z)
+        live["force"][0] = force * state.force_share
+        live["error"][0], live["share"][0] = state.force_error, state.force_share
+        live["status"][0], live["touches"][0] = state.status, len(state.contacts)
+        live["heard"][0] = time.monotonic_ns()
+        live["n_states"][0] += 1
+        n = int(live["n_rows"][0])
+        if live["recording"][0] and n < N_ROWS:
+            stamp = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
+            row = self._rows[n]
+            row["number"], row["stamp"] = info["publication_sequence_number"], stamp
+            row["tip"] = self._used(state.status, stamp)
+            row["force"], row["error"] = force, state.force_error
+            row["share"], row["status"] = state.force_share, state.status
+            live["n_rows"][0] = n + 1
+
+    def _used(self, status: int, stamp: int) -> Any:
+        """Where the tip was for the step [m]."""
+        if status == ContactState.STATUS_INVALID_POSE:
+            return np.nan
+        if status not in _PLACED:
+            return FAR_AWAY
+        return self._sent[(stamp - self._first) // PERIOD % _N_SENT]
+
+
+def main() -> int:
+    tool, frame = sys.argv[1:3]
+    stop = StopSignal()
+    line = HandLine(sys.stdin.fileno())
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node(
+        "_planning_ui_hand", enable_rosout=False, start_parameter_services=False
+    )
+    try:
+        hand = Hand(node, tool, frame, line)
+        realtime.bind_thread(-1)
+        realtime.calm_interpreter()
+        hand.run(stop)
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

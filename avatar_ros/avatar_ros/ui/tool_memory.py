@@ -1,0 +1,102 @@
+"""The process that moves the tool of the planning page, and the memory both have in common.
+
+One side writes each field, the other reads it: where the tool is wanted and whether to record go
+to the hand; where it is, what it feels, and the recorded periods come back. The last row that
+counts is said after it was written.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import signal
+import subprocess
+import sys
+from functools import partial
+
+import numpy as np
+
+from avatar_ros.framework import realtime
+
+SECONDS = 600  # of a recording, at most
+N_ROWS = SECONDS * 1000
+
+LIVE = np.dtype(
+    [
+        ("target", np.float64, 3),  # to the hand: centre of the tip [m]
+        ("recording", np.int64),
+        ("tip", np.float64, 3),  # from the hand: as sent last [m]
+        ("force", np.float64, 3),  # as sent by the contact node: its share of what was computed [N]
+        ("error", np.float64),  # [N]
+        ("share", np.float64),
+        ("status", np.int64),  # of avatar_ros/msg/ContactState
+        ("touches", np.int64),
+        ("heard", np.int64),  # when the last state came, monotonic clock [ns]
+        ("n_poses", np.int64),  # sent
+        ("n_states", np.int64),  # received
+        ("n_rows", np.int64),
+    ],
+    align=True,
+)
+ROW = np.dtype(
+    [
+        ("number", np.int64),
+        ("stamp", np.int64),  # [ns]
+        ("tip", np.float64, 3),
+        ("force", np.float64, 3),
+        ("error", np.float64),
+        ("share", np.float64),
+        ("status", np.int64),
+    ],
+    align=True,
+)
+
+
+class HandLine:
+    """The memory as two arrays, ``live`` of one entry and ``rows``; pages are there when used."""
+
+    def __init__(self, handle: int) -> None:
+        self.handle = handle
+        size = LIVE.itemsize + N_ROWS * ROW.itemsize
+        if os.fstat(handle).st_size < size:
+            os.ftruncate(handle, size)
+        memory = mmap.mmap(handle, size)
+        self.live = np.frombuffer(memory, LIVE, 1)[0:1]
+        self.rows = np.frombuffer(memory, ROW, N_ROWS, LIVE.itemsize)
+
+    @staticmethod
+    def make() -> HandLine:
+        """New memory, all zero."""
+        return HandLine(os.memfd_create("avatar-hand", os.MFD_CLOEXEC))
+
+    def recorded(self, begin: int = 0) -> np.ndarray:
+        """A copy of the rows that count, from one on."""
+        return self.rows[begin : int(self.live["n_rows"][0])].copy()
+
+
+class HandProcess:
+    """Runs :mod:`avatar_ros.ui.tool_driver` beside the page."""
+
+    def __init__(self, line: HandLine) -> None:
+        self._line = line
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def keep(self, tool: str, frame_id: str) -> None:
+        """Start it, if it does not run; the memory says where the tool is."""
+        if self._process is not None and self._process.poll() is None:
+            return
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "avatar_ros.ui.tool_driver", tool, frame_id],
+            stdin=self._line.handle,
+            env=realtime.single_threaded_libraries(dict(os.environ)),
+            cwd="/",  # -m would let whatever lies where the node was started stand first
+            start_new_session=True,  # Ctrl-C is for the node, which then ends this one
+            preexec_fn=partial(realtime.die_with_parent, signal.SIGINT),
+        )
+
+    def end(self) -> None:
+        """Returns when it has ended."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGINT)
+            self._process.wait()
+            self._process = None

@@ -1,0 +1,153 @@
+"""The three-dimensional part of the planning page: organ, clamp, tumour, tool and force."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_ros.ui.colours import table, top_for
+from avatar_ros.ui.organ import Organ
+
+N_BANDS = 10  # of the colour scale: the client has one colour for each mesh
+CLAMP = (90, 90, 90)
+TUMOUR = (213, 94, 0)  # vermilion and blue of Okabe and Ito, which the colour-blind tell apart
+TOOL = (0, 114, 178)
+ARROW = (213, 94, 0)
+FORCE_SCALE = 0.004  # length of the arrow [m/N], up to
+LONGEST = 0.06  # [m]
+_NO_FACE = np.zeros((1, 3), np.uint32)  # of a band without faces: a mesh cannot be empty
+_VIEW = 0.5  # of the view along the normal, the rest from the side: a drag presses
+_DISTANCE = 1.8  # of the camera, in lengths of the organ
+
+
+def band_shades() -> np.ndarray:
+    """Colours of the bands, shape (N_BANDS, 3), 0 to 255."""
+    middle = (np.arange(N_BANDS) + 0.5) / N_BANDS
+    return np.round(255 * table()[np.round(255 * middle).astype(int)]).astype(int)
+
+
+def camera_of(organ: Organ) -> tuple[np.ndarray, np.ndarray, float]:
+    """Position and aim of the first view [m], and its vertical angle [rad].
+
+    From the side of the accessible surface, so that a drag on the screen can press.
+    """
+    side = np.cross([0.0, 0.0, 1.0], organ.normal)
+    side /= max(float(np.linalg.norm(side)), 1e-6)
+    view = _VIEW * organ.normal + np.sqrt(1.0 - _VIEW**2) * side
+    return organ.centre + _DISTANCE * organ.size * view, organ.centre, float(np.radians(50.0))
+
+
+class OrganView:
+    """Draws into a viser server; everything in metres, in the organ's frame.
+
+    top : end of the colour scale [m]
+    """
+
+    def __init__(self, server: viser.ViserServer, on_drag: Callable[[np.ndarray], None]) -> None:
+        self._server = server
+        self._on_drag = on_drag
+        self._organ: Organ | None = None
+        self._bands: list[Any] = []
+        self._tool: Any = None
+        self._arrow: Any = None
+        self.top = top_for(0.0)
+        server.scene.set_up_direction("+z")
+        server.scene.world_axes.visible = False
+        server.scene.add_light_ambient("/light", intensity=1.2)  # the first colours are dark
+
+    def show(self, organ: Organ, tumour: SurfaceMesh | None, tip_radius: float) -> None:
+        """Another organ, at rest."""
+        scene, first = self._server.scene, self._organ is None
+        self._organ, self.top = organ, top_for(0.0)
+        clamp = organ.faces[organ.clamped]
+        # beside the moving surface, a hair outside, so that it is seen
+        lifted = organ.centre + 1.003 * (organ.vertices - organ.centre)
+        scene.add_mesh_simple("/clamp", lifted, clamp, color=CLAMP, side="double")
+        seen_through = tumour is not None
+        self._bands = [
+            scene.add_mesh_simple(
+                f"/organ/{i}",
+                organ.vertices,
+                _NO_FACE if i else organ.faces,
+                color=tuple(shade),
+                side="double",
+                opacity=0.55 if seen_through else None,
+                cast_shadow=False,
+            )
+            for i, shade in enumerate(band_shades().tolist())
+        ]
+        if tumour is not None:
+            scene.add_mesh_simple(
+                "/tumour", tumour.vertices, tumour.faces, color=TUMOUR, side="double"
+            )
+        else:
+            scene.remove_by_name("/tumour")
+        self._add_tool(tip_radius, organ.above(2.0 * tip_radius))
+        self._aim(organ)
+        if not first:
+            for client in self._server.get_clients().values():
+                client.camera.look_at = tuple(organ.centre)
+
+    def _add_tool(self, radius: float, position: np.ndarray) -> None:
+        scene = self._server.scene
+        self._tool = scene.add_icosphere("/tool", radius, TOOL, position=tuple(position))
+        self._tool.on_drag("left")(self._dragged)
+        self._arrow = scene.add_arrows(
+            "/force",
+            np.zeros((1, 2, 3)),
+            ARROW,
+            shaft_radius=0.0015,
+            head_radius=0.004,
+            head_length=0.008,
+            visible=False,
+        )
+
+    def _aim(self, organ: Organ) -> None:
+        camera = self._server.initial_camera
+        camera.near = 0.001
+        camera.position, camera.look_at, camera.fov = camera_of(organ)
+
+    def _dragged(self, event: Any) -> None:
+        way = np.array(event.end_position) - np.array(event.start_position)  # as it is shown
+        self._on_drag(np.array(self._tool.position) + way)
+
+    def resize_tool(self, radius: float) -> None:
+        """Another tip [m]."""
+        if self._tool is not None:
+            self._tool.radius = radius
+
+    def move(self, points: np.ndarray) -> float:
+        """The surface as a cloud says, (n, 6) [m]; returns the largest displacement [m]."""
+        organ = self._organ
+        if organ is None or len(points) != len(organ.vertices):
+            return 0.0
+        size = np.linalg.norm(points[:, 3:], axis=1)
+        largest = float(size.max())
+        self.top = top_for(largest, self.top)
+        of_face = size[organ.faces].mean(axis=1)
+        band = np.minimum((of_face * (N_BANDS / self.top)).astype(int), N_BANDS - 1)
+        with self._server.atomic():
+            for i, mesh in enumerate(self._bands):
+                faces = organ.faces[band == i]
+                if len(faces) == 0 and len(mesh.faces) == 1:
+                    continue  # was empty, is empty
+                mesh.vertices = np.ascontiguousarray(points[:, :3])
+                mesh.faces = faces.astype(np.uint32) if len(faces) else _NO_FACE
+        return largest
+
+    def place_tool(self, tip: np.ndarray, force: np.ndarray) -> None:
+        """Where the tool is [m], and what it feels [N]."""
+        if self._tool is None:
+            return
+        with self._server.atomic():
+            self._tool.position = tuple(tip)
+            size = float(np.linalg.norm(force))
+            if size > 1e-3:
+                length = min(FORCE_SCALE * size, LONGEST)
+                self._arrow.points = np.stack([tip, tip + force * (length / size)])[None]
+            if self._arrow.visible != (size > 1e-3):
+                self._arrow.visible = size > 1e-3

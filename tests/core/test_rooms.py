@@ -1,0 +1,122 @@
+"""The order of the packages: data flows from the first to the last, and no import runs back."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import avatar_core
+
+CORE = Path(avatar_core.__file__).resolve().parent
+NODES = CORE.parent / "avatar_ros" / "avatar_ros"  # as they lie in the repository
+
+ORDER = {
+    "avatar_core": (
+        "errors",
+        "common",
+        "geometry",
+        "fem",
+        "reduction",
+        "shapes",
+        "vademecum",
+        "contact",
+        "scene",
+        "offline",
+        "atlas",
+        "__init__",  # the public API
+        "studies",
+        "cli",
+    ),
+    "avatar_ros": ("framework", "loop", "prepare", "patients", "ui", "nodes", "bench", "__init__"),
+}
+GENERATED = {"msg", "srv", "action"}  # of avatar_ros, by rosidl
+FREE_OF_ROS = ("avatar_ros", "rclpy", "rcl_interfaces", "ament_index_python", "launch")
+FOLDERS = {"avatar_core": CORE, "avatar_ros": NODES}
+
+
+def module_name(file: Path, package: str) -> str:
+    parts = file.relative_to(FOLDERS[package]).with_suffix("").parts
+    return ".".join((package, *(parts[:-1] if parts[-1] == "__init__" else parts)))
+
+
+def imported(file: Path) -> Iterator[str]:
+    """Everything a file imports, inside functions and for type checkers too."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def imports_of(package: str) -> dict[str, set[str]]:
+    """For each module of a package, the modules of the same package that it imports."""
+    files = {module_name(f, package): f for f in sorted(FOLDERS[package].rglob("*.py"))}
+    found = {}
+    for module, file in files.items():
+        names = {name for name in imported(file) if name.split(".")[0] == package}
+        # ``a.b.name``: the module a.b.name if there is one, or else a.b.
+        targets = {name if name in files else name.rpartition(".")[0] for name in names}
+        found[module] = {target for target in targets if target in files} - {module}
+    return found
+
+
+def room(module: str) -> str:
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else "__init__"
+
+
+@pytest.fixture(params=["avatar_core", "avatar_ros"])
+def package(request: pytest.FixtureRequest) -> str:
+    if not FOLDERS[request.param].is_dir():
+        pytest.skip(f"no {request.param} beside avatar_core: not in a checkout")
+    return str(request.param)
+
+
+def test_every_folder_is_a_package_of_the_order(package: str) -> None:
+    found = {p.stem for p in FOLDERS[package].iterdir() if p.suffix == ".py" or p.is_dir()}
+    assert found - {"__pycache__", "py", *GENERATED} == set(ORDER[package])
+
+
+def test_no_import_runs_back(package: str) -> None:
+    order = ORDER[package]
+    back = [
+        f"{module} -> {target}"
+        for module, targets in imports_of(package).items()
+        for target in targets
+        if order.index(room(target)) > order.index(room(module))
+    ]
+    assert not back
+
+
+def test_no_circle(package: str) -> None:
+    try:
+        TopologicalSorter(imports_of(package)).prepare()
+    except CycleError as error:
+        pytest.fail(f"a circle of imports: {' -> '.join(error.args[1])}")
+
+
+def test_every_package_says_what_it_is_for(package: str) -> None:
+    for init in FOLDERS[package].rglob("__init__.py"):
+        text = ast.get_docstring(ast.parse(init.read_text())) or ""
+        assert len(text.split()) >= 12, f"{init}: no paragraph"
+
+
+def test_the_core_stands_without_ros() -> None:
+    for file in CORE.rglob("*.py"):
+        roots = {name.split(".")[0] for name in imported(file)}
+        assert not roots & {*FREE_OF_ROS, "std_msgs", "sensor_msgs", "geometry_msgs"}, file
+
+
+def test_studies_serve_the_command_alone() -> None:
+    users = {
+        room(module)
+        for module, targets in imports_of("avatar_core").items()
+        if any(room(target) == "studies" for target in targets)
+    }
+    assert users <= {"studies", "cli"}
+    for file in NODES.rglob("*.py"):
+        assert not any(name.startswith("avatar_core.studies") for name in imported(file)), file
