@@ -121,7 +121,7 @@ class Scene:
 
     @property
     def values(self) -> dict[str, float]:
-        """Material values that the scene chooses; see :func:`avatar_core.vademecum.at_values.at_values`.
+        """Material values that the scene chooses, for ``at_values``.
 
         The contrast is that of the effect ``tumour``.
         """
