@@ -1,12 +1,13 @@
-"""How functions of the 1 kHz step are compiled: to one piece of code that cannot allocate.
+"""How functions are compiled, and how those of the 1 kHz step cannot allocate.
 
-numba's reference counting is off in them (``_nrt``): arrays come in from outside and outlive the
-step, so that counting who uses them is a third of its time for nothing; and without it numba
-refuses, when it compiles, whatever would create an array. Every function but the entries is
-inlined into these. A division by zero gives an infinity instead of an exception.
+numba's reference counting is off in the step (``_nrt``): arrays come in from outside and outlive
+it, so that counting their users would cost a third of its time for nothing; and without it numba
+refuses, when it compiles, whatever would create an array. Every function but the entries is inlined
+into these. A division by zero gives an infinity instead of an exception.
 
-What is inlined has no way in from Python: those wrappers, of named tuples of many arrays, were 40 %
-of the time to compile a step. Called from Python, such a part runs as the Python that it is.
+What is inlined has no wrapper for Python: wrappers for named tuples of many arrays took 40 % of the
+time to compile a step. Called from Python, such a part runs as plain Python. What was compiled is
+kept on disk (:mod:`avatar_core.common.compiled_cache`).
 """
 
 from __future__ import annotations
@@ -17,8 +18,22 @@ from typing import Any
 from numba import njit
 from numba.core.registry import CPUDispatcher
 
-_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "_nrt": False}
-_NO_WAY_IN: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+from avatar_core.common.compiled_cache import ContentCache
+
+_STEP: dict[str, Any] = {"error_model": "numpy", "_nrt": False}
+_NO_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: compile by numba with its options, and keep the result by content."""
+
+    def compile_function(function: Callable[..., Any]) -> Any:
+        dispatcher: Any = njit(**options)(function)
+        if dispatcher is not function:  # as it is with NUMBA_DISABLE_JIT
+            dispatcher._cache = ContentCache(function)
+        return dispatcher
+
+    return compile_function
 
 
 class _Part(CPUDispatcher):
@@ -29,14 +44,14 @@ class _Part(CPUDispatcher):
 
 
 def _part(function: Callable[..., Any], **options: Any) -> Any:
-    compiled: Any = njit(forceinline=True, **_NO_WAY_IN, **_OPTIONS, **options)(function)
-    if isinstance(compiled, CPUDispatcher):  # with NUMBA_DISABLE_JIT it is the function itself
-        compiled.__class__ = _Part
-    return compiled
+    part = compiled(forceinline=True, **_NO_WRAPPERS, **_STEP, **options)(function)
+    if isinstance(part, CPUDispatcher):
+        part.__class__ = _Part
+    return part
 
 
 # An entry of the step, called from Python.
-entry = njit(**_OPTIONS)
+entry = compiled(**_STEP)
 
 
 def inlined(function: Callable[..., Any]) -> Any:

@@ -23,9 +23,8 @@ from collections import namedtuple
 
 import igl
 import numpy as np
-from numba import njit
 
-from avatar_core.common.jit import fast
+from avatar_core.common.jit import compiled, fast
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.vademecum.tip_field import TipField, smoothed
@@ -129,7 +128,7 @@ def _dilated(mask: np.ndarray, steps: int = 3) -> np.ndarray:
     return mask
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _self_compliance(carrier, share, normal, load, start, target, block):  # type: ignore[no-untyped-def]
     """n_s . C(s, s) n_s at every sample, C interpolated from both sides."""
     out = np.zeros(len(carrier))

@@ -15,9 +15,9 @@ from functools import cached_property
 import numpy as np
 import rslab
 import scipy.sparse as sp
-from numba import njit
 from skfem import Basis, ElementTetP2, MeshTet
 
+from avatar_core.common.jit import compiled
 from avatar_core.errors import MaterialError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity
 from avatar_core.fem.hyperelastic_materials import HyperelasticMaterial, determinant
@@ -161,7 +161,7 @@ def _gradients(basis: Basis) -> np.ndarray:
     return np.ascontiguousarray(gradients.transpose(2, 3, 0, 1))
 
 
-@njit(cache=True)
+@compiled()
 def _assemble(gradients, volumes, tangent, slot, data):  # type: ignore[no-untyped-def]
     """Add K_(ai)(bk) = sum_q V_q G_aJ A_iJkL G_bL of every element to the CSC values.
 

@@ -17,9 +17,9 @@ and for the St Venant-Kirchhoff material S = lambda tr(E) I + 2 mu E, 2 E = F^T 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.common.jit import compiled
 from avatar_core.fem.hyperelastic_materials import NeoHookean
 from avatar_core.fem.hyperelasticity import Hyperelasticity
 
@@ -73,7 +73,7 @@ class _State:
         return out
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _gradient(gradients, nodes, displacement, F):  # type: ignore[no-untyped-def]
     """grad u at one quadrature point."""
     F[:] = 0.0
@@ -84,7 +84,7 @@ def _gradient(gradients, nodes, displacement, F):  # type: ignore[no-untyped-def
                 F[i, j] += u * gradients[a, j]
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _add_forces(gradients, volume, nodes, P, out):  # type: ignore[no-untyped-def]
     for a in range(10):
         for i in range(3):
@@ -93,7 +93,7 @@ def _add_forces(gradients, volume, nodes, P, out):  # type: ignore[no-untyped-de
             )
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _neo_hookean(  # type: ignore[no-untyped-def]
     gradients, volumes, nodes, displacement, k, lam, mu, series_F, series_G, series_l, out
 ):
@@ -128,7 +128,7 @@ def _neo_hookean(  # type: ignore[no-untyped-def]
             _add_forces(gradients[e, q], volumes[e, q], nodes[e], P, out)
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _st_venant(  # type: ignore[no-untyped-def]
     gradients, volumes, nodes, displacement, k, lam, mu, series_F, series_S, unused, out
 ):

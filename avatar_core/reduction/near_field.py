@@ -11,10 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
-from avatar_core.common.jit import inlined
+from avatar_core.common.jit import compiled, inlined
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ def hash_rows(near: LocalBlocks) -> tuple[np.ndarray, np.ndarray]:
     return start, slot
 
 
-@njit(cache=True)
+@compiled()
 def _fill_slots(row_start, target, start, slot):  # type: ignore[no-untyped-def]
     for j in range(len(row_start) - 1):
         mask = start[j + 1] - start[j] - 1

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.linalg import expm
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.common.jit import compiled
 from avatar_core.contact.haptics.passivity import Passivity, limit
 from avatar_core.contact.layout import PERIOD
 
@@ -107,7 +107,7 @@ def expected_border(stiffness: float, delay: int) -> float:
     return stiffness * PERIOD * (0.5 + delay)
 
 
-@njit(cache=True)
+@compiled()
 def _run(  # type: ignore[no-untyped-def]
     a, b, stiffness, delay, resolution, push, x, passivity, trace
 ):

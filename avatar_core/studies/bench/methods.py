@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from avatar_core.common.jit import compiled
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud_kernels import write_cloud
 from avatar_core.contact.effects import several_tools as coupling
@@ -177,7 +177,7 @@ def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: in
     return np.ascontiguousarray(dense, dtype=np.float32)
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _dense_step(model, state, out, tips, reply, several, columns, compliance):  # type: ignore[no-untyped-def]
     """:func:`contact_kernels.contact_step` with stored columns instead of modes."""
     n_tools = tips.shape[0]
@@ -214,7 +214,7 @@ def _dense_step(model, state, out, tips, reply, several, columns, compliance):  
     write_cloud(model.rest, u, out.cloud)
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _dense_column(state, t, s, compliance, column):  # type: ignore[no-untyped-def]
     column[: state.n_nodes[s]] = 0.0
     for i in range(state.n_nodes[t]):
