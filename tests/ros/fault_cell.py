@@ -176,7 +176,7 @@ class FaultCell:
             self.processes[name] = Module(module, ["--ros-args", *words], self.domain)
         elif name == "viewer":
             output = str(self.patients / "clouds.json")
-            self.processes[name] = Module("cloud_viewer", [output], self.domain)
+            self.processes[name] = Module("bench.cloud_viewer", [output], self.domain)
         else:
             script = str(Path(__file__).with_name("steady_tool.py"))
             command = [sys.executable, script, *self._tool, f"{rate:g}", f"{self._swing:g}"]

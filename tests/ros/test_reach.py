@@ -143,7 +143,7 @@ def test_a_node_receives_on_the_loopback_alone(
     own_domain: dict[str, str], probe: Any, name: str, shared_memory: bool
 ) -> None:
     """And the one that keeps time through no shared memory."""
-    command = [sys.executable, "-m", f"avatar_ros.{name}"]
+    command = [sys.executable, "-m", f"avatar_ros.nodes.{name}"]
     node = subprocess.Popen(command, env=_plain(own_domain), cwd="/")
     try:
         probe.ask(GetState, f"{name}/get_state", GetState.Request())  # it is heard here

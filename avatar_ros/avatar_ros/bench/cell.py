@@ -96,11 +96,11 @@ def _measure(
     ):
         felt_file, view_file = Path(folder, "felt.npz"), Path(folder, "view.json")
         count_file = Path(folder, "count.json")
-        viewer = Module("cloud_viewer", [str(view_file)], environment)
+        viewer = Module("bench.cloud_viewer", [str(view_file)], environment)
         arguments = [str(path), "--tip-radius", str(tip_radius), "--output", str(felt_file)]
         arguments += ["--seconds", str(seconds), "--priority", str(priority)]
         arguments += ["--timeout", str(_START_TIMEOUT)]
-        tool = Module("scripted_tool", arguments, environment)
+        tool = Module("bench.scripted_tool", arguments, environment)
         slider = None
         try:
             assert tool.stdout is not None
@@ -109,8 +109,8 @@ def _measure(
                 raise CellError(f"the tool did not start: {tool.last_words()}")
             if changes > 0.0:
                 of_slider = [str(path), str(changes), str(count_file)]
-                slider = Module("material_slider", of_slider, environment)
-            floor = Module("realtime", [str(seconds), str(priority)], environment)
+                slider = Module("bench.material_slider", of_slider, environment)
+            floor = Module("framework.realtime", [str(seconds), str(priority)], environment)
             grown = _growths(seconds, processes | {"cloud_viewer": viewer, "scripted_tool": tool})
             bare, _ = floor.communicate(timeout=seconds + _START_TIMEOUT)
             if tool.wait(timeout=seconds + _START_TIMEOUT) != 0:
@@ -226,12 +226,13 @@ def cell(
 
 
 class Module(subprocess.Popen[str]):
-    """A Python module as a process; what it says on standard error is kept."""
+    """A node, or a module named with its room, as a process; its standard error is kept."""
 
     def __init__(self, name: str, arguments: list[str], environment: dict[str, str]) -> None:
         self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115, closed with the object
+        module = name if "." in name else f"nodes.{name}"
         super().__init__(
-            [sys.executable, "-m", f"avatar_ros.{name}", *arguments],
+            [sys.executable, "-m", f"avatar_ros.{module}", *arguments],
             cwd="/",  # -m would let a checkout there stand before what is installed
             env=environment,
             stdout=subprocess.PIPE,

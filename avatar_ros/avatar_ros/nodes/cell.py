@@ -40,7 +40,7 @@ def commands(params: Path | None, given: dict[str, str]) -> dict[str, list[str]]
         own = [f"{name}:={given[name]}" for name in names if name in given]
         arguments = ["--params-file", str(params)] if params is not None else []
         arguments += [word for pair in own for word in ("-p", pair)]
-        command = [sys.executable, "-m", f"avatar_ros.{node}"]
+        command = [sys.executable, "-m", f"avatar_ros.nodes.{node}"]
         found[node] = [*command, "--ros-args", *arguments] if arguments else command
     return found
 
