@@ -23,22 +23,22 @@ def export(
     modes: Annotated[int, typer.Option(help="modes of the far field to write")] = 10,
 ) -> None:
     """Write the organ at rest, its first modes and its displacement under a load."""
-    from avatar_core.scene.export import organ_mesh, point_load, write_mesh
+    from avatar_core.contact.tool_path import middle_of_access
+    from avatar_core.scene.export import export as exported
     from avatar_core.vademecum.storage import load_vademecum
 
     require(modes >= 0, f"--modes is {modes}; ask for 0 or more")
     newtons = _newtons(force)
     vademecum = load_vademecum(file)
-    load = point_load(vademecum, at, newtons)
-    mesh = organ_mesh(vademecum, load, modes)
-    write_mesh(mesh, output)
+    point = vademecum.surface.centers[middle_of_access(vademecum)] if at is None else at
+    mesh = exported(vademecum, output, point, newtons, modes)
     moved = ((mesh.point_data["displacement"] ** 2).sum(axis=1) ** 0.5).max()
-    x, y, z = load.point
+    x, y, z = vademecum.surface.nearest(point).point
     n_modes = sum(name.startswith("mode_") for name in mesh.point_data)
+    newton = sum(number * number for number in newtons) ** 0.5
     print(
         f"{output}: {len(mesh.points)} vertices, {n_modes} modes; "
-        f"{(load.force @ load.force) ** 0.5:g} N at ({x:.4f}, {y:.4f}, {z:.4f}) m move it by "
-        f"{1e3 * moved:.2f} mm at most"
+        f"{newton:g} N at ({x:.4f}, {y:.4f}, {z:.4f}) m move it by {1e3 * moved:.2f} mm at most"
     )
 
 

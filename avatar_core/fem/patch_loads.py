@@ -18,22 +18,40 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import igl
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTri
 
-from avatar_core.errors import MeshError
+from avatar_core.errors import LoadError, MeshError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.geometry.mesh import Regions, TetMesh
 
 LEAST_PATCH_RADIUS = 12e-3  # [m]
+FARTHEST = 5e-3  # of a point from the accessible surface, to which it is then moved [m]
 LEAST_OPENNESS = 0.2  # length of the mean unit normal within R, below which a face carries no load
 # Mean edge, in patch radii, from which edges get a midpoint: linear interpolation between corners
 # leaves 9 % of the contact compliance at 0.6 (a small liver, Amos-052), with its square.
 MIDPOINTS_FROM = 0.3
 MOST_POSITIONS = 6000  # with midpoints; the contact near field grows with their square
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoint:
+    """A point of the accessible surface.
+
+    positions, weights : ndarray, shape (n,), the load positions that carry it
+    point : ndarray, shape (3,) [m]
+    normal : ndarray, shape (3,), unit outward normal of its patch
+    """
+
+    positions: np.ndarray
+    weights: np.ndarray
+    point: np.ndarray
+    normal: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -93,6 +111,39 @@ class LoadSurface:
         """
         positions = self.face_positions[faces]
         return positions, barycentric if positions.shape[1] == 3 else triangle_shape(barycentric)
+
+    def nearest(self, point: ArrayLike) -> SurfacePoint:
+        """The point of the accessible surface nearest to a point in space.
+
+        Parameters
+        ----------
+        point : array_like, shape (3,) [m]
+
+        Raises
+        ------
+        LoadError
+            If the point is not finite, or farther than 5 mm from the accessible surface.
+        """
+        asked = np.array(point, float).reshape(-1)
+        if asked.shape != (3,) or not np.isfinite(asked).all():
+            raise LoadError("a point is three finite numbers; give x, y, z in metres")
+        square, face, found = igl.point_mesh_squared_distance(
+            asked[None], self.centers, self.corners.astype(np.int64)
+        )
+        distance = float(np.sqrt(np.ravel(square)[0]))
+        if distance > FARTHEST:
+            raise LoadError(
+                f"the load is {1e3 * distance:.1f} mm off the accessible surface; give a point "
+                f"within {1e3 * FARTHEST:g} mm of it, in metres"
+            )
+        faces, on_surface = np.ravel(face)[:1].astype(int), np.reshape(found, (-1, 3))[0]
+        corners = self.centers[self.corners[faces[0]]]
+        barycentric = np.linalg.lstsq(
+            np.vstack([corners.T, np.ones(3)]), np.append(on_surface, 1.0), rcond=None
+        )[0]
+        positions, weights = self.weights(faces, barycentric[None])
+        normal = weights[0] @ self.normals[positions[0]]
+        return SurfacePoint(positions[0], weights[0], on_surface, normal / np.linalg.norm(normal))
 
 
 def triangle_shape(barycentric: np.ndarray) -> np.ndarray:

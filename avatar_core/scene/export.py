@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-import igl
 import meshio
 import numpy as np
+from numpy.typing import ArrayLike
 
 from avatar_core.contact.tool_path import middle_of_access
-from avatar_core.errors import LoadError, StorageError, one_line
+from avatar_core.errors import StorageError, one_line
 from avatar_core.vademecum.model import Vademecum
-from avatar_core.vademecum.push import push
 
 # By suffix: how meshio writes it into one file. XDMF beside HDF5 would be two, and the second
 # would be called as the vademecum is.
@@ -23,88 +20,51 @@ FORMATS = {
     ".vtu": {"file_format": "vtu"},
     ".xdmf": {"file_format": "xdmf", "data_format": "XML"},
 }
-FARTHEST = 5e-3  # of a load from the accessible surface, into which it is then moved [m]
 
 
-@dataclass(frozen=True)
-class PointLoad:
-    """A force on a patch of the accessible surface.
-
-    positions, weights : of the point, :meth:`avatar_core.fem.patch_loads.LoadSurface.weights`
-    point : ndarray, shape (3,), on the surface [m]
-    normal : ndarray, shape (3,), outward, of length one
-    force : ndarray, shape (3,) [N]
-    """
-
-    positions: np.ndarray
-    weights: np.ndarray
-    point: np.ndarray
-    normal: np.ndarray
-    force: np.ndarray
-
-
-def point_load(
-    vademecum: Vademecum, at: Sequence[float] | None, force: Sequence[float]
-) -> PointLoad:
-    """A load on the surface nearest to a point.
+def export(
+    vademecum: Vademecum,
+    path: str | Path,
+    point: ArrayLike | None = None,
+    force: ArrayLike = 1.0,
+    n_modes: int = 10,
+) -> meshio.Mesh:
+    """Write the organ at rest, its first modes and its displacement under a load for ParaView.
 
     Parameters
     ----------
-    at : three coordinates [m], or None for the middle of the accessible surface
-    force : one number, along the inward normal, or the three of a vector [N]
+    path : .vtu or .xdmf
+    point : array_like, shape (3,) [m]; None for the middle of the accessible surface
+    force : float, along the inward normal, or array_like, shape (3,) [N]
+    n_modes : of the far field, at most
+
+    Returns
+    -------
+    meshio.Mesh
+        What was written; see :func:`organ_mesh`.
 
     Raises
     ------
-    LoadError
-        If the point lies off the accessible surface, or a number is not finite.
+    LoadError, StorageError
+        For a point off the accessible surface, for another suffix, a missing folder or full disk.
     """
-    surface = vademecum.surface
-    wanted = surface.centers[middle_of_access(vademecum)] if at is None else np.array(at, float)
-    given = np.array(force, float)
-    if not (np.isfinite(wanted).all() and np.isfinite(given).all()):
-        raise LoadError("a load has numbers that are not finite; give metres and newtons")
-    square, face, nearest = igl.point_mesh_squared_distance(
-        wanted[None], surface.centers, surface.corners.astype(np.int64)
-    )
-    distance = float(np.sqrt(np.ravel(square)[0]))
-    if distance > FARTHEST:
-        raise LoadError(
-            f"the load is {1e3 * distance:.1f} mm off the accessible surface; give a point within "
-            f"{1e3 * FARTHEST:g} mm of it, in metres"
-        )
-    face, point = np.ravel(face)[:1].astype(int), np.reshape(nearest, (-1, 3))[0]
-    corners = surface.centers[surface.corners[face[0]]]
-    barycentric = np.linalg.lstsq(
-        np.vstack([corners.T, np.ones(3)]), np.append(point, 1.0), rcond=None
-    )[0]
-    positions, weights = surface.weights(face, barycentric[None])
-    normal = weights[0] @ surface.normals[positions[0]]
-    normal /= np.linalg.norm(normal)
-    vector = -given[0] * normal if len(given) == 1 else given
-    return PointLoad(positions[0], weights[0], point, normal, vector)
+    where = vademecum.surface.centers[middle_of_access(vademecum)] if point is None else point
+    mesh = organ_mesh(vademecum, where, force, n_modes)
+    write_mesh(mesh, path)
+    return mesh
 
 
-def displacement_under(vademecum: Vademecum, load: PointLoad) -> np.ndarray:
-    """Displacement of all vertices under a load, shape (n_vertices, 3) [m].
-
-    What presses into the organ bends where the vademecum holds large deformation; what pulls or
-    drags is added linearly.
-    """
-    pressing = max(0.0, -float(load.force @ load.normal))
-    rest = load.force + pressing * load.normal
-    pressed = push(vademecum, load.positions, load.weights, pressing).displacement
-    dragged = vademecum.displacement(load.positions, load.weights) @ rest
-    return np.asarray(pressed + dragged).reshape(-1, 3)
-
-
-def organ_mesh(vademecum: Vademecum, load: PointLoad, n_modes: int) -> meshio.Mesh:
+def organ_mesh(
+    vademecum: Vademecum, point: ArrayLike, force: ArrayLike, n_modes: int = 10
+) -> meshio.Mesh:
     """The mesh at rest [m] with point data.
 
-    displacement (n_vertices, 3) [m] under the load; mode_001 and so on, (n_vertices, 3), as in
-    the file; clamped, accessible (n_vertices,), 1 on these parts of the surface
+    displacement (n_vertices, 3) [m] under a force, by :meth:`Vademecum.displacement_at`;
+    mode_001 and so on, (n_vertices, 3), as in the file; clamped, accessible (n_vertices,), 1 on
+    these parts of the surface
     """
     mesh, far = vademecum.mesh, vademecum.far
-    data = {"displacement": displacement_under(vademecum, load)}
+    data = {"displacement": vademecum.displacement_at(point, force)}
     for name in ("clamped", "accessible"):
         faces = mesh.boundary_faces[getattr(vademecum.regions, name)]
         data[name] = np.isin(np.arange(len(mesh.vertices)), faces).astype(np.int32)

@@ -31,6 +31,7 @@ from avatar_core.fem.hyperelastic_materials import (
     NeoHookean,
     StVenantKirchhoff,
 )
+from avatar_core.reduction.near_field import LocalBlocks
 
 POWERS = (2, 3)
 
@@ -66,6 +67,20 @@ class LargeCertificate:
 
 
 @dataclass(frozen=True, eq=False)
+class Push:
+    """An organ pushed by a force along the inward normal.
+
+    displacement : ndarray, shape (3 n_vertices,) [m]
+    depth : of the patch [m]
+    within : the force lies in the range that was computed
+    """
+
+    displacement: FloatArray
+    depth: float
+    within: bool
+
+
+@dataclass(frozen=True, eq=False)
 class LargeDeformation:
     """The terms of second and third order; k counts them.
 
@@ -91,6 +106,27 @@ class LargeDeformation:
         """Memory held [bytes]."""
         arrays = (self.space, self.load, self.near, self.depth, self.reach)
         return int(sum(array.nbytes for array in arrays))
+
+    def added_to(
+        self, linear: Push, positions: np.ndarray, weights: FloatArray, pattern: LocalBlocks
+    ) -> Push:
+        """A linear push with the terms of second and third order at the same point.
+
+        Parameters
+        ----------
+        positions, weights : ndarray, shape (n,), of the point
+        pattern : near field of the vademecum
+        """
+        reach = float(self.reach[positions].min())
+        terms = powers(linear.depth, reach)
+        load = np.einsum("k,i,kin->n", terms, weights, self.load[:, positions])
+        displacement = linear.displacement + self.space @ load
+        for position, weight in zip(positions, weights, strict=True):
+            row = slice(pattern.start[position], pattern.start[position + 1])
+            near = np.tensordot(terms, self.near[:, row], axes=1)
+            displacement.reshape(-1, 3)[pattern.target[row]] += weight * near
+        depth = linear.depth + float(terms @ (self.depth[:, positions] @ weights))
+        return Push(displacement, depth, linear.depth <= reach)
 
 
 def hyperelastic(name: str, linear: Material) -> HyperelasticMaterial:

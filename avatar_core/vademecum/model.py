@@ -11,7 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from avatar_core.errors import ConvergenceError, LoadError
 from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.mesh import Regions, TetMesh
@@ -19,7 +21,7 @@ from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.reduction.pgd import EnrichmentReport
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.certificate import Certificate
-from avatar_core.vademecum.large_deformation import LargeCertificate, LargeDeformation
+from avatar_core.vademecum.large_deformation import LargeCertificate, LargeDeformation, Push
 from avatar_core.vademecum.modal_mass import BodyResponse
 from avatar_core.vademecum.parametric import ParametricResponse
 from avatar_core.vademecum.tip_field import TipField
@@ -169,6 +171,90 @@ class Vademecum:
         right = np.einsum("i,idk->dk", other_weights, load[other_positions])
         near = self.contact_near.combined(other_positions, other_weights, len(load))
         return left @ right.T + np.einsum("i,iab->ab", weights, near.reshape(-1, 3, 3)[positions])
+
+    def push(self, positions: np.ndarray, weights: np.ndarray, force: float) -> Push:
+        """The organ under a force along the inward normal of a point of the surface.
+
+        Parameters
+        ----------
+        positions, weights : ndarray, shape (n,), as of :meth:`displacement`
+        force : f >= 0 [N]
+        """
+        inward = -weights @ self.surface.normals[positions]
+        inward /= np.linalg.norm(inward)
+        moved = force * (self.displacement(positions, weights) @ inward)
+        depth = force * float(inward @ self.compliance(positions, weights) @ inward)
+        linear = Push(moved, depth, within=True)
+        if self.large is None:
+            return linear
+        return self.large.added_to(linear, positions, weights, self.near)
+
+    def push_to(
+        self, positions: np.ndarray, weights: np.ndarray, depth: float
+    ) -> tuple[float, Push]:
+        """The force [N] that moves the patch by a depth [m], by Newton's method, and its push.
+
+        Raises
+        ------
+        ConvergenceError
+            If no force does within 30 steps.
+        """
+        force = depth / self.push(positions, weights, 1e-9).depth * 1e-9
+        for _ in range(30):
+            found, step = self.push(positions, weights, force), 1e-6 * force
+            if abs(found.depth - depth) <= 1e-9 * depth:
+                return force, found
+            slope = (self.push(positions, weights, force + step).depth - found.depth) / step
+            force += (depth - found.depth) / slope
+        raise ConvergenceError(
+            f"no force was found that pushes {1e3 * depth:g} mm deep here; ask for less depth"
+        )
+
+    def displacement_at(self, point: ArrayLike, force: ArrayLike) -> np.ndarray:
+        """Displacement of all vertices under a force at a point, shape (n_vertices, 3) [m].
+
+        Where the vademecum holds large deformation, the part of the force that presses deforms
+        the organ nonlinearly; the part that pulls or drags is added linearly.
+
+        Parameters
+        ----------
+        point : array_like, shape (3,) [m], at most 5 mm off the accessible surface
+        force : float, along the inward normal, or array_like, shape (3,) [N]
+
+        Raises
+        ------
+        LoadError
+            If the point lies off the accessible surface, or a number is not finite.
+        """
+        place = self.surface.nearest(point)
+        given = np.array(force, float).reshape(-1)
+        if given.size not in (1, 3) or not np.isfinite(given).all():
+            raise LoadError("a force is one or three finite numbers; give newtons")
+        vector = -given[0] * place.normal if given.size == 1 else given
+        pressing = max(0.0, -float(vector @ place.normal))
+        rest = vector + pressing * place.normal
+        pressed = self.push(place.positions, place.weights, pressing).displacement
+        dragged = self.displacement(place.positions, place.weights) @ rest
+        return np.asarray(pressed + dragged).reshape(-1, 3)
+
+    def compliance_at(self, point: ArrayLike, other: ArrayLike | None = None) -> np.ndarray:
+        """Contact compliance at a point, or between two, shape (3, 3) [m/N].
+
+        Entry (i, j) is the mean displacement of the patch at ``point`` along axis i under a unit
+        force along axis j on the patch at ``other``, by default the same.
+
+        Parameters
+        ----------
+        point, other : array_like, shape (3,) [m], at most 5 mm off the accessible surface
+
+        Raises
+        ------
+        LoadError
+            If a point lies off the accessible surface.
+        """
+        here = self.surface.nearest(point)
+        there = here if other is None else self.surface.nearest(other)
+        return self.compliance(here.positions, here.weights, there.positions, there.weights)
 
     def with_certificate(self, certificate: Certificate) -> Vademecum:
         """The same vademecum carrying how wrong it may be."""

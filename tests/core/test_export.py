@@ -12,9 +12,8 @@ import pytest
 from avatar_core.cli import main as cli
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import LoadError
-from avatar_core.scene.export import displacement_under, point_load
+from avatar_core.fem.patch_loads import SurfacePoint
 from avatar_core.vademecum.model import Vademecum
-from avatar_core.vademecum.push import push
 from avatar_core.vademecum.storage import save_vademecum
 
 
@@ -63,28 +62,49 @@ def test_the_file_holds_mesh_modes_and_displacement(
     ]
 
 
-def test_a_push_bends_where_the_vademecum_does(bent: Vademecum) -> None:
-    load = point_load(bent, None, [4.0])
-    moved = displacement_under(bent, load)
-    same = push(bent, load.positions, load.weights, 4.0).displacement.reshape(-1, 3)
+def middle(vademecum: Vademecum) -> SurfacePoint:
+    return vademecum.surface.nearest(vademecum.surface.centers[middle_of_access(vademecum)])
+
+
+def test_a_push_is_nonlinear_where_the_vademecum_is(bent: Vademecum) -> None:
+    place = middle(bent)
+    moved = bent.displacement_at(place.point, 4.0)
+    same = bent.push(place.positions, place.weights, 4.0).displacement.reshape(-1, 3)
     np.testing.assert_allclose(moved, same, atol=1e-12)
-    straight = 4.0 * displacement_under(bent, point_load(bent, None, [1.0]))
+    straight = 4.0 * bent.displacement_at(place.point, 1.0)
     assert np.abs(moved - straight).max() > 0.01 * np.abs(moved).max()
 
 
-def test_what_it_drags_is_added_linearly(bent: Vademecum) -> None:
-    load = point_load(bent, None, [1.0])
-    side = np.cross(load.normal, [1.0, 0.0, 0.0])
-    dragged = [
-        displacement_under(bent, point_load(bent, None, list(x * side - load.normal)))
-        for x in (0.0, 1.0, 2.0)
-    ]
-    np.testing.assert_allclose(dragged[2] - dragged[1], dragged[1] - dragged[0], atol=1e-12)
+def test_a_tangential_force_is_added_linearly(bent: Vademecum) -> None:
+    place = middle(bent)
+    side = np.cross(place.normal, [1.0, 0.0, 0.0])
+    moved = [bent.displacement_at(place.point, x * side - place.normal) for x in (0.0, 1.0, 2.0)]
+    np.testing.assert_allclose(moved[2] - moved[1], moved[1] - moved[0], atol=1e-12)
 
 
-def test_a_load_off_the_surface_is_refused(straight: Vademecum) -> None:
-    with pytest.raises(LoadError, match="off the accessible surface; give a point"):
-        point_load(straight, [1.0, 1.0, 1.0], [1.0])
+def test_compliance_between_two_points_is_reciprocal(straight: Vademecum) -> None:
+    """Maxwell and Betti: what a force here does there, a force there does here."""
+    here, there = straight.surface.centroids[[0, -1]]
+    across = straight.compliance_at(here, there)
+    np.testing.assert_allclose(across, straight.compliance_at(there, here).T, rtol=1e-5)
+    assert (np.linalg.eigvalsh(straight.compliance_at(here)) > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("point", "force", "reason"),
+    [
+        ([1.0, 1.0, 1.0], 1.0, "off the accessible surface; give a point"),
+        ([np.nan, 0.0, 0.0], 1.0, "three finite numbers"),
+        (None, [1.0, 2.0], "one or three finite numbers"),
+        (None, np.inf, "one or three finite numbers"),
+    ],
+)
+def test_a_load_that_makes_no_sense_is_refused(
+    straight: Vademecum, point: list[float] | None, force: object, reason: str
+) -> None:
+    where = middle(straight).point if point is None else point
+    with pytest.raises(LoadError, match=reason):
+        straight.displacement_at(where, force)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +112,7 @@ def test_a_load_off_the_surface_is_refused(straight: Vademecum) -> None:
     [
         (["--force", "1,2"], "one number or three"),
         (["--force", "much"], "one number or three"),
-        (["--force", "nan"], "not finite"),
+        (["--force", "nan"], "finite numbers"),
         (["--modes", "-1"], "0 or more"),
     ],
 )

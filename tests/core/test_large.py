@@ -46,7 +46,6 @@ from avatar_core.vademecum import storage
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.large_deformation import LargeCertificate, hyperelastic, powers
 from avatar_core.vademecum.model import Vademecum
-from avatar_core.vademecum.push import push, push_to
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.core.test_contact import carriers, energy_slope
 
@@ -133,8 +132,8 @@ def test_certificate_speaks_of_pushes_within_the_range(bent: Vademecum) -> None:
 
 def test_a_small_push_is_the_linear_one(bent: Vademecum) -> None:
     here = np.array([middle_of_access(bent)]), np.ones(1)
-    force, found = push_to(bent, *here, 1e-5)
-    plain, straight = push_to(replace(bent, large=None), *here, 1e-5)
+    force, found = bent.push_to(*here, 1e-5)
+    plain, straight = replace(bent, large=None).push_to(*here, 1e-5)
     assert force == pytest.approx(plain, rel=1e-3)
     assert np.abs(found.displacement - straight.displacement).max() < 1e-8
 
@@ -142,8 +141,8 @@ def test_a_small_push_is_the_linear_one(bent: Vademecum) -> None:
 def test_a_stiffer_organ_takes_more_force_for_the_same_shape(bent: Vademecum) -> None:
     here = np.array([middle_of_access(bent)]), np.ones(1)
     stiff = at_values(bent, {"young": 3.0 * bent.material.young_modulus})
-    force, found = push_to(bent, *here, 12e-3)
-    three, same = push_to(stiff, *here, 12e-3)
+    force, found = bent.push_to(*here, 12e-3)
+    three, same = stiff.push_to(*here, 12e-3)
     assert three == pytest.approx(3.0 * force, rel=1e-4)
     np.testing.assert_allclose(same.displacement, found.displacement, atol=1e-7)
 
@@ -348,11 +347,11 @@ def test_cloud_is_the_bent_field(bent: Vademecum, model: ContactModel) -> None:
     positions, weights = carriers(model)
     linear = replace(v, large=None)
     force = state.force[0] * state.scale[0]
-    straight = push(linear, positions, weights, force).displacement
+    straight = linear.push(positions, weights, force).displacement
     felt = state.self_compliance[0] * state.force[0]
-    same = force * felt / push(linear, positions, weights, force).depth  # as deep, on the surface
-    bend = push(v, positions, weights, same).displacement
-    bend -= push(linear, positions, weights, same).displacement
+    same = force * felt / linear.push(positions, weights, force).depth  # as deep, on the surface
+    bend = v.push(positions, weights, same).displacement
+    bend -= linear.push(positions, weights, same).displacement
     error = np.linalg.norm(model.out.cloud[:, 3:].ravel() - straight - bend)
     assert error < 0.02 * np.linalg.norm(straight + bend)
     assert error < 0.3 * np.linalg.norm(bend)

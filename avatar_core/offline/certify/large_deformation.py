@@ -20,7 +20,6 @@ from avatar_core.fem.patch_loads import patch_loads, patch_normals
 from avatar_core.offline.certify.combinations import CombinedRow, mean_error
 from avatar_core.vademecum.large_deformation import LargeCertificate
 from avatar_core.vademecum.model import Vademecum
-from avatar_core.vademecum.push import push_to
 
 
 @dataclass(frozen=True)
@@ -113,8 +112,8 @@ def push_rows(
     try:
         for state in press(problem, load, np.ones(1), list(depths), rule, progress=progress):
             truth = state.displacement[: 3 * len(vademecum.mesh.vertices)]
-            force, found = push_to(vademecum, positions, weights, state.depth)
-            plain, straight = push_to(linear, positions, weights, state.depth)
+            force, found = vademecum.push_to(positions, weights, state.depth)
+            plain, straight = linear.push_to(positions, weights, state.depth)
             rows.append(
                 LargeRow(
                     triangle,
@@ -128,7 +127,7 @@ def push_rows(
             )
     except EquilibriumError:
         next_depth = depths[len(rows)]
-        return rows, push_to(vademecum, positions, weights, float(next_depth))[1].within
+        return rows, vademecum.push_to(positions, weights, float(next_depth))[1].within
     return rows, False
 
 
