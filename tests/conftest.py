@@ -18,7 +18,7 @@ from avatar_core.geometry import mesh
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.large_deformation import hyperelastic_problem, with_large_deformation
-from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
 
@@ -65,7 +65,7 @@ def straight() -> Vademecum:
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loads, "MIDPOINTS_FROM", 1.0)
-        return vademecum_of(phantom_liver(12e-3), options)
+        return build(phantom_liver(12e-3), options)
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from avatar_core.atlas.base import PatientBase, PatientError
+from avatar_core.atlas.base import PatientBase, PatientError, base_of
+from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.transfer import (
     Weighting,
     by_component,
@@ -174,21 +175,30 @@ def member_problem(
 
 def patient_vademecum(
     surface: SurfaceMesh,
-    base: PatientBase,
+    atlas: Atlas | PatientBase,
     fidelity: Fidelity = "reduced",
     options: PatientOptions | None = None,
     progress: Progress = _silent,
 ) -> Patient:
     """Register, mesh, respond and certify a new patient.
 
+    Parameters
+    ----------
+    surface : SurfaceMesh of the patient [m, RAS]
+    atlas : Atlas with responses, or what :func:`avatar_core.atlas.base.base_of` makes of one
+    fidelity : "interpolated", "reduced" or "solved"
+    options : PatientOptions
+    progress : called with stage, fraction of it, and the error so far
+
     Raises
     ------
     PatientError
-        For an unknown fidelity or weighting.
+        For an unknown fidelity or weighting, or an atlas without responses.
     AvatarError
         Of the stage that refused, with the remedy.
     """
     require_fidelity(fidelity)
+    base = base_of(atlas) if isinstance(atlas, Atlas) else atlas
     options = options or PatientOptions()
     clock: dict[str, float] = {}
     progress("registration", 0.0, np.nan)

@@ -129,7 +129,7 @@ def bench_cell(
     """
     import tempfile
 
-    from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+    from avatar_core.offline.pipeline import OrganOptions, build
     from avatar_core.vademecum.storage import save_vademecum
 
     require_ros()
@@ -137,7 +137,7 @@ def bench_cell(
         file = Path(surface)
         if file.suffix != ".h5":
             with BuildBar() as progress:
-                built = vademecum_of(
+                built = build(
                     read_organ(surface, "mm", "RAS", None),
                     OrganOptions(n_vertices=vertices),
                     progress,

@@ -90,7 +90,7 @@ def demo(
 
     from avatar_core.cli.picture import palpation_picture
     from avatar_core.geometry.phantom import phantom_liver
-    from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+    from avatar_core.offline.pipeline import OrganOptions, build
     from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 
     require_ros()
@@ -98,7 +98,7 @@ def demo(
         require_ui()
     print("1. a liver that the code generates becomes a vademecum")
     with BuildBar() as progress:
-        built = vademecum_of(phantom_liver(), OrganOptions(n_vertices=vertices), progress)
+        built = build(phantom_liver(), OrganOptions(n_vertices=vertices), progress)
     with tempfile.TemporaryDirectory(prefix="avatar_demo_") as folder:
         file = Path(folder) / "phantom.h5"
         save_vademecum(built, file)

@@ -103,7 +103,7 @@ def vademecum(
     from avatar_core.fem.elasticity import Material
     from avatar_core.geometry.tumour import read_tumour
     from avatar_core.offline.large_deformation import LINEAR_RULE, LargeRule
-    from avatar_core.offline.pipeline import OrganOptions, orientation_warning, vademecum_of
+    from avatar_core.offline.pipeline import OrganOptions, orientation_warning, build
     from avatar_core.offline.rule import BuildRule
     from avatar_core.reduction.coordinates import Coordinate
     from avatar_core.vademecum.storage import load_vademecum, save_vademecum
@@ -152,7 +152,7 @@ def vademecum(
     if warning:
         print(f"warning: {warning}", file=sys.stderr)
     with BuildBar(material != "linear") as progress:
-        built = _timed(vademecum_of(organ, options, progress), progress)
+        built = _timed(build(organ, options, progress), progress)
     save_vademecum(built, output)
     show_text(load_vademecum(output))
     if not built.convergence.converged:

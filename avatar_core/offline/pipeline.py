@@ -109,7 +109,7 @@ class OrganOptions:
             raise MeshError(f"cannot read node groups from {self.groups}: there is no such file")
 
 
-def vademecum_of(
+def build(
     surface: SurfaceMesh, options: OrganOptions | None = None, progress: Progress = silent
 ) -> Vademecum:
     """Mesh, solve, separate and certify one organ.

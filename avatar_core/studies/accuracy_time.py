@@ -18,7 +18,7 @@ import numpy as np
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.offline.certify.linear import measured
 from avatar_core.offline.certify.timing import timed
-from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.studies.force_error import ForceErrors, force_errors
 from avatar_core.studies.offline_cost import grid_rows, mesh_rows, patient_rows, shape_rows
 from avatar_core.studies.online_cost import (
@@ -72,7 +72,7 @@ def study(surfaces: Path | None, plan: Plan, folder: Path) -> Study:
     surface = read_liver(surfaces, "LiTS-4")
     with Parts(6) as parts:
         options = OrganOptions(n_vertices=plan.n_vertices, n_certified=plan.n_certified)
-        vademecum = vademecum_of(surface, options, parts.part("build"))
+        vademecum = build(surface, options, parts.part("build"))
         certificate = vademecum.certificate
         assert certificate is not None and certificate.curve is not None
         v = vademecum

@@ -22,7 +22,7 @@ from avatar_core.geometry.level_set import distance_grid, isosurface
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import mesh_error
-from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.shapes.registration import RegistrationRule
 from avatar_core.studies.grid import Plan as GridPlan
 from avatar_core.studies.grid import grid_row, respond_on_own_mesh
@@ -45,7 +45,7 @@ def mesh_rows(surface: SurfaceMesh, sizes: tuple[int, ...]) -> list[dict[str, Va
     rows: list[dict[str, Value]] = []
     for n in follow(sizes, "mesh size"):
         start = time.process_time()
-        built = vademecum_of(surface, OrganOptions(n_vertices=n, n_certified=40))
+        built = build(surface, OrganOptions(n_vertices=n, n_certified=40))
         seconds = time.process_time() - start
         elasticity = Elasticity(built.mesh, built.material, built.regions.clamped, built.element)
         l2, contact = mesh_error(built, elasticity, n_loads=3)

@@ -11,7 +11,7 @@ import pytest
 from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import slide
 from avatar_core.geometry.phantom import phantom_liver
-from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.studies.bench.fused import module_of
 from avatar_core.vademecum.model import Vademecum
 
@@ -25,7 +25,7 @@ def fused() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def organ() -> Vademecum:
-    return vademecum_of(phantom_liver(12e-3), OrganOptions(n_vertices=800, n_certified=3))
+    return build(phantom_liver(12e-3), OrganOptions(n_vertices=800, n_certified=3))
 
 
 @pytest.mark.long

@@ -13,7 +13,7 @@ from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.geometry.mesh import Regions, TetMesh, make_mesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import read_surface
-from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
 
@@ -80,7 +80,7 @@ def phantom_elasticity(phantom_mesh: TetMesh) -> Elasticity:
 @pytest.fixture(scope="session")
 def phantom_vademecum() -> Vademecum:
     options = OrganOptions(n_vertices=900, rule=BuildRule(max_modes=60), n_certified=60)
-    return vademecum_of(phantom_liver(), options)
+    return build(phantom_liver(), options)
 
 
 REAL = ("LiTS-4", "LiTS-10", "LiTS-60", "Amos-007", "LiTS-23")  # five patients, one cracked
@@ -89,7 +89,7 @@ REAL = ("LiTS-4", "LiTS-10", "LiTS-60", "Amos-007", "LiTS-23")  # five patients,
 @cache  # pytest keeps one value of a fixture with parameters, and comes back to the others
 def _vademecum_of_file(path: Path) -> Vademecum:
     options = OrganOptions(n_vertices=1500, rule=BuildRule(max_modes=60), n_certified=3)
-    return vademecum_of(read_surface(path), options)
+    return build(read_surface(path), options)
 
 
 @pytest.fixture(scope="session", params=REAL)

@@ -19,7 +19,7 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tumour import share_inside
 from avatar_core.offline.certify.linear import certify
-from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.coordinates import Coordinate, node_values, node_weights, problem_at
 from avatar_core.vademecum.at_values import at_values
@@ -65,7 +65,7 @@ def organ(tumour: SurfaceMesh) -> Vademecum:
         tumour=tumour,
         n_certified=16,
     )
-    return vademecum_of(phantom_liver(12e-3), options)
+    return build(phantom_liver(12e-3), options)
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +181,7 @@ def test_the_near_field_grows_where_the_modes_do_not_do(monkeypatch: pytest.Monk
     options = OrganOptions(
         n_vertices=400, rule=rule, coordinates=(Coordinate("poisson", 0.45, 0.48),), n_certified=8
     )
-    found = vademecum_of(phantom_liver(12e-3), options)
+    found = build(phantom_liver(12e-3), options)
     at, centers = found.mesh.vertices[found.near.target], found.surface.centers
     reach = np.linalg.norm(at - centers[found.near.position], axis=1).max()
     wide = rule.near_growth * rule.near_outer * found.surface.patch_radius
@@ -359,7 +359,7 @@ def test_towards_incompressibility_on_taylor_hood() -> None:
         coordinates=(Coordinate("poisson", 0.40, 0.499),),
         n_certified=64,
     )
-    found = vademecum_of(phantom_liver(12e-3), options)
+    found = build(phantom_liver(12e-3), options)
     assert found.element == "Taylor-Hood"
     assert found.certificate is not None
     assert found.certificate.l2_mean < 0.05

@@ -17,7 +17,7 @@ from avatar_core.contact.layout import Layout
 from avatar_core.contact.model import FAR_AWAY, ContactModel, Status, make_model, prepare, step
 from avatar_core.contact.tool_path import access, inner_positions
 from avatar_core.geometry.phantom import phantom_liver
-from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
 
@@ -32,7 +32,7 @@ def liver(scale: float = 1.0) -> Vademecum:
     surface = phantom_liver(12e-3)
     surface = replace(surface, vertices=scale * surface.vertices)
     options = OrganOptions(n_vertices=600, rule=BuildRule(max_modes=40), n_certified=3)
-    return vademecum_of(surface, options)
+    return build(surface, options)
 
 
 @cache

@@ -49,12 +49,12 @@ def main(prefix: Path) -> int:
 
 def _build(library: Path) -> None:
     from avatar_core.geometry.phantom import phantom_liver
-    from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+    from avatar_core.offline.pipeline import OrganOptions, build
     from avatar_core.offline.rule import BuildRule
     from avatar_core.vademecum.storage import save_vademecum
 
     options = OrganOptions(n_vertices=600, rule=BuildRule(max_modes=10), n_certified=4)
-    save_vademecum(vademecum_of(phantom_liver(12e-3), options), library / "liver.h5")
+    save_vademecum(build(phantom_liver(12e-3), options), library / "liver.h5")
 
 
 def _state() -> str:

@@ -125,13 +125,11 @@ def own_domain() -> dict[str, str]:
 def organ() -> Any:
     """A coarse phantom's vademecum: what matters here is not how exact it is."""
     from avatar_core.geometry.phantom import phantom_liver
-    from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+    from avatar_core.offline.pipeline import OrganOptions, build
     from avatar_core.offline.rule import BuildRule
 
     rule = BuildRule(max_modes=30)
-    return vademecum_of(
-        phantom_liver(12e-3), OrganOptions(n_vertices=800, rule=rule, n_certified=10)
-    )
+    return build(phantom_liver(12e-3), OrganOptions(n_vertices=800, rule=rule, n_certified=10))
 
 
 @pytest.fixture(scope="session")

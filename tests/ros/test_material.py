@@ -21,7 +21,7 @@ from rcl_interfaces.srv import SetParameters
 
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.geometry.phantom import phantom_liver
-from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.storage import save_vademecum
@@ -41,7 +41,7 @@ def soft_organ() -> Any:
         coordinates=(Coordinate("poisson", 0.30, 0.49, 2),),
         n_certified=8,
     )
-    return vademecum_of(phantom_liver(12e-3), options)
+    return build(phantom_liver(12e-3), options)
 
 
 @pytest.fixture(scope="module")

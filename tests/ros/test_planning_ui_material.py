@@ -20,7 +20,7 @@ from rclpy.parameter import parameter_value_to_python
 
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.tumour import read_tumour
-from avatar_core.offline.pipeline import OrganOptions, vademecum_of
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.storage import save_vademecum
@@ -64,7 +64,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tumour=read_tumour(folder / "tumour.stl"),
         n_certified=4,
     )
-    save_vademecum(vademecum_of(liver, options), folder / "liver.h5")
+    save_vademecum(build(liver, options), folder / "liver.h5")
     return folder
 
 
