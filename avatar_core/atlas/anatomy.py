@@ -93,7 +93,7 @@ def require_shapes(anatomy: Anatomy, n_points: int, n_vertices: int) -> None:
         rank = response.space.shape[-1]
         fits = fits and response.space.shape == (3 * n_vertices, rank)
         fits = fits and response.load.ndim == 2 and response.load.shape[1] == rank
-        fits = fits and response.missing.shape == (len(response.load) // 3, 3, 3)
+        fits = fits and response.residual_compliance.shape == (len(response.load) // 3, 3, 3)
     if not fits:
         raise AtlasError(
             f"{anatomy.name}: its arrays do not fit the atlas's box and template; build it with "

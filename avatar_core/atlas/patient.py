@@ -35,11 +35,11 @@ from avatar_core.offline.linear import build_vademecum, with_rank
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.reduction.galerkin import (
-    ErrorEstimate,
+    GalerkinErrorEstimate,
     ReducedResponse,
     ReductionRule,
-    missing_blocks,
     reduce,
+    residual_compliance_blocks,
 )
 from avatar_core.reduction.near_field import LocalBlocks, near_pairs
 from avatar_core.reduction.separated import SeparatedField
@@ -53,7 +53,7 @@ Fidelity = Literal["interpolated", "reduced", "solved"]
 Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
 
 _CERTIFIED = {"interpolated": 24, "reduced": 24, "solved": 200}  # each is a fine solution
-MISSING_SUPPORT = 2.0  # reach of interpolated missing compliance, in patch radii
+RESIDUAL_SUPPORT = 2.0  # reach of interpolated residual compliance, in patch radii
 _FAR_HULL = 0.5  # hull distance over the neighbours' mean distance that is worth a warning
 
 
@@ -111,7 +111,7 @@ class Patient:
     fidelity : how it was made; a member of the base may have brought its own
     neighbours : names, nearest first; weights : ndarray, shape (n,)
     barycenter : Barycenter, with sum |w| and hull distance
-    estimates : ErrorEstimate of each enrichment (``reduced`` only), the last one holds
+    estimates : GalerkinErrorEstimate of each enrichment (``reduced`` only), the last one holds
     solutions : fine solutions that the response took
     notices : one line each
     seconds : StageSeconds
@@ -122,7 +122,7 @@ class Patient:
     neighbours: tuple[str, ...]
     weights: np.ndarray
     barycenter: Barycenter
-    estimates: tuple[ErrorEstimate, ...]
+    estimates: tuple[GalerkinErrorEstimate, ...]
     solutions: int
     notices: tuple[str, ...]
     seconds: StageSeconds
@@ -230,7 +230,7 @@ def respond(
     """The vademecum of a patient that is registered and meshed; see :func:`patient_vademecum`."""
     require_fidelity(fidelity)
     clock = {} if clock is None else clock
-    estimates: tuple[ErrorEstimate, ...] = ()
+    estimates: tuple[GalerkinErrorEstimate, ...] = ()
     solutions = 0
     with _timed(clock, "response"):
         progress("response", 0.0, np.nan)
@@ -270,11 +270,11 @@ def interpolated(
     """Eq. 18: no equation of the patient is solved.
 
     ``lle-grid`` combines at common places as the paper does, the others nodewise on the template.
-    The near field is that of the modes alone; the contact compliance gets what the base knows to
-    be missing under each patch.
+    The near field is that of the modes alone; the contact compliance gets the
+    residual compliance that the base holds for each patch.
     """
     response = interpolated_response(problem, base, weights, options)
-    support = MISSING_SUPPORT * problem.loads.patch_radius
+    support = RESIDUAL_SUPPORT * problem.loads.patch_radius
     convergence = Convergence(converged=False, tolerance=float("nan"))
     return _assembled(problem, response, support, convergence, options)
 
@@ -298,7 +298,7 @@ def reduced(
     weights: Barycenter,
     options: PatientOptions,
     progress: Progress = _silent,
-) -> tuple[Vademecum, tuple[ErrorEstimate, ...]]:
+) -> tuple[Vademecum, tuple[GalerkinErrorEstimate, ...]]:
     """The vademecum of :func:`reduced_response`, and the estimates on the way."""
     found = reduced_response(problem, base, weights, options, progress)
     return vademecum_of_reduced(problem, found, options), found.history
@@ -332,7 +332,7 @@ def reduced_response(
 def vademecum_of_reduced(
     problem: PatientProblem, found: ReducedResponse, options: PatientOptions
 ) -> Vademecum:
-    """What contact needs around a response: modes by worth, near field, distance and access."""
+    """What contact needs around a response: sorted modes, near field, distance and access."""
     convergence = Convergence(
         found.converged,
         options.tolerance,
@@ -383,7 +383,7 @@ def _assembled(
     """A vademecum of a compact response: its best modes far, the others near their load."""
     rule, loads = options.build, problem.loads
     radius = loads.patch_radius
-    far = _by_worth(response, problem.mesh)
+    far = _sorted_by_norm(response, problem.mesh)
     whole = Vademecum(
         name=problem.surface.name,
         mesh=problem.mesh,
@@ -393,8 +393,8 @@ def _assembled(
         surface=loads,
         far=far,
         near=_no_blocks(loads, problem.mesh, rule.near_outer * radius),
-        contact_near=missing_blocks(
-            response.missing, support, loads, rule.contact_support * radius
+        contact_near=residual_compliance_blocks(
+            response.residual_compliance, support, loads, rule.contact_support * radius
         ),
         tip_field=make_tip_field(problem.mesh, problem.regions, radius),
         convergence=convergence,
@@ -403,11 +403,11 @@ def _assembled(
     return with_rank(whole, options.max_modes, rule)
 
 
-def _by_worth(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
-    """Modes rotated so that the first are worth most in displacement; Y Y^T does not change."""
+def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
+    """Modes rotated so that the first hold most of the displacement; Y Y^T does not change."""
     field_ = SeparatedField(np.asarray(response.space, float), np.asarray(response.load, float))
     size = np.maximum((field_.load**2).sum(axis=1), 1e-300)
-    sorted_ = field_.sorted_by_worth(np.repeat(mesh.vertex_volumes, 3), 1.0 / size)
+    sorted_ = field_.sorted_by_norm(np.repeat(mesh.vertex_volumes, 3), 1.0 / size)
     return SeparatedField(sorted_.space.astype(np.float32), sorted_.load.astype(np.float32))
 
 
@@ -433,7 +433,7 @@ def _patient(
     fidelity: Fidelity,
     base: PatientBase,
     weights: Barycenter,
-    estimates: tuple[ErrorEstimate, ...],
+    estimates: tuple[GalerkinErrorEstimate, ...],
     solutions: int,
     clock: dict[str, float],
 ) -> Patient:

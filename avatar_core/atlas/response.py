@@ -34,7 +34,7 @@ class Responder:
         return Response(
             found.space,
             found.load,
-            found.missing,
+            found.residual_compliance,
             self.material,
             elasticity.element,
             loads.patch_radius,

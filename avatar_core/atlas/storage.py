@@ -45,7 +45,6 @@ from avatar_core.shapes.registration import (
 ATLAS_SCHEMA = "1.0"
 ATLAS_FORMAT = "avatar atlas"
 ANATOMY_FORMAT = "avatar anatomy"
-RESPONSE_KEYS = ("space", "load", "missing")
 MAX_FILE_BYTES = 64 << 30
 MAX_POINTS = 10_000_000  # of the box; an atlas has 50,000
 MOST_STEPS = 1000  # of a registration, in each of its loops
@@ -199,7 +198,8 @@ def _anatomy_arrays(anatomy: Anatomy) -> Arrays:
         "registered": anatomy.registered,
     }
     if response is not None:
-        arrays |= {key: getattr(response, key) for key in RESPONSE_KEYS}
+        arrays |= {"space": response.space, "load": response.load}
+        arrays["missing"] = response.residual_compliance
         about["response"] = {
             "material": asdict(response.material),
             "element": response.element,
@@ -247,7 +247,7 @@ def _response(arrays: Arrays, about: _Response | None) -> Response | None:
     return Response(
         space=arrays["space"],
         load=arrays["load"],
-        missing=arrays["missing"],
+        residual_compliance=arrays["missing"],
         material=about.material,
         element=about.element,
         patch_radius=about.patch_radius,

@@ -150,7 +150,7 @@ def combine(
     space = np.zeros((len(terms[0][1].space), len(value)), np.float32)
     for w, response in terms:
         space += w * (response.space @ (response.load.T @ dual))
-    return CompactResponse(space, load, _combined_missing(terms))
+    return CompactResponse(space, load, _combined_residual_compliance(terms))
 
 
 def leading_loads(
@@ -181,8 +181,10 @@ def leading_loads(
     return basis @ vector[:, best], value[best]
 
 
-def _combined_missing(terms: Sequence[tuple[np.floating, CompactResponse]]) -> FloatArray:
-    total = np.sum([w * response.missing for w, response in terms], axis=0, dtype=float)
+def _combined_residual_compliance(
+    terms: Sequence[tuple[np.floating, CompactResponse]],
+) -> FloatArray:
+    total = np.sum([w * response.residual_compliance for w, response in terms], axis=0, dtype=float)
     return positive_part(total)
 
 
@@ -239,9 +241,11 @@ def carried_by_place(
 def _mapped(
     response: CompactResponse, fields: sp.csr_matrix, positions: sp.csr_matrix
 ) -> CompactResponse:
-    missing = positive_part((positions @ response.missing.reshape(-1, 9)).reshape(-1, 3, 3))
+    residual = positions @ response.residual_compliance.reshape(-1, 9)
     return CompactResponse(
-        by_component(fields, response.space), by_component(positions, response.load), missing
+        by_component(fields, response.space),
+        by_component(positions, response.load),
+        positive_part(residual.reshape(-1, 3, 3)),
     )
 
 

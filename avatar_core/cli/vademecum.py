@@ -276,7 +276,7 @@ def show_text(v: Vademecum) -> None:
         ("displacement, L2", c.l2_mean, c.l2_worst),
         ("contact compliance", c.contact_mean, c.contact_worst),
         ("force of an indentation", c.force_mean, c.force_worst),
-        ("the same, felt by a sliding tip", c.felt_mean, c.felt_worst),
+        ("the same, felt by a sliding tip", c.tip_force_mean, c.tip_force_worst),
     ):
         print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
     _show_large(v)

@@ -10,8 +10,8 @@ Linear tetrahedra (P1) lock at the nu of liver (compliance 0.72 of the true one 
 are there for timing very large meshes, never as a default.
 
 With an inclusion, a tumour say, Young's modulus is (1 + (c - 1) chi) E, with the contrast c and the
-share chi of each tetrahedron that lies inside. The stiffness is then affine in mu, lambda, c mu
-and c lambda, of which the coordinates of a vademecum make use.
+volume fraction chi of each tetrahedron inside. The stiffness is then affine in mu, lambda, c mu and
+c lambda, of which the coordinates of a vademecum make use.
 """
 
 from __future__ import annotations
@@ -90,11 +90,11 @@ def factors_at(material: Material, contrast: float | None) -> np.ndarray:
 class Inclusion:
     """A part of the organ with another stiffness and the same Poisson's ratio.
 
-    share : ndarray, shape (n_tets,), volume fraction of each tetrahedron inside, chi
+    volume_fraction : ndarray, shape (n_tets,), chi, of each tetrahedron inside
     contrast : Young's modulus inside over that outside, c > 0
     """
 
-    share: np.ndarray
+    volume_fraction: np.ndarray
     contrast: float
 
     def __post_init__(self) -> None:
@@ -125,11 +125,11 @@ def scalar_mass(u, v, w):  # type: ignore[no-untyped-def]
 class _Terms:
     """The constant matrices that a stiffness is made of, shared by all values of the material.
 
-    share : ndarray, shape (n_tets,), of an inclusion in each tetrahedron, or None
+    volume_fraction : ndarray, shape (n_tets,), of an inclusion in each tetrahedron, or None
     """
 
-    def __init__(self, mesh: MeshTet, element: Element, share: np.ndarray | None) -> None:
-        self._mesh, self._element, self._share = mesh, element, share
+    def __init__(self, mesh: MeshTet, element: Element, volume_fraction: np.ndarray | None) -> None:
+        self._mesh, self._element, self._volume_fraction = mesh, element, volume_fraction
         self._shape = ElementTetP1() if element == "P1" else ElementTetP2()
         self._basis = Basis(mesh, self._shape, intorder=2)
         self.n_nodes = self._basis.N
@@ -138,10 +138,10 @@ class _Terms:
     def unit_stiffness(self) -> tuple[sp.csr_matrix, ...]:
         """K_q of :attr:`Elasticity.factors` (P1 and P2; the first for Taylor-Hood too)."""
         node = np.argsort(self.nodes_first(self._basis))[self._basis.element_dofs.T]
-        if self._share is None:
+        if self._volume_fraction is None:
             return unit_stiffness(self._basis, node)
-        outside = unit_stiffness(self._basis, node, 1.0 - self._share)
-        return outside + unit_stiffness(self._basis, node, self._share)
+        outside = unit_stiffness(self._basis, node, 1.0 - self._volume_fraction)
+        return outside + unit_stiffness(self._basis, node, self._volume_fraction)
 
     @cached_property
     def mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
@@ -212,7 +212,9 @@ class Elasticity:
         self._skfem_mesh = MeshTet(
             np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
         )
-        self._terms = _Terms(self._skfem_mesh, self.element, inclusion.share if inclusion else None)
+        self._terms = _Terms(
+            self._skfem_mesh, self.element, inclusion.volume_fraction if inclusion else None
+        )
         self.n_nodes = self._terms.n_nodes
         self.clamped_nodes = np.unique(self.face_nodes[clamped])
 
@@ -239,7 +241,7 @@ class Elasticity:
         if inclusion is not None:
             within = self._skfem_mesh.element_finder()
             parent_tet = within(*mesh.vertices[mesh.tets].mean(axis=1).T)
-            inclusion = replace(inclusion, share=inclusion.share[parent_tet])
+            inclusion = replace(inclusion, volume_fraction=inclusion.volume_fraction[parent_tet])
         return Elasticity(mesh, self.material, self._clamped_faces[owner], self.element, inclusion)
 
     def at(self, material: Material, contrast: float | None = None) -> Elasticity:
@@ -339,7 +341,7 @@ class Elasticity:
     @property
     def factor_bytes(self) -> int:
         """Memory of the factorization [bytes]."""
-        return 12 * int(self._factor.factor_nnz)  # a value and its share of an index
+        return 12 * int(self._factor.factor_nnz)  # a value and its part of an index
 
     def solve(self, loads: np.ndarray | sp.spmatrix) -> np.ndarray:
         """Displacements u = K^-1 f under nodal forces, zero at the clamp.

@@ -29,7 +29,7 @@ import scipy.sparse as sp
 from avatar_core.errors import EquilibriumError, LoadError
 from avatar_core.fem.hyperelasticity import Hyperelasticity
 
-_DESCENT = 1e-4  # Armijo's share of the decrease that the slope promises
+_DESCENT = 1e-4  # Armijo's fraction of the decrease that the slope promises
 _NOISE = 1e-15  # rounding of the energy, over Young's modulus times the volume
 _HALVINGS = 8  # of a Newton step, before the state counts as lost
 _QUICK = 5  # Newton iterations up to which the next load step doubles
@@ -102,7 +102,7 @@ def press(
     depths: Sequence[float],
     rule: NewtonRule | None = None,
     preload: np.ndarray | None = None,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> Iterator[State]:
     """The equilibria of a patch that is moved to increasing depths, as by a tool that holds it.
 
@@ -119,7 +119,7 @@ def press(
     rule : NewtonRule
     preload : ndarray, shape (3 n_nodes,), a dead load such as weight, carried before and during
         the push; depths count from there
-    progress : called with the share of the last depth that is reached, at every Newton iteration
+    progress : called with the fraction of the last depth that is reached, at every Newton iteration
 
     Raises
     ------
@@ -150,7 +150,7 @@ def _free_load(problem: Hyperelasticity, load: np.ndarray) -> np.ndarray:
 
 
 def _march(
-    newton: _Newton, targets: list[float], progress: Callable[[float], None] = lambda share: None
+    newton: _Newton, targets: list[float], progress: Callable[[float], None] = lambda fraction: None
 ) -> Iterator[State]:
     """States at increasing targets of load factor or depth, in steps of adapted size."""
     rule, whole = newton.rule, targets[-1]

@@ -1,7 +1,7 @@
 """Stiffness matrices of isotropic elasticity from products of scalar gradients.
 
 Everything follows from G_iajb = int chi d_i phi_a d_j phi_b dx, phi_a the shape functions of one
-component, chi the share of the material in each tetrahedron:
+component, chi the volume fraction of the material in each tetrahedron:
 
     int chi div(u) div(v)          ->  G_iajb,
     int chi 2 eps(u):eps(v)        ->  delta_ij sum_k G_kakb + G_jaib,
@@ -20,7 +20,7 @@ from avatar_core.common.arrays import FloatArray
 
 
 def unit_stiffness(
-    basis: CellBasis, nodes: np.ndarray, share: FloatArray | None = None
+    basis: CellBasis, nodes: np.ndarray, volume_fraction: FloatArray | None = None
 ) -> tuple[sp.csr_matrix, sp.csr_matrix]:
     """The shear part for mu = 1 and the volumetric part for lambda = 1.
 
@@ -28,13 +28,13 @@ def unit_stiffness(
     ----------
     basis : scikit-fem's scalar basis, quadrature exact for products of gradients
     nodes : ndarray of int, shape (n_tets, n_shape), node of each shape function
-    share : ndarray, shape (n_tets,), chi; None for 1
+    volume_fraction : ndarray, shape (n_tets,), chi; None for 1
 
     Returns
     -------
     shear, volume : sparse, shape (3 n_nodes, 3 n_nodes) [m], numbered 3 node + component
     """
-    weight = basis.dx if share is None else basis.dx * share[:, None]
+    weight = basis.dx if volume_fraction is None else basis.dx * volume_fraction[:, None]
     gradient = np.array([shape[0].grad for shape in basis.basis])  # (n_shape, 3, n_tets, n_points)
     gradient = np.ascontiguousarray(gradient.transpose(2, 0, 1, 3))
     n_tets, n_shape = gradient.shape[:2]

@@ -332,9 +332,9 @@ def without_islands(
         (np.ones(edge.size), (np.repeat(np.arange(len(ids)), 3), edge.ravel()))
     )
     _, label = connected_components(incidence @ incidence.T, directed=False)
-    share = np.bincount(label, weights=area[ids]) / area[ids].sum()
+    fraction = np.bincount(label, weights=area[ids]) / area[ids].sum()
     kept = np.zeros_like(chosen)
-    kept[ids[share[label] >= least]] = True
+    kept[ids[fraction[label] >= least]] = True
     return kept
 
 

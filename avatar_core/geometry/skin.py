@@ -128,10 +128,10 @@ def _require_small(covered: Soup, n_vertices: int, n_faces: int, name: str) -> N
     """Raise SurfaceError if a cone, after that many vertices and faces, covers too much."""
     areas = igl.doublearea(*covered) / 2
     cones = np.bincount(covered[1][n_faces:, 2] - n_vertices, areas[n_faces:], minlength=1)
-    share = cones.max() / areas.sum()
-    if share > LARGEST_HOLE:
+    fraction = cones.max() / areas.sum()
+    if fraction > LARGEST_HOLE:
         raise SurfaceError(
-            f"{name}: the surface is open (a hole takes {share:.0%} of it); "
+            f"{name}: the surface is open (a hole takes {fraction:.0%} of it); "
             "close it or segment the whole organ"
         )
 

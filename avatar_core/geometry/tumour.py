@@ -29,7 +29,7 @@ def read_tumour(path: str | Path, unit: str = "mm", axes: Any = "RAS") -> Surfac
     return read_surface(path, unit, axes, check_size=False, one_body=False)
 
 
-def share_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:
+def volume_fraction_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:
     """Volume fraction of each tetrahedron inside a tumour, shape (n_tets,).
 
     Counted on a lattice of points in each tetrahedron near it.
@@ -43,12 +43,12 @@ def share_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:
     lattice = _lattice()
     low, high = tumour.vertices.min(axis=0), tumour.vertices.max(axis=0)
     near = np.flatnonzero(((corners.max(axis=1) > low) & (corners.min(axis=1) < high)).all(axis=1))
-    share = np.zeros(len(mesh.tets))
+    volume_fraction = np.zeros(len(mesh.tets))
     if len(near):
         points = np.einsum("pc,tcd->tpd", lattice, corners[near])
         inside = signed_distance(points.reshape(-1, 3), tumour) < 0.0
-        share[near] = inside.reshape(len(near), -1).mean(axis=1)
-    volume = float(share @ mesh.tet_volumes)
+        volume_fraction[near] = inside.reshape(len(near), -1).mean(axis=1)
+    volume = float(volume_fraction @ mesh.tet_volumes)
     if volume < mesh.tet_volumes.mean():
         raise SurfaceError(
             f"{tumour.name}: {volume * 1e6:.2f} ml of the tumour lie in the organ, less than a "
@@ -59,7 +59,7 @@ def share_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:
             f"{tumour.name}: the tumour fills {volume / mesh.volume:.0%} of the organ; give the "
             "surface of the tumour alone"
         )
-    return share
+    return volume_fraction
 
 
 def _lattice() -> np.ndarray:

@@ -87,7 +87,7 @@ def exact_response(
     )
 
 
-class Missing:
+class FarFieldResidual:
     """What the modes found so far leave of the kept columns, outside the near field."""
 
     def __init__(
@@ -128,9 +128,9 @@ def displacement_near(
     response: ExactResponse,
     surface: LoadSurface,
     rule: BuildRule,
-    stubborn: np.ndarray,
+    outliers: np.ndarray,
 ) -> LocalBlocks:
-    """(u - far) at the vertices around each position, faded out; whole at stubborn ones."""
+    """(u - far) at the vertices around each position, faded out; whole at outliers."""
     radius = surface.patch_radius
     fade = plateau(
         response.vertex_pairs.distance, rule.near_inner * radius, rule.near_outer * radius
@@ -138,7 +138,7 @@ def displacement_near(
     blocks = remainder(response.vertex, far.space, far.load, fade)
     blocks = blocks.kept(response.vertex_pairs.distance < rule.near_outer * radius)
     rows = {}
-    for j in stubborn:
+    for j in outliers:
         k = 3 * int(np.searchsorted(response.samples, j))
         left = response.columns[:, k : k + 3] - far.space @ far.load[3 * j : 3 * j + 3].T
         rows[int(j)] = left.reshape(-1, 3, 3).astype(np.float32)

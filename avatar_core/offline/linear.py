@@ -19,7 +19,7 @@ from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
 from avatar_core.offline.exact_response import (
     ExactResponse,
-    Missing,
+    FarFieldResidual,
     contact_near,
     displacement_near,
     exact_response,
@@ -27,7 +27,7 @@ from avatar_core.offline.exact_response import (
 )
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.reduction.near_field import LocalBlocks, plateau, wendland
-from avatar_core.reduction.pgd import ParametricProblem, PGDRule, PGDSolution, solve_pgd
+from avatar_core.reduction.pgd import LoadProblem, PGDRule, PGDSolution, solve_pgd
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.modal_mass import (
     LEAST_MODES,
@@ -39,7 +39,7 @@ from avatar_core.vademecum.modal_mass import (
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.tip_field import make_tip_field
 
-_MOST_STUBBORN = 0.01  # part of the load positions whose fields may be stored whole
+_MAX_OUTLIERS = 0.01  # part of the load positions whose fields may be stored whole
 _WORST_OVER_MEAN = 8 / 3  # the worst load may be this much worse than the mean asked for
 _ENOUGH = 1.25  # the modes found must leave so much less than asked, as not all are kept
 
@@ -60,25 +60,25 @@ def build_vademecum(
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     response = exact_response(elasticity, surface, loads, rule, progress)
-    missing = Missing(elasticity, surface, response, rule)
+    residual = FarFieldResidual(elasticity, surface, response, rule)
     rule, with_body = _with_room_for_body(rule)
-    solution, weights = find_modes(elasticity, loads, response, missing, rule, progress)
+    solution, weights = find_modes(elasticity, loads, response, residual, rule, progress)
     modes = SeparatedField(elasticity.at_vertices(solution.space), solution.load)
-    mixing = modes.mixing_by_worth(np.repeat(elasticity.mesh.vertex_volumes, 3), weights)
+    mixing = modes.mixing_by_norm(np.repeat(elasticity.mesh.vertex_volumes, 3), weights)
     modes = SeparatedField(modes.space @ mixing, modes.load @ mixing)
-    errors = _rank_errors(modes, missing, rule)
+    errors = _rank_errors(modes, residual, rule)
     rank, converged = _choose_rank(errors, rule)
     if not converged and rule.near_growth > 1.0:
         rule = rule.with_wider_near_field()
-        missing = Missing(elasticity, surface, response, rule)
-        errors = _rank_errors(modes, missing, rule)
+        residual = FarFieldResidual(elasticity, surface, response, rule)
+        errors = _rank_errors(modes, residual, rule)
         rank, converged = _choose_rank(errors, rule)
     far, body = modes.truncate(rank), None
     if with_body:
         far, body = _with_body(elasticity, loads, solution.space @ mixing[:, :rank], far.load)
-    stubborn = np.empty(0, np.int64)
+    outliers = np.empty(0, np.int64)
     if not converged:
-        stubborn, final = _stubborn(far, missing, rule)
+        outliers, final = _outliers(far, residual, rule)
         errors = (*errors, final)
         converged = is_met(final.mean, final.worst, rule)
     return Vademecum(
@@ -89,7 +89,7 @@ def build_vademecum(
         element=elasticity.element,
         surface=surface,
         far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
-        near=displacement_near(far, response, surface, rule, stubborn),
+        near=displacement_near(far, response, surface, rule, outliers),
         contact_near=contact_near(far, response, surface, rule),
         tip_field=make_tip_field(elasticity.mesh, regions, surface.patch_radius),
         body=body,
@@ -154,7 +154,7 @@ def find_modes(
     elasticity: Elasticity,
     loads: sp.csr_matrix,
     response: ExactResponse,
-    missing: Missing,
+    residual: FarFieldResidual,
     rule: BuildRule,
     progress: Progress,
 ) -> tuple[PGDSolution, np.ndarray]:
@@ -173,15 +173,15 @@ def find_modes(
     def follow_error(space: np.ndarray, load: np.ndarray) -> np.ndarray | None:
         nonlocal found, current
         found += load.shape[1]
-        error = missing.remove(elasticity.at_vertices(space), load)
+        error = residual.remove(elasticity.at_vertices(space), load)
         current = float(error.mean())
         if found >= least and is_met(_ENOUGH * error.mean(), _ENOUGH * error.max(), rule):
             return None
-        weights[missing.loads] = base[missing.loads] * (error / error.mean()) ** 2
+        weights[residual.loads] = base[residual.loads] * (error / error.mean()) ** 2
         return weights.copy()
 
     solution = solve_pgd(
-        ParametricProblem(elasticity, loads.tocsr(), base, response.energy),
+        LoadProblem(elasticity, loads.tocsr(), base, response.energy),
         PGDRule(limit, tolerance=1e-6),
         lambda rank: progress("modes", rank / limit, current),
         follow_error,
@@ -189,14 +189,16 @@ def find_modes(
     return solution, weights
 
 
-def _rank_errors(modes: SeparatedField, missing: Missing, rule: BuildRule) -> tuple[RankError, ...]:
+def _rank_errors(
+    modes: SeparatedField, residual: FarFieldResidual, rule: BuildRule
+) -> tuple[RankError, ...]:
     """Error on the kept loads against the number of modes, near field included."""
-    missing.restart()
+    residual.restart()
     errors = []
     last = min(rule.max_modes, modes.rank)
     ranks = sorted({*range(5, last, 5), last})
     for before, rank in zip([0, *ranks[:-1]], ranks, strict=True):
-        error = missing.remove(modes.space[:, before:rank], modes.load[:, before:rank])
+        error = residual.remove(modes.space[:, before:rank], modes.load[:, before:rank])
         errors.append(RankError(rank, float(error.mean()), float(error.max())))
     return tuple(errors)
 
@@ -208,19 +210,19 @@ def _choose_rank(errors: tuple[RankError, ...], rule: BuildRule) -> tuple[int, b
     return errors[-1].rank, False
 
 
-def _stubborn(
-    far: SeparatedField, missing: Missing, rule: BuildRule
+def _outliers(
+    far: SeparatedField, residual: FarFieldResidual, rule: BuildRule
 ) -> tuple[np.ndarray, RankError]:
     """The few kept positions that no rank serves, and the error with their fields stored whole.
 
     They lie beside the clamp, where a push moves the organ little and not as any other does.
     """
-    missing.restart()
-    error = missing.remove(far.space, far.load)
+    residual.restart()
+    error = residual.remove(far.space, far.load)
     limit = _WORST_OVER_MEAN * rule.tolerance
-    positions = np.unique(missing.loads[error > limit] // 3)
-    positions = positions[: int(_MOST_STUBBORN * len(error) / 3)]
-    error[np.isin(missing.loads // 3, positions)] = 0.0
+    positions = np.unique(residual.loads[error > limit] // 3)
+    positions = positions[: int(_MAX_OUTLIERS * len(error) / 3)]
+    error[np.isin(residual.loads // 3, positions)] = 0.0
     return positions, RankError(far.rank, float(error.mean()), float(error.max()))
 
 

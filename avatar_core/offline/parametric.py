@@ -28,7 +28,7 @@ from avatar_core.geometry.mesh import Regions
 from avatar_core.offline.certify.linear import certificate_of, measured
 from avatar_core.offline.exact_response import (
     ExactResponse,
-    Missing,
+    FarFieldResidual,
     contact_near,
     displacement_near,
     exact_response,
@@ -59,7 +59,7 @@ class _Snapshot:
 
     elasticity: Elasticity
     response: ExactResponse
-    missing: Missing
+    residual: FarFieldResidual
     space: np.ndarray
     load: np.ndarray
     history: tuple[EnrichmentReport, ...]
@@ -96,9 +96,11 @@ def build_parametric_vademecum(
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     nodes = node_values(coordinates)
-    share = replace(rule, max_sample_bytes=rule.max_sample_bytes // len(nodes))
+    rule_per_node = replace(rule, max_sample_bytes=rule.max_sample_bytes // len(nodes))
     snapshots = [
-        _solved(problem_at(elasticity, values), loads, surface, share, _part(progress, k, nodes))
+        _solved(
+            problem_at(elasticity, values), loads, surface, rule_per_node, _part(progress, k, nodes)
+        )
         for k, values in enumerate(nodes)
     ]
     reduced, error = _reduce(snapshots, loads, rule)
@@ -141,12 +143,12 @@ def _solved(
         progress("solve", half + half * fraction, error)
 
     response = exact_response(elasticity, surface, loads, rule, first)
-    missing = Missing(elasticity, surface, response, rule)
-    solution, _ = find_modes(elasticity, loads, response, missing, rule, second)
-    missing.restart()
+    residual = FarFieldResidual(elasticity, surface, response, rule)
+    solution, _ = find_modes(elasticity, loads, response, residual, rule, second)
+    residual.restart()
     space = solution.space.astype(np.float32)
     elasticity = elasticity.at(elasticity.material)  # leaves its factorization behind, 0.5 GB
-    return _Snapshot(elasticity, response, missing, space, solution.load, solution.history)
+    return _Snapshot(elasticity, response, residual, space, solution.load, solution.history)
 
 
 def _reduce(
@@ -162,7 +164,7 @@ def _reduce(
         if best is None or error.worst < best[1].worst:
             best = reduced, error
         for snapshot, weight, left in zip(snapshots, weights, errors, strict=True):
-            weight[snapshot.missing.loads] *= (left / error.mean) ** 2
+            weight[snapshot.residual.loads] *= (left / error.mean) ** 2
     assert best is not None
     return best
 
@@ -171,8 +173,8 @@ def _errors(snapshots: Sequence[_Snapshot], reduced: _Reduced) -> list[np.ndarra
     """Relative L2 error of the kept loads at every node, near field included."""
     out = []
     for snapshot, field in zip(snapshots, reduced.fields, strict=True):
-        out.append(snapshot.missing.remove(field.space, field.load))
-        snapshot.missing.restart()
+        out.append(snapshot.residual.remove(field.space, field.load))
+        snapshot.residual.restart()
     return out
 
 
@@ -183,8 +185,8 @@ def _rank_error(errors: Sequence[np.ndarray], rule: BuildRule) -> RankError:
 
 def _with_near_field(snapshot: _Snapshot, surface: LoadSurface, rule: BuildRule) -> _Snapshot:
     """A snapshot whose errors are measured outside the near field of ``rule``."""
-    missing = Missing(snapshot.elasticity, surface, snapshot.response, rule)
-    return replace(snapshot, missing=missing)
+    residual = FarFieldResidual(snapshot.elasticity, surface, snapshot.response, rule)
+    return replace(snapshot, residual=residual)
 
 
 def _principal(

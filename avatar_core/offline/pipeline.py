@@ -20,8 +20,8 @@ from avatar_core.geometry.mesh import (
 )
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.geometry.tumour import share_inside
-from avatar_core.offline.certify.combinations import COMBINATIONS, SHARES, push_errors
+from avatar_core.geometry.tumour import volume_fraction_inside
+from avatar_core.offline.certify.combinations import COMBINATIONS, DEPTH_FRACTIONS, push_errors
 from avatar_core.offline.certify.large_deformation import certify_large, with_combinations
 from avatar_core.offline.certify.linear import certify, mesh_error
 from avatar_core.offline.large_deformation import (
@@ -168,15 +168,17 @@ def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress)
         options.n_pushed,
         options.large_rule.max_push,
         options.seed,
-        lambda share, error: progress("push", alone * share, error),
+        lambda fraction, error: progress("push", alone * fraction, error),
     )
     rows = push_errors(
         vademecum,
         problem,
-        [share * options.large_rule.max_push for share in SHARES],
+        [fraction * options.large_rule.max_push for fraction in DEPTH_FRACTIONS],
         n_combined,
         options.seed,
-        progress=lambda share: progress("push", alone + (1.0 - alone) * share, certificate.l2_mean),
+        progress=lambda fraction: progress(
+            "push", alone + (1.0 - alone) * fraction, certificate.l2_mean
+        ),
     )
     return vademecum.with_large_certificate(with_combinations(certificate, rows))
 
@@ -187,7 +189,7 @@ def _elasticity(mesh: TetMesh, regions: Regions, options: OrganOptions) -> Elast
     stiffest = replace(options.material, poisson_ratio=max(ratios)) if ratios else options.material
     inclusion = None
     if options.tumour is not None:
-        inclusion = Inclusion(share_inside(mesh, options.tumour), options.contrast)
+        inclusion = Inclusion(volume_fraction_inside(mesh, options.tumour), options.contrast)
     return Elasticity(
         mesh, options.material, regions.clamped, options.element or stiffest.element, inclusion
     )

@@ -84,7 +84,7 @@ class CanonicalField:
 
 
 @dataclass(frozen=True)
-class ErrorEstimate:
+class ResidualErrorEstimate:
     """Estimated relative errors of a field over sampled points.
 
     residual : |r| / |f| in the norm of K_0^-1, root mean square
@@ -117,8 +117,8 @@ class Samples:
         acting = _acting(problem)
         if not acting.any():
             raise ConvergenceError("all loads are zero: there is nothing to separate")
-        self.loads = rng.choice(len(acting), n, p=_share(problem.load_weights * acting))
-        nodes = [rng.choice(len(w), n, p=_share(w)) for w in problem.weights]
+        self.loads = rng.choice(len(acting), n, p=_normalized(problem.load_weights * acting))
+        nodes = [rng.choice(len(w), n, p=_normalized(w)) for w in problem.weights]
         self.nodes: NDArray[np.int64] = np.stack([*nodes, np.zeros(n, np.int64)])[:-1].T
         self._force = np.column_stack([self._right(k) for k in range(n)])
         self._size = self._norm(self._force)
@@ -129,7 +129,7 @@ class Samples:
         """|r| / |f| in the norm of K_0^-1, root mean square."""
         return self._norm(self._left(self.fields(field))) / self._size
 
-    def estimate(self, field: CanonicalField, reference: FloatArray) -> ErrorEstimate:
+    def estimate(self, field: CanonicalField, reference: FloatArray) -> ResidualErrorEstimate:
         """Errors of displacement in energy and of the displacement in contact.
 
         reference : ndarray, shape (n_terms,), theta_q(p_0) of ``precondition``
@@ -140,7 +140,7 @@ class Samples:
         own = (left * displacement).sum(axis=0)
         work = np.abs((self._force * displacement).sum(axis=0))
         alpha = np.array([(self._theta(k) / reference).min() for k in range(len(self.loads))])
-        return ErrorEstimate(
+        return ResidualErrorEstimate(
             residual=float(np.sqrt(squared.sum())) / self._size,
             contact=float((np.abs(own + squared) / work).mean()),
             contact_bound=float(((np.abs(own) + squared / alpha) / work).mean()),
@@ -189,5 +189,5 @@ def _acting(problem: AffineProblem) -> NDArray[np.bool_]:
     return np.any([source.rmatvec(probe) != 0.0 for source in problem.sources], axis=0)
 
 
-def _share(weights: FloatArray) -> FloatArray:
+def _normalized(weights: FloatArray) -> FloatArray:
     return weights / weights.sum()

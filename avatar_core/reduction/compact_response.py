@@ -15,13 +15,12 @@ class CompactResponse:
 
     space : ndarray, shape (3 n_vertices, rank), X, K-orthonormal for an anatomy
     load : ndarray, shape (3 n_positions, rank), Y
-    missing : ndarray, shape (n_positions, 3, 3) [m/N], what Y Y^T lacks of the compliance of each
-        patch
+    residual_compliance : ndarray, shape (n_positions, 3, 3) [m/N], C - Y Y^T of each patch
     """
 
     space: FloatArray
     load: FloatArray
-    missing: FloatArray
+    residual_compliance: FloatArray
 
 
 def positive_part(blocks: FloatArray) -> FloatArray:

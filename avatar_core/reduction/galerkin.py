@@ -12,7 +12,7 @@ solutions for the loads whose residual r = f - K X Y^T is largest in the norm of
     eta(s)^2 = r(s) . D^-1 r(s).
 
 A few *probes*, loads solved exactly that never enter the space, calibrate eta, so that it
-estimates the error of every load, and tell how much compliance is missing under a patch.
+estimates the error of every load, and tell how much compliance the space lacks under a patch.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ class ReductionRule:
     n_start : load functions of the neighbours
     n_block : load positions solved in one enrichment, three directions each
     n_probes : load positions solved exactly to calibrate the estimate
-    largest_share : fine solutions at most, probes included, over those of the full problem
-    supports : candidates for the reach of the missing compliance, in patch radii
+    max_solution_fraction : fine solutions at most, probes included, over those of the full problem
+    supports : candidates for the reach of the residual compliance, in patch radii
     """
 
     n_start: int = 80
     n_block: int = 14
     n_probes: int = 16
-    largest_share: float = 0.05
+    max_solution_fraction: float = 0.05
     supports: tuple[float, ...] = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 
 
 @dataclass(frozen=True)
-class ErrorEstimate:
+class GalerkinErrorEstimate:
     """Estimated relative L2 errors of displacement over all loads, and what was spent.
 
     mean, worst : over the load positions, three directions together
@@ -172,15 +172,15 @@ class Probes:
 class ReducedResponse:
     """The response in the space that was found.
 
-    response : CompactResponse at the patient's vertices and load positions, with what is missing
-    support : reach of the missing compliance [m]
-    history : one ErrorEstimate for the first space and after each enrichment
+    response : CompactResponse at the patient's vertices and load positions
+    support : reach of the residual compliance [m]
+    history : one GalerkinErrorEstimate for the first space and after each enrichment
     converged : the last estimate is below the tolerance
     """
 
     response: CompactResponse
     support: float
-    history: tuple[ErrorEstimate, ...]
+    history: tuple[GalerkinErrorEstimate, ...]
     converged: bool
 
 
@@ -191,28 +191,28 @@ def reduce(
     load_functions: FloatArray,
     tolerance: float,
     rule: ReductionRule | None = None,
-    progress: Callable[[float, ErrorEstimate], None] = lambda fraction, estimate: None,
+    progress: Callable[[float, GalerkinErrorEstimate], None] = lambda fraction, estimate: None,
 ) -> ReducedResponse:
     """Galerkin response from the neighbours' load functions, enriched until the tolerance.
 
-    Stops at the tolerance (mean, and twice that for the worst load) or at the rule's share of the
-    fine solutions, then with ``converged`` False.
+    Stops at the tolerance (mean, and twice that for the worst load), or with ``converged`` False
+    after ``max_solution_fraction`` of the fine solutions.
 
     Parameters
     ----------
     elasticity, loads, surface : of the patient's own mesh
     load_functions : ndarray, shape (n_loads, n), carried over, most important first
     tolerance : mean relative L2 error of displacement
-    progress : called with the share of the allowed solutions that is spent, and the estimate
+    progress : called with the fraction of the allowed solutions that is spent, and the estimate
     """
     rule = rule or ReductionRule()
-    limit = max(int(rule.largest_share * loads.shape[1]), 3 * (rule.n_probes + 1))
+    limit = max(int(rule.max_solution_fraction * loads.shape[1]), 3 * (rule.n_probes + 1))
     n_probes = min(rule.n_probes, limit // 6, surface.n_positions)
     probes = solve_probes(elasticity, loads, n_probes)
     basis = GalerkinBasis(elasticity, loads)
     basis.solutions = 3 * n_probes
     basis.enrich(loads @ load_functions[:, : min(rule.n_start, limit - basis.solutions)])
-    history: list[ErrorEstimate] = []
+    history: list[GalerkinErrorEstimate] = []
     while True:
         blocks = basis.residual_blocks()
         history.append(estimate_errors(basis, probes, blocks))
@@ -223,9 +223,9 @@ def reduce(
             break
         chosen = worst_positions(basis, surface, blocks, count, probes.positions)
         basis.enrich(loads[:, triples(chosen)].toarray())
-    missing, support = missing_compliance(basis, probes, surface, blocks, rule)
+    residual, support = residual_compliance(basis, probes, surface, blocks, rule)
     space = elasticity.at_vertices(basis.space)
-    response = CompactResponse(space, basis.load, missing)
+    response = CompactResponse(space, basis.load, residual)
     return ReducedResponse(response, support, tuple(history), converged)
 
 
@@ -238,7 +238,7 @@ def solve_probes(elasticity: Elasticity, loads: sp.csr_matrix, n: int, seed: int
 
 def estimate_errors(
     basis: GalerkinBasis, probes: Probes, blocks: NDArray[np.float64]
-) -> ErrorEstimate:
+) -> GalerkinErrorEstimate:
     """Errors of all loads from their residuals, calibrated on the probes.
 
     e(s) ~ c sqrt(eta(s)^2 / tr C(s, s)), c the ratio of the means over the probes.
@@ -246,10 +246,12 @@ def estimate_errors(
     relative = relative_residual(basis, blocks)
     scale = probes.errors(basis).mean() / relative[probes.positions].mean()
     estimate = scale * relative
-    return ErrorEstimate(float(estimate.mean()), float(estimate.max()), basis.rank, basis.solutions)
+    return GalerkinErrorEstimate(
+        float(estimate.mean()), float(estimate.max()), basis.rank, basis.solutions
+    )
 
 
-def is_met(estimate: ErrorEstimate, tolerance: float) -> bool:
+def is_met(estimate: GalerkinErrorEstimate, tolerance: float) -> bool:
     """Whether mean and worst error are as small as asked for."""
     return estimate.mean <= tolerance and estimate.worst <= WORST_OVER_MEAN * tolerance
 
@@ -278,7 +280,7 @@ def worst_positions(
     return np.array(chosen, np.int64)
 
 
-def missing_compliance(
+def residual_compliance(
     basis: GalerkinBasis,
     probes: Probes,
     surface: LoadSurface,
@@ -288,34 +290,34 @@ def missing_compliance(
     """What the space lacks of the compliance of each patch, and over which distance.
 
     M(s) = alpha eta-blocks(s), alpha such that the traces at the probes agree; the reach is the
-    candidate for which :func:`missing_blocks` fits the probes' columns best.
+    candidate for which :func:`residual_compliance_blocks` fits the probes' columns best.
 
     Returns
     -------
-    missing : ndarray, shape (n_positions, 3, 3) [m/N]; support : [m]
+    compliance : ndarray, shape (n_positions, 3, 3) [m/N]; support : [m]
     """
     exact = probes.compliance - basis.load @ basis.load[triples(probes.positions)].T
     exact = exact.reshape(surface.n_positions, 3, len(probes.positions), 3)
     own = sum(np.trace(exact[j, :, k]) for k, j in enumerate(probes.positions))
     scale = max(own, 0.0) / np.trace(blocks[probes.positions], axis1=1, axis2=2).sum()
-    missing = positive_part(scale * blocks)
-    root = _root(missing)
+    compliance = positive_part(scale * blocks)
+    root = _root(compliance)
     centers, radius = surface.centers, surface.patch_radius
     distance = np.linalg.norm(centers[:, None] - centers[probes.positions][None], axis=2)
     full = np.einsum("iab,kbc->iakc", root, root[probes.positions], optimize=True)
 
-    def near_misfit(support: float) -> float:
+    def misfit_nearby(support: float) -> float:
         model = wendland(distance, support * radius)[:, None, :, None] * full
         off = ((model - exact) ** 2).sum(axis=(1, 3))
         return float(off[distance < 2.0 * radius].sum())
 
-    return missing, radius * min(rule.supports, key=near_misfit)
+    return compliance, radius * min(rule.supports, key=misfit_nearby)
 
 
-def missing_blocks(
-    missing: FloatArray, support: float, surface: LoadSurface, reach: float
+def residual_compliance_blocks(
+    compliance: FloatArray, support: float, surface: LoadSurface, reach: float
 ) -> LocalBlocks:
-    """The missing compliance between neighbouring patches, positive definite by construction.
+    """The residual compliance between neighbouring patches, positive definite by construction.
 
         dC(s, s') = phi(|s - s'| / support) M(s)^(1/2) M(s')^(1/2)
 
@@ -324,12 +326,12 @@ def missing_blocks(
 
     Parameters
     ----------
-    missing : ndarray, shape (n_positions, 3, 3) [m/N], M
+    compliance : ndarray, shape (n_positions, 3, 3) [m/N], M
     support, reach : [m]
     """
     pairs = near_pairs(surface.centers, surface.centers, reach)
-    root = _root(missing)
-    position = np.repeat(np.arange(len(missing)), np.diff(pairs.start))
+    root = _root(compliance)
+    position = np.repeat(np.arange(len(compliance)), np.diff(pairs.start))
     fade = wendland(pairs.distance, support)[:, None, None]
     block = fade * (root[pairs.target] @ root[position])
     return LocalBlocks(pairs.start, pairs.target, block.astype(np.float32))

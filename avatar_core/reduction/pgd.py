@@ -93,7 +93,7 @@ class PGDSolution:
 class _Expansion:
     """The growing K-orthonormal expansion and the energy that it leaves to each load."""
 
-    def __init__(self, problem: ParametricProblem, capacity: int) -> None:
+    def __init__(self, problem: LoadProblem, capacity: int) -> None:
         self.problem = problem
         n_dofs, n_loads = problem.loads.shape
         self._space = np.zeros((n_dofs, capacity), order="F")
@@ -133,7 +133,7 @@ class _Expansion:
 
 
 @dataclass(frozen=True)
-class ParametricProblem:
+class LoadProblem:
     """K u(s) = f(s) for all loads s, with the weight of each load in the norm over s.
 
     elasticity : Elasticity, solves with and applies K
@@ -149,7 +149,7 @@ class ParametricProblem:
 
 
 def solve_pgd(
-    problem: ParametricProblem,
+    problem: LoadProblem,
     rule: PGDRule,
     progress: Callable[[int], None] = lambda rank: None,
     reweigh: Callable[[np.ndarray, np.ndarray], np.ndarray | None] | None = None,
@@ -158,7 +158,7 @@ def solve_pgd(
 
     Parameters
     ----------
-    problem : ParametricProblem
+    problem : LoadProblem
     rule : PGDRule
     progress : called with the rank after every enrichment
     reweigh : called with the new space and load functions; returns the weights of the loads for

@@ -20,8 +20,8 @@ incompressibility (``avatar study coordinates``). It is the form to take for man
 the basis needs solutions on a grid of all of them.
 
 Operators are symmetric and positive (semi-)definite, coordinates are discretised by nodes with
-quadrature weights, their norm. :func:`minimal_residual` and :func:`projection` turn a problem and a
-field into other problems of the same form.
+quadrature weights, their norm. :func:`minimal_residual` gives the normal equations as another
+problem of the same form.
 """
 
 from __future__ import annotations
@@ -31,8 +31,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
-from scipy.sparse import diags
-from scipy.sparse.linalg import LinearOperator, aslinearoperator, cg
+from scipy.sparse.linalg import LinearOperator, cg
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import ConvergenceError
@@ -67,7 +66,7 @@ class Enrichment:
 
 
 @dataclass(frozen=True)
-class PGDRule:
+class CanonicalPGDRule:
     """When to stop.
 
     max_modes : products at most; tolerance : of the relative residual
@@ -90,7 +89,7 @@ class PGDRule:
 
 
 @dataclass(frozen=True, eq=False)
-class PGDSolution:
+class CanonicalPGDSolution:
     """The field, how it ended and how it got there."""
 
     field: CanonicalField
@@ -104,11 +103,11 @@ class PGDSolution:
         return self.outcome in (Outcome.CONVERGED, Outcome.EXHAUSTED) and not cut
 
 
-def solve_pgd(
+def solve_canonical_pgd(
     problem: AffineProblem,
-    rule: PGDRule,
+    rule: CanonicalPGDRule,
     progress: Callable[[int, float], None] = lambda rank, residual: None,
-) -> PGDSolution:
+) -> CanonicalPGDSolution:
     """Greedy enrichment with alternating directions until the rule stops it.
 
     Parameters
@@ -126,20 +125,20 @@ def solve_pgd(
     while len(history) < rule.max_modes:
         product, outcome, sweeps, change = _enrich(expansion, rule)
         if product is None:
-            return PGDSolution(expansion.field, Outcome.EXHAUSTED, tuple(history))
+            return CanonicalPGDSolution(expansion.field, Outcome.EXHAUSTED, tuple(history))
         expansion.append(product)
         if rule.update:
             expansion.update()
         history.append(Enrichment(outcome, sweeps, change, samples.residual(expansion.field)))
         progress(len(history), history[-1].residual)
         if history[-1].residual <= rule.tolerance:
-            return PGDSolution(expansion.field, Outcome.CONVERGED, tuple(history))
+            return CanonicalPGDSolution(expansion.field, Outcome.CONVERGED, tuple(history))
         if _stagnated(history, rule):
-            return PGDSolution(expansion.field, Outcome.STAGNATED, tuple(history))
-    return PGDSolution(expansion.field, Outcome.MODE_LIMIT, tuple(history))
+            return CanonicalPGDSolution(expansion.field, Outcome.STAGNATED, tuple(history))
+    return CanonicalPGDSolution(expansion.field, Outcome.MODE_LIMIT, tuple(history))
 
 
-def _stagnated(history: list[Enrichment], rule: PGDRule) -> bool:
+def _stagnated(history: list[Enrichment], rule: CanonicalPGDRule) -> bool:
     if len(history) <= rule.stall:
         return False
     return history[-1].residual > (1.0 - rule.least_gain) * history[-1 - rule.stall].residual
@@ -159,7 +158,9 @@ class _Product:
     energy: float
 
 
-def _enrich(expansion: _Expansion, rule: PGDRule) -> tuple[_Product | None, Outcome, int, float]:
+def _enrich(
+    expansion: _Expansion, rule: CanonicalPGDRule
+) -> tuple[_Product | None, Outcome, int, float]:
     """Alternating directions from a random load function and constant parameters.
 
     Where constants see nothing of the residual, its mean being zero, random parameters may.
@@ -176,7 +177,10 @@ def _enrich(expansion: _Expansion, rule: PGDRule) -> tuple[_Product | None, Outc
 
 
 def _alternate(
-    expansion: _Expansion, rule: PGDRule, load: FloatArray, parameters: tuple[FloatArray, ...]
+    expansion: _Expansion,
+    rule: CanonicalPGDRule,
+    load: FloatArray,
+    parameters: tuple[FloatArray, ...],
 ) -> tuple[_Product | None, Outcome, int, float]:
     """Sweeps from a start; no product if what is left is rounding."""
     problem = expansion.problem
@@ -416,9 +420,6 @@ def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(scale.reshape(shape) * found)
 
 
-# --- other problems of the same form ----------------------------------------------------------
-
-
 def minimal_residual(problem: AffineProblem) -> AffineProblem:
     """The normal equations: its Galerkin solution minimises the residual in the K_0^-1 norm.
 
@@ -440,43 +441,3 @@ def minimal_residual(problem: AffineProblem) -> AffineProblem:
             for f, g in zip(problem.factors, problem.source_factors, strict=True)
         ),
     )
-
-
-def projection(
-    known: CanonicalField,
-    space_mass: LinearOperator,
-    inverse_mass: LinearOperator,
-    problem: AffineProblem,
-) -> AffineProblem:
-    """The problem u = known in the norms of a problem: fewer products for the same field.
-
-    space_mass : of the norm in space; inverse_mass : its inverse
-    """
-    sources = tuple(
-        aslinearoperator(space_mass @ known.space[:, [k]]) @ aslinearoperator(known.load[:, [k]].T)
-        for k in range(known.rank)
-    )
-    return replace(
-        problem,
-        terms=(space_mass,),
-        factors=tuple(np.ones((1, len(w))) for w in problem.weights),
-        sources=sources,
-        source_factors=tuple(functions.T for functions in known.parameters),
-        precondition=inverse_mass,
-    )
-
-
-def compress(
-    known: CanonicalField,
-    problem: AffineProblem,
-    space_mass: FloatArray,
-    tolerance: float,
-    max_modes: int | None = None,
-) -> PGDSolution:
-    """A shorter field within ``tolerance`` (relative, in the norms of the coordinates).
-
-    space_mass : ndarray, shape (n,), lumped
-    """
-    mass, inverse = aslinearoperator(diags(space_mass)), aslinearoperator(diags(1.0 / space_mass))
-    rule = PGDRule(max_modes or known.rank, tolerance, max_sweeps=30, sweep_tolerance=1e-3)
-    return solve_pgd(projection(known, mass, inverse, problem), rule)

@@ -36,27 +36,27 @@ class SeparatedField:
         """The first ``rank`` modes."""
         return SeparatedField(self.space[:, :rank], self.load[:, :rank])
 
-    def sorted_by_worth(
+    def sorted_by_norm(
         self, space_mass: np.ndarray, load_mass: np.ndarray | None = None
     ) -> SeparatedField:
-        """The same field with orthogonally mixed modes, of which the first are worth most."""
-        mixing = self.mixing_by_worth(space_mass, load_mass)
+        """The same field with its modes mixed and sorted by :meth:`mixing_by_norm`."""
+        mixing = self.mixing_by_norm(space_mass, load_mass)
         return SeparatedField(self.space @ mixing, self.load @ mixing)
 
-    def mixing_by_worth(
+    def mixing_by_norm(
         self, space_mass: np.ndarray, load_mass: np.ndarray | None = None
     ) -> np.ndarray:
-        """The orthogonal mixing that sorts modes by their worth, shape (rank, rank).
+        """The orthogonal mixing that sorts modes by their weighted L2 norm, shape (rank, rank).
 
-        An orthogonal mixing keeps what orthonormal modes are good for: Y Y^T, and that any
-        leading ones are a Galerkin subspace. It is the Q of B^T R = Q T, with X^T M X = A^T A,
-        Y^T W Y = B^T B and the singular value decomposition A B^T = P S R^T.
+        It is the Q of B^T R = Q T, with X^T M X = A^T A, Y^T W Y = B^T B and the singular value
+        decomposition A B^T = P S R^T. As Q is orthogonal, Y Y^T does not change, and the leading
+        modes still span a Galerkin subspace.
 
         Parameters
         ----------
         space_mass : ndarray, shape (n_dofs,), lumped, M
-        load_mass : ndarray, shape (n_loads,), W; by default 1 / |u|^2 of each load in M, so that
-            relative errors count
+        load_mass : ndarray, shape (n_loads,), W; by default 1 / |u|^2 of each load in M, which
+            makes the norm one of relative errors
         """
         a = _gram_root(self.space, space_mass)
         if load_mass is None:
@@ -64,44 +64,6 @@ class SeparatedField:
         b = _gram_root(self.load, load_mass)
         _, _, right = np.linalg.svd(a @ b.T)
         return np.asarray(np.linalg.qr(b.T @ right.T)[0])
-
-    def norm(self, space_mass: np.ndarray, load_mass: np.ndarray) -> float:
-        """sqrt(sum_ij m_i w_j u_ij^2) with lumped masses, never forming u."""
-        gram_space = self.space.T @ (space_mass[:, None] * self.space)
-        gram_load = self.load.T @ (load_mass[:, None] * self.load)
-        return float(np.sqrt(max((gram_space * gram_load).sum(), 0.0)))
-
-    def compress(
-        self, space_mass: np.ndarray, load_mass: np.ndarray, tolerance: float
-    ) -> SeparatedField:
-        """The shortest field within ``tolerance`` (relative, in :meth:`norm`) of this one.
-
-        This is the singular value decomposition, computed on the two small Gram matrices.
-        """
-        rotation, left, value = optimal_rotation(self, space_mass, load_mass)
-        energy = value**2
-        tail = np.sqrt(np.maximum(energy.sum() - np.cumsum(energy), 0.0) / energy.sum())
-        rank = int(np.argmax(tail <= max(tolerance, 1e-15))) + 1
-        return SeparatedField(self.space @ left[:, :rank], self.load @ rotation[:, :rank])
-
-
-def optimal_rotation(
-    field: SeparatedField, space_mass: np.ndarray, load_mass: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right and left mixing matrices of the weighted singular value decomposition.
-
-    With Gx = X^T M X = A^T A, Gy = Y^T W Y = B^T B and A B^T = P S Q^T, the field equals
-    (X A^-1 P S)(Y B^-1 Q)^T, whose columns are orthogonal in the two masses.
-
-    Returns
-    -------
-    load_mixing, space_mixing : ndarray, shape (rank, rank)
-    singular_values : ndarray, shape (rank,), descending
-    """
-    a = _gram_root(field.space, space_mass)
-    b = _gram_root(field.load, load_mass)
-    left, value, right = np.linalg.svd(a @ b.T)
-    return np.linalg.pinv(b) @ right.T, np.linalg.pinv(a) @ (left * value), value
 
 
 def _gram_root(factor: np.ndarray, mass: np.ndarray) -> np.ndarray:

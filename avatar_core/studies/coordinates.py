@@ -20,7 +20,7 @@ from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
 from avatar_core.geometry.mesh import Regions, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
-from avatar_core.geometry.tumour import read_tumour, share_inside
+from avatar_core.geometry.tumour import read_tumour, volume_fraction_inside
 from avatar_core.offline.certify.combinations import COMBINATIONS, push_errors
 from avatar_core.offline.certify.large_deformation import certify_large
 from avatar_core.offline.large_deformation import (
@@ -35,7 +35,11 @@ from avatar_core.offline.rule import BuildRule, Progress
 from avatar_core.reduction.affine import AffineProblem, Samples
 from avatar_core.reduction.affine_elasticity import affine_problem
 from avatar_core.reduction.coordinates import Coordinate, problem_at
-from avatar_core.reduction.pgd_parametric import PGDRule, minimal_residual, solve_pgd
+from avatar_core.reduction.pgd_parametric import (
+    CanonicalPGDRule,
+    minimal_residual,
+    solve_canonical_pgd,
+)
 from avatar_core.studies.bench.methods import time_steps
 from avatar_core.studies.shapes import DEFAULT_FOLDER, read_liver
 from avatar_core.studies.study import Parts, Study, Value
@@ -133,7 +137,9 @@ def _organ(
     regions = regions_by_rule(mesh)
     inclusion = None
     if tumour is not None:
-        inclusion = Inclusion(share_inside(mesh, read_tumour(tumour, axes=TUMOUR_AXES)), 1.0)
+        inclusion = Inclusion(
+            volume_fraction_inside(mesh, read_tumour(tumour, axes=TUMOUR_AXES)), 1.0
+        )
     material = Material()
     elasticity = Elasticity(mesh, material, regions.clamped, element, inclusion)
     return Organ(surface.name, regions, load_surface(mesh, regions), elasticity)
@@ -205,7 +211,7 @@ def _canonical(
     rows = _parametric(organ, f"{name}, small mesh", coordinates, plan, progress)
     for method, form in (("canonical, Galerkin", problem), ("canonical, minimal residual", None)):
         start = time.process_time()
-        rule = PGDRule(
+        rule = CanonicalPGDRule(
             plan.n_canonical, 1e-4, max_sweeps=4, sweep_tolerance=0.1, solve_tolerance=1e-2
         )
 
@@ -213,7 +219,7 @@ def _canonical(
             progress(method, rank / plan.n_canonical, residual)
 
         affine = minimal_residual(problem) if form is None else form
-        found = solve_pgd(affine, rule, progress=enriched)
+        found = solve_canonical_pgd(affine, rule, progress=enriched)
         seconds = time.process_time() - start
         for rank in sorted({r for r in RANKS if r < found.field.rank} | {found.field.rank}):
             some = canonical_at(found.field.truncate(rank), coordinates)

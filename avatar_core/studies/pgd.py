@@ -27,7 +27,7 @@ from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.near_field import plateau
-from avatar_core.reduction.pgd import ParametricProblem, PGDRule, solve_pgd
+from avatar_core.reduction.pgd import LoadProblem, PGDRule, solve_pgd
 from avatar_core.reduction.pgd_hadamard import solve_hadamard
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.studies.shapes import read_liver
@@ -204,7 +204,7 @@ def _at(case: Case, field: SeparatedField) -> FloatArray:
 
 def _pgd(case: Case, rule: PGDRule, relative: bool) -> SeparatedField:
     weights = 1.0 / case.size**2 if relative else np.ones(len(case.work))
-    problem = ParametricProblem(case.elasticity, case.loads, weights, case.work)
+    problem = LoadProblem(case.elasticity, case.loads, weights, case.work)
     found = solve_pgd(problem, rule)
     return SeparatedField(found.space, found.load)
 
@@ -222,10 +222,10 @@ def _default(case: Case, n_modes: int) -> tuple[SeparatedField, SeparatedField]:
         weights[:] = base * (error / error.mean()) ** 2
         return weights.copy()
 
-    problem = ParametricProblem(case.elasticity, case.loads, base, case.work)
+    problem = LoadProblem(case.elasticity, case.loads, base, case.work)
     found = solve_pgd(problem, PGDRule(n_modes, 1e-12), reweigh=follow_error)
     modes = SeparatedField(case.elasticity.at_vertices(found.space), found.load)
-    return SeparatedField(found.space, found.load), modes.sorted_by_worth(case.mass[:, 0], weights)
+    return SeparatedField(found.space, found.load), modes.sorted_by_norm(case.mass[:, 0], weights)
 
 
 def _summary(rows: list[dict[str, Value]]) -> dict[str, float]:

@@ -15,8 +15,8 @@ class Certificate:
     l2 : |u - u_FE| / |u_FE| over all vertices, mass-weighted, each load and direction
     contact : |C - C_FE|_F / |C_FE|_F of the 3 x 3 compliance of the loaded patch
     force : |F / F_FE - 1| of the normal force for an imposed normal indentation
-    felt : the same as a tip feels it anywhere on the accessible faces, through the compliance that
-        the contact step smooths so that no edge of the mesh is felt
+    tip_force : the same for a tip anywhere on the accessible faces, with the compliance that the
+        contact step uses, smoothed so that the force does not show the edges of the mesh
     vertex_contact_worst : contact error at load positions of the build, on fresh solves
     n_loads : unseen load positions; ``seed`` draws them
     build_cpu_seconds : user + system time of everything, meshing and this certificate included
@@ -31,8 +31,8 @@ class Certificate:
     contact_worst: float
     force_mean: float
     force_worst: float
-    felt_mean: float
-    felt_worst: float
+    tip_force_mean: float
+    tip_force_worst: float
     vertex_contact_worst: float
     n_loads: int
     seed: int

@@ -72,7 +72,7 @@ def galerkin_field(
     load = scipy.linalg.solve_triangular(root, basis.load.T, lower=True).T
     space = scipy.linalg.solve_triangular(root, basis.space.T, lower=True).T
     modes = SeparatedField(space, load)
-    kept = modes.mixing_by_worth(mass)
+    kept = modes.mixing_by_norm(mass)
     if body is None:
         kept = kept[:, :rank]
     else:

@@ -85,6 +85,8 @@ MAX_FILE_BYTES = 4 << 30
 
 _JSON = ("material", "provenance", "convergence", "certificate")
 _JSON_LATER = ("coordinates", "contrast", "large", "accuracy")  # from schema 2.0, the last 2.2
+# What files call fields of the certificate.
+_STORED_AS = {"tip_force_mean": "felt_mean", "tip_force_worst": "felt_worst"}
 
 
 def save_vademecum(vademecum: Vademecum, path: str | Path) -> None:
@@ -255,10 +257,16 @@ def _contrast(stored: Any) -> float | None:
 
 
 def _certificate_attribute(certificate: Certificate | None) -> dict[str, Any] | None:
-    return asdict(replace(certificate, curve=None)) if certificate else None
+    if certificate is None:
+        return None
+    plain = asdict(replace(certificate, curve=None))
+    return {_STORED_AS.get(key, key): value for key, value in plain.items()}
 
 
 def _certificate(stored: Any, curve: Any) -> Certificate | None:
+    if isinstance(stored, dict):
+        fields = {key: name for name, key in _STORED_AS.items()}
+        stored = {fields.get(key, key): value for key, value in stored.items()}
     certificate = of_plain(Certificate | None, stored, "certificate")  # type: ignore[arg-type]
     if certificate is None or curve is None:
         return certificate

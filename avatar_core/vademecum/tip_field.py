@@ -76,10 +76,10 @@ def smoothed(values: np.ndarray, deviation: float, known: np.ndarray | None = No
         once = gaussian_filter(values, deviation, mode="nearest")
         return 2.0 * once - gaussian_filter(once, deviation, mode="nearest")
     mean = values[known].mean()
-    share = np.maximum(gaussian_filter(known.astype(float), deviation), 1e-6)
+    coverage = np.maximum(gaussian_filter(known.astype(float), deviation), 1e-6)
 
     def average(f: np.ndarray) -> np.ndarray:
-        return gaussian_filter(np.where(known, f, 0.0), deviation) / share
+        return gaussian_filter(np.where(known, f, 0.0), deviation) / coverage
 
     once = average(values - mean)
     return mean + np.where(known, 2.0 * once - average(once), 0.0)

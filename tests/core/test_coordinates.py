@@ -17,7 +17,7 @@ from avatar_core.fem.elasticity import Elasticity, Inclusion, Material
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.geometry.tumour import share_inside
+from avatar_core.geometry.tumour import volume_fraction_inside
 from avatar_core.offline.certify.linear import certify
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
@@ -70,7 +70,7 @@ def organ(tumour: SurfaceMesh) -> Vademecum:
 
 @pytest.fixture(scope="module")
 def problem(organ: Vademecum, tumour: SurfaceMesh) -> Elasticity:
-    inclusion = Inclusion(share_inside(organ.mesh, tumour), 1.0)
+    inclusion = Inclusion(volume_fraction_inside(organ.mesh, tumour), 1.0)
     return Elasticity(organ.mesh, Material(), organ.regions.clamped, "P2", inclusion)
 
 
@@ -147,7 +147,7 @@ def test_an_inclusion_that_is_everything_scales_the_stiffness(problem: Elasticit
 
 
 def test_the_share_inside_a_ball_is_its_volume(organ: Vademecum, tumour: SurfaceMesh) -> None:
-    share = share_inside(organ.mesh, tumour)
+    share = volume_fraction_inside(organ.mesh, tumour)
     assert share.min() >= 0.0
     assert share.max() <= 1.0
     assert share @ organ.mesh.tet_volumes == pytest.approx(tumour.volume, rel=0.03)
@@ -339,7 +339,7 @@ def test_a_tumour_elsewhere_or_everywhere_is_refused(
     organ: Vademecum, where: float, radius: float, reason: str
 ) -> None:
     with pytest.raises(SurfaceError, match=reason):
-        share_inside(organ.mesh, ball(np.full(3, where), radius))
+        volume_fraction_inside(organ.mesh, ball(np.full(3, where), radius))
 
 
 def test_an_incompressible_organ_with_a_tumour_is_refused(organ: Vademecum) -> None:

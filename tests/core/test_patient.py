@@ -26,8 +26,8 @@ from avatar_core.reduction.galerkin import (
     GalerkinBasis,
     ReductionRule,
     compact_response,
-    missing_blocks,
     reduce,
+    residual_compliance_blocks,
     solve_probes,
 )
 from avatar_core.shapes.registration import (
@@ -38,7 +38,7 @@ from avatar_core.shapes.registration import (
 )
 
 N_BASE = 5
-ROOMY = ReductionRule(n_start=20, n_block=6, n_probes=8, largest_share=0.6)
+ROOMY = ReductionRule(n_start=20, n_block=6, n_probes=8, max_solution_fraction=0.6)
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def test_estimate_brackets_the_error_and_the_tolerance_is_met(case: Case) -> Non
 
 
 def test_a_tolerance_out_of_reach_stops_at_the_share_and_says_so(case: Case) -> None:
-    rule = replace(ROOMY, largest_share=0.15)
+    rule = replace(ROOMY, max_solution_fraction=0.15)
     found = reduce(
         case.problem.elasticity,
         case.loads,
@@ -209,7 +209,9 @@ def test_missing_compliance_is_positive_and_makes_contact_better(case: Case) -> 
         ROOMY,
     )
     loads = case.problem.loads
-    blocks = missing_blocks(found.response.missing, found.support, loads, 4 * loads.patch_radius)
+    blocks = residual_compliance_blocks(
+        found.response.residual_compliance, found.support, loads, 4 * loads.patch_radius
+    )
     dense = np.hstack(
         [
             blocks.combined(np.array([j]), np.ones(1), loads.n_positions)

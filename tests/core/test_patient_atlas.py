@@ -67,7 +67,7 @@ def file(atlas: Atlas, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_responses_survive_the_file_bit_for_bit(atlas: Atlas, file: Path) -> None:
     for one, other in zip(atlas.anatomies, load_atlas(file).anatomies, strict=True):
         assert one.response is not None and other.response is not None
-        for key in ("space", "load", "missing"):
+        for key in ("space", "load", "residual_compliance"):
             assert np.array_equal(getattr(one.response, key), getattr(other.response, key))
 
 
@@ -141,7 +141,7 @@ def test_a_build_can_be_stopped_in_every_stage(
 def test_the_study_measures_each_fidelity_against_all_solutions(
     atlas: Atlas, livers: list[Path]
 ) -> None:
-    options = replace(QUICK, reduction=ReductionRule(largest_share=0.6))
+    options = replace(QUICK, reduction=ReductionRule(max_solution_fraction=0.6))
     found = transport([read_surface(livers[1])], base_of(atlas), options=options)
     (row,) = found.rows
     assert row.name == "liver1" and row.solved_solutions == 3 * row.n_positions

@@ -8,13 +8,13 @@ import scipy.sparse as sp
 
 from avatar_core.errors import ConvergenceError
 from avatar_core.fem.elasticity import Elasticity
-from avatar_core.reduction.pgd import EnrichmentStatus, ParametricProblem, PGDRule, solve_pgd
+from avatar_core.reduction.pgd import EnrichmentStatus, LoadProblem, PGDRule, solve_pgd
 from avatar_core.reduction.separated import SeparatedField
 
 
 def problem_of_rank(
     elasticity: Elasticity, rank: int, n_loads: int = 30, seed: int = 0
-) -> tuple[ParametricProblem, np.ndarray]:
+) -> tuple[LoadProblem, np.ndarray]:
     """Loads that are combinations of ``rank`` forces, and their exact solutions."""
     rng = np.random.default_rng(seed)
     force = rng.standard_normal((3 * elasticity.n_nodes, rank))
@@ -22,7 +22,7 @@ def problem_of_rank(
     loads = force @ (rng.standard_normal((rank, n_loads)) * 0.5 ** np.arange(rank)[:, None])
     exact = elasticity.solve(loads)
     energy = np.einsum("ij,ij->j", loads, exact)
-    return ParametricProblem(elasticity, sp.csr_matrix(loads), 1.0 / energy, energy), exact
+    return LoadProblem(elasticity, sp.csr_matrix(loads), 1.0 / energy, energy), exact
 
 
 @pytest.mark.parametrize("block", [1, 4])
@@ -78,23 +78,6 @@ def test_enrichment_beyond_rounding_stops(box_elasticity: Elasticity) -> None:
 
 def test_zero_load_is_refused(box_elasticity: Elasticity) -> None:
     problem, _ = problem_of_rank(box_elasticity, 2, n_loads=3)
-    zero = ParametricProblem(box_elasticity, problem.loads * 0.0, problem.weights, np.zeros(3))
+    zero = LoadProblem(box_elasticity, problem.loads * 0.0, problem.weights, np.zeros(3))
     with pytest.raises(ConvergenceError, match="zero"):
         solve_pgd(zero, PGDRule(5, 1e-3))
-
-
-def test_norm_and_compression_equal_the_full_matrix() -> None:
-    rng = np.random.default_rng(5)
-    m, w = rng.uniform(0.5, 2.0, 40), rng.uniform(0.5, 2.0, 25)
-    field = SeparatedField(
-        rng.standard_normal((40, 6)), rng.standard_normal((25, 6)) * 10.0 ** -np.arange(6)
-    )
-    full = field.evaluate()
-    weighted = np.sqrt(m)[:, None] * full * np.sqrt(w)
-    assert field.norm(m, w) == pytest.approx(np.linalg.norm(weighted), rel=1e-12)
-    short = field.compress(m, w, 1e-2)
-    value = np.linalg.svd(weighted, compute_uv=False)
-    tail = np.sqrt(np.cumsum(value[::-1] ** 2)[::-1] / (value**2).sum())
-    assert short.rank == int(np.argmax(np.append(tail, 0.0) <= 1e-2))
-    error = np.sqrt(m)[:, None] * (short.evaluate() - full) * np.sqrt(w)
-    assert np.linalg.norm(error) <= 1e-2 * np.linalg.norm(weighted)

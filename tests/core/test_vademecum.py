@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -67,6 +68,19 @@ def test_file_gives_back_the_same_vademecum(phantom_vademecum: Vademecum, tmp_pa
             np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
     assert v.nbytes == (tmp_path / "a.h5").stat().st_size
     assert len(v.id) == 64
+
+
+def test_files_keep_their_names_for_the_force_on_a_tip(
+    phantom_vademecum: Vademecum, tmp_path: Path
+) -> None:
+    """Files of schema 2.2 call them felt_mean and felt_worst, those written before included."""
+    save_vademecum(phantom_vademecum, tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r") as file:
+        stored = json.loads(file.attrs["certificate"])
+    c = load_vademecum(tmp_path / "a.h5").certificate
+    assert c is not None
+    assert (stored["felt_mean"], stored["felt_worst"]) == (c.tip_force_mean, c.tip_force_worst)
+    assert not [name for name in stored if name.startswith("tip_force")]
 
 
 @pytest.mark.parametrize("at", [0.02, 0.3, 0.7, 0.99])

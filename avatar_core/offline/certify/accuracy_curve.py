@@ -20,7 +20,7 @@ from avatar_core.vademecum.accuracy import (
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
-SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0)  # of all modes
+MODE_FRACTIONS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0)  # of all modes
 NEAR = (0.0, 0.5, 1.0)
 SHOWN: tuple[Cloud, ...] = ("surface", "volume")
 
@@ -39,7 +39,7 @@ def details_of(rank: int) -> tuple[Detail, ...]:
 
 def mode_levels(rank: int) -> tuple[int, ...]:
     """Numbers of modes, ascending, all at the end."""
-    return tuple(sorted({max(1, round(share * rank)) for share in SHARES}))
+    return tuple(sorted({max(1, round(fraction * rank)) for fraction in MODE_FRACTIONS}))
 
 
 class DisplayErrors:
@@ -105,12 +105,12 @@ def curve_of(vademecum: Vademecum, shown: np.ndarray, force: np.ndarray) -> Accu
     force : ndarray, shape (m,), of the normal force
     """
     details = details_of(vademecum.far.rank)
-    felt = upper_quantile(force)
+    force_error = upper_quantile(force)
     n_loads = shown.shape[1] // 3
     errors = [*(upper_quantile(row, n_independent=n_loads) for row in shown), float("nan")]
     sizes = _sizes(vademecum, details)
     points = (
-        CurvePoint(detail, error, felt, size)
+        CurvePoint(detail, error, force_error, size)
         for detail, error, size in zip(details, errors, sizes, strict=True)
     )
     return AccuracyCurve(tuple(points), shown.shape[1])

@@ -24,7 +24,7 @@ from avatar_core.vademecum.large_deformation import powers
 from avatar_core.vademecum.model import Vademecum
 
 COMBINATIONS = ("oblique", "two tools", "gravity")
-SHARES = (0.25, 0.5, 0.75)  # of the depth aimed at: 5, 10 and 15 mm of 20
+DEPTH_FRACTIONS = (0.25, 0.5, 0.75)  # of the depth aimed at: 5, 10 and 15 mm of 20
 OBLIQUE = np.radians(30.0)
 APART = 40e-3  # [m]
 DENSITY, GRAVITY = 1060.0, 9.81  # of liver [kg/m^3], [m/s^2]
@@ -54,21 +54,21 @@ def push_errors(
     n_sites: int,
     seed: int = 0,
     beyond: bool = False,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[CombinedRow]:
     """Errors of every combination, site and depth that has an equilibrium.
 
     depths : increasing [m]
     beyond : also where the vademecum says that a push leaves its stored range
-    progress : called with the share that is done
+    progress : called with the fraction that is done
     """
     rng = np.random.default_rng(seed)
     surface = vademecum.surface
     rows: list[CombinedRow] = []
     done, whole = 0, n_sites * len(COMBINATIONS)
 
-    def pushed(share: float) -> None:
-        progress((done + share) / whole)
+    def pushed(fraction: float) -> None:
+        progress((done + fraction) / whole)
 
     for triangle in rng.permutation(len(surface.corners))[:n_sites]:
         for name, combined in _at_site(vademecum, problem, int(triangle), rng).items():
@@ -105,7 +105,7 @@ class _Combined:
     preload : ndarray, shape (3 n_nodes,), or None
     compliance : ndarray, shape (m, m), C
     own : ndarray, shape (m,), gamma, of each tip along its normal; bends : h of each
-    share : s, of the force that is normal
+    normal_fraction : s, of the force that is normal
     """
 
     loads: FloatArray
@@ -113,14 +113,14 @@ class _Combined:
     compliance: FloatArray
     own: FloatArray
     bends: tuple[_Bend, ...]
-    share: float = 1.0
+    normal_fraction: float = 1.0
     preload: FloatArray | None = None
 
     def bent(self, force: FloatArray) -> FloatArray:
         """d n."""
-        a = self.share * self.own * force
+        a = self.normal_fraction * self.own * force
         added = [bend(x) for bend, x in zip(self.bends, a, strict=True)]
-        return self.compliance @ force + self.share * np.array(added)
+        return self.compliance @ force + self.normal_fraction * np.array(added)
 
     def forces(self, depth: float) -> FloatArray:
         """Those that reach a depth, by Newton's method from the linear ones [N]."""
@@ -142,7 +142,7 @@ class _Combined:
 
     def reaches(self, depth: float) -> bool:
         """Whether no tip goes beyond its reach."""
-        a = self.share * self.own * self.forces(depth)
+        a = self.normal_fraction * self.own * self.forces(depth)
         return all(x <= bend.reach for bend, x in zip(self.bends, a, strict=True))
 
 
@@ -193,7 +193,7 @@ def _oblique(v: Vademecum, site: _Site, angle: float) -> _Combined:
         compliance=np.array([[along @ own @ along]]),
         own=np.array([site.inward @ own @ site.inward]),
         bends=(site.bend(v),),
-        share=float(np.cos(OBLIQUE)),
+        normal_fraction=float(np.cos(OBLIQUE)),
     )
 
 

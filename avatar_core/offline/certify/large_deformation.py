@@ -47,11 +47,11 @@ def certify_large(
     n_sites: int = 12,
     max_push: float = 20e-3,
     seed: int = 0,
-    progress: Callable[[float, float], None] = lambda share, error: None,
+    progress: Callable[[float, float], None] = lambda fraction, error: None,
 ) -> tuple[LargeCertificate, tuple[LargeRow, ...]]:
     """Push at random centroids to the depths 1/4, 1/2, 3/4 and 1 of what is stored there.
 
-    progress : called with the share that is done and the mean error so far
+    progress : called with the fraction that is done and the mean error so far
 
     Random factors of 0.9 to 1 keep the depths from being round.
     """
@@ -64,8 +64,8 @@ def certify_large(
     for done, triangle in enumerate(sites):
         depths = max_push * np.array([0.25, 0.5, 0.75, 1.0]) * rng.uniform(0.9, 1.0, 4)
 
-        def pushed(share: float, done: int = done, error: float = error) -> None:
-            progress((done + share) / len(sites), error)
+        def pushed(fraction: float, done: int = done, error: float = error) -> None:
+            progress((done + fraction) / len(sites), error)
 
         found, lost = push_rows(vademecum, problem, int(triangle), depths, progress=pushed)
         rows += found
@@ -93,12 +93,12 @@ def push_rows(
     triangle: int,
     depths: FloatArray,
     barycentric: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3),
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> tuple[list[LargeRow], bool]:
     """Errors at a point of one face; whether equilibrium was lost within the stored range.
 
     barycentric : of the point; the centroid by default
-    progress : called with the share of the last depth that is reached
+    progress : called with the fraction of the last depth that is reached
     """
     surface = vademecum.surface
     place = np.array([barycentric])

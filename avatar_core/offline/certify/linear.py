@@ -1,7 +1,7 @@
 """How wrong a vademecum is, on loads that it has never seen, and what it cost.
 
 The truth is the full finite element solution on the same mesh. Loads are patches centred at face
-centroids, which no part of the build uses, in three directions; what a tip feels is measured
+centroids, which no part of the build uses, in three directions. The force on a tip is compared
 anywhere on the faces.
 """
 
@@ -54,15 +54,15 @@ def certify(
 class UnseenErrors:
     """Relative errors, a row for each unseen load; see :class:`Certificate`.
 
-    l2 (n, 3); contact, force, felt (n,); smoothing (n,), what smoothing changed of the compliance
-    that is felt; shown (n_details, 3 n), of the displacement as it would be shown; vertex_contact
-    (m,), at load positions of the build
+    l2 (n, 3); contact, force, tip_force (n,); smoothing (n,), relative change of the compliance
+    under a tip by smoothing; shown (n_details, 3 n), of the displacement as it would be shown;
+    vertex_contact (m,), at load positions of the build
     """
 
     l2: np.ndarray
     contact: np.ndarray
     force: np.ndarray
-    felt: np.ndarray
+    tip_force: np.ndarray
     smoothing: np.ndarray
     shown: np.ndarray
     vertex_contact: np.ndarray
@@ -94,34 +94,34 @@ def measured(
             force.append(abs((n @ exact @ n) / (n @ estimate @ n) - 1.0))
         if progress is not None:
             progress(len(l2))
-    felt, smoothing = _felt(vademecum, elasticity, len(chosen), seed)
+    tip_force, smoothing = _tip_force(vademecum, elasticity, len(chosen), seed)
     return UnseenErrors(
         np.array(l2),
         np.array(contact),
         np.array(force),
-        felt,
+        tip_force,
         smoothing,
         np.concatenate(shown, axis=1),
         _vertex_contact(vademecum, elasticity, rng),
     )
 
 
-def _felt(
+def _tip_force(
     vademecum: Vademecum, elasticity: Elasticity, n: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Error of the force on tips anywhere, and what smoothing changed of the compliance, (n,)."""
+    """Error of the force on tips anywhere, and relative change by smoothing, each (n,)."""
     contacts = draw_contacts(vademecum, n, seed)
     surface, field = vademecum.surface, vademecum.tip_field
     load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
     response = make_tip_response(surface, field, load, vademecum.contact_near, 0.0, HEIGHTS[1])
     slope = np.zeros(3)
-    felt, smoothing = (
+    compliance, smoothing = (
         np.array(
             [evaluate(grid, field.origin, field.spacing[0], p, slope, np.nan) for p in contacts.tip]
         )
         for grid in (response.self_compliance, response.smoothing)
     )
-    return np.abs(contacts.true_compliance(surface, elasticity) / felt - 1.0), smoothing
+    return np.abs(contacts.true_compliance(surface, elasticity) / compliance - 1.0), smoothing
 
 
 def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: int) -> Certificate:
@@ -132,7 +132,8 @@ def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: in
             [getattr(part, name) for part in parts], axis=-1 if name == "shown" else 0
         )
 
-    l2, contact, force, felt = (all_of(name) for name in ("l2", "contact", "force", "felt"))
+    names = ("l2", "contact", "force", "tip_force")
+    l2, contact, force, tip_force = (all_of(name) for name in names)
     return Certificate(
         l2_mean=float(l2.mean()),
         l2_worst=float(l2.max()),
@@ -140,14 +141,14 @@ def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: in
         contact_worst=float(contact.max()),
         force_mean=float(force.mean()),
         force_worst=float(force.max()),
-        felt_mean=float(felt.mean()),
-        felt_worst=float(felt.max()),
+        tip_force_mean=float(tip_force.mean()),
+        tip_force_worst=float(tip_force.max()),
         vertex_contact_worst=float(all_of("vertex_contact").max()),
         n_loads=len(contact),
         seed=seed,
         modes=vademecum.far.rank,
-        force_error=calibrated(all_of("smoothing"), felt),
-        curve=curve_of(vademecum, all_of("shown"), felt),
+        force_error=calibrated(all_of("smoothing"), tip_force),
+        curve=curve_of(vademecum, all_of("shown"), tip_force),
     )
 
 

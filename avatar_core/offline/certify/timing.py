@@ -31,7 +31,7 @@ def timed(
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
     halves: bool = False,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> AccuracyCurve:
     """The same curve with the processor's time of steps on this machine, all tools 5 mm deep.
 
@@ -47,7 +47,7 @@ def timed(
         model = make_model(layout, halves)
         pairs += [(model, point) for point in group]
         progress(0.5 * len(pairs) / len(curve.points))
-    points = _timed(pairs, paths, lambda share: progress(0.5 + 0.5 * share))
+    points = _timed(pairs, paths, lambda fraction: progress(0.5 + 0.5 * fraction))
     return replace(curve, points=tuple(points), machine=processor())
 
 
@@ -55,7 +55,7 @@ def timed_points(
     model: ContactModel,
     points: Sequence[CurvePoint],
     paths: np.ndarray,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[CurvePoint]:
     """Points that differ in modes alone, timed on a model that has all of these."""
     found = _timed([(model, point) for point in points], paths, progress)
@@ -75,7 +75,7 @@ def slides(vademecum: Vademecum, tip_radii: tuple[float, ...]) -> np.ndarray:
 
 
 def _same_arrays(curve: AccuracyCurve) -> list[list[CurvePoint]]:
-    """Points by what they share but for the number of modes."""
+    """Points grouped by everything but the number of modes."""
     groups: dict[Detail, list[CurvePoint]] = {}
     for point in curve.points:
         groups.setdefault(replace(point.detail, modes=0), []).append(point)
@@ -85,7 +85,7 @@ def _same_arrays(curve: AccuracyCurve) -> list[list[CurvePoint]]:
 def _timed(
     pairs: Sequence[tuple[ContactModel, CurvePoint]],
     paths: np.ndarray,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[CurvePoint]:
     """Each point with the median over rounds of its p50 and p99.
 

@@ -104,7 +104,7 @@ def test_responses_are_kept_and_must_fit(atlas: Atlas, tmp_path: Path) -> None:
     kept = loaded["liver3"].response
     assert kept is not None and loaded["liver2"].response is None
     assert kept.space.dtype == np.float32 and np.array_equal(kept.space, space)
-    assert np.array_equal(kept.load, load) and not kept.missing.any()
+    assert np.array_equal(kept.load, load) and not kept.residual_compliance.any()
     assert (kept.material, kept.element, kept.patch_radius) == (Material(), "P2", 0.012)
     with pytest.raises(AtlasError, match="liver1: its arrays do not fit"):
         atlas.with_response("liver1", replace(response, load=load[:, :3]))
