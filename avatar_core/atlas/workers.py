@@ -18,12 +18,12 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from avatar_core.atlas.anatomy import AtlasError
+from avatar_core.common.processes import thread_limits
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 CONNECT_SECONDS = 10  # for a scheduler to answer
-_THREADS = ("OMP", "OPENBLAS", "MKL", "RAYON", "IGL")
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,9 @@ def _follow_parent() -> None:
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Processes started meanwhile use one thread: cores are shared among them already."""
-    names = [f"{library}_NUM_THREADS" for library in _THREADS]
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
+    limits = thread_limits()
+    before = {name: os.environ.get(name) for name in limits}
+    os.environ.update(limits)
     try:
         yield
     finally:

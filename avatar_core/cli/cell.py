@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from avatar_core.cli.bench import require_ros
+from avatar_core.common.processes import ModuleProcess
 from avatar_core.errors import AvatarError
 
 _AGAIN = 1.0  # until a cell that does not end is told again [s]
@@ -93,12 +94,17 @@ def run_page(vademecum: Path, host: str, port: int) -> None:
         "host": host,
         "port": str(port),
     }
-    command = [sys.executable, "-m", "avatar_ros.nodes.cell", "--ui"]
-    command += [word for name, value in given.items() for word in (f"--{name}", value)]
+    options = [word for name, value in given.items() for word in (f"--{name}", value)]
     sys.stdout.flush()
     told = False
     # Deaf until it listens for itself: half started, it would end with a traceback.
-    with subprocess.Popen(command, cwd="/", preexec_fn=_ignore_interrupts) as process:
+    with ModuleProcess(
+        "avatar_ros.nodes.cell",
+        "--ui",
+        *options,
+        start_new_session=False,
+        preexec_fn=_ignore_interrupts,
+    ) as process:
         while process.poll() is None:
             try:
                 if told:  # a terminal told it as well; told twice, it ends once

@@ -26,6 +26,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+from avatar_core.common.processes import ModuleProcess
 from avatar_core.errors import AvatarError, one_line
 
 P = ParamSpec("P")
@@ -34,7 +35,6 @@ R = TypeVar("R")
 MAX_BYTES = 2 << 30
 RETURNED, RAISED, FAILED = "returned", "raised", "failed"  # with a value, our error, a line
 _START_SECONDS = 60.0  # to import what is called, on a machine that has much else to do
-_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA")  # whose threads would count as memory
 
 
 class ConfinedError(AvatarError):
@@ -55,7 +55,7 @@ class Confined:
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
         self._max_bytes = max_bytes
         self._lock = threading.Lock()
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ModuleProcess | None = None
         self._line: Connection | None = None
 
     @property
@@ -111,14 +111,12 @@ class Confined:
     def _start(self) -> None:
         ours, theirs = socket.socketpair()
         with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "avatar_core.common.confined", str(self._max_bytes)],
+            self._process = ModuleProcess(
+                "avatar_core.common.confined",
+                str(self._max_bytes),  # of which each thread would take some
                 stdin=theirs.fileno(),
-                stdout=subprocess.DEVNULL,  # libraries talk there; the error that is raised counts
+                stdout=subprocess.DEVNULL,  # libraries print there; the error that is raised counts
                 stderr=subprocess.DEVNULL,
-                env=os.environ | {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES},
-                cwd="/",  # -m would let whatever lies where this process was started stand first
-                start_new_session=True,  # Ctrl-C is for this process, which then ends that one
             )
         self._line = Connection(ours.detach())
 

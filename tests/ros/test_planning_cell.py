@@ -17,7 +17,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.framework import qos
-from avatar_ros.nodes.cell import commands
+from avatar_ros.nodes.cell import node_arguments
 
 from avatar_ros.msg import ContactState
 from tests.ros.conftest import START_TIMEOUT
@@ -77,10 +77,10 @@ def test_a_node_that_ends_ends_the_cell_and_is_named(
 
 def test_page_and_patients_run_only_if_asked_for() -> None:
     always = {"vademecum_loader", "contact"}
-    assert set(commands(None, {})) == always
-    assert set(commands(None, {"atlas": "atlas.h5"})) == {*always, "patient_interpolation"}
-    kept = commands(None, {"state_dir": "/kept"})
+    assert set(node_arguments(None, {})) == always
+    assert set(node_arguments(None, {"atlas": "atlas.h5"})) == {*always, "patient_interpolation"}
+    kept = node_arguments(None, {"state_dir": "/kept"})
     assert all(kept[node][-1] == "state_dir:=/kept" for node in always)
-    page = commands(None, {"ui": "yes", "port": "8081"})
+    page = node_arguments(None, {"ui": "yes", "port": "8081"})
     assert set(page) == {*always, "planning_ui"}
     assert page["planning_ui"][-1] == "port:=8081"

@@ -25,12 +25,12 @@ from typing import Any
 
 import numpy as np
 
+from avatar_core.common.processes import ModuleProcess, thread_limits
 from avatar_core.errors import AvatarError
 from avatar_ros.bench import footprint
 from avatar_ros.bench.footprint import Growth, footprints
 from avatar_ros.bench.report import CellMeasurement, CellReport, Times
 from avatar_ros.bench.scripted_tool import READY, Felt
-from avatar_ros.framework import realtime
 
 PERIOD = 1e-3  # [s]
 ON_TIME = 1.5e-3  # longest period that is on time [s]
@@ -191,12 +191,17 @@ def _evaluate(
 
 def isolated_environment() -> dict[str, str]:
     """An environment with a DDS domain of its own, on this machine only."""
-    environment = realtime.single_threaded_libraries(dict(os.environ))
-    return environment | {
-        "ROS_DOMAIN_ID": str(_DOMAINS[(os.getpid() * 37 + time.monotonic_ns()) % len(_DOMAINS)]),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "PYTHONUNBUFFERED": "1",
-    }
+    return (
+        os.environ
+        | thread_limits()
+        | {
+            "ROS_DOMAIN_ID": str(
+                _DOMAINS[(os.getpid() * 37 + time.monotonic_ns()) % len(_DOMAINS)]
+            ),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "PYTHONUNBUFFERED": "1",
+        }
+    )
 
 
 @contextmanager
@@ -225,16 +230,17 @@ def cell(
         raise CellError(f"contact and loader ended with codes {codes} instead of 0")
 
 
-class Module(subprocess.Popen[str]):
+class Module(ModuleProcess):
     """A node, or a module named with its room, as a process; its standard error is kept."""
 
     def __init__(self, name: str, arguments: list[str], environment: dict[str, str]) -> None:
         self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115, closed with the object
         module = name if "." in name else f"nodes.{name}"
         super().__init__(
-            [sys.executable, "-m", f"avatar_ros.{module}", *arguments],
-            cwd="/",  # -m would let a checkout there stand before what is installed
-            env=environment,
+            f"avatar_ros.{module}",
+            *arguments,
+            environment=environment,
+            start_new_session=False,
             stdout=subprocess.PIPE,
             stderr=self._said,
             text=True,
@@ -250,15 +256,9 @@ class Module(subprocess.Popen[str]):
         lines = [line.strip() for line in self.said().splitlines() if line.strip()]
         return lines[-1] if lines else f"it said nothing, exit code {self.poll()}"
 
-    def finish(self) -> int:
+    def finish(self, seconds: float = _STOP_TIMEOUT, number: int = signal.SIGINT) -> int:
         """End it as Ctrl-C would; returns its exit code."""
-        if self.poll() is None:
-            self.send_signal(signal.SIGINT)
-        try:
-            return self.wait(_STOP_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            return self.wait()
+        return super().finish(seconds, number)
 
 
 def main() -> int:

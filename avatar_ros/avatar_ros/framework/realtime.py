@@ -107,12 +107,6 @@ def calm_interpreter() -> None:
     sys.setswitchinterval(_THREAD_SWITCH_INTERVAL)
 
 
-def single_threaded_libraries(environment: dict[str, str]) -> dict[str, str]:
-    """``environment`` with numerical libraries told not to start threads of their own."""
-    names = ("OMP", "OPENBLAS", "MKL", "NUMBA")
-    return environment | {f"{name}_NUM_THREADS": "1" for name in names}
-
-
 def sleep_until(deadline: int) -> None:
     """Sleep until ``time.monotonic_ns()`` reaches ``deadline`` [ns]; at once if it has passed."""
     when = _Timespec(deadline // 1_000_000_000, deadline % 1_000_000_000)

@@ -12,22 +12,20 @@ import json
 import os
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
-from typing import Any
 
 import numpy as np
 
+from avatar_core.common.processes import ModuleProcess
 from avatar_core.errors import AvatarError
 
 _LATENCY = 0.05  # longest until a cancellation is noticed [s]
 _REPEAT = 0.5  # a stage is told again, for whoever did not listen yet [s]
 _STOP_TIMEOUT = 5.0  # for writing a file, which is not interrupted [s]
-_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA", "RAYON", "IGL")
 
 
 class BuildError(AvatarError):
@@ -243,16 +241,16 @@ class PatientBuilder:
     def _start(self) -> None:
         ours, theirs = socket.socketpair()
         with theirs:
-            self._process = _process(self._rules, self._threads, theirs)
+            self._process = ModuleProcess(
+                "avatar_ros.patients.worker",
+                json.dumps(asdict(self._rules)),
+                n_threads=self._threads,
+                stdin=theirs.fileno(),
+            )
         self._notes = Connection(ours.detach())
 
     def _end(self) -> None:
-        self._process.terminate()
-        try:
-            self._process.wait(_STOP_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._process.finish(_STOP_TIMEOUT)
         with contextlib.suppress(OSError):
             self._notes.close()
 
@@ -263,14 +261,3 @@ class PatientBuilder:
         except subprocess.TimeoutExpired:
             return "it does not answer"
         return f"signal {-code}" if code < 0 else f"exit code {code}"
-
-
-def _process(rules: Rules, threads: int, theirs: socket.socket) -> subprocess.Popen[bytes]:
-    limits: dict[str, Any] = {f"{name}_NUM_THREADS": str(threads) for name in _LIBRARIES}
-    return subprocess.Popen(
-        [sys.executable, "-m", "avatar_ros.patients.worker", json.dumps(asdict(rules))],
-        stdin=theirs.fileno(),
-        env={**os.environ, **limits},
-        cwd="/",  # -m would let whatever lies where the node was started stand first
-        start_new_session=True,  # Ctrl-C is for the node, which then ends this one
-    )

@@ -17,20 +17,18 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import socket
-import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
 
+from avatar_core.common.processes import ModuleProcess
 from avatar_core.errors import one_line
-from avatar_ros.framework import realtime
 from avatar_ros.prepare.orders import PACKET, Change, Order, Prepared
 from avatar_ros.prepare.shared_arrays import map_shared
 
+_PREPARER = "avatar_ros.prepare.receiver"
 _RESTART_DELAY = 1.0  # [s]
 _STOP_TIMEOUT = 1.0  # [s]
 
@@ -71,7 +69,7 @@ class Handover:
         self._waiting: dict[str, tuple[Change, Answer]] = {}  # by kind
         self._asked: Answer | None = None
         self._number = 0
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ModuleProcess | None = None
         self._thread = threading.Thread(target=self._supervise, name="handover", daemon=True)
         self._thread.start()
 
@@ -116,7 +114,7 @@ class Handover:
         self._stop.set()
         process = self._process
         if process is not None:
-            _end(process)
+            process.finish(_STOP_TIMEOUT)
         self._thread.join(_STOP_TIMEOUT)
 
     def _supervise(self) -> None:
@@ -125,7 +123,7 @@ class Handover:
             with ours:
                 with theirs:
                     ours.send(json.dumps(asdict(self._order)).encode())
-                    self._process = _start(theirs)
+                    self._process = ModuleProcess(_PREPARER, stdin=theirs.fileno())
                     with self._lock:
                         self._line = ours
                 self._pass_on()
@@ -134,7 +132,7 @@ class Handover:
                 with self._lock:
                     self._line = None
                     answer, self._asked = self._asked, None
-            _end(self._process)
+            self._process.finish(_STOP_TIMEOUT)
             if answer is not None:  # not tried again: it may be what ended the process
                 answer(None, "the process that prepares models ended; ask again")
             if not self._stop.is_set():
@@ -187,23 +185,3 @@ def _prepared(note: dict[str, Any], handle: int) -> Prepared:
         cloud_divisor=note["cloud_divisor"],
         curve=note["curve"],
     )
-
-
-def _start(theirs: socket.socket) -> subprocess.Popen[bytes]:
-    environment = realtime.single_threaded_libraries(dict(os.environ))
-    return subprocess.Popen(
-        [sys.executable, "-m", "avatar_ros.prepare.receiver"],
-        stdin=theirs.fileno(),
-        env=environment,
-        cwd="/",  # -m would let whatever lies where the node was started stand first
-        start_new_session=True,  # Ctrl-C is for the node, which then ends this one
-    )
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.terminate()
-    try:
-        process.wait(_STOP_TIMEOUT)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()

@@ -10,12 +10,11 @@ from __future__ import annotations
 import mmap
 import os
 import signal
-import subprocess
-import sys
 from functools import partial
 
 import numpy as np
 
+from avatar_core.common.processes import ModuleProcess
 from avatar_ros.framework import realtime
 
 SECONDS = 600  # of a recording, at most
@@ -79,18 +78,17 @@ class HandProcess:
 
     def __init__(self, line: HandLine) -> None:
         self._line = line
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ModuleProcess | None = None
 
     def keep(self, tool: str, frame_id: str) -> None:
         """Start it, if it does not run; the memory says where the tool is."""
         if self._process is not None and self._process.poll() is None:
             return
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "avatar_ros.ui.tool_driver", tool, frame_id],
+        self._process = ModuleProcess(
+            "avatar_ros.ui.tool_driver",
+            tool,
+            frame_id,
             stdin=self._line.handle,
-            env=realtime.single_threaded_libraries(dict(os.environ)),
-            cwd="/",  # -m would let whatever lies where the node was started stand first
-            start_new_session=True,  # Ctrl-C is for the node, which then ends this one
             preexec_fn=partial(realtime.die_with_parent, signal.SIGINT),
         )
 

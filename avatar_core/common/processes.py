@@ -1,0 +1,53 @@
+"""Modules of this project as processes of their own: where they start, with how many threads."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA", "RAYON", "IGL")
+
+
+def thread_limits(n_threads: int = 1) -> dict[str, str]:
+    """Environment variables that limit the threads of each numerical library."""
+    return {f"{library}_NUM_THREADS": str(n_threads) for library in _LIBRARIES}
+
+
+class ModuleProcess(subprocess.Popen[Any]):
+    """``python -m MODULE ARGUMENTS``, with numerical libraries that share no core by default.
+
+    It runs in a session of its own: Ctrl-C reaches only the process that started it, which then
+    ends it. Its directory is ``/``, because ``-m`` prefers what lies in the current directory to
+    what is installed.
+
+    environment : None for that of this process; options : of ``subprocess.Popen``
+    """
+
+    def __init__(
+        self,
+        module: str,
+        *arguments: str,
+        n_threads: int = 1,
+        environment: Mapping[str, str] | None = None,
+        **options: Any,
+    ) -> None:
+        inherited = os.environ if environment is None else environment
+        super().__init__(
+            [sys.executable, "-m", module, *arguments],
+            cwd="/",
+            env={**inherited, **thread_limits(n_threads)},
+            **({"start_new_session": True} | options),
+        )
+
+    def finish(self, seconds: float, number: int = signal.SIGTERM) -> int:
+        """Send a signal, and kill the process if it does not end in time; returns its exit code."""
+        self.send_signal(number)  # does nothing to a process that has ended
+        try:
+            return self.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return self.wait()
