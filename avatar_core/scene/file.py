@@ -49,7 +49,7 @@ def shipped_scenes() -> dict[str, Path]:
 
     They lie beside the code, in its repository, or below the prefix that it is installed in.
     """
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     installed = [prefix / "share" / "avatar_ros" / SHIPPED for prefix in package.parents]
     for folder in (package.parent / SHIPPED, *installed):
         if folder.is_dir():
