@@ -17,7 +17,7 @@ EMPTY = "empty-"  # begins the name of an atlas without members
 
 
 @dataclass(frozen=True)
-class Parts:
+class Checkpoint:
     """The folder ``ATLAS.h5.parts``; keys say what went into a part."""
 
     folder: Path
@@ -54,7 +54,7 @@ class Parts:
 
 
 @contextmanager
-def parts_of(path: Path) -> Iterator[Parts]:
+def checkpoint_of(path: Path) -> Iterator[Checkpoint]:
     """The parts of the atlas at a path, for one build at a time; gone afterwards if empty.
 
     Raises AtlasError if another build has them, StorageError if there can be no folder.
@@ -70,7 +70,7 @@ def parts_of(path: Path) -> Iterator[Parts]:
     try:
         _lock(handle, path)
         try:
-            yield Parts(folder)
+            yield Checkpoint(folder)
         finally:
             _tidy(folder)
     finally:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar_core.atlas.anatomy import Anatomy, AtlasError, Response
-from avatar_core.atlas.checkpoint import Parts, parts_of
+from avatar_core.atlas.checkpoint import Checkpoint, checkpoint_of
 from avatar_core.atlas.model import LARGEST_ORGAN, SPACING, Atlas, anatomy_of, box_around
 from avatar_core.atlas.storage import ATLAS_SCHEMA, load_atlas, save_atlas
 from avatar_core.atlas.workers import Workers
@@ -28,7 +28,7 @@ from avatar_core.geometry.surface_files import content_of
 from avatar_core.shapes.registration import Registration, RegistrationRule, Template, register
 
 Axes = str | tuple[tuple[float, ...], ...]
-Respond = Callable[[Registration], Response]
+SolveResponse = Callable[[Registration], Response]
 Progress = Callable[[int, int, str], None]
 
 
@@ -117,7 +117,7 @@ def create_atlas(
     *,
     template: Template | None = None,
     workers: Workers | None = None,
-    respond: Respond | None = None,
+    solve_response: SolveResponse | None = None,
     progress: Progress | None = None,
 ) -> Growth:
     """Build an atlas; nothing is written to the path if no surface can be used.
@@ -130,14 +130,16 @@ def create_atlas(
     cannot be written.
     """
     path = Path(path)
-    with parts_of(path) as parts:
+    with checkpoint_of(path) as checkpoint:
         if path.exists():
             raise AtlasError(f"{path} exists; grow it by 'avatar atlas add', or remove it first")
-        empty = _empty_atlas(parts, options or AtlasOptions(), template)
-        growth, _ = _grow(empty, sources, parts, workers or Workers(), respond, progress)
+        empty = _empty_atlas(checkpoint, options or AtlasOptions(), template)
+        growth, _ = _grow(
+            empty, sources, checkpoint, workers or Workers(), solve_response, progress
+        )
         if growth.added:
             save_atlas(growth.atlas, path)
-            parts.clear()  # what is left was for other templates
+            checkpoint.clear()  # what is left was for other templates
     return growth
 
 
@@ -146,7 +148,7 @@ def extend_atlas(
     sources: Sequence[Source],
     *,
     workers: Workers | None = None,
-    respond: Respond | None = None,
+    solve_response: SolveResponse | None = None,
     progress: Progress | None = None,
 ) -> Growth:
     """Add surfaces to an atlas on disk, which stays as it is until all are done.
@@ -157,39 +159,41 @@ def extend_atlas(
     path = Path(path)
     if not path.is_file():
         load_atlas(path)  # which says what is missing
-    with parts_of(path) as parts:
+    with checkpoint_of(path) as checkpoint:
         atlas = load_atlas(path)
-        growth, keys = _grow(atlas, sources, parts, workers or Workers(), respond, progress)
+        growth, keys = _grow(
+            atlas, sources, checkpoint, workers or Workers(), solve_response, progress
+        )
         if growth.added:
             save_atlas(growth.atlas, path)
-            parts.clear(keys)
+            checkpoint.clear(keys)
     return growth
 
 
-def _empty_atlas(parts: Parts, options: AtlasOptions, template: Template | None) -> Atlas:
+def _empty_atlas(checkpoint: Checkpoint, options: AtlasOptions, template: Template | None) -> Atlas:
     """The one an interrupted build began with, or a new one."""
     if template is not None:
         return new_atlas(template, options)
     asked = json.dumps(asdict(options), sort_keys=True)
     key = hashlib.sha256(asked.encode()).hexdigest()[:32]
-    atlas = parts.load_empty(key)
+    atlas = checkpoint.load_empty(key)
     if atlas is None:
         atlas = new_atlas(default_template(options.template_vertices), options)
-        parts.save_empty(key, atlas)
+        checkpoint.save_empty(key, atlas)
     return atlas
 
 
 def _grow(
     atlas: Atlas,
     sources: Sequence[Source],
-    parts: Parts,
+    checkpoint: Checkpoint,
     workers: Workers,
-    respond: Respond | None,
+    solve_response: SolveResponse | None,
     progress: Progress | None,
 ) -> tuple[Growth, list[str | None]]:
     """What becomes of the surfaces, and the keys under which their parts are kept."""
-    recipe = Recipe(atlas.without_anatomies(), respond)
-    keys = part_keys(recipe, sources)
+    builder = AnatomyBuilder(atlas.without_anatomies(), solve_response)
+    keys = checkpoint_keys(builder, sources)
     results: dict[int, Anatomy | Skipped] = {}
 
     def keep(number: int, result: Anatomy | Skipped) -> None:
@@ -198,20 +202,20 @@ def _grow(
             progress(len(results), len(sources), sources[number].name)
 
     for number, key in enumerate(keys):
-        part = parts.load(key)
-        if part is not None:
-            keep(number, part)
+        kept = checkpoint.load(key)
+        if kept is not None:
+            keep(number, kept)
     resumed = len(results)
     numbers = [number for number in range(len(sources)) if number not in results]
     todo: list[Source | Skipped] = [sources[number] for number in numbers]
     if workers.scheduler is not None:  # its workers may not see this machine's files
         todo = [_read_here(source) for source in todo]
-    for i, result in workers.map(recipe, todo):
+    for i, result in workers.map(builder, todo):
         number = numbers[i]
         if isinstance(result, Exception):
             result = Skipped(sources[number].name, _in_one_line(result))
         if isinstance(result, Anatomy):
-            parts.save(keys[number], result)
+            checkpoint.save(keys[number], result)
         keep(number, result)
     return _growth(atlas, [results[i] for i in range(len(sources))], resumed), keys
 
@@ -229,25 +233,27 @@ def _growth(atlas: Atlas, results: Sequence[Anatomy | Skipped], resumed: int) ->
 
 
 @dataclass(frozen=True, eq=False)
-class Recipe:
+class AnatomyBuilder:
     """What all anatomies of a build have in common: an atlas without members, and a response."""
 
     atlas: Atlas
-    respond: Respond | None = None
+    solve_response: SolveResponse | None = None
 
     def __call__(self, source: Source | Skipped) -> Anatomy | Skipped:
         """An anatomy, or why there is none: one bad organ must not cost the others."""
         if isinstance(source, Skipped):
             return source
         try:
-            return build_anatomy(self.atlas, source, self.respond)
+            return build_anatomy(self.atlas, source, self.solve_response)
         except AvatarError as error:
             return Skipped(source.name, str(error))
         except Exception as error:  # a singular matrix, memory that ran out
             return Skipped(source.name, _in_one_line(error))
 
 
-def build_anatomy(atlas: Atlas, source: Source, respond: Respond | None = None) -> Anatomy:
+def build_anatomy(
+    atlas: Atlas, source: Source, solve_response: SolveResponse | None = None
+) -> Anatomy:
     """Read, register and measure one organ.
 
     Raises
@@ -259,22 +265,22 @@ def build_anatomy(atlas: Atlas, source: Source, respond: Respond | None = None) 
     atlas.require_room(surface)
     registration = register(atlas.template, surface, atlas.rule)
     anatomy = anatomy_of(atlas, surface, registration)
-    return replace(anatomy, response=respond(registration)) if respond else anatomy
+    return replace(anatomy, response=solve_response(registration)) if solve_response else anatomy
 
 
-def part_keys(recipe: Recipe, sources: Sequence[Source]) -> list[str | None]:
+def checkpoint_keys(builder: AnatomyBuilder, sources: Sequence[Source]) -> list[str | None]:
     """Hashes of all that goes into each anatomy, None for a file that cannot be read."""
-    atlas, mesh = recipe.atlas, recipe.atlas.template.mesh
+    atlas, mesh = builder.atlas, builder.atlas.template.mesh
     common = hashlib.sha256()
     for array in (mesh.vertices, mesh.tets, atlas.template.regions.accessible):
         common.update(np.ascontiguousarray(array).tobytes())
     settings = (ATLAS_SCHEMA, asdict(atlas.box), asdict(atlas.rule))
     common.update(json.dumps(settings).encode())
-    common.update(pickle.dumps(recipe.respond))
-    return [_part_key(common.digest(), source) for source in sources]
+    common.update(pickle.dumps(builder.solve_response))
+    return [_checkpoint_key(common.digest(), source) for source in sources]
 
 
-def _part_key(common: bytes, source: Source) -> str | None:
+def _checkpoint_key(common: bytes, source: Source) -> str | None:
     digest = hashlib.sha256(common)
     digest.update(source.name.encode())
     if isinstance(source, SurfaceFile):

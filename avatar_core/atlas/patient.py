@@ -215,10 +215,10 @@ def patient_vademecum(
         else:
             mesh = tetrahedralize(surface, options.n_vertices)
             problem = patient_problem(surface, base, registration, mesh)
-    return respond(problem, base, weights, fidelity, options, progress, clock)
+    return build_patient(problem, base, weights, fidelity, options, progress, clock)
 
 
-def respond(
+def build_patient(
     problem: PatientProblem,
     base: PatientBase,
     weights: Barycenter,

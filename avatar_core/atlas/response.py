@@ -13,7 +13,7 @@ from avatar_core.shapes.registration import Registration
 
 
 @dataclass(frozen=True)
-class Responder:
+class ResponseSolver:
     """Computes responses; can be sent to other processes.
 
     material : of all anatomies

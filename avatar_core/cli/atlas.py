@@ -69,7 +69,7 @@ def create(
     Exit code 1 if no surface can be used, and then nothing is written.
     """
     from avatar_core.atlas.growth import AtlasOptions, create_atlas
-    from avatar_core.atlas.response import Responder
+    from avatar_core.atlas.response import ResponseSolver
     from avatar_core.atlas.workers import Workers
 
     sources = _sources(surfaces, unit, axes, label)
@@ -80,7 +80,7 @@ def create(
             sources,
             options,
             workers=Workers(jobs, scheduler),
-            respond=None if shapes_only else Responder(),
+            solve_response=None if shapes_only else ResponseSolver(),
             progress=progress,
         )
     _report(file, growth)
@@ -102,7 +102,7 @@ def add(
     The old file stays until the new one is complete. Exit code 1 if no surface can be used.
     """
     from avatar_core.atlas.growth import extend_atlas
-    from avatar_core.atlas.response import Responder
+    from avatar_core.atlas.response import ResponseSolver
     from avatar_core.atlas.workers import Workers
 
     sources = _sources(surfaces, unit, axes, label)
@@ -111,7 +111,7 @@ def add(
             file,
             sources,
             workers=Workers(jobs, scheduler),
-            respond=None if shapes_only else Responder(),
+            solve_response=None if shapes_only else ResponseSolver(),
             progress=progress,
         )
     _report(file, growth)

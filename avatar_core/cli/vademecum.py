@@ -172,9 +172,7 @@ def _timed(built: Vademecum, progress: Progress) -> Vademecum:
 
     certificate = built.certificate
     assert certificate is not None and certificate.curve is not None
-    curve = timed(
-        built, certificate.curve, progress=lambda share: progress("time", share, math.nan)
-    )
+    curve = timed(built, certificate.curve, progress=lambda done: progress("time", done, math.nan))
     return built.with_certificate(replace(certificate, curve=curve))
 
 
@@ -370,7 +368,7 @@ class BuildBar:
     }
 
     def __init__(self, large: bool = False) -> None:
-        self._share = self._LARGE if large else self._LINEAR
+        self._stages = self._LARGE if large else self._LINEAR
 
     def __enter__(self) -> BuildBar:
         from tqdm import tqdm
@@ -389,12 +387,12 @@ class BuildBar:
     def __call__(self, stage: str, fraction: float, error: float) -> None:
         """Stage ``stage`` is done to ``fraction``; NaN: no error is known."""
         before = 0.0
-        for name, share in self._share.items():
+        for name, length in self._stages.items():
             if name == stage:
                 break
-            before += share
-        share = self._share.get(stage, 0.0)
+            before += length
+        length = self._stages.get(stage, 0.0)
         text = stage if math.isnan(error) else f"{stage}, error {error:.1%}"
         self._bar.set_description_str(text, refresh=False)
-        self._bar.n = min(1.0, before + share * min(fraction, 1.0))
+        self._bar.n = min(1.0, before + length * min(fraction, 1.0))
         self._bar.refresh()

@@ -82,11 +82,11 @@ def sample_target(surface: SurfaceMesh, n: int) -> Target:
     points, outward = points[bounding], outward[bounding]
     # divergence theorem over the samples: V = 1/3 int x.n da, c = 1/(2 V) int x^2 n da
     origin = points.mean(axis=0) if len(points) else np.zeros(3)
-    arm, share = points - origin, area[-1] / n
-    volume = share * float(np.sum(arm * outward)) / 3.0
+    arm, sample_area = points - origin, area[-1] / n
+    volume = sample_area * float(np.sum(arm * outward)) / 3.0
     if not volume > 0:
         raise RegistrationError(f"{surface.name}: the surface encloses nothing; give a closed one")
-    center = origin + share * np.sum(arm**2 * outward, axis=0) / (2.0 * volume)
+    center = origin + sample_area * np.sum(arm**2 * outward, axis=0) / (2.0 * volume)
     return Target(surface, points, outward, volume, center)
 
 

@@ -31,7 +31,7 @@ from avatar_core.studies.online_cost import (
 )
 from avatar_core.studies.report import Panel, write_report
 from avatar_core.studies.shapes import read_liver
-from avatar_core.studies.study import Parts, Study, Value
+from avatar_core.studies.study import ProgressBar, Study, Value
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,7 +44,7 @@ FRESH = 1001  # seed of loads that no certificate draws
 
 
 @dataclass(frozen=True)
-class Plan:
+class AccuracyTimeSettings:
     """Vertices, unseen loads of the certificate and fresh ones, contacts; the offline sweeps."""
 
     n_vertices: int = 2850
@@ -58,8 +58,8 @@ class Plan:
     n_patient: int = 600
 
 
-FULL = Plan()
-QUICK = Plan(1200, 60, 40, 150, (1200,), (20e-3, 10e-3), 16, 3, 350)
+FULL = AccuracyTimeSettings()
+QUICK = AccuracyTimeSettings(1200, 60, 40, 150, (1200,), (20e-3, 10e-3), 16, 3, 350)
 
 
 def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
@@ -67,33 +67,33 @@ def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
     return study(surfaces, QUICK if quick else FULL, folder)
 
 
-def study(surfaces: Path | None, plan: Plan, folder: Path) -> Study:
+def study(surfaces: Path | None, settings: AccuracyTimeSettings, folder: Path) -> Study:
     """All sweeps, the promises, and the page."""
     surface = read_liver(surfaces, "LiTS-4")
-    with Parts(6) as parts:
-        options = OrganOptions(n_vertices=plan.n_vertices, n_certified=plan.n_certified)
-        vademecum = build(surface, options, parts.part("build"))
+    with ProgressBar(6) as bar:
+        options = OrganOptions(n_vertices=settings.n_vertices, n_certified=settings.n_certified)
+        vademecum = build(surface, options, bar.begin("build"))
         certificate = vademecum.certificate
         assert certificate is not None and certificate.curve is not None
         v = vademecum
         elasticity = Elasticity(v.mesh, v.material, v.regions.clamped, v.element)
-        parts.part("timing")
+        bar.begin("timing")
         curve = timed(vademecum, certificate.curve)
         again = timed(vademecum, certificate.curve)
-        parts.part("fresh loads")
-        fresh = measured(vademecum, elasticity, plan.n_fresh, FRESH)
+        bar.begin("fresh loads")
+        fresh = measured(vademecum, elasticity, settings.n_fresh, FRESH)
         kept = promises(curve, fresh, again)
-        contacts = force_errors(vademecum, elasticity, plan.n_contacts, FRESH)
-        parts.part("rivals")
+        contacts = force_errors(vademecum, elasticity, settings.n_contacts, FRESH)
+        bar.begin("rivals")
         rows = curve_rows(curve) + budget_rows(curve)
-        rows += rival_rows(vademecum, elasticity, curve, plan.n_fresh // 2, FRESH)
+        rows += rival_rows(vademecum, elasticity, curve, settings.n_fresh // 2, FRESH)
         rows += cost_of_effects(vademecum)
-        parts.part("mesh and grid")
-        rows += mesh_rows(surface, plan.meshes)
-        rows += grid_rows(surface, plan.spacings)
-        parts.part("shapes and patients")
-        rows += shape_rows(surfaces, plan.n_livers)
-        rows += patient_rows(plan.n_base, plan.n_patient)
+        bar.begin("mesh and grid")
+        rows += mesh_rows(surface, settings.meshes)
+        rows += grid_rows(surface, settings.spacings)
+        bar.begin("shapes and patients")
+        rows += shape_rows(surfaces, settings.n_livers)
+        rows += patient_rows(settings.n_base, settings.n_patient)
     summary: dict[str, float] = {
         "promise_kept_fraction": kept.errors_kept,
         "points_kept_fraction": kept.points_kept,

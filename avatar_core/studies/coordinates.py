@@ -42,7 +42,7 @@ from avatar_core.reduction.pgd_parametric import (
 )
 from avatar_core.studies.bench.methods import time_steps
 from avatar_core.studies.shapes import DEFAULT_FOLDER, read_liver
-from avatar_core.studies.study import Parts, Study, Value
+from avatar_core.studies.study import ProgressBar, Study, Value
 from avatar_core.studies.unseen import canonical_at, errors, unseen
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
@@ -57,7 +57,7 @@ RANKS = (10, 25, 50, 100)
 
 
 @dataclass(frozen=True)
-class Plan:
+class CoordinatesSettings:
     """Vertices of the meshes and of those that the canonical forms are compared on; unseen loads.
 
     n_canonical : products at most; n_pushed : sites of large pushes; n_combined : of combinations
@@ -71,8 +71,8 @@ class Plan:
     n_combined: int = 4
 
 
-FULL = Plan()
-QUICK = Plan(1000, 700, 48, 20, 3, 1)
+FULL = CoordinatesSettings()
+QUICK = CoordinatesSettings(1000, 700, 48, 20, 3, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,30 +91,30 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(one, other, QUICK if quick else FULL)
 
 
-def study(one: SurfaceMesh, other: SurfaceMesh, plan: Plan) -> Study:
+def study(one: SurfaceMesh, other: SurfaceMesh, settings: CoordinatesSettings) -> Study:
     """All coordinates on the first organ, Poisson's ratio on both."""
     poisson = (Coordinate("poisson", 0.40, 0.49),)
     incompressible = (Coordinate("poisson", 0.40, 0.499),)
     rows: list[dict[str, Value]] = []
-    with Parts(8) as parts:
+    with ProgressBar(8) as bar:
         for surface in (one, other) if one.name != other.name else (one,):
-            progress = parts.part(f"Poisson's ratio, {surface.name}")
-            organ = _organ(surface, plan.n_vertices)
-            rows += _parametric(organ, "poisson", poisson, plan, progress)
-        progress = parts.part("towards incompressibility")
-        organ = _organ(one, plan.n_vertices, "Taylor-Hood")
-        rows += _parametric(organ, "incompressible", incompressible, plan, progress)
-        rows += _tumour_rows(plan, parts.part("tumour"))
+            progress = bar.begin(f"Poisson's ratio, {surface.name}")
+            organ = _organ(surface, settings.n_vertices)
+            rows += _parametric(organ, "poisson", poisson, settings, progress)
+        progress = bar.begin("towards incompressibility")
+        organ = _organ(one, settings.n_vertices, "Taylor-Hood")
+        rows += _parametric(organ, "incompressible", incompressible, settings, progress)
+        rows += _tumour_rows(settings, bar.begin("tumour"))
         for name, coordinates, element in (
             ("poisson", poisson, "P2"),
             ("incompressible", incompressible, "Taylor-Hood"),
         ):
-            progress = parts.part(f"canonical PGD, {name}")
-            small = _organ(one, plan.n_vertices_canonical, element)  # type: ignore[arg-type]
-            rows += _canonical(small, name, coordinates, plan, progress)
-        large = _organ(one, plan.n_vertices)
-        rows += _large(large, "neo-hookean", plan, parts.part("neo-Hookean"))
-        rows += _large(large, "st-venant-kirchhoff", plan, parts.part("St Venant-Kirchhoff"))
+            progress = bar.begin(f"canonical PGD, {name}")
+            small = _organ(one, settings.n_vertices_canonical, element)  # type: ignore[arg-type]
+            rows += _canonical(small, name, coordinates, settings, progress)
+        large = _organ(one, settings.n_vertices)
+        rows += _large(large, "neo-hookean", settings, bar.begin("neo-Hookean"))
+        rows += _large(large, "st-venant-kirchhoff", settings, bar.begin("St Venant-Kirchhoff"))
     summary = _summary(rows)
     return Study(
         name="coordinates",
@@ -152,7 +152,7 @@ def _parametric(
     organ: Organ,
     name: str,
     coordinates: tuple[Coordinate, ...],
-    plan: Plan,
+    settings: CoordinatesSettings,
     progress: Progress,
 ) -> list[dict[str, Value]]:
     """Errors of the default against modes, and the time of its build."""
@@ -172,7 +172,7 @@ def _parametric(
     rows = []
     for rank in RANKS:
         fewer = replace(vademecum, parametric=replace(vademecum.parametric, rank=rank))
-        n_loads = plan.n_loads if rank == RANKS[-1] else plan.n_loads // 2
+        n_loads = settings.n_loads if rank == RANKS[-1] else settings.n_loads // 2
         c = certify_range(fewer, organ.elasticity, n_loads, seed=1)
         found = {
             "l2_mean": c.l2_mean,
@@ -184,21 +184,21 @@ def _parametric(
     return rows
 
 
-def _tumour_rows(plan: Plan, progress: Progress) -> list[dict[str, Value]]:
+def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[dict[str, Value]]:
     """Poisson's ratio and the contrast of real tumours together."""
     liver, tumour = TUMOUR_FOLDER / "liver.vtk", TUMOUR_FOLDER / "liver_tumours.vtk"
     if not liver.is_file():
         return []
-    organ = _organ(read_surface(liver, axes=TUMOUR_AXES), plan.n_vertices, tumour=tumour)
+    organ = _organ(read_surface(liver, axes=TUMOUR_AXES), settings.n_vertices, tumour=tumour)
     coordinates = (Coordinate("poisson", 0.40, 0.49), Coordinate("contrast", 0.5, 20.0))
-    return _parametric(organ, "tumour", coordinates, plan, progress)
+    return _parametric(organ, "tumour", coordinates, settings, progress)
 
 
 def _canonical(
     organ: Organ,
     name: str,
     coordinates: tuple[Coordinate, ...],
-    plan: Plan,
+    settings: CoordinatesSettings,
     progress: Progress,
 ) -> list[dict[str, Value]]:
     """The canonical forms and the default's far field on one small mesh."""
@@ -207,16 +207,16 @@ def _canonical(
     loads = patch_loads(middle, surface.centers, surface.patch_radius)
     norm = _norms(middle, loads)
     problem = affine_problem(middle, loads, coordinates, 1.0 / norm**2)
-    cases = unseen(elasticity, surface, coordinates, 4, max(4, plan.n_loads // 8))
-    rows = _parametric(organ, f"{name}, small mesh", coordinates, plan, progress)
+    cases = unseen(elasticity, surface, coordinates, 4, max(4, settings.n_loads // 8))
+    rows = _parametric(organ, f"{name}, small mesh", coordinates, settings, progress)
     for method, form in (("canonical, Galerkin", problem), ("canonical, minimal residual", None)):
         start = time.process_time()
         rule = CanonicalPGDRule(
-            plan.n_canonical, 1e-4, max_sweeps=4, sweep_tolerance=0.1, solve_tolerance=1e-2
+            settings.n_canonical, 1e-4, max_sweeps=4, sweep_tolerance=0.1, solve_tolerance=1e-2
         )
 
         def enriched(rank: int, residual: float, method: str = method) -> None:
-            progress(method, rank / plan.n_canonical, residual)
+            progress(method, rank / settings.n_canonical, residual)
 
         affine = minimal_residual(problem) if form is None else form
         found = solve_canonical_pgd(affine, rule, progress=enriched)
@@ -271,7 +271,7 @@ def _row(
 
 
 def _large(
-    organ: Organ, material: LargeMaterial, plan: Plan, progress: Progress
+    organ: Organ, material: LargeMaterial, settings: CoordinatesSettings, progress: Progress
 ) -> list[dict[str, Value]]:
     """One material: its summary, every push, and combinations of neo-Hookean ones."""
     start = time.process_time()
@@ -288,10 +288,10 @@ def _large(
     bent = with_large_deformation(linear, problem, material, LargeRule(), LINEAR_RULE, progress)
     seconds = time.process_time() - start
 
-    def pushed(share: float, error: float) -> None:
-        progress("push", share, error)
+    def pushed(fraction: float, error: float) -> None:
+        progress("push", fraction, error)
 
-    certificate, found = certify_large(bent, problem, plan.n_pushed, seed=1, progress=pushed)
+    certificate, found = certify_large(bent, problem, settings.n_pushed, seed=1, progress=pushed)
     summary: dict[str, Value] = {
         "coordinate": f"large, {material}",
         "organ": organ.name,
@@ -306,10 +306,10 @@ def _large(
         summary["step_over_linear"] = _pace(linear, bent)
         depths = (5e-3, 10e-3, 15e-3)
 
-        def combined(share: float) -> None:
-            progress("combine", share, certificate.l2_mean)
+        def combined(fraction: float) -> None:
+            progress("combine", fraction, certificate.l2_mean)
 
-        together = push_errors(bent, problem, depths, plan.n_combined, 2, True, combined)
+        together = push_errors(bent, problem, depths, settings.n_combined, 2, True, combined)
         rows += [{"coordinate": "combination", **vars(row)} for row in together]
     return rows
 

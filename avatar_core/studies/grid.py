@@ -31,8 +31,8 @@ from avatar_core.studies.response import (
     field_at,
     nearest_face,
     relative_errors,
-    respond,
     trilinear,
+    unit_load_response,
 )
 from avatar_core.studies.shapes import Livers, read_livers
 from avatar_core.studies.study import Study, Value, follow, mean_and_worst, one_blas_thread
@@ -50,7 +50,7 @@ PAPER: dict[str, Value] = {"displacement_error_1mm": 0.09}
 
 
 @dataclass(frozen=True)
-class Plan:
+class GridSettings:
     """Livers; of them at 1 mm; of them with displacements; mesh, loads, points of the distance."""
 
     n_livers: int | None = None
@@ -65,8 +65,8 @@ class Plan:
     seed: int = 0
 
 
-FULL = Plan()
-QUICK = Plan(n_livers=6, n_fine=1, n_displaced=1, n_vertices=800, n_loads=6, remeshed=False)
+FULL = GridSettings()
+QUICK = GridSettings(n_livers=6, n_fine=1, n_displaced=1, n_vertices=800, n_loads=6, remeshed=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,23 +85,23 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(surfaces, QUICK if quick else FULL)
 
 
-def study(folder: Path | None, plan: Plan) -> Study:
+def study(folder: Path | None, settings: GridSettings) -> Study:
     """One row for each liver and spacing, and one with h = 0 for the second mesh."""
-    livers = read_livers(folder, plan.n_livers, plan.phantoms)
-    step = max(1, len(livers.surfaces) // max(plan.n_fine, plan.n_displaced, 1))
+    livers = read_livers(folder, settings.n_livers, settings.phantoms)
+    step = max(1, len(livers.surfaces) // max(settings.n_fine, settings.n_displaced, 1))
     rows: list[dict[str, Value]] = []
     with one_blas_thread() as notices:
         for i, surface in enumerate(follow(livers.surfaces, "livers")):
             rank = i // step if i % step == 0 else len(livers.surfaces)
-            reference = respond_on_own_mesh(surface, plan) if rank < plan.n_displaced else None
-            if reference is not None and plan.remeshed:
-                rows.append(other_mesh_row(surface, reference, plan))
-            fine = rank < plan.n_fine
-            chosen = [h for h in plan.spacings if h > FINEST_REMESHED or fine]
-            rows += [grid_row(surface, h, reference, plan) for h in chosen]
+            reference = reference_of(surface, settings) if rank < settings.n_displaced else None
+            if reference is not None and settings.remeshed:
+                rows.append(other_mesh_row(surface, reference, settings))
+            fine = rank < settings.n_fine
+            chosen = [h for h in settings.spacings if h > FINEST_REMESHED or fine]
+            rows += [grid_row(surface, h, reference, settings) for h in chosen]
     return Study(
         name="grid",
-        sentence=_sentence(summary := summarize(rows, plan), livers),
+        sentence=_sentence(summary := summarize(rows, settings), livers),
         summary=summary,
         rows=tuple(rows),
         paper=PAPER,
@@ -116,7 +116,7 @@ def study(folder: Path | None, plan: Plan) -> Study:
 
 
 def grid_row(
-    surface: SurfaceMesh, h: float, reference: Reference | None, plan: Plan
+    surface: SurfaceMesh, h: float, reference: Reference | None, settings: GridSettings
 ) -> dict[str, Value]:
     """Errors of one liver at one spacing; displacements only with a reference."""
     grid = distance_grid(surface, h, padding=BAND * h, band=BAND * h)
@@ -126,20 +126,22 @@ def grid_row(
         "spacing_mm": 1e3 * h,
         "volume_error": abs(grid.volume / surface.volume - 1.0),
         "isosurface_volume_error": abs(marched.volume / surface.volume - 1.0),
-        "distance_error": distance_error(surface, grid.origin, h, plan),
+        "distance_error": distance_error(surface, grid.origin, h, settings),
     }
     if reference is not None:
         errors = passage_errors(reference, grid.origin, h)
         row |= {"displacement_error": errors.mean(), "displacement_error_worst": errors.max()}
-        if plan.remeshed and h > FINEST_REMESHED:
-            found = remeshed_errors(marched, reference, plan.n_vertices)
+        if settings.remeshed and h > FINEST_REMESHED:
+            found = remeshed_errors(marched, reference, settings.n_vertices)
             row |= {"remeshed_error": found.mean(), "remeshed_error_worst": found.max()}
     return row
 
 
-def other_mesh_row(surface: SurfaceMesh, reference: Reference, plan: Plan) -> dict[str, Value]:
+def other_mesh_row(
+    surface: SurfaceMesh, reference: Reference, settings: GridSettings
+) -> dict[str, Value]:
     """What a second mesh of the same surface does to the displacement."""
-    found = remeshed_errors(surface, reference, round(OTHER_MESH * plan.n_vertices))
+    found = remeshed_errors(surface, reference, round(OTHER_MESH * settings.n_vertices))
     return {
         "liver": surface.name,
         "spacing_mm": 0.0,
@@ -148,14 +150,14 @@ def other_mesh_row(surface: SurfaceMesh, reference: Reference, plan: Plan) -> di
     }
 
 
-def respond_on_own_mesh(surface: SurfaceMesh, plan: Plan) -> Reference:
+def reference_of(surface: SurfaceMesh, settings: GridSettings) -> Reference:
     """Finite elements on the mesh of the surface, loads spread over its accessible region."""
-    mesh = tetrahedralize(surface, plan.n_vertices)
+    mesh = tetrahedralize(surface, settings.n_vertices)
     regions = regions_by_rule(mesh)
     loads = load_surface(mesh, regions)
-    chosen = np.linspace(0, loads.n_positions - 1, plan.n_loads).astype(int)
+    chosen = np.linspace(0, loads.n_positions - 1, settings.n_loads).astype(int)
     centers = loads.centers[chosen]
-    responses = respond(mesh, regions.clamped, centers, loads.patch_radius)
+    responses = unit_load_response(mesh, regions.clamped, centers, loads.patch_radius)
     return Reference(mesh, regions, centers, loads.patch_radius, responses)
 
 
@@ -172,15 +174,17 @@ def remeshed_errors(surface: SurfaceMesh, reference: Reference, n_vertices: int)
     mesh = tetrahedralize(surface, n_vertices)
     middle = mesh.vertices[mesh.boundary_faces].mean(axis=1)
     clamped = reference.regions.clamped[nearest_face(reference.mesh, middle)]
-    found = respond(mesh, clamped, reference.centers, reference.radius)
+    found = unit_load_response(mesh, clamped, reference.centers, reference.radius)
     on_old = carried(field_at(mesh, reference.mesh.vertices), found)
     return relative_errors(on_old, reference.responses, reference.mesh)
 
 
-def distance_error(surface: SurfaceMesh, origin: FloatArray, h: float, plan: Plan) -> float:
+def distance_error(
+    surface: SurfaceMesh, origin: FloatArray, h: float, settings: GridSettings
+) -> float:
     """|phi_h - phi| / |phi| in L2 over the organ, at random points of it."""
     low, high = surface.bounding_box
-    points = np.random.default_rng(plan.seed).uniform(low, high, (plan.n_points, 3))
+    points = np.random.default_rng(settings.seed).uniform(low, high, (settings.n_points, 3))
     exact = signed_distance(points, surface)
     inside = exact < 0
     corners, back = trilinear(points[inside], origin, h)
@@ -188,18 +192,20 @@ def distance_error(surface: SurfaceMesh, origin: FloatArray, h: float, plan: Pla
     return float(np.linalg.norm(found - exact[inside]) / np.linalg.norm(exact[inside]))
 
 
-def summarize(rows: list[dict[str, Value]], plan: Plan) -> dict[str, float]:
+def summarize(rows: list[dict[str, Value]], settings: GridSettings) -> dict[str, float]:
     """Mean and worst of each error over the livers, for each spacing; the order of convergence."""
     summary: dict[str, float] = {}
-    for h in plan.spacings:
+    for h in settings.spacings:
         for key in ("volume_error", "displacement_error", "distance_error", "remeshed_error"):
             found = _values(rows, key, 1e3 * h)
             if found:
                 summary |= mean_and_worst(f"{key}_{_millimetres(h)}", found)
     if floor := _values(rows, "remeshed_error", 0.0):
         summary |= mean_and_worst("remeshed_error_same_surface", floor)
-    ends = [_mean(rows, "volume_error", 1e3 * h) for h in (plan.spacings[0], plan.spacings[-1])]
-    ratio = plan.spacings[0] / plan.spacings[-1]
+    ends = [
+        _mean(rows, "volume_error", 1e3 * h) for h in (settings.spacings[0], settings.spacings[-1])
+    ]
+    ratio = settings.spacings[0] / settings.spacings[-1]
     summary["volume_order"] = math.log(ends[0] / ends[1]) / math.log(ratio)
     return summary
 

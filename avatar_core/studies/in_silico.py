@@ -20,7 +20,13 @@ from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.lle import embed, estimate_dimension, fit
-from avatar_core.studies.response import carried, field_at, relative_errors, respond, trilinear
+from avatar_core.studies.response import (
+    carried,
+    field_at,
+    relative_errors,
+    trilinear,
+    unit_load_response,
+)
 from avatar_core.studies.shapes import PAPER_GRID, as_grid, distance_vectors, paper_box
 from avatar_core.studies.study import Study, Value, follow, mean_and_worst, one_blas_thread
 
@@ -46,7 +52,7 @@ PAPER = {"volume_error": 0.05, "displacement_grid": 0.0903, "from_gap_k12": PARA
 
 
 @dataclass(frozen=True)
-class Plan:
+class InSilicoSettings:
     """How large: livers in the base and held out, mesh vertices, load positions, grid, phantom."""
 
     n_base: int = 45
@@ -58,8 +64,8 @@ class Plan:
     seed: int = 0
 
 
-FULL = Plan()
-QUICK = Plan(n_vertices=600, n_loads=8, phantom_spacing=10e-3)
+FULL = InSilicoSettings()
+QUICK = InSilicoSettings(n_vertices=600, n_loads=8, phantom_spacing=10e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +84,12 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(QUICK if quick else FULL)
 
 
-def study(plan: Plan) -> Study:
+def study(settings: InSilicoSettings) -> Study:
     """Spectrum of all livers, then errors of those held out."""
     with one_blas_thread() as notices:
-        livers = populate(plan)
-        spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < plan.n_base]
-        rows = held_out_rows(livers, plan)
+        livers = populate(settings)
+        spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < settings.n_base]
+        rows = held_out_rows(livers, settings)
         base = fit(livers.vectors, NEIGHBORS)
         eigenvalues = estimate_dimension(base).eigenvalues
         flat = embed(base, 2).coordinates
@@ -100,29 +106,29 @@ def study(plan: Plan) -> Study:
             summary[f"{key}_k{k}"] = float(at[key] or 0)
     return Study(
         name="in-silico",
-        sentence=_sentence(summary, plan),
+        sentence=_sentence(summary, settings),
         summary=summary,
         rows=(*rows, *spectra),
         paper=PAPER,
-        draw=lambda figure: _draw(figure, eigenvalues, flat, rows, plan),
+        draw=lambda figure: _draw(figure, eigenvalues, flat, rows, settings),
         notices=(*notices, *_spectrum_notices(spectra)),
     )
 
 
-def populate(plan: Plan) -> Population:
+def populate(settings: InSilicoSettings) -> Population:
     """The phantom moved by the maps of Eq. 17: distances, meshes and finite element answers."""
-    organ = phantom_liver(plan.phantom_spacing)
-    maps = population(plan.n_base + plan.n_held_out, plan.seed)
+    organ = phantom_liver(settings.phantom_spacing)
+    maps = population(settings.n_base + settings.n_held_out, settings.seed)
     moved = [shape.moved(organ) for shape in maps]
-    box = paper_box(moved, plan.shape)
-    mesh = tetrahedralize(organ, plan.n_vertices)
+    box = paper_box(moved, settings.shape)
+    mesh = tetrahedralize(organ, settings.n_vertices)
     regions = regions_by_rule(mesh)
     radius = default_patch_radius(mesh, regions)
     positions = load_surface(mesh, regions, radius).centers
-    positions = positions[np.linspace(0, len(positions) - 1, plan.n_loads).astype(int)]
+    positions = positions[np.linspace(0, len(positions) - 1, settings.n_loads).astype(int)]
     meshes = [TetMesh(shape(mesh.vertices), mesh.tets) for shape in maps]
     responses = [
-        respond(one, regions.clamped, shape(positions), radius)
+        unit_load_response(one, regions.clamped, shape(positions), radius)
         for one, shape in zip(meshes, follow(maps, "finite elements"), strict=True)
     ]
     volumes = np.array([surface.volume for surface in moved])
@@ -146,15 +152,15 @@ def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> dict[str
     }
 
 
-def held_out_rows(livers: Population, plan: Plan) -> list[dict[str, float]]:
+def held_out_rows(livers: Population, settings: InSilicoSettings) -> list[dict[str, float]]:
     """Errors of each held-out liver, interpolated among the base."""
-    base = fit(livers.vectors[: plan.n_base], NEIGHBORS)
-    everyone = fit(livers.vectors[: plan.n_base], plan.n_base - 1)
-    held_out = range(plan.n_base, plan.n_base + plan.n_held_out)
+    base = fit(livers.vectors[: settings.n_base], NEIGHBORS)
+    everyone = fit(livers.vectors[: settings.n_base], settings.n_base - 1)
+    held_out = range(settings.n_base, settings.n_base + settings.n_held_out)
     rows = []
     for i in follow(held_out, "held-out livers"):
         point = base.barycenter(livers.vectors[i])
-        blend = as_grid(point.combine(livers.vectors[: plan.n_base]), livers.box)
+        blend = as_grid(point.combine(livers.vectors[: settings.n_base]), livers.box)
         found = reinitialize(blend).volume
         mesh, wanted = livers.meshes[i], livers.responses[i]
         nodewise = relative_errors(point.combine(livers.responses), wanted, mesh)
@@ -194,14 +200,14 @@ def _passage(livers: Population, i: int, mesh: TetMesh) -> FloatArray:
     return carried((back @ field_at(mesh, corners)).tocsr(), livers.responses[i])
 
 
-def _sentence(summary: dict[str, float], plan: Plan) -> str:
+def _sentence(summary: dict[str, float], settings: InSilicoSettings) -> str:
     verdict = "stand out" if summary["six_stand_out_k12"] else "do not stand out"
     other = "stand out" if summary["six_stand_out_k10"] else "do not"
     volume, grid = summary["volume_error"], summary["displacement_grid"]
     twelve, every = summary["displacement_nodewise"], summary["displacement_nodewise_all"]
     return (
-        f"{plan.n_base} + {plan.n_held_out} livers by Eq. 17: volume {volume:.2%} wrong (paper "
-        f"< 5 %), displacement {twelve:.2%} nodewise ({every:.2%} with all neighbours) and "
+        f"{settings.n_base} + {settings.n_held_out} livers by Eq. 17: volume {volume:.2%} wrong "
+        f"(paper < 5 %), displacement {twelve:.2%} nodewise ({every:.2%} with all neighbours) and "
         f"{grid:.2%} on the grid (paper 9.03 %); six eigenvalues {verdict} for k = 12, {other} for "
         "k = 10."
     )
@@ -222,7 +228,7 @@ def _draw(
     eigenvalues: FloatArray,
     flat: FloatArray,
     rows: list[dict[str, float]],
-    plan: Plan,
+    settings: InSilicoSettings,
 ) -> None:
     left, middle, right = figure.subplots(1, 3)
     numbers = np.arange(1, len(eigenvalues) + 1)
@@ -232,8 +238,8 @@ def _draw(
     left.set(xlabel="number of the eigenvalue", ylabel="eigenvalue of M [-]")
     left.set_title(f"spectrum, k = {NEIGHBORS} (paper, Fig. 5a)")
     left.legend()
-    held = slice(plan.n_base, None)
-    middle.plot(*flat[: plan.n_base].T, "o", color="steelblue", label="base")
+    held = slice(settings.n_base, None)
+    middle.plot(*flat[: settings.n_base].T, "o", color="steelblue", label="base")
     middle.plot(*flat[held].T, "o", color="crimson", label="held out")
     middle.set(xlabel="first coordinate [-]", ylabel="second coordinate [-]", title="embedding")
     middle.legend()

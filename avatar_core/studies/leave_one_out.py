@@ -47,7 +47,7 @@ ALIGNMENTS = ("centred", "similarity")
 
 
 @dataclass(frozen=True)
-class Plan:
+class LeaveOneOutSettings:
     """Livers, neighbours (0: all), regularisations, principal components, grid, stand-ins."""
 
     n_livers: int | None = None
@@ -59,8 +59,8 @@ class Plan:
     phantoms: int = 40
 
 
-FULL = Plan()
-QUICK = Plan(
+FULL = LeaveOneOutSettings()
+QUICK = LeaveOneOutSettings(
     n_livers=24,
     neighbors=(5, 10, 0),
     components=(5, 10),
@@ -98,14 +98,14 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(surfaces, QUICK if quick else FULL)
 
 
-def study(folder: Path | None, plan: Plan) -> Study:
+def study(folder: Path | None, settings: LeaveOneOutSettings) -> Study:
     """One row for each alignment and method."""
-    livers = read_livers(folder, plan.n_livers, plan.phantoms)
+    livers = read_livers(folder, settings.n_livers, settings.phantoms)
     rows: list[dict[str, Value]] = []
     with one_blas_thread() as notices:
         for alignment in ALIGNMENTS:
-            base = placed(livers, alignment, plan)
-            tried = follow(methods(base, plan), f"leave one out, {alignment}")
+            base = placed(livers, alignment, settings)
+            tried = follow(methods(base, settings), f"leave one out, {alignment}")
             rows += [{"alignment": alignment, **judged(base, method)} for method in tried]
     summary = summarize(rows)
     best = max(_of(rows, "LLE"), key=lambda row: row["dice"])  # type: ignore[arg-type,return-value]
@@ -126,7 +126,7 @@ def study(folder: Path | None, plan: Plan) -> Study:
     )
 
 
-def placed(livers: Livers, alignment: str, plan: Plan) -> Base:
+def placed(livers: Livers, alignment: str, settings: LeaveOneOutSettings) -> Base:
     """All livers on one grid, centred or laid on the phantom."""
     scales = np.ones(len(livers.surfaces))
     if alignment == "centred":
@@ -137,17 +137,19 @@ def placed(livers: Livers, alignment: str, plan: Plan) -> Base:
             found = align(surface, reference)
             moved.append(found.moved(surface))
             scales[i] = 1.0 / found.scale
-    box = paper_box(moved, plan.shape)
+    box = paper_box(moved, settings.shape)
     vectors = distance_vectors(moved, box)
     return Base(box, vectors, scales, livers.subjects, Gram.of(list(vectors)))
 
 
-def methods(base: Base, plan: Plan) -> list[Method]:
+def methods(base: Base, settings: LeaveOneOutSettings) -> list[Method]:
     """LLE in all settings, then the rivals."""
     n = len(base.vectors)
-    settings = [(k or n - 1, r) for k in plan.neighbors for r in plan.regularizations if k < n]
-    settings += [(n - 1, r) for r in plan.least_regularizations]
-    found = [Method("LLE", k, r, partial(lle_weights, base.gram, k, r)) for k, r in settings]
+    choices = [
+        (k or n - 1, r) for k in settings.neighbors for r in settings.regularizations if k < n
+    ]
+    choices += [(n - 1, r) for r in settings.least_regularizations]
+    found = [Method("LLE", k, r, partial(lle_weights, base.gram, k, r)) for k, r in choices]
     found.append(Method("convex LLE", n - 1, None, partial(hull_weights, base.gram)))
     found.append(Method("nearest neighbour", 1, None, partial(inverse_weights, base.gram, 1)))
     found.append(
@@ -155,7 +157,7 @@ def methods(base: Base, plan: Plan) -> list[Method]:
     )
     found += [
         Method("PCA", d, None, partial(principal_weights, base.gram, d))
-        for d in plan.components
+        for d in settings.components
         if d < n - 1
     ]
     return found

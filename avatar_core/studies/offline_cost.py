@@ -16,7 +16,7 @@ import numpy as np
 from avatar_core.atlas.base import base_of
 from avatar_core.atlas.growth import AtlasOptions, build_anatomy, default_template, new_atlas
 from avatar_core.atlas.patient import Fidelity, PatientOptions, patient_vademecum
-from avatar_core.atlas.response import Responder
+from avatar_core.atlas.response import ResponseSolver
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.geometry.level_set import distance_grid, isosurface
 from avatar_core.geometry.phantom import phantom_liver, population
@@ -24,10 +24,8 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import mesh_error
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.shapes.registration import RegistrationRule
-from avatar_core.studies.grid import Plan as GridPlan
-from avatar_core.studies.grid import grid_row, respond_on_own_mesh
-from avatar_core.studies.leave_one_out import Plan as ShapePlan
-from avatar_core.studies.leave_one_out import judged, methods, placed
+from avatar_core.studies.grid import GridSettings, grid_row, reference_of
+from avatar_core.studies.leave_one_out import LeaveOneOutSettings, judged, methods, placed
 from avatar_core.studies.shapes import read_livers
 from avatar_core.studies.study import Value, follow, one_blas_thread
 
@@ -64,14 +62,14 @@ def mesh_rows(surface: SurfaceMesh, sizes: tuple[int, ...]) -> list[dict[str, Va
 
 def grid_rows(surface: SurfaceMesh, spacings: tuple[float, ...]) -> list[dict[str, Value]]:
     """Displacements kept on a grid and read back, and the time of its level set and isosurface."""
-    plan = GridPlan(n_vertices=1000, n_loads=4, n_points=1500, remeshed=False)
-    reference = respond_on_own_mesh(surface, plan)
+    settings = GridSettings(n_vertices=1000, n_loads=4, n_points=1500, remeshed=False)
+    reference = reference_of(surface, settings)
     rows: list[dict[str, Value]] = []
     for h in follow(spacings, "grid spacing"):
         start = time.process_time()
         isosurface(distance_grid(surface, h, padding=3 * h, band=3 * h))
         seconds = time.process_time() - start
-        found = grid_row(surface, h, reference, plan)
+        found = grid_row(surface, h, reference, settings)
         error = float(found["displacement_error"])  # type: ignore[arg-type]
         rows.append(
             _row("grid", "level set", f"h = {1e3 * h:g} mm", error, seconds)
@@ -85,13 +83,13 @@ def shape_rows(folder: Path | None, n_livers: int) -> list[dict[str, Value]]:
 
     The error is 1 - Dice, the time that of the weights of one liver.
     """
-    plan = ShapePlan(n_livers, (5, 10, 20, 0), (1e-3,), (), (5, 10), (29, 21, 25), 16)
+    settings = LeaveOneOutSettings(n_livers, (5, 10, 20, 0), (1e-3,), (), (5, 10), (29, 21, 25), 16)
     rows: list[dict[str, Value]] = []
     with one_blas_thread():
-        livers = read_livers(folder, plan.n_livers, plan.phantoms)
-        base = placed(livers, "similarity", plan)
+        livers = read_livers(folder, settings.n_livers, settings.phantoms)
+        base = placed(livers, "similarity", settings)
         others = np.arange(1, len(base.vectors))
-        for method in follow(methods(base, plan), "shapes"):
+        for method in follow(methods(base, settings), "shapes"):
             if method.name in ("convex LLE", "inverse distance"):
                 continue
             found = judged(base, method)
@@ -116,15 +114,15 @@ def patient_rows(n_base: int, n_vertices: int) -> list[dict[str, Value]]:
     livers = [shape.moved(organ) for shape in population(n_base + 1, seed=3, bend=0.01)]
     atlas = new_atlas(default_template(n_vertices), AtlasOptions(spacing=0.02, rule=_ROUGH))
     members = [
-        build_anatomy(atlas, replace(liver, name=f"phantom-{i}"), Responder(rank=40))
+        build_anatomy(atlas, replace(liver, name=f"phantom-{i}"), ResponseSolver(rank=40))
         for i, liver in enumerate(follow(livers[:-1], "base of anatomies"))
     ]
     base = base_of(atlas.with_anatomies(members))
     patient = replace(livers[-1], name="patient")
-    plans: list[tuple[Fidelity, int | None]] = [(fidelity, None) for fidelity in FIDELITIES]
-    plans += [("interpolated", k) for k in (2, 4) if k < n_base]
+    cases: list[tuple[Fidelity, int | None]] = [(fidelity, None) for fidelity in FIDELITIES]
+    cases += [("interpolated", k) for k in (2, 4) if k < n_base]
     rows: list[dict[str, Value]] = []
-    for fidelity, k in follow(plans, "patient"):
+    for fidelity, k in follow(cases, "patient"):
         options = PatientOptions(n_vertices, n_neighbors=k, max_modes=40, n_certified=12)
         found = patient_vademecum(patient, base, fidelity, options)
         assert found.vademecum.certificate is not None

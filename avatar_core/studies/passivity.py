@@ -50,7 +50,7 @@ HANDS = ("press", "in and out", "tremor", "pull out")
 
 
 @dataclass(frozen=True)
-class Plan:
+class PassivitySettings:
     """Cells of the map along each axis, borders of each delay, periods of a run."""
 
     n_cells: int = 36
@@ -58,8 +58,8 @@ class Plan:
     n_periods: int = 2000
 
 
-FULL = Plan()
-QUICK = Plan(n_cells=12, n_borders=3, n_periods=1500)
+FULL = PassivitySettings()
+QUICK = PassivitySettings(n_cells=12, n_borders=3, n_periods=1500)
 
 
 def run(_surfaces: Path | None, quick: bool, _folder: Path) -> Study:
@@ -67,11 +67,11 @@ def run(_surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(QUICK if quick else FULL)
 
 
-def study(plan: Plan) -> Study:
+def study(settings: PassivitySettings) -> Study:
     """The map, its borders, and all tools in all hands."""
-    rows = [map_row(*cell, plan.n_periods) for cell in follow(_cells(plan), "map")]
-    borders = [border_row(*at) for at in follow(_borders(plan), "borders")]
-    grips = [hand_row(*case, plan.n_periods) for case in follow(_hands(), "hands")]
+    rows = [map_row(*cell, settings.n_periods) for cell in follow(_cells(settings), "map")]
+    borders = [border_row(*at) for at in follow(_borders(settings), "borders")]
+    grips = [hand_row(*case, settings.n_periods) for case in follow(_hands(), "hands")]
     summary = _summary(rows, borders, grips)
     return Study(
         name="passivity",
@@ -79,23 +79,25 @@ def study(plan: Plan) -> Study:
         summary=summary,
         rows=(*rows, *borders, *grips),
         paper={},
-        draw=lambda figure: _draw(figure, rows, borders, plan),
+        draw=lambda figure: _draw(figure, rows, borders, settings),
         notices=(
             "the paper does not speak of passivity: there is no figure of its own beside ours",
         ),
     )
 
 
-def _cells(plan: Plan) -> list[tuple[int, float, float]]:
+def _cells(settings: PassivitySettings) -> list[tuple[int, float, float]]:
     return list(
         itertools.product(
-            DELAYS, np.geomspace(*DAMPING, plan.n_cells), np.geomspace(*STIFFNESS, plan.n_cells)
+            DELAYS,
+            np.geomspace(*DAMPING, settings.n_cells),
+            np.geomspace(*STIFFNESS, settings.n_cells),
         )
     )
 
 
-def _borders(plan: Plan) -> list[tuple[int, float]]:
-    return list(itertools.product(DELAYS, np.geomspace(*STIFFNESS, plan.n_borders)))
+def _borders(settings: PassivitySettings) -> list[tuple[int, float]]:
+    return list(itertools.product(DELAYS, np.geomspace(*STIFFNESS, settings.n_borders)))
 
 
 def _hands() -> list[tuple[str, float, float, float, float, int]]:
@@ -206,17 +208,20 @@ def _sentence(summary: dict[str, float]) -> str:
 
 
 def _draw(
-    figure: Figure, rows: list[dict[str, Value]], borders: list[dict[str, Value]], plan: Plan
+    figure: Figure,
+    rows: list[dict[str, Value]],
+    borders: list[dict[str, Value]],
+    settings: PassivitySettings,
 ) -> None:
     from matplotlib.colors import LogNorm
 
     axes = figure.subplots(2, len(DELAYS), sharex=True, sharey=True)
-    stiffness = np.geomspace(*STIFFNESS, plan.n_cells)
-    damping = np.geomspace(*DAMPING, plan.n_cells)
+    stiffness = np.geomspace(*STIFFNESS, settings.n_cells)
+    damping = np.geomspace(*DAMPING, settings.n_cells)
     for i, key in enumerate(("given_without_mJ", "given_with_mJ")):
         for delay, axis in zip(DELAYS, axes[i], strict=True):
             given = _column([row for row in rows if row["delay"] == delay], key)
-            grid = np.maximum(given.reshape(plan.n_cells, plan.n_cells), SEEN)
+            grid = np.maximum(given.reshape(settings.n_cells, settings.n_cells), SEEN)
             shown = axis.pcolormesh(
                 stiffness, damping, grid, norm=LogNorm(SEEN, 1e3), cmap="magma_r", rasterized=True
             )
@@ -240,7 +245,7 @@ def _draw(
 
 
 def _at(across: float, up: float) -> tuple[float, float]:
-    """A place in a panel, as shares of its logarithmic axes."""
+    """A place in a panel, as fractions of its logarithmic axes."""
     (left, right), (low, high) = STIFFNESS, DAMPING
     return left * (right / left) ** across, low * (high / low) ** up
 

@@ -41,7 +41,7 @@ ENOUGH = 0.10
 
 
 @dataclass(frozen=True)
-class Plan:
+class PGDSettings:
     """Vertices of the mesh, load nodes, modes of the vector form (slow)."""
 
     n_vertices: int = 2850
@@ -49,8 +49,8 @@ class Plan:
     n_hadamard: int = 12
 
 
-FULL = Plan()
-QUICK = Plan(n_vertices=900, n_loads=40, n_hadamard=6)
+FULL = PGDSettings()
+QUICK = PGDSettings(n_vertices=900, n_loads=40, n_hadamard=6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Case:
     """The loads, their exact answers and what counts.
 
     exact : ndarray, shape (3 n_vertices, n_loads) [m/N]; work : (n_loads,), f . u
-    near : ndarray, shape (3 n_vertices, n_loads), share of the exact answer that is stored near
+    near : ndarray, shape (3 n_vertices, n_loads), part of the answer that the near field stores
     """
 
     elasticity: Elasticity
@@ -83,21 +83,21 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(read_liver(surfaces, "LiTS-4"), QUICK if quick else FULL)
 
 
-def study(surface: SurfaceMesh, plan: Plan) -> Study:
+def study(surface: SurfaceMesh, settings: PGDSettings) -> Study:
     """Errors against modes on one organ."""
-    mesh = tetrahedralize(surface, plan.n_vertices)
+    mesh = tetrahedralize(surface, settings.n_vertices)
     regions = regions_by_rule(mesh)
     elasticity = Elasticity(mesh, Material(), regions.clamped)
     positions = load_surface(mesh, regions)
-    nodes = spread(positions, plan.n_loads)
+    nodes = spread(positions, settings.n_loads)
     rows: list[dict[str, Value]] = []
     for kind in ("patch", "point"):
         case = make_case(elasticity, positions, nodes, kind)
-        rows += _rows(case, kind, plan)
+        rows += _rows(case, kind, settings)
     summary = _summary(rows)
     return Study(
         name="pgd",
-        sentence=_sentence(summary, plan),
+        sentence=_sentence(summary, settings),
         summary=summary,
         rows=tuple(rows),
         paper=PAPER,
@@ -144,7 +144,7 @@ def make_case(elasticity: Elasticity, positions: LoadSurface, nodes: FloatArray,
     )
 
 
-def _rows(case: Case, kind: str, plan: Plan) -> list[dict[str, Value]]:
+def _rows(case: Case, kind: str, settings: PGDSettings) -> list[dict[str, Value]]:
     """Errors against modes for every method."""
     n = case.loads.shape[1]
     ranks = sorted({*range(1, 12), *range(12, min(61, n), 3), min(n, 60)})
@@ -183,8 +183,8 @@ def _rows(case: Case, kind: str, plan: Plan) -> list[dict[str, Value]]:
         basis = left_vectors[:, :rank]
         best = basis @ (basis.T @ (scaled * case.size)) / np.sqrt(case.mass)
         add("SVD optimum", rank, case.exact - best, np.full(n, np.nan))
-    vectors = solve_hadamard(case.elasticity, case.loads, min(plan.n_hadamard, n), max_sweeps=5)
-    for rank in (r for r in ranks if r <= plan.n_hadamard):
+    vectors = solve_hadamard(case.elasticity, case.loads, min(settings.n_hadamard, n), max_sweeps=5)
+    for rank in (r for r in ranks if r <= settings.n_hadamard):
         field = vectors.evaluate(rank)
         contact = np.abs(
             1.0 - np.asarray(case.loads.multiply(field).sum(axis=0)).ravel() / case.work
@@ -261,9 +261,9 @@ def _summary(rows: list[dict[str, Value]]) -> dict[str, float]:
     }
 
 
-def _sentence(summary: dict[str, float], plan: Plan) -> str:
+def _sentence(summary: dict[str, float], settings: PGDSettings) -> str:
     return (
-        f"{plan.n_loads} loads in one direction, 11 modes: the paper's greedy PGD leaves "
+        f"{settings.n_loads} loads in one direction, 11 modes: the paper's greedy PGD leaves "
         f"{summary['l2_mean_11_modes']:.0%} of the displacement (worst load "
         f"{summary['l2_worst_11_modes']:.0%}; paper: below 10 %), the best 11 modes "
         f"{summary['svd_l2_mean_11_modes']:.0%}, the default "

@@ -23,7 +23,9 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
-def respond(mesh: TetMesh, clamped: BoolArray, centers: FloatArray, radius: float) -> FloatArray:
+def unit_load_response(
+    mesh: TetMesh, clamped: BoolArray, centers: FloatArray, radius: float
+) -> FloatArray:
     """Displacements under unit patch loads along x, y, z at each centre, material of the paper.
 
     clamped : ndarray of bool, shape (n_faces,), over mesh.boundary_faces

@@ -37,7 +37,7 @@ NAN = math.nan
 
 
 @dataclass(frozen=True)
-class Plan:
+class SamplesSettings:
     """Sizes of the base, livers to be written by it, grid, phantom, runs of each timing."""
 
     sizes: tuple[int, ...] = (12, 25, 50, 100, 200, 350, 500)
@@ -48,8 +48,8 @@ class Plan:
     seed: int = 0
 
 
-FULL = Plan()
-QUICK = Plan(sizes=(12, 50, 150, 500), n_targets=5, phantom_spacing=12e-3, repeats=2)
+FULL = SamplesSettings()
+QUICK = SamplesSettings(sizes=(12, 50, 150, 500), n_targets=5, phantom_spacing=12e-3, repeats=2)
 
 
 @dataclass(frozen=True)
@@ -70,22 +70,22 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(QUICK if quick else FULL)
 
 
-def study(plan: Plan) -> Study:
+def study(settings: SamplesSettings) -> Study:
     """Errors for each size of the base, then times for the largest."""
-    organ = phantom_liver(plan.phantom_spacing)
-    maps = population(plan.sizes[-1] + plan.n_targets, plan.seed)
+    organ = phantom_liver(settings.phantom_spacing)
+    maps = population(settings.sizes[-1] + settings.n_targets, settings.seed)
     moved = [shape.moved(organ) for shape in maps]
-    vectors = distance_vectors(moved, paper_box(moved, plan.shape))
-    base, targets = vectors[: plan.sizes[-1]], vectors[plan.sizes[-1] :]
+    vectors = distance_vectors(moved, paper_box(moved, settings.shape))
+    base, targets = vectors[: settings.sizes[-1]], vectors[settings.sizes[-1] :]
     with one_blas_thread() as notices:
-        rows = [error_row(base[:n], targets) for n in follow(plan.sizes, "errors")]
-        timing = time_lle(base, plan.repeats)
+        rows = [error_row(base[:n], targets) for n in follow(settings.sizes, "errors")]
+        timing = time_lle(base, settings.repeats)
     summary = _summary(rows, timing)
     if math.isnan(timing.sklearn_seconds):
         notices = (*notices, "scikit-learn is not installed: no times beside ours")
     return Study(
         name="samples",
-        sentence=_sentence(summary, plan.sizes[-1]),
+        sentence=_sentence(summary, settings.sizes[-1]),
         summary=summary,
         rows=(*rows, {"kind": "time", **vars(timing)}),
         paper=PAPER,

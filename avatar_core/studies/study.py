@@ -100,26 +100,23 @@ def follow(items: Iterable[Item], text: str) -> Iterator[Item]:
     yield from tqdm(items, desc=f"{text:28s}", file=sys.stderr, disable=None, leave=False)
 
 
-class Parts:
-    """A progress bar over the long parts of a study, and the stage that one is in.
+class ProgressBar:
+    """A progress bar over the long stages of a study; shows what the current one is doing."""
 
-    A part is begun by :meth:`part`, which gives what its builds report to.
-    """
+    def __init__(self, n_stages: int) -> None:
+        self._n_stages, self._begun = n_stages, 0
 
-    def __init__(self, n_parts: int) -> None:
-        self._n_parts, self._begun = n_parts, 0
-
-    def __enter__(self) -> Parts:
+    def __enter__(self) -> ProgressBar:
         from tqdm import tqdm
 
-        self._bar = tqdm(total=self._n_parts, file=sys.stderr, disable=None, leave=False)
+        self._bar = tqdm(total=self._n_stages, file=sys.stderr, disable=None, leave=False)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
 
-    def part(self, name: str) -> Progress:
-        """Begin a part; the one before is done."""
+    def begin(self, name: str) -> Progress:
+        """Begin a stage, which ends the one before; returns what its builds report to."""
         self._bar.update(1 if self._begun else 0)
         self._begun += 1
         self._bar.set_description_str(name)

@@ -29,7 +29,7 @@ from avatar_core.atlas.patient import (
     reduced_response,
     vademecum_of_reduced,
 )
-from avatar_core.atlas.response import Responder
+from avatar_core.atlas.response import ResponseSolver
 from avatar_core.atlas.storage import load_atlas
 from avatar_core.atlas.transfer import Weighting, patient_weights
 from avatar_core.fem.elasticity import Elasticity
@@ -163,14 +163,16 @@ def _atlas(surfaces: Sequence[SurfaceMesh], path: Path, quick: bool) -> Atlas:
     from tqdm import tqdm
 
     options = AtlasOptions(template_vertices=700 if quick else 2500)
-    respond = Responder(rank=60 if quick else 120)
+    solve_response = ResponseSolver(rank=60 if quick else 120)
     with tqdm(total=len(surfaces), desc="atlas", file=sys.stderr, disable=None) as bar:
 
         def advance(done: int, _: int, name: str) -> None:
             bar.set_postfix_str(name, refresh=False)
             bar.update(done - bar.n)
 
-        return create_atlas(path, list(surfaces), options, respond=respond, progress=advance).atlas
+        return create_atlas(
+            path, list(surfaces), options, solve_response=solve_response, progress=advance
+        ).atlas
 
 
 def transport(

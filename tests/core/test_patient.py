@@ -12,9 +12,9 @@ from avatar_core.atlas.base import PatientBase, PatientError, leave_one_out
 from avatar_core.atlas.patient import (
     PatientOptions,
     PatientProblem,
+    build_patient,
     patient_problem,
     patient_vademecum,
-    respond,
 )
 from avatar_core.atlas.transfer import combine, kriging, patient_weights
 from avatar_core.errors import LLEError
@@ -173,7 +173,7 @@ def test_error_falls_with_neighbours_functions_and_with_enrichment(case: Case) -
 def test_estimate_brackets_the_error_and_the_tolerance_is_met(case: Case) -> None:
     weights = _weights(case)
     options = PatientOptions(tolerance=0.05, max_modes=200, reduction=ROOMY)
-    patient = respond(case.problem, case.base, weights, "reduced", options)
+    patient = build_patient(case.problem, case.base, weights, "reduced", options)
     n = case.problem.loads.n_positions
     fields = [patient.vademecum.displacement(np.array([j]), np.ones(1)) for j in range(n)]
     error = _error(case, np.hstack(fields))
@@ -244,7 +244,7 @@ def test_probes_are_exact(case: Case) -> None:
 @pytest.mark.parametrize("fidelity", ["interpolated", "reduced"])
 def test_each_fidelity_is_a_certified_vademecum(case: Case, fidelity: str) -> None:
     options = PatientOptions(tolerance=0.05, n_certified=10, reduction=ROOMY)
-    patient = respond(case.problem, case.base, _weights(case), fidelity, options)  # type: ignore[arg-type]
+    patient = build_patient(case.problem, case.base, _weights(case), fidelity, options)  # type: ignore[arg-type]
     certificate = patient.vademecum.certificate
     assert certificate is not None
     # unseen loads; a coarse phantom's interpolation between its load positions counts too

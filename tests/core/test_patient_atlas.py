@@ -14,7 +14,7 @@ from avatar_core.atlas.base import PatientError, base_of, numbers_of
 from avatar_core.atlas.growth import AtlasOptions, build_anatomy, new_atlas
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.patient import PatientOptions, patient_vademecum
-from avatar_core.atlas.response import Responder
+from avatar_core.atlas.response import ResponseSolver
 from avatar_core.atlas.storage import load_atlas, save_atlas
 from avatar_core.cli import main as cli
 from avatar_core.errors import RegistrationError
@@ -53,7 +53,9 @@ def livers(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def atlas(phantom_mesh: TetMesh, livers: list[Path]) -> Atlas:
     template = Template("phantom", phantom_mesh, regions_by_rule(phantom_mesh))
     empty = new_atlas(template, AtlasOptions(spacing=0.02, rule=ROUGH))
-    members = [build_anatomy(empty, read_surface(path), Responder(rank=30)) for path in livers[:N]]
+    members = [
+        build_anatomy(empty, read_surface(path), ResponseSolver(rank=30)) for path in livers[:N]
+    ]
     return empty.with_anatomies(members)
 
 

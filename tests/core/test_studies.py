@@ -18,14 +18,16 @@ from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.shapes.barycenter import barycenter
 from avatar_core.shapes.lle import Gram
-from avatar_core.studies import accuracy_time as study_accuracy_time
-from avatar_core.studies import coordinates as study_coordinates
-from avatar_core.studies import grid as study_grid
-from avatar_core.studies import in_silico as study_in_silico
-from avatar_core.studies import leave_one_out as study_leave_one_out
-from avatar_core.studies import passivity as study_passivity
-from avatar_core.studies import pgd as study_pgd
-from avatar_core.studies import samples as study_samples
+from avatar_core.studies import (
+    accuracy_time,
+    coordinates,
+    grid,
+    in_silico,
+    leave_one_out,
+    passivity,
+    pgd,
+    samples,
+)
 from avatar_core.studies.response import carried, field_at, relative_errors, trilinear
 from avatar_core.studies.shapes import paper_box, read_livers, subject_numbers
 from avatar_core.studies.study import Study, mean_and_worst, write_study
@@ -75,10 +77,10 @@ def write_phantoms(folder: Path, n: int) -> Path:
 @pytest.mark.usefixtures("no_folder")
 @pytest.mark.long
 def test_grid(tmp_path: Path) -> None:
-    plan = study_grid.Plan(
+    settings = grid.GridSettings(
         n_fine=1, n_displaced=1, n_vertices=300, n_loads=2, n_points=400, spacings=(10e-3, 5e-3)
     )
-    summary = checked_files(study_grid.study(None, plan), tmp_path)
+    summary = checked_files(grid.study(None, settings), tmp_path)
     # marching and quadrature are of second order; single organs scatter
     assert summary["volume_order"] > 1.0
     assert summary["volume_error_5mm"] < 0.005
@@ -90,25 +92,25 @@ def test_grid(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_in_silico(tmp_path: Path) -> None:
-    plan = study_in_silico.Plan(
+    settings = in_silico.InSilicoSettings(
         n_base=24, n_held_out=2, n_vertices=150, n_loads=1, shape=COARSE, phantom_spacing=12e-3
     )
-    study = study_in_silico.study(plan)
+    study = in_silico.study(settings)
     summary = checked_files(study, tmp_path)
     assert summary["volume_error"] < 0.02
     # the grid adds its own error to that of the weights
     assert 0 < summary["displacement_nodewise"] < summary["displacement_grid"] < 0.5
     assert summary["from_gap_k12"] == 6  # 12 neighbours span the six parameters of Eq. 17
-    assert len(study.notices) == len(study_in_silico.SPECTRA)
+    assert len(study.notices) == len(in_silico.SPECTRA)
     assert all("stand out" in notice for notice in study.notices)
 
 
 @pytest.mark.long
 def test_samples(tmp_path: Path) -> None:
-    plan = study_samples.Plan(
+    settings = samples.SamplesSettings(
         sizes=(12, 40, 120), n_targets=4, shape=COARSE, phantom_spacing=12e-3, repeats=1
     )
-    summary = checked_files(study_samples.study(plan), tmp_path)
+    summary = checked_files(samples.study(settings), tmp_path)
     assert summary["error_120"] < summary["error_12"] / 2
     assert summary["rate"] > 0.2
     assert summary["lle_seconds_120"] > 0
@@ -118,7 +120,7 @@ def test_samples(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_pgd(tmp_path: Path) -> None:
-    found = study_pgd.study(phantom_liver(12e-3), study_pgd.Plan(600, 24, 5))
+    found = pgd.study(phantom_liver(12e-3), pgd.PGDSettings(600, 24, 5))
     summary = checked_files(found, tmp_path)
     # no modes are better than the best; the default is exact near the patch
     assert summary["svd_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
@@ -134,8 +136,8 @@ def test_pgd(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_coordinates(tmp_path: Path) -> None:
     organ = phantom_liver(12e-3)
-    plan = study_coordinates.Plan(600, 600, 12, 12, 2, 2)
-    found = study_coordinates.study(organ, organ, plan)
+    settings = coordinates.CoordinatesSettings(600, 600, 12, 12, 2, 2)
+    found = coordinates.study(organ, organ, settings)
     summary = checked_files(found, tmp_path)
     assert summary["poisson_mean"] < summary["poisson_canonical_small_mesh_mean"]
     assert summary["linear_over_large_15mm"] > 1.0
@@ -144,7 +146,7 @@ def test_coordinates(tmp_path: Path) -> None:
 
 
 def test_passivity(tmp_path: Path) -> None:
-    summary = checked_files(study_passivity.study(study_passivity.Plan(5, 2, 700)), tmp_path)
+    summary = checked_files(passivity.study(passivity.PassivitySettings(5, 2, 700)), tmp_path)
     assert summary["border_error_worst"] < 0.01
     assert summary["map_given_with_mJ"] < summary["bound_mJ_delay_2"] < 2.0
     assert summary["hands_given_with_mJ"] < summary["bound_mJ_delay_2"]
@@ -155,7 +157,7 @@ def test_passivity(tmp_path: Path) -> None:
 def test_samples_without_scikit_learn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sklearn.manifold", None)
     vectors = np.random.default_rng(0).standard_normal((30, 40))
-    timing = study_samples.time_lle(vectors, repeats=1)
+    timing = samples.time_lle(vectors, repeats=1)
     assert timing.seconds > 0
     assert math.isnan(timing.sklearn_seconds)
 
@@ -163,10 +165,10 @@ def test_samples_without_scikit_learn(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_folder")
 @pytest.mark.long
 def test_leave_one_out(tmp_path: Path) -> None:
-    plan = study_leave_one_out.Plan(
+    settings = leave_one_out.LeaveOneOutSettings(
         neighbors=(5, 10, 0), components=(5, 10), shape=COARSE, phantoms=16
     )
-    study = study_leave_one_out.study(None, plan)
+    study = leave_one_out.study(None, settings)
     summary = checked_files(study, tmp_path)
     assert "stand in" in study.notices[0]
     assert summary["dice_nearest_neighbour"] < summary["dice_k10"] <= summary["dice_best"] < 1
@@ -181,7 +183,7 @@ def test_leave_one_out(tmp_path: Path) -> None:
 def test_leave_one_out_weights_are_those_of_the_library() -> None:
     vectors = np.random.default_rng(1).standard_normal((20, 60))
     gram, others = Gram.of(list(vectors)), np.arange(1, 20)
-    mine = study_leave_one_out.lle_weights(gram, 8, 1e-3, 0, others)
+    mine = leave_one_out.lle_weights(gram, 8, 1e-3, 0, others)
     point = barycenter(list(vectors), vectors[0], 8, regularization=1e-3, leave_out={0})
     wanted = np.zeros(20)
     wanted[point.neighbors] = point.weights
@@ -192,7 +194,7 @@ def test_leave_one_out_weights_are_those_of_the_library() -> None:
 def test_principal_weights_project_orthogonally() -> None:
     vectors = np.random.default_rng(2).standard_normal((12, 50))
     gram, others = Gram.of(list(vectors)), np.arange(1, 12)
-    weights = study_leave_one_out.principal_weights(gram, 4, 0, others)
+    weights = leave_one_out.principal_weights(gram, 4, 0, others)
     rest = vectors[1:] - vectors[1:].mean(axis=0)
     axes = np.linalg.svd(rest, full_matrices=False)[2][:4]
     mean = vectors[1:].mean(axis=0)
@@ -265,8 +267,10 @@ def test_json_has_no_nan(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("no_folder")
 @pytest.mark.long
 def test_accuracy_time(tmp_path: Path) -> None:
-    plan = study_accuracy_time.Plan(500, 60, 40, 150, (300,), (20e-3, 10e-3), 8, 3, 300)
-    found = study_accuracy_time.study(None, plan, tmp_path)
+    settings = accuracy_time.AccuracyTimeSettings(
+        500, 60, 40, 150, (300,), (20e-3, 10e-3), 8, 3, 300
+    )
+    found = accuracy_time.study(None, settings, tmp_path)
     summary = checked_files(found, tmp_path)
     assert summary["promise_kept_fraction"] >= 0.95
     assert summary["force_error_coverage"] >= 0.85  # 150 contacts: 90 % less two deviations
@@ -311,7 +315,7 @@ def test_the_command_prints_and_writes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     found = Study("samples", "So.", {"rate": 0.5}, ({"n": 1},), {"rate": 1.0}, lambda f: None)
-    monkeypatch.setattr(study_samples, "run", lambda surfaces, quick, folder: found)
+    monkeypatch.setattr(samples, "run", lambda surfaces, quick, folder: found)
     assert run(monkeypatch, "study", "samples", "-o", tmp_path / "new", "--quick") == 0
     shown = capsys.readouterr().out
     assert "paper" in shown.splitlines()[0]

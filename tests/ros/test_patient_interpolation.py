@@ -29,7 +29,7 @@ from rclpy.parameter import parameter_value_to_python
 from shape_msgs.msg import Mesh
 
 from avatar_core.atlas.growth import AtlasOptions, SurfaceFile, create_atlas
-from avatar_core.atlas.response import Responder
+from avatar_core.atlas.response import ResponseSolver
 from avatar_core.atlas.storage import load_atlas, save_atlas
 from avatar_core.atlas.workers import Workers
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
@@ -82,7 +82,7 @@ def folder(livers: list[SurfaceMesh], tmp_path_factory: pytest.TempPathFactory) 
         AtlasOptions(spacing=0.02, rule=ROUGH),
         template=Template("phantom", mesh, regions_by_rule(mesh)),
         workers=Workers(jobs=1),
-        respond=Responder(rank=30),
+        solve_response=ResponseSolver(rank=30),
     )
     assert len(growth.added) == N_ATLAS
     (outside / "liver.obj").write_bytes(files[0].read_bytes())

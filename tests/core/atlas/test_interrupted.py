@@ -13,14 +13,14 @@ import pytest
 
 from avatar_core.atlas import growth as atlas_build
 from avatar_core.atlas.anatomy import Anatomy, AtlasError
-from avatar_core.atlas.checkpoint import parts_of
+from avatar_core.atlas.checkpoint import checkpoint_of
 from avatar_core.atlas.growth import (
-    Recipe,
+    AnatomyBuilder,
     SurfaceFile,
+    checkpoint_keys,
     create_atlas,
     extend_atlas,
     new_atlas,
-    part_keys,
 )
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.storage import load_atlas, save_atlas
@@ -70,14 +70,16 @@ def test_parts_of_another_template_or_rule_are_not_used(
 def test_a_part_belongs_to_the_bytes_and_the_reading_of_a_file(
     empty: Atlas, livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:
-    recipe, path = Recipe(empty), write_obj(tmp_path / "liver.obj", livers[0])
+    builder, path = AnatomyBuilder(empty), write_obj(tmp_path / "liver.obj", livers[0])
     file = SurfaceFile(path)
     readings = [file, replace(file, unit="cm"), replace(file, axes="LPS"), replace(file, label=1)]
-    keys = part_keys(recipe, readings) + part_keys(Recipe(empty, print), [file])
+    keys = checkpoint_keys(builder, readings) + checkpoint_keys(
+        AnatomyBuilder(empty, print), [file]
+    )
     write_obj(path, livers[1])
-    keys += part_keys(recipe, [file])
+    keys += checkpoint_keys(builder, [file])
     assert len({*keys}) == 6 and None not in keys
-    assert part_keys(recipe, [SurfaceFile(tmp_path / "missing.obj")]) == [None]
+    assert checkpoint_keys(builder, [SurfaceFile(tmp_path / "missing.obj")]) == [None]
 
 
 def test_a_template_that_was_made_is_made_once(
@@ -150,7 +152,7 @@ def test_two_builds_of_one_atlas_at_once_are_refused(
     template: Template, livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:
     file = tmp_path / "a.h5"
-    with parts_of(file):
+    with checkpoint_of(file):
         with pytest.raises(AtlasError, match="another build"):
             create_atlas(file, livers[:1], OPTIONS, template=template, workers=ALONE)
         assert (tmp_path / "a.h5.parts").is_dir()
