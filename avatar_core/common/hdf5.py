@@ -87,6 +87,7 @@ def verified(
     what: str,
     attributes_of: Callable[[Attributes, str], Attributes],
     keys_of: Callable[[Collection[str]], Iterable[str]],
+    remedy: str = "build or copy it again",
 ) -> tuple[Attributes, Arrays]:
     """Attributes and arrays of a file that are as they were written.
 
@@ -96,6 +97,7 @@ def verified(
     origin, what : what messages call the file, and what it should be
     attributes_of : of those that the file has, those that count; raises StorageError
     keys_of : of the arrays that the file has, those that count
+    remedy : what messages advise
 
     Raises
     ------
@@ -114,10 +116,10 @@ def verified(
     except UNREADABLE as error:
         why = f"{error} is missing" if isinstance(error, KeyError) else one_line(error, 120)
         raise StorageError(
-            f"{origin} is no readable {what} ({why}); it may be truncated: build or copy it again"
+            f"{origin} is no readable {what} ({why}); it may be truncated: {remedy}"
         ) from error
     if stated != checksum(arrays, attributes):
-        raise StorageError(f"{origin} was altered or damaged (checksum); build it again")
+        raise StorageError(f"{origin} was altered or damaged (checksum); {remedy}")
     return attributes, arrays
 
 

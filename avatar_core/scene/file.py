@@ -40,39 +40,49 @@ SECTIONS = {
     "material": ("young_modulus", "poisson_ratio"),
     "outputs": ("cloud", "cloud_divisor", "modes"),
 }
-SHIPPED = Path("params") / "scenes"  # in the project; installed below share/avatar_ros
+SHIPPED = Path("params") / "scenes"  # in a checkout; installed below share/avatar_ros
 _KEYS = ("name", "text", "organ", "material", "tools", "outputs", "effects")
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Files of the scenes that come with the project, by bare name; sorted.
+    """Files of the scenes that come with the project, by name without suffix; sorted.
 
-    They lie beside the code, in its repository, or below the prefix that it is installed in.
+    They lie in ``params/scenes`` of a checkout, or below the prefix that pip or colcon installed
+    this package into.
     """
-    package = Path(__file__).resolve().parents[1]
-    installed = [prefix / "share" / "avatar_ros" / SHIPPED for prefix in package.parents]
-    for folder in (package.parent / SHIPPED, *installed):
+    here = Path(__file__).resolve()
+    installed = [prefix / "share" / "avatar_ros" / SHIPPED for prefix in here.parents]
+    for folder in (here.parents[2] / SHIPPED, *installed):
         if folder.is_dir():
             return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
     return {}
 
 
-def scene_path(name: str) -> Path:
-    """The file of a scene: a path, or the bare name of a shipped one.
+def shipped_scene(name: str) -> Path:
+    """The file of a scene that comes with the project, by name, with or without ``.yaml``.
 
     Raises
     ------
     SceneError
-        Naming the shipped scenes, for a bare name that none of them has.
+        If there is no such scene, or the name is a path; lists the scenes there are.
     """
-    path, shipped = Path(name), shipped_scenes()
-    if path.is_file() or path.name != name or path.suffix:
-        return path
-    if name not in shipped:
+    shipped = shipped_scenes()
+    if (stem := name.removesuffix(".yaml")) not in shipped:
         raise SceneError(
-            f"there is no scene '{name}'; give a file or one of {', '.join(shipped) or 'none'}"
+            f"there is no scene {name!r}; give the plain name of one that comes with avatar: "
+            f"{', '.join(shipped) or 'none is installed'}"
         )
-    return shipped[name]
+    return shipped[stem]
+
+
+def scene_path(name: str) -> Path:
+    """The file of a scene: a path, or the name of a shipped scene.
+
+    Raises SceneError as :func:`shipped_scene`, for a name without folder and suffix.
+    """
+    path = Path(name)
+    is_path = path.is_file() or path.name != name or bool(path.suffix)
+    return path if is_path else shipped_scene(name)
 
 
 def read_scene(path: str | Path) -> Scene:

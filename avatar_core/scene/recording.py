@@ -1,44 +1,49 @@
-"""A recording of what a tool did and felt, on disk: HDF5 with schema version and checksum.
+"""Recordings of a tool and of the forces on it, on disk: HDF5 with schema version and checksum.
 
 Layout (schema 1.0), attributes at the root: ``format`` = "avatar recording", ``schema``,
 ``vademecum_id``, ``vademecum_name``, ``scene`` (YAML, with the material that was in force),
 ``rate`` [Hz], ``from_rest``, ``checksum``. Datasets, n periods of the contact loop, t tools:
 
-    periods/number (n,)          as the loop counts; a jump says how many were lost
-    periods/stamp (n,) [ns]      of the pose of the first tool
-    periods/tip (n, t, 3) [m]    sphere centres as the step used them: far away without a pose
-    periods/turn (n, t, 3) [rad] of the tool since the period before, for friction
+    periods/number (n,)          counted by the loop; gaps are lost periods
+    periods/stamp (n,) [ns]      time stamp of the first tool's pose
+    periods/tip (n, t, 3) [m]    sphere centres as the step used them; far away without a pose
+    periods/turn (n, t, 3) [rad] rotation of the tool since the previous period, for friction
     periods/status (n, t)        of avatar_ros/msg/ContactState
-    periods/force (n, t, 3) [N]  of the organ on the tool, before the force guard
-    periods/error (n, t) [N]     that one contact in ten exceeds
-    periods/share (n, t)         of the force that was sent: below 1 the guard held it back
+    periods/force (n, t, 3) [N]  force of the organ on the tool, before the force guard
+    periods/error (n, t) [N]     estimated error of the force, exceeded by one contact in ten
+    periods/share (n, t)         fraction of the force that was sent; below 1 if the guard cut it
     clouds/period (m,)           number of the last period before each cloud
     clouds/displacement (m, n_points, 3) [m], float32
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
-from avatar_core.common.hdf5 import checksum, replace_file
-from avatar_core.errors import StorageError, one_line
+from avatar_core.common.files import FileError, opened
+from avatar_core.common.hdf5 import replace_file, require_schema, verified
+from avatar_core.errors import StorageError
 
 FORMAT = "avatar recording"
 SCHEMA_VERSION = "1.0"
 MAX_FILE_BYTES = 4 << 30
 
-_PERIODS = ("number", "stamp", "tip", "turn", "status", "force", "error", "share")
+_PERIODS = {  # fields of Periods, and their names in the file
+    **{name: name for name in ("number", "stamp", "tip", "turn", "status", "force", "error")},
+    "sent_fraction": "share",
+}
 _CLOUDS = ("period", "displacement")
+_KEYS = [f"periods/{key}" for key in _PERIODS.values()] + [f"clouds/{key}" for key in _CLOUDS]
 _TEXTS = ("format", "schema", "vademecum_id", "vademecum_name", "scene", "rate", "from_rest")
 
 
 @dataclass(frozen=True, eq=False)
 class Periods:
-    """What the loop did, one entry a period; shapes as in the file."""
+    """What the contact loop did, one entry per period; shapes as in the file."""
 
     number: np.ndarray
     stamp: np.ndarray
@@ -47,20 +52,20 @@ class Periods:
     status: np.ndarray
     force: np.ndarray
     error: np.ndarray
-    share: np.ndarray
+    sent_fraction: np.ndarray
 
     def __len__(self) -> int:
         return len(self.number)
 
     @property
     def lost(self) -> np.ndarray:
-        """Periods that are missing before each, shape (n,); 0 before the first."""
+        """Number of lost periods before each one, shape (n,); 0 for the first."""
         return np.diff(self.number, prepend=self.number[:1] - 1) - 1
 
 
 @dataclass(frozen=True, eq=False)
 class Clouds:
-    """How the organ looked meanwhile, at display rate; shapes as in the file."""
+    """Displacements of the organ at display rate; shapes as in the file."""
 
     period: np.ndarray
     displacement: np.ndarray
@@ -68,12 +73,13 @@ class Clouds:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A tool's path over an organ, what it felt, and how the organ looked.
+    """A tool's path over an organ, the forces on it, and the displacements of the organ.
 
-    vademecum_id : SHA-256 of the vademecum's file; ``vademecum_name`` is for people
+    vademecum_id : SHA-256 of the vademecum's file
+    vademecum_name : name of the organ, for messages
     scene : YAML text: tips, effects and material in force
-    rate : of the loop [Hz]
-    from_rest : the model was new, and no tool had touched it before the first period
+    rate : nominal rate of the loop [Hz]
+    from_rest : whether the model was new and untouched before the first period
     """
 
     vademecum_id: str
@@ -86,7 +92,7 @@ class Recording:
 
     @property
     def seconds(self) -> float:
-        """From the first pose to the last [s]; a loop that misses periods has fewer of them."""
+        """Time from the first pose to the last [s]."""
         stamp = self.periods.stamp
         return float(stamp[-1] - stamp[0]) * 1e-9
 
@@ -99,7 +105,8 @@ def save_recording(recording: Recording, path: str | Path) -> None:
     StorageError
         If the folder does not exist or the disk is full; nothing is left behind.
     """
-    arrays = {f"periods/{name}": getattr(recording.periods, name) for name in _PERIODS}
+    periods = recording.periods
+    arrays = {f"periods/{key}": getattr(periods, name) for name, key in _PERIODS.items()}
     arrays |= {f"clouds/{name}": getattr(recording.clouds, name) for name in _CLOUDS}
     attributes = {
         "format": FORMAT,
@@ -114,75 +121,64 @@ def save_recording(recording: Recording, path: str | Path) -> None:
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Read and verify a recording.
+    """Read and verify a recording, as strictly as a vademecum.
 
     Raises
     ------
     StorageError
         For a missing, truncated, altered, foreign or newer file.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise StorageError(f"no recording at {path}; make one on the planning page")
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise StorageError(f"{path} has {path.stat().st_size >> 20} MiB; is it a recording?")
+    origin = str(path)
     try:
-        with h5py.File(path, "r") as file:
-            return _read(file, path)
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        with opened(Path(path), MAX_FILE_BYTES) as source:
+            attributes, arrays = verified(
+                source, origin, "recording", _attributes_of, lambda _: _KEYS, "record again"
+            )
+    except FileError as error:
         raise StorageError(
-            f"{path} is no readable recording ({one_line(error, 120)}); "
-            "it may be truncated: record again"
+            f"no recording at {path} ({error}); make one on the planning page"
         ) from error
-
-
-def _read(file: h5py.File, path: Path) -> Recording:
-    if str(file.attrs.get("format", "")) != FORMAT:
-        raise StorageError(f"{path} is HDF5 but no recording; give one of the planning page")
-    texts = {key: str(file.attrs[key]) for key in _TEXTS}
-    if int(texts["schema"].split(".")[0]) > int(SCHEMA_VERSION.split(".")[0]):
-        raise StorageError(
-            f"{path} has schema {texts['schema']}, this version reads up to {SCHEMA_VERSION}; "
-            "upgrade avatar"
-        )
-    keys = [f"periods/{name}" for name in _PERIODS] + [f"clouds/{name}" for name in _CLOUDS]
-    arrays = {key: _numbers(file[key], path) for key in keys}
-    if str(file.attrs["checksum"]) != checksum(arrays, texts):
-        raise StorageError(f"{path} was altered or damaged (checksum); record again")
     recording = Recording(
-        vademecum_id=texts["vademecum_id"],
-        vademecum_name=texts["vademecum_name"],
-        scene=texts["scene"],
-        rate=float(texts["rate"]),
-        from_rest=texts["from_rest"] == "True",
-        periods=Periods(*(arrays[f"periods/{name}"] for name in _PERIODS)),
-        clouds=Clouds(*(arrays[f"clouds/{name}"] for name in _CLOUDS)),
+        vademecum_id=attributes["vademecum_id"],
+        vademecum_name=attributes["vademecum_name"],
+        scene=attributes["scene"],
+        rate=_rate(attributes["rate"]),
+        from_rest=attributes["from_rest"] == "True",
+        periods=Periods(*(arrays[f"periods/{key}"] for key in _PERIODS.values())),
+        clouds=Clouds(*(arrays[f"clouds/{key}"] for key in _CLOUDS)),
     )
-    _check_shapes(recording, path)
+    if not _fits_together(recording):
+        raise StorageError(f"{path}: the arrays do not fit together; record again")
     return recording
 
 
-def _numbers(dataset: object, path: Path) -> np.ndarray:
-    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiub":
-        raise StorageError(f"{path}: '{dataset}' is no array of numbers; record again")
-    if dataset.is_virtual or dataset.external or dataset.nbytes > path.stat().st_size:
-        raise StorageError(f"{path}: '{dataset.name}' is not whole in the file; record again")
-    return np.asarray(dataset[...])
+def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:
+    if held.get("format") != FORMAT:
+        raise StorageError(f"{origin} is HDF5 but no recording; give one of the planning page")
+    require_schema(held, SCHEMA_VERSION, origin)
+    return {key: held[key] for key in _TEXTS}
 
 
-def _check_shapes(recording: Recording, path: Path) -> None:
+def _rate(text: str) -> float:
+    """A positive number, or NaN."""
+    try:
+        rate = float(text)
+    except ValueError:
+        return math.nan
+    return rate if 0.0 < rate < math.inf else math.nan
+
+
+def _fits_together(recording: Recording) -> bool:
     p, c = recording.periods, recording.clouds
-    n = len(p)
+    n = len(p.number)
     n_tools = p.tip.shape[1] if p.tip.ndim == 3 else 0
-    agree = (
+    return (
         n > 0
+        and p.number.shape == p.stamp.shape == (n,)
         and all(a.shape == (n, n_tools, 3) for a in (p.tip, p.turn, p.force))
-        and all(a.shape == (n, n_tools) for a in (p.status, p.error, p.share))
-        and p.stamp.shape == (n,)
+        and all(a.shape == (n, n_tools) for a in (p.status, p.error, p.sent_fraction))
         and bool((p.lost >= 0).all())
         and c.displacement.ndim == 3
-        and c.displacement.shape[0] == len(c.period)
-        and recording.rate > 0.0
+        and c.period.shape == c.displacement.shape[:1]
+        and not math.isnan(recording.rate)
     )
-    if not agree:
-        raise StorageError(f"{path}: the arrays do not fit together; record again")

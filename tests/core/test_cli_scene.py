@@ -15,8 +15,9 @@ from avatar_core.cli import main as cli
 from avatar_core.contact.effects import Respiration
 from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import middle_of_access, push_and_slide
+from avatar_core.errors import SceneError
 from avatar_core.scene import file as scene_file
-from avatar_core.scene.file import read_scene, scene_path, shipped_scenes
+from avatar_core.scene.file import read_scene, scene_path, shipped_scene, shipped_scenes
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.studies.bench import scene as bench_scene
 from avatar_core.studies.bench.scene import DEPTH, PUSH, StepCost, _prepared, time_scene
@@ -61,7 +62,7 @@ def test_shipped_scenes_are_found_where_they_are_installed(
 ) -> None:
     package = tmp_path / "lib" / "python3" / "site-packages" / "avatar_core"
     package.mkdir(parents=True)
-    monkeypatch.setattr(scene_file, "__file__", str(package / "scene_file.py"))
+    monkeypatch.setattr(scene_file, "__file__", str(package / "scene" / "file.py"))
     assert shipped_scenes() == {}
     folder = tmp_path / "share" / "avatar_ros" / "params" / "scenes"
     folder.mkdir(parents=True)
@@ -77,6 +78,13 @@ def test_a_bare_name_is_a_shipped_scene_unless_there_is_such_a_file(
     assert scene_path("palpation").read_text() == (SCENES / "palpation.yaml").read_text()
     Path("palpation").write_text("name: mine")
     assert read_scene(scene_path("palpation")).name == "mine"
+
+
+@pytest.mark.parametrize("name", ["nothing", "../palpation", "scenes/palpation", "", "\0"])
+def test_a_scene_that_does_not_come_with_the_project(name: str) -> None:
+    assert shipped_scene("palpation.yaml") == shipped_scene("palpation")
+    with pytest.raises(SceneError, match=r"plain name of one .*: breathing, "):
+        shipped_scene(name)
 
 
 def test_list_names_every_shipped_scene_with_its_effects(run: Any) -> None:

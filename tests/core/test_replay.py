@@ -59,7 +59,7 @@ def recorded(vademecum: Vademecum, effects: Sequence[Effect], skipped: int = 0) 
         status=status,
         force=force,
         error=np.zeros((n, 1)),
-        share=np.ones((n, 1)),
+        sent_fraction=np.ones((n, 1)),
     )
     kept = {name: value[skipped:] for name, value in vars(periods).items()}
     return Recording(
@@ -170,6 +170,12 @@ def test_a_spoilt_file_is_refused(organ: Vademecum, tmp_path: Path) -> None:
         load_recording(file)
     file.write_bytes(content[: len(content) // 2])
     with pytest.raises(StorageError, match="truncated"):
+        load_recording(file)
+    file.write_bytes(content)
+    with h5py.File(file, "r+") as opened:
+        del opened["periods/force"]
+        opened["periods/force"] = h5py.ExternalLink("/etc/passwd", "/x")
+    with pytest.raises(StorageError, match=r"only a link.*record again"):
         load_recording(file)
     save_vademecum(organ, file)
     with pytest.raises(StorageError, match="no recording"):

@@ -19,14 +19,14 @@ from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.prepare.budgets import Budgets
 from avatar_ros.prepare.orders import Order
-from avatar_ros.prepare.scenes import lay_out, plan, shipped_scene
+from avatar_ros.prepare.scenes import lay_out, plan
 from geometry_msgs.msg import Quaternion, WrenchStamped
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from avatar_core.errors import AvatarError
-from avatar_core.scene.file import read_scene
+from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_core.scene.yaml_lines import MAX_BYTES
 from avatar_ros.msg import ContactState
 from avatar_ros.srv import LoadScene
@@ -155,7 +155,7 @@ def test_most_shipped_scenes_load_here(organ: Any) -> None:
     [
         ({}, "both are empty"),
         ({"yaml": BARE, "name": "palpation"}, "not both"),
-        ({"name": "nothing"}, "there are breathing, "),
+        ({"name": "nothing"}, "avatar: breathing, "),
         ({"name": "../contact"}, "plain name"),
         ({"name": "/etc/passwd"}, "plain name"),
         ({"yaml": "effects: [fricton]"}, "yaml:1: effects.fricton is unknown; did you mean"),

@@ -11,6 +11,7 @@ from avatar_core.contact import layout as contact_layout
 from avatar_core.contact.effects import Effect, Tumour
 from avatar_core.contact.effects.selection import natural_effects
 from avatar_core.errors import SceneError
+from avatar_core.scene.file import shipped_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.yaml_lines import MAX_BYTES
 from avatar_core.vademecum.accuracy import Cloud
@@ -21,35 +22,13 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
     from avatar_ros.prepare.orders import Order
 
-_INSTALLED = Path("share", "avatar_ros", "params", "scenes")  # below a prefix, pip's or colcon's
-
-
-def shipped_scene(name: str) -> Path:
-    """The file of a scene in the installed params/scenes, with or without its ``.yaml``.
-
-    Raises
-    ------
-    SceneError
-        The name is a path, or there is no such scene; names those there are.
-    """
-    if "/" in name or ".." in name or not name.isprintable():
-        raise SceneError(f"scene {name!r}: give a plain name, without / and ..")
-    folder = _folder()
-    path = folder / f"{name.removesuffix('.yaml')}.yaml"
-    if path not in folder.glob("*.yaml"):
-        known = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
-        raise SceneError(f"scene {name!r}: no such file in {folder}; there are {known}")
-    return path
-
 
 def scene_file(value: str) -> Path:
-    """What the parameter ``scene`` says: a path where there is a /, else a shipped scene.
+    """The file that the parameter ``scene`` names: a path if there is a /, else a shipped scene.
 
-    Raises SceneError as :func:`shipped_scene`.
+    Raises SceneError if there is no shipped scene of this name.
     """
-    if "/" in value:
-        return Path(value).expanduser().absolute()
-    return shipped_scene(value)
+    return Path(value).expanduser().absolute() if "/" in value else shipped_scene(value)
 
 
 def change_of(request: Any) -> dict[str, Any]:
@@ -149,10 +128,3 @@ def _with_contrast(scene: Scene, contrast: float) -> Scene:
     """The scene with a tumour of this contrast instead of its own; refused as any scene is."""
     others: Sequence[Effect] = [effect for effect in scene.effects if effect.name != Tumour.name]
     return replace(scene, effects=(*others, Tumour(contrast)))
-
-
-def _folder() -> Path:
-    for prefix in Path(__file__).parents:
-        if (prefix / _INSTALLED).is_dir():
-            return prefix / _INSTALLED
-    raise SceneError(f"no {_INSTALLED} above {__file__}; install avatar_ros again")

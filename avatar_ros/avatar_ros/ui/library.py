@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
-
-from avatar_core.vademecum import storage
+from avatar_core.vademecum.storage import is_vademecum
 
 SURFACES = (".obj", ".stl", ".ply", ".vtk", ".off")
 
@@ -28,9 +26,5 @@ class Library:
     def _is_one(self, path: Path) -> bool:
         key = (path.name, path.stat().st_mtime_ns)
         if key not in self._known:
-            try:
-                with h5py.File(path, "r") as file:
-                    self._known[key] = str(file.attrs.get("format", "")) == storage.FORMAT
-            except OSError:
-                self._known[key] = False
+            self._known[key] = is_vademecum(path)
         return self._known[key]

@@ -140,5 +140,5 @@ def _periods(rows: np.ndarray) -> Periods:
         status=rows["status"][:, None].astype(np.uint8),
         force=rows["force"][:, None].copy(),
         error=rows["error"][:, None].copy(),
-        share=rows["share"][:, None].copy(),
+        sent_fraction=rows["share"][:, None].copy(),
     )
