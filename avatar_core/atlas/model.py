@@ -18,7 +18,6 @@ from avatar_core.atlas.anatomy import (
     Anatomy,
     AtlasError,
     Duplicate,
-    Response,
     free_name,
     require_shapes,
 )
@@ -119,16 +118,6 @@ class Atlas:
     def without_anatomies(self) -> Atlas:
         """The atlas as it was created."""
         return Atlas(self.template, self.box, self.rule)
-
-    def with_response(self, name: str, response: Response | None) -> Atlas:
-        """The atlas with the response of one anatomy set, or removed.
-
-        Raises AtlasError if there is no such anatomy or the shapes do not fit.
-        """
-        chosen = self.index(name)
-        members = list(self.anatomies)
-        members[chosen] = replace(members[chosen], response=response)
-        return replace(self, anatomies=tuple(members))
 
     # --- what is the same ---------------------------------------------------------------------
 

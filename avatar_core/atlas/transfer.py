@@ -29,7 +29,7 @@ from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.compact_response import CompactResponse, positive_part
 from avatar_core.shapes.barycenter import Barycenter, barycenter
-from avatar_core.shapes.correspondence import field_map, load_map
+from avatar_core.shapes.correspondence import interpolation_matrix, load_map
 from avatar_core.shapes.registration import Registration
 
 Weighting = Literal["lle-grid", "lle-template", "kriging"]
@@ -205,7 +205,7 @@ def carried(
     loads : LoadSurface of the template; surface : that of the patient
     """
     mesh = elasticity.mesh
-    fields = field_map(registration, mesh.vertices)
+    fields = interpolation_matrix(registration.mesh, mesh.vertices)
     positions = load_map(registration, loads, surface.centers)
     return _clamped(_mapped(response, fields, positions), elasticity)
 
@@ -230,7 +230,7 @@ def carried_by_place(
         other = TetMesh(np.asarray(base.vertices[j], float), registration.mesh.tets)
         placed = TetMesh(other.vertices - _centroid(other) + here, other.tets)
         laid = replace(registration, mesh=placed)
-        fields = field_map(laid, mesh.vertices)
+        fields = interpolation_matrix(placed, mesh.vertices)
         positions = load_map(laid, base.loads, surface.centers)
         moved.append(_mapped(base.responses[j], fields, positions))
     member = None if weights.member is None else 0

@@ -1,16 +1,14 @@
-"""What a registered template carries to a patient: clamp, loads, and fields on its mesh.
+"""Transfer from a registered template to a patient: clamp, load positions, fields on the mesh.
 
-The registered template and the patient's own mesh fill the same organ. A point of one is found in
-the other by barycentric coordinates, beyond the surface at the closest point of it:
+The registered template and the patient's own mesh fill the same organ. A point of one has
+barycentric coordinates l_k in the other; outside, those of the closest point of the surface:
 
     u_patient(x) = sum_k l_k(x) u_template,k
 
-so that everything carried is a sparse matrix whose rows sum to one and keep affine fields.
+Fields are thus transferred by sparse matrices whose rows sum to one and reproduce affine fields.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import igl
 import numpy as np
@@ -27,30 +25,16 @@ from avatar_core.shapes.springs import barycentric_centroids
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_PIECES = 3  # a patient's face goes to the region that most of its 3^2 pieces lie in
-_SLACK = 1e-9  # barycentric coordinates this far below zero still count as inside
-
-
-@dataclass(frozen=True)
-class LoadPositions:
-    """Centres of load patches on a patient's surface, in the order of the template's.
-
-    centers : ndarray, shape (n_positions, 3) [m]
-    normals : ndarray, shape (n_positions, 3), unit outward normals
-    distances : ndarray, shape (n_positions,) [m], from the registered template's positions
-    """
-
-    centers: FloatArray
-    normals: FloatArray
-    distances: FloatArray
+_PIECES = 3  # a patient's face is split into 3^2 pieces, whose majority decides on its region
+_SLACK = 1e-9  # barycentric coordinates down to minus this count as inside
 
 
 def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
-    """Clamp and accessible faces of the patient's mesh by correspondence with the template.
+    """Clamped and accessible faces of the patient's mesh, from those of the template.
 
-    Each piece of a patient's face takes the region of the closest registered face, the face that
-    of most of its pieces. Accessible faces that touch the clamp and islands below 5 % of the
-    accessible area are left out, as in the anatomical rule.
+    Each piece of a patient's face takes the region of the closest registered face, and the face
+    that of most of its pieces. Accessible faces that touch the clamp and islands below 5 % of the
+    accessible area are dropped, as by the anatomical rule.
 
     Parameters
     ----------
@@ -60,13 +44,15 @@ def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
     Raises
     ------
     RegistrationError
-        If the patient's mesh lies elsewhere, or no face falls into one of the regions.
+        If the mesh does not lie on the registered template, or a region would be empty.
     """
     _require_same_place(registration, patient)
     faces = patient.boundary_faces
-    weights = barycentric_centroids(_PIECES)
-    pieces = np.einsum("qk,fkd->fqd", weights, patient.vertices[faces]).reshape(-1, 3)
-    _, owner, _ = _closest(registration.mesh.vertices, registration.mesh.boundary_faces, pieces)
+    centroids = barycentric_centroids(_PIECES)
+    pieces = np.einsum("qk,fkd->fqd", centroids, patient.vertices[faces]).reshape(-1, 3)
+    _, owner, _ = closest_points(
+        registration.mesh.vertices, registration.mesh.boundary_faces, pieces
+    )
     owner = owner.reshape(len(faces), -1)
     regions = registration.template.regions
     clamped = regions.clamped[owner].mean(axis=1) > 0.5
@@ -79,31 +65,6 @@ def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
             "use a finer patient mesh"
         )
     return Regions(clamped, accessible)
-
-
-def carry_positions(
-    registration: Registration, loads: LoadSurface, patient: TetMesh
-) -> LoadPositions:
-    """The template's load positions on the patient's surface.
-
-    Parameters
-    ----------
-    registration : Registration
-    loads : LoadSurface of the template's mesh and regions
-    patient : TetMesh of the surface that was registered to
-
-    Raises
-    ------
-    RegistrationError
-        If the patient's mesh lies elsewhere.
-    """
-    _require_same_place(registration, patient)
-    wanted = registered_positions(registration, loads)
-    faces = patient.boundary_faces
-    centers, face, weight = _closest(patient.vertices, faces, wanted)
-    normals = np.einsum("ik,ikd->id", weight, patient.vertex_normals[faces[face]])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return LoadPositions(centers, normals, np.linalg.norm(centers - wanted, axis=1))
 
 
 def registered_positions(registration: Registration, loads: LoadSurface) -> FloatArray:
@@ -135,38 +96,36 @@ def registered_positions(registration: Registration, loads: LoadSurface) -> Floa
     return positions
 
 
-def field_map(registration: Registration, points: FloatArray) -> sp.csr_matrix:
-    """Interpolation of nodal fields from the registered template to points.
+def interpolation_matrix(mesh: TetMesh, points: FloatArray) -> sp.csr_matrix:
+    """Interpolation of nodal fields of a mesh at points.
 
     Points in a tetrahedron take its barycentric coordinates, points outside those of the closest
     point of the surface.
 
     Parameters
     ----------
-    registration : Registration
+    mesh : TetMesh, for instance the registered template
     points : ndarray, shape (n, 3) [m], for instance the vertices of the patient's own mesh
 
     Returns
     -------
-    sparse, shape (n, n_template_vertices), rows sum to one
+    sparse, shape (n, n_vertices), rows sum to one
     """
-    mesh = registration.mesh
-    tet, weight = locate(mesh, points)
-    inside = np.flatnonzero(tet >= 0)
-    outside = np.flatnonzero(tet < 0)
+    tet, barycentric = locate(mesh, points)
+    inside, outside = np.flatnonzero(tet >= 0), np.flatnonzero(tet < 0)
     faces = mesh.boundary_faces
-    _, face, face_weight = _closest(mesh.vertices, faces, points[outside])
+    _, face, on_face = closest_points(mesh.vertices, faces, points[outside])
     rows = np.concatenate([np.repeat(inside, 4), np.repeat(outside, 3)])
     columns = np.concatenate([mesh.tets[tet[inside]].ravel(), faces[face].ravel()])
-    values = np.concatenate([weight[inside].ravel(), face_weight.ravel()])
+    values = np.concatenate([barycentric[inside].ravel(), on_face.ravel()])
     return sp.csr_matrix((values, (rows, columns)), shape=(len(points), len(mesh.vertices)))
 
 
 def load_map(registration: Registration, loads: LoadSurface, points: FloatArray) -> sp.csr_matrix:
-    """Interpolation between the template's load positions at points of the patient's surface.
+    """Interpolation from the template's load positions to points of the patient's surface.
 
-    By the loads' own shape functions at the closest point of the registered template's accessible
-    faces.
+    Uses the shape functions of the loads, at the closest point of the registered template's
+    accessible faces.
 
     Parameters
     ----------
@@ -184,7 +143,7 @@ def load_map(registration: Registration, loads: LoadSurface, points: FloatArray)
         If the loads belong to another mesh or other regions.
     """
     positions = registered_positions(registration, loads)
-    _, face, barycentric = _closest(positions, loads.corners, points)
+    _, face, barycentric = closest_points(positions, loads.corners, points)
     columns, values = loads.weights(face, barycentric)
     rows = np.repeat(np.arange(len(points)), columns.shape[1])
     return sp.csr_matrix(
@@ -193,35 +152,42 @@ def load_map(registration: Registration, loads: LoadSurface, points: FloatArray)
 
 
 def locate(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Tetrahedron and barycentric coordinates of points.
+    """Tetrahedra that hold points, and barycentric coordinates in them.
 
     Returns
     -------
     tet : ndarray of int, shape (n,), -1 outside
-    weight : ndarray, shape (n, 4), sums to one, zero outside
+    barycentric : ndarray, shape (n, 4), rows sum to one; zero outside
     """
     corners = mesh.vertices[mesh.tets]
     center = corners.mean(axis=1)
     reach = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
-    found = cKDTree(points).query_ball_point(center, reach * (1.0 + 1e-9))
-    size = np.array([len(hits) for hits in found])
-    tet = np.repeat(np.arange(len(found)), size)
-    point = np.fromiter((i for hits in found for i in hits), np.int64, size.sum())
+    near = cKDTree(points).query_ball_point(center, reach * (1.0 + 1e-9))
+    size = np.array([len(hits) for hits in near])
+    tet = np.repeat(np.arange(len(near)), size)
+    point = np.fromiter((i for hits in near for i in hits), np.int64, size.sum())
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     local = np.linalg.inv(edges)[tet] @ (points[point] - corners[tet, 0])[:, :, None]
-    weight = np.concatenate([1.0 - local.sum(axis=1), local[:, :, 0]], axis=1)
-    depth = weight.min(axis=1)
-    order = np.argsort(depth, kind="stable")  # the deepest of a point is written last
+    candidate = np.concatenate([1.0 - local.sum(axis=1), local[:, :, 0]], axis=1)
+    depth = candidate.min(axis=1)
+    order = np.argsort(depth, kind="stable")  # of several tetrahedra, the deepest is written last
     order = order[depth[order] >= -_SLACK]
-    where, coordinates = np.full(len(points), -1), np.zeros((len(points), 4))
-    where[point[order]], coordinates[point[order]] = tet[order], weight[order]
-    return where, coordinates
+    found, barycentric = np.full(len(points), -1), np.zeros((len(points), 4))
+    found[point[order]], barycentric[point[order]] = tet[order], candidate[order]
+    return found, barycentric
 
 
-def _closest(
+def closest_points(
     vertices: FloatArray, faces: IntArray, points: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Closest points of a triangulation (n, 3), their faces (n,) and barycentric coordinates."""
+    """Closest points of a triangulation.
+
+    Returns
+    -------
+    nearest : ndarray, shape (n, 3) [m]
+    face : ndarray of int, shape (n,), the faces they lie on
+    barycentric : ndarray, shape (n, 3), their coordinates there, rows sum to one
+    """
     faces = faces.astype(np.int64)
     if len(points) == 0:
         return np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros((0, 3))
@@ -229,15 +195,15 @@ def _closest(
         np.ascontiguousarray(points), vertices, faces
     )
     a, b, c = (np.ascontiguousarray(vertices[faces[face, k]]) for k in range(3))
-    weight = np.clip(igl.barycentric_coordinates(nearest, a, b, c), 0.0, 1.0)
-    return nearest, face, weight / weight.sum(axis=1, keepdims=True)
+    barycentric = np.clip(igl.barycentric_coordinates(nearest, a, b, c), 0.0, 1.0)
+    return nearest, face, barycentric / barycentric.sum(axis=1, keepdims=True)
 
 
 def _require_same_place(registration: Registration, patient: TetMesh) -> None:
     """Raise RegistrationError unless the patient's surface runs along the registered one."""
     mesh = registration.mesh
     on_surface = patient.vertices[patient.surface_vertices]
-    nearest, _, _ = _closest(mesh.vertices, mesh.boundary_faces, on_surface)
+    nearest, _, _ = closest_points(mesh.vertices, mesh.boundary_faces, on_surface)
     mean = float(np.linalg.norm(nearest - on_surface, axis=1).mean())
     if not mean <= 0.5 * patient.mean_surface_edge:
         raise RegistrationError(

@@ -1,7 +1,9 @@
-"""Locally linear embedding: a base of shapes that grows one by one, and its flat map.
+"""Locally linear embedding (LLE) of a base of shapes.
 
-The embedding follows Eq. 16 of Gonzalez, Cueto & Chinesta (2015) with M = (I - W)^T (I - W): the
-last term of the matrix printed there has the wrong sign (Roweis & Saul 2000, Science 290:2323).
+:func:`locally_linear_embedding` does all of it; :func:`fit` computes the weights alone, and
+:func:`embed` the coordinates. The embedding follows Eq. 16 of Gonzalez, Cueto & Chinesta (2015)
+with M = (I - W)^T (I - W); the last term of the matrix printed there has the wrong sign (Roweis &
+Saul 2000, Science 290:2323).
 """
 
 from __future__ import annotations
@@ -22,7 +24,6 @@ from avatar_core.shapes.barycenter import (
     Vectors,
     barycenter,
     barycenter_weights,
-    checked_vector,
     convex_weights,
     local_gram,
     require_regularization,
@@ -32,18 +33,18 @@ from avatar_core.shapes.barycenter import (
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-BLOCK = 8192  # values at a time in the Gram matrix: stays in cache, and threads seldom meet
+BLOCK = 8192  # values of each vector per block of the Gram matrix: the blocks stay in cache
 ROUNDING = 4 * float(np.finfo(float).eps)  # of an inner product, relative to the lengths
-TRUSTED = 5e-11  # weights that rounding may move by more than this are solved from differences
-LOCAL_VARIANCE = 0.99  # local principal components up to this part of the variance are counted
+TRUSTED = 5e-11  # if rounding may change weights by more, they are solved from differences
+LOCAL_VARIANCE = 0.99  # part of the variance that the counted principal components explain
 
 
 @dataclass(frozen=True, eq=False)
 class Gram:
     """Inner products of a base about a fixed origin, from which all distances follow.
 
-    origin : ndarray, shape (D,), the mean when the base was begun: inner products about it are
-        small, so that their rounding is too; it stays while the base grows
+    origin : ndarray, shape (D,), the mean of the first members, which keeps the products and their
+        rounding small; it does not move when the base grows
     products : ndarray, shape (n, n), G_ij = (X_i - o) . (X_j - o)
     """
 
@@ -74,7 +75,7 @@ class Gram:
         return np.maximum(lengths[rows, None] + lengths - 2 * self.products[rows], 0.0)
 
     def grown(self, vectors: Vectors, point: FloatArray) -> Gram:
-        """With one more row, of a point that follows the vectors."""
+        """The matrix with one more row, for a point appended to the vectors."""
         shifted = point - self.origin
         row = np.array([(vector - self.origin) @ shifted for vector in vectors])
         corner = np.array([[shifted @ shifted]])
@@ -83,14 +84,14 @@ class Gram:
 
 @dataclass(frozen=True, eq=False)
 class LLE:
-    """A base of shapes with the weights of each in terms of the others; grows one by one.
+    """A base of shapes with the weights of each in terms of the others.
 
     vectors : n arrays of shape (D,)
     gram : their inner products
-    same_as : ndarray of int, shape (n,), the first member equal to it, mostly itself
-    neighbors : ndarray of int, shape (n, k), nearest first, without itself and its equals
-    weights : ndarray, shape (n, k); a later equal of a member has weight 1 on that member
-    n_neighbors, regularization, convex : what was asked; see `barycenter`
+    same_as : ndarray of int, shape (n,), number of the first member equal to each, mostly its own
+    neighbors : ndarray of int, shape (n, k), nearest first; never the member itself or its equals
+    weights : ndarray, shape (n, k); a repeated member has weight 1 on the first one equal to it
+    n_neighbors, regularization, convex : as requested; see `barycenter`
     """
 
     vectors: tuple[FloatArray, ...]
@@ -107,12 +108,12 @@ class LLE:
 
     @property
     def repeated(self) -> tuple[int, ...]:
-        """Members equal to an earlier one; they are nobody's neighbours."""
+        """Members equal to an earlier one; they are not used as neighbours."""
         return tuple(int(i) for i in np.flatnonzero(self.same_as != np.arange(len(self))))
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What was changed of the request, one line each."""
+        """How the result differs from the request, one line each."""
         different = len(self) - len(self.repeated)
         notices = [f"member {i} equals member {self.same_as[i]}" for i in self.repeated]
         if self.n_neighbors >= different:
@@ -121,13 +122,13 @@ class LLE:
 
     @cached_property
     def weight_matrix(self) -> FloatArray:
-        """W, rows sum to one, shape (n, n)."""
+        """W, shape (n, n); rows sum to one."""
         matrix = np.zeros((len(self), len(self)))
         np.add.at(matrix, (np.arange(len(self))[:, None], self.neighbors), self.weights)
         return matrix
 
     def barycenter(self, point: ArrayLike, leave_out: Collection[int] = ()) -> Barycenter:
-        """Weights of a new point, with the base's settings; equal members count once."""
+        """Weights of a new point, with the settings of the base; equal members count once."""
         return barycenter(
             self.vectors,
             point,
@@ -137,28 +138,33 @@ class LLE:
             leave_out={*leave_out, *self.repeated},
         )
 
-    def insert(self, point: ArrayLike) -> LLE:
-        """The base with one more member: one row of the Gram matrix, and new weights only where
-        the newcomer is among the neighbours. Equal to `fit` on all vectors up to rounding.
 
-        Raises LLEError if the point does not fit the base.
-        """
-        x = checked_vector(point, self.vectors)
-        n = len(self)
-        gram = self.gram.grown(self.vectors, x)
-        same_as = np.append(self.same_as, _first_equal(gram, n, self.same_as))
-        grown = replace(self, vectors=(*self.vectors, x), gram=gram, same_as=same_as)
-        if _n_used(self.n_neighbors, same_as) != _n_used(self.n_neighbors, self.same_as):
-            return _with_rows(grown, np.arange(n + 1))
-        squared = gram.squared_distances(np.arange(n))
-        nearer = squared[:, n] < squared[np.arange(n), self.neighbors[:, -1]]
-        pad = np.zeros((1, self.neighbors.shape[1]))
-        grown = replace(
-            grown,
-            neighbors=np.vstack([self.neighbors, pad.astype(np.int64)]),
-            weights=np.vstack([self.weights, pad]),
-        )
-        return _with_rows(grown, np.append(np.flatnonzero(nearer), n))
+def locally_linear_embedding(
+    vectors: Sequence[ArrayLike] | FloatArray,
+    n_neighbors: int,
+    n_components: int,
+    *,
+    regularization: float = DEFAULT_REGULARIZATION,
+    convex: bool = False,
+) -> tuple[LLE, Embedding]:
+    """Weights of a base of shapes (Eq. 15) and its low-dimensional coordinates (Eq. 16).
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (n, D), or n arrays of shape (D,)
+    n_neighbors : k, neighbours of each member
+    n_components : d, dimension of the coordinates; see `estimate_dimension`
+    regularization : part of the trace added to the diagonal of each local Gram matrix
+    convex : non-negative weights; regularization is then not used
+
+    Raises
+    ------
+    LLEError
+        If there are not more different anatomies than components, k <= 0, a value is not finite, or
+        lengths differ.
+    """
+    base = fit(vectors, n_neighbors, regularization=regularization, convex=convex)
+    return base, embed(base, n_components)
 
 
 def fit(
@@ -198,36 +204,30 @@ def fit(
         same_as = np.append(same_as, _first_equal(gram, i, same_as))
     empty = (np.zeros((len(rows), 0), dtype=np.int64), np.zeros((len(rows), 0)))
     base = LLE(rows, gram, same_as, *empty, n_neighbors, regularization, convex)
-    return _with_rows(base, np.arange(len(rows)))
+    return _with_weights(base)
 
 
 def _first_equal(gram: Gram, i: int, same_as: IntArray) -> int:
-    """First member equal to member i, itself if there is none before it.
+    """Number of the first member equal to member i; i if there is none before it.
 
-    same_as : of the members before it
+    same_as : ndarray of int, shape (i,), of the members before it
     """
     lengths = np.maximum(gram.squared_lengths[:i], gram.squared_lengths[i])
-    # the origin of equal vectors is rounded, and then their lengths about it are rounding too
+    # if all vectors are equal, their lengths about the rounded origin are rounding, too
     noise = ROUNDING**2 * (gram.origin @ gram.origin)
     squared = gram.squared_distances(np.array([i]))[0, :i]
     hits = np.flatnonzero((squared <= SAME**2 * lengths + noise) & (same_as == np.arange(i)))
     return int(hits[0]) if len(hits) else i
 
 
-def _n_used(n_neighbors: int, same_as: IntArray) -> int:
-    """Neighbours each member has: k, or all others that differ from it."""
-    return min(n_neighbors, np.count_nonzero(same_as == np.arange(len(same_as))) - 1)
-
-
-def _with_rows(base: LLE, rows: IntArray) -> LLE:
-    """The base with neighbours and weights of these rows computed anew."""
-    n, n_used = len(base), _n_used(base.n_neighbors, base.same_as)
-    k = max(n_used, 1)  # a column for the sake of equals, even if all are
-    fits = base.neighbors.shape == (n, k)
-    neighbors = base.neighbors.copy() if fits else np.zeros((n, k), dtype=np.int64)
-    weights = base.weights.copy() if fits else np.zeros((n, k))
-    is_first = base.same_as[rows] == rows
-    again, first = rows[~is_first], rows[is_first]
+def _with_weights(base: LLE) -> LLE:
+    """The base with the neighbours and weights of every member."""
+    n = len(base)
+    is_first = base.same_as == np.arange(n)
+    first, again = np.flatnonzero(is_first), np.flatnonzero(~is_first)
+    n_used = min(base.n_neighbors, len(first) - 1)
+    k = max(n_used, 1)  # one column for repeated members, even if no two members differ
+    neighbors, weights = np.zeros((n, k), dtype=np.int64), np.zeros((n, k))
     neighbors[again] = base.same_as[again, None]
     weights[again] = np.eye(1, k)
     if n_used > 0:
@@ -237,7 +237,7 @@ def _with_rows(base: LLE, rows: IntArray) -> LLE:
 
 
 def _nearest(base: LLE, rows: IntArray, k: int) -> IntArray:
-    """The k nearest others that are equal to none before them; ties by number."""
+    """The k nearest others, repeated members left out; ties go to the lower number."""
     squared = base.gram.squared_distances(rows)
     squared[:, list(base.repeated)] = np.inf
     squared[np.arange(len(rows)), rows] = np.inf
@@ -245,7 +245,7 @@ def _nearest(base: LLE, rows: IntArray, k: int) -> IntArray:
 
 
 def _row_weights(base: LLE, rows: IntArray, neighbors: IntArray) -> FloatArray:
-    """Weights of members from the Gram matrix, from differences where that loses digits."""
+    """Weights of members from the Gram matrix, or from differences where it loses digits."""
     products, lengths = base.gram.products, base.gram.squared_lengths
     cross = products[rows[:, None], neighbors]
     local = products[neighbors[:, :, None], neighbors[:, None, :]]
@@ -258,10 +258,9 @@ def _row_weights(base: LLE, rows: IntArray, neighbors: IntArray) -> FloatArray:
 
 
 def _imprecise(local: FloatArray, lengths: FloatArray, base: LLE) -> IntArray:
-    """Neighbourhoods in which rounding of the Gram matrix moves the weights beyond TRUSTED.
+    """Neighbourhoods where rounding of the Gram matrix may change the weights by more than TRUSTED.
 
-    Rounding eps |X|^2 over the least eigenvalue, which is r tr(C) at least. (Computed from
-    differences, the matrix has the same bits whether the base was grown or fitted at once.)
+    Estimated as the rounding eps |X|^2 over the smallest eigenvalue, which is at least r tr(C).
     """
     ridge = base.regularization * np.trace(local, axis1=1, axis2=2)
     rounding = ROUNDING * lengths
@@ -275,29 +274,29 @@ def _imprecise(local: FloatArray, lengths: FloatArray, base: LLE) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Embedding:
-    """Low-dimensional map of a base.
+    """Low-dimensional coordinates of a base.
 
     coordinates : ndarray Y, shape (n, d), zero mean, Y^T Y = n I
-    eigenvalues : ndarray, the lowest of M without the zero of the constant vector, ascending
+    eigenvalues : ndarray, shape (d,), the lowest of M, ascending, without that of the constant
     """
 
     coordinates: FloatArray
     eigenvalues: FloatArray
 
     def of(self, point: Barycenter) -> FloatArray:
-        """Out of sample: sum_j w_j Y_j, shape (d,)."""
+        """Coordinates of a point that is not in the base, sum_j w_j Y_j, shape (d,)."""
         return point.weights @ self.coordinates[point.neighbors]
 
 
 @dataclass(frozen=True, eq=False)
 class Dimension:
-    """How many parameters the shapes of a base seem to depend on.
+    """Estimates of how many parameters the shapes of a base depend on.
 
-    from_gap : number of lowest eigenvalues of M before the largest ratio of neighbouring ones
-    gap : that ratio; near 1 nothing stands out and the number means nothing
+    from_gap : number of eigenvalues of M below its largest spectral gap
+    gap : ratio of the two eigenvalues at the gap; near 1 the spectrum shows no dimension
     from_local_pca : principal components for 99 % of the variance of a neighbourhood, median
     eigenvalues : ndarray, the lowest of M, ascending
-    local_variances : ndarray, shape (k - 1,), mean part of the variance, descending
+    local_variances : ndarray, shape (k - 1,), mean fraction of the variance, descending
     """
 
     from_gap: int
@@ -308,7 +307,7 @@ class Dimension:
 
     @property
     def agree(self) -> bool:
-        """Whether both estimates are the same."""
+        """Whether both estimates agree; if they do not, the base shows no dimension."""
         return self.from_gap == self.from_local_pca
 
 
@@ -317,7 +316,7 @@ def spectrum(base: LLE, n_values: int) -> tuple[FloatArray, FloatArray]:
 
     Returns ndarrays of shape (n_values,) and (n, n_values).
 
-    Raises LLEError if the base has not more members than values.
+    Raises LLEError unless the base has more different members than values.
     """
     n, n_different = len(base), len(base) - len(base.repeated)
     if not 1 <= n_values < n_different:
@@ -327,7 +326,7 @@ def spectrum(base: LLE, n_values: int) -> tuple[FloatArray, FloatArray]:
         )
     rest = np.eye(n) - base.weight_matrix
     matrix = rest.T @ rest
-    # the constant is an eigenvector for zero: lifted, it cannot mix with other tiny ones
+    # the constant vector has eigenvalue zero: shifted, it cannot mix with other small ones
     matrix += np.trace(matrix) / n
     values, vectors = eigh(matrix, subset_by_index=[0, n_values - 1])
     return np.maximum(values, 0.0), vectors
@@ -336,7 +335,7 @@ def spectrum(base: LLE, n_values: int) -> tuple[FloatArray, FloatArray]:
 def embed(base: LLE, n_components: int) -> Embedding:
     """Coordinates that the weights reconstruct best (Eq. 16): min |Y - W Y|^2, Y^T Y = n I.
 
-    Raises LLEError if there are not more different anatomies than components.
+    Raises LLEError unless there are more different anatomies than components.
     """
     values, vectors = spectrum(base, n_components)
     return Embedding(vectors * np.sqrt(len(base)), values)
@@ -345,7 +344,8 @@ def embed(base: LLE, n_components: int) -> Embedding:
 def estimate_dimension(base: LLE, n_values: int = 20) -> Dimension:
     """Dimension from the gap in the spectrum of M (Polito & Perona 2001) and from local PCA.
 
-    Neither can exceed the number of neighbours less one.
+    Neither can exceed the number of neighbours minus one. Check ``gap`` and ``agree`` before
+    trusting either.
 
     Raises LLEError if there are fewer than 2 neighbours or 4 different anatomies.
     """
@@ -357,7 +357,7 @@ def estimate_dimension(base: LLE, n_values: int = 20) -> Dimension:
             "give at least 4 and 2"
         )
     values, _ = spectrum(base, min(n_values, n_different - 1))
-    floor = np.finfo(float).eps * len(base)  # rounding of M, whose entries are about one
+    floor = np.finfo(float).eps * len(base)  # rounding of M, whose entries are of order one
     ratios = np.maximum(values[1:], floor) / np.maximum(values[:-1], floor)
     ratios = ratios[: max(k - 1, 1)]
     best = int(np.argmax(ratios))
@@ -373,7 +373,7 @@ def estimate_dimension(base: LLE, n_values: int = 20) -> Dimension:
 
 
 def local_variances(base: LLE) -> FloatArray:
-    """Variance along the principal axes of each neighbourhood, parts of one, descending.
+    """Fractions of the variance along the principal axes of each neighbourhood, descending.
 
     Returns ndarray, shape (members that differ, k - 1).
     """

@@ -52,19 +52,6 @@ class Alignment:
         return replace(surface, vertices=self.apply(surface.vertices))
 
 
-@dataclass(frozen=True)
-class SurfaceDistance:
-    """Distances of two surfaces, each measured from both, by area.
-
-    mean : average symmetric surface distance [m]; p95 : 95 % of the area is closer [m]
-    maximum : Hausdorff distance over vertices and edge midpoints [m]
-    """
-
-    mean: float
-    p95: float
-    maximum: float
-
-
 def align(surface: SurfaceMesh, reference: SurfaceMesh, *, scale: bool = True) -> Alignment:
     """Similarity (or, without scale, rigid motion) that brings the surface onto the reference.
 
@@ -78,38 +65,11 @@ def align(surface: SurfaceMesh, reference: SurfaceMesh, *, scale: bool = True) -
     return fit.refined(min(starts, key=fit.screened), scale)
 
 
-def surface_distance(one: SurfaceMesh, other: SurfaceMesh) -> SurfaceDistance:
-    """Symmetric distances, by area at the edge midpoints (exact for quadratics), maximum also
-    over the vertices.
-    """
-    (d1, w1), (d2, w2) = _distances(one, other), _distances(other, one)
-    distance, weight = np.concatenate([d1, d2]), np.concatenate([w1, w2])
-    order = np.argsort(distance)
-    below = np.cumsum(weight[order]) / weight.sum()
-    p95 = distance[order][np.searchsorted(below, 0.95)]
-    return SurfaceDistance(
-        float(distance @ weight / weight.sum()), float(p95), float(distance.max())
-    )
-
-
 def surface_points(surface: SurfaceMesh, n: int) -> FloatArray:
     """Centroids of faces at n equal steps of the area summed over the faces, shape (n, 3) [m]."""
     area = np.cumsum(igl.doublearea(surface.vertices, surface.faces.astype(np.int64)))
     chosen = np.searchsorted(area, (np.arange(n) + 0.5) / n * area[-1])
     return surface.vertices[surface.faces[chosen]].mean(axis=1)
-
-
-def _distances(one: SurfaceMesh, other: SurfaceMesh) -> tuple[FloatArray, FloatArray]:
-    """Distance of edge midpoints and vertices of one to the other, and the area they stand for."""
-    corners = one.vertices[one.faces]
-    midpoints = ((corners + np.roll(corners, 1, axis=1)) / 2).reshape(-1, 3)
-    area = igl.doublearea(one.vertices, one.faces.astype(np.int64)) / 6
-    points = np.vstack([midpoints, one.vertices])
-    weight = np.concatenate([np.repeat(area, 3), np.zeros(len(one.vertices))])
-    squared, _, _ = igl.point_mesh_squared_distance(
-        points, other.vertices, other.faces.astype(np.int64)
-    )
-    return np.sqrt(squared), weight
 
 
 @dataclass(frozen=True, eq=False)

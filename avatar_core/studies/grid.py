@@ -26,10 +26,9 @@ from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.level_set import distance_grid, isosurface, signed_distance
 from avatar_core.geometry.mesh import Regions, TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.correspondence import closest_points, interpolation_matrix
 from avatar_core.studies.response import (
     carried,
-    field_at,
-    nearest_face,
     relative_errors,
     trilinear,
     unit_load_response,
@@ -164,7 +163,7 @@ def reference_of(surface: SurfaceMesh, settings: GridSettings) -> Reference:
 def passage_errors(reference: Reference, origin: FloatArray, h: float) -> FloatArray:
     """Of the responses kept on a grid and read back, shape (n_loads,)."""
     corners, back = trilinear(reference.mesh.vertices, origin, h)
-    there_and_back = (back @ field_at(reference.mesh, corners)).tocsr()
+    there_and_back = (back @ interpolation_matrix(reference.mesh, corners)).tocsr()
     found = carried(there_and_back, reference.responses)
     return relative_errors(found, reference.responses, reference.mesh)
 
@@ -173,9 +172,11 @@ def remeshed_errors(surface: SurfaceMesh, reference: Reference, n_vertices: int)
     """Of finite elements on a new mesh, read at the vertices of the old one, shape (n_loads,)."""
     mesh = tetrahedralize(surface, n_vertices)
     middle = mesh.vertices[mesh.boundary_faces].mean(axis=1)
-    clamped = reference.regions.clamped[nearest_face(reference.mesh, middle)]
+    own = reference.mesh
+    _, nearest, _ = closest_points(own.vertices, own.boundary_faces, middle)
+    clamped = reference.regions.clamped[nearest]
     found = unit_load_response(mesh, clamped, reference.centers, reference.radius)
-    on_old = carried(field_at(mesh, reference.mesh.vertices), found)
+    on_old = carried(interpolation_matrix(mesh, reference.mesh.vertices), found)
     return relative_errors(on_old, reference.responses, reference.mesh)
 
 

@@ -19,10 +19,10 @@ from avatar_core.geometry.level_set import GridBox, reinitialize
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import Barycenter
-from avatar_core.shapes.lle import embed, estimate_dimension, fit
+from avatar_core.shapes.correspondence import interpolation_matrix
+from avatar_core.shapes.lle import estimate_dimension, fit, locally_linear_embedding
 from avatar_core.studies.response import (
     carried,
-    field_at,
     relative_errors,
     trilinear,
     unit_load_response,
@@ -90,9 +90,9 @@ def study(settings: InSilicoSettings) -> Study:
         livers = populate(settings)
         spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < settings.n_base]
         rows = held_out_rows(livers, settings)
-        base = fit(livers.vectors, NEIGHBORS)
+        base, embedding = locally_linear_embedding(livers.vectors, NEIGHBORS, 2)
         eigenvalues = estimate_dimension(base).eigenvalues
-        flat = embed(base, 2).coordinates
+        flat = embedding.coordinates
     summary = {
         **mean_and_worst("volume_error", [row["volume_error"] for row in rows]),
         **mean_and_worst("displacement_nodewise", [row["nodewise"] for row in rows]),
@@ -189,7 +189,7 @@ def _through_grid(livers: Population, point: Barycenter, mesh: TetMesh) -> Float
     corners, back = trilinear(mesh.vertices, np.array(livers.box.origin), livers.box.spacing)
     total = np.zeros((len(mesh.vertices), *livers.responses[0].shape[1:]))
     for weight, j in zip(point.weights, point.neighbors, strict=True):
-        there_and_back = (back @ field_at(livers.meshes[j], corners)).tocsr()
+        there_and_back = (back @ interpolation_matrix(livers.meshes[j], corners)).tocsr()
         total += weight * carried(there_and_back, livers.responses[j])
     return total
 
@@ -197,7 +197,7 @@ def _through_grid(livers: Population, point: Barycenter, mesh: TetMesh) -> Float
 def _passage(livers: Population, i: int, mesh: TetMesh) -> FloatArray:
     """The patient's own field carried to the grid and back: what the grid alone costs."""
     corners, back = trilinear(mesh.vertices, np.array(livers.box.origin), livers.box.spacing)
-    return carried((back @ field_at(mesh, corners)).tocsr(), livers.responses[i])
+    return carried((back @ interpolation_matrix(mesh, corners)).tocsr(), livers.responses[i])
 
 
 def _sentence(summary: dict[str, float], settings: InSilicoSettings) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from itertools import product
 
-import igl
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import TetMesh
-from avatar_core.shapes.correspondence import locate
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -53,26 +51,6 @@ def carried(matrix: sp.csr_matrix, field: FloatArray) -> FloatArray:
     return (matrix @ field.reshape(len(field), -1)).reshape(matrix.shape[0], *field.shape[1:])
 
 
-def field_at(mesh: TetMesh, points: FloatArray) -> sp.csr_matrix:
-    """Interpolation from the vertices of a mesh to points, shape (n, n_vertices).
-
-    Beyond the surface the value of its closest point; rows sum to one.
-    """
-    tet, weight = locate(mesh, points)
-    inside, outside = np.flatnonzero(tet >= 0), np.flatnonzero(tet < 0)
-    rows = np.concatenate([np.repeat(inside, 4), np.repeat(outside, 3)])
-    faces, face_weight = _closest(mesh, points[outside])
-    columns = np.concatenate([mesh.tets[tet[inside]].ravel(), faces.ravel()])
-    values = np.concatenate([weight[inside].ravel(), face_weight.ravel()])
-    return sp.csr_matrix((values, (rows, columns)), shape=(len(points), len(mesh.vertices)))
-
-
-def nearest_face(mesh: TetMesh, points: FloatArray) -> NDArray[np.int64]:
-    """Number of the boundary face closest to each point, shape (n,)."""
-    faces = mesh.boundary_faces.astype(np.int64)
-    return igl.point_mesh_squared_distance(np.ascontiguousarray(points), mesh.vertices, faces)[1]
-
-
 def trilinear(
     points: FloatArray, origin: FloatArray, spacing: float
 ) -> tuple[FloatArray, sp.csr_matrix]:
@@ -92,16 +70,3 @@ def trilinear(
     row = np.repeat(np.arange(len(points)), len(offsets))
     matrix = sp.csr_matrix((weight.ravel(), (row, column.ravel())), (len(points), len(corners)))
     return origin + spacing * corners, matrix
-
-
-def _closest(mesh: TetMesh, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-    """Closest boundary faces, shape (n, 3), and barycentric coordinates there, shape (n, 3)."""
-    faces = mesh.boundary_faces.astype(np.int64)
-    if len(points) == 0:
-        return faces[:0], np.zeros((0, 3))
-    _, face, nearest = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(points), mesh.vertices, faces
-    )
-    a, b, c = (np.ascontiguousarray(mesh.vertices[faces[face, k]]) for k in range(3))
-    weight = np.clip(igl.barycentric_coordinates(nearest, a, b, c), 0.0, 1.0)
-    return faces[face], weight / weight.sum(axis=1, keepdims=True)

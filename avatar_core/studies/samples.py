@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import barycenter
-from avatar_core.shapes.lle import LLE, embed, fit
+from avatar_core.shapes.lle import LLE, locally_linear_embedding
 from avatar_core.studies.shapes import PAPER_GRID, distance_vectors, paper_box
 from avatar_core.studies.study import Study, Value, follow, mean_and_worst, one_blas_thread
 
@@ -116,8 +116,9 @@ def time_lle(vectors: FloatArray, repeats: int) -> Timing:
     """Weights and embedding of all vectors, ours and scikit-learn's in turn."""
 
     def ours() -> LLE:
-        base = fit(vectors, NEIGHBORS, regularization=TIMED_REGULARIZATION)
-        embed(base, DIMENSION)
+        base, _ = locally_linear_embedding(
+            vectors, NEIGHBORS, DIMENSION, regularization=TIMED_REGULARIZATION
+        )
         return base
 
     theirs = _sklearn(vectors)

@@ -16,9 +16,9 @@ from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.shapes.correspondence import (
-    carry_positions,
     carry_regions,
-    field_map,
+    closest_points,
+    interpolation_matrix,
     load_map,
     locate,
     registered_positions,
@@ -263,11 +263,13 @@ def test_a_mesh_of_another_organ_is_refused(warped, patient):
 
 def test_load_positions_lie_on_the_patient(warped, patient):
     loads = load_surface(warped.template.mesh, warped.template.regions)
-    carried = carry_positions(warped, loads, patient)
-    assert len(carried.centers) == loads.n_positions
-    assert np.linalg.norm(carried.normals, axis=1) == pytest.approx(1.0)
+    positions = registered_positions(warped, loads)
+    assert len(positions) == loads.n_positions
+    nearest, _, _ = closest_points(patient.vertices, patient.boundary_faces, positions)
     # two meshes of one surface differ by the sagitta of their facets
-    assert carried.distances.mean() < 2 * patient.mean_surface_edge**2 / (8 * 0.07)
+    assert np.linalg.norm(positions - nearest, axis=1).mean() < 2 * patient.mean_surface_edge**2 / (
+        8 * 0.07
+    )
     with pytest.raises(RegistrationError, match="not those of the template"):
         other = replace(loads, vertices=loads.vertices[::-1])
         registered_positions(warped, other)
@@ -276,11 +278,11 @@ def test_load_positions_lie_on_the_patient(warped, patient):
 SLOPE, OFFSET = np.array([[0.3, -2.0, 1.1], [0.0, 4.0, -1.0]]), np.array([7.0, -2.0])
 
 
-def test_field_map_keeps_affine_fields_and_sums_to_one(warped):
+def test_interpolation_keeps_affine_fields_and_sums_to_one(warped):
     mesh = warped.mesh
     weight = np.random.default_rng(8).dirichlet(np.ones(4), 500)
     points = np.einsum("ik,ikd->id", weight, mesh.vertices[mesh.tets[:500]])
-    matrix = field_map(warped, points)
+    matrix = interpolation_matrix(warped.mesh, points)
     assert matrix.shape == (500, len(mesh.vertices))
     # rounding: 1e-16 of the field, times the shape of the flattest tetrahedron
     field = mesh.vertices @ SLOPE.T + OFFSET
@@ -288,8 +290,8 @@ def test_field_map_keeps_affine_fields_and_sums_to_one(warped):
     assert matrix.sum(axis=1) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_field_map_takes_the_closest_surface_point_outside(warped, patient):
-    matrix = field_map(warped, patient.vertices)
+def test_interpolation_takes_the_closest_surface_point_outside(warped, patient):
+    matrix = interpolation_matrix(warped.mesh, patient.vertices)
     assert matrix.sum(axis=1) == pytest.approx(1.0, abs=1e-12)
     assert matrix.min() >= -1e-9  # never extrapolates
     found = matrix @ warped.mesh.vertices  # of the identity: the point itself or the closest one

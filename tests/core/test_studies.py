@@ -17,6 +17,7 @@ from avatar_core.errors import SurfaceError
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.shapes.barycenter import barycenter
+from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.shapes.lle import Gram
 from avatar_core.studies import (
     accuracy_time,
@@ -28,7 +29,7 @@ from avatar_core.studies import (
     pgd,
     samples,
 )
-from avatar_core.studies.response import carried, field_at, relative_errors, trilinear
+from avatar_core.studies.response import carried, relative_errors, trilinear
 from avatar_core.studies.shapes import paper_box, read_livers, subject_numbers
 from avatar_core.studies.study import Study, mean_and_worst, write_study
 
@@ -237,12 +238,14 @@ def test_fields_pass_the_grid_unchanged_if_they_are_affine(phantom_mesh: TetMesh
     points = phantom_mesh.vertices[phantom_mesh.tets].mean(axis=1)[::7]
     corners, back = trilinear(points, np.array([-0.2, -0.2, -0.2]), 0.003)
     np.testing.assert_allclose(back @ corners, points, atol=1e-12)
-    there = field_at(phantom_mesh, points)
+    there = interpolation_matrix(phantom_mesh, points)
     np.testing.assert_allclose(there @ phantom_mesh.vertices, points, atol=1e-12)
-    outside = field_at(phantom_mesh, np.array([[1.0, 1.0, 1.0]]))
+    outside = interpolation_matrix(phantom_mesh, np.array([[1.0, 1.0, 1.0]]))
     assert math.isclose(outside.sum(), 1.0)
     field = np.ones((len(phantom_mesh.vertices), 3, 2))
-    np.testing.assert_allclose(carried((back @ field_at(phantom_mesh, corners)), field), 1.0)
+    np.testing.assert_allclose(
+        carried((back @ interpolation_matrix(phantom_mesh, corners)), field), 1.0
+    )
 
 
 def test_relative_errors_per_load(phantom_mesh: TetMesh) -> None:

@@ -31,6 +31,7 @@ from avatar_core.shapes.barycenter import (
     convex_weights,
 )
 from avatar_core.shapes.lle import LLE, embed, estimate_dimension, fit
+from tests.core.test_lle import with_one_more
 
 Figure = Callable[[str], None]
 
@@ -116,7 +117,7 @@ def check_any_base(
         base = base.astype(np.float32).astype(np.float64)
     grown = fit(base[:1], k, regularization=r)
     for row in base[1:]:
-        grown = grown.insert(row)
+        grown = with_one_more(grown, row)
     for one in (fit(base, k, regularization=r), grown):
         rows_are_sound(one, r)
     v = rng.uniform(-1.0, 1.0, n)
@@ -317,7 +318,7 @@ def test_a_base_of_one(livers: np.ndarray, figure: Figure) -> None:
         with pytest.raises(LLEError) as refused:
             call()
         assert "\n" not in str(refused.value)
-    pair = base.insert(livers[1])
+    pair = with_one_more(base, livers[1])
     assert np.array_equal(pair.weight_matrix, [[0.0, 1.0], [1.0, 0.0]])
     figure("weight 1, no map")
 
@@ -335,10 +336,10 @@ def test_a_query_equal_to_a_member(
         assert (found.member, found.neighbors[0]) == (i, i)
         assert found.weights.tolist() == [1.0] + 7 * [0.0]
         assert np.array_equal(found.combine(livers), livers[i])
-        assert base.insert((livers[i] + shift).astype(kind)).same_as[-1] == i
+        assert with_one_more(base, (livers[i] + shift).astype(kind)).same_as[-1] == i
         beside = (livers[i] + shift + NEAR).astype(kind)
         assert base.barycenter(beside).member is None
-        assert base.insert(beside).repeated == ()
+        assert with_one_more(base, beside).repeated == ()
     figure("weight 1 on all 12")
 
 

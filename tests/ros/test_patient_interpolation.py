@@ -309,9 +309,8 @@ def test_a_wrong_parameter_ends_the_node(
 ) -> None:
     if "atlas:=SHAPES" in arguments:
         atlas = load_atlas(folder / "atlas.h5")
-        for name in atlas.names:
-            atlas = atlas.with_response(name, None)
-        save_atlas(atlas, tmp_path / "shapes.h5")
+        shapes = tuple(replace(anatomy, response=None) for anatomy in atlas.anatomies)
+        save_atlas(replace(atlas, anatomies=shapes), tmp_path / "shapes.h5")
         arguments = [f"atlas:={tmp_path / 'shapes.h5'}"]
     process = _start(own_domain, folder, *arguments)
     assert process.wait(TIMEOUT) == 1
