@@ -103,7 +103,7 @@ def vademecum(
     from avatar_core.fem.elasticity import Material
     from avatar_core.geometry.tumour import read_tumour
     from avatar_core.offline.large_deformation import LINEAR_RULE, LargeRule
-    from avatar_core.offline.pipeline import OrganOptions, orientation_warning, build
+    from avatar_core.offline.pipeline import OrganOptions, build, orientation_warning
     from avatar_core.offline.rule import BuildRule
     from avatar_core.reduction.coordinates import Coordinate
     from avatar_core.vademecum.storage import load_vademecum, save_vademecum

@@ -69,7 +69,7 @@ def shipped_scene(name: str) -> Path:
     shipped = shipped_scenes()
     if (stem := name.removesuffix(".yaml")) not in shipped:
         raise SceneError(
-            f"there is no scene {name!r}; give the plain name of one that comes with avatar: "
+            f"there is no scene {name!r}; choose one of those that come with avatar: "
             f"{', '.join(shipped) or 'none is installed'}"
         )
     return shipped[stem]

@@ -83,7 +83,7 @@ def test_a_bare_name_is_a_shipped_scene_unless_there_is_such_a_file(
 @pytest.mark.parametrize("name", ["nothing", "../palpation", "scenes/palpation", "", "\0"])
 def test_a_scene_that_does_not_come_with_the_project(name: str) -> None:
     assert shipped_scene("palpation.yaml") == shipped_scene("palpation")
-    with pytest.raises(SceneError, match=r"plain name of one .*: breathing, "):
+    with pytest.raises(SceneError, match="come with avatar: breathing, "):
         shipped_scene(name)
 
 
@@ -140,7 +140,11 @@ def test_check_reads_a_scene_of_ones_own(run: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("scene", "vademecum", "reason"),
     [
-        ("palpaton", None, "no scene 'palpaton'; give a file or one of breathing, everything"),
+        (
+            "palpaton",
+            None,
+            "no scene 'palpaton'; choose one of those that come with avatar: breathing, everything",
+        ),
         ("none.yaml", None, "none.yaml: cannot be read"),
         ("bad.yaml", None, "bad.yaml:1: effects.fricton is unknown"),
         ("palpation", "none.h5", "build one with 'avatar vademecum'"),

@@ -155,9 +155,9 @@ def test_most_shipped_scenes_load_here(organ: Any) -> None:
     [
         ({}, "both are empty"),
         ({"yaml": BARE, "name": "palpation"}, "not both"),
-        ({"name": "nothing"}, "avatar: breathing, "),
-        ({"name": "../contact"}, "plain name"),
-        ({"name": "/etc/passwd"}, "plain name"),
+        ({"name": "nothing"}, "come with avatar: breathing, "),
+        ({"name": "../contact"}, "come with avatar: "),
+        ({"name": "/etc/passwd"}, "come with avatar: "),
         ({"yaml": "effects: [fricton]"}, "yaml:1: effects.fricton is unknown; did you mean"),
         ({"yaml": "effects: {friction: {static: 0.1, kinetic: 0.3}}"}, "above static"),
         ({"yaml": "effects: [large_deformation]"}, "--material"),
