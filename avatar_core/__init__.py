@@ -1,5 +1,101 @@
 """Patient avatars: an organ becomes a vademecum that answers a haptic tool at 1 kHz.
 
+    import avatar_core as av
+
+    surface = av.read_surface("liver.obj")          # metres, RAS
+    vademecum = av.build(surface)                   # about a minute; carries its own errors
+    av.save(vademecum, "liver.h5")
+    moved = vademecum.displacement_at(point, 2.0)   # (n_vertices, 3) [m] under 2 N
+    model = av.prepare(vademecum, av.Scene())       # lays out and compiles; may fail
+    status = av.step(model, tips)                   # 1 kHz; never fails: see model.out
+
+All lengths are in metres, forces in newtons. What users can cause and cure raises
+:class:`AvatarError` with one line that names cause and remedy.
+
 The rooms, in the order in which data flows and imports may run: common, geometry, fem, reduction,
 shapes, vademecum, contact, scene, offline, atlas; then studies and cli, which use all of them.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from avatar_core.atlas.growth import create_atlas as create_atlas
+    from avatar_core.atlas.growth import extend_atlas as extend_atlas
+    from avatar_core.atlas.model import Atlas as Atlas
+    from avatar_core.atlas.patient import Patient as Patient
+    from avatar_core.atlas.patient import PatientOptions as PatientOptions
+    from avatar_core.atlas.patient import patient_vademecum as patient  # noqa: F401
+    from avatar_core.atlas.storage import load_atlas as load_atlas
+    from avatar_core.atlas.storage import save_atlas as save_atlas
+    from avatar_core.contact.model import ContactModel as ContactModel
+    from avatar_core.contact.model import Status as Status
+    from avatar_core.contact.model import step as step
+    from avatar_core.errors import AvatarError as AvatarError
+    from avatar_core.fem.elasticity import Material as Material
+    from avatar_core.geometry.phantom import phantom_liver as phantom_liver
+    from avatar_core.geometry.surface import SurfaceMesh as SurfaceMesh
+    from avatar_core.geometry.surface import read_surface as read_surface
+    from avatar_core.offline.pipeline import OrganOptions as OrganOptions
+    from avatar_core.offline.pipeline import build as build
+    from avatar_core.scene.export import export as export
+    from avatar_core.scene.file import read_scene as read_scene
+    from avatar_core.scene.model import Scene as Scene
+    from avatar_core.scene.model import Tool as Tool
+    from avatar_core.scene.prepare import prepare as prepare
+    from avatar_core.vademecum.accuracy import Budget as Budget
+    from avatar_core.vademecum.at_values import at_values as at_values
+    from avatar_core.vademecum.certificate import Certificate as Certificate
+    from avatar_core.vademecum.model import Vademecum as Vademecum
+    from avatar_core.vademecum.storage import load_vademecum as load  # noqa: F401
+    from avatar_core.vademecum.storage import save_vademecum as save  # noqa: F401
+
+# Imported when first asked for: the command and the nodes start without compiling or meshing.
+_ORIGIN = {
+    "Atlas": "atlas.model",
+    "AvatarError": "errors",
+    "Budget": "vademecum.accuracy",
+    "Certificate": "vademecum.certificate",
+    "ContactModel": "contact.model",
+    "Material": "fem.elasticity",
+    "OrganOptions": "offline.pipeline",
+    "Patient": "atlas.patient",
+    "PatientOptions": "atlas.patient",
+    "Scene": "scene.model",
+    "Status": "contact.model",
+    "SurfaceMesh": "geometry.surface",
+    "Tool": "scene.model",
+    "Vademecum": "vademecum.model",
+    "at_values": "vademecum.at_values",
+    "build": "offline.pipeline",
+    "create_atlas": "atlas.growth",
+    "export": "scene.export",
+    "extend_atlas": "atlas.growth",
+    "load": "vademecum.storage:load_vademecum",
+    "load_atlas": "atlas.storage",
+    "patient": "atlas.patient:patient_vademecum",
+    "phantom_liver": "geometry.phantom",
+    "prepare": "scene.prepare",
+    "read_scene": "scene.file",
+    "read_surface": "geometry.surface",
+    "save": "vademecum.storage:save_vademecum",
+    "save_atlas": "atlas.storage",
+    "step": "contact.model",
+}
+
+__all__ = [*_ORIGIN]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ORIGIN:
+        raise AttributeError(f"module 'avatar_core' has no attribute '{name}'")
+    module, _, own = _ORIGIN[name].partition(":")
+    found = getattr(import_module(f"avatar_core.{module}"), own or name)
+    globals()[name] = found  # also where a room of this name was imported before
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

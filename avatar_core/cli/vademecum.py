@@ -168,7 +168,7 @@ def vademecum(
 
 def _timed(built: Vademecum, progress: Progress) -> Vademecum:
     """The vademecum with the steps of its accuracy curve timed on this machine."""
-    from avatar_core.offline.certify.timing import timed
+    from avatar_core.contact.timing import timed
 
     certificate = built.certificate
     assert certificate is not None and certificate.curve is not None

@@ -16,17 +16,17 @@ answers, before the force guard, whose state (limits, ramps, engagement) is not 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avatar_core.contact import model as contact
-from avatar_core.contact.model import Status, prepare
+from avatar_core.contact.model import Status, make_model
 from avatar_core.errors import StorageError
 from avatar_core.scene.file import parse_scene
 from avatar_core.scene.model import Scene
+from avatar_core.scene.prepare import specify
 from avatar_core.scene.recording import Periods, Recording
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 
 _REMEMBER_FOR_EVER = ("viscoelasticity", "inertia")
@@ -75,14 +75,8 @@ def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
             f"the recording has {periods.tip.shape[1]} tools, its scene {len(scene.tools)}; "
             "record again"
         )
-    model = prepare(
-        at_values(vademecum, scene.values),
-        tuple(tool.tip_radius for tool in scene.tools),
-        cloud="off",
-        effects=scene.effects,
-        period=1.0 / recording.rate,
-        halves=True,
-    )
+    spec = specify(vademecum, replace(scene, cloud="off"))
+    model = make_model(spec.layout(spec.finest, 1.0 / recording.rate), halves=True)
     force = np.empty(periods.force.shape)
     friction = model.effects.friction
     for k in range(len(periods)):

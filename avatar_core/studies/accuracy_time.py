@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from avatar_core.contact.timing import timed
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.offline.certify.linear import measured
-from avatar_core.offline.certify.timing import timed
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.studies.force_error import ForceErrors, force_errors
 from avatar_core.studies.offline_cost import grid_rows, mesh_rows, patient_rows, shape_rows

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from avatar_core.contact.layout import lay_out
+from avatar_core.contact.layout import PERIOD
 from avatar_core.contact.model import ContactModel, make_model, step
 from avatar_core.contact.tool_path import push_and_slide, starts_apart
 from avatar_core.scene.model import Scene
+from avatar_core.scene.prepare import specify
 from avatar_core.studies.bench.methods import PASSES, one_pass
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 
 PUSH, DEPTH = 10e-3, 5e-3  # [m] how deep the tools push, and slide
@@ -106,16 +106,15 @@ class _Prepared:
 
 def _prepared(vademecum: Vademecum, scene: Scene, name: str) -> _Prepared:
     start = time.perf_counter()
-    radii = tuple(tool.tip_radius for tool in scene.tools)
-    chosen = at_values(vademecum, scene.values)
-    layout = lay_out(chosen, radii, scene.modes, scene.cloud, scene.effects)
+    spec = specify(vademecum, scene)
+    layout = spec.layout(spec.finest, PERIOD)
     laid_out = time.perf_counter()
     model = make_model(layout)
     compiled = time.perf_counter()
-    starts = starts_apart(vademecum, len(radii))
+    starts = starts_apart(vademecum, len(spec.tip_radii))
     paths = [
         push_and_slide(vademecum, radius, PUSH, DEPTH, STEPS, at)
-        for radius, at in zip(radii, starts, strict=True)
+        for radius, at in zip(spec.tip_radii, starts, strict=True)
     ]
     tips = _followed(model, np.ascontiguousarray(np.stack(paths, axis=1)))
     return _Prepared(name, model, tips, laid_out - start, compiled - laid_out)

@@ -38,8 +38,8 @@ class Budgets:
         AccuracyError
             If no detail meets it, with the nearest two, or the vademecum was never measured.
         """
+        from avatar_core.contact.timing import timed
         from avatar_core.errors import AccuracyError
-        from avatar_core.offline.certify.timing import timed
         from avatar_core.vademecum.accuracy import Budget, Detail, choose
 
         self._keep_for(plan)
@@ -86,7 +86,7 @@ class Budgets:
         ------
         OvertakenError : as soon as ``overtaken`` says so
         """
-        from avatar_core.offline.certify.timing import slides, timed_points
+        from avatar_core.contact.timing import slides, timed_points
 
         def go_on(share: float) -> None:
             if overtaken():

@@ -1,0 +1,125 @@
+"""From a vademecum and a scene to a contact model, as exact as a budget allows.
+
+``vademecum, scene -> specify -> ModelSpec -> prepare -> ContactModel``
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from avatar_core.contact.effects import Effect
+from avatar_core.contact.effects.selection import natural_effects
+from avatar_core.contact.layout import PERIOD, Layout, lay_out
+from avatar_core.contact.model import ContactModel, make_model
+from avatar_core.contact.timing import timed
+from avatar_core.errors import AccuracyError
+from avatar_core.scene.model import Scene
+from avatar_core.vademecum.accuracy import AccuracyCurve, Budget, Cloud, Detail, choose
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.model import Vademecum
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """What a scene makes of a vademecum.
+
+    vademecum : at the values chosen for its material
+    tip_radii : of the tools [m]
+    modes : of the displacement at most; None for all
+    """
+
+    vademecum: Vademecum
+    tip_radii: tuple[float, ...]
+    modes: int | None
+    cloud: Cloud
+    effects: tuple[Effect, ...]
+
+    @property
+    def finest(self) -> Detail:
+        """All modes, with the whole near field."""
+        return Detail(self.modes or self.vademecum.far.rank, self.cloud)
+
+    @property
+    def curve(self) -> AccuracyCurve | None:
+        """Errors of all details of this cloud, as certified; None if they were not measured."""
+        certificate = self.vademecum.certificate
+        return certificate.curve.of(self.cloud) if certificate and certificate.curve else None
+
+    def timed_curve(self, period: float, halves: bool = False) -> AccuracyCurve:
+        """The curve with the times of steps on this machine.
+
+        Raises
+        ------
+        AccuracyError
+            If the errors were never measured.
+        """
+        if self.curve is None:
+            raise AccuracyError(
+                "this vademecum has no accuracy curve for a budget to choose from; build it again "
+                "with this version of 'avatar vademecum', or ask without a budget"
+            )
+        # Single precision shows nothing that 16 bits do not, and is slower.
+        usual = tuple(p for p in self.curve.points if p.detail.precision != "float32")
+        curve = replace(self.curve, points=usual)
+        return timed(self.vademecum, curve, self.tip_radii, self.effects, period, halves)
+
+    def layout(self, detail: Detail, period: float) -> Layout:
+        """Constant arrays of a contact model that shows a detail."""
+        return lay_out(
+            self.vademecum,
+            self.tip_radii,
+            detail.modes,
+            detail.cloud,
+            self.effects,
+            period,
+            detail.precision,
+            detail.near,
+        )
+
+
+def specify(
+    vademecum: Vademecum, scene: Scene | None, values: Mapping[str, float] | None = None
+) -> ModelSpec:
+    """What a scene makes of a vademecum; without one, one tool and the natural effects.
+
+    values : of the material, by coordinate; they override those of the scene
+
+    Raises
+    ------
+    AvatarError
+        What the vademecum cannot serve, with the remedy.
+    """
+    if scene is None:
+        chosen = at_values(vademecum, values or {})
+        return ModelSpec(chosen, (5e-3,), None, "surface", natural_effects(chosen, 1))
+    scene.require(vademecum)
+    chosen = at_values(vademecum, {**scene.values, **(values or {})})
+    radii = tuple(tool.tip_radius for tool in scene.tools)
+    return ModelSpec(chosen, radii, scene.modes, scene.cloud, scene.effects)
+
+
+def prepare(
+    vademecum: Vademecum,
+    scene: Scene | None = None,
+    budget: Budget | None = None,
+    period: float = PERIOD,
+) -> ContactModel:
+    """The contact model of a scene, laid out and compiled; takes seconds, may fail.
+
+    Parameters
+    ----------
+    vademecum : Vademecum
+    scene : Scene; None for one spherical tip of 5 mm and the effects the vademecum calls for
+    budget : Budget; the fastest detail of the displacement that keeps it is shown, timed on this
+        machine. None shows all modes. The force always keeps all of them.
+    period : of the steps [s]
+
+    Raises
+    ------
+    AvatarError
+        What the vademecum cannot serve, or a budget that no detail meets, with the nearest two.
+    """
+    spec = specify(vademecum, scene)
+    detail = choose(spec.timed_curve(period), budget).detail if budget else spec.finest
+    return make_model(spec.layout(detail, period))

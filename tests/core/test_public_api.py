@@ -1,0 +1,75 @@
+"""The public API: what a notebook imports, and the lines of the README, run as they stand there."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import avatar_core as av
+from avatar_core.vademecum.model import Vademecum
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+
+
+def test_names_for_type_checkers_are_the_names_that_exist() -> None:
+    tree = ast.parse(Path(av.__file__).read_text())
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    named = {a.asname or a.name for node in ast.walk(block) for a in getattr(node, "names", ())}
+    assert named == set(av.__all__) == {n for n in dir(av) if getattr(av, n, None) and n in named}
+
+
+@pytest.mark.parametrize("name", av.__all__)
+def test_everything_public_is_documented(name: str) -> None:
+    found = getattr(av, name)
+    assert len((found.__doc__ or "").split()) >= 5
+    if callable(found) and not isinstance(found, type):
+        assert found.__annotations__.get("return") is not None
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'vademecum_of'"):
+        av.vademecum_of  # noqa: B018
+
+
+def test_a_budget_chooses_what_is_shown_and_leaves_the_force(phantom_vademecum: Vademecum) -> None:
+    """The tolerance of a coarser point of the certified curve: fewer modes, the same force."""
+    vademecum = phantom_vademecum
+    assert vademecum.certificate is not None and vademecum.certificate.curve is not None
+    scene = av.Scene(effects=())
+    points = vademecum.certificate.curve.of("surface").points
+    loose = float(np.median([point.l2 for point in points]))
+    coarse = av.prepare(vademecum, scene, av.Budget(tolerance=loose, deadline=np.inf))
+    fine = av.prepare(vademecum, scene)
+    assert coarse.n_modes < fine.n_modes
+    forces = [press(model, vademecum) for model in (coarse, fine)]
+    np.testing.assert_allclose(forces[0], forces[1], rtol=1e-6)
+    with pytest.raises(av.AvatarError, match="nearest"):
+        av.prepare(vademecum, scene, av.Budget(tolerance=1e-9, deadline=np.inf))
+
+
+def press(model: Any, vademecum: Vademecum) -> Sequence[float]:
+    point, normal = vademecum.surface.centers[100], vademecum.surface.normals[100]
+    for depth in np.linspace(-5e-3, 2e-3, 50):
+        av.step(model, point + (5e-3 - depth) * normal)
+    return list(model.out.force[0])
+
+
+def test_the_lines_of_the_readme_give_the_numbers_beside_them(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each ``# -> number`` is what its line prints, to 10 %: meshes differ from run to run."""
+    block = re.search(r"<!-- python-example -->\n```python\n(.*?)```", README.read_text(), re.S)
+    assert block is not None
+    code = block[1]
+    promised = [float(number) for number in re.findall(r"# -> (-?[\d.e-]+)", code)]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, str(README), "exec"), {})
+    printed = [float(line) for line in capsys.readouterr().out.split()]
+    assert len(promised) >= 2
+    np.testing.assert_allclose(printed, promised, rtol=0.1)
