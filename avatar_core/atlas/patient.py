@@ -407,7 +407,7 @@ def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
     """Modes rotated so that the first hold most of the displacement; Y Y^T does not change."""
     field_ = SeparatedField(np.asarray(response.space, float), np.asarray(response.load, float))
     size = np.maximum((field_.load**2).sum(axis=1), 1e-300)
-    sorted_ = field_.sorted_by_norm(np.repeat(mesh.vertex_volumes, 3), 1.0 / size)
+    sorted_ = field_.sorted_by_norm(mesh.lumped_mass, 1.0 / size)
     return SeparatedField(sorted_.space.astype(np.float32), sorted_.load.astype(np.float32))
 
 

@@ -1,8 +1,8 @@
-"""HDF5 files that appear complete or not at all, and tell whether they were altered since.
+"""The only module that opens HDF5 files: written complete or not at all, verified when read.
 
-Nothing outside a file is followed, and what it claims to hold is weighed against its size before it
-is read. That leaves the HDF5 library itself, which some damaged files end or hang; who reads files
-of others does so in a process of its own, :mod:`avatar_core.common.confined`.
+No link that leaves a file is followed, and the size that its arrays claim is compared with the size
+of the file before they are read. The HDF5 library itself may still crash or hang on damaged files:
+files of others are read in a separate process, :mod:`avatar_core.common.confined`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import BinaryIO
 import h5py
 import numpy as np
 
+from avatar_core.common.files import FileError, opened
 from avatar_core.errors import StorageError, one_line
 
 Arrays = dict[str, np.ndarray]
@@ -89,7 +90,7 @@ def verified(
     keys_of: Callable[[Collection[str]], Iterable[str]],
     remedy: str = "build or copy it again",
 ) -> tuple[Attributes, Arrays]:
-    """Attributes and arrays of a file that are as they were written.
+    """Attributes and arrays of a file, checked to be as they were written.
 
     Parameters
     ----------
@@ -121,6 +122,15 @@ def verified(
     if stated != checksum(arrays, attributes):
         raise StorageError(f"{origin} was altered or damaged (checksum); {remedy}")
     return attributes, arrays
+
+
+def format_of(path: Path, max_bytes: int) -> str | None:
+    """The attribute ``format`` of an HDF5 file, None if it is not one; nothing else is read."""
+    try:
+        with opened(path, max_bytes) as source, h5py.File(source, "r") as file:
+            return root_attributes(file).get("format")
+    except (FileError, *UNREADABLE):
+        return None
 
 
 def root_attributes(file: h5py.File) -> Attributes:

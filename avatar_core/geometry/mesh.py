@@ -85,9 +85,14 @@ class TetMesh:
 
     @cached_property
     def vertex_volumes(self) -> np.ndarray:
-        """Lumped volume of each vertex, shape (n_vertices,) [m^3]: the mass of the L2 norm."""
+        """Lumped volume of each vertex, shape (n_vertices,) [m^3]."""
         quarter = np.repeat(self.tet_volumes / 4.0, 4)
         return np.bincount(self.tets.ravel(), weights=quarter, minlength=len(self.vertices))
+
+    @cached_property
+    def lumped_mass(self) -> np.ndarray:
+        """Vertex volume of each displacement component, shape (3 n_vertices,) [m^3]."""
+        return np.repeat(self.vertex_volumes, 3)
 
     @cached_property
     def pieces(self) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress
 from avatar_core.reduction.near_field import LocalBlocks, Pairs, near_pairs, plateau, wendland
@@ -58,14 +59,15 @@ def exact_response(
     sampled = np.sort(sampled[: max(1, rule.max_sample_bytes // (36 * len(vertices)))])
     columns = np.empty((3 * len(vertices), len(sampled), 3), np.float32)
     place = {int(j): k for k, j in enumerate(sampled)}
-    mass = elasticity.mesh.vertex_volumes[:, None, None, None]
+    mass = elasticity.mesh.lumped_mass
     by_column, average = loads.tocsc(), loads.T.tocsr()
     for first in range(0, n, _BATCH):
         batch = range(first, min(first + _BATCH, n))
         solution = elasticity.solve(by_column[:, 3 * batch.start : 3 * batch.stop])
-        at_vertex = elasticity.at_vertices(solution).reshape(len(vertices), 3, -1, 3)
+        displacement = elasticity.at_vertices(solution)
+        at_vertex = displacement.reshape(len(vertices), 3, -1, 3)
         at_position = (average @ solution).reshape(n, 3, -1, 3)
-        norm[batch] = np.sqrt((mass * at_vertex**2).sum(axis=(0, 1)))
+        norm[batch] = l2_norm(displacement, mass).reshape(-1, 3)
         for k, j in enumerate(batch):
             row = slice(vertex_pairs.start[j], vertex_pairs.start[j + 1])
             vertex[row] = at_vertex[vertex_pairs.target[row], :, k]

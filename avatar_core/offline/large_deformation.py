@@ -96,7 +96,7 @@ def with_large_deformation(
     """
     rule, build = rule or LargeRule(), build or BuildRule()
     paths = _follow(problem, vademecum.surface, rule, progress)
-    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)
+    mass = vademecum.mesh.lumped_mass
     space = _principal(paths, mass, rule)
     load = paths.fields @ (mass[:, None] * space)
     near = _near(vademecum, paths, space, load, build)
@@ -111,7 +111,7 @@ def _follow(
     problem: Hyperelasticity, surface: LoadSurface, rule: LargeRule, progress: Progress
 ) -> _Paths:
     n, n_vertices = surface.n_positions, len(problem.mesh.vertices)
-    mass = np.repeat(problem.mesh.vertex_volumes, 3)
+    mass = problem.mesh.lumped_mass
     loads = patch_loads(problem.linear, surface.centers, surface.patch_radius).tocsc()
     fields = np.empty((len(POWERS), n, 3 * n_vertices), np.float32)
     depth, reach, size = np.empty((len(POWERS), n)), np.empty(n), np.empty(n)

@@ -64,7 +64,7 @@ def build_vademecum(
     rule, with_body = _with_room_for_body(rule)
     solution, weights = find_modes(elasticity, loads, response, residual, rule, progress)
     modes = SeparatedField(elasticity.at_vertices(solution.space), solution.load)
-    mixing = modes.mixing_by_norm(np.repeat(elasticity.mesh.vertex_volumes, 3), weights)
+    mixing = modes.mixing_by_norm(elasticity.mesh.lumped_mass, weights)
     modes = SeparatedField(modes.space @ mixing, modes.load @ mixing)
     errors = _rank_errors(modes, residual, rule)
     rank, converged = _choose_rank(errors, rule)

@@ -199,7 +199,7 @@ def _principal(
     """
     mesh = snapshots[0].elasticity.mesh
     space = np.hstack([snapshot.space for snapshot in snapshots])
-    mass = np.repeat(mesh.vertex_volumes, 3)
+    mass = mesh.lumped_mass
     a = np.linalg.qr(np.sqrt(mass)[:, None] * space[: len(mass)].astype(float), mode="r")
     roots = [
         np.linalg.qr(np.sqrt(weight)[:, None] * snapshot.load, mode="r")
@@ -222,7 +222,7 @@ def _project(
     inverse = np.linalg.inv(np.linalg.cholesky(stiffness)).T  # single precision can hold these
     space, operators = space @ inverse, inverse.T @ operators @ inverse
     basis = SeparatedField(middle.at_vertices(space), loads.T @ space)
-    mass = np.repeat(middle.mesh.vertex_volumes, 3)
+    mass = middle.mesh.lumped_mass
     body = body_response(middle, space) if rule.max_modes >= LEAST_MODES else None
     fields = tuple(
         galerkin_field(basis, operators, s.elasticity.factors, mass, rule.max_modes, body)[0]

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import ConvergenceError
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.reduction.compact_response import CompactResponse, positive_part
 from avatar_core.reduction.near_field import LocalBlocks, near_pairs, wendland
@@ -161,11 +162,12 @@ class Probes:
     def errors(self, basis: GalerkinBasis) -> FloatArray:
         """Relative mass-weighted L2 error of the Galerkin displacement at each probe, (n,)."""
         elasticity = basis.elasticity
-        mass = np.repeat(elasticity.mesh.vertex_volumes, 3)[:, None]
         estimate = elasticity.at_vertices(basis.space) @ basis.load[triples(self.positions)].T
-        off = (mass * (estimate - self.columns) ** 2).sum(axis=0).reshape(-1, 3).sum(axis=1)
-        size = (mass * self.columns**2).sum(axis=0).reshape(-1, 3).sum(axis=1)
-        return np.asarray(np.sqrt(off / size))
+        error, size = (
+            np.linalg.norm(l2_norm(field, elasticity.mesh.lumped_mass).reshape(-1, 3), axis=1)
+            for field in (estimate - self.columns, self.columns)
+        )
+        return np.asarray(error / size)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
+from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
 from avatar_core.geometry.mesh import Regions, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
@@ -244,13 +245,12 @@ def _estimates(problem: AffineProblem, found, rank: int) -> dict[str, float]:  #
 
 
 def _norms(elasticity: Elasticity, loads) -> np.ndarray:  # type: ignore[no-untyped-def]
-    mass = np.repeat(elasticity.mesh.vertex_volumes, 3)[:, None]
     out = np.empty(loads.shape[1])
     by_column = loads.tocsc()
     for first in range(0, loads.shape[1], 300):
         block = slice(first, min(first + 300, loads.shape[1]))
         solution = elasticity.at_vertices(elasticity.solve(by_column[:, block]))
-        out[block] = np.sqrt((mass * solution**2).sum(axis=0))
+        out[block] = l2_norm(solution, elasticity.mesh.lumped_mass)
     return out
 
 

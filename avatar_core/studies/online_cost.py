@@ -19,6 +19,7 @@ import numpy as np
 from avatar_core.contact.effects import LargeDeformationEffect
 from avatar_core.errors import AccuracyError
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.norms import l2_norm, relative_l2
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.offline.certify.linear import UnseenErrors
 from avatar_core.studies.bench.effects import CASES, effect_rows
@@ -129,7 +130,7 @@ def rival_rows(
     drawn = np.random.default_rng(seed).permutation(len(surface.corners))
     chosen, others = drawn[:n_loads], drawn[n_loads : n_loads + N_SNAPSHOTS]
     truth = _solutions(elasticity, surface.centroids[chosen], surface.patch_radius)
-    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)[:, None]
+    mass = vademecum.mesh.lumped_mass
     errors = _table_errors(vademecum, elasticity, chosen, truth, mass)
     table = upper_quantile(errors, n_independent=n_loads)
     return [
@@ -184,11 +185,7 @@ def _table_errors(
     columns = columns.reshape(len(columns), len(needed), 3)
     rows = zip(index.reshape(positions.shape), weights, strict=True)
     found = np.stack([np.einsum("vid,i->vd", columns[:, row], w) for row, w in rows], axis=1)
-    return _relative(found.reshape(truth.shape), truth, mass)
-
-
-def _relative(found: np.ndarray, truth: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    return np.sqrt((mass * (found - truth) ** 2).sum(axis=0) / (mass * truth**2).sum(axis=0))
+    return relative_l2(found.reshape(truth.shape), truth, mass)
 
 
 def _optimum_rows(
@@ -197,7 +194,7 @@ def _optimum_rows(
     """The best n modes for the snapshots, on other loads; as fast as ours without near field."""
 
     def scaled_of(field: np.ndarray) -> np.ndarray:
-        return np.asarray(np.sqrt(mass) * field / np.sqrt((mass * field**2).sum(axis=0)))
+        return np.asarray(np.sqrt(mass)[:, None] * field / l2_norm(field, mass))
 
     basis = np.linalg.svd(scaled_of(snapshots), full_matrices=False)[0]
     scaled = scaled_of(truth)

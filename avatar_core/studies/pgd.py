@@ -22,6 +22,7 @@ import scipy.sparse as sp
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
@@ -69,13 +70,13 @@ class Case:
 
     @property
     def mass(self) -> FloatArray:
-        """Lumped, shape (3 n_vertices, 1)."""
-        return np.repeat(self.elasticity.mesh.vertex_volumes, 3)[:, None]
+        """Lumped, shape (3 n_vertices,)."""
+        return self.elasticity.mesh.lumped_mass
 
     @property
     def size(self) -> FloatArray:
         """L2 norm of each answer."""
-        return np.asarray(np.sqrt((self.mass * self.exact**2).sum(axis=0)))
+        return l2_norm(self.exact, self.mass)
 
 
 def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
@@ -151,7 +152,7 @@ def _rows(case: Case, kind: str, settings: PGDSettings) -> list[dict[str, Value]
     found: list[dict[str, Value]] = []
 
     def add(method: str, rank: int, left: FloatArray, contact: FloatArray) -> None:
-        l2 = np.sqrt((case.mass * left**2).sum(axis=0)) / case.size
+        l2 = l2_norm(left, case.mass) / case.size
         found.append(
             {
                 "loads": kind,
@@ -166,7 +167,8 @@ def _rows(case: Case, kind: str, settings: PGDSettings) -> list[dict[str, Value]
 
     greedy = _pgd(case, PGDRule(max(ranks), 1e-12, block=1), relative=False)
     default, sorted_field = _default(case, max(ranks))
-    scaled = np.sqrt(case.mass) * case.exact / case.size
+    root = np.sqrt(case.mass)[:, None]
+    scaled = root * case.exact / case.size
     left_vectors = np.linalg.svd(scaled, full_matrices=False)[0]
     for rank in follow(ranks, f"{kind} loads"):
         for method, load in (("PGD, paper's norm", greedy), ("default", default)):
@@ -181,7 +183,7 @@ def _rows(case: Case, kind: str, settings: PGDSettings) -> list[dict[str, Value]
             else:
                 add(method, rank, case.exact - _at(case, some), contact)
         basis = left_vectors[:, :rank]
-        best = basis @ (basis.T @ (scaled * case.size)) / np.sqrt(case.mass)
+        best = basis @ (basis.T @ (scaled * case.size)) / root
         add("SVD optimum", rank, case.exact - best, np.full(n, np.nan))
     vectors = solve_hadamard(case.elasticity, case.loads, min(settings.n_hadamard, n), max_sweeps=5)
     for rank in (r for r in ranks if r <= settings.n_hadamard):
@@ -217,15 +219,14 @@ def _default(case: Case, n_modes: int) -> tuple[SeparatedField, SeparatedField]:
     def follow_error(space: FloatArray, load: FloatArray) -> FloatArray:
         nonlocal left
         left = left - case.elasticity.at_vertices(space) @ load.T
-        outside = (case.mass * ((1.0 - case.near) * left) ** 2).sum(axis=0)
-        error = np.sqrt(outside) / case.size
+        error = l2_norm((1.0 - case.near) * left, case.mass) / case.size
         weights[:] = base * (error / error.mean()) ** 2
         return weights.copy()
 
     problem = LoadProblem(case.elasticity, case.loads, base, case.work)
     found = solve_pgd(problem, PGDRule(n_modes, 1e-12), reweigh=follow_error)
     modes = SeparatedField(case.elasticity.at_vertices(found.space), found.load)
-    return SeparatedField(found.space, found.load), modes.sorted_by_norm(case.mass[:, 0], weights)
+    return SeparatedField(found.space, found.load), modes.sorted_by_norm(case.mass, weights)
 
 
 def _summary(rows: list[dict[str, Value]]) -> dict[str, float]:

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import TetMesh
 
@@ -41,9 +42,8 @@ def relative_errors(found: FloatArray, wanted: FloatArray, mesh: TetMesh) -> Flo
 
     found, wanted : ndarray, shape (n_vertices, 3, n_loads), at the vertices of the mesh
     """
-    mass = mesh.vertex_volumes
-    off = np.einsum("v,vcl->l", mass, (found - wanted) ** 2)
-    return np.sqrt(off / np.einsum("v,vcl->l", mass, wanted**2))
+    shape = (len(mesh.lumped_mass), -1)
+    return relative_l2(found.reshape(shape), wanted.reshape(shape), mesh.lumped_mass)
 
 
 def carried(matrix: sp.csr_matrix, field: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.reduction.affine import CanonicalField
 from avatar_core.reduction.affine_elasticity import N_NODES
@@ -25,7 +26,7 @@ class Unseen:
 
     positions, weights : ndarray, shape (n, 3 or 6), the centroids among the load positions
     loads : sparse, shape (3 n_nodes, 3 n); solution : ndarray of that shape [m/N]
-    mass : ndarray, shape (3 n_vertices, 1)
+    mass : ndarray, shape (3 n_vertices,), lumped
     """
 
     values: Mapping[str, float]
@@ -38,8 +39,7 @@ class Unseen:
     def errors(self, found: FloatArray) -> tuple[FloatArray, FloatArray]:
         """L2 of each load, and of the 3 x 3 contact displacement of each patch (Frobenius)."""
         n_vertex = len(self.mass)
-        left = self.mass * (found[:n_vertex] - self.solution[:n_vertex]) ** 2
-        l2 = np.sqrt(left.sum(axis=0) / (self.mass * self.solution[:n_vertex] ** 2).sum(axis=0))
+        l2 = relative_l2(found[:n_vertex], self.solution[:n_vertex], self.mass)
         exact, mine = self._own(self.solution), self._own(found)
         contact = np.linalg.norm(mine - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
         return l2, contact
@@ -60,7 +60,7 @@ def unseen(
 ) -> list[Unseen]:
     """Random values, even in each coordinate's own scale, and random centroids for each."""
     rng = np.random.default_rng(seed)
-    mass = np.repeat(elasticity.mesh.vertex_volumes, 3)[:, None]
+    mass = elasticity.mesh.lumped_mass
     out = []
     for _ in range(n_values):
         values = {c.name: c.value_at(rng.random()) for c in coordinates}

@@ -42,7 +42,7 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     material = replace(material, poisson_ratio=point.get("poisson", material.poisson_ratio))
     contrast = point.get("contrast", vademecum.contrast)
     reference = replace(material, young_modulus=parametric.young_modulus)
-    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)
+    mass = vademecum.mesh.lumped_mass
     factors = factors_at(reference, contrast)
     far, body = galerkin_field(
         parametric.basis, parametric.operators, factors, mass, parametric.rank, parametric.body

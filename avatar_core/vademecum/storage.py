@@ -41,16 +41,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import h5py
 import numpy as np
 
 from avatar_core.common.dataclass_json import of_plain, parsed, require_name
 from avatar_core.common.files import FileError, opened
 from avatar_core.common.hdf5 import (
-    UNREADABLE,
+    format_of,
     replace_file,
     require_schema,
-    root_attributes,
     verified,
 )
 from avatar_core.errors import AvatarError, StorageError
@@ -135,11 +133,7 @@ def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
 
 def is_vademecum(path: str | Path) -> bool:
     """Whether a path is an ordinary file that calls itself a vademecum; nothing else is read."""
-    try:
-        with opened(Path(path), MAX_FILE_BYTES) as source, h5py.File(source, "r") as file:
-            return root_attributes(file).get("format") == FORMAT
-    except (FileError, *UNREADABLE):
-        return False
+    return format_of(Path(path), MAX_FILE_BYTES) == FORMAT
 
 
 def _read(source: BinaryIO, origin: str) -> Vademecum:

@@ -111,6 +111,16 @@ def test_the_core_stands_without_ros() -> None:
         assert not roots & {*FREE_OF_ROS, "std_msgs", "sensor_msgs", "geometry_msgs"}, file
 
 
+def test_one_module_opens_hdf5_files() -> None:
+    users = {
+        file.relative_to(folder).as_posix()
+        for folder in FOLDERS.values()
+        for file in folder.rglob("*.py")
+        if any(name.split(".")[0] == "h5py" for name in imported(file))
+    }
+    assert users == {"common/hdf5.py"}
+
+
 def test_studies_serve_the_command_alone() -> None:
     users = {
         room(module)

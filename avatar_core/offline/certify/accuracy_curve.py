@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from avatar_core.contact.cloud import CloudArrays, cloud_arrays, out_of_blocks, shown_vertices
+from avatar_core.fem.norms import l2_norm
 from avatar_core.vademecum.accuracy import (
     AccuracyCurve,
     Cloud,
@@ -74,15 +75,15 @@ class DisplayErrors:
             points = shown_vertices(self._vademecum, cloud)
             mass = np.repeat(self._vademecum.mesh.vertex_volumes[points], 3)
             wanted = truth.reshape(-1, 3, 3)[points].reshape(-1, 3)
-            size = mass @ wanted**2
+            size = l2_norm(wanted, mass)
             for space, fields in precisions:
-                missing = [
+                outside = [
                     wanted - arrays.near.combined(positions, weights, len(points))
                     for arrays in fields
                 ]
                 rows += [
-                    np.sqrt(mass @ (left - part) ** 2 / size)
-                    for left in missing
+                    l2_norm(left - part, mass) / size
+                    for left in outside
                     for part in self._partial_sums(space, load)
                 ]
         return np.array(rows)

@@ -16,6 +16,7 @@ from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import EquilibriumError
 from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.newton import NewtonRule, press
+from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
 from avatar_core.offline.certify.combinations import CombinedRow, mean_error
 from avatar_core.vademecum.large_deformation import LargeCertificate
@@ -106,7 +107,7 @@ def push_rows(
     normal = patch_normals(vademecum.mesh, center, surface.patch_radius)[0]
     load = patch_loads(problem.linear, center, surface.patch_radius) @ -normal
     positions, weights = (x[0] for x in surface.weights(np.array([triangle]), place))
-    linear = replace(vademecum, large=None)
+    linear, mass = replace(vademecum, large=None), vademecum.mesh.lumped_mass
     rows: list[LargeRow] = []
     rule = NewtonRule(exact_stability=False)
     try:
@@ -118,9 +119,9 @@ def push_rows(
                 LargeRow(
                     triangle,
                     state.depth,
-                    _l2(vademecum, found.displacement, truth),
+                    float(relative_l2(found.displacement, truth, mass)),
                     abs(force / float(state.force[0]) - 1.0),
-                    _l2(vademecum, straight.displacement, truth),
+                    float(relative_l2(straight.displacement, truth, mass)),
                     abs(plain / float(state.force[0]) - 1.0),
                     found.within,
                 )
@@ -155,8 +156,3 @@ def summary(
         reach_median=float(np.median(vademecum.large.reach)),
         reach_least=float(vademecum.large.reach.min()),
     )
-
-
-def _l2(vademecum: Vademecum, found: FloatArray, truth: FloatArray) -> float:
-    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)
-    return float(np.sqrt(mass @ (found - truth) ** 2 / (mass @ truth**2)))

@@ -15,6 +15,7 @@ import numpy as np
 
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.tip_response import make_tip_response
+from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
 from avatar_core.offline.certify.accuracy_curve import DisplayErrors, curve_of
 from avatar_core.offline.certify.unseen_contacts import HEIGHTS, draw_contacts
@@ -81,13 +82,14 @@ def measured(
     chosen = rng.permutation(len(surface.corners))[:n_loads]
     normals = patch_normals(elasticity.mesh, surface.centroids, surface.patch_radius)
     display = DisplayErrors(vademecum)
+    mass = vademecum.mesh.lumped_mass
     l2, shown, contact, force = [], [], [], []
     for batch in np.array_split(chosen, max(1, len(chosen) // _BATCH)):
         truth, compliance = _reference(elasticity, surface.centroids[batch], vademecum)
         for k, triangle in enumerate(batch):
             n, exact = normals[triangle], compliance[k]
             here = _at_centroid(surface, triangle)
-            l2.append(_l2(vademecum, vademecum.displacement(*here), truth[k]))
+            l2.append(relative_l2(vademecum.displacement(*here), truth[k], mass))
             shown.append(display(*here, truth[k]))
             estimate = vademecum.compliance(*here)
             contact.append(_frobenius(estimate, exact))
@@ -170,12 +172,6 @@ def _reference(
     return vertex, average[own, :, own, :]
 
 
-def _l2(vademecum: Vademecum, estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Relative mass-weighted error of each direction, shape (3,)."""
-    mass = np.repeat(vademecum.mesh.vertex_volumes, 3)[:, None]
-    return np.sqrt((mass * (estimate - truth) ** 2).sum(axis=0) / (mass * truth**2).sum(axis=0))
-
-
 def _frobenius(estimate: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
 
@@ -210,6 +206,6 @@ def mesh_error(
     coarse, coarse_compliance = _reference(elasticity, where, vademecum)
     fine, fine_compliance = _reference(refined, where, vademecum)
     fine = fine[:, : coarse.shape[1]]  # refinement appends its vertices
-    l2 = [_l2(vademecum, coarse[k], fine[k]) for k in range(len(chosen))]
+    l2 = relative_l2(coarse.swapaxes(0, 1), fine.swapaxes(0, 1), vademecum.mesh.lumped_mass)
     contact = [_frobenius(coarse_compliance[k], fine_compliance[k]) for k in range(len(chosen))]
     return float(np.mean(l2)), float(np.mean(contact))
