@@ -11,7 +11,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
-from hypothesis import settings
 
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry import mesh
@@ -22,13 +21,22 @@ from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
 
+from . import examples
+from .alone import Turns
 from .recorded_meshes import recorded
-
-# The same examples in every run; `--hypothesis-profile=default` looks for new ones.
-settings.register_profile("same", deadline=None, derandomize=True)
-settings.load_profile("same")
+from .stored import stored
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    examples.choose(config)
+    config.pluginmanager.register(Turns())
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest looks at markers
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    examples.mark(config, items)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -60,6 +68,17 @@ def phantom() -> SurfaceMesh:
 @pytest.fixture(scope="session")
 def straight() -> Vademecum:
     """A coarse phantom with wide patches: few load positions."""
+    return _straight()
+
+
+@pytest.fixture(scope="session")
+def bent() -> Vademecum:
+    """The same under large pushes."""
+    return _bent()
+
+
+@stored
+def _straight() -> Vademecum:
     options = OrganOptions(
         n_vertices=800, patch_radius=30e-3, rule=BuildRule(max_modes=60), n_certified=10
     )
@@ -68,11 +87,10 @@ def straight() -> Vademecum:
         return build(phantom_liver(12e-3), options)
 
 
-@pytest.fixture(scope="session")
-def bent(straight: Vademecum) -> Vademecum:
-    """The same under large pushes."""
-    problem = hyperelastic_problem(straight, "neo-hookean")
-    return with_large_deformation(straight, problem, "neo-hookean")
+@stored
+def _bent() -> Vademecum:
+    problem = hyperelastic_problem(_straight(), "neo-hookean")
+    return with_large_deformation(_straight(), problem, "neo-hookean")
 
 
 def _data(name: str) -> Path:

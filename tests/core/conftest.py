@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from avatar_core.geometry.surface import read_surface
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
+from tests.stored import stored
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 
@@ -79,6 +79,11 @@ def phantom_elasticity(phantom_mesh: TetMesh) -> Elasticity:
 
 @pytest.fixture(scope="session")
 def phantom_vademecum() -> Vademecum:
+    return _phantom_vademecum()
+
+
+@stored
+def _phantom_vademecum() -> Vademecum:
     options = OrganOptions(n_vertices=900, rule=BuildRule(max_modes=60), n_certified=60)
     return build(phantom_liver(), options)
 
@@ -86,7 +91,7 @@ def phantom_vademecum() -> Vademecum:
 REAL = ("LiTS-4", "LiTS-10", "LiTS-60", "Amos-007", "LiTS-23")  # five patients, one cracked
 
 
-@cache  # pytest keeps one value of a fixture with parameters, and comes back to the others
+@stored
 def _vademecum_of_file(path: Path) -> Vademecum:
     options = OrganOptions(n_vertices=1500, rule=BuildRule(max_modes=60), n_certified=3)
     return build(read_surface(path), options)

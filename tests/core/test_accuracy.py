@@ -153,6 +153,7 @@ def test_promised_errors_hold_on_fresh_loads(phantom_vademecum: Vademecum) -> No
     assert kept.mean() >= 0.95
 
 
+@pytest.mark.long
 def test_curve_errors_are_those_of_the_cloud_that_a_step_writes(
     phantom_vademecum: Vademecum,
 ) -> None:

@@ -29,6 +29,7 @@ from tests.core.effect_cases import (
 # --- Inertia ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_free_vibration_has_the_frequencies_of_the_whole_organ(
     phantom_vademecum: Vademecum,
 ) -> None:
@@ -131,6 +132,7 @@ def test_the_organ_sags_as_full_finite_elements_do(
     assert np.abs(exact).max() > 1e-4
 
 
+@pytest.mark.long
 def test_a_tip_meets_the_organ_where_it_hangs(phantom_vademecum: Vademecum) -> None:
     """The patch under it has moved as full finite elements say, but for the smoothing of w(p)."""
     v = phantom_vademecum

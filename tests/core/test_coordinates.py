@@ -25,6 +25,7 @@ from avatar_core.reduction.coordinates import Coordinate, node_values, node_weig
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.stored import stored
 
 POISSON = Coordinate("poisson", 0.30, 0.49, 2)
 CONTRAST = Coordinate("contrast", 0.5, 10.0, 3)
@@ -52,17 +53,26 @@ def ball(center: np.ndarray, radius: float) -> SurfaceMesh:
 
 @pytest.fixture(scope="module")
 def tumour() -> SurfaceMesh:
+    return _tumour()
+
+
+def _tumour() -> SurfaceMesh:
     return ball(phantom_liver(12e-3).vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0]), 0.02)
 
 
 @pytest.fixture(scope="module")
-def organ(tumour: SurfaceMesh) -> Vademecum:
+def organ() -> Vademecum:
     """A coarse phantom over Poisson's ratio and the contrast of a tumour."""
+    return _soft_organ()
+
+
+@stored
+def _soft_organ() -> Vademecum:
     options = OrganOptions(
         n_vertices=450,
         rule=BuildRule(max_modes=60),
         coordinates=(POISSON, CONTRAST),
-        tumour=tumour,
+        tumour=_tumour(),
         n_certified=16,
     )
     return build(phantom_liver(12e-3), options)
@@ -175,6 +185,7 @@ def test_unseen_values_agree_with_full_finite_elements(
     assert c.contact_mean < 0.03
 
 
+@pytest.mark.long
 def test_the_near_field_grows_where_the_modes_do_not_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loads, "MIDPOINTS_FROM", 1.0)  # fewer load positions
     rule = BuildRule(max_modes=5, most_oversampling=1.2)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from avatar_core.contact.haptics.force_guard import (
@@ -18,6 +18,7 @@ from avatar_core.contact.haptics.force_guard import (
     ForceLimits,
 )
 from avatar_core.errors import ContactError
+from tests.examples import examples
 
 PERIOD = 1e-3
 LIMITS = ForceLimits(5.0, 1000.0)
@@ -110,7 +111,7 @@ FORCES = st.one_of(st.floats(-100.0, 100.0), st.sampled_from([math.nan, math.inf
 STRETCH = st.tuples(st.booleans(), st.integers(1, 120), FORCES, FORCES, PERIODS)
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.lists(STRETCH, min_size=1, max_size=12))
 def test_nothing_that_comes_breaks_a_limit(
     stretches: list[tuple[bool, int, float, float, float]],

@@ -188,6 +188,7 @@ def certified(bent: Vademecum, certificate: LargeCertificate | None = None) -> V
     return bent.with_large_certificate(certificate or summary(bent, [], 0, 0))
 
 
+@pytest.mark.long
 def test_what_is_added_linearly_to_a_large_push_is_nearly_right(bent: Vademecum) -> None:
     """Wrong by less than half; together less than without the bending of each tip for itself."""
     shares: list[float] = []
@@ -375,6 +376,7 @@ def test_force_is_the_derivative_of_the_energy(bent: Vademecum, share: float) ->
         np.testing.assert_allclose(force, -slope, atol=2e-3 * np.linalg.norm(force))
 
 
+@pytest.mark.long
 def test_two_tips_stay_coupled(bent: Vademecum) -> None:
     model = prepare(bent, (RADIUS, RADIUS), cloud="off")
     one, other = inner_positions(bent)[[0, 20]]

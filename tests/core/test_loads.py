@@ -123,6 +123,7 @@ def test_patch_normals_turn_smoothly_over_an_edge(box: Box) -> None:
     assert turn.max() < 3.0  # 0.5 mm steps over a patch of 30 mm
 
 
+@pytest.mark.long
 def test_walls_of_a_narrow_fissure_carry_no_load(box: Box) -> None:
     """A slot 5 mm wide in a box: a patch of 30 mm has no room on its walls, and has beside it."""
     mesh, _ = box(20)

@@ -23,6 +23,7 @@ def test_a_real_liver_keeps_its_lobes(real_vademecum: Vademecum, livers_dir: Pat
     assert real_vademecum.mesh.volume == pytest.approx(surface.volume, rel=0.02)
 
 
+@pytest.mark.long
 def test_a_mesh_that_lacks_a_part_of_the_organ_is_refused() -> None:
     organ = phantom_liver(12e-3)
     apart = organ.vertices + np.array([0.5, 0.0, 0.0])

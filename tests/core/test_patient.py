@@ -199,6 +199,7 @@ def test_a_tolerance_out_of_reach_stops_at_the_share_and_says_so(case: Case) -> 
     assert found.history[-1].solutions <= 0.15 * case.loads.shape[1]
 
 
+@pytest.mark.long
 def test_missing_compliance_is_positive_and_makes_contact_better(case: Case) -> None:
     found = reduce(
         case.problem.elasticity,

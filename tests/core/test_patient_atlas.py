@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -18,13 +19,14 @@ from avatar_core.atlas.response import ResponseSolver
 from avatar_core.atlas.storage import load_atlas, save_atlas
 from avatar_core.cli import main as cli
 from avatar_core.errors import RegistrationError
-from avatar_core.geometry.mesh import TetMesh, regions_by_rule
+from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.reduction.galerkin import ReductionRule
 from avatar_core.shapes.registration import RegistrationRule, Template
 from avatar_core.studies.transport import transport
 from avatar_core.vademecum.storage import load_vademecum
+from tests.stored import stored
 
 # rough and coarse, 1 s an anatomy; the atlas's own tests use the same rule
 ROUGH = RegistrationRule(
@@ -37,7 +39,10 @@ N = 4
 @pytest.fixture(scope="module")
 def livers(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """N anatomies and a patient, as files."""
-    folder = tmp_path_factory.mktemp("livers")
+    return _livers(tmp_path_factory.mktemp("livers"))
+
+
+def _livers(folder: Path) -> list[Path]:
     coarse, paths = phantom_liver(12e-3), []
     for i, shape in enumerate(population(N + 1, seed=3)):
         path = folder / f"liver{i}.obj"
@@ -50,12 +55,18 @@ def livers(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def atlas(phantom_mesh: TetMesh, livers: list[Path]) -> Atlas:
+def atlas() -> Atlas:
+    return _atlas()
+
+
+@stored
+def _atlas() -> Atlas:
+    phantom_mesh = tetrahedralize(phantom_liver(), 700)
+    with TemporaryDirectory() as folder:
+        surfaces = [read_surface(path) for path in _livers(Path(folder))[:N]]
     template = Template("phantom", phantom_mesh, regions_by_rule(phantom_mesh))
     empty = new_atlas(template, AtlasOptions(spacing=0.02, rule=ROUGH))
-    members = [
-        build_anatomy(empty, read_surface(path), ResponseSolver(rank=30)) for path in livers[:N]
-    ]
+    members = [build_anatomy(empty, surface, ResponseSolver(rank=30)) for surface in surfaces]
     return empty.with_anatomies(members)
 
 
@@ -93,6 +104,7 @@ def test_a_member_gets_its_own_vademecum_bit_for_bit(
     assert np.array_equal(own.contact_near.block, again.vademecum.contact_near.block)
 
 
+@pytest.mark.long
 def test_copies_count_once(atlas: Atlas, livers: list[Path]) -> None:
     doubled = atlas.with_anatomies([atlas["liver1"]])
     base = base_of(doubled)
@@ -102,6 +114,7 @@ def test_copies_count_once(atlas: Atlas, livers: list[Path]) -> None:
     assert patient.weights.sum() == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.long
 def test_an_atlas_of_one_answers(atlas: Atlas, livers: list[Path]) -> None:
     alone = atlas.without_anatomies().with_anatomies([atlas["liver0"]])
     options = replace(QUICK, n_certified=0)
@@ -188,6 +201,7 @@ def test_the_command_writes_a_certified_vademecum(
     assert certificate.l2_mean < limit
 
 
+@pytest.mark.long
 def test_a_tolerance_out_of_reach_exits_with_three(
     run: Callable[..., tuple[int, str, str]], file: Path, livers: list[Path], tmp_path: Path
 ) -> None:

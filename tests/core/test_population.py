@@ -22,6 +22,7 @@ def in_silico(phantom) -> tuple[list[ShapeMap], list[DistanceGrid]]:
     return maps, [distance_in_box(organ, box) for organ in organs]
 
 
+@pytest.mark.long
 def test_six_parameters_of_the_population_stand_out(in_silico):
     vectors = [grid.values.ravel() for grid in in_silico[1]]
     found = estimate_dimension(fit(vectors, 12))
@@ -31,6 +32,7 @@ def test_six_parameters_of_the_population_stand_out(in_silico):
     assert estimate_dimension(fit(vectors, 12, regularization=1e-3)).gap < found.gap / 5
 
 
+@pytest.mark.long
 def test_held_out_organs_are_interpolated(in_silico):
     _, grids = in_silico
     vectors = [grid.values.ravel() for grid in grids]

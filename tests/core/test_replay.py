@@ -79,7 +79,12 @@ def organ(straight: Vademecum, tmp_path_factory: pytest.TempPathFactory) -> Vade
 
 
 @pytest.mark.parametrize(
-    "effects", [(), (Friction(),), (VISCOUS,)], ids=["elastic", "friction", "viscous"]
+    "effects",
+    [
+        pytest.param((), id="elastic"),
+        pytest.param((Friction(),), id="friction", marks=pytest.mark.long),
+        pytest.param((VISCOUS,), id="viscous"),
+    ],
 )
 def test_the_forces_are_the_same(
     organ: Vademecum, effects: tuple[Effect, ...], tmp_path: Path
@@ -96,6 +101,7 @@ def test_the_forces_are_the_same(
             np.testing.assert_array_equal(getattr(getattr(read, part), name), value)
 
 
+@pytest.mark.long
 def test_large_pushes_too(bent: Vademecum, tmp_path: Path) -> None:
     organ = stored(bent, tmp_path)
     made = recorded(organ, natural_effects(organ, 1))
@@ -124,6 +130,7 @@ def test_after_lost_periods_what_relaxes_is_unknown(organ: Vademecum) -> None:
         assert found.difference(with_gap) <= SAME
 
 
+@pytest.mark.long
 def test_breath_is_never_known(organ: Vademecum) -> None:
     assert not replay(recorded(organ, (Respiration(),)), organ).known.any()
 

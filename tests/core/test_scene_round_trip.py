@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from avatar_core.contact.effects import (
@@ -23,6 +23,7 @@ from avatar_core.errors import SceneError
 from avatar_core.scene.file import parse_scene, read_scene, write_scene
 from avatar_core.scene.model import CONFLICTS, Scene, Tool
 from tests.core.scene_cases import SHIPPED
+from tests.examples import examples
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -119,13 +120,13 @@ def scenes(draw: st.DrawFn) -> Scene:
 
 
 @given(scenes())
-@settings(max_examples=80, deadline=None)
+@examples(80)
 def test_any_scene_reads_back_equal(scene: Scene) -> None:
     assert parse_scene(write_scene(scene), "written") == scene
 
 
 @given(st.text(alphabet="nametxtol: {}[],-&*!|>'\"#%\n\t0.5efriction_", max_size=80))
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_no_text_raises_anything_but_a_scene_error_of_one_line(text: str) -> None:
     try:
         parse_scene(text, "x")

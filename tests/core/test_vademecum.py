@@ -31,6 +31,7 @@ def test_certificate_meets_the_promise_on_the_phantom(phantom_vademecum: Vademec
     assert c.vertex_contact_worst <= 1e-3
 
 
+@pytest.mark.long
 def test_certificate_sees_a_damaged_vademecum(phantom_vademecum: Vademecum) -> None:
     """A certificate that cannot tell a good from a bad file would certify anything."""
     v = phantom_vademecum

@@ -12,13 +12,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from avatar_core.contact.effects import Friction
 from avatar_core.contact.kernels import BARRED, ENTRY_DEPTH, LEAP
 from avatar_core.contact.model import Status, prepare, step, stored_energy
 from avatar_core.errors import ContactError
+from tests.examples import examples
 
 from ..core.flat_organ import BALL, COMPLIANCE, at_depth, ball_organ, flat_organ
 from .touching import (
@@ -38,7 +39,7 @@ from .touching import (
 )
 
 Figure = Callable[[str], None]
-often = settings(deadline=None, max_examples=40, print_blob=True)
+often = examples(40)
 FRICTION = Friction(static=0.4, kinetic=0.3)
 
 
@@ -71,6 +72,7 @@ def check_start_inside(spot: Spot, depth: float, aside: float) -> None:
 STARTED: list[float] = []
 
 
+@pytest.mark.examples
 def test_tip_that_starts_inside_gets_no_force_before_it_has_left(figure: Figure) -> None:
     STARTED.clear()
     check_start_inside()
@@ -134,6 +136,7 @@ def check_ball(direction: tuple[float, float, float], depth: float, radius: floa
 BALLS: dict[float, object] = {}
 
 
+@pytest.mark.examples
 def test_force_of_a_ball_points_out_of_it_whatever_the_radius(figure: Figure) -> None:
     BALLS.clear()
     check_ball()
@@ -169,6 +172,7 @@ def check_grazing(spot: Spot, turn: float, depth: float) -> None:
     GRAZED.append((jump / (stiff * h), abs(loop.work[-1])))
 
 
+@pytest.mark.examples
 def test_grazing_has_no_steps_and_costs_nothing(figure: Figure) -> None:
     GRAZED.clear()
     check_grazing()
@@ -223,6 +227,7 @@ def check_together(
     TOGETHER.append(total)
 
 
+@pytest.mark.examples
 def test_tools_in_one_place_press_as_one(figure: Figure) -> None:
     TOGETHER.clear()
     check_together()
@@ -242,6 +247,7 @@ def test_two_radii_around_one_centre(figure: Figure) -> None:
     figure("1 um larger takes all of 20 N, in either order")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mu", [0.4, 1.0])
 def test_tools_side_by_side_with_friction_converge(mu: float, figure: Figure) -> None:
     """Pressed down and dragged, each a little its own way, 0 to 5 mm apart."""
@@ -291,6 +297,7 @@ def check_leap(one: Spot, other: Spot, deep: float) -> None:
     LEAPT.append(float(far))
 
 
+@pytest.mark.examples
 def test_tip_that_leaps_into_the_organ_is_barred(figure: Figure) -> None:
     LEAPT.clear()
     check_leap()

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from avatar_core.common.splines import evaluate
@@ -18,6 +18,7 @@ from avatar_core.contact.effects import Friction, Inertia, Viscoelasticity
 from avatar_core.contact.effects.friction import tangential
 from avatar_core.contact.kernels import LEAP, MAX_DEPTH
 from avatar_core.contact.model import ContactModel, Status, step, stored_energy
+from tests.examples import examples
 
 from ..core.flat_organ import COMPLIANCE, at_depth, flat_organ
 from ..core.flat_organ import RADIUS as FLAT_RADIUS
@@ -37,7 +38,7 @@ from .touching import (
 )
 
 Figure = Callable[[str], None]
-often = settings(deadline=None, max_examples=40, print_blob=True)
+often = examples(40)
 PERIOD = 1e-3
 FAST = 5.0  # [m/s]
 FRICTION = Friction(static=0.4, kinetic=0.3)
@@ -89,6 +90,7 @@ def check_fast_push(start: float, slope: float, periods: int, kind: str) -> None
     assert not model.out.force.any()
 
 
+@pytest.mark.examples
 def test_push_at_5_m_per_s(figure: Figure) -> None:
     MISSED.clear()
     check_fast_push()
@@ -159,6 +161,7 @@ def rule_error(model: ContactModel, force: np.ndarray, h: float) -> float:
     return float(stiff * h**2 / 8.0 * touches + len(force) * h**3 / 12.0 * stiff / 12e-3)
 
 
+@pytest.mark.examples
 def test_slide_at_5_m_per_s(figure: Figure) -> None:
     SLID.clear()
     check_fast_slide()
@@ -211,6 +214,7 @@ def check_stiff(
     CLOSED.append((max(inside, apart), int((s.force > 0.0).sum())))
 
 
+@pytest.mark.examples
 def test_very_stiff_organs_stay_complementary(figure: Figure) -> None:
     CLOSED.clear()
     check_stiff()

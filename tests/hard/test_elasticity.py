@@ -8,12 +8,13 @@ from functools import cache, cached_property
 import numpy as np
 import pytest
 import scipy.linalg
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import TetMesh, make_mesh, quality
+from tests.examples import examples
 
 from .shapes import TOP, block, compliance, cube, nodes_of, regions_of, shell_octant
 
@@ -182,11 +183,12 @@ def test_layered_bar_is_a_chain_of_springs(contrast: float, figure: Figure) -> N
     assert error < 2.2e-16 * 1e3 * max(contrast, 1.0 / contrast)
 
 
+@pytest.mark.examples
 def test_any_composite_lies_between_its_bounds(figure: Figure) -> None:
     """For c > 1: C(1) / c <= C(c) <= C(1), as matrices; reactions balance the force."""
     worst = [0.0]
 
-    @settings(deadline=None, max_examples=25, print_blob=True)
+    @examples(25)
     @given(st.floats(-3.0, 6.0), st.integers(0, 2**31))
     @example(-3.0, 0)
     @example(6.0, 0)

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import scipy.linalg
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from avatar_core.errors import MaterialError, MeshError
@@ -25,6 +25,7 @@ from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum import tip_field
 from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.model import Provenance
+from tests.examples import examples
 
 from .shapes import TOP, block, compliance, cube, nodes_of, regions_of
 
@@ -34,10 +35,11 @@ Figure = Callable[[str], None]
 # --- size -------------------------------------------------------------------------------------
 
 
+@pytest.mark.examples
 def test_compliance_scales_with_one_over_stiffness_and_size(figure: Figure) -> None:
     worst = [0.0]
 
-    @settings(deadline=None, max_examples=15, print_blob=True)
+    @examples(15)
     @given(st.floats(-3.0, 2.0), st.floats(0.0, 7.0), st.sampled_from([0.48, 0.4999]))
     @example(-3.0, 0.0, 0.48)  # 0.1 mm, as soft as jelly
     @example(2.0, 7.0, 0.4999)  # 10 m, as stiff as rubber
@@ -105,11 +107,12 @@ def test_organs_of_millimetres_and_metres_are_meshed(scale: float, figure: Figur
 # --- clamps -----------------------------------------------------------------------------------
 
 
+@pytest.mark.examples
 def test_a_single_clamped_triangle_holds_the_organ(figure: Figure) -> None:
     """Positive definite; the reaction takes the whole force and its moment."""
     worst = [0.0]
 
-    @settings(deadline=None, max_examples=20, print_blob=True)
+    @examples(20)
     @given(st.integers(0, 47), st.sampled_from(["P1", "P2", "Taylor-Hood"]))
     @example(0, "P1")
     def check(face: int, element: Element) -> None:
@@ -207,11 +210,12 @@ def test_a_patch_of_no_size_is_refused(radius: float, figure: Figure) -> None:
     figure(f"refused: {refused.value}")
 
 
+@pytest.mark.examples
 def test_a_patch_larger_than_the_organ_is_refused(figure: Figure) -> None:
     """Its pull would be no direction's; one that the organ can hold pulls with all its force."""
     held = [0.0]
 
-    @settings(deadline=None, max_examples=30, print_blob=True)
+    @examples(30)
     @given(st.floats(0.04, 1e3))
     @example(0.17)
     @example(0.18)

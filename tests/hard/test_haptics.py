@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from avatar_core.contact.haptics.haptic_loop import (
@@ -42,6 +42,7 @@ from avatar_core.contact.haptics.passivity import Passivity, limit, make_passivi
 from avatar_core.contact.layout import PERIOD
 from avatar_core.contact.model import ContactModel, Status, step
 from avatar_core.studies.passivity import HANDS, hand_push
+from tests.examples import examples
 
 from ..core.flat_organ import BALL, RADIUS, ball_organ, flat_organ
 
@@ -246,7 +247,7 @@ def shaken(seed: int, active: str, delay: int, q: float, n: int = 300) -> tuple[
 WORST: dict[str, float] = {}
 
 
-@settings(deadline=None, max_examples=60, print_blob=True)
+@examples(60)
 @given(
     seed=st.integers(0, 10**6),
     active=st.sampled_from(["along", "random", "late spring"]),
@@ -263,6 +264,7 @@ def check_bound(seed: int, active: str, delay: int, q: float) -> None:
         WORST[active] = max(WORST.get(active, 0.0), run.given / passivity.bound)
 
 
+@pytest.mark.examples
 def test_bound_holds_for_any_force_and_any_motion(figure: Figure) -> None:
     """An active organ spends what the bound allows, to the last, and no more."""
     check_bound()
@@ -276,7 +278,7 @@ def test_bound_holds_for_any_force_and_any_motion(figure: Figure) -> None:
 BORDER: list[float] = []
 
 
-@settings(deadline=None, max_examples=12, print_blob=True)
+@examples(12)
 @given(
     stiffness=st.floats(100.0, 2500.0),
     delay=st.integers(0, 2),
@@ -291,6 +293,7 @@ def check_border(stiffness: float, delay: int, mass: float) -> None:
     assert abs(BORDER[-1]) < 0.01
 
 
+@pytest.mark.examples
 def test_border_of_stability_without_grip(figure: Figure) -> None:
     """Within 20 % is what was asked; at these masses it is a matter of 1 %."""
     check_border()

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.level_set import distance_grid, isosurface, signed_distance
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from tests.examples import examples
 
 from .surfaces import (
     DEPTH,
@@ -39,12 +40,8 @@ from .surfaces import (
 H = 4e-3  # spacing of the grids, if nothing else is said [m]
 WHOLE = ball()
 UP = np.array([0.0, 0.0, RADIUS])
-few = settings(
-    max_examples=5,
-    deadline=None,
-    print_blob=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],  # figures are only added to
-)
+# figures are only added to
+few = examples(5, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def direction(turn: float, height: float) -> np.ndarray:

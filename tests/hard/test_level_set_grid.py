@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, example, given
 from hypothesis import strategies as st
 
 from avatar_core.errors import SurfaceError
@@ -20,6 +20,7 @@ from avatar_core.geometry.level_set import (
     signed_distance,
 )
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from tests.examples import examples
 
 from .surfaces import (
     RADIUS,
@@ -36,12 +37,8 @@ from .surfaces import (
     written,
 )
 
-few = settings(
-    max_examples=5,
-    deadline=None,
-    print_blob=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],  # figures are only added to
-)
+# figures are only added to
+few = examples(5, suppress_health_check=[HealthCheck.function_scoped_fixture])
 fractions = st.tuples(*3 * [st.floats(0, 1)])  # of a cell: where the grid lies
 
 

@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from avatar_core.errors import LLEError
@@ -32,6 +32,7 @@ from avatar_core.shapes.barycenter import (
 )
 from avatar_core.shapes.lle import LLE, embed, estimate_dimension, fit
 from tests.core.test_lle import with_one_more
+from tests.examples import examples
 
 Figure = Callable[[str], None]
 
@@ -97,7 +98,7 @@ def base_of(kind: str, n: int, length: int, seed: int) -> np.ndarray:
     return 0.1 * base
 
 
-@settings(deadline=None, max_examples=150, print_blob=True)
+@examples(150)
 @given(
     kind=st.sampled_from(KINDS),
     n=st.integers(1, 12),
@@ -153,6 +154,7 @@ def check_any_base(
 tally = {"share": 0.0}
 
 
+@pytest.mark.examples
 def test_any_base_gives_bounded_weights_that_sum_to_one(figure: Figure) -> None:
     """Fitted, grown or asked for a new point; n = 1, k = 1, k = n, k > n, any regularisation."""
     tally["share"] = 0.0

@@ -9,7 +9,7 @@ from math import inf, nan, nextafter
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.sparse.linalg import aslinearoperator
 
@@ -26,6 +26,7 @@ from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.reduction.pgd_hadamard import solve_hadamard
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Provenance, Vademecum
+from tests.examples import examples
 
 from .shapes import cube, regions_of
 
@@ -234,11 +235,12 @@ def test_rank_one_takes_one_product(figure: Figure) -> None:
     assert off(alone.field, exact) < 1e-9
 
 
+@pytest.mark.examples
 def test_any_rank_over_loads_takes_as_many_modes(block: Elasticity, figure: Figure) -> None:
     """Rank one, full rank and between, whatever number of pairs is sought at once."""
     worst = [0.0]
 
-    @settings(deadline=None, max_examples=25, print_blob=True)
+    @examples(25)
     @given(st.integers(1, 16), st.integers(1, 24), st.sampled_from([0.5, 1.0]))
     @example(1, 1, 0.5)
     @example(16, 16, 1.0)
@@ -358,11 +360,12 @@ def test_a_field_that_vanishes_in_the_mean_is_not_mistaken_for_rounding(figure: 
 # --- the ends of the ranges -------------------------------------------------------------------
 
 
+@pytest.mark.examples
 def test_ends_are_nodes_and_nothing_beyond_is_answered(figure: Figure) -> None:
     """Any range: its ends answer with one node each; the next number outside is refused."""
     seen = []
 
-    @settings(deadline=None, max_examples=100, print_blob=True)
+    @examples(100)
     @given(
         st.one_of(
             st.tuples(st.just("poisson"), st.floats(0.0, 0.4999), st.floats(0.0, 0.4999)),

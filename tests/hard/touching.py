@@ -20,13 +20,14 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
+from tests.stored import stored
 
 RADIUS = 5e-3  # of the tips [m]
 DEEP = (6e-3, 12e-3, 18e-3)  # where places have access, too [m]
 AWAY = np.full(3, FAR_AWAY)
 
 
-@cache
+@stored
 def liver(scale: float = 1.0) -> Vademecum:
     """The phantom, coarse: what matters here is not how exact it is."""
     surface = phantom_liver(12e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from tests.stored import stored
 
 TIP_RADIUS = 0.005  # [m]
 # Of a contact node: a test may be kept from sending poses for longer than a driver.
@@ -112,11 +115,16 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def own_domain() -> dict[str, str]:
+def own_domain(worker_id: str, testrun_uid: str) -> dict[str, str]:
     """No other cell on this machine or network hears these tests, nor they it."""
+    from avatar_ros.bench import cell
     from avatar_ros.bench.cell import isolated_environment
 
     environment = isolated_environment()
+    if worker_id != "master":  # next to one another, whatever the first
+        first = zlib.crc32(testrun_uid.encode())
+        number = first + int(worker_id.removeprefix("gw"))
+        environment["ROS_DOMAIN_ID"] = str(1 + number % len(cell._DOMAINS))
     os.environ.update(environment)
     return environment
 
@@ -124,6 +132,11 @@ def own_domain() -> dict[str, str]:
 @pytest.fixture(scope="session")
 def organ() -> Any:
     """A coarse phantom's vademecum: what matters here is not how exact it is."""
+    return _organ()
+
+
+@stored
+def _organ() -> Any:
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.offline.pipeline import OrganOptions, build
     from avatar_core.offline.rule import BuildRule

@@ -41,6 +41,7 @@ def run(
     return command
 
 
+@pytest.mark.long
 def test_create_add_and_show(
     run: Callable[..., tuple[int, str, str]], livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:

@@ -1,0 +1,53 @@
+"""Files of tests that measure time run when no other file does, and last.
+
+With several workers of pytest-xdist, a file with a test marked ``timing`` waits until the other
+workers are between two files, and they wait for its end, the teardown of its fixtures included.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import tempfile
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+
+
+def is_timing(item: pytest.Item) -> bool:
+    return item.get_closest_marker("timing") is not None
+
+
+class Turns:
+    """Holds a lock over each file of tests: shared, or exclusive if one of them measures time."""
+
+    def __init__(self) -> None:
+        self._timing: set[Path] = set()
+        self._held: IO[Any] | None = None
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        self._timing = {item.path for item in items if is_timing(item)}
+        items.sort(key=lambda item: item.path in self._timing)
+
+    @pytest.hookimpl(wrapper=True, tryfirst=True)
+    def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> Any:
+        if self._held is None:
+            self._held = _lock(item.config, exclusive=item.path in self._timing)
+        try:
+            return (yield)
+        finally:
+            if nextitem is None or nextitem.path != item.path:
+                self._held.close()
+                self._held = None
+
+
+def _lock(config: pytest.Config, exclusive: bool) -> IO[Any]:
+    """The door is held by who waits, so that those who come later cannot keep it waiting."""
+    run = getattr(config, "workerinput", {}).get("testrunuid", os.getpid())
+    path = Path(tempfile.gettempdir(), f"avatar-tests-{run}")
+    held = path.with_suffix(".lock").open("w")
+    with path.with_suffix(".door").open("w") as door:
+        fcntl.flock(door, fcntl.LOCK_EX)
+        fcntl.flock(held, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
+    return held

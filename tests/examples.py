@@ -1,0 +1,41 @@
+"""How many examples property tests draw: few in the quick suite, all with ``-m long``.
+
+The same in every run; ``--hypothesis-profile=default`` looks for new ones.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import settings
+
+FEW, ALL = "few", "all"
+_PART = 8  # of the examples, one in so many in the quick suite
+
+settings.register_profile(FEW, deadline=None, derandomize=True, print_blob=True, max_examples=12)
+settings.register_profile(ALL, deadline=None, derandomize=True, print_blob=True)
+
+
+def choose(config: pytest.Config) -> None:
+    """Load the profile of this run."""
+    chosen = config.getoption("--hypothesis-profile", None)
+    settings.load_profile(chosen or (ALL if _is_long(config) else FEW))
+
+
+def examples(n: int, least: int = 2, **more: Any) -> settings:
+    """Settings for ``n`` examples, of which the quick suite draws the first few."""
+    few = settings.get_current_profile_name() == FEW
+    return settings(max_examples=min(n, max(least, n // _PART)) if few else n, **more)
+
+
+def mark(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """In a run of the long tests, tests that draw examples belong to them."""
+    for item in items if _is_long(config) else []:
+        drawn = getattr(getattr(item, "obj", None), "is_hypothesis_test", False)
+        if drawn or item.get_closest_marker("examples"):
+            item.add_marker("long")
+
+
+def _is_long(config: pytest.Config) -> bool:
+    return str(config.getoption("markexpr")).strip() == "long"

@@ -1,0 +1,83 @@
+"""What tests compute from the code under test, computed once for all workers and runs.
+
+A result is found by the content of everything that it may follow from: the core, the file of the
+function that computes it, its arguments, the recorded meshes, Python and all installed packages.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import functools
+import hashlib
+import inspect
+import os
+import pickle
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import avatar_core
+
+P, T = ParamSpec("P"), TypeVar("T")
+
+HERE = Path(__file__).parent
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avatar" / "tests"
+UNUSED = 14 * 86400.0  # after which a result is removed [s]
+_LATE_ROOMS = ("studies", "cli")  # nothing that is stored comes from them
+
+
+def stored(compute: Callable[P, T]) -> Callable[P, T]:
+    """Decorator: keep what a function gives; its arguments tell themselves by ``repr``, files
+    by their content."""
+
+    @functools.wraps(compute)
+    def found(*arguments: P.args, **named: P.kwargs) -> T:
+        key = hashlib.sha256(_of_all().encode())
+        key.update(Path(inspect.getfile(compute)).read_bytes() + compute.__name__.encode())
+        for value in (*arguments, *sorted(named.items())):
+            text = repr(value)
+            assert "..." not in text and " at 0x" not in text, "give what tells itself by repr"
+            key.update(value.read_bytes() if isinstance(value, Path) else text.encode())
+        file = CACHE / f"{compute.__name__}-{key.hexdigest()[:24]}.pickle"
+        CACHE.mkdir(parents=True, exist_ok=True)
+        with _locked(file.with_suffix(".lock")):
+            if not file.is_file():
+                _drop_unused()
+                part = file.with_suffix(".part")
+                part.write_bytes(pickle.dumps(compute(*arguments, **named), protocol=5))
+                part.replace(file)
+            os.utime(file)
+        return pickle.loads(file.read_bytes())
+
+    return functools.cache(found)
+
+
+@functools.cache
+def _of_all() -> str:
+    """Hash of what every result may follow from."""
+    found = hashlib.sha256(sys.version.encode())
+    found.update(repr(sorted((d.name, d.version) for d in distributions())).encode())
+    core = Path(avatar_core.__file__).parent
+    files = [f for f in core.rglob("*.py") if f.relative_to(core).parts[0] not in _LATE_ROOMS]
+    for file in sorted(files, key=lambda f: f.relative_to(core).as_posix()):
+        found.update(file.read_bytes())
+    for file in (HERE / "recorded_meshes.py", HERE / "data" / "phantom_meshes.npz"):
+        found.update(file.read_bytes())
+    return found.hexdigest()
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with path.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _drop_unused() -> None:
+    for file in CACHE.iterdir():
+        if file.stat().st_mtime < time.time() - UNUSED:
+            file.unlink(missing_ok=True)
