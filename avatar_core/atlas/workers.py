@@ -1,7 +1,8 @@
-"""Independent pieces of work on this machine's cores or on a Dask cluster.
+"""Independent tasks on this machine's cores or on a Dask cluster.
 
-Results come as they are ready. A piece whose process dies is told apart from the others, which are
-done all the same.
+Results arrive in the order in which they are ready. A task whose process dies yields an error; the
+others are done all the same. With concurrent.futures, as with joblib, a process that dies breaks
+its whole pool: that is why unfinished tasks then get a pool each.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ CONNECT_SECONDS = 10  # for a scheduler to answer
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work.
+    """Where tasks run.
 
-    jobs : processes on this machine, None for one a CPU; 1 works in this process
-    scheduler : address of a Dask scheduler whose workers do it instead; they need avatar too
+    jobs : processes on this machine; None for one per CPU, 1 for this process
+    scheduler : address of a Dask scheduler whose workers run them instead; they need avatar, too
 
     Raises AtlasError if there are no jobs.
     """
@@ -46,11 +47,11 @@ class Workers:
     def map(
         self, function: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | Exception]]:
-        """Number and result of each item, or the error with which its process ended.
+        """Number of each item with its result, or with the error that ended it.
 
         function, items : picklable, unless there is one job
 
-        Raises AtlasError if the cluster is not there.
+        Raises AtlasError if no scheduler answers.
         """
         numbered = dict(enumerate(items))
         jobs = min(self.jobs or len(os.sched_getaffinity(0)), len(items))
@@ -67,21 +68,21 @@ class Workers:
 def _in_processes(
     function: Callable[[Item], Result], items: dict[int, Item], jobs: int
 ) -> Iterator[tuple[int, Result | Exception]]:
-    """In a pool; when a process dies the whole pool does, so what is left gets one pool each."""
+    """In one pool; once a process has died, each unfinished task gets a pool of its own."""
     left = dict(items)
     for number, result in _in_pool(function, items, jobs):
         del left[number]
         yield number, result
     for number, item in left.items():
-        died = RuntimeError("its process died, perhaps for want of memory; try fewer --jobs")
+        died = RuntimeError("its process died, perhaps out of memory; try fewer --jobs")
         yield next(_in_pool(function, {number: item}, 1), (number, died))
 
 
 def _in_pool(
     function: Callable[[Item], Result], items: Mapping[int, Item], jobs: int
 ) -> Iterator[tuple[int, Result | Exception]]:
-    """Results until one of the processes dies."""
-    spawn = multiprocessing.get_context("spawn")  # forked, the threads of libraries would hang
+    """Results, until a process dies."""
+    spawn = multiprocessing.get_context("spawn")  # threads of numerical libraries hang when forked
     with (
         _one_thread_each(),
         ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_start_worker) as pool,
@@ -92,16 +93,13 @@ def _in_pool(
                 error = future.exception()
                 if isinstance(error, BrokenProcessPool):
                     return
-                if isinstance(error, Exception):
-                    yield futures[future], error
-                else:
-                    yield futures[future], future.result()
+                yield futures[future], error if isinstance(error, Exception) else future.result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _start_worker() -> None:
-    """Die silently when interrupted, and with the parent, however that ends."""
+    """End without a traceback on Ctrl-C, and end with the parent even if that is killed."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_follow_parent, daemon=True).start()
 
@@ -115,7 +113,7 @@ def _follow_parent() -> None:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Processes started meanwhile use one thread: cores are shared among them already."""
+    """Limit processes that are started meanwhile to one thread each: there is one per core."""
     limits = thread_limits()
     before = {name: os.environ.get(name) for name in limits}
     os.environ.update(limits)
@@ -137,7 +135,8 @@ def _on_cluster(
 ) -> Iterator[tuple[int, Result | Exception]]:
     client, completed = _connected(address)
     with client:
-        shared = client.scatter(function)
+        # a result, not scattered data, which would be lost with the workers that hold it
+        shared = client.submit(_itself, function, pure=False)
         futures = {
             client.submit(_call, shared, item, pure=False): number for number, item in items.items()
         }
@@ -146,12 +145,16 @@ def _on_cluster(
             yield futures[future], future.result() if error is None else error
 
 
+def _itself(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
+    return function
+
+
 def _call(function: Callable[[Item], Result], item: Item) -> Result:
     return function(item)
 
 
 def _connected(address: str) -> tuple[Any, Any]:
-    """A client of the scheduler, and what waits for its results."""
+    """A client of the scheduler, and the as_completed that goes with it."""
     try:
         from distributed import Client
         from distributed import as_completed as completed

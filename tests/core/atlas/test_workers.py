@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,24 +91,53 @@ def test_a_process_that_dies_costs_its_own_result_only() -> None:
     assert isinstance(results[1], RuntimeError) and "memory" in str(results[1])
 
 
-def test_a_cluster_builds_too(
-    template: Template, livers: list[SurfaceMesh], members: list[Anatomy], tmp_path: Path
-) -> None:
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """A real scheduler and two worker processes."""
     distributed = pytest.importorskip("distributed")
-    quiet = {"processes": False, "dashboard_address": None, "threads_per_worker": 1}
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    ) as running:
+        yield running
+
+
+def test_a_cluster_builds_too_though_a_worker_is_killed(
+    template: Template,
+    livers: list[SurfaceMesh],
+    members: list[Anatomy],
+    tmp_path: Path,
+    cluster: Any,
+) -> None:
     source = SurfaceFile(write_obj(tmp_path / "liver0.obj", livers[0]))
     missing = SurfaceFile(tmp_path / "missing.obj")
-    with distributed.LocalCluster(n_workers=1, **quiet) as cluster:
-        growth = create_atlas(
-            tmp_path / "a.h5",
-            [source, livers[1], missing],
-            OPTIONS,
-            template=template,
-            workers=Workers(scheduler=cluster.scheduler_address),
-        )
-    assert growth.added == ("liver0", "liver1") and growth.skipped[0].name == "missing"
+    killed: list[int] = []
+
+    def kill_one(done: int, total: int, name: str) -> None:
+        if name != "missing" and not killed:  # half way: both are at work
+            killed.append(next(iter(cluster.workers.values())).pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    growth = create_atlas(
+        tmp_path / "a.h5",
+        [source, *livers[1:4], missing],
+        OPTIONS,
+        template=template,
+        workers=Workers(scheduler=cluster.scheduler_address),
+        progress=kill_one,
+    )
+    assert killed and growth.added == ("liver0", "liver1", "liver2", "liver3")
+    assert [one.name for one in growth.skipped] == ["missing"]
     # the OBJ holds its coordinates to the last digit, in mm
-    np.testing.assert_allclose(growth.atlas.vectors[0], members[0].distances, atol=1e-6)
+    for one, other in zip(growth.atlas.vectors, members, strict=False):
+        np.testing.assert_allclose(one, other.distances, atol=1e-6)
+
+
+@pytest.mark.long  # the scheduler tries it on four workers, each of which has to start again
+def test_a_task_that_kills_every_worker_costs_its_own_result_only(cluster: Any) -> None:
+    work = ["1 + 1", "__import__('os')._exit(1)", "2 + 2"]
+    results = dict(Workers(scheduler=cluster.scheduler_address).map(eval, work))
+    assert results[0] == 2 and results[2] == 4
+    assert type(results[1]).__name__ == "KilledWorker"
 
 
 def test_without_dask_the_extra_is_named(
