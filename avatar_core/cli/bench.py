@@ -71,8 +71,14 @@ def bench_effects(
     vertices: Vertices = 2850,
     modes: Annotated[int, typer.Option(help="of the far field")] = 50,
     fused: Annotated[
-        Path, typer.Option(help="file with the linear step fused by hand, in a checkout")
-    ] = Path("tests/bench/fused_step.py"),
+        Path | None,
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="Python file with a function fused_step, the linear step written by hand as one "
+            "function, to compare the bare step with",
+        ),
+    ] = None,
     output: Json = None,
 ) -> None:
     """Time the step bare, with each effect alone, and with everything (minutes to build)."""
@@ -83,14 +89,11 @@ def bench_effects(
     organ = read_organ(surface, unit, axes, label)
     with BuildBar(large=True) as progress:
         vademecum = build_for_effects(organ, vertices, modes, progress)
-    yardstick = fused if fused.is_file() else None
-    if yardstick is None:
-        print(f"notice: no {fused} here, so nothing to compare the bare step with", file=sys.stderr)
 
     def announce(scene: str) -> None:
         print(f"compiling and timing: {scene}", file=sys.stderr, flush=True)
 
-    rows, summary = run_effects_bench(vademecum, yardstick, announce)
+    rows, summary = run_effects_bench(vademecum, fused, announce)
     print(
         f"load average {load_average():.2f}; {vertices} vertices, {modes} modes; 10 mm spheres "
         "sliding 5 mm deep, field at all vertices at every step"

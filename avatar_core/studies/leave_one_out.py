@@ -1,9 +1,10 @@
-"""Each real liver written by the others (paper, Sec. 3.3): which settings, and what rivals do.
+"""Each real liver interpolated from the others (paper, Sec. 3.3): LLE and its rivals.
 
-Every method here gives weights that sum to one, so all are judged alike: blended distances, made
-distances again near the surface, and their overlap with the liver (Dice). Livers are compared as
-they lie with centres of volume together, and laid on the phantom by a similarity transform; lengths
-are always those of the patient. Scans of one person are left out together.
+Every method yields weights that sum to one, and all are judged alike: the blended signed distances
+are re-initialised near the surface, and the Dice overlap with the true liver is measured. Livers
+are compared with centred volumes, and aligned to the phantom by a similarity transform; lengths are
+always those of the patient. Scans of one person are left out together. Each method may choose its
+best setting: LLE among numbers of neighbours up to all, PCA among numbers of components up to all.
 """
 
 from __future__ import annotations
@@ -48,13 +49,20 @@ ALIGNMENTS = ("centred", "similarity")
 
 @dataclass(frozen=True)
 class LeaveOneOutSettings:
-    """Livers, neighbours (0: all), regularisations, principal components, grid, stand-ins."""
+    """Sizes of the study, and the settings that each method may choose from.
+
+    n_livers : at most; None for all
+    neighbors, regularizations : of LLE; 0 neighbours are all
+    least_regularizations : further ones, with all neighbours only
+    components : of PCA; 0 are as many as there are
+    shape : of the grid; phantoms : number that stand in for a missing folder
+    """
 
     n_livers: int | None = None
     neighbors: tuple[int, ...] = (5, 10, 20, 40, 0)
     regularizations: tuple[float, ...] = (1e-3, 1e-6)
-    least_regularizations: tuple[float, ...] = (1e-9,)  # with all neighbours only
-    components: tuple[int, ...] = (5, 10, 20, 40)
+    least_regularizations: tuple[float, ...] = (1e-9,)
+    components: tuple[int, ...] = (5, 10, 20, 40, 60, 80, 100, 120, 0)
     shape: tuple[int, int, int] = PAPER_GRID
     phantoms: int = 40
 
@@ -63,7 +71,7 @@ FULL = LeaveOneOutSettings()
 QUICK = LeaveOneOutSettings(
     n_livers=24,
     neighbors=(5, 10, 0),
-    components=(5, 10),
+    components=(5, 10, 0),
     shape=(29, 21, 25),
     phantoms=16,
 )
@@ -156,7 +164,7 @@ def methods(base: Base, settings: LeaveOneOutSettings) -> list[Method]:
         Method("inverse distance", K_PAPER, None, partial(inverse_weights, base.gram, K_PAPER))
     )
     found += [
-        Method("PCA", d, None, partial(principal_weights, base.gram, d))
+        Method("PCA", d or n - 1, None, partial(principal_weights, base.gram, d or n - 1))
         for d in settings.components
         if d < n - 1
     ]
@@ -235,14 +243,16 @@ def inverse_weights(gram: Gram, k: int, i: int, others: IntArray) -> FloatArray:
 def principal_weights(gram: Gram, n_components: int, i: int, others: IntArray) -> FloatArray:
     """Projection on the first principal components of the others, as weights that sum to one.
 
-    With centred products G = V L V^T and c = centred products with the liver itself,
-    w = 1/n + V_d L_d^-1 V_d^T c.
+    With the centred products G = V L V^T and the centred products c with the liver itself,
+    w = 1/n + V_d L_d^-1 V_d^T c. Components without variance do not count: of n livers, there are
+    at most n - 1.
     """
     products = gram.products[np.ix_(others, others)]
     mean = products.mean(axis=0)
     row = gram.products[i, others] - mean
     values, vectors = np.linalg.eigh(products - mean - mean[:, None] + mean.mean())
-    leading = slice(len(values) - n_components, None)
+    with_variance = np.count_nonzero(values > len(values) * np.finfo(float).eps * values[-1])
+    leading = slice(len(values) - min(n_components, with_variance, len(values) - 1), None)
     part = (vectors[:, leading].T @ (row - row.mean())) / values[leading]
     return 1.0 / len(others) + vectors[:, leading] @ part
 

@@ -83,7 +83,9 @@ def shape_rows(folder: Path | None, n_livers: int) -> list[dict[str, Value]]:
 
     The error is 1 - Dice, the time that of the weights of one liver.
     """
-    settings = LeaveOneOutSettings(n_livers, (5, 10, 20, 0), (1e-3,), (), (5, 10), (29, 21, 25), 16)
+    settings = LeaveOneOutSettings(
+        n_livers, (5, 10, 20, 0), (1e-3,), (), (5, 10, 20, 0), (29, 21, 25), 16
+    )
     rows: list[dict[str, Value]] = []
     with one_blas_thread():
         livers = read_livers(folder, settings.n_livers, settings.phantoms)

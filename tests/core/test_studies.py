@@ -167,7 +167,7 @@ def test_samples_without_scikit_learn(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.long
 def test_leave_one_out(tmp_path: Path) -> None:
     settings = leave_one_out.LeaveOneOutSettings(
-        neighbors=(5, 10, 0), components=(5, 10), shape=COARSE, phantoms=16
+        neighbors=(5, 10, 0), components=(5, 10, 0), shape=COARSE, phantoms=16
     )
     study = leave_one_out.study(None, settings)
     summary = checked_files(study, tmp_path)
@@ -176,6 +176,8 @@ def test_leave_one_out(tmp_path: Path) -> None:
     assert summary["dice_convex_lle"] < summary["dice_best"]
     rows = {(r["alignment"], r["method"], r["k"], r["regularization"]): r for r in study.rows}
     assert math.isclose(rows["similarity", "convex LLE", 15, None]["absolute_sum"], 1.0)
+    # PCA has the freedom of LLE: with all components it projects on the same affine hull
+    assert ("similarity", "PCA", 15, None) in rows
 
 
 # --- the parts --------------------------------------------------------------------------------
@@ -203,6 +205,17 @@ def test_principal_weights_project_orthogonally() -> None:
     np.testing.assert_allclose(
         weights @ vectors[1:], mean + axes.T @ (axes @ (vectors[0] - mean)), atol=1e-10
     )
+
+
+def test_all_principal_components_span_what_all_neighbours_do() -> None:
+    vectors = np.random.default_rng(4).standard_normal((12, 50))
+    vectors[11] = vectors[10]  # adds no variance
+    gram, others = Gram.of(list(vectors)), np.arange(1, 12)
+    pca = leave_one_out.principal_weights(gram, 11, 0, others)
+    lle = leave_one_out.lle_weights(gram, 11, 1e-12, 0, others)
+    assert math.isclose(pca.sum(), 1.0)
+    # regularised by 1e-12 of the trace, which is some 1e2 times the least eigenvalue
+    np.testing.assert_allclose(pca @ vectors[1:], lle @ vectors[1:], atol=1e-8)
 
 
 def test_one_person_is_one_subject(tmp_path: Path) -> None:
