@@ -27,7 +27,7 @@ def main() -> None:
     node = rclpy.create_node("steady_tool", enable_rosout=False, start_parameter_services=False)
     publisher = node.create_publisher(PoseStamped, "tool/measured_cp", qos.NEWEST)
     pose = PoseTemplate("organ")
-    realtime.calm_interpreter()
+    realtime.tune_interpreter()
     tick, period = time.monotonic_ns(), round(1e9 / rate)
     while True:
         tick = max(tick + period, time.monotonic_ns() - 20 * period)

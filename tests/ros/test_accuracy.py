@@ -15,13 +15,13 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.framework import qos
-from avatar_ros.loop.shown_modes import Accuracy, Report
+from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
 from avatar_ros.nodes.contact import ContactNode
-from avatar_ros.prepare import scenes
 from avatar_ros.prepare.budget_requests import BudgetRequests
-from avatar_ros.prepare.budgets import Budgets
-from avatar_ros.prepare.handover import Answer
-from avatar_ros.prepare.orders import Change, Order
+from avatar_ros.prepare.detail_chooser import DetailChooser
+from avatar_ros.prepare.model_spec import model_spec
+from avatar_ros.prepare.requests import Change, PreparationRequest
+from avatar_ros.prepare.supplier import Answer
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
@@ -45,31 +45,31 @@ def window(missed: int, step_p99: float) -> LoopStatistics:
 
 def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> None:
     model = prepare(organ, halves=True)
-    accuracy = Accuracy(model, organ.certificate.curve.of("surface"), float("inf"))
-    report = accuracy.after(window(50, 30e-6))
+    accuracy = ShownModes(model, organ.certificate.curve.of("surface"), float("inf"))
+    report = accuracy.update(window(50, 30e-6))
     assert report.shedding and report.changed
     assert model.n_shown < model.n_modes
     assert "5.0% of the periods missed" in report.text and "force keeps all modes" in report.text
     for _ in range(5):
-        report = accuracy.after(window(0, 30e-6))
+        report = accuracy.update(window(0, 30e-6))
     assert not report.shedding and model.n_shown == model.n_modes
 
 
 def test_the_log_names_modes_left_out_and_taken_back(probe: Probe) -> None:
     """At two severities, which rclpy does not let one line of code have."""
     node = SimpleNamespace(get_logger=probe.node.get_logger)
-    said: Callable[[Any, Report], None] = ContactNode._say_shown
+    said: Callable[[Any, ShownModesReport], None] = ContactNode._log_shown_modes
     for shedding in (True, False, True):
-        said(node, Report("modes", shedding, changed=True))
+        said(node, ShownModesReport("modes", shedding, changed=True))
 
 
 def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> None:
     model = prepare(organ, halves=True)
     points = {p.detail.modes: p for p in organ.certificate.curve.like(_ordinary(model)).points}
-    accuracy = Accuracy(model, organ.certificate.curve.like(_ordinary(model)), float("inf"))
+    accuracy = ShownModes(model, organ.certificate.curve.like(_ordinary(model)), float("inf"))
     first, second = window(50, 30e-6), window(0, 30e-6)
-    accuracy.after(first)
-    accuracy.after(second)
+    accuracy.update(first)
+    accuracy.update(second)
     assert first.modes_shown == first.modes == model.n_modes
     assert first.promised_l2 == points[model.n_modes].l2
     assert second.modes_shown == model.n_shown
@@ -78,8 +78,8 @@ def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> No
 
 
 def test_a_budget_chooses_what_keeps_it(organ: Any) -> None:
-    order = Order("vademecum", "handover", "/", (5e-3,), None, "surface", 1e-3)
-    what, budgets = scenes.plan(organ, order, None), Budgets()
+    order = PreparationRequest("vademecum", "handover", "/", (5e-3,), None, "surface", 1e-3)
+    what, budgets = model_spec(organ, order, None), DetailChooser()
     exact = budgets.detail(what, order)
     assert exact == Detail(organ.far.rank)
     errors = {p.detail: p.l2 for p in organ.certificate.curve.points}
@@ -100,7 +100,7 @@ def _ordinary(model: Any) -> Any:
 
 
 class Waiting:
-    """In place of the handover: keeps what is asked, for the test to answer."""
+    """In place of the supplier: keeps what is asked, for the test to answer."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[Change, Answer]] = []
@@ -114,32 +114,32 @@ class Waiting:
 
 
 def test_a_budget_that_is_taken_back_before_it_was_answered_is_asked_for_again() -> None:
-    handover = Waiting()
-    handover.requests.ask(Budget(1.0, 1e-3))
-    handover.requests.ask(None)  # which is still in force
-    (_, loose), (change, none) = handover.asked
+    supplier = Waiting()
+    supplier.requests.ask(Budget(1.0, 1e-3))
+    supplier.requests.ask(None)  # which is still in force
+    (_, loose), (change, none) = supplier.asked
     assert change == {"budget": {}}
     loose(None, "")
     none(None, "")
-    assert handover.told == [Budget(1.0, 1e-3), None]
-    assert handover.requests.kept is None
+    assert supplier.told == [Budget(1.0, 1e-3), None]
+    assert supplier.requests.in_force is None
 
 
 def test_a_refused_budget_gives_way_to_the_one_in_force_unless_a_newer_one_comes() -> None:
-    handover = Waiting()
+    supplier = Waiting()
     good, bad = Budget(1.0, 1e-3), Budget(1e-6, 1e-3)
-    handover.requests.ask(good)
-    handover.asked[0][1](None, "")
-    handover.requests.ask(bad)
-    handover.asked[1][1](None, "infeasible")
-    assert handover.told == [good, (good, "infeasible")]
-    handover.requests.ask(good)  # as its parameters are put back
-    assert len(handover.asked) == 2
-    handover.requests.ask(bad)
-    handover.requests.ask(None)
-    handover.asked[2][1](None, "infeasible")
-    handover.asked[3][1](None, "")
-    assert handover.told[2:] == [None]
+    supplier.requests.ask(good)
+    supplier.asked[0][1](None, "")
+    supplier.requests.ask(bad)
+    supplier.asked[1][1](None, "infeasible")
+    assert supplier.told == [good, (good, "infeasible")]
+    supplier.requests.ask(good)  # as its parameters are put back
+    assert len(supplier.asked) == 2
+    supplier.requests.ask(bad)
+    supplier.requests.ask(None)
+    supplier.asked[2][1](None, "infeasible")
+    supplier.asked[3][1](None, "")
+    assert supplier.told[2:] == [None]
 
 
 # --- In the cell -------------------------------------------------------------------------------
@@ -190,8 +190,8 @@ def test_a_tolerance_shows_fewer_modes_and_leaves_the_force(
     assert before.modes_shown == rank or before.missed > 0
     _, force = felt(probe, hand)
     assert set_budget(probe, tolerance=1.0).successful
-    after = statistics(probe, hand, lambda s: 0 < s.modes < rank)
-    assert organ.certificate.curve.like(Detail(rank)).points[-1].l2 < after.promised_l2 <= 1.0
+    update = statistics(probe, hand, lambda s: 0 < s.modes < rank)
+    assert organ.certificate.curve.like(Detail(rank)).points[-1].l2 < update.promised_l2 <= 1.0
     np.testing.assert_allclose(felt(probe, hand)[1], force, rtol=1e-6)
     assert set_budget(probe, tolerance=0.0).successful
     statistics(probe, hand, lambda s: s.modes == rank)

@@ -51,7 +51,7 @@ def test_the_cell_keeps_time(library: Path, tmp_path: Path) -> None:
         assert run.answered_fraction > 0.9
         assert run.latency.p50_ms < 1.0
         assert run.cloud_hz > 0.5 * run.rate_hz
-        touched = np.linalg.norm(run.felt.forces, axis=1) > 0.1
+        touched = np.linalg.norm(run.round_trips.forces, axis=1) > 0.1
         assert 0.3 < touched.mean() < 0.9  # of a touch, pushing and sliding make 0.7
 
 

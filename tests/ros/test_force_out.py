@@ -16,9 +16,9 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.loop.contact_loop import Online
+from avatar_ros.loop.contact_loop import ActiveModel
 from avatar_ros.loop.safety import Safety
-from avatar_ros.loop.tool import Tool
+from avatar_ros.loop.tool_channel import ToolChannel
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 
@@ -168,7 +168,7 @@ def test_large_forces_are_limited_and_the_state_says_how_much(
 ) -> None:
     cell = Cell(bench(20e-3), touch, replace(SAFETY, limits=ForceLimits(1.5, 200.0)))
     assert np.linalg.norm(cell.force) == pytest.approx(1.5)
-    whole = np.linalg.norm(cell.loop.online.model.out.force[0])
+    whole = np.linalg.norm(cell.loop.active.model.out.force[0])
     assert cell.loop.guards[0].share == pytest.approx(1.5 / whole)
     away = cell.hold(30, lambda: pose(cell.tip + 15e-3 * cell.normal))
     change = np.linalg.norm(np.diff(np.vstack([cell.force, away[:, 1:]]), axis=0), axis=1)
@@ -181,7 +181,7 @@ def test_a_swap_goes_from_old_to_new_within_the_slew(cell: Cell, organ: Any) -> 
     limits = ForceLimits(20.0, 30.0)
     cell.loop.settings = replace(cell.loop.settings, safety=replace(SAFETY, limits=limits))
     model = prepare(organ, (5e-3,), modes=3, cloud="off", halves=True)
-    cell.loop.online = Online("b", model, cell.loop.settings)
+    cell.loop.active = ActiveModel("b", model, cell.loop.settings)
     found = np.vstack([cell.force, cell.hold(500)[:, 1:]])
     assert np.linalg.norm(np.diff(found, axis=0), axis=1).max() <= 30e-3 * (1 + 1e-9)
 
@@ -196,9 +196,9 @@ def test_poses_in_a_frame_of_the_tool_give_forces_in_it(
     own = replace(SAFETY, frame="device", transform=transform)
     other = bench(20e-3)
     queue = other.poses[0]
-    other.tools[0] = Tool(queue, queue, "organ", own)
+    other.tools[0] = ToolChannel(queue, queue, "organ", own)
     other.loop._tools = other.tools
-    expected = cell.loop.online.model.out.force[0].copy()
+    expected = cell.loop.active.model.out.force[0].copy()
     found = None
     for d in [*np.arange(-6e-3, -1e-3, 1e-3), *[-1e-3] * 5]:
         tip = rotation.T @ (touch[0] - d * touch[1] - transform[:3])

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import mmap
 import os
-import socket
 import subprocess
 import sys
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 
-pytest.importorskip("avatar_ros.prepare.handover", reason="avatar_ros is not installed")
+pytest.importorskip("avatar_ros.prepare.supplier", reason="avatar_ros is not installed")
 
-from avatar_ros.prepare.orders import Order
-from avatar_ros.prepare.shared_arrays import map_shared, share
+from avatar_ros.prepare.protocol import Channel
+from avatar_ros.prepare.requests import PreparationRequest
+from avatar_ros.prepare.shared_arrays import map_shared, write_shared
 
 pytestmark = pytest.mark.ros
 
@@ -33,7 +31,7 @@ def _arrays() -> dict[str, np.ndarray]:
 
 def test_arrays_arrive_as_they_were() -> None:
     sent = _arrays()
-    received = map_shared(*share(sent))
+    received = map_shared(*write_shared(sent))
     for name, values in sent.items():
         np.testing.assert_array_equal(received[name], values)
         assert received[name].dtype == values.dtype
@@ -42,7 +40,7 @@ def test_arrays_arrive_as_they_were() -> None:
 
 
 def test_neither_side_can_alter_what_was_handed_over() -> None:
-    handle, _ = share(_arrays())
+    handle, _ = write_shared(_arrays())
     with pytest.raises(PermissionError):
         os.ftruncate(handle, 1)
     with pytest.raises(PermissionError):
@@ -54,12 +52,12 @@ def test_neither_side_can_alter_what_was_handed_over() -> None:
 
 def test_the_receiving_process_ends_with_the_node(own_domain: dict[str, str]) -> None:
     """Which may have been killed before its child could ask to be told."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    order = Order("vademecum", "orphan", "/", (0.005,), None, "surface", 1e-3)
-    ours.send(json.dumps(asdict(order)).encode())
+    ours, theirs = Channel.pair()
+    request = PreparationRequest("vademecum", "orphan", "/", (0.005,), None, "surface", 1e-3)
+    Channel(ours).send(request)
     with theirs:
         process = subprocess.Popen(
-            [sys.executable, "-m", "avatar_ros.prepare.receiver"],
+            [sys.executable, "-m", "avatar_ros.prepare.worker"],
             stdin=theirs.fileno(),
             env=own_domain,
             cwd="/",

@@ -21,11 +21,12 @@ from avatar_ros.framework.library import (
     read_in_library,
 )
 from avatar_ros.framework.reader import Reader
-from avatar_ros.nodes.patient_interpolation import order_of
+from avatar_ros.nodes.patient_interpolation import patient_request
 from avatar_ros.patients.builder import BuildError
 from avatar_ros.patients.worker import require_replaceable
-from avatar_ros.prepare.orders import Order
-from avatar_ros.prepare.receiver import Receiver
+from avatar_ros.prepare.protocol import Channel, Refused
+from avatar_ros.prepare.requests import PreparationRequest
+from avatar_ros.prepare.worker import ModelPreparer
 
 from avatar_core.errors import one_line
 from avatar_ros.msg import VademecumFile
@@ -132,7 +133,7 @@ def test_a_large_mesh_is_refused_before_it_is_copied(
     request = InterpolatePatient.Request()
     request.mesh = conversions.surface_mesh(*_triangles(1000))
     settings: Any = SimpleNamespace(library_dir=str(shelf), max_bytes=36_000)
-    order = order_of(request, settings)
+    order = patient_request(request, settings)
     assert order.vertices is not None and order.vertices.shape == (1000, 3)
 
     def never(mesh: Any) -> Any:
@@ -141,7 +142,7 @@ def test_a_large_mesh_is_refused_before_it_is_copied(
     monkeypatch.setattr(conversions, "mesh_arrays", never)
     settings.max_bytes = 35_999
     with pytest.raises(RefusedError, match="raise max_megabytes"):
-        order_of(request, settings)
+        patient_request(request, settings)
 
 
 def _triangles(n: int) -> tuple[Any, Any]:
@@ -158,15 +159,14 @@ def test_an_answer_is_one_short_line() -> None:
 
 
 def test_a_forged_vademecum_with_a_long_name_is_refused_in_one_packet() -> None:
-    """The refusal goes through a socket that takes some 200 kB; the receiver has to survive it."""
-    import json
-    import socket
-
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    order = Order("vademecum", "n", "/", (0.005,), None, "surface", 1e-3)
+    """The refusal goes through a socket that takes some 200 kB; the worker has to survive it."""
+    ours, theirs = Channel.pair()
+    request = PreparationRequest("vademecum", "n", "/", (0.005,), None, "surface", 1e-3)
     with ours, theirs:
-        Receiver(order, theirs).receive(
+        ModelPreparer(request, Channel(theirs)).receive(
             VademecumFile(id="0" * 64, name="x\n" * 1_000_000, data=b"no file")
         )
-        said = json.loads(ours.recv(1 << 20))["refusal"]
-    assert "refused" in said and "\n" not in said and len(said) < 1000
+        received = Channel(ours).receive()
+    assert received is not None and isinstance(received[0], Refused)
+    reason = received[0].reason
+    assert "refused" in reason and "\n" not in reason and len(reason) < 1000

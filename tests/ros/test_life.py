@@ -117,7 +117,7 @@ def test_a_wrong_parameter_ends_the_node(
     options = [word for argument in arguments for word in ("-p", argument)]
     process = Module(node, ["--ros-args", *options], own_domain)
     assert process.wait(60.0) == 1
-    assert reason in process.last_words()
+    assert reason in process.last_line()
 
 
 def test_a_broken_vademecum_from_elsewhere_is_refused(

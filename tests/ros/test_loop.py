@@ -13,10 +13,10 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 import rclpy
-from avatar_ros.framework.conversions import WrenchTemplate, small_turn, stamp_bytes
-from avatar_ros.loop.contact_loop import BLEND, ContactLoop, Online
+from avatar_ros.framework.conversions import WrenchTemplate, rotation_between, stamp_bytes
+from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop
 from avatar_ros.loop.settings import ContactSettings
-from avatar_ros.loop.tool import OK
+from avatar_ros.loop.tool_channel import OK
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
@@ -88,7 +88,7 @@ class Bench:
 
     def use(self, *effects: Any, identity: str = "a", cloud: Any = "surface") -> None:
         model = prepare(self.organ, effects=effects, cloud=cloud, period=1.0 / RATE, halves=True)
-        self.loop.online = Online(identity, model, SETTINGS)
+        self.loop.active = ActiveModel(identity, model, SETTINGS)
 
     def step(self, n: int = 1) -> np.ndarray:
         """Force and torque of the last periods, shape (n, 6)."""
@@ -255,7 +255,7 @@ def test_a_small_turn_is_the_rotation_vector() -> None:
         vector = rng.normal(size=3) * 0.01
         now = _times(_quaternion(vector), before)
         for sign in (1.0, -1.0):  # both are the same orientation
-            turn = small_turn(tuple(before), tuple(sign * now))
+            turn = rotation_between(tuple(before), tuple(sign * now))
             np.testing.assert_allclose(turn, vector, atol=2e-6)  # |v|^3 / 24
 
 

@@ -314,7 +314,7 @@ def test_a_wrong_parameter_ends_the_node(
         arguments = [f"atlas:={tmp_path / 'shapes.h5'}"]
     process = _start(own_domain, folder, *arguments)
     assert process.wait(TIMEOUT) == 1
-    assert reason in process.last_words()
+    assert reason in process.last_line()
 
 
 # --- while one is built -----------------------------------------------------------------------

@@ -27,11 +27,11 @@ from avatar_ros.framework.conversions import (
     stamp_nanoseconds,
 )
 from avatar_ros.loop import contact_loop
-from avatar_ros.loop.contact_loop import ContactLoop, Online
+from avatar_ros.loop.contact_loop import ActiveModel, ContactLoop
 from avatar_ros.loop.safety import Safety
 from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.loop.statistics import statistics
-from avatar_ros.loop.tool import Tool
+from avatar_ros.loop.tool_channel import ToolChannel
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
@@ -98,7 +98,7 @@ class Bench:
         self.settings = ContactSettings(**(base | {"pose_timeout": timeout}))
         self.now = 0.0
         self.poses = [Queue() for _ in names]
-        self.tools = [Tool(queue, queue, "organ") for queue in self.poses]
+        self.tools = [ToolChannel(queue, queue, "organ") for queue in self.poses]
         self.state = Queue()
         outlets = SimpleNamespace(
             state=self.state, deformation=Queue(), statistics=Queue(), diagnostics=Queue()
@@ -106,8 +106,8 @@ class Bench:
         self.loop = ContactLoop(self.settings, self.tools, outlets, context)
         self.loop.guards = [Through() for _ in names]
         model = prepare(organ, (5e-3,) * n_tools, cloud="off", halves=True)
-        self.loop.online = Online("a", model, self.settings)
-        self.loop._used = self.loop.online  # at once, not faded in
+        self.loop.active = ActiveModel("a", model, self.settings)
+        self.loop._used = self.loop.active  # at once, not faded in
 
     def step(self, *messages: bytes | None, after: float = 1e-3) -> tuple[int, np.ndarray]:
         """Status and force of the first tool in the period after some messages."""

@@ -82,8 +82,8 @@ def test_what_would_harm_is_refused_in_one_line(
 ) -> None:
     process = Module(node, ["--ros-args", "-p", value], own_domain)
     assert process.wait(60.0) == 1
-    assert reason in process.last_words()
-    assert f"parameter {value.split(':=')[0].rsplit('.', 1)[0]}" in process.last_words()
+    assert reason in process.last_line()
+    assert f"parameter {value.split(':=')[0].rsplit('.', 1)[0]}" in process.last_line()
 
 
 def test_an_override_is_what_others_see(own_domain: dict[str, str], probe: Any) -> None:

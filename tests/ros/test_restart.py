@@ -17,8 +17,8 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.framework import qos
-from avatar_ros.framework.kept_state import KeptState
 from avatar_ros.framework.parameters import ParameterError
+from avatar_ros.framework.saved_state import SavedState
 from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
@@ -210,9 +210,9 @@ class Started:
 def test_a_change_comes_back_at_the_same_start_alone(tmp_path: Path) -> None:
     node: Any = Started(tmp_path)
     started = {"stiffness": 1.0, "scene": ""}
-    KeptState(node, started).keep({"stiffness": 2.0, "scene": ""})
-    assert KeptState(node, started).kept() == {"stiffness": 2.0}
-    assert KeptState(node, started | {"scene": "palpation"}).kept() == {}
+    SavedState(node, started).save({"stiffness": 2.0, "scene": ""})
+    assert SavedState(node, started).load() == {"stiffness": 2.0}
+    assert SavedState(node, started | {"scene": "palpation"}).load() == {}
     assert [file.name for file in tmp_path.iterdir()] == ["left.contact.json"]
 
 
@@ -220,11 +220,11 @@ def test_a_broken_file_is_named_and_not_used(tmp_path: Path) -> None:
     node: Any = Started(tmp_path)
     for text in ("", "[]", '{"started": {"a": 1}}', '{"started"'):
         (tmp_path / "left.contact.json").write_text(text)
-        assert KeptState(node, {"a": 1}).kept() == {}
+        assert SavedState(node, {"a": 1}).load() == {}
         assert "left.contact.json not used" in node.said.pop()
 
 
 def test_a_directory_that_is_none_is_refused(tmp_path: Path) -> None:
     node: Any = Started(tmp_path / "nowhere")
     with pytest.raises(ParameterError, match="no directory"):
-        KeptState(node, {})
+        SavedState(node, {})

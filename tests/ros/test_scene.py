@@ -17,9 +17,9 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
-from avatar_ros.prepare.budgets import Budgets
-from avatar_ros.prepare.orders import Order
-from avatar_ros.prepare.scenes import lay_out, plan
+from avatar_ros.prepare.detail_chooser import DetailChooser
+from avatar_ros.prepare.model_spec import lay_out, model_spec
+from avatar_ros.prepare.requests import PreparationRequest
 from geometry_msgs.msg import Quaternion, WrenchStamped
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -42,7 +42,7 @@ YOUNG = 0.17e6  # [Pa] of the organ
 BARE = "name: bare"
 FRICTION = "effects: {friction: {static: 1.0, kinetic: 1.0}}"
 RELAXING = "effects: {viscoelasticity: {g: [0.5], tau: [0.2]}}"
-ORDER = Order("", "", "", (5e-3,), None, "surface", 1e-3)
+ORDER = PreparationRequest("", "", "", (5e-3,), None, "surface", 1e-3)
 
 
 class Palpation:
@@ -119,8 +119,8 @@ def palpation(lasting_palpation: Palpation) -> Palpation:
 def _refusal(path: Path, organ: Any) -> str:
     """Why the organ of the tests cannot serve a scene; empty if it can."""
     try:
-        what = plan(organ, ORDER, read_scene(path))
-        lay_out(what, Budgets().detail(what, ORDER), ORDER.period)
+        what = model_spec(organ, ORDER, read_scene(path))
+        lay_out(what, DetailChooser().detail(what, ORDER), ORDER.period)
     except AvatarError as error:
         return str(error)
     return ""

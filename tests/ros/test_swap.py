@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import socket
 import threading
@@ -21,8 +20,9 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.framework.conversions import vademecum_file
-from avatar_ros.prepare.orders import Order
-from avatar_ros.prepare.receiver import Receiver
+from avatar_ros.prepare.protocol import ChangeRequest, Channel, ModelReady, Packet, Timed
+from avatar_ros.prepare.requests import PreparationRequest
+from avatar_ros.prepare.worker import ModelPreparer
 
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from avatar_ros.msg import ContactState, LoopStatistics
@@ -32,7 +32,7 @@ from tests.ros.test_cell import Hand
 
 pytestmark = pytest.mark.ros
 
-ORDER = Order("vademecum", "handover", "/", (5e-3,), None, "surface", 1e-3)
+REQUEST = PreparationRequest("vademecum", "handover", "/", (5e-3,), None, "surface", 1e-3)
 SWAPS = 6
 
 
@@ -46,33 +46,36 @@ def twins(organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Line:
-    """The end of a receiver's socket that the contact node has."""
+    """The end of a worker's socket that the contact node has."""
 
     def __init__(self) -> None:
-        self.ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.ours, theirs = Channel.pair()
         self.ours.settimeout(60.0)
-        self.receiver = Receiver(ORDER, theirs)
+        self.channel = Channel(self.ours)
+        self.preparer = ModelPreparer(REQUEST, Channel(theirs))
 
-    def note(self) -> tuple[dict[str, Any], int]:
-        """The next note, and how many handles came with it."""
-        packet, handles, _, _ = socket.recv_fds(self.ours, 1 << 20, 1)
-        for handle in handles:
+    def packet(self) -> tuple[Packet, int]:
+        """The next packet, and how many descriptors came with it."""
+        received = self.channel.receive()
+        assert received is not None
+        for handle in received[1]:
             socket.close(handle)
-        return json.loads(packet), len(handles)
+        return received[0], len(received[1])
 
 
 def test_a_model_is_sent_before_its_times(twins: Path) -> None:
     line = Line()
     data = (twins / "one.h5").read_bytes()
     identity = load_vademecum(twins / "one.h5").id
-    line.receiver.receive(vademecum_file(identity, "one", data))
-    model, n = line.note()
-    assert (n, model["id"]) == (1, identity)
-    assert model["curve"]["l2"] and all(map(math.isnan, model["curve"]["p99"]))
-    times, n = line.note()
-    assert n == 0 and set(times) == {"times"}
-    assert times["times"]["l2"] == model["curve"]["l2"]
-    pairs = zip(times["times"]["p50"], times["times"]["p99"], strict=True)
+    line.preparer.receive(vademecum_file(identity, "one", data))
+    model, n = line.packet()
+    assert isinstance(model, ModelReady) and (n, model.id) == (1, identity)
+    assert model.curve is not None
+    assert model.curve["l2"] and all(map(math.isnan, model.curve["p99"]))
+    times, n = line.packet()
+    assert n == 0 and isinstance(times, Timed)
+    assert times.curve["l2"] == model.curve["l2"]
+    pairs = zip(times.curve["p50"], times.curve["p99"], strict=True)
     assert all(0.0 < p50 <= p99 for p50, p99 in pairs)
 
 
@@ -81,21 +84,21 @@ def test_a_change_that_waits_comes_before_the_times(
 ) -> None:
     """What is prepared next is what is timed."""
     line = Line()
-    receiver = line.receiver
+    preparer = line.preparer
     data = (twins / "one.h5").read_bytes()
-    monkeypatch.setattr(receiver, "_waiting", {1})
-    receiver.receive(vademecum_file(load_vademecum(twins / "one.h5").id, "one", data))
-    assert line.note()[1] == 1
+    monkeypatch.setattr(preparer, "_waiting", {1})
+    preparer.receive(vademecum_file(load_vademecum(twins / "one.h5").id, "one", data))
+    assert line.packet()[1] == 1
     line.ours.settimeout(0.0)
     with pytest.raises(BlockingIOError):
-        line.note()
+        line.packet()
     line.ours.settimeout(60.0)
-    monkeypatch.setattr(receiver, "_waiting", set())
-    threading.Thread(target=receiver.listen, daemon=True).start()
-    change = {"number": 1, "change": {"material": {"young": 0.3e6}}}
-    line.ours.send(json.dumps(change).encode())
-    assert line.note()[0]["number"] == 1
-    assert "times" in line.note()[0]
+    monkeypatch.setattr(preparer, "_waiting", set())
+    threading.Thread(target=preparer.listen, daemon=True).start()
+    line.channel.send(ChangeRequest(1, {"material": {"young": 0.3e6}}))
+    changed, _ = line.packet()
+    assert isinstance(changed, ModelReady) and changed.number == 1
+    assert isinstance(line.packet()[0], Timed)
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from avatar_core.errors import AvatarError
 from avatar_ros.bench import footprint
 from avatar_ros.bench.footprint import Growth, footprints
 from avatar_ros.bench.report import CellMeasurement, CellReport, Times
-from avatar_ros.bench.scripted_tool import READY, Felt
+from avatar_ros.bench.scripted_tool import READY, RoundTrips
 
 PERIOD = 1e-3  # [s]
 ON_TIME = 1.5e-3  # longest period that is on time [s]
@@ -94,10 +94,10 @@ def _measure(
         tempfile.TemporaryDirectory(prefix="avatar-bench-") as folder,
         cell(path, tip_radius, priority) as (environment, processes),
     ):
-        felt_file, view_file = Path(folder, "felt.npz"), Path(folder, "view.json")
+        trips_file, view_file = Path(folder, "round_trips.npz"), Path(folder, "view.json")
         count_file = Path(folder, "count.json")
         viewer = Module("bench.cloud_viewer", [str(view_file)], environment)
-        arguments = [str(path), "--tip-radius", str(tip_radius), "--output", str(felt_file)]
+        arguments = [str(path), "--tip-radius", str(tip_radius), "--output", str(trips_file)]
         arguments += ["--seconds", str(seconds), "--priority", str(priority)]
         arguments += ["--timeout", str(_START_TIMEOUT)]
         tool = Module("bench.scripted_tool", arguments, environment)
@@ -106,7 +106,7 @@ def _measure(
             assert tool.stdout is not None
             if tool.stdout.readline().strip() != READY:
                 tool.wait(_STOP_TIMEOUT)
-                raise CellError(f"the tool did not start: {tool.last_words()}")
+                raise CellError(f"the tool did not start: {tool.last_line()}")
             if changes > 0.0:
                 of_slider = [str(path), str(changes), str(count_file)]
                 slider = Module("bench.material_slider", of_slider, environment)
@@ -114,17 +114,17 @@ def _measure(
             grown = _growths(seconds, processes | {"cloud_viewer": viewer, "scripted_tool": tool})
             bare, _ = floor.communicate(timeout=seconds + _START_TIMEOUT)
             if tool.wait(timeout=seconds + _START_TIMEOUT) != 0:
-                raise CellError(f"the tool failed: {tool.last_words()}")
+                raise CellError(f"the tool failed: {tool.last_line()}")
         finally:
             tool.finish()
             viewer.finish()
             code = 0 if slider is None else slider.finish()
         if slider is not None and code != 0:
-            raise CellError(f"the slider failed: {slider.last_words()}")
+            raise CellError(f"the slider failed: {slider.last_line()}")
         accepted = 0 if slider is None else json.loads(count_file.read_text())["accepted"]
-        felt = Felt.load(felt_file)
+        round_trips = RoundTrips.load(trips_file)
         view = json.loads(view_file.read_text())
-        return _evaluate(felt, view, json.loads(bare), load, accepted, grown)
+        return _evaluate(round_trips, view, json.loads(bare), load, accepted, grown)
 
 
 def _growths(seconds: float, processes: dict[str, Module]) -> tuple[Growth, ...]:
@@ -143,46 +143,47 @@ def _growths(seconds: float, processes: dict[str, Module]) -> tuple[Growth, ...]
 
 
 def _evaluate(
-    felt: Felt,
+    round_trips: RoundTrips,
     view: dict[str, Any],
     bare: dict[str, Any],
     load: float,
     accepted: int,
     grown: tuple[Growth, ...],
 ) -> CellMeasurement:
+    begin, end = float(round_trips.begin), float(round_trips.end)
     windows = [
         w
         for w in view["statistics"]
-        if felt.begin <= w["received"] - w["window"] and w["received"] <= felt.end
+        if begin <= w["received"] - w["window"] and w["received"] <= end
     ]
     if not windows:
         raise CellError("no statistics from the contact node: measure for 3 s or longer")
     periods = sum(w["periods"] for w in windows)
-    duration = float(felt.end - felt.begin)
-    clouds = [n for at, n in view["clouds"].items() if felt.begin < int(at) < felt.end - 1.0]
+    duration = end - begin
+    clouds = [n for at, n in view["clouds"].items() if begin < int(at) < end - 1.0]
     floor = np.array(bare["periods"])
-    at_tool = np.diff(felt.arrivals)
-    answered = felt.latencies[np.isfinite(felt.latencies)]
+    at_tool = np.diff(round_trips.arrivals)
+    answered = round_trips.latencies[np.isfinite(round_trips.latencies)]
     return CellMeasurement(
-        priority=int(felt.priority),
+        priority=int(round_trips.priority),
         load_average=load,
         seconds=duration,
         rate_hz=periods / sum(w["window"] for w in windows),
         on_time_fraction=1.0 - sum(w["missed"] for w in windows) / periods,
         period_max_ms=1e3 * max(w["period_max"] for w in windows),
-        rate_at_tool_hz=len(felt.arrivals) / duration,
+        rate_at_tool_hz=len(round_trips.arrivals) / duration,
         on_time_at_tool_fraction=float(np.mean(at_tool <= ON_TIME)),
         latency=Times.of(answered),
-        answered_fraction=len(answered) / len(felt.latencies),
+        answered_fraction=len(answered) / len(round_trips.latencies),
         compute_p99_ms=1e3 * max(w["compute_p99"] for w in windows),
         floor=Times.of(floor),
         floor_on_time_fraction=float(np.mean(floor <= ON_TIME)),
         cloud_hz=float(np.mean(clouds)) if clouds else 0.0,
         cloud_bytes=view["cloud_bytes"],
         material_changes=accepted,
-        force_max_n=float(np.nanmax(np.linalg.norm(felt.forces, axis=1))),
+        force_max_n=float(np.nanmax(np.linalg.norm(round_trips.forces, axis=1))),
         growths=grown,
-        felt=felt,
+        round_trips=round_trips,
     )
 
 
@@ -223,7 +224,7 @@ def cell(
         yield environment, {"vademecum_loader": loader, "contact": contact}
         for name, process in (("vademecum_loader", loader), ("contact", contact)):
             if process.poll() is not None:
-                raise CellError(f"{name} ended by itself: {process.last_words()}")
+                raise CellError(f"{name} ended by itself: {process.last_line()}")
     finally:
         codes = [process.finish() for process in (contact, loader)]
     if any(codes):
@@ -251,7 +252,7 @@ class Module(ModuleProcess):
         number = self._said.fileno()
         return os.pread(number, os.fstat(number).st_size, 0).decode(errors="replace")
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """The last line of standard error."""
         lines = [line.strip() for line in self.said().splitlines() if line.strip()]
         return lines[-1] if lines else f"it said nothing, exit code {self.poll()}"

@@ -42,7 +42,7 @@ def main() -> int:
 
     node.create_subscription(PointCloud2, "deformation", view, qos.NEWEST, raw=True)
     node.create_subscription(LoopStatistics, "statistics", note, qos.STATISTICS)
-    realtime.calm_interpreter()
+    realtime.tune_interpreter()
     spin_until(stop, node)
     output.write_text(
         json.dumps({"clouds": clouds, "cloud_bytes": n_bytes[0], "statistics": statistics})

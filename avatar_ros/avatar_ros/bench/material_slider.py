@@ -56,7 +56,7 @@ def main() -> int:
         client.call_async(request).add_done_callback(count)
 
     node.create_timer(1.0 / rate, change)
-    realtime.calm_interpreter()
+    realtime.tune_interpreter()
     spin_until(stop, node)
     Path(sys.argv[3]).write_text(json.dumps({"accepted": accepted[0]}))
     return 0

@@ -11,7 +11,7 @@ import numpy as np
 
 from avatar_ros.bench import footprint
 from avatar_ros.bench.footprint import Growth
-from avatar_ros.bench.scripted_tool import Felt
+from avatar_ros.bench.scripted_tool import RoundTrips
 
 PROMISED_ON_TIME = 0.99  # of the contact loop's periods, on a quiet machine
 
@@ -45,9 +45,9 @@ class CellMeasurement:
     floor : periods of the sleeping loop in the same seconds
     cloud_hz, cloud_bytes : what the viewer got
     material_changes : that the contact node accepted in the run
-    force_max_n : largest force felt
+    force_max_n : largest force on the tool
     growths : of every process of the cell
-    felt : every pose and its answer; not in the data file
+    round_trips : every pose and its answer; not in the data file
     """
 
     priority: int
@@ -68,7 +68,7 @@ class CellMeasurement:
     material_changes: int
     force_max_n: float
     growths: tuple[Growth, ...]
-    felt: Felt
+    round_trips: RoundTrips
 
     @property
     def complaints(self) -> list[str]:
@@ -126,7 +126,7 @@ class CellReport:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: _plain(held) for name, held in value.items() if name != "felt"}
+        return {name: _plain(held) for name, held in value.items() if name != "round_trips"}
     if isinstance(value, list | tuple):
         return [_plain(held) for held in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value

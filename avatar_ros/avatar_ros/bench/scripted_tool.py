@@ -1,6 +1,6 @@
 """A tool that palpates by itself: approaches the organ, pushes, slides, and times the answers.
 
-Run as ``python -m avatar_ros.bench.scripted_tool FILE.h5``; what it felt goes into an ``.npz``
+Run as ``python -m avatar_ros.bench.scripted_tool FILE.h5``; poses and answers go into an ``.npz``
 file.
 """
 
@@ -39,7 +39,7 @@ _SETTLE = 1.0  # poses sent before the measured part [s]
 
 
 @dataclass(frozen=True)
-class Felt:
+class RoundTrips:
     """What a tool sent and got back, one entry a pose.
 
     tips : (n, 3) [m]; forces : (n, 3) [N], NaN where no answer came
@@ -60,10 +60,10 @@ class Felt:
         np.savez(path, **vars(self))
 
     @staticmethod
-    def load(path: Path) -> Felt:
+    def load(path: Path) -> RoundTrips:
         with np.load(path) as held:
             values: dict[str, Any] = {name: held[name] for name in held.files}
-        return Felt(**values)
+        return RoundTrips(**values)
 
 
 # --- Where the tool goes ---------------------------------------------------------------------
@@ -147,7 +147,7 @@ class ScriptedTool:
             rclpy.spin_once(self._node, timeout_sec=0.1)
         self._node.destroy_subscription(listener)
 
-    def play(self, tips: np.ndarray, stop: StopSignal, priority: int = 0) -> Felt:
+    def play(self, tips: np.ndarray, stop: StopSignal, priority: int = 0) -> RoundTrips:
         """Send one pose a period; returns what came back."""
         n = len(tips)
         forces = np.full((n, 3), np.nan)
@@ -178,7 +178,7 @@ class ScriptedTool:
                     if 0 <= k <= i and np.isnan(latencies[k]):
                         latencies[k] = (now - sent[k]) * 1e-9
                         forces[k] = force
-        return Felt(
+        return RoundTrips(
             tips=tips[:n],
             forces=forces[:n],
             latencies=latencies[:n],
@@ -215,12 +215,12 @@ def main() -> int:
         tool.wait_for_model(options.timeout)
         granted = realtime.claim(options.priority)
         realtime.bind_thread(options.cpu)
-        realtime.calm_interpreter()
+        realtime.tune_interpreter()
         tool.play(np.repeat(tips[:1], round(_SETTLE * options.rate), axis=0), stop)
         print(READY, flush=True)
-        felt = tool.play(tips, stop, granted.priority)
+        round_trips = tool.play(tips, stop, granted.priority)
         if options.output:
-            felt.save(options.output)
+            round_trips.save(options.output)
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
@@ -238,7 +238,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--priority", type=int, default=0, help="SCHED_FIFO priority; 0: none")
     parser.add_argument("--cpu", type=int, default=-1, help="core; -1: any")
     parser.add_argument("--timeout", type=float, default=60.0, help="for the contact node [s]")
-    parser.add_argument("--output", type=Path, help="file for what was felt (.npz)")
+    parser.add_argument("--output", type=Path, help="file for poses and answers (.npz)")
     return parser.parse_args()
 
 

@@ -113,7 +113,7 @@ class PoseReader:
         return int(ContactState.STATUS_OK)
 
 
-def small_turn(
+def rotation_between(
     before: tuple[float, float, float, float], now: tuple[float, float, float, float]
 ) -> tuple[float, float, float]:
     """Rotation vector from one orientation to another, in the frame of both [rad].

@@ -65,7 +65,7 @@ class ManagedNode(LifecycleNode, ABC):
         return ""
 
     @property
-    def owes_answers(self) -> bool:
+    def has_pending_answers(self) -> bool:
         """Whether a request is still to be answered, for which the node is kept a moment."""
         return False
 
@@ -174,7 +174,7 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
     finally:
         node.trigger_shutdown()
         end = time.monotonic() + _LAST_ANSWERS
-        while node.owes_answers and time.monotonic() < end:
+        while node.has_pending_answers and time.monotonic() < end:
             executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
         executor.shutdown(timeout_sec=_LAST_ANSWERS)  # without, it waits for ever for what is open
         node.destroy_node()

@@ -95,7 +95,7 @@ def release() -> None:
     os.nice(10)
 
 
-def calm_interpreter() -> None:
+def tune_interpreter() -> None:
     """No garbage collection on its own account, and quick hand-over of the global lock.
 
     Whoever calls this calls ``gc.collect()`` from time to time outside the loop; what exists now
@@ -125,7 +125,7 @@ def wake_up_periods(seconds: float, period: float = 1e-3) -> np.ndarray:
     return np.diff(wakes) * 1e-9
 
 
-def bring_into_memory(pages: np.ndarray) -> None:
+def prefault(pages: np.ndarray) -> None:
     """Map every page of ``pages`` now, without holding the global lock, not at first use."""
     page = os.sysconf("SC_PAGESIZE")
     start = pages.ctypes.data // page * page
@@ -148,7 +148,7 @@ def main() -> int:
     seconds, priority = float(sys.argv[1]), int(sys.argv[2])
     granted = claim(priority)
     bind_thread(-1)
-    calm_interpreter()
+    tune_interpreter()
     periods = wake_up_periods(seconds)
     print(json.dumps({"priority": granted.priority, "periods": periods.tolist()}))
     return 0

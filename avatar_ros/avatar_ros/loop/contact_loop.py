@@ -33,9 +33,9 @@ from avatar_ros.framework.conversions import (
     stamp_nanoseconds,
 )
 from avatar_ros.loop.settings import ContactSettings
-from avatar_ros.loop.shown_modes import Accuracy
-from avatar_ros.loop.statistics import Record
-from avatar_ros.loop.tool import FAR_AWAY, OK, Tool
+from avatar_ros.loop.shown_modes import ShownModes
+from avatar_ros.loop.statistics import TimingRecord
+from avatar_ros.loop.tool_channel import FAR_AWAY, OK, ToolChannel
 from avatar_ros.msg import ContactState
 
 NO_MODEL = int(ContactState.STATUS_NO_MODEL)
@@ -43,12 +43,12 @@ ENGAGING = int(ContactState.STATUS_ENGAGING)
 INACTIVE = int(ContactState.STATUS_INACTIVE)
 
 BLEND = 0.1  # [s]
-_PATIENCE = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own
-_SHORTEST = 0.5  # periods between two answers to poses, however fast they come
+_LONGEST_WAIT = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own
+_SHORTEST_PERIOD = 0.5  # periods between two answers to poses, however fast they come
 _NO_ERROR = float("nan")  # of a force that no model gave
 
 
-class OwnThread(CallbackGroup):
+class PolledSubscriptions(CallbackGroup):
     """For subscriptions that the loop takes from itself: no executor ever touches them.
 
     Nor their events: one that waits for these is woken by every pose, and holds up the loop.
@@ -64,11 +64,11 @@ class OwnThread(CallbackGroup):
         pass
 
 
-class Online:
+class ActiveModel:
     """A contact model and the messages that have its size: exchanged as one.
 
     effects : that are in it, by name
-    accuracy : what it promises with fewer and more modes, and which it shows
+    shown_modes : which of its modes are shown, and the accuracy promised with them
     """
 
     def __init__(
@@ -77,12 +77,12 @@ class Online:
         model: Any,
         settings: ContactSettings,
         effects: tuple[str, ...] = (),
-        accuracy: Accuracy | None = None,
+        shown_modes: ShownModes | None = None,
     ) -> None:
         self.id = vademecum_id
         self.model = model
         self.effects = effects
-        self.accuracy = accuracy
+        self.shown_modes = shown_modes
         self.cloud: CloudTemplate | None = None
         if model is not None and len(model.out.cloud) > 0:
             self.cloud = CloudTemplate(settings.frame_id, len(model.out.cloud))
@@ -94,7 +94,7 @@ class Online:
 
 
 @dataclass
-class Outlets:
+class Publishers:
     """Publishers of what concerns all tools."""
 
     state: Any
@@ -116,25 +116,25 @@ class ContactLoop:
     def __init__(
         self,
         settings: ContactSettings,
-        tools: list[Tool],
-        outlets: Outlets,
+        tools: list[ToolChannel],
+        publishers: Publishers,
         context: Any,
     ) -> None:
         self.settings = settings
-        self.online = Online("", None, settings)
-        self.record = Record(time.monotonic_ns())
+        self.active = ActiveModel("", None, settings)
+        self.record = TimingRecord(time.monotonic_ns())
         self.failure = ""
         period = 1.0 / settings.rate
         self.guards = [ForceGuard(settings.safety.limits) for _ in tools]
         self.energies = settings.safety.observer(len(tools), period)
         self._tools = tools
         self._forces = np.zeros((len(tools), 3))
-        self._outlets = outlets
+        self._publishers = publishers
         self._tips = np.full((len(tools), 3), FAR_AWAY)
-        self._turns = np.zeros((len(tools), 3))
-        self._used = self.online  # of the last step
-        self._leaving: Any = None  # the model that it replaces, while both are stepped
-        self._part = 1.0  # of the model in use, in what is published
+        self._rotations = np.zeros((len(tools), 3))
+        self._used = self.active  # of the last step
+        self._outgoing: Any = None  # the model that it replaces, while both are stepped
+        self._blend = 1.0  # of the model in use, in what is published
         self._part_per_step = 1.0 / max(1, round(BLEND * settings.rate))
         self._wait_set = _rclpy.WaitSet(len(tools), 0, 0, 0, 0, 0, context.handle)
         self._period = round(1e9 / settings.rate)
@@ -149,12 +149,12 @@ class ContactLoop:
     @property
     def is_changing(self) -> bool:
         """Whether the loop still steps a model that was replaced, or is yet to see the new one."""
-        changing = self._leaving is not None or self._used is not self.online
+        changing = self._outgoing is not None or self._used is not self.active
         return self._running and not self.failure and changing
 
     def start(self, cpu: int = -1) -> None:
         self._running, self._stopping = True, False
-        self._used, self._leaving = self.online, None
+        self._used, self._outgoing = self.active, None
         self._thread = threading.Thread(target=self._run, args=(cpu,), name="contact loop")
         self._thread.start()
 
@@ -180,15 +180,15 @@ class ContactLoop:
         except Exception as error:
             self.failure = f"the contact loop ended: {type(error).__name__}: {error}"
             with suppress(Exception):
-                self._let_go()
+                self._send_zero()
 
     def _ports(self) -> list[Any]:
         of_tools = [port for tool in self._tools for port in (tool.subscription, tool.publisher)]
-        return [*of_tools, self._outlets.state, self._outlets.deformation]
+        return [*of_tools, self._publishers.state, self._publishers.deformation]
 
     def _wait(self) -> None:
         """Until a pose came, or until this period must not wait any longer."""
-        realtime.sleep_until(self._answered + round(_SHORTEST * self._period))
+        realtime.sleep_until(self._answered + round(_SHORTEST_PERIOD * self._period))
         wait_set = self._wait_set
         wait_set.clear_entities()
         for tool in self._tools:
@@ -197,12 +197,12 @@ class ContactLoop:
 
     def _step(self) -> None:
         start = time.monotonic_ns()
-        settings, online, record = self.settings, self.online, self.record
+        settings, active, record = self.settings, self.active, self.record
         timeout = round(settings.pose_timeout * 1e9)
-        if online is not self._used:
-            self._begin_change(online)
+        if active is not self._used:
+            self._begin_change(active)
         fresh, answered = False, NO_STAMP
-        for tool, tip, turn in zip(self._tools, self._tips, self._turns, strict=True):
+        for tool, tip, turn in zip(self._tools, self._tips, self._rotations, strict=True):
             if tool.take(start, timeout, tip, turn, settings.safety.leap):
                 fresh, answered = True, tool.stamp
         record.note_period(start - self._step_start)
@@ -211,54 +211,54 @@ class ContactLoop:
         if fresh:
             self._answered = start
             record.note_age(time.time_ns() - stamp_nanoseconds(answered))
-        model, leaving = online.model, self._leaving
+        model, outgoing = active.model, self._outgoing
         busy = 0
         if model is not None:
             self._solve(model)
             busy = time.monotonic_ns() - start
-        if leaving is not None:
-            self._solve(leaving)
-            self._part = min(1.0, self._part + self._part_per_step)
-            _fade_in(model.out.force, leaving.out.force, self._part)
-            _fade_in(model.out.torque, leaving.out.torque, self._part)
+        if outgoing is not None:
+            self._solve(outgoing)
+            self._blend = min(1.0, self._blend + self._part_per_step)
+            _fade_in(model.out.force, outgoing.out.force, self._blend)
+            _fade_in(model.out.torque, outgoing.out.torque, self._blend)
         self._publish_wrenches(start * 1e-9, model)
         record.note_step(time.monotonic_ns() - start)
         if model is not None:
             contact.estimate_error(model)
         for i, tool in enumerate(self._tools):
-            self._publish_state(i, tool, online)
+            self._publish_state(i, tool, active)
         self._cycle += 1
-        if online.cloud is not None and self._cycle % settings.cloud_divisor == 0:
+        if active.cloud is not None and self._cycle % settings.cloud_divisor == 0:
             begin = time.monotonic_ns()
             contact.deform(model)
             record.note_model(busy + time.monotonic_ns() - begin)
-            if leaving is not None and len(leaving.out.cloud) == len(model.out.cloud):
-                contact.deform(leaving)
-                _fade_in(model.out.cloud, leaving.out.cloud, self._part)
-            online.cloud.points[:] = model.out.cloud
+            if outgoing is not None and len(outgoing.out.cloud) == len(model.out.cloud):
+                contact.deform(outgoing)
+                _fade_in(model.out.cloud, outgoing.out.cloud, self._blend)
+            active.cloud.points[:] = model.out.cloud
             stamp = self._tools[0].stamp
-            self._outlets.deformation.handle.publish_raw(online.cloud.serialise(stamp))
-        if self._part == 1.0:
-            self._leaving = None  # whoever exchanged the model frees it, outside the loop
+            self._publishers.deformation.handle.publish_raw(active.cloud.serialise(stamp))
+        if self._blend == 1.0:
+            self._outgoing = None  # whoever exchanged the model frees it, outside the loop
 
-    def _begin_change(self, online: Online) -> None:
+    def _begin_change(self, active: ActiveModel) -> None:
         """Go on with another model; the one before fades out, on the same organ in its contacts."""
-        leaving = self._used.model
-        if leaving is not None:
-            self._part = 0.0
-            if online.id == self._used.id:
-                online.model.resume(leaving)
-        self._leaving, self._used = leaving, online
+        outgoing = self._used.model
+        if outgoing is not None:
+            self._blend = 0.0
+            if active.id == self._used.id:
+                active.model.resume(outgoing)
+        self._outgoing, self._used = outgoing, active
 
     def _solve(self, model: Any) -> None:
         if model.effects.friction is not None:
-            model.effects.friction.spin[:] = self._turns
+            model.effects.friction.spin[:] = self._rotations
         contact.solve(model, self._tips)
 
     def _next_due(self, start: int, fresh: bool) -> int:
         """When to step even without a pose: later if one is expected, else in a fixed rhythm."""
         if fresh:
-            return start + round(_PATIENCE * self._period)
+            return start + round(_LONGEST_WAIT * self._period)
         due = self._due + self._period
         return due if due > start else start + self._period
 
@@ -280,43 +280,43 @@ class ContactLoop:
                 energies.held[i, -1] = wrench.force
             tool.answer()
 
-    def _let_go(self) -> None:
+    def _send_zero(self) -> None:
         """After a failure: a last wrench of zero to every tool."""
         for tool in self._tools:
             tool.wrench.force[:] = 0.0
             tool.wrench.torque[:] = 0.0
             tool.answer()
 
-    def _publish_state(self, i: int, tool: Tool, online: Online) -> None:
-        template = online.states[i]
+    def _publish_state(self, i: int, tool: ToolChannel, active: ActiveModel) -> None:
+        template = active.states[i]
         guard = self.guards[i]
         status = tool.status
         if self._stopping:
             status = INACTIVE
-        elif online.model is None:
+        elif active.model is None:
             status = NO_MODEL
         elif status == OK:
-            status = int(online.model.out.status[i])
+            status = int(active.model.out.status[i])
             if status == OK and not guard.engaged:
                 status = ENGAGING
         n, error = 0, _NO_ERROR
-        if online.model is not None:
+        if active.model is not None:
             n, error = (
-                _write_contacts(template, online.model.out, i),
-                online.model.out.force_error[i],
+                _write_contacts(template, active.model.out, i),
+                active.model.out.force_error[i],
             )
-        self._outlets.state.handle.publish_raw(
+        self._publishers.state.handle.publish_raw(
             template.serialise(tool.stamp, status, n, error, guard.share)
         )
 
 
-def _fade_in(new: np.ndarray, old: np.ndarray, part: float) -> None:
+def _fade_in(new: np.ndarray, old: np.ndarray, blend: float) -> None:
     """``new`` becomes part of itself and the rest of ``old``, which is used up: no array is made.
 
     Both are written anew by the next step.
     """
-    new *= part
-    old *= 1.0 - part
+    new *= blend
+    old *= 1.0 - blend
     new += old
 
 

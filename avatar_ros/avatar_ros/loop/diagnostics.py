@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from avatar_core.contact.haptics.force_guard import ForceGuard
 from avatar_core.contact.haptics.passivity import Passivity
 from avatar_ros.framework.parameters import Parameter
-from avatar_ros.loop.tool import Tool
+from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.msg import ContactState, LoopStatistics
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -81,7 +81,7 @@ class Faults:
 class FaultCounter:
     """How many faults each tool had since it was last asked."""
 
-    def __init__(self, tools: Sequence[Tool]) -> None:
+    def __init__(self, tools: Sequence[ToolChannel]) -> None:
         self._tools = tools
         self._seen = [tool.faults.copy() for tool in tools]
 
@@ -145,7 +145,7 @@ def loop_status(
 def tool_status(
     name: str,
     tool_name: str,
-    tool: Tool,
+    tool: ToolChannel,
     guard: ForceGuard,
     faults: Faults,
     energies: Passivity | None,

@@ -8,8 +8,8 @@ from typing import Any, get_args
 
 from avatar_core.contact.layout import TIP_RADIUS_RANGE
 from avatar_core.vademecum.accuracy import Budget, Cloud, Quantity
-from avatar_ros.framework.kept_state import STATE_DIR
 from avatar_ros.framework.parameters import AUTOSTART, FRAME_ID, Parameter, ParameterError
+from avatar_ros.framework.saved_state import STATE_DIR
 from avatar_ros.loop.diagnostics import THRESHOLDS
 from avatar_ros.loop.safety import SAFETY, Safety
 

@@ -15,7 +15,7 @@ _NAN = float("nan")
 
 
 @dataclass(frozen=True)
-class Report:
+class ShownModesReport:
     """One line on what is shown, for logs and diagnostics.
 
     shedding : fewer modes are shown than there would be time for on a quiet machine
@@ -27,7 +27,7 @@ class Report:
     changed: bool
 
 
-class Accuracy:
+class ShownModes:
     """Of one model in use; belongs to the node, which calls it once a window.
 
     Parameters
@@ -61,15 +61,15 @@ class Accuracy:
                 text += f", steps of {point.p99 * 1e6:.0f} us"
         return text
 
-    def learn(self, curve: AccuracyCurve) -> None:
+    def set_times(self, curve: AccuracyCurve) -> None:
         """Promise the times of the same points, timed on this machine since."""
         self._points = {p.detail.modes: p for p in curve.points}
 
-    def keep(self, deadline: float) -> None:
+    def set_deadline(self, deadline: float) -> None:
         """Shed by another deadline from now on [s]."""
         self._shedder.deadline = deadline
 
-    def after(self, statistics: LoopStatistics) -> Report:
+    def update(self, statistics: LoopStatistics) -> ShownModesReport:
         """Choose the modes for the next window, and write into a window's statistics what it had.
 
         The change is a single number that the loop reads at its next step.
@@ -85,7 +85,7 @@ class Accuracy:
                 f": {missed:.1%} of the periods missed, 99 % of steps within "
                 f"{statistics.step_p99 * 1e6:.0f} us; the force keeps all modes"
             )
-        return Report(text, self._shedder.is_shedding, modes != before)
+        return ShownModesReport(text, self._shedder.is_shedding, modes != before)
 
     def _describe(self, statistics: LoopStatistics, shown: int) -> None:
         measured = [n for n in self._points if n <= shown]

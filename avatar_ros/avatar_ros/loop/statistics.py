@@ -9,7 +9,7 @@ from avatar_ros.msg import LoopStatistics
 LATE = 1.5  # a period this many times the nominal one counts as missed
 
 
-class Record:
+class TimingRecord:
     """Times of the steps since the record was begun [ns]; writing allocates nothing."""
 
     CAPACITY = 4096
@@ -47,7 +47,7 @@ class Record:
             self.n_ages += 1
 
 
-def statistics(record: Record, end: int, rate: float) -> LoopStatistics:
+def statistics(record: TimingRecord, end: int, rate: float) -> LoopStatistics:
     """Summary of a record that ended at ``end`` [ns] of a loop with a nominal rate [Hz]."""
     periods = record.periods[: record.n_periods] * 1e-9
     computes = record.computes[: record.n_steps] * 1e-9

@@ -31,11 +31,17 @@ from avatar_core.contact.layout import Layout
 from avatar_core.errors import AccuracyError, SceneError, one_line
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget
 from avatar_ros.framework import qos, realtime
-from avatar_ros.framework.kept_state import KeptState
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
+from avatar_ros.framework.saved_state import SavedState
 from avatar_ros.loop import diagnostics
-from avatar_ros.loop.contact_loop import BLEND, ContactLoop, Online, Outlets, OwnThread
+from avatar_ros.loop.contact_loop import (
+    BLEND,
+    ActiveModel,
+    ContactLoop,
+    PolledSubscriptions,
+    Publishers,
+)
 from avatar_ros.loop.safety import SAFETY, chosen_safety
 from avatar_ros.loop.settings import (
     CHANGEABLE,
@@ -45,15 +51,15 @@ from avatar_ros.loop.settings import (
     chosen_budget,
     of_budget,
 )
-from avatar_ros.loop.shown_modes import Accuracy, Report
-from avatar_ros.loop.statistics import Record, statistics
-from avatar_ros.loop.tool import Tool
+from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
+from avatar_ros.loop.statistics import TimingRecord, statistics
+from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.msg import ContactState, LoopStatistics
 from avatar_ros.nodes.contact_parameters import read_contact
 from avatar_ros.prepare import scenes
 from avatar_ros.prepare.budget_requests import BudgetRequests
-from avatar_ros.prepare.handover import OVERTAKEN, Handover
-from avatar_ros.prepare.orders import Change, Order, Prepared
+from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedModel
+from avatar_ros.prepare.supplier import SUPERSEDED, ModelSupplier
 from avatar_ros.srv import LoadScene
 
 _STATISTICS_PERIOD = 1.0  # [s]
@@ -67,10 +73,10 @@ class ContactNode(ManagedNode):
 
     def __init__(self) -> None:
         self._loop: ContactLoop | None = None
-        self._handover: Handover | None = None
+        self._supplier: ModelSupplier | None = None
         self._budget: BudgetRequests | None = None
-        self._tools: list[Tool] = []
-        self._outlets: Outlets | None = None
+        self._tools: list[ToolChannel] = []
+        self._outputs: Publishers | None = None
         self._timers: list[Any] = []
         self._faults: diagnostics.FaultCounter | None = None
         self._said: dict[str, str] = {}  # of each tool's faults, last
@@ -78,8 +84,8 @@ class ContactNode(ManagedNode):
         self._n_awaited = 0
         self._changing = threading.RLock()
         super().__init__("contact", CONTACT)
-        self._state = KeptState(self, self._values((*CHANGEABLE, "scene"), []))
-        self._scene = self._go_on(self._state.kept())  # YAML, in place of the parameter's
+        self._state = SavedState(self, self._values((*CHANGEABLE, "scene"), []))
+        self._scene = self._go_on(self._state.load())  # YAML, in place of the parameter's
         # As long as the node, and beside everything else: an answer may take a minute.
         self.create_service(
             LoadScene, "load_scene", self._load_scene, callback_group=ReentrantCallbackGroup()
@@ -92,19 +98,19 @@ class ContactNode(ManagedNode):
         return "" if self._loop is None else self._loop.failure
 
     @property
-    def owes_answers(self) -> bool:
+    def has_pending_answers(self) -> bool:
         return self._n_awaited > 0
 
     def configure(self) -> None:
         settings = self._settings()
         if settings.scene:
-            self._say_divisor(settings.cloud_divisor)
+            self._set_cloud_divisor(settings.cloud_divisor)
         contact.warm_up(len(settings.tools))
         if settings.safety.passivity != "off":
             passivity.warm_up()
-        own, period = OwnThread(), 1.0 / settings.rate
+        own, period = PolledSubscriptions(), 1.0 / settings.rate
         self._tools = [
-            Tool(
+            ToolChannel(
                 self.ports.subscription(
                     PoseStamped,
                     f"{name}/measured_cp",
@@ -122,7 +128,7 @@ class ContactNode(ManagedNode):
             )
             for name in settings.tools
         ]
-        self._outlets = Outlets(
+        self._outputs = Publishers(
             self.ports.publisher(
                 ContactState, "contact_state", qos.states(len(self._tools), period)
             ),
@@ -130,8 +136,8 @@ class ContactNode(ManagedNode):
             self.ports.publisher(LoopStatistics, "statistics", qos.reports(_STATISTICS_PERIOD)),
             self.ports.publisher(DiagnosticArray, "/diagnostics", qos.reports(_STATISTICS_PERIOD)),
         )
-        self._loop = ContactLoop(settings, self._tools, self._outlets, self.context)
-        order = Order(
+        self._loop = ContactLoop(settings, self._tools, self._outputs, self.context)
+        request = PreparationRequest(
             topic=self.resolve_topic_name("vademecum"),
             node_name=f"_{self.get_name()}_handover",
             namespace=self.get_namespace(),
@@ -143,11 +149,11 @@ class ContactNode(ManagedNode):
             scene=settings.scene,
             budget=asdict(settings.budget) if settings.budget else {},
         )
-        self._handover = Handover(
-            order, self._take_model, self._take_times, self.get_logger().error
+        self._supplier = ModelSupplier(
+            request, self._take_model, self._take_times, self.get_logger().error
         )
         self._budget = BudgetRequests(
-            settings.budget, self._handover.ask, self._keep_budget, self._refuse_budget
+            settings.budget, self._supplier.ask, self._grant_budget, self._refuse_budget
         )
         self._keep_state()
 
@@ -168,8 +174,8 @@ class ContactNode(ManagedNode):
         granted = realtime.claim(settings.priority, settings.cpu, settings.lock_memory)
         for refusal in granted.refusals:
             self.get_logger().warning(refusal)
-        realtime.calm_interpreter()
-        self._loop.record = Record(time.monotonic_ns())
+        realtime.tune_interpreter()
+        self._loop.record = TimingRecord(time.monotonic_ns())
         self._loop.start(granted.cpu)
         self._faults = diagnostics.FaultCounter(self._tools)
         self._timers = [
@@ -190,19 +196,19 @@ class ContactNode(ManagedNode):
             self._loop.stop()
 
     def clean_up(self) -> None:
-        if self._handover is not None:
-            self._handover.stop()
-            self._handover = self._budget = None
+        if self._supplier is not None:
+            self._supplier.stop()
+            self._supplier = self._budget = None
             self._scene = ""
         self._loop = None
         for tool in self._tools:
             self.destroy_subscription(tool.subscription)
             self.destroy_publisher(tool.publisher)
-        for publisher in vars(self._outlets).values() if self._outlets else ():
+        for publisher in vars(self._outputs).values() if self._outputs else ():
             self.destroy_publisher(publisher)
-        self._tools, self._outlets = [], None
+        self._tools, self._outputs = [], None
 
-    def _take_model(self, prepared: Prepared) -> None:
+    def _take_model(self, prepared: PreparedModel) -> None:
         """In the handover's thread: put a model into use between two steps.
 
         Returns when it has replaced the one before entirely.
@@ -211,16 +217,16 @@ class ContactNode(ManagedNode):
         if loop is None:
             return
         model = contact.make_model(Layout.of(prepared.arrays), halves=True)
-        replaced = loop.online
+        replaced = loop.active
         self._ranges = prepared.ranges
         curve = AccuracyCurve.of_plain(prepared.curve) if prepared.curve else None
-        kept = self._budget.kept if self._budget is not None else None
-        accuracy = Accuracy(model, curve, _deadline(kept))
-        loop.online = Online(prepared.id, model, loop.settings, prepared.effects, accuracy)
+        kept = self._budget.in_force if self._budget is not None else None
+        shown_modes = ShownModes(model, curve, _deadline(kept))
+        loop.active = ActiveModel(prepared.id, model, loop.settings, prepared.effects, shown_modes)
         what = ", ".join(prepared.effects) or "no effects"
         self.get_logger().info(
             f"vademecum {prepared.name!r} ({prepared.id[:12]}) in use, with {what}; "
-            f"{accuracy.promise}"
+            f"{shown_modes.promise}"
         )
         while loop.is_changing:
             time.sleep(BLEND / 4)
@@ -230,9 +236,9 @@ class ContactNode(ManagedNode):
     def _take_times(self, curve: dict[str, Any]) -> None:
         """In the handover's thread: promise the times of the model in use, measured since."""
         loop = self._loop
-        if loop is not None and loop.online.accuracy is not None:
-            loop.online.accuracy.learn(AccuracyCurve.of_plain(curve))
-            self.get_logger().info(f"timed here: {loop.online.accuracy.promise}")
+        if loop is not None and loop.active.shown_modes is not None:
+            loop.active.shown_modes.set_times(AccuracyCurve.of_plain(curve))
+            self.get_logger().info(f"timed here: {loop.active.shown_modes.promise}")
 
     async def _load_scene(
         self, request: LoadScene.Request, response: LoadScene.Response
@@ -240,15 +246,15 @@ class ContactNode(ManagedNode):
         try:
             prepared = await self._in_use(scenes.change_of(request))
             if prepared.cloud_divisor is not None:
-                self._say_divisor(prepared.cloud_divisor)
-            self._scene = self._handover.scene if self._handover is not None else ""
+                self._set_cloud_divisor(prepared.cloud_divisor)
+            self._scene = self._supplier.scene if self._supplier is not None else ""
             self._keep_state()
             response.success = True
         except Exception as error:  # a service always answers; the text decides what is raised
             response.message = one_line(error)
             self.get_logger().error(f"load_scene: {response.message}")
         if self._loop is not None:
-            response.effects = list(self._loop.online.effects)
+            response.effects = list(self._loop.active.effects)
         return response
 
     def _go_on(self, kept: dict[str, Any]) -> str:
@@ -268,28 +274,28 @@ class ContactNode(ManagedNode):
             if self._budget is None:
                 return
             now = self._values(CHANGEABLE, [])
-            now |= of_budget(self._budget.kept)
+            now |= of_budget(self._budget.in_force)
             now["scene"] = self._scene or self.get_parameter("scene").value
-            self._state.keep(now)
+            self._state.save(now)
 
-    def _say_divisor(self, divisor: int) -> None:
+    def _set_cloud_divisor(self, divisor: int) -> None:
         """A scene's own is in force from now on, and free to change."""
         self.set_parameters([Parameter("cloud_divisor", value=divisor)])
 
-    async def _in_use(self, change: Change) -> Prepared:
+    async def _in_use(self, change: Change) -> PreparedModel:
         """Wait until a change of the model is in use, while the executor goes on.
 
         Raises
         ------
         SceneError : it was refused
         """
-        executor, handover = self.executor, self._handover
+        executor, supplier = self.executor, self._supplier
         assert executor is not None  # which runs this
-        if handover is None or not self._timers:
+        if supplier is None or not self._timers:
             raise SceneError("the node is inactive; activate it first")
         done = Future(executor=executor)
 
-        def answer(prepared: Prepared | None, refusal: str) -> None:
+        def answer(prepared: PreparedModel | None, refusal: str) -> None:
             if prepared is None:
                 done.set_exception(SceneError(refusal))
             else:
@@ -298,7 +304,7 @@ class ContactNode(ManagedNode):
 
         self._n_awaited += 1
         try:
-            handover.ask(change, answer)
+            supplier.ask(change, answer)
             return await done
         finally:
             self._n_awaited -= 1
@@ -334,8 +340,8 @@ class ContactNode(ManagedNode):
             if change.value != 0.0:
                 material[name] = change.value
         changed = {p.name: p.value for p in changes if hasattr(loop.settings, p.name)}
-        if material != settings.material and self._handover is not None:
-            self._handover.ask({"material": material}, self._note_material)
+        if material != settings.material and self._supplier is not None:
+            self._supplier.ask({"material": material}, self._note_material)
         if self._budget is not None:
             self._budget.ask(budget)
         loop.settings = replace(settings, **changed, material=material, safety=safety)
@@ -346,10 +352,10 @@ class ContactNode(ManagedNode):
         value = {name: self.get_parameter(name).value for name in names}
         return value | {p.name: p.value for p in changes if p.name in value}
 
-    def _keep_budget(self, budget: Budget | None) -> None:
+    def _grant_budget(self, budget: Budget | None) -> None:
         loop = self._loop
-        if loop is not None and loop.online.accuracy is not None:
-            loop.online.accuracy.keep(_deadline(budget))
+        if loop is not None and loop.active.shown_modes is not None:
+            loop.active.shown_modes.set_deadline(_deadline(budget))
         self._keep_state()
 
     def _refuse_budget(self, kept: Budget | None, refusal: str) -> None:
@@ -357,8 +363,8 @@ class ContactNode(ManagedNode):
         values = of_budget(kept)
         self.set_parameters([Parameter(name, value=value) for name, value in values.items()])
 
-    def _note_material(self, prepared: Prepared | None, refusal: str) -> None:
-        if refusal and refusal != OVERTAKEN:
+    def _note_material(self, prepared: PreparedModel | None, refusal: str) -> None:
+        if refusal and refusal != SUPERSEDED:
             self.get_logger().error(f"material refused: {refusal}")
 
     def _refusal_of(self, name: str, value: float) -> str:
@@ -371,37 +377,37 @@ class ContactNode(ManagedNode):
         return "" if low <= value <= high else f"the vademecum holds {low:g} to {high:g}"
 
     def _publish_statistics(self) -> None:
-        loop, outlets = self._loop, self._outlets
-        if loop is None or outlets is None:
+        loop, publishers = self._loop, self._outputs
+        if loop is None or publishers is None:
             return
         end = time.monotonic_ns()
-        record, loop.record = loop.record, Record(end)
+        record, loop.record = loop.record, TimingRecord(end)
         message = statistics(record, end, loop.settings.rate)
         message.header.stamp = self.get_clock().now().to_msg()
-        accuracy = loop.online.accuracy
-        report = accuracy.after(message) if accuracy is not None else None
-        outlets.statistics.publish(message)
+        shown_modes = loop.active.shown_modes
+        report = shown_modes.update(message) if shown_modes is not None else None
+        publishers.statistics.publish(message)
         self._publish_diagnostics(loop, message, report)
         gc.collect()
 
     def _publish_diagnostics(
-        self, loop: ContactLoop, window: LoopStatistics, report: Report | None
+        self, loop: ContactLoop, window: LoopStatistics, report: ShownModesReport | None
     ) -> None:
-        assert self._outlets is not None and self._faults is not None
-        name, online = self.get_name(), loop.online
+        assert self._outputs is not None and self._faults is not None
+        name, active = self.get_name(), loop.active
         limits = {p.name: self.get_parameter(p.name).value for p in diagnostics.THRESHOLDS}
-        promise = online.accuracy.promise if online.accuracy is not None else ""
+        promise = active.shown_modes.promise if active.shown_modes is not None else ""
         statuses = [
             diagnostics.loop_status(name, window, loop.settings.rate, limits),
-            diagnostics.vademecum_status(name, online.id, promise),
+            diagnostics.vademecum_status(name, active.id, promise),
             diagnostics.qos_status(name, self.ports.mismatches()),
         ]
         if report is not None:
-            self._say_shown(report)
+            self._log_shown_modes(report)
             statuses.append(diagnostics.accuracy_status(name, report.text, report.shedding, window))
         for i, faults in enumerate(self._faults.window()):
             tool_name = loop.settings.tools[i]
-            self._say_fault(tool_name, faults.text)
+            self._log_fault(tool_name, faults.text)
             statuses.append(
                 diagnostics.tool_status(
                     name, tool_name, self._tools[i], loop.guards[i], faults, loop.energies, i
@@ -409,9 +415,9 @@ class ContactNode(ManagedNode):
             )
         message = DiagnosticArray(status=statuses)
         message.header.stamp = self.get_clock().now().to_msg()
-        self._outlets.diagnostics.publish(message)
+        self._outputs.diagnostics.publish(message)
 
-    def _say_shown(self, report: Report) -> None:
+    def _log_shown_modes(self, report: ShownModesReport) -> None:
         """Of modes that were left out or taken back: a line when it changes."""
         if not report.changed:
             return
@@ -420,7 +426,7 @@ class ContactNode(ManagedNode):
         else:  # on a line of its own: rclpy allows a line of code but one severity
             self.get_logger().info(report.text)
 
-    def _say_fault(self, tool: str, text: str) -> None:
+    def _log_fault(self, tool: str, text: str) -> None:
         """A line when a tool's fault is another than a window ago."""
         if text != self._said.get(tool, ""):
             self._said[tool] = text

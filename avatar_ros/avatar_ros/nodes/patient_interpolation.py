@@ -20,14 +20,8 @@ from avatar_ros.framework import conversions
 from avatar_ros.framework.library import RefusedError, file_name, find_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
-from avatar_ros.patients.builder import (
-    Built,
-    BusyError,
-    CancelledError,
-    Order,
-    PatientBuilder,
-    Stage,
-)
+from avatar_ros.patients.builder import PatientBuilder
+from avatar_ros.patients.protocol import Built, BusyError, CancelledError, PatientRequest, Stage
 from avatar_ros.patients.settings import (
     PATIENT_INTERPOLATION,
     InterpolationSettings,
@@ -38,7 +32,7 @@ from avatar_ros.srv import InterpolatePatient
 _DEFAULT_FIDELITY = "interpolated"
 
 
-def order_of(request: Any, settings: InterpolationSettings) -> Order:
+def patient_request(request: Any, settings: InterpolationSettings) -> PatientRequest:
     """What a request or a goal asks for, as far as that shows without the atlas.
 
     Raises
@@ -68,7 +62,7 @@ def order_of(request: Any, settings: InterpolationSettings) -> Order:
         vertices, faces = conversions.mesh_arrays(mesh)
     else:
         surface = str(find_in_library(request.surface, settings.library_dir, settings.max_bytes))
-    return Order(
+    return PatientRequest(
         surface=surface,
         vertices=vertices,
         faces=faces,
@@ -127,8 +121,8 @@ class PatientInterpolationNode(ManagedNode):
                 f"parameter library_dir: {settings.library_dir} cannot be written to"
             )
         self._settings = settings
-        self._builder = PatientBuilder(settings.rules, settings.threads)
-        self.get_logger().info(f"{settings.rules.atlas}: {self._builder.n_anatomies} anatomies")
+        self._builder = PatientBuilder(settings.build, settings.threads)
+        self.get_logger().info(f"{settings.build.atlas}: {self._builder.n_anatomies} anatomies")
 
     def activate(self) -> None:
         self._active = True
@@ -144,7 +138,7 @@ class PatientInterpolationNode(ManagedNode):
             self._builder = None
 
     @property
-    def owes_answers(self) -> bool:
+    def has_pending_answers(self) -> bool:
         return self._n_awaited > 0
 
     def build(
@@ -162,10 +156,10 @@ class PatientInterpolationNode(ManagedNode):
         if self._settings is None or self._builder is None or not self._active:
             raise RefusedError("the node is inactive; activate it first")
         self._builder.require_idle()  # before a large mesh is looked at
-        order = order_of(request, self._settings)
-        built = self._builder.build(order, on_stage, cancelled)
+        patient = patient_request(request, self._settings)
+        built = self._builder.build(patient, on_stage, cancelled)
         self.get_logger().info(
-            f"wrote {built.file} ({built.vademecum_id[:12]}), {order.fidelity}, in "
+            f"wrote {built.file} ({built.vademecum_id[:12]}), {patient.fidelity}, in "
             f"{built.seconds:.1f} s"
         )
         return built

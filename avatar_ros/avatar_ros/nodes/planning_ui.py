@@ -33,11 +33,11 @@ from avatar_ros.prepare.scenes import scene_file
 from avatar_ros.ui.display import RATE, NewestCloud
 from avatar_ros.ui.library import Library
 from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.panels import Panels, Wishes
+from avatar_ros.ui.panels import Actions, Panels
 from avatar_ros.ui.recorder import Recorder, scene_in_force
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.texts import frame_text, scene_texts, warnings
-from avatar_ros.ui.tool_memory import HandLine, HandProcess
+from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess
 from avatar_ros.ui.view import OrganView
 
 FRAME = "organ"
@@ -61,9 +61,9 @@ class PlanningNode(ManagedNode):
 
     def __init__(self) -> None:
         self._server: viser.ViserServer | None = None
-        self._line = HandLine.make()
-        self._hand = HandProcess(self._line)
-        self._recorder = Recorder(self._line)
+        self._state = SharedToolState.make()
+        self._driver = ToolDriverProcess(self._state)
+        self._recorder = Recorder(self._state)
         self._reader = Reader(1 << 30)
         self._organ: Organ | None = None
         self._cloud: NewestCloud | None = None
@@ -93,7 +93,7 @@ class PlanningNode(ManagedNode):
         self._view = OrganView(server, self._drag)
         self._panels = Panels(
             server,
-            Wishes(
+            Actions(
                 vademecum=lambda name: self._requests.load_vademecum(name, self._say),
                 material=self._choose_material,
                 scene=self._choose_scene,
@@ -124,7 +124,7 @@ class PlanningNode(ManagedNode):
             self.destroy_timer(self._timer)
             self._timer = None
         self._recorder.drop()
-        self._hand.end()
+        self._driver.end()
 
     def clean_up(self) -> None:
         for subscription in self._subscriptions_of_mine:
@@ -144,7 +144,7 @@ class PlanningNode(ManagedNode):
     def _take_frame(self, info: VademecumInfo) -> None:
         if info.header.frame_id != self._frame_id:
             self._frame_id = info.header.frame_id
-            self._hand.end()  # started again with the new one
+            self._driver.end()  # started again with the new one
             self._listen_to_clouds()
 
     def _listen_to_clouds(self) -> None:
@@ -168,7 +168,7 @@ class PlanningNode(ManagedNode):
         self._stop_recording("the organ changed")
         self._material = {}
         radius = self._radius()
-        self._line.live["target"][0] = organ.above(4.0 * radius)
+        self._state.live["target"][0] = organ.above(4.0 * radius)
         self._view.show(organ, tumour, radius)
         self._panels.show_organ(organ)
         self._organ = organ
@@ -189,7 +189,7 @@ class PlanningNode(ManagedNode):
 
     def _show(self) -> None:
         """One frame of the page."""
-        live, organ = self._line.live[0], self._organ
+        live, organ = self._state.live[0], self._organ
         self._frame += 1
         if self._frame % _LOOK == 1:
             self._look_around()
@@ -213,17 +213,17 @@ class PlanningNode(ManagedNode):
 
     def _answers(self) -> bool:
         """Whether the contact node answered lately."""
-        silence = time.monotonic_ns() - int(self._line.live["heard"][0])
+        silence = time.monotonic_ns() - int(self._state.live["heard"][0])
         return silence < _SILENCE * 1e9
 
     def _look_around(self) -> None:
         """Who is there, what the library holds, and whether the hand lives."""
         missing = self._requests.missing
-        status = int(self._line.live["status"][0]) if self._answers() else None
+        status = int(self._state.live["status"][0]) if self._answers() else None
         self._panels.warnings.content = warnings(missing, self._organ is not None, status)
         self._panels.offer(*self._library.offer())
         if self._organ is not None:
-            self._hand.keep(self._tool, self._frame_id)
+            self._driver.keep(self._tool, self._frame_id)
         if "contact" in missing:
             if not self._was_missing:
                 self._stop_recording("the contact node ended")
@@ -268,10 +268,10 @@ class PlanningNode(ManagedNode):
 
     def _drag(self, target: np.ndarray) -> None:
         if np.isfinite(target).all():
-            self._line.live["target"][0] = target
+            self._state.live["target"][0] = target
 
     def _nudge(self, axis: Any, way: float) -> None:
-        target = self._line.live["target"][0].copy()
+        target = self._state.live["target"][0].copy()
         if axis is None and self._organ is not None:
             axis = self._organ.outward(target)
         if axis is not None:
@@ -279,7 +279,7 @@ class PlanningNode(ManagedNode):
 
     def _lift(self) -> None:
         if self._organ is not None:
-            target = self._line.live["target"][0].copy()
+            target = self._state.live["target"][0].copy()
             self._drag(target + 0.03 * self._organ.outward(target))
 
     def _choose_material(self, name: str, value: float) -> None:
@@ -320,7 +320,7 @@ class PlanningNode(ManagedNode):
         if len(self._contact.get("tools", ())) != 1:
             self._say("a recording holds one tool; start the contact node with one")
             return
-        if self._line.live["touches"][0]:
+        if self._state.live["touches"][0]:
             self._say("lift the tool off the organ first: a recording starts at rest")
             return
         scene = self._scene_in_force(organ)

@@ -13,7 +13,6 @@ from std_msgs.msg import Header
 from avatar_core.errors import AvatarError, one_line
 from avatar_core.vademecum import storage
 from avatar_ros.framework import conversions, qos
-from avatar_ros.framework.kept_state import STATE_DIR, KeptState
 from avatar_ros.framework.library import read_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import (
@@ -25,6 +24,7 @@ from avatar_ros.framework.parameters import (
     values,
 )
 from avatar_ros.framework.reader import Reader
+from avatar_ros.framework.saved_state import STATE_DIR, SavedState
 from avatar_ros.msg import VademecumFile, VademecumInfo
 from avatar_ros.srv import LoadVademecum
 
@@ -66,7 +66,7 @@ class LoaderNode(ManagedNode):
         self._service: Any = None
         super().__init__("vademecum_loader", VADEMECUM_LOADER)
         started = self.get_parameter("vademecum").value
-        self._state = KeptState(self, {"vademecum": started})
+        self._state = SavedState(self, {"vademecum": started})
 
     def configure(self) -> None:
         self._settings = read_loader(self)
@@ -104,7 +104,7 @@ class LoaderNode(ManagedNode):
 
     def _load_first(self, name: str) -> None:
         """What was loaded last, else the parameter's."""
-        kept = self._state.kept().get("vademecum", name)
+        kept = self._state.load().get("vademecum", name)
         if kept != name:
             try:
                 self.load(kept)
@@ -142,7 +142,7 @@ class LoaderNode(ManagedNode):
     ) -> LoadVademecum.Response:
         try:
             response.info = self.load(request.name)
-            self._state.keep({"vademecum": request.name})
+            self._state.save({"vademecum": request.name})
             response.success = True
         except Exception as error:  # a service always answers; the file decides what is raised
             response.message = one_line(error)

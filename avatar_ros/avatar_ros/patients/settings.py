@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from rclpy.node import Node
 
 from avatar_ros.framework.parameters import AUTOSTART, Parameter, ParameterError, values
-from avatar_ros.patients.builder import Rules
+from avatar_ros.patients.protocol import BuildSettings
 
 WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
 
@@ -34,7 +34,7 @@ PATIENT_INTERPOLATION = (
 class InterpolationSettings:
     """Parameters of the patient_interpolation node."""
 
-    rules: Rules
+    build: BuildSettings
     library_dir: str
     max_bytes: int
     threads: int
@@ -53,7 +53,7 @@ def read_interpolation(node: Node) -> InterpolationSettings:
     if value["weighting"] not in WEIGHTINGS:
         raise ParameterError(f"parameter weighting: give one of {', '.join(WEIGHTINGS)}")
     return InterpolationSettings(
-        rules=Rules(
+        build=BuildSettings(
             atlas=os.path.abspath(os.path.expanduser(value["atlas"])),
             n_vertices=value["vertices"],
             max_modes=value["modes"],

@@ -1,4 +1,4 @@
-"""The surface of a patient, of a file or of a message: both are checked alike."""
+"""The surface of a patient, from a file or from a message: both are checked alike."""
 
 from __future__ import annotations
 
@@ -14,29 +14,31 @@ from avatar_core.geometry.surface import (
 )
 from avatar_core.geometry.surface_files import MAX_LABEL_BYTES
 from avatar_ros.framework.reader import Reader
-from avatar_ros.patients.builder import Order
+from avatar_ros.patients.protocol import PatientRequest
 
 
-def read_confined(order: Order, reader: Reader) -> SurfaceMesh:
-    """What :func:`surface_of` gives, in the process of a reader.
+def read_confined(request: PatientRequest, reader: Reader) -> SurfaceMesh:
+    """What :func:`surface_of` returns, read in the process of a reader.
 
-    Raises AvatarError for what is no surface of an organ.
+    Raises AvatarError for anything but the surface of an organ.
     """
-    if order.vertices is not None and order.faces is not None:
-        return reader.read("mesh", order.vertices.nbytes + order.faces.nbytes, surface_of, order)
-    packed = order.surface.endswith((".gz", ".nii"))  # which may unpack to so much
-    n_bytes = MAX_LABEL_BYTES if packed else os.path.getsize(order.surface)
-    return reader.read(os.path.basename(order.surface), n_bytes, surface_of, order)
+    if request.vertices is not None and request.faces is not None:
+        return reader.read(
+            "mesh", request.vertices.nbytes + request.faces.nbytes, surface_of, request
+        )
+    packed = request.surface.endswith((".gz", ".nii"))  # may unpack to MAX_LABEL_BYTES
+    n_bytes = MAX_LABEL_BYTES if packed else os.path.getsize(request.surface)
+    return reader.read(os.path.basename(request.surface), n_bytes, surface_of, request)
 
 
-def surface_of(order: Order) -> SurfaceMesh:
-    """The surface of the order's file or arrays.
+def surface_of(request: PatientRequest) -> SurfaceMesh:
+    """The surface of the request's file or arrays.
 
     Raises SurfaceError as ``read_surface`` does.
     """
-    if order.vertices is None or order.faces is None:
-        return read_surface(order.surface, order.unit, order.axes)
-    surface = SurfaceMesh(order.vertices, order.faces, order.name)
+    if request.vertices is None or request.faces is None:
+        return read_surface(request.surface, request.unit, request.axes)
+    surface = SurfaceMesh(request.vertices, request.faces, request.name)
     surface = orient_outward(require_closed(keep_organ(surface)))
     require_plausible_size(surface)
     return surface

@@ -1,4 +1,4 @@
-"""The process that keeps the atlas and builds patients.
+"""The worker process that keeps the atlas and builds patients.
 
 Run as ``python -m avatar_ros.patients.worker JSON`` by ``PatientBuilder``, never by hand.
 """
@@ -33,28 +33,42 @@ from avatar_core.vademecum import storage
 from avatar_ros.framework import realtime
 from avatar_ros.framework.library import RefusedError
 from avatar_ros.framework.reader import Reader
-from avatar_ros.patients.builder import BuildError, Built, Order, Ready, Refused, Rules, Stage
+from avatar_ros.patients.protocol import (
+    BuildError,
+    BuildSettings,
+    Built,
+    PatientRequest,
+    Ready,
+    Refused,
+    Stage,
+)
 from avatar_ros.patients.surface import read_confined
 
-_LARGEST = 1 << 30  # surface, unpacked [bytes]
-_NICENESS = 10  # a contact loop on the same machine goes first
+_MAX_BYTES = 1 << 30  # of a surface, unpacked
+_NICENESS = 10  # a contact loop on the same machine has precedence
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
-    """The atlas as patients need it; ``volumes`` [m3] by name of the anatomy."""
+class LoadedAtlas:
+    """What patients are built from; ``volumes`` [m3] by name of the anatomy."""
 
     base: PatientBase
     volumes: dict[str, float]
 
     @classmethod
-    def load(cls, path: str) -> Source:
+    def load(cls, path: str) -> LoadedAtlas:
         """Raises AvatarError if the atlas cannot be read or has no responses."""
         atlas = load_atlas(path)
         return cls(base_of(atlas), {one.name: one.volume for one in atlas.anatomies})
 
 
-def build(order: Order, source: Source, rules: Rules, reader: Reader, notes: Connection) -> Built:
+def build(
+    request: PatientRequest,
+    atlas: LoadedAtlas,
+    settings: BuildSettings,
+    reader: Reader,
+    connection: Connection,
+) -> Built:
     """Build one patient and write it.
 
     Raises
@@ -63,21 +77,21 @@ def build(order: Order, source: Source, rules: Rules, reader: Reader, notes: Con
     """
 
     def report(stage: str, fraction: float, error: float) -> None:
-        notes.send(Stage(stage, min(float(fraction), 1.0), float(error)))
+        connection.send(Stage(stage, min(float(fraction), 1.0), float(error)))
 
-    require_fidelity(order.fidelity)
-    options = _options(order, source.base, rules)
-    require_replaceable(Path(order.output), reader)
+    require_fidelity(request.fidelity)
+    options = _options(request, atlas.base, settings)
+    require_replaceable(Path(request.output), reader)
     report("surface", 0.0, math.nan)
-    surface = read_confined(order, reader)
-    fidelity: Fidelity = order.fidelity  # type: ignore[assignment]
-    patient = patient_vademecum(surface, source.base, fidelity, options, report)
+    surface = read_confined(request, reader)
+    fidelity: Fidelity = request.fidelity  # type: ignore[assignment]
+    patient = patient_vademecum(surface, atlas.base, fidelity, options, report)
     report("save", 0.0, math.nan)
     with _uninterrupted():
-        require_replaceable(Path(order.output), reader)
-        storage.save_vademecum(patient.vademecum, order.output)
-        built = _account(patient, surface, source, order)
-        notes.send(built)
+        require_replaceable(Path(request.output), reader)
+        storage.save_vademecum(patient.vademecum, request.output)
+        built = _result_of(patient, surface, atlas, request)
+        connection.send(built)
     return built
 
 
@@ -107,32 +121,34 @@ def displacement_error(patient: Patient) -> float:
     return float(patient.estimates[-1].mean) if patient.estimates else math.nan
 
 
-def _options(order: Order, base: PatientBase, rules: Rules) -> PatientOptions:
+def _options(request: PatientRequest, base: PatientBase, settings: BuildSettings) -> PatientOptions:
     default = PatientOptions()
-    left_out = numbers_of(base, order.leave_out)
+    left_out = numbers_of(base, request.leave_out)
     if len({*left_out, *base.copies}) == len(base.names):
         raise BuildError("no anatomy is left in the atlas; leave out fewer")
     return PatientOptions(
-        n_vertices=rules.n_vertices,
-        weighting=rules.weighting,  # type: ignore[arg-type]
-        n_neighbors=order.neighbors or None,
-        tolerance=default.tolerance if order.tolerance == 0.0 else order.tolerance,
-        max_modes=rules.max_modes,
-        n_certified=None if rules.n_certified < 0 else rules.n_certified,
+        n_vertices=settings.n_vertices,
+        weighting=settings.weighting,  # type: ignore[arg-type]
+        n_neighbors=request.neighbors or None,
+        tolerance=default.tolerance if request.tolerance == 0.0 else request.tolerance,
+        max_modes=settings.max_modes,
+        n_certified=None if settings.n_certified < 0 else settings.n_certified,
         leave_out=left_out,
     )
 
 
-def _account(patient: Patient, surface: SurfaceMesh, source: Source, order: Order) -> Built:
+def _result_of(
+    patient: Patient, surface: SurfaceMesh, atlas: LoadedAtlas, request: PatientRequest
+) -> Built:
     weights = np.asarray(patient.weights, dtype=float)
     return Built(
-        vademecum_id=storage.file_id(order.output),
-        file=os.path.basename(order.output),
+        vademecum_id=storage.file_id(request.output),
+        file=os.path.basename(request.output),
         neighbours=list(patient.neighbours),
         weights=weights.tolist(),
         weight_abs_sum=patient.barycenter.absolute_sum,
         hull_distance=float(patient.barycenter.hull_distance),
-        volume_error=volume_error(patient, surface.volume, source.volumes),
+        volume_error=volume_error(patient, surface.volume, atlas.volumes),
         displacement_error=displacement_error(patient),
         notices=[*surface.notices, *patient.notices],
     )
@@ -148,32 +164,32 @@ def _uninterrupted() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
-def serve(rules: Rules, notes: Connection) -> None:
-    """Load the atlas, then build what is ordered until the line is closed."""
+def serve(settings: BuildSettings, connection: Connection) -> None:
+    """Load the atlas, then build what is requested until the connection is closed."""
     try:
-        source = Source.load(rules.atlas)
-    except Exception as error:  # whatever a file provokes, the node says it in one line
-        notes.send(Refused(one_line(error)))
+        atlas = LoadedAtlas.load(settings.atlas)
+    except Exception as error:  # whatever a file provokes, the node reports it in one line
+        connection.send(Refused(one_line(error)))
         return
-    notes.send(Ready(len(source.base.names)))
-    reader = Reader(_LARGEST)
+    connection.send(Ready(len(atlas.base.names)))
+    reader = Reader(_MAX_BYTES)
     while True:
-        order = notes.recv()
+        request = connection.recv()
         try:
-            build(order, source, rules, reader, notes)
+            build(request, atlas, settings, reader, connection)
         except (BrokenPipeError, EOFError):
             raise
         except Exception as error:  # as above
-            notes.send(Refused(one_line(error)))
+            connection.send(Refused(one_line(error)))
 
 
 def main() -> int:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     realtime.die_with_parent(signal.SIGTERM)
     os.nice(_NICENESS)
-    notes = Connection(os.dup(sys.stdin.fileno()))
+    connection = Connection(os.dup(sys.stdin.fileno()))
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the node is gone
-        serve(Rules(**json.loads(sys.argv[1])), notes)
+        serve(BuildSettings(**json.loads(sys.argv[1])), connection)
     return 0
 
 

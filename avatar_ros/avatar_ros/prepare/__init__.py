@@ -1,4 +1,7 @@
-"""The way of a vademecum into the loop: another process verifies the file, applies scene,
-material and budget, compiles, and hands the arrays over through shared memory, so that the loop
-never waits.
+"""How a vademecum reaches the contact loop. A separate process verifies the file, applies scene,
+material and budget, compiles the step and puts the model's arrays into shared memory; the loop's
+process only maps them, so the loop never waits.
+
+Read in this order: requests, protocol, supplier (in the node), worker (the process), and what the
+worker uses: model_spec, detail_chooser, shared_arrays.
 """

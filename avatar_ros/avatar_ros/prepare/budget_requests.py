@@ -1,4 +1,4 @@
-"""The budget that was asked for last, and the one in force."""
+"""The budget that was requested last, and the one in force."""
 
 from __future__ import annotations
 
@@ -7,58 +7,58 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 from avatar_core.vademecum.accuracy import Budget
-from avatar_ros.prepare.handover import OVERTAKEN, Answer
-from avatar_ros.prepare.orders import Change, Prepared
+from avatar_ros.prepare.requests import Change, PreparedModel
+from avatar_ros.prepare.supplier import SUPERSEDED, Answer
 
 
 class BudgetRequests:
-    """Has the detail chosen anew for each budget; one that cannot be met gives way to the last.
+    """Has the detail chosen anew for each budget; if one cannot be met, the last stays in force.
 
-    What is asked is compared with what was asked last, not with what is in force: between the two
-    lie some tenths of a second in which a budget may be taken back. Answers come in a thread of
-    their own.
+    A new budget is compared with the one requested last, not with the one in force: it takes some
+    tenths of a second from one to the other, in which a budget may be withdrawn. Answers come in
+    a thread of the supplier.
 
-    kept : the budget in force; None for none
-    ask : of the handover
-    on_kept : called with a budget once it is in force
-    on_refused : called with the budget that stays in force, and why the one asked for is refused
+    in_force : the budget in force; None for none
+    ask : of the ModelSupplier
+    on_granted : called with a budget once it is in force
+    on_refused : called with the budget that stays in force, and the reason of the refusal
     """
 
     def __init__(
         self,
-        kept: Budget | None,
+        in_force: Budget | None,
         ask: Callable[[Change, Answer], None],
-        on_kept: Callable[[Budget | None], None],
+        on_granted: Callable[[Budget | None], None],
         on_refused: Callable[[Budget | None, str], None],
     ) -> None:
-        self.kept = kept
-        self._asked = kept
+        self.in_force = in_force
+        self._requested = in_force
         self._number = 0
-        self._lock = threading.Lock()  # of the three above
-        self._ask, self._on_kept, self._on_refused = ask, on_kept, on_refused
+        self._lock = threading.Lock()  # guards the three above
+        self._ask, self._on_granted, self._on_refused = ask, on_granted, on_refused
 
     def ask(self, budget: Budget | None) -> None:
-        """Returns at once; what was asked last already is not asked again."""
+        """Request a budget, unless it was requested last already; returns at once."""
         with self._lock:
-            if budget == self._asked:
+            if budget == self._requested:
                 return
-            self._asked = budget
+            self._requested = budget
             self._number += 1
             number = self._number
 
-        def answer(prepared: Prepared | None, refusal: str) -> None:
-            if refusal == OVERTAKEN:
+        def answer(model: PreparedModel | None, refusal: str) -> None:
+            if refusal == SUPERSEDED:
                 return
             with self._lock:
                 if not refusal:
-                    self.kept = budget
+                    self.in_force = budget
                 elif number == self._number:
-                    self._asked = self.kept
-                else:  # a newer one is on its way
+                    self._requested = self.in_force
+                else:  # a newer request is pending
                     return
             if refusal:
-                self._on_refused(self.kept, refusal)
+                self._on_refused(self.in_force, refusal)
             else:
-                self._on_kept(budget)
+                self._on_granted(budget)
 
         self._ask({"budget": asdict(budget) if budget else {}}, answer)

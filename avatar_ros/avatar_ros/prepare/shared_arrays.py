@@ -1,4 +1,4 @@
-"""Arrays handed from one process to another through sealed shared memory."""
+"""Arrays passed from one process to another through sealed shared memory."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _ALIGNMENT = 64  # of every array [bytes]
 _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
 
 
-def share(arrays: dict[str, np.ndarray]) -> tuple[int, list[dict[str, Any]]]:
-    """Copy arrays into sealed anonymous shared memory; returns its handle and a table of contents.
+def write_shared(arrays: dict[str, np.ndarray]) -> tuple[int, list[dict[str, Any]]]:
+    """Copy arrays into sealed anonymous shared memory; returns its descriptor and its contents.
 
-    Sealed: neither side can change or shorten it afterwards, so a fault in one cannot reach the
+    Once it is sealed, neither process can change or shorten it, so a fault in one cannot reach the
     other through it.
     """
     contents = []
@@ -39,13 +39,13 @@ def share(arrays: dict[str, np.ndarray]) -> tuple[int, list[dict[str, Any]]]:
 
 
 def map_shared(handle: int, contents: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Map shared arrays, private to this process, with all pages present; closes the handle."""
+    """Map shared arrays, private to this process, with all pages present; closes the descriptor."""
     try:
         # Writable, but a private copy: jitted code compiled for ordinary arrays accepts it.
         memory = mmap.mmap(handle, 0, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE)
     finally:
         os.close(handle)
-    realtime.bring_into_memory(np.frombuffer(memory, dtype=np.uint8))
+    realtime.prefault(np.frombuffer(memory, dtype=np.uint8))
     return {entry["name"]: _view(memory, entry) for entry in contents}
 
 

@@ -27,7 +27,7 @@ from avatar_ros.framework.conversions import (
     find_bytes,
     find_number,
 )
-from avatar_ros.loop.contact_loop import OwnThread
+from avatar_ros.loop.contact_loop import PolledSubscriptions
 
 RATE = 30.0  # as fast as eyes need [Hz]
 
@@ -45,7 +45,7 @@ class NewestCloud:
             "deformation",
             _never_called,
             qos.NEWEST,
-            callback_group=OwnThread(),
+            callback_group=PolledSubscriptions(),
             raw=True,
         )
 

@@ -40,7 +40,7 @@ KEYS = {
 
 
 @dataclass(frozen=True)
-class Wishes:
+class Actions:
     """What the user may want; called in threads of the page's server."""
 
     vademecum: Callable[[str], None]
@@ -56,8 +56,8 @@ class Wishes:
 class Panels:
     """Controls and readouts of the page."""
 
-    def __init__(self, server: viser.ViserServer, wishes: Wishes) -> None:
-        self._server, self._gui, self._wishes = server, server.gui, wishes
+    def __init__(self, server: viser.ViserServer, actions: Actions) -> None:
+        self._server, self._gui, self._actions = server, server.gui, actions
         self._times: deque[float] = deque(maxlen=round(HISTORY * 5))
         self._forces: deque[tuple[float, float]] = deque(maxlen=round(HISTORY * 5))
         self._loop: deque[tuple[float, float, float]] = deque(maxlen=60)
@@ -91,9 +91,9 @@ class Panels:
         for labels in (("press 1 mm", "lift 1 mm"), ("right", "left", "up", "down")):
             group = self._gui.add_button_group("Tool" if len(labels) == 2 else "1 mm", labels)
             group.on_click(lambda event: self._nudge(event.target.value))
-        self._gui.add_button("Lift off the organ").on_click(lambda _: self._wishes.lift())
+        self._gui.add_button("Lift off the organ").on_click(lambda _: self._actions.lift())
         self._recording = self._gui.add_button("Record")
-        self._recording.on_click(lambda _: self._wishes.record(self._recording.label == "Record"))
+        self._recording.on_click(lambda _: self._actions.record(self._recording.label == "Record"))
         self._gui.add_markdown(
             "Drag the blue tool, or use the keys J L I K, U to press, O to lift."
         )
@@ -105,7 +105,7 @@ class Panels:
             "up": (0.0, 0.0, 1.0),
             "down": (0.0, 0.0, -1.0),
         }.get(label)
-        self._wishes.nudge(axis, -STEP if label.startswith("press") else STEP)
+        self._actions.nudge(axis, -STEP if label.startswith("press") else STEP)
 
     def _add_keys(self) -> None:
         for key, (label, axis) in KEYS.items():
@@ -114,17 +114,17 @@ class Panels:
             command.on_trigger(partial(self._on_key, axis, way))
 
     def _on_key(self, axis: Any, way: float, _: Any) -> None:
-        self._wishes.nudge(axis, way)
+        self._actions.nudge(axis, way)
 
     def _on_slider(self, name: str, unit: float, bounds: tuple[float, float], event: Any) -> None:
         if event.client is None:  # nobody moved it: show_material did
             return
-        self._wishes.material(name, float(np.clip(event.target.value * unit, *bounds)))
+        self._actions.material(name, float(np.clip(event.target.value * unit, *bounds)))
 
     def _fill_organ(self) -> None:
         self._files = self._gui.add_dropdown("Vademecum", (NOTHING,))
         self._gui.add_button("Load vademecum").on_click(
-            lambda _: self._wishes.vademecum(self._files.value)
+            lambda _: self._actions.vademecum(self._files.value)
         )
         self._about = self._gui.add_markdown("")
         self._sliders: dict[str, Any] = {}
@@ -137,20 +137,20 @@ class Panels:
             "Tolerance [%]", min=0.5, max=20.0, step=0.5, initial_value=3.0
         )
         self._gui.add_button("Build patient").on_click(
-            lambda _: self._wishes.build(
+            lambda _: self._actions.build(
                 self._surfaces.value, self._fidelity.value, self._tolerance.value / 100.0
             )
         )
         self.stage = self._gui.add_markdown("")
         self._progress: Any = self._gui.add_progress_bar(0.0)
-        self._gui.add_button("Cancel").on_click(lambda _: self._wishes.cancel())
+        self._gui.add_button("Cancel").on_click(lambda _: self._actions.cancel())
 
     def _fill_scene(self) -> None:
         self._scenes = self._gui.add_dropdown("Scene", (NOTHING,))
         self._scene_text = self._gui.add_markdown("")
         self._scenes.on_update(lambda _: self._describe_scene())
         self._gui.add_button("Switch to scene").on_click(
-            lambda _: self._wishes.scene(self._scenes.value)
+            lambda _: self._actions.scene(self._scenes.value)
         )
         self._scene_texts: dict[str, str] = {}
 

@@ -15,7 +15,7 @@ from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
 from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.model import Vademecum
-from avatar_ros.ui.tool_memory import HandLine
+from avatar_ros.ui.tool_state import SharedToolState
 
 
 def scene_in_force(
@@ -56,8 +56,8 @@ class Recorder:
     is_on : periods are kept
     """
 
-    def __init__(self, line: HandLine) -> None:
-        self._line = line
+    def __init__(self, state: SharedToolState) -> None:
+        self._state = state
         self._clouds: list[np.ndarray] = []
         self._after: list[int] = []
         self._begin = -1
@@ -65,36 +65,36 @@ class Recorder:
 
     @property
     def is_on(self) -> bool:
-        return bool(self._line.live["recording"][0])
+        return bool(self._state.live["recording"][0])
 
     @property
     def n_periods(self) -> int:
         """Kept so far."""
-        return int(self._line.live["n_rows"][0]) - max(self._begin, 0)
+        return int(self._state.live["n_rows"][0]) - max(self._begin, 0)
 
     def open(self, vademecum: Vademecum, scene: Scene, rate: float) -> str:
         """Keep periods from now on, before a new model comes; returns the scene's text."""
         text = write_scene(scene)
         self._about = (vademecum.id, vademecum.name, text, rate)
         self._clouds, self._after, self._begin = [], [], -1
-        self._line.live["n_rows"][0] = 0
-        self._line.live["recording"][0] = 1
+        self._state.live["n_rows"][0] = 0
+        self._state.live["recording"][0] = 1
         return text
 
     def begin(self) -> None:
         """The new model is in use: what was kept before does not count."""
-        self._begin = int(self._line.live["n_rows"][0])
+        self._begin = int(self._state.live["n_rows"][0])
 
     def note_cloud(self, displacement: np.ndarray) -> None:
         """A cloud that was shown, (n_points, 3) [m]."""
-        n = int(self._line.live["n_rows"][0])
+        n = int(self._state.live["n_rows"][0])
         if self._begin >= 0 and n > self._begin:
             self._clouds.append(displacement.astype(np.float32))
-            self._after.append(int(self._line.rows["number"][n - 1]))
+            self._after.append(int(self._state.rows["number"][n - 1]))
 
     def drop(self) -> None:
         """Keep nothing."""
-        self._line.live["recording"][0] = 0
+        self._state.live["recording"][0] = 0
         self._begin = -1
 
     def save(self, folder: Path) -> tuple[Path, Recording] | None:
@@ -106,7 +106,7 @@ class Recorder:
         """
         begin = self._begin
         self.drop()
-        rows = self._line.recorded()
+        rows = self._state.recorded()
         if begin < 0 or len(rows) <= begin:
             return None
         identity, name, scene, rate = self._about
@@ -140,5 +140,5 @@ def _periods(rows: np.ndarray) -> Periods:
         status=rows["status"][:, None].astype(np.uint8),
         force=rows["force"][:, None].copy(),
         error=rows["error"][:, None].copy(),
-        sent_fraction=rows["share"][:, None].copy(),
+        sent_fraction=rows["sent_fraction"][:, None].copy(),
     )

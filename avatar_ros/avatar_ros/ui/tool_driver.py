@@ -23,10 +23,10 @@ from rclpy.signals import SignalHandlerOptions
 from avatar_ros.framework import qos, realtime
 from avatar_ros.framework.conversions import PoseTemplate, stamp_bytes
 from avatar_ros.framework.managed_node import StopSignal
-from avatar_ros.loop.contact_loop import OwnThread
-from avatar_ros.loop.tool import FAR_AWAY
+from avatar_ros.loop.contact_loop import PolledSubscriptions
+from avatar_ros.loop.tool_channel import FAR_AWAY
 from avatar_ros.msg import ContactState
-from avatar_ros.ui.tool_memory import N_ROWS, HandLine
+from avatar_ros.ui.tool_state import N_ROWS, SharedToolState
 
 PERIOD = 1_000_000  # [ns]
 _SHARE = 0.04  # of the way to the target that is left, in a period: 25 ms behind the mouse
@@ -49,19 +49,19 @@ _PLACED = frozenset(
 _STATES = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 
 
-class Hand:
+class ToolDriver:
     """Publishes the tool's poses and listens to what is answered."""
 
-    def __init__(self, node: Any, tool: str, frame_id: str, line: HandLine) -> None:
+    def __init__(self, node: Any, tool: str, frame_id: str, state: SharedToolState) -> None:
         self._tool = tool
-        self._live, self._rows = line.live, line.rows
+        self._live, self._rows = state.live, state.rows
         self._publisher = node.create_publisher(PoseStamped, f"{tool}/measured_cp", qos.NEWEST)
         self._states = node.create_subscription(
             ContactState,
             "contact_state",
             lambda _: None,
             _STATES,
-            callback_group=OwnThread(),
+            callback_group=PolledSubscriptions(),
             raw=True,
         )
         self._pose = PoseTemplate(frame_id)
@@ -102,7 +102,7 @@ class Hand:
         for contact in state.contacts:
             force += (contact.force.x, contact.force.y, contact.force.z)
         live["force"][0] = force * state.force_share
-        live["error"][0], live["share"][0] = state.force_error, state.force_share
+        live["error"][0], live["sent_fraction"][0] = state.force_error, state.force_share
         live["status"][0], live["touches"][0] = state.status, len(state.contacts)
         live["heard"][0] = time.monotonic_ns()
         live["n_states"][0] += 1
@@ -113,7 +113,7 @@ class Hand:
             row["number"], row["stamp"] = info["publication_sequence_number"], stamp
             row["tip"] = self._used(state.status, stamp)
             row["force"], row["error"] = force, state.force_error
-            row["share"], row["status"] = state.force_share, state.status
+            row["sent_fraction"], row["status"] = state.force_share, state.status
             live["n_rows"][0] = n + 1
 
     def _used(self, status: int, stamp: int) -> Any:
@@ -128,16 +128,16 @@ class Hand:
 def main() -> int:
     tool, frame = sys.argv[1:3]
     stop = StopSignal()
-    line = HandLine(sys.stdin.fileno())
+    state = SharedToolState(sys.stdin.fileno())
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(
         "_planning_ui_hand", enable_rosout=False, start_parameter_services=False
     )
     try:
-        hand = Hand(node, tool, frame, line)
+        driver = ToolDriver(node, tool, frame, state)
         realtime.bind_thread(-1)
-        realtime.calm_interpreter()
-        hand.run(stop)
+        realtime.tune_interpreter()
+        driver.run(stop)
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

@@ -27,7 +27,7 @@ LIVE = np.dtype(
         ("tip", np.float64, 3),  # from the hand: as sent last [m]
         ("force", np.float64, 3),  # as sent by the contact node: its share of what was computed [N]
         ("error", np.float64),  # [N]
-        ("share", np.float64),
+        ("sent_fraction", np.float64),
         ("status", np.int64),  # of avatar_ros/msg/ContactState
         ("touches", np.int64),
         ("heard", np.int64),  # when the last state came, monotonic clock [ns]
@@ -44,14 +44,14 @@ ROW = np.dtype(
         ("tip", np.float64, 3),
         ("force", np.float64, 3),
         ("error", np.float64),
-        ("share", np.float64),
+        ("sent_fraction", np.float64),
         ("status", np.int64),
     ],
     align=True,
 )
 
 
-class HandLine:
+class SharedToolState:
     """The memory as two arrays, ``live`` of one entry and ``rows``; pages are there when used."""
 
     def __init__(self, handle: int) -> None:
@@ -64,20 +64,20 @@ class HandLine:
         self.rows = np.frombuffer(memory, ROW, N_ROWS, LIVE.itemsize)
 
     @staticmethod
-    def make() -> HandLine:
+    def make() -> SharedToolState:
         """New memory, all zero."""
-        return HandLine(os.memfd_create("avatar-hand", os.MFD_CLOEXEC))
+        return SharedToolState(os.memfd_create("avatar-hand", os.MFD_CLOEXEC))
 
     def recorded(self, begin: int = 0) -> np.ndarray:
         """A copy of the rows that count, from one on."""
         return self.rows[begin : int(self.live["n_rows"][0])].copy()
 
 
-class HandProcess:
+class ToolDriverProcess:
     """Runs :mod:`avatar_ros.ui.tool_driver` beside the page."""
 
-    def __init__(self, line: HandLine) -> None:
-        self._line = line
+    def __init__(self, state: SharedToolState) -> None:
+        self._state = state
         self._process: ModuleProcess | None = None
 
     def keep(self, tool: str, frame_id: str) -> None:
@@ -88,7 +88,7 @@ class HandProcess:
             "avatar_ros.ui.tool_driver",
             tool,
             frame_id,
-            stdin=self._line.handle,
+            stdin=self._state.handle,
             preexec_fn=partial(realtime.die_with_parent, signal.SIGINT),
         )
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 
-from avatar_ros.framework.conversions import NO_STAMP, PoseReader, WrenchTemplate, small_turn
+from avatar_ros.framework.conversions import NO_STAMP, PoseReader, WrenchTemplate, rotation_between
 from avatar_ros.loop.safety import Safety
 from avatar_ros.msg import ContactState
 
@@ -28,7 +28,7 @@ _NO_NUMBER = 2**64 - 1  # where the middleware does not count
 _N_STATUS = 32
 
 
-class Tool:
+class ToolChannel:
     """One tool's subscription, publisher and last pose.
 
     Poses come in the frame of the tool, ``tip`` and ``turn`` of the step are in the organ's.
@@ -130,7 +130,7 @@ class Tool:
     def _place(self, tip: np.ndarray, turn: np.ndarray) -> None:
         tip[:] = self._last
         if self._orientation is not None:
-            turn[:] = small_turn(self._orientation, self._reader.orientation)
+            turn[:] = rotation_between(self._orientation, self._reader.orientation)
         if self._is_turned:
             for part in (tip, turn):
                 np.dot(self._rotation, part, out=self._turned)

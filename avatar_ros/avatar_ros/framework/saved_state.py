@@ -23,7 +23,7 @@ STATE_DIR = Parameter(
 )
 
 
-class KeptState:
+class SavedState:
     """The file of one node; without a directory, nothing is kept and nothing comes back.
 
     started : what the node is started with, by name; values as JSON has them
@@ -49,7 +49,7 @@ class KeptState:
         name = node.get_fully_qualified_name().strip("/").replace("/", ".")
         self._path = Path(folder).resolve() / f"{name}.json"
 
-    def kept(self) -> dict[str, Any]:
+    def load(self) -> dict[str, Any]:
         """What had been changed, unless the node is started with other values now."""
         if self._path is None or not self._path.exists():
             return {}
@@ -63,7 +63,7 @@ class KeptState:
             )
             return {}
 
-    def keep(self, now: dict[str, Any]) -> None:
+    def save(self, now: dict[str, Any]) -> None:
         """Write what differs from the start, whole or not at all; nothing where nothing is new."""
         if self._path is None:
             return

@@ -1,0 +1,101 @@
+"""What the patient node asks of its worker process, and what that reports: pickled objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar_core.errors import AvatarError
+
+
+class BuildError(AvatarError):
+    """A patient's vademecum was not built."""
+
+
+class BusyError(BuildError):
+    """Another one is being built."""
+
+
+class CancelledError(BuildError):
+    """It was cancelled before anything was written."""
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """What is the same for all patients of a node.
+
+    atlas : path
+    n_vertices : of a patient's mesh
+    max_modes, weighting : see PatientOptions
+    n_certified : unseen loads of the certificate; -1 for the default of the fidelity
+    """
+
+    atlas: str
+    n_vertices: int
+    max_modes: int
+    weighting: str
+    n_certified: int
+
+
+@dataclass(frozen=True, eq=False)
+class PatientRequest:
+    """One patient; all paths are absolute.
+
+    surface : file, or empty if there are vertices, shape (n, 3) [m], and faces, shape (m, 3)
+    unit, axes : of the file
+    neighbors : 0 for all
+    tolerance : 0 for the default
+    output : file to write
+    """
+
+    surface: str
+    vertices: np.ndarray | None
+    faces: np.ndarray | None
+    unit: str
+    axes: str
+    leave_out: tuple[str, ...]
+    neighbors: int
+    fidelity: str
+    tolerance: float
+    name: str
+    output: str
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The finished ``fraction`` of a ``stage``, and the ``error`` so far (NaN: unknown)."""
+
+    stage: str
+    fraction: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Ready:
+    """The atlas is loaded; so many of its anatomies have a response."""
+
+    n_anatomies: int
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Nothing was written, for this reason."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Built:
+    """What was written; fields as in InterpolatePatient.srv."""
+
+    vademecum_id: str
+    file: str
+    neighbours: list[str]
+    weights: list[float]
+    weight_abs_sum: float
+    hull_distance: float
+    volume_error: float
+    displacement_error: float
+    notices: list[str]
+    seconds: float = 0.0

@@ -1,0 +1,231 @@
+"""The worker process that receives vademecums, verifies them and prepares their contact models.
+
+Run as ``python -m avatar_ros.prepare.worker`` by
+:class:`avatar_ros.prepare.supplier.ModelSupplier`, never by hand.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from avatar_core.errors import one_line
+from avatar_ros.framework import realtime
+from avatar_ros.framework.reader import Reader
+from avatar_ros.prepare.detail_chooser import DetailChooser, SupersededError
+from avatar_ros.prepare.protocol import (
+    Accepted,
+    ChangeRequest,
+    Channel,
+    ModelReady,
+    Packet,
+    Refused,
+    Timed,
+)
+from avatar_ros.prepare.requests import Change, PreparationRequest
+from avatar_ros.prepare.shared_arrays import map_shared, write_shared
+
+_MAX_NAME = 80  # letters quoted of a name from elsewhere
+_MAX_BYTES = 1 << 30  # of a vademecum that can be received
+
+
+class SentModel(NamedTuple):
+    """A model that was sent, its specification and the detail that it shows."""
+
+    spec: Any
+    detail: Any
+    model: Any
+
+
+class ModelPreparer:
+    """Verifies and prepares what comes in, and reports through a socket.
+
+    Vademecums come in the thread of the node, changes of the request in that of :meth:`listen`. A
+    model is timed after it was sent; whatever comes in meanwhile interrupts the timing.
+
+    stop : true when the process is to end
+    """
+
+    def __init__(
+        self,
+        request: PreparationRequest,
+        channel: Channel,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._request = request
+        self._channel = channel
+        self._vademecum: Any = None
+        self._reader = Reader(_MAX_BYTES)
+        self._chooser = DetailChooser()
+        self._lock = threading.Lock()
+        self._stop = stop
+        self._waiting: set[int] = set()  # threads that interrupt the timing
+
+    @contextlib.contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        """Hold the lock; interrupt a timing that holds it."""
+        self._waiting.add(threading.get_ident())
+        with self._lock:
+            self._waiting.discard(threading.get_ident())
+            yield
+
+    def receive(self, message: Any) -> None:
+        """Take a VademecumFile."""
+        with self._exclusive():
+            if self._vademecum is not None and message.id == self._vademecum.id:
+                return  # announced again by a restarted loader
+            try:
+                vademecum = _verified(message.id, bytes(message.data), self._reader)
+                sent = self._prepare(vademecum, self._request, 0, {})
+            except Exception as error:  # whatever a foreign file provokes, the worker goes on
+                name = message.name[:_MAX_NAME]
+                self._send(Refused(0, f"vademecum {name!r} refused: {one_line(error)}"))
+                return
+            self._vademecum = vademecum
+            self._time(sent)
+
+    def listen(self) -> None:
+        """Take changes of the request until the socket is closed."""
+        while received := self._channel.receive():
+            asked, _ = received
+            assert isinstance(asked, ChangeRequest)
+            with self._exclusive():
+                try:
+                    sent = self._change(asked.number, asked.change)
+                except Exception as error:  # as above
+                    self._send(Refused(asked.number, one_line(error)))
+                    continue
+                if sent is not None:
+                    self._time(sent)
+
+    def _change(self, number: int, change: Change) -> SentModel | None:
+        """The model that was sent for a change; None without a vademecum."""
+        from avatar_core.errors import SceneError
+
+        change = _with_scene_text(change)
+        request = replace(self._request, **change)
+        sent = None
+        if self._vademecum is not None:
+            sent = self._prepare(self._vademecum, request, number, change)
+        elif "scene" in change:
+            raise SceneError("there is no vademecum yet; load one, then the scene")
+        else:
+            self._send(Accepted(number, change))
+        self._request = request
+        return sent
+
+    def _prepare(
+        self, vademecum: Any, request: PreparationRequest, number: int, change: Change
+    ) -> SentModel:
+        """Prepare the model of a vademecum that a request asks for, and send it."""
+        from avatar_core.contact.layout import Layout
+        from avatar_core.contact.model import make_model
+        from avatar_core.scene.file import parse_scene
+        from avatar_ros.prepare.model_spec import lay_out, model_spec
+
+        scene = parse_scene(request.scene, "scene") if request.scene else None
+        spec = model_spec(vademecum, request, scene)
+        detail = self._chooser.detail(spec, request)
+        handle, contents = write_shared(lay_out(spec, detail, request.period).flat())
+        coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
+        try:
+            # Compiles the step for these effects, if that was never done on this machine, from
+            # arrays as the node will map them: it then finds the same types in numba's cache.
+            model = make_model(Layout.of(map_shared(os.dup(handle), contents)), halves=True)
+            ready = ModelReady(
+                number,
+                change,
+                id=vademecum.id,
+                name=vademecum.name,
+                contents=contents,
+                ranges={c.name: (c.low, c.high) for c in coordinates},
+                effects=spec.effect_names,
+                cloud_divisor=scene.cloud_divisor if scene else None,
+                curve=self._chooser.curve(spec, detail),
+            )
+            self._send(ready, handle)
+        finally:
+            os.close(handle)
+        return SentModel(spec, detail, model)
+
+    def _time(self, sent: SentModel) -> None:
+        """Measure the times of a model that was sent and send them, unless they were known."""
+        with contextlib.suppress(SupersededError):
+            curve = self._chooser.times(
+                *sent, superseded=lambda: bool(self._waiting) or self._stop()
+            )
+            if curve is not None:
+                self._send(Timed(curve))
+
+    def _send(self, packet: Packet, *handles: int) -> None:
+        self._channel.send(packet, *handles)
+
+
+def _with_scene_text(change: Change) -> Change:
+    """The change with its scene checked and complete: no file has to be read for it again."""
+    from avatar_core.scene.file import parse_scene, read_scene, write_scene
+
+    if "scene_file" in change:
+        return {"scene": write_scene(read_scene(change["scene_file"]))}
+    if "scene" in change:
+        return {"scene": write_scene(parse_scene(change["scene"], "yaml"))}
+    return change
+
+
+def _verified(identity: str, data: bytes, reader: Reader) -> Any:
+    from avatar_core.vademecum import storage
+
+    origin = "the received vademecum"
+    vademecum = reader.read(origin, len(data), storage.parse_vademecum, data, origin)
+    if vademecum.id != identity:
+        raise ValueError("altered on the way, its checksum differs: load it again")
+    return vademecum
+
+
+def _listen(preparer: ModelPreparer) -> None:
+    """Until the contact node is gone; then end at once, whatever is being prepared for it."""
+    preparer.listen()
+    os._exit(0)
+
+
+def main() -> int:
+    realtime.die_with_parent(signal.SIGTERM)
+    realtime.release()
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    from avatar_ros.framework import qos
+    from avatar_ros.framework.managed_node import StopSignal, spin_until
+    from avatar_ros.msg import VademecumFile
+
+    stop = StopSignal()
+    channel = Channel(socket.socket(fileno=os.dup(sys.stdin.fileno())))
+    received = channel.receive()
+    if received is None:  # the contact node is gone
+        return 0
+    request, _ = received
+    assert isinstance(request, PreparationRequest)
+    preparer = ModelPreparer(request, channel, lambda: bool(stop))
+    threading.Thread(target=_listen, args=[preparer], name="changes", daemon=True).start()
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node(
+        request.node_name,
+        namespace=request.namespace,
+        start_parameter_services=False,
+        enable_rosout=False,
+    )
+    node.create_subscription(VademecumFile, request.topic, preparer.receive, qos.LATCHED)
+    with contextlib.suppress(BrokenPipeError):  # the contact node is gone
+        spin_until(stop, node)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
