@@ -339,6 +339,9 @@ class _Newton(ABC):
     ) -> np.ndarray:
         """K^-1 r in the free directions, by projected conjugate gradients.
 
+        After ``_MOST_INNER`` iterations the direction is inexact but still one of descent; the
+        line search and the residual of Newton's method decide what it is worth.
+
         forcing : reduction of the residual r . M^-1 r, as a norm
         enough : r . M^-1 r [J] that is small whatever it was at the start
         """

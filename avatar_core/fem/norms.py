@@ -1,4 +1,6 @@
-"""The L2 norm of displacement over an organ, by lumped masses: |u|^2 = sum_i m_i u_i^2."""
+"""The L2 norm of displacement over an organ, by lumped masses, |u|^2 = sum_i m_i u_i^2, and
+orthonormality in any inner product.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import ConvergenceError
 
 
 def l2_norm(field: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
@@ -26,3 +29,28 @@ def l2_norm(field: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
 def relative_l2(estimate: FloatArray, truth: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
     """|u - u_ref| / |u_ref| of each column; arguments as of :func:`l2_norm`."""
     return l2_norm(estimate - truth, mass) / l2_norm(truth, mass)
+
+
+def require_orthonormal(
+    functions: FloatArray, images: FloatArray, what: str, tolerance: float = 1e-6
+) -> None:
+    """Check the Gram matrix X^T A X' = [0; I], X' the last columns of X, in every entry.
+
+    Parameters
+    ----------
+    functions : ndarray, shape (n, rank), X
+    images : ndarray, shape (n, m), A X' for the last m functions; A a stiffness or a mass
+    what : names the functions in the error
+
+    Raises
+    ------
+    ConvergenceError
+        If an entry is off by more than the tolerance.
+    """
+    gram = functions.T @ images
+    deviation = float(np.abs(gram - np.eye(*gram.shape, gram.shape[1] - gram.shape[0])).max())
+    if not deviation <= tolerance:
+        raise ConvergenceError(
+            f"{what} are not orthonormal: their Gram matrix is off by {deviation:.1e}; "
+            "check the mesh for slivers"
+        )

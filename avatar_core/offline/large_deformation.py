@@ -22,6 +22,7 @@ import scipy.sparse as sp
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.fem.hyperelasticity import Hyperelasticity
+from avatar_core.fem.norms import require_orthonormal
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.reduction.asymptotic_series import path_series
@@ -93,18 +94,27 @@ def with_large_deformation(
     Parameters
     ----------
     problem : Hyperelasticity on the vademecum's mesh, clamp and material
+
+    Where ``max_modes`` do not meet ``mode_tolerance``, a notice in the provenance says so.
     """
     rule, build = rule or LargeRule(), build or BuildRule()
     paths = _follow(problem, vademecum.surface, rule, progress)
     mass = vademecum.mesh.lumped_mass
-    space = _principal(paths, mass, rule)
+    space, remainder = _principal(paths, mass, rule)
     load = paths.fields @ (mass[:, None] * space)
     near = _near(vademecum, paths, space, load, build)
     single = np.float32
     large = LargeDeformation(
         material, space.astype(single), load.astype(single), near, paths.depth, paths.reach
     )
-    return replace(vademecum, large=large)
+    provenance = vademecum.provenance
+    if remainder > rule.mode_tolerance:
+        notice = (
+            f"the {space.shape[1]} modes of large deformation leave {remainder:.1%} of the "
+            f"displacement, more than the {rule.mode_tolerance:.1%} asked for"
+        )
+        provenance = replace(provenance, notices=(*provenance.notices, notice))
+    return replace(vademecum, large=large, provenance=provenance)
 
 
 def _follow(
@@ -183,10 +193,15 @@ def _linear_depth(beta: FloatArray, rule: LargeRule) -> float:
     return float(a[max(1, int(np.argmin(holds)) - 1)]) if not holds.all() else float(a[-1])
 
 
-def _principal(paths: _Paths, mass: FloatArray, rule: LargeRule) -> FloatArray:
-    """Mass-orthonormal space functions worth most for the terms at the reach, (3 n_vertices, n).
+def _principal(paths: _Paths, mass: FloatArray, rule: LargeRule) -> tuple[FloatArray, float]:
+    """Principal components of the terms at the reach, and what they leave of these.
 
     By a randomised range finder (Halko, Martinsson & Tropp, SIAM Review 53, 2011).
+
+    Returns
+    -------
+    space : ndarray, shape (3 n_vertices, n), mass-orthonormal
+    remainder : mean relative L2 error
     """
     scale = paths.reach ** np.array(POWERS)[:, None] / paths.size
     root = np.sqrt(mass).astype(np.float32)
@@ -207,7 +222,9 @@ def _principal(paths: _Paths, mass: FloatArray, rule: LargeRule) -> FloatArray:
     enough = left <= rule.mode_tolerance
     rank = int(np.argmax(enough)) + 1 if enough.any() else len(value)
     rank = min(rank, rule.max_modes)
-    return np.asarray((basis @ vector[:, ::-1][:, :rank]) / root[:, None], float)
+    space = np.asarray((basis @ vector[:, ::-1][:, :rank]) / root[:, None], float)
+    require_orthonormal(space, mass[:, None] * space, "modes", tolerance=1e-5)  # single precision
+    return space, float(left[rank - 1])
 
 
 def _near(

@@ -25,6 +25,7 @@ import scipy.sparse as sp
 
 from avatar_core.errors import ConvergenceError
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.norms import require_orthonormal
 
 # An enrichment that captures less of the total energy than this is made of rounding errors.
 _ROUNDING = 1e-13
@@ -117,16 +118,22 @@ class _Expansion:
         return float(np.sqrt(left / (weights @ total)))
 
     def append(self, space: np.ndarray) -> int:
-        """Make space functions K-orthonormal and add them; the number of those that were new."""
+        """Make space functions K-orthonormal and add them; the number of those that were new.
+
+        Raises ConvergenceError if the modes do not come out orthonormal.
+        """
         for _ in range(2):  # once more for rounding
             dual = self.problem.elasticity.apply(space)
             space = space - self.space @ (self.space.T @ dual)
-        value, vector = np.linalg.eigh(space.T @ self.problem.elasticity.apply(space))
+        dual = self.problem.elasticity.apply(space)
+        value, vector = np.linalg.eigh(space.T @ dual)
         new = value > 1e-18 * value.max()
-        space = space @ (vector[:, new] / np.sqrt(value[new]))
+        scale = vector[:, new] / np.sqrt(value[new])
+        space, dual = space @ scale, dual @ scale
         load = self.problem.loads.T @ space
         columns = slice(self.rank, self.rank + space.shape[1])
         self._space[:, columns], self._load[:, columns] = space, load
+        require_orthonormal(self._space[:, : columns.stop], dual, "PGD modes")
         self.energy -= (load**2).sum(axis=1)
         self.rank += space.shape[1]
         return int(space.shape[1])
@@ -168,7 +175,8 @@ def solve_pgd(
     Raises
     ------
     ConvergenceError
-        If the right-hand side is zero, so that no relative error exists.
+        If the right-hand side is zero, so that no relative error exists, or modes do not come out
+        orthonormal.
     """
     if not problem.weights @ problem.energy > 0:
         raise ConvergenceError("all loads are zero: there is nothing to separate")

@@ -17,12 +17,15 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as sla
 
+from avatar_core.errors import ConvergenceError
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.norms import require_orthonormal
 
 N_VIBRATIONS = 6
 N_BODY = 3 + N_VIBRATIONS
 LEAST_MODES = 4 * N_BODY  # with fewer, touches need them all
 _DEPENDENT = 1e-6  # part of a body function's energy below which the other modes hold it already
+_EIGEN_TOLERANCE = 1e-6  # of the slowest vibrations
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +63,11 @@ def body_functions(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray, shape (3 n_nodes, n), n <= N_BODY
+
+    Raises
+    ------
+    ConvergenceError
+        If the eigenvalue solver does not converge or the functions are not orthonormal.
     """
     mass = sp.kron(elasticity.mass, sp.identity(3), format="csr")
     pull = mass @ np.tile(np.eye(3), (elasticity.n_nodes, 1))
@@ -72,7 +80,9 @@ def body_functions(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
     energy = functions.T @ forces - held.T @ held
     value, vector = np.linalg.eigh((energy + energy.T) / 2.0)
     new = value > _DEPENDENT
-    return np.asarray((functions - space @ held) @ (vector[:, new] / np.sqrt(value[new])))
+    own = np.asarray((functions - space @ held) @ (vector[:, new] / np.sqrt(value[new])))
+    require_orthonormal(np.hstack([space, own]), elasticity.apply(own), "modes and body functions")
+    return own
 
 
 def _vibrations(elasticity: Elasticity, mass: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
@@ -90,9 +100,14 @@ def _vibrations(elasticity: Elasticity, mass: sp.csr_matrix) -> tuple[np.ndarray
     # K^-1 is all that Lanczos asks of K in shift and invert around zero
     inverse = sla.LinearOperator((size, size), matvec=solved, dtype=float)
     start = np.random.default_rng(0).standard_normal(size)
-    rate, vector = sla.eigsh(
-        inverse, N_VIBRATIONS, inner, sigma=0.0, OPinv=inverse, v0=start, tol=1e-6
-    )
+    try:
+        rate, vector = sla.eigsh(
+            inverse, N_VIBRATIONS, inner, sigma=0.0, OPinv=inverse, v0=start, tol=_EIGEN_TOLERANCE
+        )
+    except sla.ArpackNoConvergence as error:
+        raise ConvergenceError(
+            f"the slowest vibrations were not found ({error}); check the mesh for slivers"
+        ) from error
     swing = np.zeros((mass.shape[0], N_VIBRATIONS))
     swing[free] = vector
     return swing, rate

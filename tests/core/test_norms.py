@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.fem.norms import l2_norm, relative_l2
+from avatar_core.errors import ConvergenceError
+from avatar_core.fem.norms import l2_norm, relative_l2, require_orthonormal
 from avatar_core.geometry.mesh import TetMesh
 
 
@@ -21,3 +22,15 @@ def test_relative_errors_are_those_of_each_column(shape: tuple[int, ...]) -> Non
     truth, mass = rng.standard_normal(shape), rng.uniform(0.5, 2.0, 30)
     scale = rng.uniform(-0.5, 0.5, shape[1:])
     np.testing.assert_allclose(relative_l2((1.0 + scale) * truth, truth, mass), np.abs(scale))
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 0), (5, 3), (2, 1)])
+def test_one_wrong_entry_of_the_gram_matrix_is_noticed(row: int, column: int) -> None:
+    """With the last four of six functions new: on the diagonal, among them, and to an old one."""
+    functions = np.linalg.qr(np.random.default_rng(1).standard_normal((40, 6)))[0]
+    images = functions[:, 2:]
+    require_orthonormal(functions, images, "functions")
+    spoilt = images.copy()
+    spoilt[:, column] += 1e-3 * functions[:, row]
+    with pytest.raises(ConvergenceError, match=r"functions are not .* off by 1\.0e-03"):
+        require_orthonormal(functions, spoilt, "functions")

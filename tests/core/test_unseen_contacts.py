@@ -6,7 +6,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
+from avatar_core.errors import ConvergenceError
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.offline.certify.unseen_contacts import draw_contacts
 from avatar_core.vademecum.tip_field import TipField
@@ -39,3 +41,10 @@ def test_a_contact_can_be_reached_along_its_normal() -> None:
         place = contacts.tip + height * contacts.normal
         assert np.linalg.norm(place, axis=1).min() > RADIUS
         assert np.linalg.norm(place - LOBE[0], axis=1).min() > LOBE[1] - 1e-3  # between samples
+
+
+def test_an_organ_without_a_place_to_touch_is_refused() -> None:
+    closed = organ()
+    closed.tip_field = closed.tip_field._replace(access=0.0 * closed.tip_field.access)
+    with pytest.raises(ConvergenceError, match="0 of 5 tips found a place"):
+        draw_contacts(closed, 5, seed=0)

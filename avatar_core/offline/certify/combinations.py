@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.errors import EquilibriumError
+from avatar_core.errors import ConvergenceError, EquilibriumError
 from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.newton import NewtonRule, State, press
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
@@ -28,6 +28,7 @@ DEPTH_FRACTIONS = (0.25, 0.5, 0.75)  # of the depth aimed at: 5, 10 and 15 mm of
 OBLIQUE = np.radians(30.0)
 APART = 40e-3  # [m]
 DENSITY, GRAVITY = 1060.0, 9.81  # of liver [kg/m^3], [m/s^2]
+_MAX_ITERATIONS = 30  # of Newton's method
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def mean_error(rows: Sequence[CombinedRow], combination: str) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Bend:
+class _DepthCurve:
     """h(a) = sum_k beta_k a^k of a tip, tangential beyond its reach."""
 
     depth: FloatArray  # (2,) beta_k
@@ -104,7 +105,7 @@ class _Combined:
     loads : ndarray, shape (3 n_nodes, m), unit loads; motion : ndarray, shape (m,), n
     preload : ndarray, shape (3 n_nodes,), or None
     compliance : ndarray, shape (m, m), C
-    own : ndarray, shape (m,), gamma, of each tip along its normal; bends : h of each
+    own : ndarray, shape (m,), gamma, of each tip along its normal; curves : h of each
     normal_fraction : s, of the force that is normal
     """
 
@@ -112,29 +113,35 @@ class _Combined:
     motion: FloatArray
     compliance: FloatArray
     own: FloatArray
-    bends: tuple[_Bend, ...]
+    curves: tuple[_DepthCurve, ...]
     normal_fraction: float = 1.0
     preload: FloatArray | None = None
 
-    def bent(self, force: FloatArray) -> FloatArray:
-        """d n."""
+    def motion_under(self, force: FloatArray) -> FloatArray:
+        """d n, of each patch along its load [m]."""
         a = self.normal_fraction * self.own * force
-        added = [bend(x) for bend, x in zip(self.bends, a, strict=True)]
+        added = [curve(x) for curve, x in zip(self.curves, a, strict=True)]
         return self.compliance @ force + self.normal_fraction * np.array(added)
 
     def forces(self, depth: float) -> FloatArray:
-        """Those that reach a depth, by Newton's method from the linear ones [N]."""
+        """Those that reach a depth, by Newton's method from the linear ones [N].
+
+        Raises ConvergenceError if it finds none.
+        """
         goal = depth * self.motion
         force = self.linear_forces(depth)
-        for _ in range(30):
-            left = goal - self.bent(force)
-            if np.abs(left).max() < 1e-9 * goal.max():
-                break
+        for _ in range(_MAX_ITERATIONS):
+            residual = goal - self.motion_under(force)
+            if np.abs(residual).max() < 1e-9 * goal.max():
+                return force
             step = 1e-5 * np.abs(force).max()
-            ahead = [self.bent(force + step * e) for e in np.eye(len(goal))]
-            slope = (np.stack(ahead, axis=1) - self.bent(force)[:, None]) / step
-            force = force + np.linalg.solve(slope, left)
-        return force
+            ahead = [self.motion_under(force + step * e) for e in np.eye(len(goal))]
+            slope = (np.stack(ahead, axis=1) - self.motion_under(force)[:, None]) / step
+            force = force + np.linalg.solve(slope, residual)
+        raise ConvergenceError(
+            f"no forces found that push {depth * 1e3:.3g} mm deep in {_MAX_ITERATIONS} Newton "
+            "iterations; certify shallower pushes"
+        )
 
     def linear_forces(self, depth: float) -> FloatArray:
         """The same of the linear vademecum."""
@@ -143,7 +150,7 @@ class _Combined:
     def reaches(self, depth: float) -> bool:
         """Whether no tip goes beyond its reach."""
         a = self.normal_fraction * self.own * self.forces(depth)
-        return all(x <= bend.reach for bend, x in zip(self.bends, a, strict=True))
+        return all(x <= curve.reach for curve, x in zip(self.curves, a, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,12 +166,12 @@ class _Site:
         """C(s, s')."""
         return vademecum.compliance(self.positions, self.weights, other.positions, other.weights)
 
-    def bend(self, vademecum: Vademecum) -> _Bend:
-        """How its depth bends."""
+    def depth_curve(self, vademecum: Vademecum) -> _DepthCurve:
+        """What large deformation adds to its depth."""
         large = vademecum.large
         assert large is not None
         reach = float(large.reach[self.positions].min())
-        return _Bend(large.depth[:, self.positions] @ self.weights, reach)
+        return _DepthCurve(large.depth[:, self.positions] @ self.weights, reach)
 
 
 def _at_site(
@@ -192,7 +199,7 @@ def _oblique(v: Vademecum, site: _Site, angle: float) -> _Combined:
         motion=np.ones(1),
         compliance=np.array([[along @ own @ along]]),
         own=np.array([site.inward @ own @ site.inward]),
-        bends=(site.bend(v),),
+        curves=(site.depth_curve(v),),
         normal_fraction=float(np.cos(OBLIQUE)),
     )
 
@@ -208,7 +215,7 @@ def _two_tools(v: Vademecum, one: _Site, other: _Site) -> _Combined:
         motion=np.ones(2),
         compliance=compliance,
         own=np.diag(compliance),
-        bends=(one.bend(v), other.bend(v)),
+        curves=(one.depth_curve(v), other.depth_curve(v)),
     )
 
 
@@ -222,7 +229,7 @@ def _gravity(v: Vademecum, problem: Hyperelasticity, site: _Site) -> _Combined:
         motion=np.ones(1),
         compliance=gamma,
         own=gamma[0],
-        bends=(site.bend(v),),
+        curves=(site.depth_curve(v),),
         preload=weight.ravel(),
     )
 
@@ -247,11 +254,11 @@ def _states(
 def _row(name: str, site: int, combined: _Combined, state: State) -> CombinedRow:
     """The vademecum beside a full equilibrium."""
     depth, truth = float(state.depth), state.force
-    bent, linear = (
+    curved, linear = (
         float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
         for found in (combined.forces(depth), combined.linear_forces(depth))
     )
-    return CombinedRow(name, site, depth, bent, linear, combined.reaches(depth))
+    return CombinedRow(name, site, depth, curved, linear, combined.reaches(depth))
 
 
 def _site(v: Vademecum, problem: Hyperelasticity, triangle: int) -> _Site:

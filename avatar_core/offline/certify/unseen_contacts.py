@@ -9,6 +9,7 @@ import igl
 import numpy as np
 
 from avatar_core.common.splines import evaluate
+from avatar_core.errors import ConvergenceError
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ HEIGHTS = (0.0, 6e-3)  # of a tip's centre above the surface, pressed in or just
 _OPEN = 0.999  # access from which a tip may touch without the force fading
 _WAY = np.linspace(1 / 3, 7 / 3, 8)  # heights above a tip in which it comes in [HEIGHTS[1]]
 _BATCH = 40  # patches solved at once
+MAX_DRAWS = 1000  # for one contact, on average; on livers most draws succeed
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,11 @@ def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
     """Tips above points that are drawn evenly over the accessible faces.
 
     Each can come in along its normal: no other lobe of the organ hangs over it.
+
+    Raises
+    ------
+    ConvergenceError
+        If a tip finds no such place in ``MAX_DRAWS`` random draws.
     """
     surface, field = vademecum.surface, vademecum.tip_field
     rng = np.random.default_rng(seed)
@@ -57,8 +64,14 @@ def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
         np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
     )
     tips, normals = np.empty((n, 3)), np.empty((n, 3))
-    found = 0
+    found, draws = 0, 0
     while found < n:
+        draws += 1
+        if draws > MAX_DRAWS * (found + 1):
+            raise ConvergenceError(
+                f"{found} of {n} tips found a place on the accessible surface in {draws - 1} "
+                "random draws; open a larger or smoother region to the tool"
+            )
         face = rng.choice(len(corner), p=area / area.sum())
         point = rng.dirichlet(np.ones(3)) @ corner[face]
         tip = point + rng.uniform(*HEIGHTS) * surface.face_normals[face]
