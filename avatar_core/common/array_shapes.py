@@ -1,8 +1,8 @@
-"""What arrays of a file have to look like, as tables: kind of number, and sizes by name.
+"""Tables of the kind and shape that the arrays of a file must have, with sizes by name.
 
     {"mesh/vertices": "f: vertices 3", "far/space": "f: 3*vertices rank"}
 
-A name is one size wherever it stands; ``3*vertices`` is three times that of ``vertices``.
+A name stands for one size everywhere; ``3*vertices`` is three times ``vertices``.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Calls that may end badly, in a process of their own: there, files of others are read.
+"""Calls in a separate process with limits of time and memory, for reading files of others.
 
-The libraries behind HDF5, VTK and NIfTI are large. Some damaged files end them (a segmentation
-fault of HDF5 2.0), hang them or make them ask for all memory there is; no check of ours comes
-before that. A process that has a limit of time and of memory may die of it, and another is started.
+Some damaged files crash the libraries behind HDF5, VTK and NIfTI (a segmentation fault of HDF5
+2.0), hang them or make them allocate all memory, before any check of this project. In a process of
+their own they do no harm: if it dies, another is started.
 
-This guards against accidents and nuisances. It is no wall: what comes back is a pickle, and the
-process has the rights of its user.
+This protects against accidents, not against attacks: results are pickled, and the process has the
+rights of its user.
 
 Run as ``python -m avatar_core.common.confined MAX_BYTES`` by ``Confined``, never by hand.
 """

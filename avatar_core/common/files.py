@@ -1,7 +1,7 @@
-"""Opening files of others: once, ordinary ones only, and no larger than said.
+"""Opening files of unknown origin: regular files only, of limited size.
 
-What a name stands for may change between a look and an opening; so the file is looked at again when
-it is open, which waits for nobody.
+A path may name something else between the check and the opening, so the open descriptor is checked
+again; opening never blocks.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from avatar_core.errors import AvatarError
 
 
 class FileError(AvatarError):
-    """What a name stands for is no file that may be read; the message begins after its name."""
+    """A path does not name a readable regular file; the message is what follows the path."""
 
 
 @contextmanager
 def opened(path: Path, max_bytes: int) -> Iterator[BinaryIO]:
-    """An ordinary file, open for reading.
+    """A regular file, open for reading.
 
     Raises
     ------
@@ -30,9 +30,9 @@ def opened(path: Path, max_bytes: int) -> Iterator[BinaryIO]:
         No such file, no permission, a directory, device or pipe, or more than ``max_bytes``.
     """
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # some devices act when they are opened
+        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a device may act on it
             raise FileError("not a file")
-        # Not to wait until somebody writes into a pipe that took its place.
+        # O_NONBLOCK: do not wait for a writer if a pipe has taken the file's place.
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except (OSError, ValueError) as error:
         raise FileError(_reason(error)) from error
@@ -46,10 +46,10 @@ def opened(path: Path, max_bytes: int) -> Iterator[BinaryIO]:
 
 
 def content_of(source: BinaryIO) -> bytes:
-    """The bytes of an open file; FileError if it grows meanwhile."""
+    """The bytes of an open file; FileError if it grows during reading."""
     size = os.fstat(source.fileno()).st_size
     try:
-        content = source.read(size + 1)  # so much is allocated
+        content = source.read(size + 1)  # allocates no more than this
     except OSError as error:
         raise FileError(_reason(error)) from error
     if len(content) > size:

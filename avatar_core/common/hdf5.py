@@ -24,17 +24,17 @@ from avatar_core.errors import StorageError, one_line
 Arrays = dict[str, np.ndarray]
 Attributes = dict[str, str]
 
-# What h5py raises of files that are damaged in one way or another.
+# What h5py raises for damaged files.
 UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, ArithmeticError)
 
 
 def replace_file(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> None:
-    """Put arrays and attributes, with their checksum, in the place of a file in one step.
+    """Write arrays and attributes with their checksum, replacing a file atomically.
 
     Raises
     ------
     StorageError
-        If the folder does not exist or the disk is full; what was at the path is then unharmed.
+        If the folder does not exist or the disk is full; the old file is then unchanged.
     """
     if not path.parent.is_dir():
         raise StorageError(f"folder {path.parent} does not exist; create it first")
@@ -95,9 +95,9 @@ def verified(
     Parameters
     ----------
     source : the file
-    origin, what : what messages call the file, and what it should be
-    attributes_of : of those that the file has, those that count; raises StorageError
-    keys_of : of the arrays that the file has, those that count
+    origin, what : name and kind of the file in messages
+    attributes_of : selects the attributes to verify among those held; raises StorageError
+    keys_of : selects the arrays to read among those held
     remedy : what messages advise
 
     Raises

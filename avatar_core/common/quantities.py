@@ -1,4 +1,8 @@
-"""Numbers that know their unit and range, as fields of dataclasses, and what refuses the others."""
+"""Dataclass fields for numbers with unit and range, and the check of their values.
+
+Own code: pydantic validates ranges, but has neither units nor these messages, which name the
+remedy; they would take as many lines on top of it.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ MAX_LETTERS = 300  # of a name or a text
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a number means: its unit, its range (ends included) and one line."""
+    """Unit, range (ends included) and one-line description of a number."""
 
     unit: str
     low: float
@@ -43,7 +47,7 @@ def is_whole(owner: type, key: str) -> bool:
 
 
 def check_numbers(one: Any, prefix: str = "") -> None:
-    """Refuse a dataclass with a number out of its range; None is left alone."""
+    """Raise SceneError if a field of a dataclass is out of its range; None is allowed."""
     for item in fields(one):
         allowed, value = item.metadata.get("quantity"), getattr(one, item.name)
         if allowed is None or value is None:
@@ -59,6 +63,6 @@ def check_numbers(one: Any, prefix: str = "") -> None:
 
 
 def check_line(key: str, value: str) -> None:
-    """Refuse what is not one line of printable text."""
+    """Raise SceneError unless a value is one line of printable text."""
     if not isinstance(value, str) or not value.isprintable() or len(value) > MAX_LETTERS:
         raise SceneError(f"{key} must be one line of text, of {MAX_LETTERS} letters at most")

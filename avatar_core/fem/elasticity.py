@@ -245,7 +245,7 @@ class Elasticity:
         return Elasticity(mesh, self.material, self._clamped_faces[owner], self.element, inclusion)
 
     def at(self, material: Material, contrast: float | None = None) -> Elasticity:
-        """The same problem with other values on the same element; what can be shared is."""
+        """The same problem and element at other values of the material; matrices are shared."""
         other = copy(self)
         other.material = material
         if self.inclusion is not None and contrast is not None:
@@ -316,9 +316,9 @@ class Elasticity:
         return rslab.ldlt(sp.csc_matrix(system))
 
     def _require_all_held(self) -> None:
-        """Raise MeshError if a part of the organ can move off without resistance.
+        """Raise MeshError if a part of the organ can move freely.
 
-        The factorization of such a system need not fail, nor a load on the other parts show it.
+        The factorization of such a system need not fail, and loads elsewhere do not reveal it.
         """
         mesh, held = self.mesh, self.mesh.boundary_faces[self._clamped_faces]
         n_pieces = int(mesh.pieces.max()) + 1
@@ -329,7 +329,7 @@ class Elasticity:
         ]
         if loose:
             raise MeshError(
-                f"{len(loose)} of {n_pieces} pieces that hang together by faces are not clamped; "
+                f"{len(loose)} of {n_pieces} pieces connected by faces are not clamped; "
                 "clamp a face of each or remove them"
             )
 

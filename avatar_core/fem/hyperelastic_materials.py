@@ -1,8 +1,8 @@
 """Hyperelastic materials: energy, stress and tangent as functions of the deformation gradient.
 
 With F = I + grad u, the first Piola stress P = d psi / dF is force per undeformed area, and the
-tangent A = dP/dF makes Newton's method quadratic. Both materials are a linear one (Young's modulus,
-Poisson's ratio) continued to large strain: at F = I their tangent is Hooke's.
+tangent A = dP/dF makes Newton's method quadratic. Both materials extend a linear one (Young's
+modulus, Poisson's ratio) to large strain: at F = I their tangent is Hooke's.
 
 Source: Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008, ch. 6.
 """
@@ -20,7 +20,7 @@ _IDENTITY = np.eye(3)
 
 
 class HyperelasticMaterial(Protocol):
-    """What the finite elements ask of a material; F has the shape (..., 3, 3), det F > 0."""
+    """What the finite elements need of a material; F has the shape (..., 3, 3), det F > 0."""
 
     @property
     def linear(self) -> Material:

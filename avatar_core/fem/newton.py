@@ -5,8 +5,8 @@ march in steps that halve where Newton fails and double where it is quick, and m
 
     Pi(u) = int psi dx - f . u    over all u (solve), over those with C^T u = depth n (press).
 
-Under an imposed motion of the patch the force is the multiplier of the constraint, and states are
-found that a growing force would pass by with a snap. Where no step lowers the energy without
+Under an imposed motion of the patch the force is the multiplier of the constraint; states are found
+that a growing force would skip by snapping through. Where no step lowers the energy without
 turning an element inside out, where the tangent is not positive definite, or where the state found
 is far from the one that the tangent predicted however small the step, equilibrium is lost.
 

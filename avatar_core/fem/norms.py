@@ -48,7 +48,8 @@ def require_orthonormal(
         If an entry is off by more than the tolerance.
     """
     gram = functions.T @ images
-    deviation = float(np.abs(gram - np.eye(*gram.shape, gram.shape[1] - gram.shape[0])).max())
+    n, m = gram.shape
+    deviation = float(np.abs(gram - np.eye(n, m, m - n)).max())
     if not deviation <= tolerance:
         raise ConvergenceError(
             f"{what} are not orthonormal: their Gram matrix is off by {deviation:.1e}; "

@@ -139,9 +139,9 @@ def signed_distance(points: FloatArray, surface: SurfaceMesh) -> FloatArray:
 
     points : ndarray, shape (k, 3) [m]
 
-    Distance (AABB tree) and sign (winding number) are asked separately: pseudo-normals and rays
-    give wrong signs on cracked surfaces. Both are asked of the surface's skin: holes are covered,
-    what lies inside does not count, and an inside-out surface has the same inside.
+    Distance (AABB tree) and sign (winding number) are computed separately: pseudo-normals and rays
+    give wrong signs on cracked surfaces. Both refer to the skin of the surface: holes are covered,
+    faces inside are ignored, and an inside-out surface has the same inside.
 
     Raises SurfaceError if the surface encloses nothing or has a large hole.
     """
@@ -171,7 +171,7 @@ def distance_in_box(surface: SurfaceMesh, box: GridBox, band: float | None = Non
     """Signed distance at the points of a box; what sticks out of the box is cut off.
 
     band : distances are cut to [-band, band] and computed only there, for fine grids [m]; a
-        grid of twice the spacing says, from coarse to fine, which points are farther away
+        hierarchy of coarser grids excludes the points that are farther away
 
     Raises SurfaceError if the band is narrower than two spacings: less spoils the isosurface.
     """
@@ -219,7 +219,8 @@ def reinitialize(grid: DistanceGrid) -> DistanceGrid:
 
     Raises SurfaceError if the grid has no zero surface.
     """
-    zero = _in_space(grid, *march(grid.values), "zero surface")  # no lid: the organ goes on there
+    # Not closed at the border of the grid, where the organ continues.
+    zero = _in_space(grid, *march(grid.values), "zero surface")
     squared, _, _ = igl.point_mesh_squared_distance(
         grid.points, zero.vertices, zero.faces.astype(np.int64)
     )

@@ -96,7 +96,7 @@ class TetMesh:
 
     @cached_property
     def pieces(self) -> np.ndarray:
-        """Number of the piece, hanging together by faces, of each element, shape (n_tets,)."""
+        """Face-connected component of each element, shape (n_tets,)."""
         return _face_components(self.tets)
 
     @property
@@ -252,7 +252,7 @@ def _scratch_folder() -> Iterator[None]:
 
 @contextmanager
 def _own_interrupt() -> Iterator[None]:
-    """Take Ctrl-C back: fTetWild's geometry library leaves the handler of the C runtime."""
+    """Restore the handler of Ctrl-C, which the geometry library of fTetWild replaces."""
     handler = signal.getsignal(signal.SIGINT)
     try:
         yield
@@ -262,7 +262,7 @@ def _own_interrupt() -> Iterator[None]:
 
 
 def _largest_component(tets: np.ndarray) -> np.ndarray:
-    """Elements of the largest piece that hangs together by faces."""
+    """Elements of the largest face-connected component."""
     label = _face_components(tets)
     return tets[label == np.bincount(label).argmax()]
 

@@ -1,8 +1,8 @@
 """The skin of a surface: the triangles that separate inside from outside, and nothing else.
 
-A surface from a file may have holes, overlap itself or lie twice: its triangles then end short of
-the boundary of the solid, or lie inside of it. Distances are asked of the skin, so that they vanish
-where the sign changes and nowhere else.
+A surface from a file may have holes, overlap itself or lie twice: its triangles then leave parts of
+the boundary of the solid open, or lie inside it. Distances are measured to the skin, so that they
+vanish where the sign changes and nowhere else.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ OFF = 0.01  # a cover farther than this from the surface does not lie on it [mea
 UNDECIDED = (0.25, 0.75)  # winding numbers of a hole's cover, over the layers of the surface
 LARGEST_HOLE = 0.1  # [area of all]; a flat cover loses 3 % of a ball's volume there
 HALVINGS = 3  # of the triangles that an intersection cuts: it is met to an eighth of them
-BESIDE = 1e-4  # where the two sides of a triangle are asked [edges]
+BESIDE = 1e-4  # offset of the points tested on the two sides of a triangle [edges]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +97,8 @@ def _covers(vertices: FloatArray, faces: IntArray) -> Soup:
     """Cones over the rims of all holes: apices, and triangles that name them after the vertices.
 
     A cone over the unpaired edges of a surface makes it a closed chain, whatever its shape. It
-    covers a hole if, off the surface, it is undecided there what is inside; cracks and faces
-    turned round have unpaired edges too, and are left.
+    covers a hole if the winding number on it, off the surface, is neither that of inside nor of
+    outside. Cracks and flipped faces have unpaired edges too and are left alone.
     """
     none = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
     edge = float(igl.avg_edge_length(vertices, faces))
@@ -152,7 +152,7 @@ def _unpaired(triangles: IntArray) -> tuple[IntArray, IntArray]:
 def _boundary(soup: Soup) -> Soup:
     """The triangles with inside on one side only, those cut by others to an eighth of an edge.
 
-    Triangles at an intersection are quartered and asked again. Of the smallest, those on either
+    Triangles at an intersection are quartered and tested again. Of the smallest, those on either
     side of it are kept: the skin has no gaps, which a narrow band would jump through.
     """
     merged, vertices = weld(soup[0]), soup[0]

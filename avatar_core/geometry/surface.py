@@ -1,7 +1,7 @@
-"""The front door: a closed organ surface, read once, checked once, in metres and RAS axes.
+"""Closed organ surfaces: read once, checked once, in metres and RAS axes.
 
-Cracked, doubled and locally flipped surfaces are taken as they are: what decides is whether the
-generalised winding number (Jacobson 2013, evaluated as in Barill 2018) says clearly what is inside.
+Cracked, doubled and locally flipped surfaces are accepted where the generalised winding number
+(Jacobson 2013, evaluated as in Barill 2018) clearly separates inside from outside.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class SurfaceMesh:
     name : what the surface is called, the stem of its file
     unit : unit of the file it came from (the vertices are in metres whatever it says)
     axes : ndarray, shape (4, 4), rigid map from the file's coordinates (in its unit) to RAS
-    notices : what was changed or dropped at the door, one line each
+    notices : what was changed or dropped on reading, one line each
     source_sha256 : hash of the file's bytes, empty for a generated surface
 
     Raises SurfaceError if the arrays are empty, not finite or do not fit each other.
@@ -173,7 +173,7 @@ def read_surface(
     return surface
 
 
-# --- what the door checks ---------------------------------------------------------------------
+# --- checks on reading ------------------------------------------------------------------------
 
 
 def keep_organ(surface: SurfaceMesh) -> SurfaceMesh:

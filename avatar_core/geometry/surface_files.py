@@ -1,4 +1,4 @@
-"""Surface file formats: what each reader yields is a soup of vertices and triangles.
+"""Surface file formats: each reader returns vertices and triangles, unconnected and unchecked.
 
 OBJ, STL, PLY, VTK and OFF give triangles in the file's coordinates; NIfTI label maps are meshed.
 Nothing is checked here but that the file can be read; :mod:`avatar_core.geometry.surface` decides.
@@ -47,7 +47,7 @@ def parse(path: Path, label: int | None) -> Soup:
         return _read_label_map(path, label) if kind == ".nii" else _READERS[kind](path)
     except SurfaceError:
         raise
-    except Exception as error:  # the parsers of five formats raise whatever they like
+    except Exception as error:  # parsers of five formats, each with errors of its own
         raise SurfaceError(
             f"{path.name}: not a readable {kind[1:].upper()} file ({one_line(error, 80)}); "
             "export it again"

@@ -1,8 +1,8 @@
 """A tumour: which part of each tetrahedron of an organ it fills.
 
 Its level set is the second one of the organ (paper, Sec. 4): the signed distance to its surface,
-which may have several bodies. The mesh does not follow it; a tetrahedron that it cuts takes a mean
-stiffness by volume.
+which may have several bodies. The mesh does not conform to it; a tetrahedron that it cuts has the
+volume-weighted mean stiffness.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The full solutions of a build: solved once each, and only what the vademecum needs is kept."""
+"""The full solutions of a build: each is computed once, and reduced to what the vademecum needs."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def exact_response(
 
 
 class FarFieldResidual:
-    """What the modes found so far leave of the kept columns, outside the near field."""
+    """Error that the modes found so far leave in the sampled columns, outside the near field."""
 
     def __init__(
         self,
@@ -111,12 +111,12 @@ class FarFieldResidual:
         self._columns = response.columns
         self._left: np.ndarray | None = None
 
-    def restart(self) -> None:
-        """Forget all modes, and give their memory back."""
+    def reset(self) -> None:
+        """Discard all modes and free their memory."""
         self._left = None
 
-    def remove(self, space: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Take modes off; the relative L2 error of each kept load, shape (n,)."""
+    def subtract(self, space: np.ndarray, load: np.ndarray) -> np.ndarray:
+        """Subtract modes; returns the relative L2 error of each sampled load, shape (n,)."""
         if self._left is None:
             self._left = self._columns.copy()
         self._left -= space.astype(np.float32) @ load[self.loads].astype(np.float32).T
@@ -132,7 +132,7 @@ def displacement_near(
     rule: BuildRule,
     outliers: np.ndarray,
 ) -> LocalBlocks:
-    """(u - far) at the vertices around each position, faded out; whole at outliers."""
+    """(u - far) at the vertices around each position, faded out; stored in full at outliers."""
     radius = surface.patch_radius
     fade = plateau(
         response.vertex_pairs.distance, rule.near_inner * radius, rule.near_outer * radius

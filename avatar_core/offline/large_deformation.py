@@ -8,9 +8,9 @@ replaced by the two that are kept,
     x^4 ~ -0.431 x^2 + 1.392 x^3,   x^5 ~ -0.686 x^2 + 1.610 x^3,   x = a / A in [0, 1],
 
 to 3.8 and 7.5 % of A^4 and A^5, the least possible relative to x (Lanczos, Applied Analysis, 1956).
-What is left, and the terms never computed, tell the reach. (The residual K^-1 r is no measure:
-nearly incompressible tissue answers the rotation left in it by a change of volume, 50 times too
-much.)
+The error of that, and an estimate of the terms never computed, determine the reach. (The residual
+K^-1 r is no measure: in nearly incompressible tissue the remaining rotation appears in it as a
+change of volume, 50 times too large.)
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def _reach(
 
 
 def _left(size: FloatArray) -> FloatArray:
-    """What two terms leave, from the sizes of all at some reaches, shape (n, 5): (n,).
+    """Relative error of two terms, from the sizes of all five at n reaches, shape (n, 5): (n,).
 
     Terms never computed count as the sixth, in proportion to the last two: on a real liver, within
     a factor of three of the truth up to 20 mm.
@@ -183,7 +183,7 @@ def _left(size: FloatArray) -> FloatArray:
 
 
 def _linear_depth(beta: FloatArray, rule: LargeRule) -> float:
-    """a at which the depth is ``max_push``, or earlier where the organ hardly resists any more."""
+    """a at which the depth is ``max_push``, or less where the organ hardly resists."""
     a = np.linspace(0.0, 1.5 * rule.max_push, 301)
     order = np.arange(1, _ORDER + 1)
     depth = a[:, None] ** order @ beta

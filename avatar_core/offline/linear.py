@@ -1,9 +1,9 @@
 """The offline stage: from an organ's mesh to its vademecum.
 
 1. every patch is solved once; what lies near it, its energy and its norm are kept;
-2. PGD finds the modes, a rotation sorts them by what they are worth in displacement;
+2. PGD finds the modes, and an orthogonal mixing sorts them by displacement norm;
 3. the rank is the smallest that meets the tolerance on the build's own loads; where none does,
-   the near field grows, and the last few loads that no mode serves are stored whole;
+   the near field grows, and the fields of a few outliers are stored in full;
 4. the near field becomes the exact remainder, tapered.
 """
 
@@ -39,9 +39,9 @@ from avatar_core.vademecum.modal_mass import (
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.tip_field import make_tip_field
 
-_MAX_OUTLIERS = 0.01  # part of the load positions whose fields may be stored whole
+_MAX_OUTLIERS = 0.01  # part of the load positions whose fields may be stored in full
 _WORST_OVER_MEAN = 8 / 3  # the worst load may be this much worse than the mean asked for
-_ENOUGH = 1.25  # the modes found must leave so much less than asked, as not all are kept
+_ENOUGH = 1.25  # factor below the tolerance that the found modes must reach, as not all are kept
 
 
 def build_vademecum(
@@ -99,7 +99,7 @@ def build_vademecum(
 
 
 def _with_room_for_body(rule: BuildRule) -> tuple[BuildRule, bool]:
-    """The rule without the modes that are kept for the body's own functions, if it has enough."""
+    """The rule without the modes reserved for body functions, if it has enough modes."""
     if rule.max_modes < LEAST_MODES:
         return rule, False
     return replace(rule, max_modes=rule.max_modes - N_BODY), True
@@ -118,8 +118,8 @@ def _with_body(
 def with_rank(vademecum: Vademecum, rank: int, rule: BuildRule) -> Vademecum:
     """The vademecum that a build with fewer modes would have given.
 
-    What the dropped modes held of the near fields moves into these, so that the response at the
-    load positions stays exact.
+    The near fields absorb the near part of the dropped modes, so that the response at the load
+    positions stays exact.
     """
     surface, far = vademecum.surface, vademecum.far
     if rank >= far.rank:
@@ -161,7 +161,7 @@ def find_modes(
     """PGD in the energy norm, and the weights of the loads that it ended with.
 
     Every column is divided by its own L2 norm, so that the relative error of a load at a stiff
-    place counts as much as that at a soft one, and weighs more the worse it still is.
+    place counts as much as that at a soft one; weights grow with the remaining error.
     """
     base = 1.0 / response.norm**2
     weights = base.copy()
@@ -173,7 +173,7 @@ def find_modes(
     def follow_error(space: np.ndarray, load: np.ndarray) -> np.ndarray | None:
         nonlocal found, current
         found += load.shape[1]
-        error = residual.remove(elasticity.at_vertices(space), load)
+        error = residual.subtract(elasticity.at_vertices(space), load)
         current = float(error.mean())
         if found >= least and is_met(_ENOUGH * error.mean(), _ENOUGH * error.max(), rule):
             return None
@@ -193,12 +193,12 @@ def _rank_errors(
     modes: SeparatedField, residual: FarFieldResidual, rule: BuildRule
 ) -> tuple[RankError, ...]:
     """Error on the kept loads against the number of modes, near field included."""
-    residual.restart()
+    residual.reset()
     errors = []
     last = min(rule.max_modes, modes.rank)
     ranks = sorted({*range(5, last, 5), last})
     for before, rank in zip([0, *ranks[:-1]], ranks, strict=True):
-        error = residual.remove(modes.space[:, before:rank], modes.load[:, before:rank])
+        error = residual.subtract(modes.space[:, before:rank], modes.load[:, before:rank])
         errors.append(RankError(rank, float(error.mean()), float(error.max())))
     return tuple(errors)
 
@@ -213,12 +213,12 @@ def _choose_rank(errors: tuple[RankError, ...], rule: BuildRule) -> tuple[int, b
 def _outliers(
     far: SeparatedField, residual: FarFieldResidual, rule: BuildRule
 ) -> tuple[np.ndarray, RankError]:
-    """The few kept positions that no rank serves, and the error with their fields stored whole.
+    """Sampled positions above the limit of the worst load, and the error once they are stored.
 
-    They lie beside the clamp, where a push moves the organ little and not as any other does.
+    They lie beside the clamp, where displacements are small and unlike those of other loads.
     """
-    residual.restart()
-    error = residual.remove(far.space, far.load)
+    residual.reset()
+    error = residual.subtract(far.space, far.load)
     limit = _WORST_OVER_MEAN * rule.tolerance
     positions = np.unique(residual.loads[error > limit] // 3)
     positions = positions[: int(_MAX_OUTLIERS * len(error) / 3)]

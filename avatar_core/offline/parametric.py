@@ -3,9 +3,8 @@
 1. at every node of the coordinates all patches are solved, as for an ordinary vademecum, and PGD
    finds the modes there;
 2. the modes of all nodes are compressed into one space basis (proper orthogonal decomposition
-   over nodes and loads), loads weighing more the worse the basis serves them;
-3. the stiffness is projected term by term, and what the projected problem misses near the patch
-   is kept at every node.
+   over nodes and loads), with weights of the loads that grow with their error;
+3. the stiffness is projected term by term, and its error near the patch is kept at every node.
 
 The space basis serves every value in the range by a small Galerkin system. A canonical separated
 form in all coordinates (:mod:`avatar_core.reduction.pgd_parametric`) needs several times as many
@@ -47,7 +46,7 @@ from avatar_core.vademecum.tip_field import make_tip_field
 
 _BASIS_OVER_RANK = 4.0  # functions of the basis over the modes used at given values
 _DRAWN = 6  # random values that a certificate is made at
-_ROUNDS = 3  # of weighing loads by what the basis leaves of them
+_ROUNDS = 3  # of weighting loads by the error that the basis leaves
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,16 +144,16 @@ def _solved(
     response = exact_response(elasticity, surface, loads, rule, first)
     residual = FarFieldResidual(elasticity, surface, response, rule)
     solution, _ = find_modes(elasticity, loads, response, residual, rule, second)
-    residual.restart()
+    residual.reset()
     space = solution.space.astype(np.float32)
-    elasticity = elasticity.at(elasticity.material)  # leaves its factorization behind, 0.5 GB
+    elasticity = elasticity.at(elasticity.material)  # drops the factorization, 0.5 GB
     return _Snapshot(elasticity, response, residual, space, solution.load, solution.history)
 
 
 def _reduce(
     snapshots: Sequence[_Snapshot], loads: sp.csr_matrix, rule: BuildRule
 ) -> tuple[_Reduced, RankError]:
-    """The basis that serves all nodes best: a few rounds of weighing loads by their error."""
+    """The best basis for all nodes, after a few rounds of weighting loads by their error."""
     weights = [1.0 / snapshot.response.norm**2 for snapshot in snapshots]
     best: tuple[_Reduced, RankError] | None = None
     for _ in range(_ROUNDS):
@@ -173,8 +172,8 @@ def _errors(snapshots: Sequence[_Snapshot], reduced: _Reduced) -> list[np.ndarra
     """Relative L2 error of the kept loads at every node, near field included."""
     out = []
     for snapshot, field in zip(snapshots, reduced.fields, strict=True):
-        out.append(snapshot.residual.remove(field.space, field.load))
-        snapshot.residual.restart()
+        out.append(snapshot.residual.subtract(field.space, field.load))
+        snapshot.residual.reset()
     return out
 
 
@@ -192,7 +191,7 @@ def _with_near_field(snapshot: _Snapshot, surface: LoadSurface, rule: BuildRule)
 def _principal(
     snapshots: Sequence[_Snapshot], weights: Sequence[np.ndarray], rule: BuildRule
 ) -> np.ndarray:
-    """The space functions worth most over all nodes and loads, shape (3 n_nodes, n).
+    """Principal space functions over all nodes and loads, shape (3 n_nodes, n).
 
     With X the modes of all nodes side by side, X^T M X = A^T A, and Y block-diagonal with
     Y^T W Y = B^T B, these are X B^T R for the leading R in A B^T = P S R^T.

@@ -63,7 +63,7 @@ class OrganOptions:
     Raises
     ------
     CoordinateError, MaterialError, MeshError
-        For what cannot be had together, and for a file that is not there, before any work.
+        For options that exclude each other, and for a file that does not exist, before any work.
     """
 
     n_vertices: int = 2850

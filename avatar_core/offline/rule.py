@@ -1,4 +1,4 @@
-"""What the offline stage aims at, and how it tells how far it is."""
+"""Settings of the offline stage, and the reports of its progress."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ def silent(stage: str, fraction: float, error: float) -> None:
 
 @dataclass(frozen=True)
 class BuildRule:
-    """What the offline stage aims at.
+    """Tolerance and sizes of a build.
 
     tolerance : mean relative L2 error over the build's own loads; the worst load may have
         8/3 times it
     max_modes : far-field modes at most
-    oversampling : PGD finds this many times ``max_modes``, of which the best are kept; where
-        these leave too much, up to ``most_oversampling`` times
+    oversampling : PGD finds this many times ``max_modes``, of which the best are kept; if these
+        miss the tolerance, up to ``most_oversampling`` times
     near_inner, near_outer : the displacement near field is exact within, absent beyond, in
         patch radii
     near_growth : both grow by this factor where ``max_modes`` do not meet the tolerance

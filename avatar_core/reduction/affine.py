@@ -8,7 +8,7 @@ Comput. Methods Eng. 15:229, 2008):
 
     e . K e = r . K^-1 r <= r . K_0^-1 r / alpha(p),   alpha(p) = min_q theta_q(p) / theta_q(p_0)
 
-and the work f . u of a load, for a unit patch load the displacement that is felt in contact, by
+and the work f . u of a load, for a unit patch load the displacement in contact, by
 
     f . (u_exact - u) = r . u + r . K^-1 r.
 """

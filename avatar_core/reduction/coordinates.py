@@ -1,4 +1,4 @@
-"""The extra coordinates of a vademecum u(x, s, p): named ranges chosen before, values after.
+"""The material coordinates of a vademecum u(x, s, p): ranges chosen at build time, values later.
 
 Both coordinates enter the stiffness through affine factors of constant matrices
 (:attr:`avatar_core.fem.elasticity.Elasticity.factors`), so that everything that depends on them is
@@ -34,7 +34,7 @@ class Coordinate:
     name : "poisson" (Poisson's ratio) or "contrast" (Young's modulus inside the tumour over that
         outside)
     low, high : its range
-    n_nodes : at which the organ is solved, both ends included; 0: as many as the range calls for
+    n_nodes : at which the organ is solved, both ends included; 0: as many as the range needs
 
     Raises
     ------
@@ -137,7 +137,7 @@ def node_weights(coordinates: Sequence[Coordinate], values: Mapping[str, float])
 
 
 def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]) -> None:
-    """Raise CoordinateError if a value is given for a coordinate that is not there."""
+    """Raise CoordinateError if a value is given for an unknown coordinate."""
     names = [coordinate.name for coordinate in coordinates]
     for name in values:
         if name not in names:
@@ -152,7 +152,7 @@ def _known() -> str:
 
 
 def problem_at(elasticity: Elasticity, values: Mapping[str, float]) -> Elasticity:
-    """The elastic problem at values of the coordinates; what is not given keeps its value."""
+    """The elastic problem at values of the coordinates; others keep their values."""
     poisson = values.get("poisson", elasticity.material.poisson_ratio)
     material = replace(elasticity.material, poisson_ratio=poisson)
     return elasticity.at(material, values.get("contrast"))

@@ -1,7 +1,7 @@
 """A Galerkin basis on the patient's own mesh, grown from the neighbours' load functions.
 
-The neighbours' response, combined and carried over, tells which forces matter: its load functions
-w_k(s). On the patient's own mesh each gives one solution, and these span the first space,
+The combined response of the neighbours, mapped to the patient, gives load functions w_k(s). On the
+patient's own mesh each gives one solution, and these span the first space,
 
     K X_k = sum_s w_k(s) f(s),      Y(s) = X^T f(s),      u(x, s) ~ X(x) Y(s)^T,
 
@@ -11,8 +11,8 @@ solutions for the loads whose residual r = f - K X Y^T is largest in the norm of
 
     eta(s)^2 = r(s) . D^-1 r(s).
 
-A few *probes*, loads solved exactly that never enter the space, calibrate eta, so that it
-estimates the error of every load, and tell how much compliance the space lacks under a patch.
+A few *probes*, loads solved exactly that never enter the space, calibrate eta as an estimate of the
+error of every load, and give the residual compliance under a patch.
 """
 
 from __future__ import annotations
@@ -267,7 +267,7 @@ def worst_positions(
 ) -> NDArray[np.int64]:
     """Load positions of the largest relative residuals, at least 1.5 patch radii apart."""
     left = relative_residual(basis, blocks)
-    left[excluded] = 0.0  # a probe that entered the space would flatter the estimate
+    left[excluded] = 0.0  # a probe in the space would make the estimate too small
     chosen: list[int] = []
     while len(chosen) < n and left.max() > 0.0:
         chosen.append(int(left.argmax()))
@@ -283,7 +283,7 @@ def residual_compliance(
     blocks: NDArray[np.float64],
     rule: ReductionRule,
 ) -> tuple[FloatArray, float]:
-    """What the space lacks of the compliance of each patch, and over which distance.
+    """Residual compliance of each patch, C - Y Y^T, and the distance over which it extends.
 
     M(s) = alpha eta-blocks(s), alpha such that the traces at the probes agree; the reach is the
     candidate for which :func:`residual_compliance_blocks` fits the probes' columns best.

@@ -1,7 +1,7 @@
 """The exact part of the response close to a load, and the tapers that let it fade out.
 
-A truncated separated field is smooth and too stiff under the tool. What it misses near the patch
-is stored exactly: 3 x 3 blocks for the pairs of (load position, target) closer than a radius,
+A truncated separated field is smooth and too stiff under the tool. Its error near the patch is
+stored exactly: 3 x 3 blocks for the pairs of (load position, target) closer than a radius,
 faded out so that no jump remains. Targets are mesh vertices (displacement field) or load
 positions (contact compliance).
 """

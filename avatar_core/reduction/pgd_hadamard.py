@@ -6,7 +6,7 @@ Alternating directions of an enrichment R o S (paper Eqs. 7-14): with S known, t
 couples the components of R by m_cc' = sum_s S^c(s) S^c'(s); with R known, every load is a 3 x 3
 system.
 Where all loads have one direction this says no more than a scalar S, and costs a different
-stiffness in every sweep: it is here to be compared with, nothing is built by it.
+stiffness in every sweep: it serves as a baseline for comparison only.
 """
 
 from __future__ import annotations

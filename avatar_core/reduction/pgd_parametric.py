@@ -163,7 +163,7 @@ def _enrich(
 ) -> tuple[_Product | None, Outcome, int, float]:
     """Alternating directions from a random load function and constant parameters.
 
-    Where constants see nothing of the residual, its mean being zero, random parameters may.
+    Where the mean of the residual vanishes, constants find nothing; random parameters may.
     """
     problem = expansion.problem
     rng = np.random.default_rng(expansion.field.rank)

@@ -1,4 +1,4 @@
-"""Accuracy against time: what a step may cost, how wrong it may be, and which choice gives both.
+"""Accuracy against time: measured error and cost of contact steps, and the choice for a budget.
 
 A :class:`Detail` says how finely a step shows the displacement. An :class:`AccuracyCurve` holds the
 measured error and time of many, and :func:`choose` picks among them for a :class:`Budget`.
@@ -45,7 +45,7 @@ class Detail:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """What a detail was measured to give.
+    """Measured error, size and time of a detail.
 
     l2, force : relative error that 95 % of unseen loads stay below, of the displacement of the
         cloud and of the normal force; l2 is NaN where nothing is shown
@@ -67,7 +67,7 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class Budget:
-    """What is asked of a step.
+    """Limits on the error and the time of a step.
 
     tolerance : on the relative error of ``quantity``, which 95 % of the loads keep
     deadline : on the time that a step takes of the processor, which 99 % keep [s]
@@ -75,7 +75,7 @@ class Budget:
     Raises
     ------
     AccuracyError
-        For what no step can have.
+        For a limit that is not positive, or an unknown quantity.
     """
 
     tolerance: float
@@ -162,7 +162,7 @@ def choose(curve: AccuracyCurve, budget: Budget) -> CurvePoint:
     Raises
     ------
     AccuracyError
-        Where none does, with the two points that come closest, one on either side.
+        If none does; the message names the nearest point on either side.
     """
     feasible = [point for point in curve.points if budget.holds(point)]
     if feasible:
@@ -201,8 +201,8 @@ def upper_quantile(
     Distribution-free tolerance bound (Wilks, Annals of Mathematical Statistics 12, 1941): the
     smallest order statistic x_(r) with P[B >= r] <= 1 - confidence, B binomial of n and
     ``content``; the largest value where the sample is too small for the confidence. Where only
-    some of the values are independent, r / n is that of so many: the three directions of a load
-    are wrong together.
+    some of the values are independent, r / n is that of so many: the errors of the three directions
+    of a load are correlated.
 
     n_independent : of the values; None for all
     """

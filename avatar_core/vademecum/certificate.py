@@ -1,4 +1,4 @@
-"""What a vademecum says of its own errors; :mod:`avatar_core.offline.certify` measures it."""
+"""The certificate of a vademecum's errors; :mod:`avatar_core.offline.certify` measures them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Certificate:
     n_loads : unseen load positions; ``seed`` draws them
     build_cpu_seconds : user + system time of everything, meshing and this certificate included
     mesh_l2, mesh_contact : change of the reference when the mesh is refined once (NaN: not asked)
-    force_error : how wrong the force at a place may be, calibrated on the same loads
-    curve : the same errors for displacements that are shown less finely, and what a step takes
+    force_error : estimate of the force error at a place, calibrated on the same loads
+    curve : the same errors for coarser details of the displacement, and the time of a step
     """
 
     l2_mean: float
@@ -45,6 +45,6 @@ class Certificate:
 
     @classmethod
     def unknown(cls) -> Certificate:
-        """A certificate that promises nothing."""
+        """A certificate without any figures."""
         nan = float("nan")
         return cls(nan, nan, nan, nan, nan, nan, nan, nan, nan, 0, 0, 0)

@@ -1,8 +1,8 @@
-"""How wrong the force on a tip may be, said along with it.
+"""Error estimate of the force on a tip.
 
-What separates the felt compliance from the true one is smoothing, which differs from place to
-place and is known, and what the interpolation between load positions leaves, which does not and is
-not. The estimate of the relative error at a place s is
+The compliance that a contact step uses differs from the true one by smoothing, which varies from
+place to place and is known, and by the error of interpolation between load positions, taken as
+uniform. The estimate of the relative error at a place s is
 
     e(s) = factor [ smoothing(s) + floor ],
 
@@ -44,16 +44,16 @@ class ForceError:
 def calibrated(smoothing: np.ndarray, error: np.ndarray) -> ForceError:
     """Factor and floor from unseen contacts, both (n,).
 
-    The floor is that under which the errors are most likely, were they exponential.
+    The floor maximises the likelihood of exponentially distributed errors.
     """
     n = len(error)
     if n == 0:
         return ForceError()
 
-    def surprise(floor: float) -> float:
+    def negative_log_likelihood(floor: float) -> float:
         scale = smoothing + floor
         return float(np.log(np.mean(error / scale)) + np.mean(np.log(scale)))
 
-    floor = float(min(_FLOORS, key=surprise))
+    floor = float(min(_FLOORS, key=negative_log_likelihood))
     rank = min(int(np.ceil(COVERED * (n + 1))), n)
     return ForceError(float(np.sort(error / (smoothing + floor))[rank - 1]), floor)

@@ -12,8 +12,9 @@ linear response: low rank far away, exact near the patch. They hold up to a_max(
 continue tangentially. As stress is proportional to Young's modulus, V_k and beta_k do not depend on
 it.
 
-Only the response of a tip to itself bends: the way from one tip to another, and a force across the
-normal, stay linear. What that costs is measured by :mod:`avatar_core.offline.certify.combinations`.
+Only the response of a patch to its own normal force is nonlinear; coupling between patches and
+forces along the surface stay linear. :mod:`avatar_core.offline.certify.combinations` measures the
+error of that.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The organ as a body: its mass and its weight, as the modes of a vademecum see them.
+"""Mass and weight of the organ, projected onto the modes of a vademecum.
 
-Modes that PGD finds for touches at the surface serve a force in the bulk badly (some 3 %), and free
-vibration worse (7 % in the fifth frequency). N_BODY functions of their own are therefore kept
-beside them: the sag under gravity along x, y and z, and the slowest modes of free vibration,
+PGD modes of loads at the surface represent body forces with an error of some 3 % and free vibration
+with 7 % in the fifth frequency. N_BODY functions are therefore added to them: the sag under gravity
+along x, y and z, and the slowest modes of free vibration,
 
     K phi = omega^2 rho M phi,
 
@@ -23,17 +23,17 @@ from avatar_core.fem.norms import require_orthonormal
 
 N_VIBRATIONS = 6
 N_BODY = 3 + N_VIBRATIONS
-LEAST_MODES = 4 * N_BODY  # with fewer, touches need them all
-_DEPENDENT = 1e-6  # part of a body function's energy below which the other modes hold it already
+LEAST_MODES = 4 * N_BODY  # with fewer, surface loads need them all
+_DEPENDENT = 1e-6  # part of a body function's energy below which the modes already represent it
 _EIGEN_TOLERANCE = 1e-6  # of the slowest vibrations
 
 
 @dataclass(frozen=True, eq=False)
 class BodyResponse:
-    """What K-orthonormal modes X have of the organ's mass.
+    """Mass and weight of the organ, projected onto K-orthonormal modes X.
 
     mass : ndarray, shape (rank, rank), X^T M X for a unit density [s^2 m^3 / kg]
-    weight : ndarray, shape (rank, 3), X^T M e_d, the modes' share of a body force [m^3.5 ...]
+    weight : ndarray, shape (rank, 3), X^T M e_d, a uniform body force on each mode [m^3.5 ...]
     """
 
     mass: np.ndarray
@@ -70,10 +70,10 @@ def body_functions(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
         If the eigenvalue solver does not converge or the functions are not orthonormal.
     """
     mass = sp.kron(elasticity.mass, sp.identity(3), format="csr")
-    pull = mass @ np.tile(np.eye(3), (elasticity.n_nodes, 1))
-    sag = elasticity.solve(pull)
-    swing, rate = _vibrations(elasticity, mass)
-    functions, forces = np.hstack([sag, swing]), np.hstack([pull, (mass @ swing) * rate])
+    weight = mass @ np.tile(np.eye(3), (elasticity.n_nodes, 1))
+    sag = elasticity.solve(weight)
+    vibration, rate = _vibrations(elasticity, mass)
+    functions, forces = np.hstack([sag, vibration]), np.hstack([weight, (mass @ vibration) * rate])
     size = np.sqrt(np.einsum("xk,xk->k", functions, forces))
     functions, forces = functions / size, forces / size
     held = space.T @ forces
@@ -108,9 +108,9 @@ def _vibrations(elasticity: Elasticity, mass: sp.csr_matrix) -> tuple[np.ndarray
         raise ConvergenceError(
             f"the slowest vibrations were not found ({error}); check the mesh for slivers"
         ) from error
-    swing = np.zeros((mass.shape[0], N_VIBRATIONS))
-    swing[free] = vector
-    return swing, rate
+    vibration = np.zeros((mass.shape[0], N_VIBRATIONS))
+    vibration[free] = vector
+    return vibration, rate
 
 
 def completed(body: BodyResponse, kept: np.ndarray) -> np.ndarray:

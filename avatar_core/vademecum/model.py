@@ -1,4 +1,4 @@
-"""The computational vademecum: an organ's response to a touch anywhere, ready to be looked up.
+"""The computational vademecum: an organ's precomputed response to a load anywhere on its surface.
 
 u(x, s) = far field (separated, low rank) + near field (exact, sparse). The contact compliance
 C(s, s'), the patch-averaged displacement at s per patch force at s', is the Galerkin one of the
@@ -35,7 +35,7 @@ class Provenance:
     unit, axes : as applied at the door
     versions : "package version" of everything that took part
     parameters : "name=value" of the build
-    notices : what the reader of the surface had to say
+    notices : of the reader of the surface and of the build
     """
 
     source: str
@@ -74,7 +74,7 @@ class Convergence:
 
 @dataclass(frozen=True)
 class VademecumInfo:
-    """What is announced of a vademecum; the fields of avatar_ros/msg/VademecumInfo."""
+    """Summary of a vademecum; the fields of avatar_ros/msg/VademecumInfo."""
 
     id: str
     name: str
@@ -257,11 +257,11 @@ class Vademecum:
         return self.compliance(here.positions, here.weights, there.positions, there.weights)
 
     def with_certificate(self, certificate: Certificate) -> Vademecum:
-        """The same vademecum carrying how wrong it may be."""
+        """The same vademecum with a certificate of its errors."""
         return replace(self, certificate=certificate)
 
     def with_large_certificate(self, certificate: LargeCertificate) -> Vademecum:
-        """The same vademecum carrying how wrong its large deformation may be."""
+        """The same vademecum with a certificate of its errors at large deformation."""
         assert self.large is not None
         return replace(self, large=replace(self.large, certificate=certificate))
 
@@ -276,7 +276,7 @@ class Vademecum:
         return np.searchsorted(self.mesh.surface_vertices, self.mesh.boundary_faces)
 
     def info(self) -> VademecumInfo:
-        """The announcement."""
+        """The summary."""
         c = self.certificate or Certificate.unknown()
         return VademecumInfo(
             id=self.id,

@@ -7,8 +7,8 @@ Offline, one space basis V serves the whole range. Online, values p give the Gal
 which is K(p)-orthonormal as any far field of this project is, so that what remains of the contact
 compliance, C(p) - Y Y^T, is positive semi-definite. It is kept at the nodes of the range
 (:mod:`avatar_core.reduction.coordinates`) and combined with weights that are not negative: positive
-semi-definite again. The modes are sorted by what they are worth in displacement at p, and the
-first of them are used. The result is an ordinary Vademecum, so that a step costs what it costs
+semi-definite again. The modes are sorted by their displacement norm at p, and the first of them are
+used. The result is an ordinary Vademecum, so that a step costs what it costs
 without coordinates.
 """
 
@@ -27,7 +27,7 @@ from avatar_core.vademecum.modal_mass import N_BODY, BodyResponse, completed
 
 @dataclass(frozen=True, eq=False)
 class ParametricResponse:
-    """What the coordinates of a vademecum need beside its own fields.
+    """The data of a vademecum's coordinates, beside its own fields.
 
     coordinates : at least one
     basis : SeparatedField, V at the vertices (3 n_vertices, n) and V^T f (3 n_positions, n)
@@ -57,7 +57,7 @@ def galerkin_field(
     rank: int,
     body: BodyResponse | None,
 ) -> tuple[SeparatedField, BodyResponse | None]:
-    """The K(p)-orthonormal response in a space: the modes worth most, then the body's own.
+    """The K(p)-orthonormal response in a space: modes by displacement norm, then body functions.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def galerkin_field(
     operators, factors : A_q and theta_q(p)
     mass : ndarray, shape (3 n_vertices,), lumped
     rank : modes in all
-    body : of the basis; None for modes of touches alone
+    body : of the basis; None for modes of surface loads alone
     """
     stiffness = np.tensordot(factors, operators, axes=1)
     root = np.linalg.cholesky((stiffness + stiffness.T) / 2.0)

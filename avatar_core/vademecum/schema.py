@@ -1,4 +1,4 @@
-"""The arrays of a vademecum file, and what holds of them before compiled code may use them."""
+"""The arrays of a vademecum file, and their checks before compiled code uses them."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ PARAMETRIC_KEYS = tuple(_PARAMETRIC)
 PARAMETRIC_BODY_KEYS = tuple(_PARAMETRIC_BODY)
 LARGE_KEYS = tuple(_LARGE)
 
-# Each is there as a whole or not at all, by its first key.
+# Each is present or absent as a whole; its first key decides.
 _PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE)
 
 
@@ -81,7 +81,7 @@ def shapes_of(held: Container[str]) -> dict[str, str]:
 
 
 def require_sound(arrays: Arrays) -> None:
-    """Check shapes, indices and lengths, so that compiled code cannot go astray.
+    """Check shapes, indices and lengths, so that compiled code stays within bounds.
 
     Raises
     ------

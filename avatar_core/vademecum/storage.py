@@ -22,7 +22,7 @@ the JSON attributes ``coordinates``, ``contrast``, and
     parametric/operators (n_terms, n, n) parametric/rank, parametric/young_modulus [Pa]
     parametric/near, parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N]
 
-one that knows the organ's mass (from schema 2.1) body/mass (rank, rank) and body/weight (rank, 3),
+one with the organ's mass (from schema 2.1) body/mass (rank, rank) and body/weight (rank, 3),
 and the same under parametric/body for that basis; one with large deformation the JSON attribute
 ``large`` (material, certificate) and, for k = 2, 3,
 
@@ -124,7 +124,7 @@ def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
     Parameters
     ----------
     content : the bytes of a vademecum file
-    origin : what messages call it
+    origin : its name in messages
     """
     if len(content) > MAX_FILE_BYTES:
         raise StorageError(f"{origin} has {len(content) >> 20} MiB, more than a vademecum may have")
@@ -132,7 +132,7 @@ def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
 
 
 def is_vademecum(path: str | Path) -> bool:
-    """Whether a path is an ordinary file that calls itself a vademecum; nothing else is read."""
+    """Whether a path is a regular HDF5 file of the format of vademecums; no more is read."""
     return format_of(Path(path), MAX_FILE_BYTES) == FORMAT
 
 

@@ -1,14 +1,14 @@
-"""The geometry that a tool tip feels: a smooth distance to the organ, and where it may touch.
+"""The contact geometry of a tool tip: a smooth distance to the organ, and where it may touch.
 
 phi(p) is the signed distance from p to the closest point of the organ's faces (negative inside),
 chi(p) is one where that point is accessible and fades to zero beyond. Both are sampled on a grid
 and evaluated by quadratic B-splines, whose second derivatives are bounded: a force made of them
 never jumps.
 
-A tip presses through a patch of radius R, so that shape much finer than R is not felt, and the
-corners of a coarse mesh should not be: phi is smoothed with the kernel 2 G - G * G, G a Gaussian
-of standard deviation 0.4 R, which keeps planes and curved sides where they are (its error is of
-fourth order) and rounds edges over about that.
+A tip presses through a patch of radius R: shape much finer than R does not change the force, and
+the corners of a coarse mesh should not either. phi is therefore smoothed with the kernel
+2 G - G * G, G a Gaussian of standard deviation 0.4 R, which leaves planes and curved sides in place
+(its error is of fourth order) and rounds edges over about that.
 """
 
 from __future__ import annotations

@@ -1,3 +1,3 @@
-"""How wrong a vademecum is. A vademecum and the finite element problem it was built from come in;
+"""Errors of a vademecum. A vademecum and the finite element problem it was built from come in;
 relative errors on loads that the build never saw go out, and the time that a step takes.
 """

@@ -1,4 +1,4 @@
-"""The errors of an accuracy curve: the displacement as it would be shown, on unseen loads."""
+"""The errors of an accuracy curve: the displayed displacement on unseen loads."""
 
 from __future__ import annotations
 

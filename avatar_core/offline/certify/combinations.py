@@ -1,7 +1,8 @@
-"""Large pushes together with other effects: how wrong it is to add what does not superpose.
+"""Large pushes together with other effects: the error of superposing them linearly.
 
-Only the answer of a tip to itself bends; oblique forces, other tips and preloads are added
-linearly. Each is compared with full nonlinear finite elements under the same motion of the patch:
+Only the response of a patch to its own normal force is nonlinear; oblique forces, other tips and
+preloads are superposed. Each is compared with full nonlinear finite elements under the same motion
+of the patch:
 
     oblique   30 degrees off the normal
     two tools 40 mm apart, pushed to the same depth together

@@ -1,8 +1,8 @@
-"""How wrong a vademecum with large deformation is, on pushes that it has never seen.
+"""Errors of a vademecum with large deformation on unseen pushes.
 
 The truth is the full nonlinear finite element solution on the same mesh, by Newton's method, for
-patches centred at face centroids, pushed along the inward normal to depths that no part of the
-build knows.
+patches centred at face centroids, pushed along the inward normal to depths that the build does not
+use.
 """
 
 from __future__ import annotations

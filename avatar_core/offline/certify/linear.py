@@ -1,4 +1,4 @@
-"""How wrong a vademecum is, on loads that it has never seen, and what it cost.
+"""Errors of a vademecum on unseen loads, and the cost of its build.
 
 The truth is the full finite element solution on the same mesh. Loads are patches centred at face
 centroids, which no part of the build uses, in three directions. The force on a tip is compared

@@ -1,4 +1,4 @@
-"""Contacts that no part of a build has seen: tips anywhere over the accessible faces."""
+"""Contacts that a build does not use: tips anywhere over the accessible faces."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 HEIGHTS = (0.0, 6e-3)  # of a tip's centre above the surface, pressed in or just touching [m]
 _OPEN = 0.999  # access from which a tip may touch without the force fading
-_WAY = np.linspace(1 / 3, 7 / 3, 8)  # heights above a tip in which it comes in [HEIGHTS[1]]
+_WAY = np.linspace(1 / 3, 7 / 3, 8)  # heights above a tip along its approach [HEIGHTS[1]]
 _BATCH = 40  # patches solved at once
 MAX_DRAWS = 1000  # for one contact, on average; on livers most draws succeed
 
 
 @dataclass(frozen=True, eq=False)
 class UnseenContacts:
-    """Tips and what they touch, each (n, 3).
+    """Tips and the points that they touch, each (n, 3).
 
     tip : centre of the sphere [m]; place : closest point of the faces [m]; normal : that the step
     presses along
@@ -80,7 +80,7 @@ def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
             continue
         _at(field, field.distance, tip, gradient)
         normal = gradient / np.linalg.norm(gradient)
-        if _is_barred(field, tip, normal):
+        if _is_obstructed(field, tip, normal):
             continue
         tips[found], normals[found] = tip, normal
         found += 1
@@ -88,7 +88,7 @@ def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
     return UnseenContacts(tips, np.ascontiguousarray(place), normals)
 
 
-def _is_barred(field: TipField, tip: np.ndarray, normal: np.ndarray) -> bool:
+def _is_obstructed(field: TipField, tip: np.ndarray, normal: np.ndarray) -> bool:
     """Whether the organ itself is in the way of a tip along its normal."""
     way = tip + HEIGHTS[1] * np.outer(_WAY, normal)
     slope = np.zeros(3)
