@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +15,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.framework import qos
 from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
-from avatar_ros.nodes.contact import ContactNode
+from avatar_ros.nodes.contact_reports import log_shown_modes
 from avatar_ros.prepare.budget_requests import BudgetRequests
 from avatar_ros.prepare.detail_chooser import DetailChooser
 from avatar_ros.prepare.model_spec import model_spec
@@ -58,9 +57,8 @@ def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> 
 def test_the_log_names_modes_left_out_and_taken_back(probe: Probe) -> None:
     """At two severities, which rclpy does not let one line of code have."""
     node = SimpleNamespace(get_logger=probe.node.get_logger)
-    said: Callable[[Any, ShownModesReport], None] = ContactNode._log_shown_modes
     for shedding in (True, False, True):
-        said(node, ShownModesReport("modes", shedding, changed=True))
+        log_shown_modes(node, ShownModesReport("modes", shedding, changed=True))
 
 
 def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> None:

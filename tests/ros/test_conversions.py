@@ -10,11 +10,11 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.framework.conversions import (
+from avatar_ros.framework.state_template import StateTemplate
+from avatar_ros.framework.templates import (
     CloudTemplate,
     PoseReader,
     PoseTemplate,
-    StateTemplate,
     WrenchReader,
     WrenchTemplate,
     stamp_bytes,

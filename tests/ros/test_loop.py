@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 import rclpy
-from avatar_ros.framework.conversions import WrenchTemplate, rotation_between, stamp_bytes
+from avatar_ros.framework.templates import WrenchTemplate, rotation_between, stamp_bytes
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop
 from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.loop.tool_channel import OK

@@ -20,9 +20,9 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 import rclpy
-from avatar_ros.framework.conversions import (
+from avatar_ros.framework.state_template import StateTemplate
+from avatar_ros.framework.templates import (
     PoseReader,
-    StateTemplate,
     stamp_bytes,
     stamp_nanoseconds,
 )

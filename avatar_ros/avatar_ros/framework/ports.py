@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
@@ -34,6 +35,23 @@ POLICIES = (
 
 
 _MOST_TOLD = 100  # lines; then diagnostics alone tell
+
+
+class PolledSubscriptions(CallbackGroup):
+    """A callback group that no executor serves: the loop takes the messages itself.
+
+    An executor that waited for events of these subscriptions would wake up with every pose and
+    delay the loop.
+    """
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
 
 
 class Ports:

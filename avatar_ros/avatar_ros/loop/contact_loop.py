@@ -1,13 +1,14 @@
-"""The loop of the contact node: a thread that waits for a pose, steps, publishes; nothing else.
+"""The loop of the contact node: a thread that waits for a pose, steps and publishes.
 
-It never waits for anything but poses, and never raises but once, when it ends. The node exchanges
-two references, whole: the model in use and the record of times.
+It waits for nothing but poses. An exception ends it, with a last wrench of zero. The node exchanges
+two references with it: the model in use and the record of times.
 
-A model that replaces another is faded in over ``BLEND`` seconds, during which the loop steps both:
-what is published changes per period by its share of the difference, beside what motion does.
+When a model replaces another, the loop steps both for ``BLEND`` seconds and publishes a mean of
+both whose weight moves linearly from the old model to the new one.
 
-What the organ answers goes through a guard (:mod:`avatar_core.contact.haptics.force_guard`) to each
-tool: limits, a ramp to none on a fault, a soft return. To stop is a fault as well.
+Before the organ's force is sent to a tool, a guard
+(:mod:`avatar_core.contact.haptics.force_guard`) limits it, fades it out on a fault and lets it come
+back gradually. Stopping the loop counts as a fault.
 """
 
 from __future__ import annotations
@@ -19,17 +20,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 from avatar_core.contact import model as contact
 from avatar_core.contact.haptics import passivity
 from avatar_core.contact.haptics.force_guard import ForceGuard
 from avatar_ros.framework import realtime
-from avatar_ros.framework.conversions import (
+from avatar_ros.framework.state_template import StateTemplate
+from avatar_ros.framework.templates import (
     NO_STAMP,
     CloudTemplate,
-    StateTemplate,
     stamp_nanoseconds,
 )
 from avatar_ros.loop.settings import ContactSettings
@@ -48,26 +48,10 @@ _SHORTEST_PERIOD = 0.5  # periods between two answers to poses, however fast the
 _NO_ERROR = float("nan")  # of a force that no model gave
 
 
-class PolledSubscriptions(CallbackGroup):
-    """For subscriptions that the loop takes from itself: no executor ever touches them.
-
-    Nor their events: one that waits for these is woken by every pose, and holds up the loop.
-    """
-
-    def can_execute(self, entity: Any) -> bool:
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        pass
-
-
 class ActiveModel:
-    """A contact model and the messages that have its size: exchanged as one.
+    """A contact model with the message templates of its size; the loop exchanges them as one.
 
-    effects : that are in it, by name
+    effects : names of the effects that it simulates
     shown_modes : which of its modes are shown, and the accuracy promised with them
     """
 
@@ -95,7 +79,7 @@ class ActiveModel:
 
 @dataclass
 class Publishers:
-    """Publishers of what concerns all tools."""
+    """Publishers of the topics that all tools share."""
 
     state: Any
     deformation: Any
@@ -106,11 +90,11 @@ class Publishers:
 class ContactLoop:
     """Answers every pose at once, and keeps its period when none comes.
 
-    online : what is simulated; exchange it when ``is_changing`` is false, for a smooth change
-    record : where times go; exchange it at any time
-    failure : what ended the loop before ``stop``, else empty
+    active : the model in use; exchange it while ``is_changing`` is false, for a smooth change
+    record : of the times; exchange it at any time
+    failure : the exception that ended the loop; empty otherwise
     guards : of the force on each tool
-    energies : of the loop and hold, by tool; None where nothing keeps account
+    energies : of each tool; None unless ``safety.passivity`` asks for them
     """
 
     def __init__(
@@ -148,18 +132,19 @@ class ContactLoop:
 
     @property
     def is_changing(self) -> bool:
-        """Whether the loop still steps a model that was replaced, or is yet to see the new one."""
+        """Whether the loop still steps a replaced model, or has not seen the new one yet."""
         changing = self._outgoing is not None or self._used is not self.active
         return self._running and not self.failure and changing
 
     def start(self, cpu: int = -1) -> None:
+        """Start the thread, bound to a core; -1: any."""
         self._running, self._stopping = True, False
         self._used, self._outgoing = self.active, None
         self._thread = threading.Thread(target=self._run, args=(cpu,), name="contact loop")
         self._thread.start()
 
     def stop(self) -> None:
-        """Returns when all forces have faded out and the last step is over, within 20 ms."""
+        """End the thread; returns when all forces have faded out, within 20 ms."""
         self._stopping = True
         if self._thread is not None:
             self._thread.join()
@@ -187,7 +172,7 @@ class ContactLoop:
         return [*of_tools, self._publishers.state, self._publishers.deformation]
 
     def _wait(self) -> None:
-        """Until a pose came, or until this period must not wait any longer."""
+        """Wait for a pose, at most until the step is due. Real-time safe."""
         realtime.sleep_until(self._answered + round(_SHORTEST_PERIOD * self._period))
         wait_set = self._wait_set
         wait_set.clear_entities()
@@ -196,6 +181,7 @@ class ContactLoop:
         wait_set.wait(max(0, self._due - time.monotonic_ns()))
 
     def _step(self) -> None:
+        """Take poses, solve, and publish wrenches, states and the cloud. Real-time safe."""
         start = time.monotonic_ns()
         settings, active, record = self.settings, self.active, self.record
         timeout = round(settings.pose_timeout * 1e9)
@@ -242,7 +228,10 @@ class ContactLoop:
             self._outgoing = None  # whoever exchanged the model frees it, outside the loop
 
     def _begin_change(self, active: ActiveModel) -> None:
-        """Go on with another model; the one before fades out, on the same organ in its contacts."""
+        """Begin to fade in another model, from the same contacts if the organ is the same.
+
+        Real-time safe.
+        """
         outgoing = self._used.model
         if outgoing is not None:
             self._blend = 0.0
@@ -251,19 +240,20 @@ class ContactLoop:
         self._outgoing, self._used = outgoing, active
 
     def _solve(self, model: Any) -> None:
+        """Forces at the tips of the moment. Real-time safe."""
         if model.effects.friction is not None:
             model.effects.friction.spin[:] = self._rotations
         contact.solve(model, self._tips)
 
     def _next_due(self, start: int, fresh: bool) -> int:
-        """When to step even without a pose: later if one is expected, else in a fixed rhythm."""
+        """When to step without a pose; later if one is expected. Real-time safe."""
         if fresh:
             return start + round(_LONGEST_WAIT * self._period)
         due = self._due + self._period
         return due if due > start else start + self._period
 
     def _publish_wrenches(self, now: float, model: Any) -> None:
-        """What the organ answers, as far as it is safe; none without a model or a pose."""
+        """Send the guarded forces; zero without a model or a pose. Real-time safe."""
         limits, energies = self.settings.safety.limits, self.energies
         self._forces[:] = 0.0 if model is None else model.out.force
         if energies is not None:
@@ -281,13 +271,14 @@ class ContactLoop:
             tool.answer()
 
     def _send_zero(self) -> None:
-        """After a failure: a last wrench of zero to every tool."""
+        """Send a last wrench of zero to every tool, after a failure."""
         for tool in self._tools:
             tool.wrench.force[:] = 0.0
             tool.wrench.torque[:] = 0.0
             tool.answer()
 
     def _publish_state(self, i: int, tool: ToolChannel, active: ActiveModel) -> None:
+        """Send the status and the contacts of one tool. Real-time safe."""
         template = active.states[i]
         guard = self.guards[i]
         status = tool.status
@@ -311,9 +302,9 @@ class ContactLoop:
 
 
 def _fade_in(new: np.ndarray, old: np.ndarray, blend: float) -> None:
-    """``new`` becomes part of itself and the rest of ``old``, which is used up: no array is made.
+    """``new`` becomes ``blend * new + (1 - blend) * old``; overwrites ``old``. Real-time safe.
 
-    Both are written anew by the next step.
+    The next step computes both again.
     """
     new *= blend
     old *= 1.0 - blend
@@ -321,7 +312,7 @@ def _fade_in(new: np.ndarray, old: np.ndarray, blend: float) -> None:
 
 
 def _write_contacts(template: StateTemplate, out: Any, tool: int) -> int:
-    """Copy a tool's contacts into its message; returns their number."""
+    """Copy a tool's contacts into its message; returns their number. Real-time safe."""
     total = int(out.n_contacts[0])
     if total == 0:
         return 0

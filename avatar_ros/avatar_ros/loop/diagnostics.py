@@ -11,52 +11,11 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from avatar_core.contact.haptics.force_guard import ForceGuard
 from avatar_core.contact.haptics.passivity import Passivity
-from avatar_ros.framework.parameters import Parameter
+from avatar_ros.loop.statuses import explanation
 from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.msg import ContactState, LoopStatistics
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-
-
-def _threshold(name: str, warn: float, error: float, what: str) -> tuple[Parameter, Parameter]:
-    return (
-        Parameter(f"diagnostics.{name}.warn", warn, f"{what}: warning", (0.0, 1e6), False),
-        Parameter(f"diagnostics.{name}.error", error, f"{what}: error", (0.0, 1e6), False),
-    )
-
-
-# The first two as ros2_control's controller manager has them.
-THRESHOLDS = (
-    *_threshold("periodicity.mean_error", 5.0, 10.0, "rate off the nominal one [Hz]"),
-    *_threshold("execution_time.mean", 1000.0, 2000.0, "mean time of a step with messages [us]"),
-    *_threshold("missed", 0.01, 0.05, "share of periods longer than 1.5 nominal ones"),
-)
-
-_REASONS = {
-    ContactState.STATUS_OK: ("sound", ""),
-    ContactState.STATUS_NO_POSE: ("no pose yet", "start the tool's driver"),
-    ContactState.STATUS_STALE_POSE: (
-        "its poses ceased",
-        "look at the driver and the network, or give a longer pose_timeout",
-    ),
-    ContactState.STATUS_INVALID_POSE: (
-        "a pose is not finite, has stamp 0, or is not a rotation",
-        "look at the driver",
-    ),
-    ContactState.STATUS_UNKNOWN_FRAME: (
-        "its poses are in another frame",
-        "give tool_frame and tool_transform, or publish in the organ's frame",
-    ),
-    ContactState.STATUS_LEAP: (
-        "its pose leapt",
-        "look at the driver, or give a larger safety.leap",
-    ),
-    ContactState.STATUS_SEVERAL_PUBLISHERS: (
-        "more than one node sends its poses",
-        "stop all but one",
-    ),
-    ContactState.STATUS_LOST_TOOL: ("no node sends its poses any more", "start its driver again"),
-}
 
 
 @dataclass(frozen=True)
@@ -72,10 +31,7 @@ class Faults:
         status = self.status
         if status == ContactState.STATUS_OK and self.counts:
             status = max(self.counts, key=lambda key: self.counts[key])
-        if status == ContactState.STATUS_OK:
-            return ""
-        cause, remedy = _REASONS.get(status, (f"status {status}", "see contact_state"))
-        return f"no force: {cause}; {remedy}"
+        return "" if status == ContactState.STATUS_OK else f"no force: {explanation(status)}"
 
 
 class FaultCounter:

@@ -10,8 +10,22 @@ from avatar_core.contact.layout import TIP_RADIUS_RANGE
 from avatar_core.vademecum.accuracy import Budget, Cloud, Quantity
 from avatar_ros.framework.parameters import AUTOSTART, FRAME_ID, Parameter, ParameterError
 from avatar_ros.framework.saved_state import STATE_DIR
-from avatar_ros.loop.diagnostics import THRESHOLDS
 from avatar_ros.loop.safety import SAFETY, Safety
+
+
+def _threshold(name: str, warn: float, error: float, what: str) -> tuple[Parameter, Parameter]:
+    return (
+        Parameter(f"diagnostics.{name}.warn", warn, f"{what}: warning", (0.0, 1e6), False),
+        Parameter(f"diagnostics.{name}.error", error, f"{what}: error", (0.0, 1e6), False),
+    )
+
+
+# The first two as ros2_control's controller manager has them.
+THRESHOLDS = (
+    *_threshold("periodicity.mean_error", 5.0, 10.0, "rate off the nominal one [Hz]"),
+    *_threshold("execution_time.mean", 1000.0, 2000.0, "mean time of a step with messages [us]"),
+    *_threshold("missed", 0.01, 0.05, "share of periods longer than 1.5 nominal ones"),
+)
 
 CONTACT = (
     AUTOSTART,

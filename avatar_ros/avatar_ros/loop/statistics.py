@@ -1,4 +1,4 @@
-"""Times of the contact loop: written by it, summed up once a second by the node."""
+"""Times of the contact loop: recorded by the loop, summarised once a second by the node."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from avatar_ros.msg import LoopStatistics
 
-LATE = 1.5  # a period this many times the nominal one counts as missed
+LATE = 1.5  # a period longer than this many nominal ones counts as missed
 
 
 class TimingRecord:
-    """Times of the steps since the record was begun [ns]; writing allocates nothing."""
+    """Times of the steps since its begin [ns]. Every ``note`` method is real-time safe."""
 
     CAPACITY = 4096
 
@@ -36,7 +36,7 @@ class TimingRecord:
             self.n_steps += 1
 
     def note_model(self, duration: int) -> None:
-        """Of the computation alone: forces and cloud, no message."""
+        """Time of the computation alone: forces and cloud, without messages."""
         if self.n_models < self.CAPACITY:
             self.models[self.n_models] = duration
             self.n_models += 1

@@ -1,4 +1,4 @@
-"""One tool of the contact loop: its poses, checked, and the force that goes back to it."""
+"""The channel between the contact loop and one tool: checked poses in, wrenches out."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ import math
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 
-from avatar_ros.framework.conversions import NO_STAMP, PoseReader, WrenchTemplate, rotation_between
+from avatar_ros.framework import qos
+from avatar_ros.framework.ports import PolledSubscriptions, Ports
+from avatar_ros.framework.templates import NO_STAMP, PoseReader, WrenchTemplate, rotation_between
 from avatar_ros.loop.safety import Safety
+from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.msg import ContactState
 
 OK = int(ContactState.STATUS_OK)
@@ -20,23 +23,23 @@ LEAP = int(ContactState.STATUS_LEAP)
 SEVERAL_PUBLISHERS = int(ContactState.STATUS_SEVERAL_PUBLISHERS)
 LOST_TOOL = int(ContactState.STATUS_LOST_TOOL)
 
-FAR_AWAY = 1e3  # where a tool without a pose is, for the step [m]
-_UNKNOWN = float("nan")  # and one whose last pose was broken: it may go on where it was
-_LEAP_INTERVAL = 2e-3  # between two poses, for which a leap is given [s]
-_TURNS = 500_000_000  # within which poses of several publishers take turns [ns]
-_NO_NUMBER = 2**64 - 1  # where the middleware does not count
+FAR_AWAY = 1e3  # position of a tool without a pose, for the step [m]
+_UNKNOWN = float("nan")  # position of a tool whose last pose was invalid: it may not have moved
+_LEAP_INTERVAL = 2e-3  # between two poses, to which ``leap`` refers [s]
+_ALTERNATION = 500_000_000  # within which messages of several publishers alternate [ns]
+_NO_NUMBER = 2**64 - 1  # of middleware that does not count messages
 _N_STATUS = 32
 
 
 class ToolChannel:
     """One tool's subscription, publisher and last pose.
 
-    Poses come in the frame of the tool, ``tip`` and ``turn`` of the step are in the organ's.
+    Poses come in the tool's frame; ``tip`` and ``turn`` of the step are in the organ's.
 
-    status : OK with a usable pose, otherwise why not
+    status : OK with a usable pose, otherwise the reason why there is none
     stamp : of the last valid pose, eight bytes; zero before the first
-    publishers : of its poses that are known, as the node last counted; a killed one stays a while
-    faults : how often each status was entered, by its number, since the node started
+    publishers : of its poses, as the node last counted them; one that was killed counts for a while
+    faults : how often each status was entered since the node started, by its number
     """
 
     def __init__(
@@ -59,18 +62,19 @@ class ToolChannel:
         self._last = np.full(3, FAR_AWAY)  # valid position, in the tool's frame [m]
         self._received = 0  # [ns]
         self._number = -1  # of the last message, as its publisher counts
-        self._went_back = -_TURNS  # when the numbers last did [ns]
+        self._last_decrease = -_ALTERNATION  # when the numbers last decreased [ns]
         self._several_until = 0  # [ns]
         self._orientation: tuple[float, float, float, float] | None = None  # of the last valid pose
 
     def take(
         self, now: int, timeout: int, tip: np.ndarray, turn: np.ndarray, leap: float = math.inf
     ) -> bool:
-        """Take the newest pose, if any, and place ``tip``; true if a usable one came.
+        """Take the newest pose, if any; true if a usable one came. Real-time safe.
 
-        ``turn`` is what it turned since the last valid one [rad]; zero after a gap.
-
-        now, timeout : [ns]; leap : way in 2 ms, in proportion for longer, that is a fault [m]
+        now, timeout : [ns]
+        tip : receives the position [m]
+        turn : receives the rotation vector since the last valid pose [rad]; zero after a gap
+        leap : distance in 2 ms, proportionally more in a longer interval, that is a fault [m]
         """
         turn[:] = 0.0
         taken = self.subscription.handle.take_message(PoseStamped, True)
@@ -88,7 +92,7 @@ class ToolChannel:
         return True
 
     def answer(self) -> None:
-        """Send the wrench, in the tool's frame; its force and torque are in the organ's."""
+        """Send ``wrench``, given in the organ's frame, in the tool's frame. Real-time safe."""
         if self._is_turned:
             for part in (self.wrench.force, self.wrench.torque):
                 np.dot(part, self._rotation, out=self._turned)  # R^T v
@@ -96,7 +100,7 @@ class ToolChannel:
         self.publisher.handle.publish_raw(self.wrench.serialise(self.stamp))
 
     def _judge(self, taken: Any, now: int, timeout: int, leap: float) -> int:
-        """The status after a message, or none."""
+        """The status after a message, or after none came. Real-time safe."""
         if taken is None:
             if self.status == NO_POSE or now - self._received <= timeout:
                 return self.status
@@ -112,22 +116,23 @@ class ToolChannel:
         self._last[:] = self._reader.position
         self._received = now
         self.stamp = self._reader.stamp
-        if late:  # of a pose that was good, only if the loop itself stood still meanwhile
+        if late:  # with a good pose before, only if the loop itself was held up
             return STALE_POSE if self.status == OK else OK
         return LEAP if leapt and self.status in (OK, LEAP, INVALID_POSE) else OK
 
     def _comes_from_several(self, info: Any, now: int) -> bool:
-        """Whether the numbers of the messages went back twice lately: once is a restart."""
+        """Whether message numbers decreased twice lately; once is a restart. Real-time safe."""
         number = info["publication_sequence_number"] if info else None
         if number is not None and number != _NO_NUMBER:
             if number <= self._number:
-                if now - self._went_back < _TURNS:
-                    self._several_until = now + _TURNS
-                self._went_back = now
+                if now - self._last_decrease < _ALTERNATION:
+                    self._several_until = now + _ALTERNATION
+                self._last_decrease = now
             self._number = number
         return now < self._several_until
 
     def _place(self, tip: np.ndarray, turn: np.ndarray) -> None:
+        """Transform the last pose into the organ's frame. Real-time safe."""
         tip[:] = self._last
         if self._orientation is not None:
             turn[:] = rotation_between(self._orientation, self._reader.orientation)
@@ -137,6 +142,33 @@ class ToolChannel:
                 part[:] = self._turned
         tip += self._origin
         self._orientation = self._reader.orientation
+
+
+def tool_channels(ports: Ports, settings: ContactSettings) -> list[ToolChannel]:
+    """The channels of all tools, whose messages the loop takes itself.
+
+    Raises
+    ------
+    ParameterError : an override of the quality of service has a value that is refused
+    """
+    period, polled = 1.0 / settings.rate, PolledSubscriptions()
+    return [
+        ToolChannel(
+            ports.subscription(
+                PoseStamped,
+                f"{name}/measured_cp",
+                lambda message: None,  # never called
+                qos.poses(period),
+                silent=True,
+                callback_group=polled,
+                raw=True,
+            ),
+            ports.publisher(WrenchStamped, f"{name}/spatial/servo_cf", qos.wrenches(period)),
+            settings.frame_id,
+            settings.safety,
+        )
+        for name in settings.tools
+    ]
 
 
 def _rotation(quaternion: tuple[float, ...]) -> np.ndarray:

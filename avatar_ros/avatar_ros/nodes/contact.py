@@ -1,16 +1,15 @@
 """The contact node: poses of tools in; force on each tool and deformation of the organ out.
 
-Three threads of control, each in its place:
+Three threads of control:
 
-- the loop (:mod:`avatar_ros.loop.contact_loop`, a thread): waits for a pose, steps, publishes.
-- the node (``ContactNode``, the main thread): parameters, transitions, statistics.
-- the handover (a process, and a thread that maps what it sends): brings a vademecum in, and
-  prepares it anew for another scene, material or budget.
+- the loop (:mod:`avatar_ros.loop.contact_loop`, a thread) waits for a pose, steps, publishes.
+- the node (``ContactNode``, the main thread) handles parameters, transitions and statistics.
+- the supplier (:mod:`avatar_ros.prepare.supplier`, a thread with a worker process) prepares the
+  model of a vademecum, and prepares it again for another scene, material or budget.
 """
 
 from __future__ import annotations
 
-import gc
 import math
 import threading
 import time
@@ -18,7 +17,6 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.parameter import Parameter
@@ -34,12 +32,10 @@ from avatar_ros.framework import qos, realtime
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
-from avatar_ros.loop import diagnostics
 from avatar_ros.loop.contact_loop import (
     BLEND,
     ActiveModel,
     ContactLoop,
-    PolledSubscriptions,
     Publishers,
 )
 from avatar_ros.loop.safety import SAFETY, chosen_safety
@@ -51,25 +47,26 @@ from avatar_ros.loop.settings import (
     chosen_budget,
     of_budget,
 )
-from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
-from avatar_ros.loop.statistics import TimingRecord, statistics
-from avatar_ros.loop.tool_channel import ToolChannel
+from avatar_ros.loop.shown_modes import ShownModes
+from avatar_ros.loop.statistics import TimingRecord
+from avatar_ros.loop.tool_channel import ToolChannel, tool_channels
 from avatar_ros.msg import ContactState, LoopStatistics
 from avatar_ros.nodes.contact_parameters import read_contact
+from avatar_ros.nodes.contact_reports import ContactReports
 from avatar_ros.prepare import scenes
 from avatar_ros.prepare.budget_requests import BudgetRequests
 from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedModel
 from avatar_ros.prepare.supplier import SUPERSEDED, ModelSupplier
 from avatar_ros.srv import LoadScene
 
-_STATISTICS_PERIOD = 1.0  # [s]
-_COUNT_PERIOD = 0.1  # from one count of the tools' publishers to the next [s]
+_REPORT_PERIOD = 1.0  # [s]
+_COUNT_PERIOD = 0.1  # between two counts of the tools' publishers [s]
 _BUDGET = ("accuracy.tolerance", "accuracy.quantity", "accuracy.deadline")
-_GRACE = 0.1  # a replaced model is kept for so long after the last step that uses it [s]
+_GRACE = 0.1  # for which a replaced model is kept after the last step that uses it [s]
 
 
 class ContactNode(ManagedNode):
-    """Parameters, transitions, statistics; the work is done by ``ContactLoop``."""
+    """Parameters, transitions and services; ``ContactLoop`` does the work."""
 
     def __init__(self) -> None:
         self._loop: ContactLoop | None = None
@@ -78,20 +75,18 @@ class ContactNode(ManagedNode):
         self._tools: list[ToolChannel] = []
         self._outputs: Publishers | None = None
         self._timers: list[Any] = []
-        self._faults: diagnostics.FaultCounter | None = None
-        self._said: dict[str, str] = {}  # of each tool's faults, last
         self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
         self._n_awaited = 0
         self._changing = threading.RLock()
         super().__init__("contact", CONTACT)
         self._state = SavedState(self, self._values((*CHANGEABLE, "scene"), []))
-        self._scene = self._go_on(self._state.load())  # YAML, in place of the parameter's
-        # As long as the node, and beside everything else: an answer may take a minute.
+        self._scene = self._restore(self._state.load())  # YAML, overrides the parameter
+        # Exists as long as the node; reentrant, because an answer may take a minute.
         self.create_service(
             LoadScene, "load_scene", self._load_scene, callback_group=ReentrantCallbackGroup()
         )
         self.add_on_set_parameters_callback(self._change_parameters)
-        self.add_post_set_parameters_callback(lambda changes: self._keep_state())
+        self.add_post_set_parameters_callback(lambda changes: self._save_state())
 
     @property
     def failure(self) -> str:
@@ -108,33 +103,15 @@ class ContactNode(ManagedNode):
         contact.warm_up(len(settings.tools))
         if settings.safety.passivity != "off":
             passivity.warm_up()
-        own, period = PolledSubscriptions(), 1.0 / settings.rate
-        self._tools = [
-            ToolChannel(
-                self.ports.subscription(
-                    PoseStamped,
-                    f"{name}/measured_cp",
-                    _never_called,
-                    qos.poses(period),
-                    silent=True,
-                    callback_group=own,
-                    raw=True,
-                ),
-                self.ports.publisher(
-                    WrenchStamped, f"{name}/spatial/servo_cf", qos.wrenches(period)
-                ),
-                settings.frame_id,
-                settings.safety,
-            )
-            for name in settings.tools
-        ]
+        period = 1.0 / settings.rate
+        self._tools = tool_channels(self.ports, settings)
         self._outputs = Publishers(
             self.ports.publisher(
                 ContactState, "contact_state", qos.states(len(self._tools), period)
             ),
             self.ports.publisher(PointCloud2, "deformation", qos.clouds(period)),
-            self.ports.publisher(LoopStatistics, "statistics", qos.reports(_STATISTICS_PERIOD)),
-            self.ports.publisher(DiagnosticArray, "/diagnostics", qos.reports(_STATISTICS_PERIOD)),
+            self.ports.publisher(LoopStatistics, "statistics", qos.reports(_REPORT_PERIOD)),
+            self.ports.publisher(DiagnosticArray, "/diagnostics", qos.reports(_REPORT_PERIOD)),
         )
         self._loop = ContactLoop(settings, self._tools, self._outputs, self.context)
         request = PreparationRequest(
@@ -155,21 +132,21 @@ class ContactNode(ManagedNode):
         self._budget = BudgetRequests(
             settings.budget, self._supplier.ask, self._grant_budget, self._refuse_budget
         )
-        self._keep_state()
+        self._save_state()
 
     def _settings(self) -> ContactSettings:
-        """Of parameters and kept scene; without that where it does not fit any more."""
+        """From the parameters and the saved scene, which is dropped if it does not fit any more."""
         try:
             return read_contact(self, self._scene)
         except ParameterError as error:
             if not self._scene:
                 raise
-            self.get_logger().error(f"the scene that was kept is not used: {error}")
+            self.get_logger().error(f"the saved scene is not used: {error}")
             self._scene = ""
             return read_contact(self)
 
     def activate(self) -> None:
-        assert self._loop is not None
+        assert self._loop is not None and self._outputs is not None
         settings = self._loop.settings
         granted = realtime.claim(settings.priority, settings.cpu, settings.lock_memory)
         for refusal in granted.refusals:
@@ -177,10 +154,10 @@ class ContactNode(ManagedNode):
         realtime.tune_interpreter()
         self._loop.record = TimingRecord(time.monotonic_ns())
         self._loop.start(granted.cpu)
-        self._faults = diagnostics.FaultCounter(self._tools)
+        reports = ContactReports(self, self._loop, self._tools, self._outputs, self.ports)
         self._timers = [
-            self.create_timer(_STATISTICS_PERIOD, self._publish_statistics),
-            self.create_timer(_COUNT_PERIOD, self._count_publishers),
+            self.create_timer(_REPORT_PERIOD, reports.publish),
+            self.create_timer(_COUNT_PERIOD, reports.count_publishers),
         ]
         limits = settings.safety.limits
         self.get_logger().info(
@@ -209,9 +186,9 @@ class ContactNode(ManagedNode):
         self._tools, self._outputs = [], None
 
     def _take_model(self, prepared: PreparedModel) -> None:
-        """In the handover's thread: put a model into use between two steps.
+        """Put a model into use between two steps; called in the supplier's thread.
 
-        Returns when it has replaced the one before entirely.
+        Returns once it has entirely replaced the one before.
         """
         loop = self._loop
         if loop is None:
@@ -234,7 +211,7 @@ class ContactNode(ManagedNode):
         del replaced  # frees its memory here, not in the loop
 
     def _take_times(self, curve: dict[str, Any]) -> None:
-        """In the handover's thread: promise the times of the model in use, measured since."""
+        """Promise the measured times of the model in use; called in the supplier's thread."""
         loop = self._loop
         if loop is not None and loop.active.shown_modes is not None:
             loop.active.shown_modes.set_times(AccuracyCurve.of_plain(curve))
@@ -248,7 +225,7 @@ class ContactNode(ManagedNode):
             if prepared.cloud_divisor is not None:
                 self._set_cloud_divisor(prepared.cloud_divisor)
             self._scene = self._supplier.scene if self._supplier is not None else ""
-            self._keep_state()
+            self._save_state()
             response.success = True
         except Exception as error:  # a service always answers; the text decides what is raised
             response.message = one_line(error)
@@ -257,19 +234,19 @@ class ContactNode(ManagedNode):
             response.effects = list(self._loop.active.effects)
         return response
 
-    def _go_on(self, kept: dict[str, Any]) -> str:
-        """Set parameters that were kept; the scene, if one was."""
+    def _restore(self, kept: dict[str, Any]) -> str:
+        """Set the saved parameters; returns the saved scene, or an empty string."""
         scene = str(kept.pop("scene", ""))
         for result in self.set_parameters([Parameter(n, value=v) for n, v in kept.items()]):
             if not result.successful:
-                self.get_logger().error(f"a value that was kept is not used: {result.reason}")
+                self.get_logger().error(f"a saved value is not used: {result.reason}")
         if scene or kept:
             named = [*sorted(kept), *(["the scene"] if scene else [])]
-            self.get_logger().info(f"goes on with {', '.join(named)} of the last run (state_dir)")
+            self.get_logger().info(f"continues with {', '.join(named)} of the last run (state_dir)")
         return scene
 
-    def _keep_state(self) -> None:
-        """For the next start: what is in force, of a budget the one that was granted."""
+    def _save_state(self) -> None:
+        """Save what is in force for the next start; of the budget, the one that was granted."""
         with self._changing:
             if self._budget is None:
                 return
@@ -279,11 +256,11 @@ class ContactNode(ManagedNode):
             self._state.save(now)
 
     def _set_cloud_divisor(self, divisor: int) -> None:
-        """A scene's own is in force from now on, and free to change."""
+        """Set the divisor of a scene as the parameter, which may change later."""
         self.set_parameters([Parameter("cloud_divisor", value=divisor)])
 
     async def _in_use(self, change: Change) -> PreparedModel:
-        """Wait until a change of the model is in use, while the executor goes on.
+        """Wait until a change of the model is in use, while the executor keeps running.
 
         Raises
         ------
@@ -310,10 +287,10 @@ class ContactNode(ManagedNode):
             self._n_awaited -= 1
 
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        """Type and range were checked; those that may change take effect with the next step.
+        """Apply changes whose type and range were checked, from the next step on.
 
-        A change of the material takes some tenths of a second, in the handover's process. Called
-        by the executor, and in the handover's thread where a refused budget is put back.
+        A change of the material takes some tenths of a second, in the worker process. Called by
+        the executor, and in the supplier's thread when a refused budget is reset.
         """
         with self._changing:
             return self._change(changes)
@@ -341,14 +318,14 @@ class ContactNode(ManagedNode):
                 material[name] = change.value
         changed = {p.name: p.value for p in changes if hasattr(loop.settings, p.name)}
         if material != settings.material and self._supplier is not None:
-            self._supplier.ask({"material": material}, self._note_material)
+            self._supplier.ask({"material": material}, self._log_refused_material)
         if self._budget is not None:
             self._budget.ask(budget)
         loop.settings = replace(settings, **changed, material=material, safety=safety)
         return SetParametersResult(successful=True)
 
     def _values(self, names: tuple[str, ...], changes: list[Parameter]) -> dict[str, Any]:
-        """Of some parameters, after changes."""
+        """Values of some parameters after changes."""
         value = {name: self.get_parameter(name).value for name in names}
         return value | {p.name: p.value for p in changes if p.name in value}
 
@@ -356,19 +333,19 @@ class ContactNode(ManagedNode):
         loop = self._loop
         if loop is not None and loop.active.shown_modes is not None:
             loop.active.shown_modes.set_deadline(_deadline(budget))
-        self._keep_state()
+        self._save_state()
 
     def _refuse_budget(self, kept: Budget | None, refusal: str) -> None:
         self.get_logger().error(f"budget refused: {refusal}")
         values = of_budget(kept)
         self.set_parameters([Parameter(name, value=value) for name, value in values.items()])
 
-    def _note_material(self, prepared: PreparedModel | None, refusal: str) -> None:
+    def _log_refused_material(self, prepared: PreparedModel | None, refusal: str) -> None:
         if refusal and refusal != SUPERSEDED:
             self.get_logger().error(f"material refused: {refusal}")
 
     def _refusal_of(self, name: str, value: float) -> str:
-        """Why the vademecum in use does not have a value of the material; empty if it has."""
+        """Why a value of the material lies outside the vademecum in use; empty if it does not."""
         if value == 0.0 or name == "young" or self._ranges is None:
             return ""
         if name not in self._ranges:
@@ -376,76 +353,9 @@ class ContactNode(ManagedNode):
         low, high = self._ranges[name]
         return "" if low <= value <= high else f"the vademecum holds {low:g} to {high:g}"
 
-    def _publish_statistics(self) -> None:
-        loop, publishers = self._loop, self._outputs
-        if loop is None or publishers is None:
-            return
-        end = time.monotonic_ns()
-        record, loop.record = loop.record, TimingRecord(end)
-        message = statistics(record, end, loop.settings.rate)
-        message.header.stamp = self.get_clock().now().to_msg()
-        shown_modes = loop.active.shown_modes
-        report = shown_modes.update(message) if shown_modes is not None else None
-        publishers.statistics.publish(message)
-        self._publish_diagnostics(loop, message, report)
-        gc.collect()
-
-    def _publish_diagnostics(
-        self, loop: ContactLoop, window: LoopStatistics, report: ShownModesReport | None
-    ) -> None:
-        assert self._outputs is not None and self._faults is not None
-        name, active = self.get_name(), loop.active
-        limits = {p.name: self.get_parameter(p.name).value for p in diagnostics.THRESHOLDS}
-        promise = active.shown_modes.promise if active.shown_modes is not None else ""
-        statuses = [
-            diagnostics.loop_status(name, window, loop.settings.rate, limits),
-            diagnostics.vademecum_status(name, active.id, promise),
-            diagnostics.qos_status(name, self.ports.mismatches()),
-        ]
-        if report is not None:
-            self._log_shown_modes(report)
-            statuses.append(diagnostics.accuracy_status(name, report.text, report.shedding, window))
-        for i, faults in enumerate(self._faults.window()):
-            tool_name = loop.settings.tools[i]
-            self._log_fault(tool_name, faults.text)
-            statuses.append(
-                diagnostics.tool_status(
-                    name, tool_name, self._tools[i], loop.guards[i], faults, loop.energies, i
-                )
-            )
-        message = DiagnosticArray(status=statuses)
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._outputs.diagnostics.publish(message)
-
-    def _log_shown_modes(self, report: ShownModesReport) -> None:
-        """Of modes that were left out or taken back: a line when it changes."""
-        if not report.changed:
-            return
-        if report.shedding:
-            self.get_logger().warning(report.text)
-        else:  # on a line of its own: rclpy allows a line of code but one severity
-            self.get_logger().info(report.text)
-
-    def _log_fault(self, tool: str, text: str) -> None:
-        """A line when a tool's fault is another than a window ago."""
-        if text != self._said.get(tool, ""):
-            self._said[tool] = text
-            if text:
-                self.get_logger().warning(f"{tool}: {text}")
-            else:
-                self.get_logger().info(f"{tool}: poses are sound again")
-
-    def _count_publishers(self) -> None:
-        for tool in self._tools:
-            tool.publishers = tool.subscription.get_publisher_count()
-
 
 def _deadline(budget: Budget | None) -> float:
     return budget.deadline if budget else math.inf
-
-
-def _never_called(message: bytes) -> None:
-    """The loop takes poses itself."""
 
 
 def main() -> int:

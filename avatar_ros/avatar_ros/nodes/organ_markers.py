@@ -9,9 +9,10 @@ from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
 from avatar_ros.framework import qos
-from avatar_ros.framework.conversions import NO_STAMP, mesh_arrays
+from avatar_ros.framework.conversions import mesh_arrays
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import AUTOSTART, Parameter
+from avatar_ros.framework.templates import NO_STAMP
 from avatar_ros.msg import VademecumInfo
 from avatar_ros.ui.colours import colours
 from avatar_ros.ui.display import NewestCloud, TriangleTemplate

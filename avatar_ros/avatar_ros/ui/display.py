@@ -18,7 +18,8 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
 from avatar_ros.framework import qos
-from avatar_ros.framework.conversions import (
+from avatar_ros.framework.ports import PolledSubscriptions
+from avatar_ros.framework.templates import (
     NO_STAMP,
     POINT_BYTES,
     CloudTemplate,
@@ -27,7 +28,6 @@ from avatar_ros.framework.conversions import (
     find_bytes,
     find_number,
 )
-from avatar_ros.loop.contact_loop import PolledSubscriptions
 
 RATE = 30.0  # as fast as eyes need [Hz]
 

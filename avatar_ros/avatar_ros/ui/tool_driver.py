@@ -21,9 +21,9 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 
 from avatar_ros.framework import qos, realtime
-from avatar_ros.framework.conversions import PoseTemplate, stamp_bytes
 from avatar_ros.framework.managed_node import StopSignal
-from avatar_ros.loop.contact_loop import PolledSubscriptions
+from avatar_ros.framework.ports import PolledSubscriptions
+from avatar_ros.framework.templates import PoseTemplate, stamp_bytes
 from avatar_ros.loop.tool_channel import FAR_AWAY
 from avatar_ros.msg import ContactState
 from avatar_ros.ui.tool_state import N_ROWS, SharedToolState

@@ -1,0 +1,53 @@
+"""What each status of ContactState means to an operator: its cause, and what to do about it."""
+
+from __future__ import annotations
+
+from avatar_ros.msg import ContactState
+
+# Cause and remedy of every status in which a tool's force is missing or doubtful.
+EXPLANATIONS: dict[int, tuple[str, str]] = {
+    ContactState.STATUS_NO_MODEL: ("no vademecum is loaded", "load one"),
+    ContactState.STATUS_NO_POSE: ("no pose of the tool has arrived yet", "start its driver"),
+    ContactState.STATUS_STALE_POSE: (
+        "the tool's poses stopped or come too late",
+        "check its driver, the network and the load of the machine, or raise pose_timeout",
+    ),
+    ContactState.STATUS_INVALID_POSE: (
+        "a pose of the tool is not finite, has stamp 0, or is not a rotation",
+        "check its driver",
+    ),
+    ContactState.STATUS_NOT_CONVERGED: (
+        "the contact solve reached its iteration limit",
+        "lift the tool a little",
+    ),
+    ContactState.STATUS_OUT_OF_RANGE: (
+        "the tool is outside what the vademecum covers: too deep, or off the accessible surface",
+        "lift it off the organ",
+    ),
+    ContactState.STATUS_UNKNOWN_FRAME: (
+        "the tool's poses are in another frame",
+        "set tool_frame and tool_transform of the contact node, or publish in the organ's frame",
+    ),
+    ContactState.STATUS_EXTRAPOLATED: (
+        "the tool presses deeper than the vademecum was built for; the force is extrapolated",
+        "press less deeply",
+    ),
+    ContactState.STATUS_LEAP: (
+        "the tool's pose jumped",
+        "check its driver, or raise safety.leap",
+    ),
+    ContactState.STATUS_SEVERAL_PUBLISHERS: (
+        "several nodes send poses of the tool",
+        "stop all but one",
+    ),
+    ContactState.STATUS_LOST_TOOL: (
+        "no node sends poses of the tool any more",
+        "start its driver again",
+    ),
+    ContactState.STATUS_INACTIVE: ("the contact node is being stopped", "activate it again"),
+}
+
+
+def explanation(status: int) -> str:
+    """Cause and remedy in one line; empty for a status that needs none."""
+    return "; ".join(EXPLANATIONS.get(status, ()))

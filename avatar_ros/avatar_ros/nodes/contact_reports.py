@@ -1,0 +1,100 @@
+"""What the contact node reports once a second: statistics, diagnostics, and lines in the log."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Sequence
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+
+from avatar_ros.framework.ports import Ports
+from avatar_ros.loop import diagnostics
+from avatar_ros.loop.contact_loop import ContactLoop, Publishers
+from avatar_ros.loop.settings import THRESHOLDS
+from avatar_ros.loop.shown_modes import ShownModesReport
+from avatar_ros.loop.statistics import TimingRecord, statistics
+from avatar_ros.loop.tool_channel import ToolChannel
+from avatar_ros.msg import LoopStatistics
+
+
+class ContactReports:
+    """Summarises the loop's last window, chooses the modes of the next, and publishes both.
+
+    ports : of the node, whose mismatches are reported
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        loop: ContactLoop,
+        tools: Sequence[ToolChannel],
+        publishers: Publishers,
+        ports: Ports,
+    ) -> None:
+        self._node, self._loop, self._tools = node, loop, tools
+        self._publishers, self._ports = publishers, ports
+        self._faults = diagnostics.FaultCounter(tools)
+        self._logged: dict[str, str] = {}  # last fault, by tool
+
+    def publish(self) -> None:
+        """Publish statistics and diagnostics of the window that ends now."""
+        loop, end = self._loop, time.monotonic_ns()
+        record, loop.record = loop.record, TimingRecord(end)
+        window = statistics(record, end, loop.settings.rate)
+        window.header.stamp = self._node.get_clock().now().to_msg()
+        shown_modes = loop.active.shown_modes
+        report = shown_modes.update(window) if shown_modes is not None else None
+        self._publishers.statistics.publish(window)
+        self._publish_diagnostics(window, report)
+        gc.collect()  # the loop's process does it nowhere else
+
+    def _publish_diagnostics(self, window: LoopStatistics, report: ShownModesReport | None) -> None:
+        node, loop, active = self._node, self._loop, self._loop.active
+        name = node.get_name()
+        limits = {p.name: node.get_parameter(p.name).value for p in THRESHOLDS}
+        promise = active.shown_modes.promise if active.shown_modes is not None else ""
+        statuses = [
+            diagnostics.loop_status(name, window, loop.settings.rate, limits),
+            diagnostics.vademecum_status(name, active.id, promise),
+            diagnostics.qos_status(name, self._ports.mismatches()),
+        ]
+        if report is not None:
+            log_shown_modes(node, report)
+            statuses.append(diagnostics.accuracy_status(name, report.text, report.shedding, window))
+        for i, faults in enumerate(self._faults.window()):
+            tool_name = loop.settings.tools[i]
+            self._log_fault(tool_name, faults.text)
+            statuses.append(
+                diagnostics.tool_status(
+                    name, tool_name, self._tools[i], loop.guards[i], faults, loop.energies, i
+                )
+            )
+        message = DiagnosticArray(status=statuses)
+        message.header.stamp = node.get_clock().now().to_msg()
+        self._publishers.diagnostics.publish(message)
+
+    def _log_fault(self, tool: str, text: str) -> None:
+        """Log a tool's fault when it differs from the last window's."""
+        if text != self._logged.get(tool, ""):
+            self._logged[tool] = text
+            if text:
+                self._node.get_logger().warning(f"{tool}: {text}")
+            else:
+                self._node.get_logger().info(f"{tool}: poses are sound again")
+
+    def count_publishers(self) -> None:
+        """Note how many nodes send poses of each tool."""
+        for tool in self._tools:
+            tool.publishers = tool.subscription.get_publisher_count()
+
+
+def log_shown_modes(node: Node, report: ShownModesReport) -> None:
+    """Log that modes are left out or shown again."""
+    if not report.changed:
+        return
+    if report.shedding:
+        node.get_logger().warning(report.text)
+    else:  # on a line of its own: rclpy allows only one severity for each line of code
+        node.get_logger().info(report.text)
