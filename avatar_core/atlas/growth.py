@@ -25,7 +25,13 @@ from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.geometry.surface_files import content_of
-from avatar_core.shapes.registration import Registration, RegistrationRule, Template, register
+from avatar_core.shapes.registration import (
+    Registration,
+    RegistrationRule,
+    Template,
+    not_converged,
+    register,
+)
 
 Axes = str | tuple[tuple[float, ...], ...]
 SolveResponse = Callable[[Registration], Response]
@@ -225,6 +231,11 @@ def _growth(atlas: Atlas, results: Sequence[Anatomy | Skipped], resumed: int) ->
     grown = atlas.with_anatomies(one for one in results if isinstance(one, Anatomy))
     added = grown.names[len(atlas) :]
     notices = tuple(str(one) for one in grown.duplicates if one.name in added) if added else ()
+    notices += tuple(
+        f"{one.name}: {not_converged(one.quality)}"
+        for one in grown.anatomies[len(atlas) :]
+        if not one.converged
+    )
     skipped = tuple(one for one in results if isinstance(one, Skipped))
     return Growth(grown, added, skipped, resumed, notices)
 

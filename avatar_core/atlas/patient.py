@@ -250,7 +250,9 @@ def build_patient(
         spent = replace(vademecum.certificate, build_cpu_seconds=sum(clock.values()))
         vademecum = vademecum.with_certificate(spent)
     progress("certify", 1.0, _mean_error(vademecum))
-    return _patient(vademecum, fidelity, base, weights, estimates, solutions, clock)
+    return _patient(
+        vademecum, fidelity, base, problem.registration, weights, estimates, solutions, clock
+    )
 
 
 def require_fidelity(fidelity: str) -> None:
@@ -432,6 +434,7 @@ def _patient(
     vademecum: Vademecum,
     fidelity: Fidelity,
     base: PatientBase,
+    registration: Registration,
     weights: Barycenter,
     estimates: tuple[GalerkinErrorEstimate, ...],
     solutions: int,
@@ -445,7 +448,7 @@ def _patient(
         barycenter=weights,
         estimates=estimates,
         solutions=solutions,
-        notices=weights.notices + _warnings(base, weights, fidelity, vademecum),
+        notices=_warnings(base, registration, weights, fidelity, vademecum),
         seconds=StageSeconds(
             *(clock.get(name, 0.0) for name in ("registration", "mesh", "response", "certificate"))
         ),
@@ -453,23 +456,28 @@ def _patient(
 
 
 def _warnings(
-    base: PatientBase, weights: Barycenter, fidelity: Fidelity, vademecum: Vademecum
+    base: PatientBase,
+    registration: Registration,
+    weights: Barycenter,
+    fidelity: Fidelity,
+    vademecum: Vademecum,
 ) -> tuple[str, ...]:
-    """What the reader should know: member, distance from the base, what was not reached."""
+    """What did not converge, and where the patient lies among the anatomies of the base."""
+    lines = [*registration.notices, *weights.notices]
+    away = weights.hull_distance / max(float(weights.distances.mean()), 1e-300)
     if weights.member is not None:
-        return (f"the patient is {base.names[weights.member]} of the base",)
-    lines = []
-    away = weights.hull_distance / float(weights.distances.mean())
-    if away > _FAR_HULL:
+        lines.append(f"the patient is {base.names[weights.member]} of the base")
+    elif away > _FAR_HULL:
         lines.append(
-            f"the patient lies {away:.2g} of its mean distance to the neighbours outside their "
-            "hull; trust 'interpolated' less, or add anatomies like it"
+            f"the patient lies outside the hull of the neighbours, by {away:.2g} of the mean "
+            "distance to them; trust 'interpolated' less, or add similar anatomies"
         )
-    if fidelity == "reduced" and not vademecum.convergence.converged:
+    if fidelity != "interpolated" and not vademecum.convergence.converged:
         last = vademecum.convergence.rank_errors[-1]
+        remedy = "choose 'solved'" if fidelity == "reduced" else "allow more modes"
         lines.append(
             f"the tolerance was not reached: estimated error {last.mean:.2g} mean, "
-            f"{last.worst:.2g} worst; choose 'solved'"
+            f"{last.worst:.2g} worst; {remedy}, or a larger tolerance"
         )
     return tuple(lines)
 

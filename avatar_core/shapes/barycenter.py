@@ -102,7 +102,10 @@ def convex_weights(gram: FloatArray) -> FloatArray:
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     right = np.zeros(len(gram) + 1)
     right[-1] = 1.0
-    weights, _ = nnls(np.vstack([root, np.ones(len(gram))]), right)
+    try:
+        weights, _ = nnls(np.vstack([root, np.ones(len(gram))]), right)
+    except RuntimeError as error:  # its iterations are limited
+        raise LLEError(f"lle: no convex weights ({error}); use fewer neighbours") from error
     return weights / weights.sum()
 
 

@@ -36,6 +36,7 @@ IntArray = NDArray[np.int64]
 BLOCK = 8192  # values of each vector per block of the Gram matrix: the blocks stay in cache
 ROUNDING = 4 * float(np.finfo(float).eps)  # of an inner product, relative to the lengths
 TRUSTED = 5e-11  # if rounding may change weights by more, they are solved from differences
+CLEAR_GAP = 3.0  # ratio of neighbouring eigenvalues from which a spectral gap is clear
 LOCAL_VARIANCE = 0.99  # part of the variance that the counted principal components explain
 
 
@@ -307,8 +308,24 @@ class Dimension:
 
     @property
     def agree(self) -> bool:
-        """Whether both estimates agree; if they do not, the base shows no dimension."""
+        """Whether both estimates agree."""
         return self.from_gap == self.from_local_pca
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """Why the estimates should not be trusted, one line each."""
+        lines = []
+        if self.gap < CLEAR_GAP:
+            lines.append(
+                f"no clear gap in the spectrum: the largest ratio is {self.gap:.2g}, after "
+                f"{self.from_gap}; add anatomies, or choose another number of neighbours"
+            )
+        if not self.agree:
+            lines.append(
+                f"the spectral gap gives {self.from_gap} dimension(s), local PCA "
+                f"{self.from_local_pca}"
+            )
+        return tuple(lines)
 
 
 def spectrum(base: LLE, n_values: int) -> tuple[FloatArray, FloatArray]:
@@ -344,8 +361,8 @@ def embed(base: LLE, n_components: int) -> Embedding:
 def estimate_dimension(base: LLE, n_values: int = 20) -> Dimension:
     """Dimension from the gap in the spectrum of M (Polito & Perona 2001) and from local PCA.
 
-    Neither can exceed the number of neighbours minus one. Check ``gap`` and ``agree`` before
-    trusting either.
+    Neither can exceed the number of neighbours minus one. ``notices`` say if
+    they should not be trusted.
 
     Raises LLEError if there are fewer than 2 neighbours or 4 different anatomies.
     """

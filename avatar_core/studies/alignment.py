@@ -27,12 +27,14 @@ class Alignment:
 
     rotation : ndarray R, shape (3, 3); scale : s; translation : ndarray t, shape (3,) [m]
     residual : root mean square distance of either surface to the other [m]
+    converged : whether the least squares met their tolerance
     """
 
     rotation: FloatArray
     scale: float
     translation: FloatArray
     residual: float
+    converged: bool = False
 
     @property
     def angle(self) -> float:
@@ -115,7 +117,7 @@ class _Fit:
             lambda x: self.residuals(moved(x)), np.zeros(7 if scale else 6), ftol=TOLERANCE
         )
         rms = float(np.sqrt(np.mean(solution.fun**2)))
-        return replace(moved(solution.x), residual=rms)
+        return replace(moved(solution.x), residual=rms, converged=bool(solution.success))
 
 
 def _rotations_to_try(fit: _Fit) -> FloatArray:

@@ -20,7 +20,7 @@ from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix
-from avatar_core.shapes.lle import estimate_dimension, fit, locally_linear_embedding
+from avatar_core.shapes.lle import CLEAR_GAP, estimate_dimension, fit, locally_linear_embedding
 from avatar_core.studies.response import (
     carried,
     relative_errors,
@@ -37,7 +37,6 @@ FloatArray = NDArray[np.float64]
 
 PARAMETERS = 6
 NEIGHBORS = 12
-STANDS_OUT = 3.0  # an eigenvalue stands out from the next if that is this many times larger
 SPECTRA: tuple[tuple[int, float], ...] = (
     (8, 1e-6),
     (10, 1e-3),
@@ -147,7 +146,7 @@ def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> dict[str
         "from_gap": found.from_gap,
         "gap": found.gap,
         "seventh_over_sixth": float(values[PARAMETERS] / values[PARAMETERS - 1]),
-        "six_stand_out": bool(found.from_gap == PARAMETERS and found.gap >= STANDS_OUT),
+        "six_stand_out": bool(found.from_gap == PARAMETERS and found.gap >= CLEAR_GAP),
         "from_local_pca": found.from_local_pca,
     }
 

@@ -79,13 +79,20 @@ QUICK = LeaveOneOutSettings(
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """Livers on one grid: vectors (n, D) [m], the factor (n,) from grid to patient lengths."""
+    """Livers on one grid.
+
+    vectors : ndarray, shape (n, D), signed distances [m]
+    scales : ndarray, shape (n,), from lengths on the grid to those of the patient
+    subjects : ndarray of int, shape (n,), equal for scans of one person
+    notices : livers whose alignment did not converge
+    """
 
     box: GridBox
     vectors: FloatArray
     scales: FloatArray
     subjects: IntArray
     gram: Gram
+    notices: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +120,7 @@ def study(folder: Path | None, settings: LeaveOneOutSettings) -> Study:
     with one_blas_thread() as notices:
         for alignment in ALIGNMENTS:
             base = placed(livers, alignment, settings)
+            notices = (*notices, *base.notices)
             tried = follow(methods(base, settings), f"leave one out, {alignment}")
             rows += [{"alignment": alignment, **judged(base, method)} for method in tried]
     summary = summarize(rows)
@@ -136,7 +144,7 @@ def study(folder: Path | None, settings: LeaveOneOutSettings) -> Study:
 
 def placed(livers: Livers, alignment: str, settings: LeaveOneOutSettings) -> Base:
     """All livers on one grid, centred or laid on the phantom."""
-    scales = np.ones(len(livers.surfaces))
+    scales, notices = np.ones(len(livers.surfaces)), list[str]()
     if alignment == "centred":
         moved = [centred(surface) for surface in livers.surfaces]
     else:
@@ -145,9 +153,11 @@ def placed(livers: Livers, alignment: str, settings: LeaveOneOutSettings) -> Bas
             found = align(surface, reference)
             moved.append(found.moved(surface))
             scales[i] = 1.0 / found.scale
+            if not found.converged:
+                notices.append(f"{surface.name}: the alignment did not converge")
     box = paper_box(moved, settings.shape)
     vectors = distance_vectors(moved, box)
-    return Base(box, vectors, scales, livers.subjects, Gram.of(list(vectors)))
+    return Base(box, vectors, scales, livers.subjects, Gram.of(list(vectors)), tuple(notices))
 
 
 def methods(base: Base, settings: LeaveOneOutSettings) -> list[Method]:
@@ -251,7 +261,7 @@ def principal_weights(gram: Gram, n_components: int, i: int, others: IntArray) -
     mean = products.mean(axis=0)
     row = gram.products[i, others] - mean
     values, vectors = np.linalg.eigh(products - mean - mean[:, None] + mean.mean())
-    with_variance = np.count_nonzero(values > len(values) * np.finfo(float).eps * values[-1])
+    with_variance = int(np.count_nonzero(values > len(values) * np.finfo(float).eps * values[-1]))
     leading = slice(len(values) - min(n_components, with_variance, len(values) - 1), None)
     part = (vectors[:, leading].T @ (row - row.mean())) / values[leading]
     return 1.0 / len(others) + vectors[:, leading] @ part

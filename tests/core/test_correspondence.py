@@ -28,6 +28,7 @@ from avatar_core.shapes.registration import (
     Registration,
     RegistrationRule,
     Template,
+    align_upright,
     line_search,
     register,
 )
@@ -207,6 +208,19 @@ def test_template_on_itself_stays(itself, template):
 def test_a_shrunken_target_is_refused_with_the_unit_as_remedy(template):
     with pytest.raises(RegistrationError, match="--unit"):
         register(template, sphere(0.02))
+
+
+def test_what_does_not_converge_says_so(template, phantom, warped):
+    """A tolerance out of reach, and an alignment cut off after one step."""
+    target = replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT)
+    found = register(
+        template, target, RegistrationRule(tolerance=1e-6, n_stages=3)
+    )
+    assert not found.converged and warped.converged and warped.notices == ()
+    assert "not converged" in found.notices[0]
+    sampled = sample_target(target, 4000)
+    _, converged = align_upright(template.mesh, sampled, RegistrationRule(), iterations=1)
+    assert not converged
 
 
 def test_a_ring_is_refused(template):

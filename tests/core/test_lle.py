@@ -406,6 +406,7 @@ def test_dimension_of_affine_families(d):
     points = rng.uniform(-1, 1, (200, d)) @ rng.standard_normal((d, 60))
     found = estimate_dimension(fit(points, 12))
     assert (found.from_gap, found.from_local_pca, found.agree) == (d, d, True)
+    assert found.notices == ()
     assert found.gap > 100
     assert np.all(np.diff(found.eigenvalues) >= 0)
     assert found.local_variances.sum() == pytest.approx(1.0)
@@ -417,6 +418,7 @@ def test_local_variances_find_a_curved_sheet_and_full_noise():
     rng = np.random.default_rng(6)
     noise = estimate_dimension(fit(rng.standard_normal((200, 40)), 12))
     assert noise.gap < 3  # nothing stands out
+    assert noise.notices[0].startswith("no clear gap")
     assert noise.from_local_pca >= 10
 
 

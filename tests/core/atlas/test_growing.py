@@ -163,7 +163,9 @@ def test_two_identical_livers(
     file = tmp_path / "a.h5"
     growth = create_atlas(file, [livers[0]] * 2, OPTIONS, template=template, workers=ALONE)
     assert growth.added == ("liver0", "liver0-2")
-    assert growth.notices == ("liver0-2 has the same shape as liver0: kept, but not counted again",)
+    assert growth.notices[0] == "liver0-2 has the same shape as liver0: kept, but not counted again"
+    assert all(": registration not converged" in line for line in growth.notices[1:])
+    assert len(growth.notices) == 1 + sum(not one.converged for one in growth.atlas.anatomies)
     twins = load_atlas(file)
     assert twins.barycenter(members[1].distances, 5).neighbors.tolist() == [0]
     assert twins.lle(3).weight_matrix[1].tolist() == [1.0, 0.0]
