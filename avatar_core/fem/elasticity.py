@@ -279,12 +279,8 @@ class Elasticity:
         terms = zip(self.factors, self._terms.unit_stiffness, strict=True)
         return sum(theta * matrix for theta, matrix in terms).tocsr()
 
-    def apply_terms(self, displacement: np.ndarray) -> tuple[np.ndarray, ...]:
-        """K_q u for each of :attr:`factors`, shape (3 n_nodes, n) [m^2]."""
-        return tuple(self.apply_term(q, displacement) for q in range(len(self.factors)))
-
     def apply_term(self, q: int, displacement: np.ndarray) -> np.ndarray:
-        """K_q u, shape (3 n_nodes, n) [m^2]."""
+        """K_q u of one of :attr:`factors`, shape (3 n_nodes, n) [m^2]."""
         if self.element != "Taylor-Hood":
             return np.asarray(self._terms.unit_stiffness[q] @ displacement)
         shear, coupling, _ = self._terms.mixed
@@ -381,8 +377,8 @@ class Elasticity:
         """Internal forces K u, shape (3 n_nodes, n) [N]; reactions appear at the clamp."""
         if self.element != "Taylor-Hood":
             return self.stiffness @ displacement
-        terms = zip(self.factors, self.apply_terms(displacement), strict=True)
-        return np.asarray(sum(theta * force for theta, force in terms))
+        terms = enumerate(self.factors)
+        return np.asarray(sum(theta * self.apply_term(q, displacement) for q, theta in terms))
 
     def at_vertices(self, displacement: np.ndarray) -> np.ndarray:
         """The vertex part of nodal displacements, shape (3 n_vertices, n)."""

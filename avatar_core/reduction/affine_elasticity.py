@@ -63,15 +63,10 @@ def _factors(
     here, out = elasticity.factors, []
     for coordinate in coordinates:
         values = gauss_nodes(coordinate, n_nodes)[0]
-        along = [elasticity_factors(elasticity, coordinate.name, value) for value in values]
+        along = [problem_at(elasticity, {coordinate.name: value}).factors for value in values]
         out.append(np.array(along).T / here[:, None])
     out[0] = out[0] * here[:, None]
     return tuple(out)
-
-
-def elasticity_factors(elasticity: Elasticity, name: str, value: float) -> FloatArray:
-    """theta_q with one value changed."""
-    return np.asarray(problem_at(elasticity, {name: value}).factors)
 
 
 def _symmetric(elasticity: Elasticity, q: int, free: FloatArray) -> LinearOperator:

@@ -14,7 +14,7 @@ from avatar_core.cli.vademecum import show_text
 from avatar_core.contact.effects import Friction, LargeDeformationEffect
 from avatar_core.contact.model import ContactModel, Status, prepare, step
 from avatar_core.contact.tool_path import inner_positions, middle_of_access
-from avatar_core.errors import MaterialError, SceneError
+from avatar_core.errors import ConvergenceError, MaterialError, SceneError
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.newton import NewtonRule, solve
@@ -145,6 +145,17 @@ def test_a_stiffer_organ_takes_more_force_for_the_same_shape(bent: Vademecum) ->
     three, same = stiff.push_to(*here, 12e-3)
     assert three == pytest.approx(3.0 * force, rel=1e-4)
     np.testing.assert_allclose(same.displacement, found.displacement, atol=1e-7)
+
+
+def test_a_depth_that_no_force_reaches_is_refused(bent: Vademecum) -> None:
+    """A depth of a - 50 a^2 / m has its maximum at 5 mm."""
+    assert bent.large is not None
+    depth = np.zeros_like(bent.large.depth)
+    depth[0] = -50.0
+    soft = replace(bent.large, depth=depth, reach=np.ones_like(bent.large.reach))
+    here = np.array([middle_of_access(bent)]), np.ones(1)
+    with pytest.raises(ConvergenceError, match="12 mm deep"):
+        replace(bent, large=soft).push_to(*here, 12e-3)
 
 
 def test_reach_shrinks_with_the_tolerance(straight: Vademecum, bent: Vademecum) -> None:
