@@ -43,7 +43,7 @@ def cloud_arrays(
     cloud: Cloud,
     precision: Precision,
     near: float,
-    bent: np.ndarray | None = None,
+    nonlinear: np.ndarray | None = None,
 ) -> CloudArrays:
     """Far and near field at the points of a cloud.
 
@@ -56,8 +56,8 @@ def cloud_arrays(
     points = shown_vertices(vademecum, cloud)
     n_vertices = len(vademecum.mesh.vertices)
     space = vademecum.far.space.reshape(n_vertices, 3, -1)[points, :, :modes]
-    if bent is not None:
-        space = np.concatenate([space, bent.reshape(n_vertices, 3, -1)[points]], axis=2)
+    if nonlinear is not None:
+        space = np.concatenate([space, nonlinear.reshape(n_vertices, 3, -1)[points]], axis=2)
     blocks, fade = _near_at(vademecum.near, _fade(vademecum, near), points, n_vertices)
     return CloudArrays(*in_blocks(space, precision), blocks, points, fade)
 

@@ -15,32 +15,42 @@ import numpy as np
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.effects.large_deformation import (
-    add_amplitudes,
-    add_near_row,
+    add_nonlinear_amplitudes,
+    add_nonlinear_near,
     powers_of_depth,
 )
-from avatar_core.contact.effects.respiration import move_cloud
+from avatar_core.contact.effects.respiration import shift_cloud
 from avatar_core.contact.effects.viscoelasticity import least_shown
 
 LEAST_WEIGHT = 0.02  # what each load position leaves of its near field to the others
 
 
 @fast
-def deform(model, state, out, reply, large, friction, memory, motion):  # type: ignore[no-untyped-def]
+def deform(model, state, out, effects):  # type: ignore[no-untyped-def]
     """The cloud under the forces of a period."""
-    if reply is None and out.n_contacts[0] == 0:
-        state.field[:] = np.float32(0.0)
-    else:
-        _amplitudes(state, reply, large)
-        _far_field(model, state, large)
-        for t in range(state.passage.shape[0]):
-            if state.force[t] > 0.0:
-                _near_field(model, state, large, friction, memory, t)
-        if memory is not None:
-            _near_trail(model, state, memory)
+    e = effects
+    _displace(
+        model, state, out, e.superposition, e.large_deformation, e.friction, e.viscoelasticity
+    )
     write_cloud(model.rest, state.field, out.cloud)
-    if motion is not None:
-        move_cloud(motion, out.cloud)
+    shift_cloud(e.respiration, out.cloud)
+
+
+@fast
+def _displace(  # type: ignore[no-untyped-def]
+    model, state, out, superposition, large_deformation, friction, viscoelasticity
+):
+    """Far and near field into ``state.field``."""
+    if superposition is None and out.n_contacts[0] == 0:
+        state.field[:] = np.float32(0.0)
+        return
+    _amplitudes(state, superposition, large_deformation)
+    _far_field(model, state, large_deformation)
+    for t in range(state.passage.shape[0]):
+        if state.force[t] > 0.0:
+            _near_field(model, state, large_deformation, friction, viscoelasticity, t)
+    if viscoelasticity is not None:
+        _near_history(model, state, viscoelasticity)
 
 
 @fast
@@ -54,29 +64,29 @@ def write_cloud(rest, field, cloud):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _amplitudes(state, reply, large):  # type: ignore[no-untyped-def]
+def _amplitudes(state, superposition, large_deformation):  # type: ignore[no-untyped-def]
     """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards. Then the bent ones."""
     amplitude = state.amplitude
     n_modes = amplitude.shape[0]
     amplitude[:] = np.float32(0.0)
-    if large is not None:
-        n_modes -= large.load.shape[2]
-    if reply is not None:
+    if large_deformation is not None:
+        n_modes -= large_deformation.load.shape[2]
+    if superposition is not None:
         for k in range(n_modes):
-            amplitude[k] = np.float32(reply.total[k])
+            amplitude[k] = np.float32(superposition.total[k])
     for t in range(state.passage.shape[0]):
         if state.force[t] <= 0.0:
             continue
-        if reply is None:
+        if superposition is None:
             force = np.float32(state.force[t] * state.scale[t])
             for k in range(n_modes):
                 amplitude[k] -= force * state.mode[t, k]
-        if large is not None:
-            add_amplitudes(state, large, t, amplitude)
+        if large_deformation is not None:
+            add_nonlinear_amplitudes(state, large_deformation, t, amplitude)
 
 
 @fast
-def _far_field(model, state, large):  # type: ignore[no-untyped-def]
+def _far_field(model, state, large_deformation):  # type: ignore[no-untyped-def]
     """sum_k X_k a_k over the modes that are shown, four at a time, and those of large deformation.
 
     Modes may be stored as fractions of their peak.
@@ -97,8 +107,8 @@ def _far_field(model, state, large):  # type: ignore[no-untyped-def]
             a = amplitude[k] * scale[k]
             for i in range(BLOCK):
                 u[i] += x[k, i] * a
-        if large is not None:
-            _add_modes(amplitude, scale, x, u, scale.shape[0] - large.load.shape[2])
+        if large_deformation is not None:
+            _add_modes(amplitude, scale, x, u, scale.shape[0] - large_deformation.load.shape[2])
 
 
 @fast
@@ -117,42 +127,44 @@ def _add_modes(amplitude, scale, x, u, first):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _near_field(model, state, large, friction, memory, t):  # type: ignore[no-untyped-def]
+def _near_field(model, state, large_deformation, friction, viscoelasticity, t):  # type: ignore[no-untyped-def]
     """The exact remainder around the load positions that carry the force of a tip."""
     kept = 0.0
     for i in range(state.n_nodes[t]):
-        kept += _shrunk(state.weight[t, i, 0])
+        kept += _soft_threshold(state.weight[t, i, 0])
     n, scale = state.normal[t], state.scale[t] / kept
     f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
     if friction is not None:
         f0, f1, f2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
     second = third = 0.0
-    if large is not None:
-        second, third = powers_of_depth(state, large, t)
+    if large_deformation is not None:
+        second, third = powers_of_depth(state, large_deformation, t)
     for i in range(state.n_nodes[t]):
-        w = _shrunk(state.weight[t, i, 0])
+        w = _soft_threshold(state.weight[t, i, 0])
         if w != 0.0:
             j, part = state.nodes[t, i], w * scale
-            if memory is None:
+            if viscoelasticity is None:
                 _add_row(model, state, j, part * f0, part * f1, part * f2)
-            if large is not None:
-                add_near_row(model, state, large, j, w / kept, second, third)
+            if large_deformation is not None:
+                add_nonlinear_near(model, state, large_deformation, j, w / kept, second, third)
 
 
 @fast
-def _near_trail(model, state, memory):  # type: ignore[no-untyped-def]
+def _near_history(model, state, viscoelasticity):  # type: ignore[no-untyped-def]
     """The same around what a relaxing organ remembers, the weakest of it faded out."""
-    least = least_shown(memory)
-    for m in range(memory.count[0]):
-        e = memory.trail_elastic[m]
+    least = least_shown(viscoelasticity)
+    for m in range(viscoelasticity.count[0]):
+        e = viscoelasticity.near_elastic[m]
         size = np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
         if size > least:
             part = (size - least) / size
-            _add_row(model, state, memory.place[m], part * e[0], part * e[1], part * e[2])
+            _add_row(
+                model, state, viscoelasticity.position[m], part * e[0], part * e[1], part * e[2]
+            )
 
 
 @inlined
-def _shrunk(w):  # type: ignore[no-untyped-def]
+def _soft_threshold(w):  # type: ignore[no-untyped-def]
     """A weight moved towards zero, so that a load position that leaves does so without a jump."""
     if w > 0.0:
         return max(w - LEAST_WEIGHT, 0.0)

@@ -1,4 +1,4 @@
-"""The compiled contact step. No allocation of size, no exception, no I/O.
+"""The compiled contact step: no allocation, no exception, no I/O.
 
 Each tool tip (sphere, centre p, radius r) presses through one patch, at the surface point below
 it, along the normal n = grad phi / |grad phi|. Forces lambda solve the Signorini conditions
@@ -14,11 +14,12 @@ For one tip on an organ at rest, W = lambda gamma lambda / 2,
 the normal force, and the small tangential one by which a frictionless tip slides towards softer
 tissue. Without it a closed path would gain or lose energy.
 
-The arguments after ``tips`` are the effects of a scene (:mod:`avatar_core.contact.effects`), each
-None or the arrays that it works on. numba compiles the step anew for every selection: of an effect
-that is
-None, no instruction is left. ``reply`` is there with any effect for which one tip is not alone with
-an organ at rest (:mod:`avatar_core.contact.superposition`).
+``effects`` holds the effects of a scene (:mod:`avatar_core.contact.effects.selection`), each None
+or its arrays. A stage takes those it needs as arguments of their own and does nothing for None:
+numba compiles the step for every selection of effects, without the branches on what is None.
+
+Every iteration here is bounded; where one ends unconverged, the status of all tips in contact is
+NOT_CONVERGED.
 """
 
 from __future__ import annotations
@@ -30,16 +31,37 @@ import numpy as np
 from avatar_core.common.jit import entry, fast, inlined
 from avatar_core.common.splines import cell_at, in_cell, on_grid, value_in_cell
 from avatar_core.contact.cloud_kernels import deform
-from avatar_core.contact.effects import friction as stick_slip
-from avatar_core.contact.effects import inertia as swing
-from avatar_core.contact.effects import large_deformation as bending
-from avatar_core.contact.effects import respiration as breath
-from avatar_core.contact.effects import several_tools as coupling
-from avatar_core.contact.effects import viscoelasticity as relaxation
-from avatar_core.contact.superposition import add_superposed_force, lift_tip, superpose
+from avatar_core.contact.effects.friction import (
+    force_squared,
+    gather_friction,
+    solve_friction,
+    write_torque,
+)
+from avatar_core.contact.effects.inertia import advance_inertia, predict_inertia
+from avatar_core.contact.effects.large_deformation import (
+    add_nonlinear_force,
+    evaluate_added_depth,
+    sample_coefficients,
+)
+from avatar_core.contact.effects.respiration import to_organ_frame, to_world_frame
+from avatar_core.contact.effects.several_tools import (
+    assemble_coupling,
+    couple_near_fields,
+    solve_active_set,
+)
+from avatar_core.contact.effects.viscoelasticity import (
+    advance_history,
+    predict_history,
+    predict_modes,
+)
+from avatar_core.contact.superposition import (
+    free_tip_displacement,
+    superpose_modes,
+    write_superposed_force,
+)
 from avatar_core.contact.tip_compliance import (
     assemble_own,
-    mode,
+    modal_load,
     near_along_normal,
     near_column,
     near_gram,
@@ -52,15 +74,15 @@ MAX_SWEEPS = 1000
 OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
 UNKNOWN_FRAME, EXTRAPOLATED = 8, 9
 
-# A tip that did not come in through the surface is barred until it is outside again: a contact
-# that began at depth would give back energy that nobody put in.
+# A tip that did not enter through the surface is barred until it is outside again: a contact that
+# began at depth would release energy that no tool has put in.
 OUTSIDE, ENTERED, BARRED = range(3)
 
-PATIENCE = 8  # sweeps before the exact solution is worth its time,
-MAX_EXACT = 64  # and after which it has not helped
+PATIENCE = 8  # sweeps before the active-set solution is worth its time,
+MAX_EXACT = 64  # and after which it is no longer tried
 GAP_TOLERANCE = 1e-9  # [m] of gap change that ends Gauss-Seidel
-ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not come in through the surface
-LEAP = 50e-3  # [m] in a period: whoever is that far off did not move there, but comes in anew
+ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not enter through the surface
+LEAP = 50e-3  # [m] in a period; a tip that is farther from its last pose makes a new contact
 MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
 MIN_ACCESS = 1e-2  # below, the tip is off the accessible surface
 FULL_ACCESS = 0.99  # below, the force fades
@@ -75,7 +97,7 @@ ModelArrays = namedtuple(
         "spacing",
         "row",
         "carrier",
-        "share",
+        "carrier_weight",
         "self_compliance",
         "force_error",
         "position",
@@ -98,10 +120,10 @@ ModelArrays = namedtuple(
 State = namedtuple(
     "State",
     [
-        "passage",  # (T,) whether the tip came in through the surface: OUTSIDE, ENTERED, BARRED
-        "seen",  # (T, 3) the last valid tip that was in contact [m]
+        "passage",  # (T,) whether the tip entered through the surface: OUTSIDE, ENTERED, BARRED
+        "seen",  # (T, 3) last valid position of the tip in contact [m]
         "force",  # (T,) lambda
-        "active",  # (T,) the tip is closer than its radius, where it may touch
+        "active",  # (T,) the tip is closer than its radius to a surface that it may touch
         "gap",  # (T,) phi - r
         "slope",  # (T, 3) grad phi
         "steepness",  # (T,) |grad phi|
@@ -120,9 +142,9 @@ State = namedtuple(
         "gram",  # (T, T) f_t . C f_t'
         "scale",  # (T,) a_t
         "compliance",  # (T, T)
-        "shown",  # (1,) modes of the far field that the cloud shows
-        "amplitude",  # (rank,) of the far field, and last of what large deformation adds
-        "field",  # (n_blocks BLOCK,) displacement of the cloud, component after component
+        "shown",  # (1,) number of far-field modes in the cloud
+        "amplitude",  # (rank,) of the far-field modes, those of large deformation last
+        "field",  # (n_blocks BLOCK,) displacement of the cloud, three components a point
     ],
 )
 
@@ -145,38 +167,34 @@ Out = namedtuple(
 
 
 @entry
-def contact_step(  # type: ignore[no-untyped-def]
-    model, state, out, tips, reply, several, large, friction, memory, inertia, weight, motion
-):
-    """One period: forces, then the deformed cloud. Returns the worst status."""
-    status = _solve_period(
-        model, state, out, tips, reply, several, large, friction, memory, inertia, weight, motion
-    )
-    deform(model, state, out, reply, large, friction, memory, motion)
+def contact_step(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
+    """One period: forces, then the deformed cloud. Returns the worst status.
+
+    Real-time safe: allocates nothing, raises nothing, bounded iterations.
+    """
+    status = _solve_period(model, state, out, tips, effects)
+    deform(model, state, out, effects)
     return status
 
 
 @entry
-def contact_solve(  # type: ignore[no-untyped-def]
-    model, state, out, tips, reply, several, large, friction, memory, inertia, weight, motion
-):
-    """First half of a period: forces and contacts."""
-    return _solve_period(
-        model, state, out, tips, reply, several, large, friction, memory, inertia, weight, motion
-    )
+def contact_solve(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
+    """First half of a period: forces and contacts. Real-time safe, as :func:`contact_step`."""
+    return _solve_period(model, state, out, tips, effects)
 
 
 @entry
-def contact_deform(  # type: ignore[no-untyped-def]
-    model, state, out, reply, large, friction, memory, motion
-):
-    """Second half: the cloud under the forces of the first."""
-    deform(model, state, out, reply, large, friction, memory, motion)
+def contact_deform(model, state, out, effects):  # type: ignore[no-untyped-def]
+    """Second half: the cloud under these forces. Real-time safe, as :func:`contact_step`."""
+    deform(model, state, out, effects)
 
 
 @entry
 def force_error(model, out, tips):  # type: ignore[no-untyped-def]
-    """How wrong the forces of a period may be: the relative error at the tip, times the force."""
+    """Expected error of the forces: the relative error at the tip, times the force.
+
+    Real-time safe, as :func:`contact_step`.
+    """
     for t in range(tips.shape[0]):
         force = out.force[t]
         size = np.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
@@ -187,72 +205,63 @@ def force_error(model, out, tips):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _solve_period(  # type: ignore[no-untyped-def]
-    model, state, out, tips, reply, several, large, friction, memory, inertia, weight, motion
-):
-    """Locate, assemble, solve, differentiate. ``tips`` may change."""
-    if motion is not None:
-        breath.into_organ(motion, tips)
-    status = OK
-    for t in range(tips.shape[0]):
-        out.status[t] = locate(model, state, t, tips[t], reply)
-        status = max(status, out.status[t])
-        if not state.active[t]:
-            state.force[t] = 0.0
-            continue
-        mode(model, state, t)
-        if reply is not None:
-            near_column(model, state, t)
-            near = near_along_normal(state, t, state.column[t])
-        else:
-            near = near_gram(model, state, t)
-        assemble_own(model, state, t, near)
-        if large is not None:
-            bending.sample(model, large, t, tips[t])
-        if friction is not None:
-            stick_slip.gather(model, state, friction, t)
-    if several is not None:
-        coupling.connect(model, state, several, friction)
-    if reply is not None:
-        _expect(reply, memory, inertia, weight)
-        for t in range(tips.shape[0]):
-            if state.active[t]:
-                lift_tip(model, state, reply, memory, t)
-        _assemble_moving(state, reply, memory, inertia)
-    if several is not None and friction is None:
-        coupling.assemble(state, reply, several)
-    if friction is not None:
-        converged = stick_slip.solve(model, state, tips, reply, several, large, friction)
-    elif several is not None or large is not None:
-        converged = solve_together(state, reply, several, large)
-    else:
-        converged = solve_alone(state, reply)
+def _solve_period(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
+    """Locate, assemble, solve, differentiate, advance. ``tips`` may change."""
+    e = effects
+    to_organ_frame(e.respiration, tips)
+    status = _locate_tips(model, state, out, tips, e.superposition, e.large_deformation, e.friction)
+    couple_near_fields(model, state, e.several_tools, e.friction)
+    _predict(e.superposition, e.viscoelasticity, e.inertia, e.self_weight)
+    _assemble_incremental(model, state, e.superposition, e.viscoelasticity, e.inertia)
+    converged = solve_contact(
+        model, state, tips, e.superposition, e.several_tools, e.large_deformation, e.friction
+    )
     if not converged:
         for t in range(tips.shape[0]):
             if state.active[t]:
                 out.status[t] = NOT_CONVERGED
-    if reply is not None:
-        superpose(state, reply, friction)
-    write_forces(model, state, out, tips, reply, several, large, friction, memory)
-    if memory is not None:
-        relaxation.remember(state, reply, memory, friction, weight)
-    if inertia is not None:
-        swing.advance(reply, inertia)
-    if motion is not None:
-        breath.out_of_organ(motion, out)
+    superpose_modes(state, e.superposition, e.friction)
+    write_forces(model, state, out, tips, e)
+    advance_history(state, e.superposition, e.viscoelasticity, e.friction, e.self_weight)
+    advance_inertia(e.superposition, e.inertia)
+    to_world_frame(e.respiration, out)
     for t in range(tips.shape[0]):
         status = max(status, out.status[t])
     return status
 
 
 @inlined
-def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
-    """Gap, normal, access, compliance, surface point and load positions of a tip, if it touches."""
-    before, goes_on = state.passage[t], _goes_on(state, t, tip)
+def _locate_tips(  # type: ignore[no-untyped-def]
+    model, state, out, tips, superposition, large_deformation, friction
+):
+    """Gap and compliance of each tip on its own; returns the worst status."""
+    status = OK
+    for t in range(tips.shape[0]):
+        out.status[t] = locate(model, state, t, tips[t], superposition)
+        status = max(status, out.status[t])
+        if not state.active[t]:
+            state.force[t] = 0.0
+            continue
+        modal_load(model, state, t)
+        if superposition is not None:
+            near_column(model, state, t)
+            near = near_along_normal(state, t, state.column[t])
+        else:
+            near = near_gram(model, state, t)
+        assemble_own(model, state, t, near)
+        sample_coefficients(model, large_deformation, t, tips[t])
+        gather_friction(model, state, friction, t)
+    return status
+
+
+@inlined
+def locate(model, state, t, tip, superposition):  # type: ignore[no-untyped-def]
+    """Gap, normal, access, compliance, surface point and load positions of a tip in contact."""
+    before, continuous = state.passage[t], _is_continuous(state, t, tip)
     state.active[t] = False
     state.access[t] = 1.0
     if not np.isfinite(tip[0] + tip[1] + tip[2]):
-        return INVALID_POSE  # wherever the tip is: it may well be where it was
+        return INVALID_POSE  # keeps its passage: the tip may still be where it was
     state.passage[t] = OUTSIDE
     if not on_grid(model.distance.shape, model.origin, model.spacing[0], tip):
         return OK
@@ -265,7 +274,7 @@ def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
     state.access[t] = min(access, 1.0)
     if access < MIN_ACCESS:
         return OUT_OF_RANGE
-    deepest = MAX_DEPTH if before == ENTERED and goes_on else ENTRY_DEPTH
+    deepest = MAX_DEPTH if before == ENTERED and continuous else ENTRY_DEPTH
     if before == BARRED or phi < -deepest:
         state.passage[t] = BARRED
         return OUT_OF_RANGE
@@ -273,19 +282,19 @@ def locate(model, state, t, tip, reply):  # type: ignore[no-untyped-def]
     state.active[t] = True
     for d in range(3):
         state.seen[t, d] = tip[d]
-    if not goes_on:
+    if not continuous:
         state.force[t] = 0.0
-    _direct(state, t, tip, phi)
+    _set_normal(state, t, tip, phi)
     state.self_compliance[t] = in_cell(model.self_compliance, cell, state.self_slope[t])
-    gather(model, state, t, cell, reply)
+    gather(model, state, t, cell, superposition)
     return OK if access >= FULL_ACCESS else OUT_OF_RANGE
 
 
 @inlined
-def _goes_on(state, t, tip):  # type: ignore[no-untyped-def]
-    """Whether a tip in contact is where it can have moved from its last contact.
+def _is_continuous(state, t, tip):  # type: ignore[no-untyped-def]
+    """Whether the tip can have moved here from its last contact.
 
-    After invalid poses nobody has seen it move: as deep as a contact may begin, it may have.
+    After invalid poses its motion is unknown; then no more than ``ENTRY_DEPTH`` is believed.
     """
     square = 0.0
     for d in range(3):
@@ -295,7 +304,7 @@ def _goes_on(state, t, tip):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _direct(state, t, p, phi):  # type: ignore[no-untyped-def]
+def _set_normal(state, t, p, phi):  # type: ignore[no-untyped-def]
     """n = g / |g| with g = grad phi, and s = p - phi n."""
     g = state.slope[t]
     state.steepness[t] = max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
@@ -305,78 +314,102 @@ def _direct(state, t, p, phi):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _expect(reply, memory, inertia, weight):  # type: ignore[no-untyped-def]
-    """Where the modes would be at the end of the period without any force, and their gain."""
-    if memory is not None:
-        relaxation.expect(memory)
+def _predict(superposition, viscoelasticity, inertia, self_weight):  # type: ignore[no-untyped-def]
+    """Modes at the end of the period without any load, and their gain by a unit load."""
+    if viscoelasticity is not None:
+        predict_history(viscoelasticity)
+        superposition.near_gain[0] = viscoelasticity.gain[0]
     if inertia is not None:
-        swing.expect(reply, inertia, memory, weight)
-    elif memory is not None:
-        relaxation.expect_modes(reply, memory, weight)
-    elif weight is not None:
-        for k in range(reply.free.shape[0]):
-            reply.free[k] = weight.amplitude[k]
-    if memory is not None:
-        reply.near_gain[0] = memory.gain[0]
+        predict_inertia(superposition, inertia, viscoelasticity, self_weight)
+    elif viscoelasticity is not None:
+        predict_modes(superposition, viscoelasticity, self_weight)
+    elif self_weight is not None:
+        for k in range(superposition.free.shape[0]):
+            superposition.free[k] = self_weight.amplitude[k]
 
 
 @fast
-def _assemble_moving(state, reply, memory, inertia):  # type: ignore[no-untyped-def]
-    """The part of a tip's compliance that answers within the period."""
+def _assemble_incremental(  # type: ignore[no-untyped-def]
+    model, state, superposition, viscoelasticity, inertia
+):
+    """Displacement without load at each tip, and its compliance within the period."""
+    if superposition is None:
+        return
     for t in range(state.passage.shape[0]):
         if not state.active[t]:
             continue
+        free_tip_displacement(model, state, superposition, viscoelasticity, t)
         if inertia is not None:
             far, near = 0.0, near_along_normal(state, t, state.column[t])
             for k in range(state.mode.shape[1]):
-                far += reply.gain[k] * state.mode[t, k] * state.mode[t, k]
-            moving = state.scale[t] ** 2 * (far + reply.near_gain[0] * near)
-            state.compliance[t, t] += moving - state.self_compliance[t]
-        elif memory is not None:
-            state.compliance[t, t] += (memory.gain[0] - 1.0) * state.self_compliance[t]
+                far += superposition.gain[k] * state.mode[t, k] * state.mode[t, k]
+            incremental = state.scale[t] ** 2 * (far + superposition.near_gain[0] * near)
+            state.compliance[t, t] += incremental - state.self_compliance[t]
+        elif viscoelasticity is not None:
+            softened = viscoelasticity.gain[0] - 1.0
+            state.compliance[t, t] += softened * state.self_compliance[t]
 
 
 @inlined
-def solve_alone(state, reply):  # type: ignore[no-untyped-def]
-    """0 <= lambda  perp  gap + C lambda >= 0, each tip for itself."""
+def solve_contact(  # type: ignore[no-untyped-def]
+    model, state, tips, superposition, several_tools, large_deformation, friction
+):
+    """Forces of all tips, by the cheapest solver for the effects; whether it converged."""
+    if friction is not None:
+        return solve_friction(
+            model, state, tips, superposition, several_tools, large_deformation, friction
+        )
+    if several_tools is not None:
+        assemble_coupling(state, superposition, several_tools)
+    if several_tools is not None or large_deformation is not None:
+        return solve_together(state, superposition, several_tools, large_deformation)
+    return solve_alone(state, superposition)
+
+
+@inlined
+def solve_alone(state, superposition):  # type: ignore[no-untyped-def]
+    """0 <= lambda  perp  gap + C lambda >= 0, each tip on its own, in closed form."""
     for t in range(state.passage.shape[0]):
         if state.active[t]:
             gap = state.gap[t]
-            if reply is not None:
-                gap -= reply.lift[t]
+            if superposition is not None:
+                gap -= superposition.free_normal[t]
             state.force[t] = max(0.0, -gap / state.compliance[t, t])
     return True
 
 
 @inlined
-def solve_together(state, reply, several, large):  # type: ignore[no-untyped-def]
+def solve_together(  # type: ignore[no-untyped-def]
+    state, superposition, several_tools, large_deformation
+):
     """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda + h >= 0, from the last forces.
 
-    Where the depth is bent each update is one of Newton's. Tips close to each other share forces
-    that sweeps hardly change: then the sweeps start again from the exact solution.
+    With large deformation each update is a Newton step. Sweeps hardly change how tips close to
+    each other share their load; then they restart from the active-set solution. Returns whether
+    the last sweep changed every gap by less than ``GAP_TOLERANCE``.
     """
     n_tools = state.passage.shape[0]
     for sweep in range(MAX_SWEEPS):
-        if several is not None and sweep < MAX_EXACT and sweep % PATIENCE == PATIENCE - 1:
-            coupling.share(state, reply, several, large)
+        if several_tools is not None and sweep < MAX_EXACT and sweep % PATIENCE == PATIENCE - 1:
+            solve_active_set(state, superposition, several_tools, large_deformation)
         worst = 0.0
         for t in range(n_tools):
             if not state.active[t]:
                 continue
-            stiff = state.compliance[t, t]
-            gap = state.gap[t] + stiff * state.force[t]
-            if reply is not None:
-                gap -= reply.lift[t]
-            if several is not None:
+            compliance = state.compliance[t, t]
+            gap = state.gap[t] + compliance * state.force[t]
+            if superposition is not None:
+                gap -= superposition.free_normal[t]
+            if several_tools is not None:
                 for s in range(n_tools):
                     if s != t and state.active[s]:
                         gap += state.compliance[t, s] * state.force[s]
-            if large is not None:
-                bending.bend(state, large, t)
-                gap += large.bent[t, 0]
-                stiff += large.bent[t, 1] * state.self_compliance[t]
-            new = max(0.0, state.force[t] - gap / stiff)
-            worst = max(worst, abs(new - state.force[t]) * stiff)
+            if large_deformation is not None:
+                evaluate_added_depth(state, large_deformation, t)
+                gap += large_deformation.added_depth[t, 0]
+                compliance += large_deformation.added_depth[t, 1] * state.self_compliance[t]
+            new = max(0.0, state.force[t] - gap / compliance)
+            worst = max(worst, abs(new - state.force[t]) * compliance)
             state.force[t] = new
         if worst < GAP_TOLERANCE:
             return True
@@ -384,41 +417,58 @@ def solve_together(state, reply, several, large):  # type: ignore[no-untyped-def
 
 
 @fast
-def write_forces(  # type: ignore[no-untyped-def]
-    model, state, out, tips, reply, several, large, friction, memory
-):
-    """Forces on the tools and the contacts that make them."""
-    n = 0
+def write_forces(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
+    """Forces on the tools and the contacts that cause them."""
+    e, n = effects, 0
     for t in range(state.passage.shape[0]):
         out.force[t] = 0.0
         out.torque[t] = 0.0
-        force, chi = state.force[t], state.access[t]
-        if force <= 0.0:
+        if state.force[t] <= 0.0:
             continue
-        if reply is not None:
-            add_superposed_force(
-                model, state, out, tips, reply, several, large, friction, memory, t
-            )
-        else:
-            for d in range(3):
-                out.force[t, d] = force * (state.slope[t, d] + 0.5 * force * state.self_slope[t, d])
-        if chi < 1.0:
-            fading = model.softness[0] / (chi * chi)
-            square = stick_slip.squared(friction, t) if friction is not None else force * force
-            for d in range(3):
-                out.force[t, d] -= 0.5 * square * fading * state.access_slope[t, d]
-        if large is not None:
-            bending.bend(state, large, t)
-            bending.add_force(state, large, out, t)
-            if state.self_compliance[t] * force > large.bend[t, 2] and out.status[t] == OK:
-                out.status[t] = EXTRAPOLATED
-        if friction is not None:
-            stick_slip.write_torque(model, state, friction, out, t)
+        _write_force_at_rest(state, out, t)
+        write_superposed_force(
+            model,
+            state,
+            out,
+            tips[t],
+            e.superposition,
+            e.several_tools,
+            e.large_deformation,
+            e.friction,
+            e.viscoelasticity,
+            t,
+        )
+        _add_fading_force(model, state, out, e.friction, t)
+        if add_nonlinear_force(state, e.large_deformation, out, t) and out.status[t] == OK:
+            out.status[t] = EXTRAPOLATED
+        write_torque(model, state, e.friction, out, t)
         out.contact_tool[n] = t
-        out.contact_penetration[n] = model.softness[0] * (1.0 / chi - 1.0) * force
+        fade = model.softness[0] * (1.0 / state.access[t] - 1.0)
+        out.contact_penetration[n] = fade * state.force[t]
         for d in range(3):
             out.contact_force[n, d] = out.force[t, d]
             out.contact_normal[n, d] = state.normal[t, d]
             out.contact_position[n, d] = tips[t, d] - model.tip_radius[t] * state.normal[t, d]
         n += 1
     out.n_contacts[0] = n
+
+
+@fast
+def _write_force_at_rest(state, out, t):  # type: ignore[no-untyped-def]
+    """F = lambda [grad phi + lambda grad gamma / 2], of a single tip on an organ at rest."""
+    force = state.force[t]
+    for d in range(3):
+        out.force[t, d] = force * (state.slope[t, d] + 0.5 * force * state.self_slope[t, d])
+
+
+@fast
+def _add_fading_force(model, state, out, friction, t):  # type: ignore[no-untyped-def]
+    """Derivative of the compliance that is added where access fades."""
+    chi = state.access[t]
+    if chi < 1.0:
+        fading = model.softness[0] / (chi * chi)
+        square = state.force[t] * state.force[t]
+        if friction is not None:
+            square = force_squared(friction, t)
+        for d in range(3):
+            out.force[t, d] -= 0.5 * square * fading * state.access_slope[t, d]

@@ -1,7 +1,6 @@
-"""What a step reads and never changes: a vademecum, tools and effects laid out in flat arrays.
+"""The constant arrays of a step: a vademecum, tools and effects laid out flat.
 
-``vademecum -> lay_out -> Layout``; :mod:`avatar_core.contact.model` puts state and compiled code to
-it.
+``vademecum -> lay_out -> Layout``; :mod:`avatar_core.contact.model` adds state and compiled code.
 """
 
 from __future__ import annotations
@@ -15,27 +14,31 @@ import numpy as np
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud import cloud_arrays
 from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.large_deformation import LargeArrays, LargeDeformationEffect
+from avatar_core.contact.effects.large_deformation import (
+    LargeDeformationArrays,
+    LargeDeformationEffect,
+)
 from avatar_core.contact.effects.selection import (
     ARRAYS,
     Constants,
+    adapted_vademecum,
+    default_effects,
     find,
-    in_its_modes,
-    natural_effects,
     selected_arrays,
 )
 from avatar_core.contact.effects.several_tools import SeveralTools
 from avatar_core.contact.kernels import ModelArrays
-from avatar_core.contact.tip_response import make_tip_response, sampled_at_tip
+from avatar_core.contact.tip_response import TipResponse, make_tip_response, sampled_at_tip
 from avatar_core.errors import ContactError, SceneError
 from avatar_core.reduction.near_field import LocalBlocks, hash_rows
-from avatar_core.vademecum.accuracy import Cloud, Precision
+from avatar_core.vademecum.accuracy import Cloud, Detail, Precision
 from avatar_core.vademecum.certificate import Certificate
 
 if TYPE_CHECKING:
+    from avatar_core.vademecum.large_deformation import LargeDeformation
     from avatar_core.vademecum.model import Vademecum
 
-LANES = 32  # single numbers that a vectorised loop takes at once
+LANES = 32  # float32 numbers that a vectorised loop processes at once
 TIP_RADIUS_RANGE = (2e-3, 20e-3)  # [m]
 PERIOD = 1e-3  # of the steps [s]
 
@@ -45,12 +48,12 @@ class Layout:
     """The constant arrays of a step: of the organ and its tools, and of the chosen effects.
 
     arrays : ModelArrays
-        distance, access, origin, spacing: the tip field; row, carrier, share,
-        self_compliance: the tip response on its grid; force_error, relative, on it too;
+        distance, access, origin, spacing: the tip field; row, carrier, carrier_weight,
+        self_compliance: the tip response on its grid; force_error, relative, on the same grid;
         position (n_positions, 3) [m]; load (n_positions, 3, rank and zeros) and the contact_*
-        blocks, found by their hash tables: compliance [m/N]; softness (1,), added where access
-        fades [m/N];
-        space (n_blocks, rank, BLOCK) int16, modes of the displacement of the cloud, in parts of
+        blocks with their hash tables: compliance [m/N]; softness (1,), added where access fades
+        [m/N];
+        space (n_blocks, rank, BLOCK) int16, displacement modes of the cloud in units of
         space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 6), the cloud without
         displacement [m]; tip_radius (n_tools,) [m]
     effects : Constants, None for each effect that was not chosen
@@ -80,56 +83,55 @@ class Layout:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all of it [bytes]."""
+        """Memory of all arrays [bytes]."""
         return int(sum(array.nbytes for array in self.flat().values()))
 
 
 def lay_out(
     vademecum: Vademecum,
     tip_radii: tuple[float, ...] = (5e-3,),
-    modes: int | None = None,
-    cloud: Cloud = "surface",
+    detail: Detail | None = None,
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
-    precision: Precision = "int16",
-    near: float = 1.0,
 ) -> Layout:
-    """The constant arrays of a contact model; see :func:`avatar_core.contact.model.prepare`."""
-    _check(vademecum, tip_radii, modes, cloud, precision, near)
+    """The constant arrays of a contact model; see :func:`avatar_core.contact.model.prepare`.
+
+    detail : of the displacement; by default all modes at the surface
+    """
+    detail = detail or Detail(vademecum.far.rank)
+    _check(vademecum, tip_radii, detail)
     if effects is None:
-        effects = natural_effects(vademecum, len(tip_radii))
+        effects = default_effects(vademecum, len(tip_radii))
     for effect in effects:
         effect.require(vademecum)
     if len(tip_radii) > 1 and find(effects, SeveralTools) is None:
         raise SceneError(
             f"{len(tip_radii)} tools without several_tools; add it to the effects, or name one tool"
         )
-    vademecum, mass = in_its_modes(vademecum, effects)
-    surface, mesh = vademecum.surface, vademecum.mesh
-    contact = vademecum.contact_near
+    modes = None if detail.modes == vademecum.far.rank else detail.modes
+    vademecum, mass = adapted_vademecum(vademecum, effects)
+    surface, contact = vademecum.surface, vademecum.contact_near
     contact_start, contact_slot = hash_rows(contact)
     load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
     response = make_tip_response(
         surface, vademecum.tip_field, load, contact, kernels.MAX_DEPTH, max(tip_radii)
     )
-    bends = find(effects, LargeDeformationEffect) is not None
-    bent = vademecum.large if bends else None
-    shown = cloud_arrays(vademecum, modes, cloud, precision, near, bent.space if bent else None)
-    large = None
-    if bent is not None:
-        values = np.vstack([bent.depth, bent.reach])
-        grid = sampled_at_tip(surface, vademecum.tip_field, response, values)
-        kept = shown.fade > 0.0
-        fade = shown.fade[kept, None].astype(bent.near.dtype)
-        # in rows whether or not blocks were left out: one layout, one compilation
-        large = LargeArrays(grid, bent.load, np.ascontiguousarray(bent.near[:, kept] * fade))
+    large = vademecum.large if find(effects, LargeDeformationEffect) is not None else None
+    shown = cloud_arrays(
+        vademecum,
+        modes,
+        detail.cloud,
+        detail.precision,
+        detail.near,
+        large.space if large else None,
+    )
     arrays = ModelArrays(
         *vademecum.tip_field,
         row=response.row,
         carrier=response.carrier,
-        share=response.share,
+        carrier_weight=response.carrier_weight,
         self_compliance=response.self_compliance,
-        force_error=_force_error(vademecum, response.smoothing, bends),
+        force_error=_force_error(vademecum.certificate, large, response.smoothing),
         position=np.ascontiguousarray(surface.centers),
         load=_padded(load),
         contact_start=contact_start,
@@ -141,21 +143,34 @@ def lay_out(
         near_start=shown.near.start,
         near_target=shown.near.target,
         near_block=shown.near.block,
-        rest=np.pad(mesh.vertices[shown.points], ((0, 0), (0, 3))).astype(np.float32),
+        rest=np.pad(vademecum.mesh.vertices[shown.points], ((0, 0), (0, 3))).astype(np.float32),
         tip_radius=np.array(tip_radii, float),
     )
+    nonlinear = _nonlinear_arrays(vademecum, large, response, shown.fade) if large else None
     reach = _reach(contact, surface.centers)
-    return Layout(arrays, selected_arrays(vademecum, effects, mass, large, reach, period))
+    return Layout(arrays, selected_arrays(vademecum, effects, mass, nonlinear, reach, period))
 
 
-def _force_error(vademecum: Vademecum, smoothing: np.ndarray, bends: bool) -> np.ndarray:
+def _nonlinear_arrays(
+    vademecum: Vademecum, large: LargeDeformation, response: TipResponse, fade: np.ndarray
+) -> LargeDeformationArrays:
+    """Coefficients of large deformation on the grid, and its modes at the cloud."""
+    values = np.vstack([large.depth, large.reach])
+    grid = sampled_at_tip(vademecum.surface, vademecum.tip_field, response, values)
+    kept = fade > 0.0
+    near = large.near[:, kept] * fade[kept, None].astype(large.near.dtype)
+    # C order whether or not blocks were left out: one memory layout, one compilation
+    return LargeDeformationArrays(grid, large.load, np.ascontiguousarray(near))
+
+
+def _force_error(
+    certificate: Certificate | None, large: LargeDeformation | None, smoothing: np.ndarray
+) -> np.ndarray:
     """The relative error of the force on the grid of the tip field; NaN if it is not known."""
-    certificate = vademecum.certificate or Certificate.unknown()
-    bending = 0.0
-    if bends and vademecum.large is not None:
-        pushed = vademecum.large.certificate
-        bending = pushed.contact_mean if pushed else float("nan")
-    return certificate.force_error.relative(smoothing, bending)
+    nonlinear = 0.0
+    if large is not None:
+        nonlinear = large.certificate.contact_mean if large.certificate else float("nan")
+    return (certificate or Certificate.unknown()).force_error.relative(smoothing, nonlinear)
 
 
 def _reach(near: LocalBlocks, centers: np.ndarray) -> float:
@@ -165,31 +180,25 @@ def _reach(near: LocalBlocks, centers: np.ndarray) -> float:
 
 
 def _padded(load: np.ndarray) -> np.ndarray:
-    """Zeros up to a multiple of the modes that a compiled loop takes at once."""
+    """The loads with zeros up to a multiple of ``LANES`` modes."""
     return np.pad(load, ((0, 0), (0, 0), (0, -load.shape[2] % LANES)))
 
 
-def _check(
-    vademecum: Vademecum,
-    tip_radii: tuple[float, ...],
-    modes: int | None,
-    cloud: str,
-    precision: str,
-    near: float,
-) -> None:
+def _check(vademecum: Vademecum, tip_radii: tuple[float, ...], detail: Detail) -> None:
     low, high = TIP_RADIUS_RANGE
     if not 1 <= len(tip_radii) <= kernels.MAX_TOOLS:
         raise ContactError(f"{len(tip_radii)} tools; give 1 to {kernels.MAX_TOOLS} tip radii")
     for radius in tip_radii:
         if not low <= radius <= high:
             raise ContactError(f"tip radius {radius:g} m; it must lie in {low:g} to {high:g} m")
-    if modes is not None and not 1 <= modes <= vademecum.far.rank:
-        raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {vademecum.far.rank}")
-    for name, value, known in (
-        ("cloud", cloud, get_args(Cloud)),
-        ("precision", precision, get_args(Precision)),
-    ):
+    modes, rank = detail.modes, vademecum.far.rank
+    if not 1 <= modes <= rank:
+        raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {rank}")
+    for name, known in (("cloud", get_args(Cloud)), ("precision", get_args(Precision))):
+        value = getattr(detail, name)
         if value not in known:
             raise ContactError(f"{name} '{value}' is unknown; choose {', '.join(known)}")
-    if not 0.0 <= near <= 1.0:
-        raise ContactError(f"near is {near:g}; give a part of the near field's radius, 0 to 1")
+    if not 0.0 <= detail.near <= 1.0:
+        raise ContactError(
+            f"near is {detail.near:g}; give a fraction of the near field's radius, 0 to 1"
+        )

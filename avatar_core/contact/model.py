@@ -20,14 +20,13 @@ from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.selection import (
     NO_EFFECTS,
     Selection,
-    for_cloud,
-    online,
+    allocate,
 )
-from avatar_core.contact.effects.several_tools import SeveralArrays
+from avatar_core.contact.effects.several_tools import SeveralToolsArrays
 from avatar_core.contact.kernels import ModelArrays, Out, State
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
 from avatar_core.contact.tip_response import MAX_STENCIL
-from avatar_core.vademecum.accuracy import Cloud, Precision
+from avatar_core.vademecum.accuracy import Cloud, Detail, Precision
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
@@ -126,8 +125,8 @@ class ContactModel:
         if mine.friction is not None and theirs.friction is not None:
             for name in ("anchor", "motion", "push"):
                 getattr(mine.friction, name)[:] = getattr(theirs.friction, name)
-        if mine.motion is not None and theirs.motion is not None:
-            mine.motion.clock[:] = theirs.motion.clock
+        if mine.respiration is not None and theirs.respiration is not None:
+            mine.respiration.clock[:] = theirs.respiration.clock
 
     def reset(self) -> None:
         """Forget all contacts and all that has passed: the organ is at rest."""
@@ -172,8 +171,8 @@ def prepare(
     ContactError, SceneError
         For radii, modes or clouds out of range; for effects that the vademecum cannot serve.
     """
-    layout = lay_out(vademecum, tip_radii, modes, cloud, effects, period, precision, near)
-    return make_model(layout, halves)
+    detail = Detail(vademecum.far.rank if modes is None else modes, cloud, precision, near)
+    return make_model(lay_out(vademecum, tip_radii, detail, effects, period), halves)
 
 
 def make_model(layout: Layout, halves: bool = False) -> ContactModel:
@@ -229,11 +228,11 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     effects = _online(layout)
     kernels.force_error(arrays, out, far_away)
     if halves:
-        first = _compiled(kernels.contact_solve, arrays, state, out, far_away, *effects)
-        second = _compiled(kernels.contact_deform, arrays, state, out, *for_cloud(effects))
+        first = _compiled(kernels.contact_solve, arrays, state, out, far_away, effects)
+        second = _compiled(kernels.contact_deform, arrays, state, out, effects)
         compiled = Compiled(first, second, None)
     else:
-        whole = _compiled(kernels.contact_step, arrays, state, out, far_away, *effects)
+        whole = _compiled(kernels.contact_step, arrays, state, out, far_away, effects)
         compiled = Compiled(None, None, whole)
     model = ContactModel(layout, state, effects, out, far_away, compiled)
     model.reset()
@@ -242,13 +241,15 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
 
 def _n_far(layout: Layout) -> int:
     """Modes of the far field that the cloud can show."""
-    large = layout.effects.large
-    return len(layout.arrays.space_scale) - (0 if large is None else large.load.shape[2])
+    large_deformation = layout.effects.large_deformation
+    return len(layout.arrays.space_scale) - (
+        0 if large_deformation is None else large_deformation.load.shape[2]
+    )
 
 
 def _online(layout: Layout) -> Selection:
     n_positions, _, n_modes = layout.arrays.load.shape
-    return online(layout.effects, len(layout.arrays.tip_radius), n_modes, n_positions)
+    return allocate(layout.effects, len(layout.arrays.tip_radius), n_modes, n_positions)
 
 
 def _compiled(kernel: Any, *arguments: Any) -> Any:
@@ -275,7 +276,7 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
     model.tips[:] = tips
     assert model.compiled.step is not None
     return model.compiled.step(
-        model.layout.arrays, model.state, model.out, model.tips, *model.effects
+        model.layout.arrays, model.state, model.out, model.tips, model.effects
     )
 
 
@@ -284,14 +285,14 @@ def solve(model: ContactModel, tips: np.ndarray) -> int:
     model.tips[:] = tips
     assert model.compiled.solve is not None
     return model.compiled.solve(
-        model.layout.arrays, model.state, model.out, model.tips, *model.effects
+        model.layout.arrays, model.state, model.out, model.tips, model.effects
     )
 
 
 def deform(model: ContactModel) -> None:
     """The second half of :func:`step`: the cloud under the forces of :func:`solve`."""
     assert model.compiled.deform is not None
-    model.compiled.deform(model.layout.arrays, model.state, model.out, *for_cloud(model.effects))
+    model.compiled.deform(model.layout.arrays, model.state, model.out, model.effects)
 
 
 def estimate_error(model: ContactModel) -> None:
@@ -316,7 +317,7 @@ def warm_up(n_tools: int = 1) -> None:
         spacing=np.ones(1, double),
         row=np.full((8, 8, 8), -1, np.int32),
         carrier=np.zeros((0, 6), np.int32),
-        share=np.zeros((0, 6), single),
+        carrier_weight=np.zeros((0, 6), single),
         self_compliance=np.full((8, 8, 8), 1.0, single),
         force_error=np.zeros((8, 8, 8), single),
         position=np.zeros((n, 3), double),
@@ -333,8 +334,8 @@ def warm_up(n_tools: int = 1) -> None:
         rest=np.zeros((points, 6), single),
         tip_radius=np.full(n_tools, 5e-3, double),
     )
-    several = SeveralArrays(np.ones(1)) if n_tools > 1 else None
-    make_model(Layout(arrays, NO_EFFECTS._replace(several=several)), halves=True)
+    several_tools = SeveralToolsArrays(np.ones(1)) if n_tools > 1 else None
+    make_model(Layout(arrays, NO_EFFECTS._replace(several_tools=several_tools)), halves=True)
 
 
 def stored_energy(model: ContactModel) -> float:
@@ -352,8 +353,8 @@ def stored_energy(model: ContactModel) -> float:
     else:
         force = state.force[active]
         energy = 0.5 * force @ state.compliance[np.ix_(active, active)] @ force
-    if effects.large is not None:
+    if effects.large_deformation is not None:
         for t in active:
-            h, _, whole, _ = effects.large.bent[t]
+            h, _, whole, _ = effects.large_deformation.added_depth[t]
             energy += h * state.force[t] - whole / state.self_compliance[t]
     return float(energy)

@@ -1,21 +1,22 @@
-"""Where a tip is not alone with an organ at rest: what all causes do at its load positions.
+"""Superposition: the displacement by all causes at the load positions of each tip.
 
-The organ is linear: other tips, the past, its weight and its swing add up. All of them are
+The organ is linear: the effects of other tips, load history, weight and inertia add up,
 
     u(s) = sum_k Y_k(s) q_k + near field,      q = free + gain * (Y^T f),
 
-f the loads of all tips. ``free`` is where the modes would be at the end of the period without any
-load, ``gain`` how far a load moves them within it (0 and 1 where nothing remembers or swings). The
-same for the near field, whose memory is a distribution of loads, and which has no mass.
+with f the loads of all tips, ``free`` the modes at the end of the period without any load, and
+``gain`` their displacement within the period by a unit load (0 and 1 without viscoelasticity and
+inertia). The near field follows the same equation; its history is a distribution of loads, and it
+has no mass.
 
-The force on a tip is the derivative of the elastic energy at fixed loads and memory. With the
-displacement u_j at the load positions by all causes, U = a sum_j w_j u_j that of the patch, and g
-the force on the tissue,
+The force on a tip is the derivative of the elastic energy at fixed loads and history. With u_j the
+displacement at load position j by all causes, U = a sum_j w_j u_j that of the patch, and g the
+force on the tissue,
 
     F_d = - g . d(target)/dp_d + (da/dp_d / a) g . U + a sum_j dw_j/dp_d g . u_j,
 
-target the displacement that the tip asks of its patch, along n only where nothing sticks, and
-a^2 = gamma / (f . C f) from :mod:`avatar_core.contact.tip_response`.
+where target is the displacement that contact prescribes for the patch (along n only, unless the tip
+sticks), and a^2 = gamma / (f . C f) from :mod:`avatar_core.contact.tip_response`.
 """
 
 from __future__ import annotations
@@ -26,47 +27,51 @@ import numpy as np
 
 from avatar_core.common.jit import fast
 from avatar_core.common.splines import cell_at, second_derivatives
-from avatar_core.contact.effects import friction as stick_slip
-from avatar_core.contact.effects import several_tools as coupling
-from avatar_core.contact.effects import viscoelasticity as relaxation
+from avatar_core.contact.effects.friction import (
+    add_modal_load,
+    add_near_friction,
+    target_derivative,
+)
+from avatar_core.contact.effects.several_tools import add_near_of_others
+from avatar_core.contact.effects.viscoelasticity import near_free_displacement
 
-Reply = namedtuple(
-    "Reply",
+Superposition = namedtuple(
+    "Superposition",
     [
         "free",  # (k,) modes at the end of the period without any load
-        "gain",  # (k,) what a load of one moves them
+        "gain",  # (k,) their displacement by a unit load within the period
         "total",  # (k,) modes at the end of the period
-        "near_gain",  # (1,) the same for the near field
-        "lift",  # (T,) displacement along n of the patch without any load [m]
-        "lifted",  # (T, 3) in all directions
-        "trail",  # (T, MAX_STENCIL, 3) near displacement at the nodes by remembered loads
-        "own",  # (MAX_STENCIL, 3) displacement at the nodes by a unit normal force at rest
-        "joint",  # (MAX_STENCIL, 3) displacement at the nodes by all causes
+        "near_gain",  # (1,) gain of the near field
+        "free_normal",  # (T,) its component along n [m]
+        "free_displacement",  # (T, 3) of the patch without any load [m]
+        "near_free",  # (T, MAX_STENCIL, 3) near displacement at the nodes by the load history
+        "unit_displacement",  # (MAX_STENCIL, 3) at the nodes by a unit normal force, at rest
+        "displacement",  # (MAX_STENCIL, 3) at the nodes by all causes
         "hessian",  # (3, 3) of phi
-        "turning",  # (3, 3) dn_i / dp_d
+        "normal_gradient",  # (3, 3) dn_i / dp_d
     ],
 )
 
 
-def make_reply(n_tools: int, n_modes: int, n_nodes: int) -> Reply:
-    """Scratch, at rest."""
-    return Reply(
+def make_superposition(n_tools: int, n_modes: int, n_nodes: int) -> Superposition:
+    """State of an organ at rest, and scratch."""
+    return Superposition(
         free=np.zeros(n_modes),
         gain=np.ones(n_modes),
         total=np.zeros(n_modes),
         near_gain=np.ones(1),
-        lift=np.zeros(n_tools),
-        lifted=np.zeros((n_tools, 3)),
-        trail=np.zeros((n_tools, n_nodes, 3)),
-        own=np.zeros((n_nodes, 3)),
-        joint=np.zeros((n_nodes, 3)),
+        free_normal=np.zeros(n_tools),
+        free_displacement=np.zeros((n_tools, 3)),
+        near_free=np.zeros((n_tools, n_nodes, 3)),
+        unit_displacement=np.zeros((n_nodes, 3)),
+        displacement=np.zeros((n_nodes, 3)),
         hessian=np.zeros((3, 3)),
-        turning=np.zeros((3, 3)),
+        normal_gradient=np.zeros((3, 3)),
     )
 
 
 @fast
-def at_nodes(model, state, t, amplitude, out):  # type: ignore[no-untyped-def]
+def modes_at_nodes(model, state, t, amplitude, out):  # type: ignore[no-untyped-def]
     """sum_k Y_k(s_j) q_k at the load positions of a tip."""
     for i in range(state.n_nodes[t]):
         load = model.load[state.nodes[t, i]]
@@ -78,73 +83,88 @@ def at_nodes(model, state, t, amplitude, out):  # type: ignore[no-untyped-def]
 
 
 @fast
-def lift_tip(model, state, reply, memory, t):  # type: ignore[no-untyped-def]
-    """Displacement of a tip's patch that is there without any load in this period."""
-    at_nodes(model, state, t, reply.free, reply.joint)
-    if memory is not None:
-        relaxation.leave_trail(model, state, memory, t, reply.trail[t])
+def free_tip_displacement(model, state, superposition, viscoelasticity, t):  # type: ignore[no-untyped-def]
+    """Displacement of a tip's patch without any load in this period."""
+    modes_at_nodes(model, state, t, superposition.free, superposition.displacement)
+    if viscoelasticity is not None:
+        near_free_displacement(model, state, viscoelasticity, t, superposition.near_free[t])
     n = state.n_nodes[t]
-    reply.lift[t] = 0.0
+    superposition.free_normal[t] = 0.0
     for d in range(3):
         value = 0.0
         for i in range(n):
-            value += state.weight[t, i, 0] * reply.joint[i, d]
-            if memory is not None:
-                value += state.weight[t, i, 0] * reply.trail[t, i, d]
-        reply.lifted[t, d] = state.scale[t] * value
-        reply.lift[t] += state.normal[t, d] * reply.lifted[t, d]
+            value += state.weight[t, i, 0] * superposition.displacement[i, d]
+            if viscoelasticity is not None:
+                value += state.weight[t, i, 0] * superposition.near_free[t, i, d]
+        superposition.free_displacement[t, d] = state.scale[t] * value
+        superposition.free_normal[t] += state.normal[t, d] * superposition.free_displacement[t, d]
 
 
 @fast
-def superpose(state, reply, friction):  # type: ignore[no-untyped-def]
-    """The modes under the forces found."""
-    total = reply.total
+def superpose_modes(state, superposition, friction):  # type: ignore[no-untyped-def]
+    """The modes under the forces that were found."""
+    if superposition is None:
+        return
+    total = superposition.total
     total[:] = 0.0
     for t in range(state.passage.shape[0]):
         if state.force[t] <= 0.0:
             continue
         if friction is not None:
-            stick_slip.drive(state, friction, t, total)
+            add_modal_load(state, friction, t, total)
         else:
             force = state.force[t] * state.scale[t]
             for k in range(total.shape[0]):
                 total[k] -= force * state.mode[t, k]
     for k in range(total.shape[0]):
-        total[k] = reply.free[k] + reply.gain[k] * total[k]
+        total[k] = superposition.free[k] + superposition.gain[k] * total[k]
 
 
 @fast
-def add_superposed_force(  # type: ignore[no-untyped-def]
-    model, state, out, tips, reply, several, large, friction, memory, t
+def write_superposed_force(  # type: ignore[no-untyped-def]
+    model,
+    state,
+    out,
+    tip,
+    superposition,
+    several_tools,
+    large_deformation,
+    friction,
+    viscoelasticity,
+    t,
 ):
-    """F of the module's text, without what bending and fading add."""
+    """F of the module's docstring, without the terms of large deformation and fading access."""
+    if superposition is None:
+        return
     n, a = state.normal[t], state.scale[t]
-    _turn(model, state, reply, t, tips[t])
-    at_nodes(model, state, t, state.mode[t], reply.own)
-    at_nodes(model, state, t, reply.total, reply.joint)
+    displacement, unit = superposition.displacement, superposition.unit_displacement
+    gradient = superposition.normal_gradient
+    _normal_gradient(model, state, superposition, t, tip)
+    modes_at_nodes(model, state, t, state.mode[t], unit)
+    modes_at_nodes(model, state, t, superposition.total, displacement)
     count = state.n_nodes[t]
     for i in range(count):
         for d in range(3):
-            reply.own[i, d] += state.column[t, i, d]
+            unit[i, d] += state.column[t, i, d]
     if friction is not None:
-        stick_slip.add_near(model, state, reply, several, friction, t)
+        add_near_friction(model, state, superposition, several_tools, friction, t)
     else:
-        near = -state.force[t] * a * reply.near_gain[0]
+        near = -state.force[t] * a * superposition.near_gain[0]
         for i in range(count):
             for d in range(3):
-                reply.joint[i, d] += near * state.column[t, i, d]
-        if several is not None:
-            coupling.add_near(state, reply, several, t)
-    if memory is not None:
+                displacement[i, d] += near * state.column[t, i, d]
+        if several_tools is not None:
+            add_near_of_others(state, superposition, several_tools, t)
+    if viscoelasticity is not None:
         for i in range(count):
             for d in range(3):
-                reply.joint[i, d] += reply.trail[t, i, d]
+                displacement[i, d] += superposition.near_free[t, i, d]
     g0, g1, g2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
     if friction is not None:
         g0, g1, g2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
     u0 = u1 = u2 = v0 = v1 = v2 = 0.0
     for i in range(count):
-        w, u, v = state.weight[t, i, 0], reply.joint[i], reply.own[i]
+        w, u, v = state.weight[t, i, 0], displacement[i], unit[i]
         u0 += w * u[0]
         u1 += w * u[1]
         u2 += w * u[2]
@@ -153,17 +173,19 @@ def add_superposed_force(  # type: ignore[no-untyped-def]
         v2 += w * v[2]
     for d in range(3):
         # da / a, from the grids' gamma and the derivative of f . C f
-        turn0, turn1, turn2 = reply.turning[0, d], reply.turning[1, d], reply.turning[2, d]
+        turn0, turn1, turn2 = gradient[0, d], gradient[1, d], gradient[2, d]
         slope = turn0 * v0 + turn1 * v1 + turn2 * v2
         joint = 0.0
         for i in range(count):
-            dw, u, v = state.weight[t, i, 1 + d], reply.joint[i], reply.own[i]
+            dw, u, v = state.weight[t, i, 1 + d], displacement[i], unit[i]
             slope += dw * (n[0] * v[0] + n[1] * v[1] + n[2] * v[2])
             joint += dw * (g0 * u[0] + g1 * u[1] + g2 * u[2])
         change = 0.5 * state.self_slope[t, d] / state.self_compliance[t] - slope / state.gram[t, t]
         value = a * (joint + change * (g0 * u0 + g1 * u1 + g2 * u2))
         if friction is not None:
-            value -= stick_slip.asked(model, state, reply, large, friction, t, d)
+            value -= target_derivative(
+                model, state, superposition, large_deformation, friction, t, d
+            )
         else:
             turned = turn0 * u0 + turn1 * u1 + turn2 * u2
             value += state.force[t] * (state.slope[t, d] - a * turned)
@@ -171,12 +193,14 @@ def add_superposed_force(  # type: ignore[no-untyped-def]
 
 
 @fast
-def _turn(model, state, reply, t, p):  # type: ignore[no-untyped-def]
+def _normal_gradient(model, state, superposition, t, p):  # type: ignore[no-untyped-def]
     """dn/dp = (I - n n^T) grad g / |g|, g = grad phi."""
-    n, hessian = state.normal[t], reply.hessian
+    n, hessian = state.normal[t], superposition.hessian
     cell = cell_at(model.origin, model.spacing[0], p)
     second_derivatives(model.distance, cell, model.spacing[0], hessian)
     for d in range(3):
         along = n[0] * hessian[0, d] + n[1] * hessian[1, d] + n[2] * hessian[2, d]
         for i in range(3):
-            reply.turning[i, d] = (hessian[i, d] - n[i] * along) / state.steepness[t]
+            superposition.normal_gradient[i, d] = (hessian[i, d] - n[i] * along) / state.steepness[
+                t
+            ]

@@ -40,11 +40,8 @@ def timed(
     paths = slides(vademecum, tip_radii)
     pairs: list[tuple[ContactModel, CurvePoint]] = []
     for group in _same_arrays(curve):
-        first = group[0].detail
-        layout = lay_out(
-            vademecum, tip_radii, None, first.cloud, effects, period, first.precision, first.near
-        )
-        model = make_model(layout, halves)
+        whole = replace(group[0].detail, modes=vademecum.far.rank)
+        model = make_model(lay_out(vademecum, tip_radii, whole, effects, period), halves)
         pairs += [(model, point) for point in group]
         progress(0.5 * len(pairs) / len(curve.points))
     points = _timed(pairs, paths, lambda fraction: progress(0.5 + 0.5 * fraction))

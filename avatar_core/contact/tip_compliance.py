@@ -13,7 +13,7 @@ from avatar_core.reduction.near_field import find_block
 
 
 @fast
-def mode(model, state, t):  # type: ignore[no-untyped-def]
+def modal_load(model, state, t):  # type: ignore[no-untyped-def]
     """Y^T f: how a unit normal force of tip t drives the modes."""
     mode, n = state.mode[t], state.normal[t]
     mode[:] = np.float32(0.0)

@@ -36,7 +36,9 @@ MAX_STENCIL = 128  # load positions that carry one tip, at most
 # 6) int32 load positions and share (n_rows, 3 or 6) float32, their weights;
 # self_compliance, smoothing (nx, ny, nz) float32, gamma [m/N] and what smoothing changed of it,
 # K |gamma_0 / gamma - 1|
-TipResponse = namedtuple("TipResponse", ["row", "carrier", "share", "self_compliance", "smoothing"])
+TipResponse = namedtuple(
+    "TipResponse", ["row", "carrier", "carrier_weight", "self_compliance", "smoothing"]
+)
 
 
 def make_tip_response(
@@ -61,11 +63,11 @@ def make_tip_response(
     shell = (field.distance > -depth - margin) & (field.distance < height + margin)
     shell &= _dilated(field.access > 0.0)
     points = field.origin + spacing * np.argwhere(shell)
-    carrier, share = closest_weights(surface, points)
+    carrier, carrier_weight = closest_weights(surface, points)
     normal = _normals(field)[shell]
     compliance = np.zeros(shell.shape)
     compliance[shell] = _self_compliance(
-        carrier, share, normal, load, near.start, near.target, near.block
+        carrier, carrier_weight, normal, load, near.start, near.target, near.block
     )
     deviation = SMOOTHING * surface.patch_radius / spacing
     smooth = smoothed(compliance, deviation, shell)
@@ -76,7 +78,7 @@ def make_tip_response(
     return TipResponse(
         row,
         carrier.astype(np.int32),
-        share.astype(np.float32),
+        carrier_weight.astype(np.float32),
         smooth.astype(np.float32),
         smoothed(change, deviation, shell).astype(np.float32),
     )
@@ -103,7 +105,7 @@ def sampled_at_tip(
     out = np.zeros((len(values), *shell.shape), np.float32)
     for k, value in enumerate(values):
         grid = np.zeros(shell.shape)
-        grid[shell] = (response.share * value[response.carrier]).sum(axis=1)
+        grid[shell] = (response.carrier_weight * value[response.carrier]).sum(axis=1)
         out[k] = smoothed(grid, deviation, shell)
     return out
 
@@ -129,7 +131,7 @@ def _dilated(mask: np.ndarray, steps: int = 3) -> np.ndarray:
 
 
 @compiled(fastmath=True)
-def _self_compliance(carrier, share, normal, load, start, target, block):  # type: ignore[no-untyped-def]
+def _self_compliance(carrier, carrier_weight, normal, load, start, target, block):  # type: ignore[no-untyped-def]
     """n_s . C(s, s) n_s at every sample, C interpolated from both sides."""
     out = np.zeros(len(carrier))
     rank, n_carriers = load.shape[2], carrier.shape[1]
@@ -138,7 +140,7 @@ def _self_compliance(carrier, share, normal, load, start, target, block):  # typ
         n0, n1, n2 = normal[q, 0], normal[q, 1], normal[q, 2]
         mode[:] = 0.0
         for i in range(n_carriers):
-            w = share[q, i]
+            w = carrier_weight[q, i]
             y = load[carrier[q, i]]
             for k in range(rank):
                 mode[k] += w * (n0 * y[0, k] + n1 * y[1, k] + n2 * y[2, k])
@@ -151,7 +153,7 @@ def _self_compliance(carrier, share, normal, load, start, target, block):  # typ
                 for m in range(n_carriers):
                     if target[e] == carrier[q, m]:
                         b = block[e]
-                        value += (share[q, i] * share[q, m]) * (
+                        value += (carrier_weight[q, i] * carrier_weight[q, m]) * (
                             n0 * (b[0, 0] * n0 + b[0, 1] * n1 + b[0, 2] * n2)
                             + n1 * (b[1, 0] * n0 + b[1, 1] * n1 + b[1, 2] * n2)
                             + n2 * (b[2, 0] * n0 + b[2, 1] * n1 + b[2, 2] * n2)
@@ -161,7 +163,7 @@ def _self_compliance(carrier, share, normal, load, start, target, block):  # typ
 
 
 @fast
-def gather(model, state, t, cell, reply):  # type: ignore[no-untyped-def]
+def gather(model, state, t, cell, superposition):  # type: ignore[no-untyped-def]
     """Weights of tip t in a cell of the grid, and where there is a ``reply`` their gradient.
 
     Of ``state`` it fills ``nodes[t]``, the load positions that carry the tip, their number
@@ -176,12 +178,12 @@ def gather(model, state, t, cell, reply):  # type: ignore[no-untyped-def]
                 if row < 0:
                     continue
                 b = wx[i] * wy[j] * wz[k]
-                if reply is not None:
+                if superposition is not None:
                     b0, b1 = dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k]
                     b2 = wx[i] * wy[j] * dz[k]
                 for e in range(model.carrier.shape[1]):
-                    share = model.share[row, e]
-                    if share == 0.0:
+                    carrier_weight = model.carrier_weight[row, e]
+                    if carrier_weight == 0.0:
                         continue
                     carrier = model.carrier[row, e]
                     q = state.local[carrier]
@@ -192,11 +194,11 @@ def gather(model, state, t, cell, reply):  # type: ignore[no-untyped-def]
                         state.local[carrier], nodes[q] = q, carrier
                         weight[q] = 0.0
                         n += 1
-                    weight[q, 0] += b * share
-                    if reply is not None:
-                        weight[q, 1] += b0 * share
-                        weight[q, 2] += b1 * share
-                        weight[q, 3] += b2 * share
+                    weight[q, 0] += b * carrier_weight
+                    if superposition is not None:
+                        weight[q, 1] += b0 * carrier_weight
+                        weight[q, 2] += b1 * carrier_weight
+                        weight[q, 3] += b2 * carrier_weight
     for q in range(n):
         state.local[nodes[q]] = -1
     state.n_nodes[t] = n

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from avatar_core.contact.effects import Effect
-from avatar_core.contact.effects.selection import natural_effects
+from avatar_core.contact.effects.selection import default_effects
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
 from avatar_core.contact.model import ContactModel, make_model
 from avatar_core.contact.timing import timed
@@ -66,16 +66,7 @@ class ModelSpec:
 
     def layout(self, detail: Detail, period: float) -> Layout:
         """Constant arrays of a contact model that shows a detail."""
-        return lay_out(
-            self.vademecum,
-            self.tip_radii,
-            detail.modes,
-            detail.cloud,
-            self.effects,
-            period,
-            detail.precision,
-            detail.near,
-        )
+        return lay_out(self.vademecum, self.tip_radii, detail, self.effects, period)
 
 
 def specify(
@@ -92,7 +83,7 @@ def specify(
     """
     if scene is None:
         chosen = at_values(vademecum, values or {})
-        return ModelSpec(chosen, (5e-3,), None, "surface", natural_effects(chosen, 1))
+        return ModelSpec(chosen, (5e-3,), None, "surface", default_effects(chosen, 1))
     scene.require(vademecum)
     chosen = at_values(vademecum, {**scene.values, **(values or {})})
     radii = tuple(tool.tip_radius for tool in scene.tools)

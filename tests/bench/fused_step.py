@@ -31,7 +31,7 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
     before, seen = state.passage[0], state.seen[0]
     farthest = 50e-3 if state.active[0] else 5e-3
     way = (x - seen[0]) ** 2 + (y - seen[1]) ** 2 + (z - seen[2]) ** 2
-    goes_on = way < farthest * farthest
+    continuous = way < farthest * farthest
     state.active[0] = False
     state.force[0] = 0.0
     touches = False
@@ -104,7 +104,7 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
                 g2 += wx[i] * along_z
             gap = phi - model.tip_radius[0]
             if gap < 0.0:
-                deepest = 25e-3 if before == ENTERED and goes_on else 5e-3
+                deepest = 25e-3 if before == ENTERED and continuous else 5e-3
                 if chi < 1e-2:
                     status = OUT_OF_RANGE
                 elif before == BARRED or phi < -deepest:
@@ -133,8 +133,8 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
                         continue
                     b = wx[i] * wy[j] * wz[k]
                     for e in range(model.carrier.shape[1]):
-                        share = model.share[row, e]
-                        if share == 0.0:
+                        carrier_weight = model.carrier_weight[row, e]
+                        if carrier_weight == 0.0:
                             continue
                         carrier = model.carrier[row, e]
                         q = state.local[carrier]
@@ -145,7 +145,7 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
                             state.local[carrier], nodes[q] = q, carrier
                             weight[q, 0] = 0.0
                             count += 1
-                        weight[q, 0] += b * share
+                        weight[q, 0] += b * carrier_weight
         for q in range(count):
             state.local[nodes[q]] = -1
         # --- modes, near column, compliance of the interpolation ------------------------------

@@ -22,12 +22,12 @@ from avatar_core.vademecum.model import Vademecum
 
 TIP = 10e-3
 CHOICES: dict[str, tuple[Effect, str]] = {
-    "several_tools": (SeveralTools(), "several"),
+    "several_tools": (SeveralTools(), "several_tools"),
     "friction": (Friction(), "friction"),
-    "viscoelasticity": (Viscoelasticity((0.3, 0.2), (0.05, 1.0)), "memory"),
+    "viscoelasticity": (Viscoelasticity((0.3, 0.2), (0.05, 1.0)), "viscoelasticity"),
     "inertia": (Inertia(), "inertia"),
-    "self_weight": (SelfWeight(), "weight"),
-    "respiration": (Respiration(period=0.5), "motion"),
+    "self_weight": (SelfWeight(), "self_weight"),
+    "respiration": (Respiration(period=0.5), "respiration"),
 }
 
 

@@ -66,7 +66,7 @@ def _organ(
         spacing=np.array([spacing]),
         row=np.zeros(shape, np.int32),
         carrier=np.zeros((1, 3), np.int32),
-        share=np.array([[1.0, 0.0, 0.0]], single),
+        carrier_weight=np.array([[1.0, 0.0, 0.0]], single),
         self_compliance=np.full(shape, gamma, single),
         force_error=np.zeros(shape, single),
         position=np.zeros((1, 3)),

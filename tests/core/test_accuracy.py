@@ -209,7 +209,7 @@ def test_sag_stays_when_modes_are_left_out(
 
     kept = lost(0.75)
     monkeypatch.setattr(
-        "avatar_core.contact.effects.self_weight.body_first", lambda vademecum: vademecum
+        "avatar_core.contact.effects.selection.body_first", lambda vademecum: vademecum
     )
     assert kept < 0.1 and kept < 0.5 * lost(0.75)  # in their own order the last modes hold it
 

@@ -12,7 +12,7 @@ from avatar_core.contact.effects import (
     Respiration,
     SelfWeight,
 )
-from avatar_core.contact.effects.inertia import kinetic_energy, turned_modes
+from avatar_core.contact.effects.inertia import kinetic_energy, vibration_modes
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.contact.tool_path import inner_positions, middle_of_access
 from avatar_core.fem.patch_loads import patch_loads
@@ -48,13 +48,13 @@ def test_free_vibration_has_the_frequencies_of_the_whole_organ(
     free = np.flatnonzero(free)
     stiffness = elasticity.stiffness[free][:, free].tocsc()
     value = sla.eigsh(stiffness, 5, mass[free][:, free], sigma=0.0, return_eigenvectors=False)
-    _, modal = turned_modes(v, rho)
+    _, modal = vibration_modes(v, rho)
     np.testing.assert_allclose(1.0 / np.sqrt(modal[:5]), np.sqrt(np.sort(value)), rtol=0.01)
 
 
 def swing_energy(model: ContactModel) -> float:
-    swing = model.effects.inertia
-    return kinetic_energy(swing) + 0.5 * float(swing.modes @ swing.modes)
+    inertia = model.effects.inertia
+    return kinetic_energy(inertia) + 0.5 * float(inertia.modes @ inertia.modes)
 
 
 def test_a_released_organ_swings_with_its_frequency_and_never_gains_energy(
@@ -94,7 +94,7 @@ def test_energy_never_grows_in_a_minute_of_swinging(phantom_vademecum: Vademecum
     for k in range(60_000):
         step(model, rest if k < 30_000 else np.full((1, 3), 1e3))
         near = model.state.compliance[0, 0] - model.state.scale[0] ** 2 * float(
-            model.effects.reply.gain @ model.state.mode[0].astype(float) ** 2
+            model.effects.superposition.gain @ model.state.mode[0].astype(float) ** 2
         )
         held = 0.5 * near * model.state.force[0] ** 2 if model.state.force[0] > 0.0 else 0.0
         energy.append(swing_energy(model) + held)
@@ -146,7 +146,7 @@ def test_a_tip_meets_the_organ_where_it_hangs(phantom_vademecum: Vademecum) -> N
         patch = patch_loads(elasticity, v.surface.centers[[j]], v.surface.patch_radius)
         exact = float(normal @ (patch.T @ (sag @ normal)))
         assert exact > 0.0
-        ratio.append(model.effects.reply.lift[0] / exact)
+        ratio.append(model.effects.superposition.free_normal[0] / exact)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.03)
     np.testing.assert_allclose(ratio, 1.0, atol=0.15)
 

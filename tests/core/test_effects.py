@@ -48,15 +48,15 @@ def test_an_effect_is_absent_from_the_step_when_off(
 
 
 def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -> None:
-    """Its signature ends in eight times none, and its code names no function of an effect."""
+    """Its last argument is eight times none."""
     import numba
 
     from avatar_core.contact import kernels
 
     model = prepare(phantom_vademecum, (TIP,), cloud="off", effects=())
-    arguments = (model.arrays, model.state, model.out, model.tips, *model.effects)
+    arguments = (model.arrays, model.state, model.out, model.tips, model.effects)
     signature = tuple(numba.typeof(argument) for argument in arguments)
-    assert [str(kind) for kind in signature[4:]] == ["none"] * 8
+    assert [str(kind) for kind in signature[4]] == ["none"] * 8
     assert signature in kernels.contact_step.overloads
 
 
@@ -76,7 +76,7 @@ def test_the_list_of_effects_is_complete() -> None:
 
 def test_a_layout_survives_being_flat(phantom_vademecum: Vademecum) -> None:
     effects = tuple(effect for effect, _ in CHOICES.values())
-    layout = lay_out(phantom_vademecum, (TIP,), cloud="off", effects=effects)
+    layout = lay_out(phantom_vademecum, (TIP,), effects=effects)
     again = Layout.of(layout.flat())
     for a, b in zip(layout.effects, again.effects, strict=True):
         assert (a is None) == (b is None)
@@ -113,9 +113,12 @@ def test_everything_at_once_stays_sane(phantom_vademecum: Vademecum) -> None:
     assert 0.5 < peak < 100.0
     for _ in range(20_000):
         step(model, np.full((2, 3), 1e3))
-    memory = model.effects.memory
-    assert np.abs(memory.past).max() < 1e-3 * peak
-    assert memory.count[0] == 0 or np.abs(memory.trail_elastic[: memory.count[0]]).max() < 1e-3
+    viscoelasticity = model.effects.viscoelasticity
+    assert np.abs(viscoelasticity.past).max() < 1e-3 * peak
+    assert (
+        viscoelasticity.count[0] == 0
+        or np.abs(viscoelasticity.near_elastic[: viscoelasticity.count[0]]).max() < 1e-3
+    )
 
 
 @pytest.mark.parametrize(

@@ -345,8 +345,12 @@ def test_tip_feels_the_bent_force(bent: Vademecum, model: ContactModel) -> None:
         depth = -model.state.gap[0]
         state = model.state
         a = state.self_compliance[0] * state.force[0]
-        second, third = powers(a, model.effects.large.bend[0, 2])
-        felt = a + model.effects.large.bend[0, 0] * second + model.effects.large.bend[0, 1] * third
+        second, third = powers(a, model.effects.large_deformation.coefficient[0, 2])
+        felt = (
+            a
+            + model.effects.large_deformation.coefficient[0, 0] * second
+            + model.effects.large_deformation.coefficient[0, 1] * third
+        )
         assert felt == pytest.approx(depth, rel=1e-6)
 
 

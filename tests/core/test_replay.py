@@ -14,7 +14,7 @@ import pytest
 from avatar_core.cli import main as cli
 from avatar_core.contact import model as contact
 from avatar_core.contact.effects import Effect, Friction, Respiration, Viscoelasticity
-from avatar_core.contact.effects.selection import natural_effects
+from avatar_core.contact.effects.selection import default_effects
 from avatar_core.contact.model import FAR_AWAY, prepare
 from avatar_core.contact.tool_path import push_and_slide
 from avatar_core.errors import StorageError
@@ -104,7 +104,7 @@ def test_the_forces_are_the_same(
 @pytest.mark.long
 def test_large_pushes_too(bent: Vademecum, tmp_path: Path) -> None:
     organ = stored(bent, tmp_path)
-    made = recorded(organ, natural_effects(organ, 1))
+    made = recorded(organ, default_effects(organ, 1))
     assert replay(made, organ).difference(made) <= SAME
 
 

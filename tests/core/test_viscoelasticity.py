@@ -78,10 +78,10 @@ def crept(period: float, force: float, end: float) -> float:
         # the next step is affine in the depth: two trials, of which the memory knows nothing
         found = []
         for trial in (depth + 1e-3, depth + 2e-3):
-            kept = [array.copy() for array in model.effects.memory]
+            kept = [array.copy() for array in model.effects.viscoelasticity]
             step(model, at_depth(trial))
             found.append(model.out.force[0, 2])
-            for array, before in zip(model.effects.memory, kept, strict=True):
+            for array, before in zip(model.effects.viscoelasticity, kept, strict=True):
                 array[...] = before
         depth += 1e-3 + 1e-3 * (wanted - found[0]) / (found[1] - found[0])
         step(model, at_depth(depth))

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.effects import Friction, Inertia, Viscoelasticity
-from avatar_core.contact.effects.friction import tangential
+from avatar_core.contact.effects.friction import tangential_force
 from avatar_core.contact.kernels import LEAP, MAX_DEPTH
 from avatar_core.contact.model import ContactModel, Status, step, stored_energy
 from tests.examples import examples
@@ -265,12 +265,12 @@ def test_viscoelastic_organ_creeps_back(figure: Figure) -> None:
     for _ in range(3000):
         step(model, at_depth(depth))
     assert model.out.force[0, 2] == pytest.approx((1.0 - g) * depth / COMPLIANCE, rel=1e-6)
-    held = model.effects.memory.elastic[2]
+    held = model.effects.viscoelasticity.elastic[2]
     step(model, AWAY[None])
     assert not model.out.force.any()
     times, left = np.arange(200) * PERIOD, np.zeros(200)
     for k in range(200):
-        left[k] = model.effects.memory.elastic[2] / held
+        left[k] = model.effects.viscoelasticity.elastic[2] / held
         step(model, AWAY[None])
     expected = g * np.exp(-(1.0 - g) * times / tau)
     off = np.abs(left / left[0] * g - expected).max()
@@ -278,7 +278,7 @@ def test_viscoelastic_organ_creeps_back(figure: Figure) -> None:
     assert left[0] == pytest.approx(g, rel=PERIOD / tau)
     for _ in range(8000):
         step(model, AWAY[None])
-    assert abs(model.effects.memory.elastic[2]) < 1e-10 * abs(held)
+    assert abs(model.effects.viscoelasticity.elastic[2]) < 1e-10 * abs(held)
     figure(f"creep off by {off:.1e}, nothing left after 8 s")
 
 
@@ -291,9 +291,9 @@ def test_organ_with_mass_swings_out(figure: Figure) -> None:
         step(model, spot.tip(RADIUS + 10e-3)[None])
     step(model, AWAY[None])
     assert not model.out.force.any()
-    swing, energy = model.effects.inertia, []
+    inertia, energy = model.effects.inertia, []
     for _ in range(n):
-        energy.append(0.5 * (swing.mass * swing.speed**2 + swing.modes**2))
+        energy.append(0.5 * (inertia.mass * inertia.velocity**2 + inertia.modes**2))
         step(model, AWAY[None])
     modes = np.array(energy)
     total = modes.sum(axis=1)
@@ -301,9 +301,9 @@ def test_organ_with_mass_swings_out(figure: Figure) -> None:
     assert total[0] > 1e-3
     rates = []
     for k in np.argsort(-modes[0])[:5]:
-        if swing.mass[k] == 0.0:
+        if inertia.mass[k] == 0.0:
             continue
-        omega = 1.0 / np.sqrt(swing.mass[k])
+        omega = 1.0 / np.sqrt(inertia.mass[k])
         # energy swings about its mean decay by zeta: over whole half periods it does not
         half = round(np.pi / omega / PERIOD)
         last = half * max(1, round(min(n - 1, 3.0 / (2.0 * zeta * omega * PERIOD)) // half))
@@ -362,7 +362,7 @@ def test_held_pose_leaves_friction_as_it_is(figure: Figure) -> None:
         for _ in range(50):
             step(model, tip)
             worst = max(worst, float(np.abs(model.out.force - first).max()))
-        moved = max(moved, float(tangential.py_func(model.state, model.effects.friction, 0)))
+        moved = max(moved, float(tangential_force.py_func(model.state, model.effects.friction, 0)))
     assert moved > 0.1
     assert worst < 1e-5  # the tolerance of a gap, 1e-9 m, over the compliance
     figure(

@@ -70,7 +70,7 @@ def stiffened(model: ContactModel, factor: float, several: bool) -> ContactModel
     root = single(np.sqrt(1.0 / factor))
     scaled |= {name: getattr(arrays, name) * root for name in ("load", "space_scale")}
     scaled["softness"] = arrays.softness / factor
-    chosen = Constants(several=model.layout.effects.several if several else None)
+    chosen = Constants(several_tools=model.layout.effects.several_tools if several else None)
     return make_model(Layout(arrays._replace(**scaled), chosen))
 
 

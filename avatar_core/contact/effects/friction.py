@@ -24,8 +24,8 @@ import numpy as np
 from avatar_core.common.jit import fast, inlined
 from avatar_core.common.quantities import quantity
 from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.friction_newton import approach, displaced
-from avatar_core.contact.effects.large_deformation import bend
+from avatar_core.contact.effects.friction_newton import newton_steps, patch_displacement
+from avatar_core.contact.effects.large_deformation import evaluate_added_depth
 from avatar_core.errors import SceneError
 from avatar_core.reduction.near_field import find_block
 
@@ -56,8 +56,8 @@ GAP_TOLERANCE = 1e-9  # [m]
 NONE, STICKS, SLIPS = range(3)  # what a tip did in the last period
 
 FrictionArrays = namedtuple("FrictionArrays", ["coefficients"])
-StickSlip = namedtuple(
-    "StickSlip",
+FrictionState = namedtuple(
+    "FrictionState",
     [
         "coefficients",  # (2,) mu_s, mu_k
         "spin",  # (T, 3) turn of the tool in this period [rad]; used up by it
@@ -68,10 +68,10 @@ StickSlip = namedtuple(
         "mode",  # (T, 3, k) Y^T w for forces along x, y, z
         "near",  # (T, T, 3, 3) near part of w . C w
         "compliance",  # (T, T, 3, 3) C
-        "asked",  # (T, 3) c - s_a
+        "offset",  # (T, 3) c - s_a
         "slipped",  # (T,) way of the anchor in this period [m]
         "matrix",  # (3T, 3T) of Newton's steps
-        "side",  # (3T,) [N]
+        "rhs",  # (3T,) [N]
         "best",  # (T, 3) push nearest to the solution among them [N]
     ],
 )
@@ -82,9 +82,9 @@ def friction_arrays(effect: Friction) -> FrictionArrays:
     return FrictionArrays(np.array([effect.static, effect.kinetic]))
 
 
-def make_stick_slip(arrays: FrictionArrays, n_tools: int, n_modes: int) -> StickSlip:
+def friction_state(arrays: FrictionArrays, n_tools: int, n_modes: int) -> FrictionState:
     """No tip touches."""
-    return StickSlip(
+    return FrictionState(
         *arrays,
         spin=np.zeros((n_tools, 3)),
         anchor=np.zeros((n_tools, 3)),
@@ -94,17 +94,19 @@ def make_stick_slip(arrays: FrictionArrays, n_tools: int, n_modes: int) -> Stick
         mode=np.zeros((n_tools, 3, n_modes), np.float32),
         near=np.zeros((n_tools, n_tools, 3, 3)),
         compliance=np.zeros((n_tools, n_tools, 3, 3)),
-        asked=np.zeros((n_tools, 3)),
+        offset=np.zeros((n_tools, 3)),
         slipped=np.zeros(n_tools),
         matrix=np.zeros((3 * n_tools, 3 * n_tools)),
-        side=np.zeros(3 * n_tools),
+        rhs=np.zeros(3 * n_tools),
         best=np.zeros((n_tools, 3)),
     )
 
 
 @fast
-def gather(model, state, friction, t):  # type: ignore[no-untyped-def]
+def gather_friction(model, state, friction, t):  # type: ignore[no-untyped-def]
     """How forces along x, y and z drive the modes, and the near part of the tip's compliance."""
+    if friction is None:
+        return
     mode = friction.mode[t]
     mode[:] = np.float32(0.0)
     for i in range(state.n_nodes[t]):
@@ -125,14 +127,14 @@ def _near_between(model, state, friction, t, s):  # type: ignore[no-untyped-def]
         for q in range(state.n_nodes[t]):
             e = find_block(model.contact_start, model.contact_slot, j, state.nodes[t, q])
             if e >= 0:
-                share, b = w * state.weight[t, q, 0], model.contact_block[e]
+                factor, b = w * state.weight[t, q, 0], model.contact_block[e]
                 for c in range(3):
                     for d in range(3):
-                        near[c, d] += share * b[c, d]
+                        near[c, d] += factor * b[c, d]
 
 
 @fast
-def _assemble(model, state, reply, several, friction):  # type: ignore[no-untyped-def]
+def _assemble(model, state, superposition, several_tools, friction):  # type: ignore[no-untyped-def]
     """C between all tips that touch, three by three."""
     for t in range(state.passage.shape[0]):
         for s in range(t + 1):
@@ -140,16 +142,16 @@ def _assemble(model, state, reply, several, friction):  # type: ignore[no-untype
                 continue
             if s != t:
                 friction.near[t, s] = 0.0
-                if several is not None and several.near[s, t]:
+                if several_tools is not None and several_tools.near[s, t]:
                     _near_between(model, state, friction, t, s)
             scale = state.scale[t] * state.scale[s]
             for c in range(3):
                 for d in range(3):
                     far = 0.0
                     one, other = friction.mode[t, c], friction.mode[s, d]
-                    for k in range(reply.gain.shape[0]):
-                        far += reply.gain[k] * one[k] * other[k]
-                    value = scale * (far + reply.near_gain[0] * friction.near[t, s, c, d])
+                    for k in range(superposition.gain.shape[0]):
+                        far += superposition.gain[k] * one[k] * other[k]
+                    value = scale * (far + superposition.near_gain[0] * friction.near[t, s, c, d])
                     friction.compliance[t, s, c, d] = value
                     if s != t:
                         friction.compliance[s, t, d, c] = value
@@ -160,9 +162,9 @@ def _assemble(model, state, reply, several, friction):  # type: ignore[no-untype
 
 
 @inlined
-def solve(model, state, tips, reply, several, large, friction):  # type: ignore[no-untyped-def]
+def solve_friction(model, state, tips, superposition, several_tools, large_deformation, friction):  # type: ignore[no-untyped-def]
     """Stick where friction can hold the tip, slip where it cannot."""
-    _assemble(model, state, reply, several, friction)
+    _assemble(model, state, superposition, several_tools, friction)
     mu_s, mu_k = friction.coefficients[0], friction.coefficients[1]
     for t in range(state.passage.shape[0]):
         if not state.active[t]:
@@ -172,28 +174,28 @@ def solve(model, state, tips, reply, several, large, friction):  # type: ignore[
         if state.force[t] <= 0.0:  # none before, or it was taken from a tip that leapt
             friction.motion[t] = NONE
             friction.push[t] = 0.0
-        _ask(model, state, friction, tips, t)
+        _set_offset(model, state, friction, tips, t)
         friction.limit[t] = 0.0  # a new contact starts without friction
         if friction.motion[t] == STICKS:
             friction.limit[t] = mu_s
         elif friction.motion[t] == SLIPS:
             friction.limit[t] = mu_k
-    converged = _sweep(state, reply, several, large, friction)
+    converged = _sweep(state, superposition, several_tools, large_deformation, friction)
     again = False
     for t in range(state.passage.shape[0]):
-        if state.active[t] and friction.motion[t] == STICKS and not _holds(state, friction, t):
+        if state.active[t] and friction.motion[t] == STICKS and not _sticks(state, friction, t):
             friction.limit[t] = mu_k
             again = True
     if again:
-        converged = _sweep(state, reply, several, large, friction)
+        converged = _sweep(state, superposition, several_tools, large_deformation, friction)
     for t in range(state.passage.shape[0]):
         if state.active[t]:
-            _settle(state, reply, several, friction, t)
+            _slide_anchor(state, superposition, several_tools, friction, t)
     return converged
 
 
 @inlined
-def _ask(model, state, friction, tips, t):  # type: ignore[no-untyped-def]
+def _set_offset(model, state, friction, tips, t):  # type: ignore[no-untyped-def]
     """y = c - s_a; a turn of the tool takes the anchor's partner along."""
     n, r, spin = state.normal[t], model.tip_radius[t], friction.spin[t]
     if friction.motion[t] != NONE:
@@ -203,31 +205,38 @@ def _ask(model, state, friction, tips, t):  # type: ignore[no-untyped-def]
         a[2] += r * (spin[0] * n[1] - spin[1] * n[0])
     for d in range(3):
         spin[d] = 0.0
-        friction.asked[t, d] = tips[t, d] - r * n[d] - friction.anchor[t, d]
+        friction.offset[t, d] = tips[t, d] - r * n[d] - friction.anchor[t, d]
 
 
 @inlined
-def _sweep(state, reply, several, large, friction):  # type: ignore[no-untyped-def]
+def _sweep(state, superposition, several_tools, large_deformation, friction):  # type: ignore[no-untyped-def]
     """Gauss-Seidel over the tips, the normal and then the tangential force of each."""
     for sweep in range(MAX_SWEEPS):
-        if several is not None and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
+        if several_tools is not None and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
             start = (sweep // PATIENCE) % (state.passage.shape[0] + 1)
-            approach(state, reply, several, large, friction, start)
+            newton_steps(state, superposition, several_tools, large_deformation, friction, start)
         worst = 0.0
         for t in range(state.passage.shape[0]):
             if state.active[t]:
-                worst = max(worst, _press(state, reply, several, large, friction, t))
-                worst = max(worst, _drag(state, reply, several, friction, t))
+                worst = max(
+                    worst,
+                    _update_normal(
+                        state, superposition, several_tools, large_deformation, friction, t
+                    ),
+                )
+                worst = max(
+                    worst, _update_tangential(state, superposition, several_tools, friction, t)
+                )
         if worst < GAP_TOLERANCE:
             return True
     return False
 
 
 @fast
-def _press(state, reply, several, large, friction, t):  # type: ignore[no-untyped-def]
+def _update_normal(state, superposition, several_tools, large_deformation, friction, t):  # type: ignore[no-untyped-def]
     """0 <= lambda  perp  gap - n . U + h >= 0."""
     n, c = state.normal[t], friction.compliance[t, t]
-    u0, u1, u2 = displaced(state, reply, several, friction, t)
+    u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
     gap = state.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2)
     stiff = 0.0
     for i in range(3):
@@ -236,10 +245,10 @@ def _press(state, reply, several, large, friction, t):  # type: ignore[no-untype
     g = friction.push[t]
     force = -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
     state.force[t] = max(0.0, force)
-    if large is not None:
-        bend(state, large, t)
-        gap += large.bent[t, 0]
-        stiff += large.bent[t, 1] * state.self_compliance[t]
+    if large_deformation is not None:
+        evaluate_added_depth(state, large_deformation, t)
+        gap += large_deformation.added_depth[t, 0]
+        stiff += large_deformation.added_depth[t, 1] * state.self_compliance[t]
     change = max(0.0, force - gap / stiff) - force
     for d in range(3):
         g[d] -= n[d] * change
@@ -248,10 +257,10 @@ def _press(state, reply, several, large, friction, t):  # type: ignore[no-untype
 
 
 @fast
-def _drag(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
+def _update_tangential(state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
     """tau <- tau + (what is asked - U) / stiffness, not beyond mu lambda."""
-    n, c, g, y = state.normal[t], friction.compliance[t, t], friction.push[t], friction.asked[t]
-    u0, u1, u2 = displaced(state, reply, several, friction, t)
+    n, c, g, y = state.normal[t], friction.compliance[t, t], friction.push[t], friction.offset[t]
+    u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
     along = x0 * n[0] + x1 * n[1] + x2 * n[2]
     across = c[0, 0] + c[1, 1] + c[2, 2]
@@ -274,7 +283,7 @@ def _drag(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
 
 
 @fast
-def tangential(state, friction, t):  # type: ignore[no-untyped-def]
+def tangential_force(state, friction, t):  # type: ignore[no-untyped-def]
     """|tau|."""
     n, g = state.normal[t], friction.push[t]
     along = g[0] * n[0] + g[1] * n[1] + g[2] * n[2]
@@ -282,24 +291,24 @@ def tangential(state, friction, t):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _holds(state, friction, t):  # type: ignore[no-untyped-def]
+def _sticks(state, friction, t):  # type: ignore[no-untyped-def]
     """Whether friction stays below its limit."""
-    return tangential(state, friction, t) < (1.0 - 1e-9) * friction.limit[t] * state.force[t]
+    return tangential_force(state, friction, t) < (1.0 - 1e-9) * friction.limit[t] * state.force[t]
 
 
 @fast
-def _settle(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
+def _slide_anchor(state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
     """Let the anchor slide to where the tissue under the tip is; note what the tip does."""
     friction.slipped[t] = 0.0
     if state.force[t] <= 0.0:
         friction.motion[t] = NONE
         friction.push[t] = 0.0
         return
-    if friction.motion[t] != NONE and _holds(state, friction, t):
+    if friction.motion[t] != NONE and _sticks(state, friction, t):
         friction.motion[t] = STICKS
         return
-    n, y = state.normal[t], friction.asked[t]
-    u0, u1, u2 = displaced(state, reply, several, friction, t)
+    n, y = state.normal[t], friction.offset[t]
+    u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
     if friction.motion[t] != NONE:
         along = x0 * n[0] + x1 * n[1] + x2 * n[2]
@@ -315,7 +324,7 @@ def _settle(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
 
 
 @fast
-def drive(state, friction, t, total):  # type: ignore[no-untyped-def]
+def add_modal_load(state, friction, t, total):  # type: ignore[no-untyped-def]
     """Y^T of the loads of a tip, added."""
     a, g, mode = state.scale[t], friction.push[t], friction.mode[t]
     for k in range(total.shape[0]):
@@ -323,16 +332,16 @@ def drive(state, friction, t, total):  # type: ignore[no-untyped-def]
 
 
 @fast
-def add_near(model, state, reply, several, friction, t):  # type: ignore[no-untyped-def]
+def add_near_friction(model, state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
     """Near displacement at the nodes of a tip by the pushes of all, into ``joint``."""
     for s in range(state.passage.shape[0]):
         if state.force[s] <= 0.0:
             continue
-        if s != t and (several is None or not several.near[s, t]):
+        if s != t and (several_tools is None or not several_tools.near[s, t]):
             continue
-        share, g = state.scale[s] * reply.near_gain[0], friction.push[s]
+        factor, g = state.scale[s] * superposition.near_gain[0], friction.push[s]
         for i in range(state.n_nodes[s]):
-            w = share * state.weight[s, i, 0]
+            w = factor * state.weight[s, i, 0]
             w0, w1, w2 = np.float32(w * g[0]), np.float32(w * g[1]), np.float32(w * g[2])
             for q in range(state.n_nodes[t]):
                 e = find_block(
@@ -342,22 +351,22 @@ def add_near(model, state, reply, several, friction, t):  # type: ignore[no-unty
                     continue
                 b = model.contact_block[e]
                 for d in range(3):
-                    reply.joint[q, d] += b[d, 0] * w0 + b[d, 1] * w1 + b[d, 2] * w2
+                    superposition.displacement[q, d] += b[d, 0] * w0 + b[d, 1] * w1 + b[d, 2] * w2
 
 
 @fast
-def asked(model, state, reply, large, friction, t, d):  # type: ignore[no-untyped-def]
+def target_derivative(model, state, superposition, large_deformation, friction, t, d):  # type: ignore[no-untyped-def]
     """g . d(target)/dp_d of U = y + n (gap - n . y), y = p - r n - s_a."""
-    n, g, y, r = state.normal[t], friction.push[t], friction.asked[t], model.tip_radius[t]
+    n, g, y, r = state.normal[t], friction.push[t], friction.offset[t], model.tip_radius[t]
     gap = state.gap[t]
-    if large is not None:
-        bend(state, large, t)
-        gap += large.bent[t, 0]
+    if large_deformation is not None:
+        evaluate_added_depth(state, large_deformation, t)
+        gap += large_deformation.added_depth[t, 0]
     gap -= n[0] * y[0] + n[1] * y[1] + n[2] * y[2]
     slope = state.slope[t, d]
     value = pulled = 0.0
     for i in range(3):
-        turn = reply.turning[i, d]
+        turn = superposition.normal_gradient[i, d]
         step = (1.0 if i == d else 0.0) - r * turn  # dy_i / dp_d
         value += g[i] * (step + turn * gap)
         slope -= turn * y[i] + n[i] * step
@@ -366,7 +375,7 @@ def asked(model, state, reply, large, friction, t, d):  # type: ignore[no-untype
 
 
 @fast
-def squared(friction, t):  # type: ignore[no-untyped-def]
+def force_squared(friction, t):  # type: ignore[no-untyped-def]
     """|g|^2."""
     g = friction.push[t]
     return g[0] * g[0] + g[1] * g[1] + g[2] * g[2]
@@ -375,6 +384,8 @@ def squared(friction, t):  # type: ignore[no-untyped-def]
 @fast
 def write_torque(model, state, friction, out, t):  # type: ignore[no-untyped-def]
     """Moment about the tip's centre of the force at its contact point, -r n x F."""
+    if friction is None:
+        return
     n, r, f = state.normal[t], model.tip_radius[t], out.force[t]
     out.torque[t, 0] = -r * (n[1] * f[2] - n[2] * f[1])
     out.torque[t, 1] = -r * (n[2] * f[0] - n[0] * f[2])

@@ -17,18 +17,22 @@ from __future__ import annotations
 import numpy as np
 
 from avatar_core.common.jit import fast, inlined
-from avatar_core.contact.effects.large_deformation import bend
+from avatar_core.contact.effects.large_deformation import evaluate_added_depth
 
 STEPS = 7
 LEAST_PIVOT = 1e-9
 
 
 @fast
-def displaced(state, reply, several, friction, t):  # type: ignore[no-untyped-def]
+def patch_displacement(state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
     """U of a tip's patch under the present pushes and all that is there without them."""
-    u0, u1, u2 = reply.lifted[t, 0], reply.lifted[t, 1], reply.lifted[t, 2]
+    u0, u1, u2 = (
+        superposition.free_displacement[t, 0],
+        superposition.free_displacement[t, 1],
+        superposition.free_displacement[t, 2],
+    )
     for s in range(state.passage.shape[0]):
-        if s != t and (several is None or not state.active[s]):
+        if s != t and (several_tools is None or not state.active[s]):
             continue
         c, g = friction.compliance[t, s], friction.push[s]
         u0 += c[0, 0] * g[0] + c[0, 1] * g[1] + c[0, 2] * g[2]
@@ -38,7 +42,7 @@ def displaced(state, reply, several, friction, t):  # type: ignore[no-untyped-de
 
 
 @inlined
-def approach(state, reply, several, large, friction, start):  # type: ignore[no-untyped-def]
+def newton_steps(state, superposition, several_tools, large_deformation, friction, start):  # type: ignore[no-untyped-def]
     """Bring all pushes nearer to the solution, or leave them.
 
     start : 0 from the present pushes, t from the t-th tip alone
@@ -48,19 +52,19 @@ def approach(state, reply, several, large, friction, start):  # type: ignore[no-
     for k in range(STEPS + 1):
         size = 0.0
         for t in range(n_tools):
-            size += _linearise(state, reply, several, large, friction, t)
+            size += _linearise(state, superposition, several_tools, large_deformation, friction, t)
         if size < least:
             least = size
             for t in range(n_tools):
                 for d in range(3):
                     best[t, d] = push[t, d]
         if k == 0 and start > 0 and state.active[start - 1]:
-            _push_alone(state, reply, friction, start - 1)
+            _start_from_one_tip(state, superposition, friction, start - 1)
         elif k < STEPS:
-            _eliminate(friction.matrix, friction.side)
+            _gauss(friction.matrix, friction.rhs)
             for t in range(n_tools):
                 for d in range(3):
-                    push[t, d] += friction.side[3 * t + d]
+                    push[t, d] += friction.rhs[3 * t + d]
     for t in range(n_tools):
         for d in range(3):
             push[t, d] = best[t, d]
@@ -69,12 +73,12 @@ def approach(state, reply, several, large, friction, start):  # type: ignore[no-
 
 
 @inlined
-def _push_alone(state, reply, friction, t):  # type: ignore[no-untyped-def]
+def _start_from_one_tip(state, superposition, friction, t):  # type: ignore[no-untyped-def]
     """What a tip pushes if no other touches and it is dragged at its limit."""
-    n, y, c = state.normal[t], friction.asked[t], friction.compliance[t, t]
+    n, y, c = state.normal[t], friction.offset[t], friction.compliance[t, t]
     gap, stiff, along = state.gap[t], 0.0, 0.0
     for i in range(3):
-        gap -= n[i] * reply.lifted[t, i]
+        gap -= n[i] * superposition.free_displacement[t, i]
         stiff += n[i] * (c[i, 0] * n[0] + c[i, 1] * n[1] + c[i, 2] * n[2])
         along += y[i] * n[i]
     across = 0.0
@@ -88,28 +92,28 @@ def _push_alone(state, reply, friction, t):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _linearise(state, reply, several, large, friction, t):  # type: ignore[no-untyped-def]
+def _linearise(state, superposition, several_tools, large_deformation, friction, t):  # type: ignore[no-untyped-def]
     """A tip's rows of Newton's system; returns the square of what it is off [N^2]."""
-    matrix, side, n_tools = friction.matrix, friction.side, state.passage.shape[0]
+    matrix, rhs, n_tools = friction.matrix, friction.rhs, state.passage.shape[0]
     for i in range(3):
-        side[3 * t + i] = 0.0
+        rhs[3 * t + i] = 0.0
         for column in range(3 * n_tools):
             matrix[3 * t + i, column] = 1.0 if column == 3 * t + i else 0.0
     if not state.active[t]:
         return 0.0
-    n, g, y, c = state.normal[t], friction.push[t], friction.asked[t], friction.compliance[t, t]
+    n, g, y, c = state.normal[t], friction.push[t], friction.offset[t], friction.compliance[t, t]
     normal = 0.0
     for i in range(3):
         normal += n[i] * (c[i, 0] * n[0] + c[i, 1] * n[1] + c[i, 2] * n[2])
     across = 0.5 * (c[0, 0] + c[1, 1] + c[2, 2] - normal)
-    u0, u1, u2 = displaced(state, reply, several, friction, t)
+    u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
     force = -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
     w, bending = state.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2), 0.0
-    if large is not None:
+    if large_deformation is not None:
         state.force[t] = max(0.0, force)
-        bend(state, large, t)
-        w += large.bent[t, 0]
-        bending = large.bent[t, 1] * state.self_compliance[t]
+        evaluate_added_depth(state, large_deformation, t)
+        w += large_deformation.added_depth[t, 0]
+        bending = large_deformation.added_depth[t, 1] * state.self_compliance[t]
     pressed = force - w / (normal + bending)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
     along = x0 * n[0] + x1 * n[1] + x2 * n[2]
@@ -128,7 +132,7 @@ def _linearise(state, reply, several, large, friction, t):  # type: ignore[no-un
     e, square = (e0, e1, e2), 0.0
     for i in range(3):
         off = -n[i] * max(0.0, pressed) + kept[i] - g[i]
-        side[3 * t + i] = off
+        rhs[3 * t + i] = off
         square += off * off
     if pressed <= 0.0:
         return square
@@ -153,7 +157,7 @@ def _linearise(state, reply, several, large, friction, t):  # type: ignore[no-un
 
 
 @inlined
-def _eliminate(a, b):  # type: ignore[no-untyped-def]
+def _gauss(a, b):  # type: ignore[no-untyped-def]
     """a x = b by Gauss with row exchange; x in place of b. Pivots that vanish get a small one."""
     n = b.shape[0]
     for k in range(n):

@@ -25,7 +25,7 @@ import numpy as np
 from avatar_core.common.jit import fast
 from avatar_core.common.quantities import quantity
 from avatar_core.contact.effects.base import Effect, require_body
-from avatar_core.contact.effects.self_weight import WeightArrays
+from avatar_core.contact.effects.self_weight import SelfWeightArrays
 from avatar_core.reduction.separated import SeparatedField
 
 if TYPE_CHECKING:
@@ -46,20 +46,20 @@ class Inertia(Effect):
         require_body(vademecum, self.name)
 
 
-InertiaArrays = namedtuple("InertiaArrays", ["mass", "drag", "timing"])
-Swing = namedtuple(
-    "Swing",
+InertiaArrays = namedtuple("InertiaArrays", ["mass", "damping", "period"])
+InertiaState = namedtuple(
+    "InertiaState",
     [
         "mass",  # (k,) m_k [s^2]
-        "drag",  # (k,) d_k [s]
-        "timing",  # (1,) dt [s]
+        "damping",  # (k,) d_k [s]
+        "period",  # (1,) dt [s]
         "modes",  # (k,) q
-        "speed",  # (k,) q'
+        "velocity",  # (k,) q'
     ],
 )
 
 
-def turned_modes(vademecum: Vademecum, density: float) -> tuple[Vademecum, np.ndarray]:
+def vibration_modes(vademecum: Vademecum, density: float) -> tuple[Vademecum, np.ndarray]:
     """The vademecum in modes of free vibration, slowest first, and their masses (k,) [s^2]."""
     far, body = vademecum.far, vademecum.body
     assert body is not None  # `require` has seen it
@@ -75,47 +75,51 @@ def inertia_arrays(effect: Inertia, mass: np.ndarray, period: float) -> InertiaA
     return InertiaArrays(mass, 2.0 * effect.damping * np.sqrt(mass), np.array([period]))
 
 
-def make_swing(arrays: InertiaArrays, n_modes: int, weight: WeightArrays | None) -> Swing:
+def inertia_state(
+    arrays: InertiaArrays, n_modes: int, self_weight: SelfWeightArrays | None
+) -> InertiaState:
     """At rest, hanging where there is gravity."""
-    still = np.zeros(n_modes) if weight is None else weight.amplitude.copy()
+    still = np.zeros(n_modes) if self_weight is None else self_weight.amplitude.copy()
     padding = n_modes - len(arrays.mass)
-    mass, drag = np.pad(arrays.mass, (0, padding)), np.pad(arrays.drag, (0, padding))
-    return Swing(mass, drag, arrays.timing, still, np.zeros(n_modes))
+    mass, drag = np.pad(arrays.mass, (0, padding)), np.pad(arrays.damping, (0, padding))
+    return InertiaState(mass, drag, arrays.period, still, np.zeros(n_modes))
 
 
 @fast
-def expect(reply, inertia, memory, weight):  # type: ignore[no-untyped-def]
+def predict_inertia(superposition, inertia, viscoelasticity, self_weight):  # type: ignore[no-untyped-def]
     """Modes at the end of the period without any load of a tool, and what a load adds."""
-    dt = inertia.timing[0]
-    for k in range(reply.free.shape[0]):
-        m, q, v = inertia.mass[k], inertia.modes[k], inertia.speed[k]
+    dt = inertia.period[0]
+    for k in range(superposition.free.shape[0]):
+        m, q, v = inertia.mass[k], inertia.modes[k], inertia.velocity[k]
         stiff, before, after = 1.0, q, q  # dR/dq of the period, R now, R at its end if q stays
-        if memory is not None:
-            stiff = 1.0 / memory.gain[0]
-            before, after = memory.rest[0] * memory.elastic[k], 0.0
-            for i in range(memory.decay.shape[0]):
-                before += memory.past[i, k]
-            after = memory.held[k] + stiff * memory.elastic[k]
-        elif weight is not None:  # R counts from where the organ hangs
-            before -= weight.amplitude[k]
-            after -= weight.amplitude[k]
-        whole = 2.0 * m / dt + 0.5 * stiff * dt + inertia.drag[k]
+        if viscoelasticity is not None:
+            stiff = 1.0 / viscoelasticity.gain[0]
+            before, after = viscoelasticity.rest[0] * viscoelasticity.elastic[k], 0.0
+            for i in range(viscoelasticity.decay.shape[0]):
+                before += viscoelasticity.past[i, k]
+            after = viscoelasticity.held[k] + stiff * viscoelasticity.elastic[k]
+        elif self_weight is not None:  # R counts from where the organ hangs
+            before -= self_weight.amplitude[k]
+            after -= self_weight.amplitude[k]
+        whole = 2.0 * m / dt + 0.5 * stiff * dt + inertia.damping[k]
         middle = (2.0 * m * v / dt - 0.5 * (before + after)) / whole
-        reply.free[k] = q + dt * middle
-        reply.gain[k] = dt / whole
+        superposition.free[k] = q + dt * middle
+        superposition.gain[k] = dt / whole
 
 
 @fast
-def advance(reply, inertia):  # type: ignore[no-untyped-def]
+def advance_inertia(superposition, inertia):  # type: ignore[no-untyped-def]
     """Complete the period."""
-    dt = inertia.timing[0]
-    for k in range(reply.total.shape[0]):
-        new = reply.total[k]
-        speed = 2.0 * (new - inertia.modes[k]) / dt - inertia.speed[k]
-        inertia.speed[k] = speed if abs(speed) > 1e-30 else 0.0
+    if inertia is None:
+        return
+    dt = inertia.period[0]
+    for k in range(superposition.total.shape[0]):
+        new = superposition.total[k]
+        speed = 2.0 * (new - inertia.modes[k]) / dt - inertia.velocity[k]
+        inertia.velocity[k] = speed if abs(speed) > 1e-30 else 0.0
         inertia.modes[k] = new if abs(new) > 1e-30 else 0.0
 
 
-def kinetic_energy(inertia: Swing) -> float:
+def kinetic_energy(inertia: InertiaState) -> float:
     """sum_k m_k v_k^2 / 2 [J]."""
-    return float(0.5 * inertia.mass @ inertia.speed**2)
+    return float(0.5 * inertia.mass @ inertia.velocity**2)

@@ -37,103 +37,125 @@ class LargeDeformationEffect(Effect):
             )
 
 
-LargeArrays = namedtuple(
-    "LargeArrays",
+LargeDeformationArrays = namedtuple(
+    "LargeDeformationArrays",
     [
         "grid",  # (3, nx, ny, nz) beta_2, beta_3 and the reach where a tip is
         "load",  # (2, n_positions, n) far part of V_2 and V_3
         "near",  # (2, n_blocks, 3) their near part at the cloud
     ],
 )
-Large = namedtuple(
-    "Large",
+LargeDeformationState = namedtuple(
+    "LargeDeformationState",
     [
         "grid",
         "load",
         "near",
-        "bend",  # (T, 3) beta_2, beta_3 and the reach
-        "bend_slope",  # (T, 3, 3) their gradients
-        "bent",  # (T, 4) h, dh/da, its integral, d2h/da2 at the reach
+        "coefficient",  # (T, 3) beta_2, beta_3 and the reach
+        "coefficient_gradient",  # (T, 3, 3) their gradients
+        "added_depth",  # (T, 4) h, dh/da, its integral, d2h/da2 at the reach
     ],
 )
 
 
-def make_large(arrays: LargeArrays, n_tools: int) -> Large:
+def large_deformation_state(arrays: LargeDeformationArrays, n_tools: int) -> LargeDeformationState:
     """With scratch for the tools."""
-    return Large(*arrays, np.zeros((n_tools, 3)), np.zeros((n_tools, 3, 3)), np.zeros((n_tools, 4)))
+    return LargeDeformationState(
+        *arrays, np.zeros((n_tools, 3)), np.zeros((n_tools, 3, 3)), np.zeros((n_tools, 4))
+    )
 
 
 @inlined
-def sample(model, large, t, tip):  # type: ignore[no-untyped-def]
+def sample_coefficients(model, large_deformation, t, tip):  # type: ignore[no-untyped-def]
     """beta_2, beta_3 and the reach of a tip."""
+    if large_deformation is None:
+        return
     cell = cell_at(model.origin, model.spacing[0], tip)
     for k in range(3):
-        large.bend[t, k] = in_cell(large.grid[k], cell, large.bend_slope[t, k])
+        large_deformation.coefficient[t, k] = in_cell(
+            large_deformation.grid[k], cell, large_deformation.coefficient_gradient[t, k]
+        )
 
 
 @fast
-def bend(state, large, t):  # type: ignore[no-untyped-def]
+def evaluate_added_depth(state, large_deformation, t):  # type: ignore[no-untyped-def]
     """h(a) = beta_2 a^2 + beta_3 a^3 at the present force, its slope and integral."""
     a = state.self_compliance[t] * state.force[t]
-    b2, b3, reach = large.bend[t, 0], large.bend[t, 1], large.bend[t, 2]
+    b2, b3, reach = (
+        large_deformation.coefficient[t, 0],
+        large_deformation.coefficient[t, 1],
+        large_deformation.coefficient[t, 2],
+    )
     inside = min(a, reach)
     over = a - inside
     h = inside * inside * (b2 + b3 * inside)
     slope = inside * (2.0 * b2 + 3.0 * b3 * inside)
     whole = inside**3 * (b2 / 3.0 + b3 * inside / 4.0)
-    large.bent[t, 0] = h + slope * over
-    large.bent[t, 1] = slope
-    large.bent[t, 2] = whole + over * (h + 0.5 * slope * over)
-    large.bent[t, 3] = 2.0 * b2 + 6.0 * b3 * reach
+    large_deformation.added_depth[t, 0] = h + slope * over
+    large_deformation.added_depth[t, 1] = slope
+    large_deformation.added_depth[t, 2] = whole + over * (h + 0.5 * slope * over)
+    large_deformation.added_depth[t, 3] = 2.0 * b2 + 6.0 * b3 * reach
 
 
 @fast
-def add_force(state, large, out, t):  # type: ignore[no-untyped-def]
-    """d/dp of the energy H = 1/gamma int_0^a h, at fixed force."""
-    gamma, reach = state.self_compliance[t], large.bend[t, 2]
+def add_nonlinear_force(state, large_deformation, out, t):  # type: ignore[no-untyped-def]
+    """d/dp of the energy H = 1/gamma int_0^a h, at fixed force; whether a exceeds the reach."""
+    if large_deformation is None:
+        return False
+    evaluate_added_depth(state, large_deformation, t)
+    gamma, reach = state.self_compliance[t], large_deformation.coefficient[t, 2]
     a = gamma * state.force[t]
     inside = min(a, reach)
     over = a - inside
     # derivatives of int h by beta_2, beta_3 and the reach, and of H by gamma
     by2 = inside**3 / 3.0 + over * (inside**2 + inside * over)
     by3 = inside**4 / 4.0 + over * (inside**3 + 1.5 * inside**2 * over)
-    by_reach = 0.5 * large.bent[t, 3] * over * over
-    by_gamma = (large.bent[t, 0] * a - large.bent[t, 2]) / gamma
+    by_reach = 0.5 * large_deformation.added_depth[t, 3] * over * over
+    by_gamma = (
+        large_deformation.added_depth[t, 0] * a - large_deformation.added_depth[t, 2]
+    ) / gamma
     for d in range(3):
-        change = by2 * large.bend_slope[t, 0, d] + by3 * large.bend_slope[t, 1, d]
-        change += by_reach * large.bend_slope[t, 2, d] + by_gamma * state.self_slope[t, d]
+        change = (
+            by2 * large_deformation.coefficient_gradient[t, 0, d]
+            + by3 * large_deformation.coefficient_gradient[t, 1, d]
+        )
+        change += (
+            by_reach * large_deformation.coefficient_gradient[t, 2, d]
+            + by_gamma * state.self_slope[t, d]
+        )
         out.force[t, d] += change / gamma
+    return a > reach
 
 
 @fast
-def powers_of_depth(state, large, t):  # type: ignore[no-untyped-def]
+def powers_of_depth(state, large_deformation, t):  # type: ignore[no-untyped-def]
     """a^2 and a^3 of a tip's linear depth, tangential beyond the reach."""
     a = state.self_compliance[t] * state.force[t]
-    inside = min(a, large.bend[t, 2])
+    inside = min(a, large_deformation.coefficient[t, 2])
     over = a - inside
     return inside * (inside + 2.0 * over), inside * inside * (inside + 3.0 * over)
 
 
 @fast
-def add_amplitudes(state, large, t, amplitude):  # type: ignore[no-untyped-def]
+def add_nonlinear_amplitudes(state, large_deformation, t, amplitude):  # type: ignore[no-untyped-def]
     """Far part of what a tip bends, into the last amplitudes of the cloud."""
-    n_bent = large.load.shape[2]
-    bent = amplitude[amplitude.shape[0] - n_bent :]
-    second, third = powers_of_depth(state, large, t)
+    n_nonlinear = large_deformation.load.shape[2]
+    nonlinear = amplitude[amplitude.shape[0] - n_nonlinear :]
+    second, third = powers_of_depth(state, large_deformation, t)
     for i in range(state.n_nodes[t]):
         w, j = state.weight[t, i, 0], state.nodes[t, i]
         w2, w3 = np.float32(w * second), np.float32(w * third)
-        y2, y3 = large.load[0, j], large.load[1, j]
-        for k in range(n_bent):
-            bent[k] += w2 * y2[k] + w3 * y3[k]
+        y2, y3 = large_deformation.load[0, j], large_deformation.load[1, j]
+        for k in range(n_nonlinear):
+            nonlinear[k] += w2 * y2[k] + w3 * y3[k]
 
 
 @fast
-def add_near_row(model, state, large, j, w, second, third):  # type: ignore[no-untyped-def]
+def add_nonlinear_near(model, state, large_deformation, j, w, second, third):  # type: ignore[no-untyped-def]
     """Near part of it, around one load position."""
     u = state.field
     w2, w3 = np.float32(w * second), np.float32(w * third)
     for e in range(model.near_start[j], model.near_start[j + 1]):
         v = 3 * model.near_target[e]
         for d in range(3):
-            u[v + d] += w2 * large.near[0, e, d] + w3 * large.near[1, e, d]
+            u[v + d] += w2 * large_deformation.near[0, e, d] + w3 * large_deformation.near[1, e, d]

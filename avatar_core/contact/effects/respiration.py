@@ -38,9 +38,9 @@ class Respiration(Effect):
         object.__setattr__(self, "axis", direction(self.axis, self.name, "axis"))
 
 
-MotionArrays = namedtuple("MotionArrays", ["stroke", "timing"])
-Motion = namedtuple(
-    "Motion",
+RespirationArrays = namedtuple("RespirationArrays", ["stroke", "timing"])
+RespirationState = namedtuple(
+    "RespirationState",
     [
         "stroke",  # (3,) A e [m]
         "timing",  # (3,) period of the breath [s], n, period of the step [s]
@@ -50,44 +50,54 @@ Motion = namedtuple(
 )
 
 
-def motion_arrays(effect: Respiration, period: float) -> MotionArrays:
+def respiration_arrays(effect: Respiration, period: float) -> RespirationArrays:
     """What the step needs of the breath."""
-    return MotionArrays(
+    return RespirationArrays(
         effect.amplitude * np.array(effect.axis),
         np.array([effect.period, float(effect.dwell), period]),
     )
 
 
-def make_motion(arrays: MotionArrays) -> Motion:
+def respiration_state(arrays: RespirationArrays) -> RespirationState:
     """At the end of a breath out."""
-    return Motion(*arrays, np.zeros(1), np.zeros(3))
+    return RespirationState(*arrays, np.zeros(1), np.zeros(3))
 
 
 @inlined
-def into_organ(motion, tips):  # type: ignore[no-untyped-def]
+def to_organ_frame(respiration, tips):  # type: ignore[no-untyped-def]
     """Advance the breath by a period, and take the tips into the organ's frame."""
-    period = motion.timing[0]
-    motion.clock[0] = (motion.clock[0] + motion.timing[2]) % period
-    out = np.cos(np.pi * motion.clock[0] / period) ** 2
-    part = 1.0 - out ** motion.timing[1]
+    if respiration is None:
+        return
+    period = respiration.timing[0]
+    respiration.clock[0] = (respiration.clock[0] + respiration.timing[2]) % period
+    out = np.cos(np.pi * respiration.clock[0] / period) ** 2
+    part = 1.0 - out ** respiration.timing[1]
     for d in range(3):
-        motion.shift[d] = part * motion.stroke[d]
+        respiration.shift[d] = part * respiration.stroke[d]
         for t in range(tips.shape[0]):
-            tips[t, d] -= motion.shift[d]
+            tips[t, d] -= respiration.shift[d]
 
 
 @inlined
-def out_of_organ(motion, out):  # type: ignore[no-untyped-def]
+def to_world_frame(respiration, out):  # type: ignore[no-untyped-def]
     """Contacts back into the world's frame; forces are the same in both."""
+    if respiration is None:
+        return
     for i in range(out.n_contacts[0]):
         for d in range(3):
-            out.contact_position[i, d] += motion.shift[d]
+            out.contact_position[i, d] += respiration.shift[d]
 
 
 @fast
-def move_cloud(motion, cloud):  # type: ignore[no-untyped-def]
+def shift_cloud(respiration, cloud):  # type: ignore[no-untyped-def]
     """Deformed positions too; the displacement stays that within the organ."""
-    x, y, z = np.float32(motion.shift[0]), np.float32(motion.shift[1]), np.float32(motion.shift[2])
+    if respiration is None:
+        return
+    x, y, z = (
+        np.float32(respiration.shift[0]),
+        np.float32(respiration.shift[1]),
+        np.float32(respiration.shift[2]),
+    )
     for v in range(cloud.shape[0]):
         cloud[v, 0] += x
         cloud[v, 1] += y

@@ -1,7 +1,7 @@
 """From the effects that a scene names to the arguments of its step.
 
-Offline, :func:`selected_arrays` asks each chosen effect for the constant arrays it needs; online,
-:func:`online` puts state and scratch around them. What is not chosen stays None in both.
+Offline, :func:`selected_arrays` asks each chosen effect for the constant arrays it needs; then
+:func:`allocate` adds state and scratch. An effect that is not chosen stays None in both.
 """
 
 from __future__ import annotations
@@ -11,21 +11,50 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from avatar_core.contact.effects import friction, inertia, respiration, self_weight, viscoelasticity
 from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.friction import Friction
-from avatar_core.contact.effects.inertia import Inertia
-from avatar_core.contact.effects.large_deformation import (
-    LargeArrays,
-    LargeDeformationEffect,
-    make_large,
+from avatar_core.contact.effects.friction import (
+    Friction,
+    FrictionArrays,
+    friction_arrays,
+    friction_state,
 )
-from avatar_core.contact.effects.respiration import Respiration
-from avatar_core.contact.effects.self_weight import SelfWeight
-from avatar_core.contact.effects.several_tools import SeveralArrays, SeveralTools, make_several
+from avatar_core.contact.effects.inertia import (
+    Inertia,
+    InertiaArrays,
+    inertia_arrays,
+    inertia_state,
+    vibration_modes,
+)
+from avatar_core.contact.effects.large_deformation import (
+    LargeDeformationArrays,
+    LargeDeformationEffect,
+    large_deformation_state,
+)
+from avatar_core.contact.effects.respiration import (
+    Respiration,
+    RespirationArrays,
+    respiration_arrays,
+    respiration_state,
+)
+from avatar_core.contact.effects.self_weight import (
+    SelfWeight,
+    SelfWeightArrays,
+    body_first,
+    self_weight_arrays,
+)
+from avatar_core.contact.effects.several_tools import (
+    SeveralTools,
+    SeveralToolsArrays,
+    several_tools_state,
+)
 from avatar_core.contact.effects.tumour import Tumour, at_contrast
-from avatar_core.contact.effects.viscoelasticity import Viscoelasticity
-from avatar_core.contact.superposition import make_reply
+from avatar_core.contact.effects.viscoelasticity import (
+    Viscoelasticity,
+    ViscoelasticityArrays,
+    viscoelasticity_arrays,
+    viscoelasticity_state,
+)
+from avatar_core.contact.superposition import make_superposition
 from avatar_core.contact.tip_response import MAX_STENCIL
 
 if TYPE_CHECKING:
@@ -33,38 +62,41 @@ if TYPE_CHECKING:
 
 
 class Constants(NamedTuple):
-    """Constant arrays by argument of the step, in its order; None where a scene does without."""
+    """Constant arrays of each effect, in the order of the step's arguments; None if not chosen."""
 
-    several: Any = None
-    large: Any = None
+    several_tools: Any = None
+    large_deformation: Any = None
     friction: Any = None
-    memory: Any = None
+    viscoelasticity: Any = None
     inertia: Any = None
-    weight: Any = None
-    motion: Any = None
+    self_weight: Any = None
+    respiration: Any = None
 
 
 class Selection(NamedTuple):
-    """The arguments themselves; ``reply`` with any of the next but ``large``, or ``weight``."""
+    """The step's arguments after ``tips``.
 
-    reply: Any
-    several: Any
-    large: Any
+    superposition : present with any effect but large deformation and respiration
+    """
+
+    superposition: Any
+    several_tools: Any
+    large_deformation: Any
     friction: Any
-    memory: Any
+    viscoelasticity: Any
     inertia: Any
-    weight: Any
-    motion: Any
+    self_weight: Any
+    respiration: Any
 
 
 ARRAYS: dict[str, Any] = {
-    "several": SeveralArrays,
-    "large": LargeArrays,
-    "friction": friction.FrictionArrays,
-    "memory": viscoelasticity.MemoryArrays,
-    "inertia": inertia.InertiaArrays,
-    "weight": self_weight.WeightArrays,
-    "motion": respiration.MotionArrays,
+    "several_tools": SeveralToolsArrays,
+    "large_deformation": LargeDeformationArrays,
+    "friction": FrictionArrays,
+    "viscoelasticity": ViscoelasticityArrays,
+    "inertia": InertiaArrays,
+    "self_weight": SelfWeightArrays,
+    "respiration": RespirationArrays,
 }
 NO_EFFECTS = Constants()
 
@@ -76,8 +108,8 @@ def find(effects: Sequence[Effect], kind: type[_E]) -> _E | None:
     return next((effect for effect in effects if isinstance(effect, kind)), None)
 
 
-def natural_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
-    """What a vademecum and a number of tools call for when no scene says otherwise."""
+def default_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
+    """Effects of a scene that names none: those that the vademecum and the tools require."""
     effects: list[Effect] = []
     if vademecum.large is not None:
         effects.append(LargeDeformationEffect())
@@ -88,72 +120,65 @@ def natural_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
-def in_its_modes(
+def adapted_vademecum(
     vademecum: Vademecum, effects: Sequence[Effect]
 ) -> tuple[Vademecum, np.ndarray | None]:
-    """The vademecum as the effects need it, and the mass of its modes, if it swings.
+    """The vademecum in the modes that the effects need, and with inertia the mass of each mode.
 
-    Modes that the body itself moves in come first, since a cloud may show only the first.
+    The modes of the moving body come first, since a cloud may show only the first.
     """
     vademecum = at_contrast(vademecum, find(effects, Tumour))
-    swing = find(effects, Inertia)
-    if swing is None:
-        hangs = find(effects, SelfWeight) is not None and vademecum.body is not None
-        return (self_weight.body_first(vademecum) if hangs else vademecum), None
-    return inertia.turned_modes(vademecum, swing.density)
+    inertia = find(effects, Inertia)
+    if inertia is not None:
+        return vibration_modes(vademecum, inertia.density)
+    if find(effects, SelfWeight) is not None and vademecum.body is not None:
+        return body_first(vademecum), None
+    return vademecum, None
 
 
 def selected_arrays(
     vademecum: Vademecum,
     effects: Sequence[Effect],
     mass: np.ndarray | None,
-    large: LargeArrays | None,
+    large_deformation: LargeDeformationArrays | None,
     contact_reach: float,
     period: float,
 ) -> Constants:
-    """What the chosen effects need; all but ``large`` is made here."""
-    memory, weight = find(effects, Viscoelasticity), find(effects, SelfWeight)
-    swing, drag, breath = (
-        find(effects, Inertia),
-        find(effects, Friction),
-        find(effects, Respiration),
-    )
-    softened = 1.0 / (1.0 - sum(memory.g)) if memory else 1.0
-    several = find(effects, SeveralTools)
+    """Constant arrays of the chosen effects; those of large deformation come in complete.
+
+    mass : of each mode, from :func:`adapted_vademecum`
+    contact_reach : longest distance that the near field of contact spans [m]
+    """
+    several_tools, friction = find(effects, SeveralTools), find(effects, Friction)
+    viscoelasticity, inertia = find(effects, Viscoelasticity), find(effects, Inertia)
+    self_weight, respiration = find(effects, SelfWeight), find(effects, Respiration)
+    softened = 1.0 / (1.0 - sum(viscoelasticity.g)) if viscoelasticity else 1.0
     return Constants(
-        several=SeveralArrays(np.array([contact_reach])) if several else None,
-        large=large,
-        friction=friction.friction_arrays(drag) if drag else None,
-        memory=viscoelasticity.memory_arrays(memory, period) if memory else None,
-        inertia=inertia.inertia_arrays(swing, mass, period) if swing and mass is not None else None,
-        weight=self_weight.weight_arrays(weight, vademecum, softened) if weight else None,
-        motion=respiration.motion_arrays(breath, period) if breath else None,
+        SeveralToolsArrays(np.array([contact_reach])) if several_tools else None,
+        large_deformation,
+        friction_arrays(friction) if friction else None,
+        viscoelasticity_arrays(viscoelasticity, period) if viscoelasticity else None,
+        inertia_arrays(inertia, mass, period) if inertia and mass is not None else None,
+        self_weight_arrays(self_weight, vademecum, softened) if self_weight else None,
+        respiration_arrays(respiration, period) if respiration else None,
     )
 
 
-def online(constants: Constants, n_tools: int, n_modes: int, n_positions: int) -> Selection:
+def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int) -> Selection:
     """State and scratch around the constant arrays: the organ at rest, no tool near it."""
-    c = constants
-    weight = None
-    if c.weight is not None:
-        weight = self_weight.WeightArrays(_padded(c.weight.amplitude, n_modes))
-    replies = any(x is not None for x in (c.several, c.friction, c.memory, c.inertia, c.weight))
-    return Selection(
-        reply=make_reply(n_tools, n_modes, MAX_STENCIL) if replies else None,
-        several=make_several(c.several, n_tools, MAX_STENCIL) if c.several else None,
-        large=make_large(c.large, n_tools) if c.large else None,
-        friction=friction.make_stick_slip(c.friction, n_tools, n_modes) if c.friction else None,
-        memory=viscoelasticity.make_memory(c.memory, n_modes, n_positions) if c.memory else None,
-        inertia=inertia.make_swing(c.inertia, n_modes, weight) if c.inertia else None,
-        weight=weight,
-        motion=respiration.make_motion(c.motion) if c.motion else None,
+    several_tools, large_deformation, friction, viscoelasticity, inertia, weight, respiration = (
+        constants
     )
-
-
-def for_cloud(chosen: Selection) -> tuple[object, ...]:
-    """The arguments of the step's second half."""
-    return (chosen.reply, chosen.large, chosen.friction, chosen.memory, chosen.motion)
-
-
-def _padded(values: np.ndarray, length: int) -> np.ndarray:
-    return np.pad(np.asarray(values, float), (0, length - len(values)))
+    if weight is not None:
+        weight = SelfWeightArrays(np.pad(weight.amplitude, (0, n_modes - len(weight.amplitude))))
+    superposed = (several_tools, friction, viscoelasticity, inertia, weight)
+    return Selection(
+        make_superposition(n_tools, n_modes, MAX_STENCIL) if any(superposed) else None,
+        several_tools_state(several_tools, n_tools, MAX_STENCIL) if several_tools else None,
+        large_deformation_state(large_deformation, n_tools) if large_deformation else None,
+        friction_state(friction, n_tools, n_modes) if friction else None,
+        viscoelasticity_state(viscoelasticity, n_modes, n_positions) if viscoelasticity else None,
+        inertia_state(inertia, n_modes, weight) if inertia else None,
+        weight,
+        respiration_state(respiration) if respiration else None,
+    )

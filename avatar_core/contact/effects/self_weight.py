@@ -52,14 +52,18 @@ def body_first(vademecum: Vademecum) -> Vademecum:
     return replace(vademecum, far=far, body=turned)
 
 
-WeightArrays = namedtuple("WeightArrays", ["amplitude"])  # (k,) of the modes, the organ hanging
+SelfWeightArrays = namedtuple(
+    "SelfWeightArrays", ["amplitude"]
+)  # (k,) of the modes, the organ hanging
 
 
-def weight_arrays(effect: SelfWeight, vademecum: Vademecum, softened: float) -> WeightArrays:
+def self_weight_arrays(
+    effect: SelfWeight, vademecum: Vademecum, softened: float
+) -> SelfWeightArrays:
     """Amplitudes of the modes.
 
     softened : Young's modulus of a touch over that after a long time
     """
     assert vademecum.body is not None  # `require` has seen it
     force = effect.density * effect.gravity * np.array(effect.direction)
-    return WeightArrays(softened * (vademecum.body.weight @ force))
+    return SelfWeightArrays(softened * (vademecum.body.weight @ force))

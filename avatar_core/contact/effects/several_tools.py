@@ -16,7 +16,7 @@ import numpy as np
 
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.large_deformation import bend
+from avatar_core.contact.effects.large_deformation import evaluate_added_depth
 from avatar_core.reduction.near_field import find_block
 
 MAX_EXCHANGES = 4  # for each tool, of the tips that are held
@@ -32,9 +32,9 @@ class SeveralTools(Effect):
     text: ClassVar[str] = "tools feel each other through the organ"
 
 
-SeveralArrays = namedtuple("SeveralArrays", ["reach"])  # (1,) of the near field [m]
-Several = namedtuple(
-    "Several",
+SeveralToolsArrays = namedtuple("SeveralToolsArrays", ["reach"])  # (1,) of the near field [m]
+SeveralToolsState = namedtuple(
+    "SeveralToolsState",
     [
         "reach",  # (1,) of the near field [m]
         "column",  # (T, T, MAX_STENCIL, 3) near displacement at the nodes of the second tip by a
@@ -43,16 +43,18 @@ Several = namedtuple(
         "extent",  # (T,) radius of a tip's nodes [m]
         "matrix",  # (T, T) C, with what large deformation adds
         "factor",  # (T, T) its Cholesky factor
-        "asked",  # (T,) the gap without any force [m]
+        "free_gap",  # (T,) the gap without any force [m]
         "trial",  # (T,) forces that close the gaps of the tips that are held [N]
-        "held",  # (T,)
+        "active_set",  # (T,)
     ],
 )
 
 
-def make_several(arrays: SeveralArrays, n_tools: int, n_nodes: int) -> Several:
+def several_tools_state(
+    arrays: SeveralToolsArrays, n_tools: int, n_nodes: int
+) -> SeveralToolsState:
     """With scratch for the pairs of tools."""
-    return Several(
+    return SeveralToolsState(
         *arrays,
         np.zeros((n_tools, n_tools, n_nodes, 3), np.float32),
         np.zeros((n_tools, n_tools), np.bool_),
@@ -66,45 +68,49 @@ def make_several(arrays: SeveralArrays, n_tools: int, n_nodes: int) -> Several:
 
 
 @inlined
-def connect(model, state, several, friction):  # type: ignore[no-untyped-def]
+def couple_near_fields(model, state, several_tools, friction):  # type: ignore[no-untyped-def]
     """Near fields between all pairs of tips that touch; with friction, whether there are any."""
+    if several_tools is None:
+        return
     n_tools = state.passage.shape[0]
     for t in range(n_tools):
         if state.active[t]:
-            _measure_extent(model, state, several, t)
+            _measure_extent(model, state, several_tools, t)
     for t in range(n_tools):
         for s in range(t):
-            several.near[t, s] = several.near[s, t] = False
+            several_tools.near[t, s] = several_tools.near[s, t] = False
             if state.active[t] and state.active[s]:
-                near = _are_near(state, several, t, s)
-                several.near[t, s] = several.near[s, t] = near
+                near = _are_near(state, several_tools, t, s)
+                several_tools.near[t, s] = several_tools.near[s, t] = near
                 if friction is None and near:
-                    _connect_pair(model, state, several, t, s)
+                    _couple_pair(model, state, several_tools, t, s)
 
 
 @fast
-def _measure_extent(model, state, several, t):  # type: ignore[no-untyped-def]
+def _measure_extent(model, state, several_tools, t):  # type: ignore[no-untyped-def]
     farthest = 0.0
     for i in range(state.n_nodes[t]):
-        j, squared = state.nodes[t, i], 0.0
+        j, force_squared = state.nodes[t, i], 0.0
         for d in range(3):
-            squared += (model.position[j, d] - state.point[t, d]) ** 2
-        farthest = max(farthest, squared)
-    several.extent[t] = np.sqrt(farthest)
+            force_squared += (model.position[j, d] - state.point[t, d]) ** 2
+        farthest = max(farthest, force_squared)
+    several_tools.extent[t] = np.sqrt(farthest)
 
 
 @fast
-def _are_near(state, several, t, s):  # type: ignore[no-untyped-def]
+def _are_near(state, several_tools, t, s):  # type: ignore[no-untyped-def]
     apart = 0.0
     for d in range(3):
         apart += (state.point[s, d] - state.point[t, d]) ** 2
-    return np.sqrt(apart) < several.reach[0] + several.extent[t] + several.extent[s]
+    return (
+        np.sqrt(apart) < several_tools.reach[0] + several_tools.extent[t] + several_tools.extent[s]
+    )
 
 
 @fast
-def _connect_pair(model, state, several, t, s):  # type: ignore[no-untyped-def]
+def _couple_pair(model, state, several_tools, t, s):  # type: ignore[no-untyped-def]
     """By Maxwell and Betti the block from m to j is that from j to m transposed."""
-    there, back = several.column[t, s], several.column[s, t]
+    there, back = several_tools.column[t, s], several_tools.column[s, t]
     there[: state.n_nodes[s]] = np.float32(0.0)
     back[: state.n_nodes[t]] = np.float32(0.0)
     n, m, zero = state.normal[t], state.normal[s], np.float32(0.0)
@@ -131,7 +137,7 @@ def _connect_pair(model, state, several, t, s):  # type: ignore[no-untyped-def]
 
 
 @fast
-def assemble(state, reply, several):  # type: ignore[no-untyped-def]
+def assemble_coupling(state, superposition, several_tools):  # type: ignore[no-untyped-def]
     """Compliance between the tips."""
     for t in range(state.passage.shape[0]):
         for s in range(t):
@@ -139,21 +145,21 @@ def assemble(state, reply, several):  # type: ignore[no-untyped-def]
                 continue
             value = 0.0
             for k in range(state.mode.shape[1]):
-                value += reply.gain[k] * state.mode[t, k] * state.mode[s, k]
-            if several.near[s, t]:
+                value += superposition.gain[k] * state.mode[t, k] * state.mode[s, k]
+            if several_tools.near[s, t]:
                 n = state.normal[t]
                 near = 0.0
                 for i in range(state.n_nodes[t]):
-                    u = several.column[s, t, i]
+                    u = several_tools.column[s, t, i]
                     near += state.weight[t, i, 0] * (n[0] * u[0] + n[1] * u[1] + n[2] * u[2])
-                value += reply.near_gain[0] * near
+                value += superposition.near_gain[0] * near
             state.gram[t, s] = state.gram[s, t] = value
             value *= state.scale[t] * state.scale[s]
             state.compliance[t, s] = state.compliance[s, t] = value
 
 
 @inlined
-def share(state, reply, several, large):  # type: ignore[no-untyped-def]
+def solve_active_set(state, superposition, several_tools, large_deformation):  # type: ignore[no-untyped-def]
     """The forces that solve the contact, by exchange of the tips that are held.
 
     Nonnegative least squares in the energy (Lawson & Hanson, Solving Least Squares Problems,
@@ -161,70 +167,82 @@ def share(state, reply, several, large):  # type: ignore[no-untyped-def]
     and let it go; else hold the one that is inside deepest. Forces stay >= 0 and the energy falls,
     however close the tips are. Of large deformation it is one step of Newton's.
     """
-    _linearise(state, reply, several, large)
-    n_tools, force, trial, held = state.passage.shape[0], state.force, several.trial, several.held
+    _linearise(state, superposition, several_tools, large_deformation)
+    n_tools, force, trial, active_set = (
+        state.passage.shape[0],
+        state.force,
+        several_tools.trial,
+        several_tools.active_set,
+    )
     for _ in range(MAX_EXCHANGES * n_tools):
-        _close_gaps(several)
+        _close_gaps(several_tools)
         part, pulled = 1.0, -1
         for t in range(n_tools):
-            if held[t] and trial[t] < 0.0 and force[t] <= part * (force[t] - trial[t]):
+            if active_set[t] and trial[t] < 0.0 and force[t] <= part * (force[t] - trial[t]):
                 part, pulled = force[t] / (force[t] - trial[t]), t
         for t in range(n_tools):
-            if held[t]:
+            if active_set[t]:
                 force[t] += part * (trial[t] - force[t])
         if pulled >= 0:
-            force[pulled], held[pulled] = 0.0, False
+            force[pulled], active_set[pulled] = 0.0, False
             continue
         least, deepest = -INSIDE, -1
         for t in range(n_tools):
-            if state.active[t] and not held[t]:
-                gap = several.asked[t]
+            if state.active[t] and not active_set[t]:
+                gap = several_tools.free_gap[t]
                 for s in range(n_tools):
-                    if held[s]:
-                        gap += several.matrix[t, s] * force[s]
+                    if active_set[s]:
+                        gap += several_tools.matrix[t, s] * force[s]
                 if gap < least:
                     least, deepest = gap, t
         if deepest < 0:
             return
-        held[deepest] = True
+        active_set[deepest] = True
 
 
 @inlined
-def _linearise(state, reply, several, large):  # type: ignore[no-untyped-def]
+def _linearise(state, superposition, several_tools, large_deformation):  # type: ignore[no-untyped-def]
     """Gap without forces and compliance, about the present forces; who has one is held."""
     for t in range(state.passage.shape[0]):
-        several.held[t] = False
+        several_tools.active_set[t] = False
         if not state.active[t]:
             continue
-        several.held[t] = state.force[t] > 0.0
+        several_tools.active_set[t] = state.force[t] > 0.0
         for s in range(state.passage.shape[0]):
-            several.matrix[t, s] = state.compliance[t, s]
-        several.asked[t] = state.gap[t] - reply.lift[t]
-        if large is not None:
-            bend(state, large, t)
-            stiff = large.bent[t, 1] * state.self_compliance[t]
-            several.matrix[t, t] += stiff
-            several.asked[t] += large.bent[t, 0] - stiff * state.force[t]
+            several_tools.matrix[t, s] = state.compliance[t, s]
+        several_tools.free_gap[t] = state.gap[t] - superposition.free_normal[t]
+        if large_deformation is not None:
+            evaluate_added_depth(state, large_deformation, t)
+            stiff = large_deformation.added_depth[t, 1] * state.self_compliance[t]
+            several_tools.matrix[t, t] += stiff
+            several_tools.free_gap[t] += (
+                large_deformation.added_depth[t, 0] - stiff * state.force[t]
+            )
 
 
 @inlined
-def _close_gaps(several):  # type: ignore[no-untyped-def]
+def _close_gaps(several_tools):  # type: ignore[no-untyped-def]
     """matrix trial = - asked among the tips that are held, by Cholesky.
 
     Of two tips in one place the second has no pivot: it gets a small one, and what is left of its
     gap goes to the force of whoever is deeper.
     """
-    held, c, root, x = several.held, several.matrix, several.factor, several.trial
-    for t in range(held.shape[0]):
-        if not held[t]:
+    active_set, c, root, x = (
+        several_tools.active_set,
+        several_tools.matrix,
+        several_tools.factor,
+        several_tools.trial,
+    )
+    for t in range(active_set.shape[0]):
+        if not active_set[t]:
             continue
-        x[t] = -several.asked[t]
+        x[t] = -several_tools.free_gap[t]
         for s in range(t + 1):
-            if not held[s]:
+            if not active_set[s]:
                 continue
             value = c[t, s]
             for k in range(s):
-                if held[k]:
+                if active_set[k]:
                     value -= root[t, k] * root[s, k]
             if s < t:
                 root[t, s] = value / root[s, s]
@@ -232,21 +250,21 @@ def _close_gaps(several):  # type: ignore[no-untyped-def]
             else:
                 root[t, t] = np.sqrt(max(value, LEAST_PIVOT * c[t, t]))
         x[t] /= root[t, t]
-    for t in range(held.shape[0] - 1, -1, -1):
-        if held[t]:
-            for k in range(t + 1, held.shape[0]):
-                if held[k]:
+    for t in range(active_set.shape[0] - 1, -1, -1):
+        if active_set[t]:
+            for k in range(t + 1, active_set.shape[0]):
+                if active_set[k]:
                     x[t] -= root[k, t] * x[k]
             x[t] /= root[t, t]
 
 
 @fast
-def add_near(state, reply, several, t):  # type: ignore[no-untyped-def]
+def add_near_of_others(state, superposition, several_tools, t):  # type: ignore[no-untyped-def]
     """Near displacement at the nodes of a tip by the others' normal forces, into ``joint``."""
     for s in range(state.passage.shape[0]):
-        if s == t or state.force[s] <= 0.0 or not several.near[s, t]:
+        if s == t or state.force[s] <= 0.0 or not several_tools.near[s, t]:
             continue
-        force = -state.force[s] * state.scale[s] * reply.near_gain[0]
+        force = -state.force[s] * state.scale[s] * superposition.near_gain[0]
         for i in range(state.n_nodes[t]):
             for d in range(3):
-                reply.joint[i, d] += force * several.column[s, t, i, d]
+                superposition.displacement[i, d] += force * several_tools.column[s, t, i, d]

@@ -58,13 +58,13 @@ class Viscoelasticity(Effect):
             )
 
 
-TRAIL = 160  # load positions whose past is kept for the near field
+MAX_HISTORY = 160  # load positions whose past is kept for the near field
 _FORGOTTEN = 1e-7  # [N] a past that is as good as none
 _SHOWN = 0.04  # part of the strongest load below which the trail is not seen in the cloud
 
-MemoryArrays = namedtuple("MemoryArrays", ["decay", "ramp", "rest"])
-Memory = namedtuple(
-    "Memory",
+ViscoelasticityArrays = namedtuple("ViscoelasticityArrays", ["decay", "ramp", "rest"])
+ViscoelasticityState = namedtuple(
+    "ViscoelasticityState",
     [
         "decay",  # (n,) exp(-dt / tau_i)
         "ramp",  # (n,) r_i
@@ -74,111 +74,120 @@ Memory = namedtuple(
         "past",  # (n, k) Y^T h_i
         "held",  # (k,) Y^T of the load that would hold e as it is
         "slot",  # (n_positions,) where in the trail a load position is, or -1
-        "place",  # (TRAIL,) load position
+        "position",  # (TRAIL,) load position
         "count",  # (1,) length of the trail
-        "trail_elastic",  # (TRAIL, 3) e [N]
-        "trail_past",  # (n, TRAIL, 3) h_i [N]
-        "trail_held",  # (TRAIL, 3) [N]
-        "trail_load",  # (TRAIL, 3) f of this period [N]
+        "near_elastic",  # (TRAIL, 3) e [N]
+        "near_past",  # (n, TRAIL, 3) h_i [N]
+        "near_held",  # (TRAIL, 3) [N]
+        "near_load",  # (TRAIL, 3) f of this period [N]
     ],
 )
 
 
-def memory_arrays(effect: Viscoelasticity, period: float) -> MemoryArrays:
+def viscoelasticity_arrays(effect: Viscoelasticity, period: float) -> ViscoelasticityArrays:
     """The factors of one period [s]."""
     g, tau = np.array(effect.g, float), np.array(effect.tau, float)
     ramp = g * (tau / period) * -np.expm1(-period / tau)
-    return MemoryArrays(np.exp(-period / tau), ramp, np.array([1.0 - g.sum()]))
+    return ViscoelasticityArrays(np.exp(-period / tau), ramp, np.array([1.0 - g.sum()]))
 
 
-def make_memory(arrays: MemoryArrays, n_modes: int, n_positions: int) -> Memory:
+def viscoelasticity_state(
+    arrays: ViscoelasticityArrays, n_modes: int, n_positions: int
+) -> ViscoelasticityState:
     """Of an organ that was never touched."""
     n = len(arrays.decay)
-    return Memory(
+    return ViscoelasticityState(
         *arrays,
         gain=1.0 / (arrays.rest + arrays.ramp.sum()),
         elastic=np.zeros(n_modes),
         past=np.zeros((n, n_modes)),
         held=np.zeros(n_modes),
         slot=np.full(n_positions, -1, np.int64),
-        place=np.zeros(TRAIL, np.int64),
+        position=np.zeros(MAX_HISTORY, np.int64),
         count=np.zeros(1, np.int64),
-        trail_elastic=np.zeros((TRAIL, 3)),
-        trail_past=np.zeros((n, TRAIL, 3)),
-        trail_held=np.zeros((TRAIL, 3)),
-        trail_load=np.zeros((TRAIL, 3)),
+        near_elastic=np.zeros((MAX_HISTORY, 3)),
+        near_past=np.zeros((n, MAX_HISTORY, 3)),
+        near_held=np.zeros((MAX_HISTORY, 3)),
+        near_load=np.zeros((MAX_HISTORY, 3)),
     )
 
 
 @fast
-def expect(memory):  # type: ignore[no-untyped-def]
+def predict_history(viscoelasticity):  # type: ignore[no-untyped-def]
     """sum_i exp(-dt / tau_i) h_i - e sum_i r_i, of the modes and along the trail."""
     ramp = 0.0
-    for i in range(memory.ramp.shape[0]):
-        ramp += memory.ramp[i]
-    for k in range(memory.held.shape[0]):
-        memory.held[k] = -ramp * memory.elastic[k]
-        for i in range(memory.decay.shape[0]):
-            memory.held[k] += memory.decay[i] * memory.past[i, k]
-    for m in range(memory.count[0]):
+    for i in range(viscoelasticity.ramp.shape[0]):
+        ramp += viscoelasticity.ramp[i]
+    for k in range(viscoelasticity.held.shape[0]):
+        viscoelasticity.held[k] = -ramp * viscoelasticity.elastic[k]
+        for i in range(viscoelasticity.decay.shape[0]):
+            viscoelasticity.held[k] += viscoelasticity.decay[i] * viscoelasticity.past[i, k]
+    for m in range(viscoelasticity.count[0]):
         for d in range(3):
-            memory.trail_held[m, d] = -ramp * memory.trail_elastic[m, d]
-            memory.trail_load[m, d] = 0.0
-            for i in range(memory.decay.shape[0]):
-                memory.trail_held[m, d] += memory.decay[i] * memory.trail_past[i, m, d]
+            viscoelasticity.near_held[m, d] = -ramp * viscoelasticity.near_elastic[m, d]
+            viscoelasticity.near_load[m, d] = 0.0
+            for i in range(viscoelasticity.decay.shape[0]):
+                viscoelasticity.near_held[m, d] += (
+                    viscoelasticity.decay[i] * viscoelasticity.near_past[i, m, d]
+                )
 
 
 @fast
-def expect_modes(reply, memory, weight):  # type: ignore[no-untyped-def]
+def predict_modes(superposition, viscoelasticity, self_weight):  # type: ignore[no-untyped-def]
     """Modes at the end of the period without any load, where there is no mass."""
-    gain = memory.gain[0]
-    for k in range(reply.free.shape[0]):
-        free = -gain * memory.held[k]
-        if weight is not None:
-            free += weight.amplitude[k]
-        reply.free[k] = free
-        reply.gain[k] = gain
+    gain = viscoelasticity.gain[0]
+    for k in range(superposition.free.shape[0]):
+        free = -gain * viscoelasticity.held[k]
+        if self_weight is not None:
+            free += self_weight.amplitude[k]
+        superposition.free[k] = free
+        superposition.gain[k] = gain
 
 
 @fast
-def leave_trail(model, state, memory, t, trail):  # type: ignore[no-untyped-def]
+def near_free_displacement(model, state, viscoelasticity, t, near_free):  # type: ignore[no-untyped-def]
     """Near displacement at the nodes of a tip by the trail, into (MAX_STENCIL, 3)."""
-    gain = memory.gain[0]
+    gain = viscoelasticity.gain[0]
     for i in range(state.n_nodes[t]):
         j = state.nodes[t, i]
         u0 = u1 = u2 = 0.0
-        if memory.count[0] > 0:
+        if viscoelasticity.count[0] > 0:
             for k in range(model.contact_start[j], model.contact_start[j + 1]):
                 target = model.contact_slot[k, 0]
                 if target < 0:
                     continue
-                m = memory.slot[target]
+                m = viscoelasticity.slot[target]
                 if m < 0:
                     continue
                 b = model.contact_block[model.contact_slot[k, 1]]
-                f = memory.trail_held[m]
+                f = viscoelasticity.near_held[m]
                 u0 -= b[0, 0] * f[0] + b[1, 0] * f[1] + b[2, 0] * f[2]
                 u1 -= b[0, 1] * f[0] + b[1, 1] * f[1] + b[2, 1] * f[2]
                 u2 -= b[0, 2] * f[0] + b[1, 2] * f[1] + b[2, 2] * f[2]
-        trail[i, 0] = gain * u0
-        trail[i, 1] = gain * u1
-        trail[i, 2] = gain * u2
+        near_free[i, 0] = gain * u0
+        near_free[i, 1] = gain * u1
+        near_free[i, 2] = gain * u2
 
 
 @fast
-def remember(state, reply, memory, friction, weight):  # type: ignore[no-untyped-def]
+def advance_history(state, superposition, viscoelasticity, friction, self_weight):  # type: ignore[no-untyped-def]
     """Complete the period: e and h_i at its end."""
-    for k in range(memory.elastic.shape[0]):
-        new = reply.total[k]
-        if weight is not None:
-            new -= weight.amplitude[k]
+    if viscoelasticity is None:
+        return
+    for k in range(viscoelasticity.elastic.shape[0]):
+        new = superposition.total[k]
+        if self_weight is not None:
+            new -= self_weight.amplitude[k]
         if abs(new) < 1e-30:
             new = 0.0
-        change = new - memory.elastic[k]
-        for i in range(memory.decay.shape[0]):
-            past = memory.decay[i] * memory.past[i, k] + memory.ramp[i] * change
-            memory.past[i, k] = past if abs(past) > 1e-30 else 0.0
-        memory.elastic[k] = new
+        change = new - viscoelasticity.elastic[k]
+        for i in range(viscoelasticity.decay.shape[0]):
+            past = (
+                viscoelasticity.decay[i] * viscoelasticity.past[i, k]
+                + viscoelasticity.ramp[i] * change
+            )
+            viscoelasticity.past[i, k] = past if abs(past) > 1e-30 else 0.0
+        viscoelasticity.elastic[k] = new
     for t in range(state.passage.shape[0]):
         if state.force[t] <= 0.0:
             continue
@@ -189,87 +198,94 @@ def remember(state, reply, memory, friction, weight):  # type: ignore[no-untyped
         for i in range(state.n_nodes[t]):
             w = a * state.weight[t, i, 0]
             if w != 0.0:
-                m = _slot_of(memory, state.nodes[t, i])
-                memory.trail_load[m, 0] += w * f0
-                memory.trail_load[m, 1] += w * f1
-                memory.trail_load[m, 2] += w * f2
-    _advance_trail(memory)
+                m = _slot_of(viscoelasticity, state.nodes[t, i])
+                viscoelasticity.near_load[m, 0] += w * f0
+                viscoelasticity.near_load[m, 1] += w * f1
+                viscoelasticity.near_load[m, 2] += w * f2
+    _advance_trail(viscoelasticity)
 
 
 @fast
-def _advance_trail(memory):  # type: ignore[no-untyped-def]
+def _advance_trail(viscoelasticity):  # type: ignore[no-untyped-def]
     m = 0
-    while m < memory.count[0]:
+    while m < viscoelasticity.count[0]:
         left = 0.0
         for d in range(3):
-            new = memory.gain[0] * (memory.trail_load[m, d] - memory.trail_held[m, d])
-            change = new - memory.trail_elastic[m, d]
-            memory.trail_elastic[m, d] = new
-            left = max(left, abs(new), abs(memory.trail_load[m, d]))
-            for i in range(memory.decay.shape[0]):
-                past = memory.decay[i] * memory.trail_past[i, m, d] + memory.ramp[i] * change
-                memory.trail_past[i, m, d] = past
+            new = viscoelasticity.gain[0] * (
+                viscoelasticity.near_load[m, d] - viscoelasticity.near_held[m, d]
+            )
+            change = new - viscoelasticity.near_elastic[m, d]
+            viscoelasticity.near_elastic[m, d] = new
+            left = max(left, abs(new), abs(viscoelasticity.near_load[m, d]))
+            for i in range(viscoelasticity.decay.shape[0]):
+                past = (
+                    viscoelasticity.decay[i] * viscoelasticity.near_past[i, m, d]
+                    + viscoelasticity.ramp[i] * change
+                )
+                viscoelasticity.near_past[i, m, d] = past
                 left = max(left, abs(past))
         if left < _FORGOTTEN:
-            _forget(memory, m)
+            _remove(viscoelasticity, m)
         else:
             m += 1
 
 
 @inlined
-def _slot_of(memory, position):  # type: ignore[no-untyped-def]
+def _slot_of(viscoelasticity, position):  # type: ignore[no-untyped-def]
     """Where a load position is in the trail, in the weakest one's place if the trail is full."""
-    m = memory.slot[position]
+    m = viscoelasticity.slot[position]
     if m >= 0:
         return m
-    if memory.count[0] == TRAIL:
+    if viscoelasticity.count[0] == MAX_HISTORY:
         weakest, least = 0, np.inf
-        for q in range(TRAIL):
-            e, f = memory.trail_elastic[q], memory.trail_load[q]
+        for q in range(MAX_HISTORY):
+            e, f = viscoelasticity.near_elastic[q], viscoelasticity.near_load[q]
             size = abs(e[0]) + abs(e[1]) + abs(e[2]) + abs(f[0]) + abs(f[1]) + abs(f[2])
             if size < least:
                 weakest, least = q, size
-        _forget(memory, weakest)
-    m = memory.count[0]
-    memory.count[0] = m + 1
-    memory.slot[position], memory.place[m] = m, position
+        _remove(viscoelasticity, weakest)
+    m = viscoelasticity.count[0]
+    viscoelasticity.count[0] = m + 1
+    viscoelasticity.slot[position], viscoelasticity.position[m] = m, position
     for d in range(3):
-        memory.trail_elastic[m, d] = memory.trail_held[m, d] = memory.trail_load[m, d] = 0.0
-        for i in range(memory.decay.shape[0]):
-            memory.trail_past[i, m, d] = 0.0
+        viscoelasticity.near_elastic[m, d] = viscoelasticity.near_held[
+            m, d
+        ] = viscoelasticity.near_load[m, d] = 0.0
+        for i in range(viscoelasticity.decay.shape[0]):
+            viscoelasticity.near_past[i, m, d] = 0.0
     return m
 
 
 @inlined
-def _forget(memory, m):  # type: ignore[no-untyped-def]
+def _remove(viscoelasticity, m):  # type: ignore[no-untyped-def]
     """Take a place out of the trail; the last one moves there."""
-    last = memory.count[0] - 1
-    memory.slot[memory.place[m]] = -1
+    last = viscoelasticity.count[0] - 1
+    viscoelasticity.slot[viscoelasticity.position[m]] = -1
     if m != last:
-        memory.place[m] = memory.place[last]
-        memory.slot[memory.place[m]] = m
+        viscoelasticity.position[m] = viscoelasticity.position[last]
+        viscoelasticity.slot[viscoelasticity.position[m]] = m
         for d in range(3):
-            memory.trail_elastic[m, d] = memory.trail_elastic[last, d]
-            memory.trail_held[m, d] = memory.trail_held[last, d]
-            memory.trail_load[m, d] = memory.trail_load[last, d]
-            for i in range(memory.decay.shape[0]):
-                memory.trail_past[i, m, d] = memory.trail_past[i, last, d]
-    memory.count[0] = last
+            viscoelasticity.near_elastic[m, d] = viscoelasticity.near_elastic[last, d]
+            viscoelasticity.near_held[m, d] = viscoelasticity.near_held[last, d]
+            viscoelasticity.near_load[m, d] = viscoelasticity.near_load[last, d]
+            for i in range(viscoelasticity.decay.shape[0]):
+                viscoelasticity.near_past[i, m, d] = viscoelasticity.near_past[i, last, d]
+    viscoelasticity.count[0] = last
 
 
 @fast
-def least_shown(memory):  # type: ignore[no-untyped-def]
+def least_shown(viscoelasticity):  # type: ignore[no-untyped-def]
     """Load below which a place of the trail is not seen in the cloud [N]."""
     strongest = 0.0
-    for m in range(memory.count[0]):
-        e = memory.trail_elastic[m]
+    for m in range(viscoelasticity.count[0]):
+        e = viscoelasticity.near_elastic[m]
         strongest = max(strongest, e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
     return _SHOWN * np.sqrt(strongest)
 
 
-def forget_all(memory: Memory) -> None:
+def forget_all(viscoelasticity: ViscoelasticityState) -> None:
     """The organ was never touched."""
-    memory.elastic[:] = 0.0
-    memory.past[:] = 0.0
-    memory.slot[:] = -1
-    memory.count[:] = 0
+    viscoelasticity.elastic[:] = 0.0
+    viscoelasticity.past[:] = 0.0
+    viscoelasticity.slot[:] = -1
+    viscoelasticity.count[:] = 0

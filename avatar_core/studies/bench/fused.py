@@ -79,7 +79,7 @@ def fused_ratio(bare: ContactModel, fused: Callable[..., int], path: np.ndarray)
     compiled = bare.compiled.step
     assert compiled is not None
     _agree(bare, lambda: overload(*arguments), path[::50])
-    calls = (lambda: overload(*arguments), lambda: compiled(*arguments, *bare.effects))
+    calls = (lambda: overload(*arguments), lambda: compiled(*arguments, bare.effects))
     ratios = []
     for first in range(_WARM, len(path) - 100, 100):
         for _ in range(3):

@@ -15,7 +15,6 @@ import numpy as np
 from avatar_core.common.jit import compiled
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud_kernels import write_cloud
-from avatar_core.contact.effects import several_tools as coupling
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.contact.tip_compliance import assemble_own, near_along_normal
 from avatar_core.contact.tool_path import slide, starts_apart
@@ -72,11 +71,10 @@ def time_dense_table(
     columns = _dense(vademecum.far.space, load, vademecum.near, n_v).reshape(n_s, 3, 3 * n_v)
     compliance = _dense(vademecum.far.load, load, vademecum.contact_near, n_s)
 
+    effects = model.effects._replace(large_deformation=None)
+
     def dense(tips: np.ndarray) -> None:
-        e = model.effects
-        _dense_step(
-            model.arrays, model.state, model.out, tips, e.reply, e.several, columns, compliance
-        )
+        _dense_step(model.arrays, model.state, model.out, tips, effects, columns, compliance)
 
     row = _timed("dense table", vademecum, model, 0, n_tools, dense, clock)
     return StepRow(**{**row.__dict__, "bytes": columns.nbytes + compliance.nbytes})
@@ -178,11 +176,11 @@ def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: in
 
 
 @compiled(fastmath=True)
-def _dense_step(model, state, out, tips, reply, several, columns, compliance):  # type: ignore[no-untyped-def]
-    """:func:`contact_kernels.contact_step` with stored columns instead of modes."""
-    n_tools = tips.shape[0]
-    for t in range(n_tools):
-        kernels.locate(model, state, t, tips[t], reply)
+def _dense_step(model, state, out, tips, effects, columns, compliance):  # type: ignore[no-untyped-def]
+    """:func:`avatar_core.contact.kernels.contact_step` with stored columns instead of modes."""
+    e = effects
+    for t in range(tips.shape[0]):
+        kernels.locate(model, state, t, tips[t], e.superposition)
         state.mode[t] = np.float32(0.0)
         if not state.active[t]:
             state.force[t] = 0.0
@@ -190,21 +188,12 @@ def _dense_step(model, state, out, tips, reply, several, columns, compliance):  
         _dense_column(state, t, t, compliance, state.column[t])
         near = near_along_normal(state, t, state.column[t])
         assemble_own(model, state, t, near)
-    if several is not None:
-        for t in range(n_tools):
-            for s in range(n_tools):
-                several.near[t, s] = s != t
-                if s != t and state.active[t] and state.active[s]:
-                    _dense_column(state, t, s, compliance, several.column[t, s])
-    if several is not None:
-        coupling.assemble(state, reply, several)
-        kernels.solve_together(state, reply, several, None)
-    else:
-        kernels.solve_alone(state, reply)
-    kernels.write_forces(model, state, out, tips, reply, several, None, None, None)
+    _couple_dense(state, e.several_tools, compliance)
+    kernels.solve_contact(model, state, tips, e.superposition, e.several_tools, None, None)
+    kernels.write_forces(model, state, out, tips, e)
     u = state.field[: 3 * out.cloud.shape[0]]
     u[:] = np.float32(0.0)
-    for t in range(n_tools):
+    for t in range(tips.shape[0]):
         for i in range(state.n_nodes[t] if state.force[t] > 0.0 else 0):
             force = -state.weight[t, i, 0] * state.scale[t] * state.force[t]
             for c in range(3):
@@ -212,6 +201,16 @@ def _dense_step(model, state, out, tips, reply, several, columns, compliance):  
                 for k in range(u.shape[0]):
                     u[k] += f * row[k]
     write_cloud(model.rest, u, out.cloud)
+
+
+@compiled(fastmath=True)
+def _couple_dense(state, several_tools, compliance):  # type: ignore[no-untyped-def]
+    if several_tools is not None:
+        for t in range(state.passage.shape[0]):
+            for s in range(state.passage.shape[0]):
+                several_tools.near[t, s] = s != t
+                if s != t and state.active[t] and state.active[s]:
+                    _dense_column(state, t, s, compliance, several_tools.column[t, s])
 
 
 @compiled(fastmath=True)

@@ -122,12 +122,12 @@ def _prepared(vademecum: Vademecum, scene: Scene, name: str) -> _Prepared:
 
 def _followed(model: ContactModel, tips: np.ndarray) -> np.ndarray:
     """The same ways on an organ that breathes: where it is in each period, from rest."""
-    motion = model.effects.motion
-    if motion is None:
+    respiration = model.effects.respiration
+    if respiration is None:
         return tips
     model.reset()
     out = tips.copy()
     for k in range(len(tips)):
         step(model, tips[k])
-        out[k] += motion.shift
+        out[k] += respiration.shift
     return out

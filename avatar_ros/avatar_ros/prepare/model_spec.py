@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from avatar_core.contact import layout as contact_layout
 from avatar_core.contact.effects import Effect, Tumour
-from avatar_core.contact.effects.selection import natural_effects
+from avatar_core.contact.effects.selection import default_effects
 from avatar_core.scene.model import Scene
 from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.at_values import at_values
@@ -53,7 +53,7 @@ def model_spec(vademecum: Vademecum, request: PreparationRequest, scene: Scene |
     if scene is None:
         chosen = at_values(vademecum, request.material)
         radii = tuple(request.tip_radii)
-        effects = natural_effects(chosen, len(radii))
+        effects = default_effects(chosen, len(radii))
         return ModelSpec(chosen, radii, request.modes, request.cloud, effects)
     require_tools(scene, len(request.tip_radii))
     values = dict(request.material)
@@ -67,16 +67,7 @@ def model_spec(vademecum: Vademecum, request: PreparationRequest, scene: Scene |
 
 def lay_out(spec: ModelSpec, detail: Detail, period: float) -> contact_layout.Layout:
     """Constant arrays of the contact model that shows a detail; ``period`` of its steps [s]."""
-    return contact_layout.lay_out(
-        spec.vademecum,
-        spec.tip_radii,
-        detail.modes,
-        detail.cloud,
-        spec.effects,
-        period,
-        detail.precision,
-        detail.near,
-    )
+    return contact_layout.lay_out(spec.vademecum, spec.tip_radii, detail, spec.effects, period)
 
 
 def _with_contrast(scene: Scene, contrast: float) -> Scene:

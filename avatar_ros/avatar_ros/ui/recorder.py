@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar_core.contact.effects import Tumour
-from avatar_core.contact.effects.selection import natural_effects
+from avatar_core.contact.effects.selection import default_effects
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
@@ -36,7 +36,7 @@ def scene_in_force(
         tools=(Tool(tip_radius=tip_radius),),
         cloud=cloud,
         cloud_divisor=cloud_divisor,
-        effects=natural_effects(vademecum, 1),
+        effects=default_effects(vademecum, 1),
     )
     effects = scene.effects
     if "contrast" in material:
