@@ -1,6 +1,6 @@
-"""What a step shows of the displacement field, laid out for its compiled half.
+"""The displacement modes of a cloud of points, laid out for the compiled step.
 
-How finely it is shown is a matter of display alone: the force comes from the contact compliance,
+Their number and precision concern the display alone: the force comes from the contact compliance,
 which keeps all modes in single precision.
 """
 
@@ -17,14 +17,14 @@ from avatar_core.vademecum.accuracy import Cloud, Precision
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
-BLOCK = 256  # displacements that are summed together while they lie in the fastest cache
+BLOCK = 256  # displacements that are summed together, within the first-level cache
 
 _LARGEST = {"int16": 32767, "int8": 127}
-_FADE = 0.5  # a shortened near field begins to fade at this part of its radius
+_FADE = 0.5  # of its radius, where a shortened near field begins to fade
 
 
 class CloudArrays(NamedTuple):
-    """The arrays of the same names in :class:`avatar_core.contact.layout.Layout`, and where from.
+    """The arrays of the same names in :class:`avatar_core.contact.layout.Layout`, and their source.
 
     points : vertices of the mesh that are shown
     fade : factor of each block of the vademecum's near field; zero where it is left out
@@ -51,7 +51,7 @@ def cloud_arrays(
     ----------
     modes : of the far field; None for all
     near : radius of the near field over the vademecum's own, 0 to 1
-    bent : ndarray, shape (3 n_vertices, n), further modes, of large deformation
+    nonlinear : ndarray, shape (3 n_vertices, n), modes of large deformation
     """
     points = shown_vertices(vademecum, cloud)
     n_vertices = len(vademecum.mesh.vertices)
@@ -70,10 +70,10 @@ def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
 
 
 def in_blocks(space: np.ndarray, precision: Precision = "int16") -> tuple[np.ndarray, np.ndarray]:
-    """Modes (n_points, 3, rank) as (n_blocks, rank, BLOCK), and what one step of each is worth.
+    """Modes (n_points, 3, rank) as (n_blocks, rank, BLOCK), and the scale (rank,) of each.
 
-    Integers take half or a quarter of the memory of single precision, which is what the cloud
-    waits for; rounding costs 1 / 65536 or 1 / 256 of each mode's peak.
+    The time of the cloud is that of reading its modes; integers take a half or a quarter of single
+    precision. Rounding costs 1 / 65536 or 1 / 256 of each mode's peak.
     """
     flat = space.reshape(-1, space.shape[2])
     kind, scale = np.dtype(precision), np.ones(flat.shape[1], np.float32)
@@ -94,17 +94,17 @@ def out_of_blocks(blocks: np.ndarray, scale: np.ndarray, n_points: int) -> np.nd
     return np.asarray(flat * scale, np.float32)
 
 
-def _fade(vademecum: Vademecum, part: float) -> np.ndarray:
-    """Factor of every block of the near field when it ends at a part of its own radius."""
+def _fade(vademecum: Vademecum, fraction: float) -> np.ndarray:
+    """Factor of every block of a near field that is cut to a fraction of its radius."""
     near = vademecum.near
     distance = _reach(vademecum)
-    if part >= 1.0 or len(distance) == 0:
+    if fraction >= 1.0 or len(distance) == 0:
         return np.ones(len(distance))
-    if part <= 0.0:
+    if fraction <= 0.0:
         return np.zeros(len(distance))
     filled = np.flatnonzero(np.diff(near.start))
     farthest = np.maximum.reduceat(distance, near.start[filled])
-    radius = part * float(np.median(farthest))  # some positions keep all of the organ
+    radius = fraction * float(np.median(farthest))  # median: some positions reach across the organ
     return plateau(distance, _FADE * radius, radius)
 
 
@@ -118,7 +118,7 @@ def _reach(vademecum: Vademecum) -> np.ndarray:
 def _near_at(
     near: LocalBlocks, fade: np.ndarray, points: np.ndarray, n_vertices: int
 ) -> tuple[LocalBlocks, np.ndarray]:
-    """The faded near field at some vertices, renumbered to their order, and the blocks' factors.
+    """The faded near field at some vertices, renumbered in their order, and the blocks' factors.
 
     The factors (n_blocks,) are zero where a block is left out.
     """

@@ -4,8 +4,6 @@
 
 with f_t = w(p_t) n_t as in :mod:`avatar_core.contact.kernels`, N_j the exact near field of load
 position j, and for large deformation the terms of :mod:`avatar_core.vademecum.large_deformation`.
-Effects are
-arguments, None where a scene does without, as in :mod:`avatar_core.contact.kernels`.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from avatar_core.contact.effects.large_deformation import (
 from avatar_core.contact.effects.respiration import shift_cloud
 from avatar_core.contact.effects.viscoelasticity import least_shown
 
-LEAST_WEIGHT = 0.02  # what each load position leaves of its near field to the others
+LEAST_WEIGHT = 0.02  # of a load position, below which its near field is left out
 
 
 @fast
@@ -65,7 +63,7 @@ def write_cloud(rest, field, cloud):  # type: ignore[no-untyped-def]
 
 @fast
 def _amplitudes(state, superposition, large_deformation):  # type: ignore[no-untyped-def]
-    """Far amplitudes - sum_t lambda_t a_t Y^T f_t: the tips press inwards. Then the bent ones."""
+    """Far amplitudes - sum_t lambda_t a_t Y^T f_t, then those of large deformation."""
     amplitude = state.amplitude
     n_modes = amplitude.shape[0]
     amplitude[:] = np.float32(0.0)
@@ -87,10 +85,7 @@ def _amplitudes(state, superposition, large_deformation):  # type: ignore[no-unt
 
 @fast
 def _far_field(model, state, large_deformation):  # type: ignore[no-untyped-def]
-    """sum_k X_k a_k over the modes that are shown, four at a time, and those of large deformation.
-
-    Modes may be stored as fractions of their peak.
-    """
+    """sum_k X_k a_k over the modes that are shown, then those of large deformation."""
     amplitude, scale = state.amplitude, model.space_scale
     shown = min(state.shown[0], scale.shape[0])
     for b in range(model.space.shape[0]):
@@ -113,7 +108,7 @@ def _far_field(model, state, large_deformation):  # type: ignore[no-untyped-def]
 
 @fast
 def _add_modes(amplitude, scale, x, u, first):  # type: ignore[no-untyped-def]
-    """The same for all modes from the first; as a function, the bare step would be 6 % slower."""
+    """The same sum from mode ``first``. Calling it in the loop above costs the bare step 6 %."""
     end = scale.shape[0]
     for k in range(first, end - 3, 4):
         a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
@@ -128,7 +123,7 @@ def _add_modes(amplitude, scale, x, u, first):  # type: ignore[no-untyped-def]
 
 @fast
 def _near_field(model, state, large_deformation, friction, viscoelasticity, t):  # type: ignore[no-untyped-def]
-    """The exact remainder around the load positions that carry the force of a tip."""
+    """The exact near field around the load positions that carry the force of a tip."""
     kept = 0.0
     for i in range(state.n_nodes[t]):
         kept += _soft_threshold(state.weight[t, i, 0])
@@ -151,7 +146,7 @@ def _near_field(model, state, large_deformation, friction, viscoelasticity, t): 
 
 @fast
 def _near_history(model, state, viscoelasticity):  # type: ignore[no-untyped-def]
-    """The same around what a relaxing organ remembers, the weakest of it faded out."""
+    """The near field of the load history; its weakest loads fade out."""
     least = least_shown(viscoelasticity)
     for m in range(viscoelasticity.count[0]):
         e = viscoelasticity.near_elastic[m]
@@ -165,7 +160,7 @@ def _near_history(model, state, viscoelasticity):  # type: ignore[no-untyped-def
 
 @inlined
 def _soft_threshold(w):  # type: ignore[no-untyped-def]
-    """A weight moved towards zero, so that a load position that leaves does so without a jump."""
+    """Soft thresholding, so that the near field of a load position vanishes continuously."""
     if w > 0.0:
         return max(w - LEAST_WEIGHT, 0.0)
     return min(w + LEAST_WEIGHT, 0.0)

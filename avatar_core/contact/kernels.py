@@ -78,7 +78,7 @@ UNKNOWN_FRAME, EXTRAPOLATED = 8, 9
 # began at depth would release energy that no tool has put in.
 OUTSIDE, ENTERED, BARRED = range(3)
 
-PATIENCE = 8  # sweeps before the active-set solution is worth its time,
+PATIENCE = 8  # sweeps before the active-set solution is tried,
 MAX_EXACT = 64  # and after which it is no longer tried
 GAP_TOLERANCE = 1e-9  # [m] of gap change that ends Gauss-Seidel
 ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not enter through the surface

@@ -17,11 +17,7 @@ import numpy as np
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.selection import (
-    NO_EFFECTS,
-    Selection,
-    allocate,
-)
+from avatar_core.contact.effects.selection import NO_EFFECTS, Selection, allocate
 from avatar_core.contact.effects.several_tools import SeveralToolsArrays
 from avatar_core.contact.kernels import ModelArrays, Out, State
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
@@ -31,11 +27,11 @@ from avatar_core.vademecum.accuracy import Cloud, Detail, Precision
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
-FAR_AWAY = 1e3  # where a tool without a pose is, for the step [m]
+FAR_AWAY = 1e3  # coordinate of a tool without a pose [m]
 
 
 class Status(IntEnum):
-    """What a step came to; the numbers of avatar_ros/msg/ContactState."""
+    """Result of a step; the numbers of avatar_ros/msg/ContactState."""
 
     OK = kernels.OK
     NO_MODEL = kernels.NO_MODEL
@@ -52,7 +48,7 @@ class Status(IntEnum):
 class Compiled(NamedTuple):
     """The halves of a step or the whole, compiled for the types of one model.
 
-    Called without numba's look-up of the types, which takes 4 us for as many arrays.
+    Called without numba's look-up of argument types, which takes 4 us for so many arrays.
     """
 
     solve: Callable[..., int] | None
@@ -113,12 +109,16 @@ class ContactModel:
     def show(self, modes: int) -> None:
         """Show the displacement with fewer modes, or with all again, from the next step on.
 
-        The force does not change: the contact compliance keeps all modes and the near field.
+        Real-time safe. The force does not change: the contact compliance keeps all modes and the
+        near field.
         """
         self.state.shown[0] = min(max(modes, 0), self.n_modes)
 
     def resume(self, before: ContactModel) -> None:
-        """Go on where another model of the same organ and tools is: tips in contact stay so."""
+        """Take over the contacts of another model of the same organ and tools.
+
+        Real-time safe: copies arrays of a few numbers per tool.
+        """
         for name in ("passage", "seen", "active", "force"):
             getattr(self.state, name)[:] = getattr(before.state, name)
         mine, theirs = self.effects, before.effects
@@ -129,10 +129,10 @@ class ContactModel:
             mine.respiration.clock[:] = theirs.respiration.clock
 
     def reset(self) -> None:
-        """Forget all contacts and all that has passed: the organ is at rest."""
+        """Return to the organ at rest, without contacts or history. Not real-time safe."""
         self.state.passage[:] = kernels.OUTSIDE
         self.state.force[:] = 0.0
-        fresh = _online(self.layout)
+        fresh = _effects(self.layout)
         for mine, new in zip(self.effects, fresh, strict=True):
             pairs: Any = zip(mine or (), new or (), strict=True)
             for array, clean in pairs:
@@ -151,7 +151,7 @@ def prepare(
     precision: Precision = "int16",
     near: float = 1.0,
 ) -> ContactModel:
-    """Lay out a vademecum for the step, and compile the step for the effects.
+    """Lay out a vademecum for the step, and compile the step for the effects. Not real-time safe.
 
     Parameters
     ----------
@@ -160,9 +160,9 @@ def prepare(
     modes : far-field modes of the *displacement*; None for all. Fewer modes leave the force
         exact, since the contact compliance keeps all of them.
     cloud : "surface" or "volume" vertices, or "off"
-    effects : what is simulated; by default what the vademecum and the tools call for
-    period : of the steps [s], for effects that know time
-    halves : to call :func:`solve` and :func:`deform` instead of :func:`step`
+    effects : to simulate; by default those that the vademecum and the tools require
+    period : of the steps [s], for effects that depend on time
+    halves : compile :func:`solve` and :func:`deform` instead of :func:`step`
     precision : of the displacement's modes
     near : radius of the displacement's near field over the vademecum's own, 0 to 1
 
@@ -176,15 +176,30 @@ def prepare(
 
 
 def make_model(layout: Layout, halves: bool = False) -> ContactModel:
-    """Allocate state and outputs around the constant arrays, and run the step once.
+    """Allocate state and outputs, and compile and run the step once. Not real-time safe.
 
     halves : compile :func:`solve` and :func:`deform` instead of :func:`step`
     """
-    arrays = layout.arrays
+    arrays, state, out, effects = layout.arrays, _state(layout), _out(layout), _effects(layout)
+    far_away = np.full((len(arrays.tip_radius), 3), FAR_AWAY)
+    kernels.force_error(arrays, out, far_away)
+    if halves:
+        first = _compiled(kernels.contact_solve, arrays, state, out, far_away, effects)
+        second = _compiled(kernels.contact_deform, arrays, state, out, effects)
+        compiled = Compiled(first, second, None)
+    else:
+        whole = _compiled(kernels.contact_step, arrays, state, out, far_away, effects)
+        compiled = Compiled(None, None, whole)
+    model = ContactModel(layout, state, effects, out, far_away, compiled)
+    model.reset()
+    return model
+
+
+def _state(layout: Layout) -> State:
+    """Without any contact."""
+    arrays, single = layout.arrays, np.float32
     n_tools, n_modes = len(arrays.tip_radius), arrays.load.shape[2]
-    single = np.float32
-    n_far = _n_far(layout)
-    state = State(
+    return State(
         passage=np.zeros(n_tools, np.int64),
         seen=np.zeros((n_tools, 3)),
         force=np.zeros(n_tools),
@@ -207,16 +222,21 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
         gram=np.ones((n_tools, n_tools)),
         scale=np.ones(n_tools),
         compliance=np.zeros((n_tools, n_tools)),
-        shown=np.array([n_far], np.int64),
+        shown=np.array([_n_far(layout)], np.int64),
         amplitude=np.zeros(len(arrays.space_scale), single),
         field=np.zeros(arrays.space.shape[0] * BLOCK, single),
     )
-    out = Out(
+
+
+def _out(layout: Layout) -> Out:
+    """Without any force."""
+    n_tools = len(layout.arrays.tip_radius)
+    return Out(
         force=np.zeros((n_tools, 3)),
         torque=np.zeros((n_tools, 3)),
         force_error=np.zeros(n_tools),
         status=np.zeros(n_tools, np.int64),
-        cloud=np.zeros((len(arrays.rest), 6), np.float32),
+        cloud=np.zeros((len(layout.arrays.rest), 6), np.float32),
         n_contacts=np.zeros(1, np.int64),
         contact_tool=np.zeros(n_tools, np.int64),
         contact_position=np.zeros((n_tools, 3)),
@@ -224,19 +244,6 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
         contact_force=np.zeros((n_tools, 3)),
         contact_penetration=np.zeros(n_tools),
     )
-    far_away = np.full((n_tools, 3), FAR_AWAY)
-    effects = _online(layout)
-    kernels.force_error(arrays, out, far_away)
-    if halves:
-        first = _compiled(kernels.contact_solve, arrays, state, out, far_away, effects)
-        second = _compiled(kernels.contact_deform, arrays, state, out, effects)
-        compiled = Compiled(first, second, None)
-    else:
-        whole = _compiled(kernels.contact_step, arrays, state, out, far_away, effects)
-        compiled = Compiled(None, None, whole)
-    model = ContactModel(layout, state, effects, out, far_away, compiled)
-    model.reset()
-    return model
 
 
 def _n_far(layout: Layout) -> int:
@@ -247,19 +254,21 @@ def _n_far(layout: Layout) -> int:
     )
 
 
-def _online(layout: Layout) -> Selection:
+def _effects(layout: Layout) -> Selection:
     n_positions, _, n_modes = layout.arrays.load.shape
     return allocate(layout.effects, len(layout.arrays.tip_radius), n_modes, n_positions)
 
 
 def _compiled(kernel: Any, *arguments: Any) -> Any:
-    """A kernel compiled for the types of some arguments, with which it runs once."""
+    """A kernel compiled for the types of these arguments, after one run with them."""
     kernel(*arguments)
     return kernel.get_overload(tuple(numba.typeof(argument) for argument in arguments))
 
 
 def step(model: ContactModel, tips: np.ndarray) -> int:
-    """Advance one period; real-time safe: allocates no array of size, never raises or logs.
+    """Advance one period.
+
+    Real-time safe: allocates no arrays, takes no locks, never raises or logs.
 
     Parameters
     ----------
@@ -270,8 +279,9 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
     -------
     int
         The worst :class:`Status` of the tools; ``out.status`` has each. INVALID_POSE: not
-        finite; OUT_OF_RANGE: off the accessible surface, too deep, or not come in through the
-        surface. The tools concerned have no force or a fading one, the others are served.
+        finite; OUT_OF_RANGE: off the accessible surface, too deep, or not entered through the
+        surface; these tools have no force or a fading one. NOT_CONVERGED: the contact forces are
+        those of the last iteration. EXTRAPOLATED: deeper than the computed large deformation.
     """
     model.tips[:] = tips
     assert model.compiled.step is not None
@@ -281,7 +291,7 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
 
 
 def solve(model: ContactModel, tips: np.ndarray) -> int:
-    """The first half of :func:`step`: forces and contacts, so that they can leave at once."""
+    """The first half of :func:`step`: forces and contacts. Real-time safe, as :func:`step`."""
     model.tips[:] = tips
     assert model.compiled.solve is not None
     return model.compiled.solve(
@@ -290,23 +300,23 @@ def solve(model: ContactModel, tips: np.ndarray) -> int:
 
 
 def deform(model: ContactModel) -> None:
-    """The second half of :func:`step`: the cloud under the forces of :func:`solve`."""
+    """The second half of :func:`step`: the cloud. Real-time safe, as :func:`step`."""
     assert model.compiled.deform is not None
     model.compiled.deform(model.layout.arrays, model.state, model.out, model.effects)
 
 
 def estimate_error(model: ContactModel) -> None:
-    """How wrong the forces of the last step may be, into ``out.force_error`` [N].
+    """Expected error of the forces of the last step, into ``out.force_error`` [N].
 
-    One contact in ten exceeds it; see :mod:`avatar_core.vademecum.force_error`. NaN where the
-    vademecum was not measured. Real-time safe, and apart from the step, so that forces can leave
-    before.
+    Exceeded by one contact in ten; see :mod:`avatar_core.vademecum.force_error`. NaN where the
+    vademecum was not measured. Real-time safe, as :func:`step`; separate, so that it can follow
+    the sending of the forces.
     """
     kernels.force_error(model.layout.arrays, model.out, model.tips)
 
 
 def warm_up(n_tools: int = 1) -> None:
-    """Compile the halves of a step, or read them from numba's cache, before there is a model."""
+    """Compile the halves of a step or read them from the cache. Not real-time safe."""
     single, double = np.float32, np.float64
     n, rank, points = 1, 1, 1
     blocks = (np.zeros(n + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, 3, 3), single))
@@ -339,9 +349,9 @@ def warm_up(n_tools: int = 1) -> None:
 
 
 def stored_energy(model: ContactModel) -> float:
-    """Energy of the organ: elastic lambda . C lambda / 2, of bending, of the swing [J].
+    """Elastic energy of the organ, lambda . C lambda / 2 and that of large deformation [J].
 
-    Not with viscoelasticity, which stores and loses it at once.
+    Not defined with viscoelasticity, which stores and dissipates at once.
     """
     state, effects = model.state, model.effects
     active = np.flatnonzero(state.force > 0.0)

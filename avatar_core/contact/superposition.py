@@ -121,6 +121,32 @@ def superpose_modes(state, superposition, friction):  # type: ignore[no-untyped-
 
 
 @fast
+def _displacement_at_nodes(  # type: ignore[no-untyped-def]
+    model, state, superposition, several_tools, friction, viscoelasticity, t
+):
+    """Displacement at the nodes of a tip by all causes, and by its unit normal force at rest."""
+    displacement, unit = superposition.displacement, superposition.unit_displacement
+    modes_at_nodes(model, state, t, state.mode[t], unit)
+    modes_at_nodes(model, state, t, superposition.total, displacement)
+    for i in range(state.n_nodes[t]):
+        for d in range(3):
+            unit[i, d] += state.column[t, i, d]
+    if friction is not None:
+        add_near_friction(model, state, superposition, several_tools, friction, t)
+    else:
+        near = -state.force[t] * state.scale[t] * superposition.near_gain[0]
+        for i in range(state.n_nodes[t]):
+            for d in range(3):
+                displacement[i, d] += near * state.column[t, i, d]
+        if several_tools is not None:
+            add_near_of_others(state, superposition, several_tools, t)
+    if viscoelasticity is not None:
+        for i in range(state.n_nodes[t]):
+            for d in range(3):
+                displacement[i, d] += superposition.near_free[t, i, d]
+
+
+@fast
 def write_superposed_force(  # type: ignore[no-untyped-def]
     model,
     state,
@@ -136,29 +162,11 @@ def write_superposed_force(  # type: ignore[no-untyped-def]
     """F of the module's docstring, without the terms of large deformation and fading access."""
     if superposition is None:
         return
-    n, a = state.normal[t], state.scale[t]
+    n, a, count = state.normal[t], state.scale[t], state.n_nodes[t]
     displacement, unit = superposition.displacement, superposition.unit_displacement
     gradient = superposition.normal_gradient
     _normal_gradient(model, state, superposition, t, tip)
-    modes_at_nodes(model, state, t, state.mode[t], unit)
-    modes_at_nodes(model, state, t, superposition.total, displacement)
-    count = state.n_nodes[t]
-    for i in range(count):
-        for d in range(3):
-            unit[i, d] += state.column[t, i, d]
-    if friction is not None:
-        add_near_friction(model, state, superposition, several_tools, friction, t)
-    else:
-        near = -state.force[t] * a * superposition.near_gain[0]
-        for i in range(count):
-            for d in range(3):
-                displacement[i, d] += near * state.column[t, i, d]
-        if several_tools is not None:
-            add_near_of_others(state, superposition, several_tools, t)
-    if viscoelasticity is not None:
-        for i in range(count):
-            for d in range(3):
-                displacement[i, d] += superposition.near_free[t, i, d]
+    _displacement_at_nodes(model, state, superposition, several_tools, friction, viscoelasticity, t)
     g0, g1, g2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
     if friction is not None:
         g0, g1, g2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]

@@ -1,4 +1,4 @@
-"""What a unit normal force of a tip does: to the modes, near the tip, and to the tip itself.
+"""Response to a unit normal force of a tip: of the modes, near the tip, and at the tip itself.
 
 Compiled parts of the contact step; C_tt = a_t^2 f_t . C f_t as in
 :mod:`avatar_core.contact.tip_response`.
@@ -14,7 +14,7 @@ from avatar_core.reduction.near_field import find_block
 
 @fast
 def modal_load(model, state, t):  # type: ignore[no-untyped-def]
-    """Y^T f: how a unit normal force of tip t drives the modes."""
+    """Y^T f: the modal load of a unit normal force of tip t."""
     mode, n = state.mode[t], state.normal[t]
     mode[:] = np.float32(0.0)
     for i in range(state.n_nodes[t]):
@@ -28,7 +28,7 @@ def modal_load(model, state, t):  # type: ignore[no-untyped-def]
 def near_column(model, state, t):  # type: ignore[no-untyped-def]
     """Near displacement at the nodes of a tip under its own unit normal force.
 
-    By Maxwell and Betti the block from j to m is that from m to j transposed: each is read once.
+    By Maxwell and Betti the block from j to m is the transpose of that from m to j: one is read.
     """
     column, n = state.column[t], state.normal[t]
     column[: state.n_nodes[t]] = np.float32(0.0)
@@ -77,7 +77,7 @@ def near_gram(model, state, t):  # type: ignore[no-untyped-def]
 
 @fast
 def assemble_own(model, state, t, near):  # type: ignore[no-untyped-def]
-    """What a tip feels alone of an organ at rest; softer where access fades."""
+    """Compliance of a single tip on an organ at rest; it grows where access fades."""
     far = np.float32(0.0)
     for k in range(state.mode.shape[1]):
         far += state.mode[t, k] * state.mode[t, k]

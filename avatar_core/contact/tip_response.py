@@ -1,16 +1,15 @@
-"""How the organ answers a tip anywhere near it: smooth weights and a smooth compliance.
+"""Interpolation of the response for a tip at any position: smooth weights and compliance.
 
 On the faces, the response is interpolated in s by the six-node triangles of the load positions,
 exact at each of them. Neither that interpolation nor the closest point s(p) is smooth: edges and
-folds would be felt as jumps. What a moving tip needs is therefore sampled on the grid of the tip
+folds would make the force jump. Weights and compliance are therefore sampled on the grid of the tip
 field and evaluated by the same B-splines B_q(p), twice differentiable almost everywhere:
 
-    w_j(p)   = sum_q B_q(p) w_j(s(x_q))         share of load position j, sum_j w_j = 1
+    w_j(p)   = sum_q B_q(p) w_j(s(x_q))         weight of load position j, sum_j w_j = 1
     gamma(p) = sum_q B_q(p) [K gamma_0](x_q)    gamma_0 = n . C(s, s) n at s = s(x_q)
 
-with n = grad phi / |grad phi| the normal that a tip presses along and K the kernel of the tip
-field, over a fifth of the patch radius. gamma is the compliance that one tip feels; between tips t
-and t' it is
+with n = grad phi / |grad phi| the direction of pressing and K the kernel of the tip field, with a
+fifth of the patch radius. gamma is the compliance of a single tip; between tips t and t' it is
 
     C_tt' = a_t a_t' f_t . C f_t',    f_t = w(p_t) n(p_t),    a_t^2 = gamma(p_t) / (f_t . C f_t),
 
@@ -33,9 +32,9 @@ SMOOTHING = 0.2  # standard deviation of K, in patch radii
 MAX_STENCIL = 128  # load positions that carry one tip, at most
 
 # row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
-# 6) int32 load positions and share (n_rows, 3 or 6) float32, their weights;
-# self_compliance, smoothing (nx, ny, nz) float32, gamma [m/N] and what smoothing changed of it,
-# K |gamma_0 / gamma - 1|
+# 6) int32 load positions and carrier_weight (n_rows, 3 or 6) float32;
+# self_compliance, smoothing (nx, ny, nz) float32, gamma [m/N] and its relative change by
+# smoothing, K |gamma_0 / gamma - 1|
 TipResponse = namedtuple(
     "TipResponse", ["row", "carrier", "carrier_weight", "self_compliance", "smoothing"]
 )
@@ -94,7 +93,7 @@ def _normals(field: TipField) -> np.ndarray:
 def sampled_at_tip(
     surface: LoadSurface, field: TipField, response: TipResponse, values: np.ndarray
 ) -> np.ndarray:
-    """Values at the load positions (n, n_positions), carried to the grid as gamma is.
+    """Values at the load positions (n, n_positions), interpolated to the grid as gamma is.
 
     Returns
     -------
@@ -164,7 +163,7 @@ def _self_compliance(carrier, carrier_weight, normal, load, start, target, block
 
 @fast
 def gather(model, state, t, cell, superposition):  # type: ignore[no-untyped-def]
-    """Weights of tip t in a cell of the grid, and where there is a ``reply`` their gradient.
+    """Weights of tip t in a cell of the grid, and with ``superposition`` their gradient.
 
     Of ``state`` it fills ``nodes[t]``, the load positions that carry the tip, their number
     ``n_nodes[t]`` and ``weight[t]``: w, dw/dx, dw/dy, dw/dz of each. ``local`` is scratch.

@@ -1,20 +1,22 @@
-"""Scripted tool motions over an organ: what the benchmarks, the demo and the tests replay."""
+"""Scripted tool motions over an organ, for benchmarks, the demo and tests."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from avatar_core.common.splines import evaluate
+from avatar_core.errors import ContactError
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.tip_field import FAR, TipField
 
-_PRESSED = 5e-3  # how deep a tip may go from an inner position [m]
+_PRESSED = 5e-3  # depth to which access is checked below an inner position [m]
+_LEVEL_TOLERANCE = 1e-6  # [m]
 
 
 def inner_positions(vademecum: Vademecum, margin: float = 12e-3) -> np.ndarray:
     """Load positions with full access ``margin`` [m] around them (all, if there are none).
 
-    Above, and below where a tip presses: in a fold, the access fades inside the organ first.
+    Checked above and below the surface: in a fold, access fades inside the organ first.
     """
     surface, field = vademecum.surface, vademecum.tip_field
     around = margin * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
@@ -73,6 +75,11 @@ def slide(
     ----------
     radius, depth : of the tip and of its penetration of the surface at rest [m]
     length, step : travelled and between periods [m]
+
+    Raises
+    ------
+    ContactError
+        If there is no point at that depth next to the path.
     """
     field = vademecum.tip_field
     j = middle_of_access(vademecum) if position is None else position
@@ -93,7 +100,7 @@ def slide(
 def push_and_slide(
     vademecum: Vademecum, radius: float, push: float, depth: float, n: int, position: int
 ) -> np.ndarray:
-    """A push and back out, then in again and along, shape (n, 3) [m]: a third, and two thirds.
+    """A push and retreat, then a slide, shape (n, 3) [m]: a third and two thirds of the steps.
 
     push, depth : of the push and of the slide [m]
     """
@@ -116,10 +123,14 @@ def _gradient(field: TipField, p: np.ndarray) -> np.ndarray:
 
 
 def _at_level(field: TipField, p: np.ndarray, level: float) -> np.ndarray:
+    """A point with phi = level, by three Newton steps along grad phi from a point close to it."""
     gradient = np.zeros(3)
     for _ in range(3):
         phi = evaluate(field.distance, field.origin, field.spacing[0], p, gradient, FAR)
         p = p - (phi - level) * gradient / (gradient @ gradient)
+    phi = evaluate(field.distance, field.origin, field.spacing[0], p, gradient, FAR)
+    if not abs(phi - level) < _LEVEL_TOLERANCE:
+        raise ContactError(f"no point at distance {level:g} m near {p}; start at the surface")
     return p
 
 

@@ -72,7 +72,7 @@ class ModelSpec:
 def specify(
     vademecum: Vademecum, scene: Scene | None, values: Mapping[str, float] | None = None
 ) -> ModelSpec:
-    """What a scene makes of a vademecum; without one, one tool and the natural effects.
+    """What a scene makes of a vademecum; without one, one tool and the default effects.
 
     values : of the material, by coordinate; they override those of the scene
 

@@ -21,13 +21,16 @@ from avatar_core.fem.elasticity import Elasticity
 from avatar_core.vademecum.model import Vademecum
 
 TIP = 10e-3
-CHOICES: dict[str, tuple[Effect, str]] = {
-    "several_tools": (SeveralTools(), "several_tools"),
-    "friction": (Friction(), "friction"),
-    "viscoelasticity": (Viscoelasticity((0.3, 0.2), (0.05, 1.0)), "viscoelasticity"),
-    "inertia": (Inertia(), "inertia"),
-    "self_weight": (SelfWeight(), "self_weight"),
-    "respiration": (Respiration(period=0.5), "respiration"),
+CHOICES: dict[str, Effect] = {
+    effect.name: effect
+    for effect in (
+        SeveralTools(),
+        Friction(),
+        Viscoelasticity((0.3, 0.2), (0.05, 1.0)),
+        Inertia(),
+        SelfWeight(),
+        Respiration(period=0.5),
+    )
 }
 
 

@@ -35,16 +35,14 @@ def test_an_effect_is_absent_from_the_step_when_off(
     phantom_vademecum: Vademecum, name: str
 ) -> None:
     """No argument of the compiled step, no array in the model: only None."""
-    effect, argument = CHOICES[name]
     without = prepare(phantom_vademecum, (TIP,), cloud="off", effects=())
-    with_it = prepare(phantom_vademecum, (TIP,), cloud="off", effects=(effect,))
-    assert getattr(without.effects, argument) is None
-    assert getattr(with_it.effects, argument) is not None
+    with_it = prepare(phantom_vademecum, (TIP,), cloud="off", effects=(CHOICES[name],))
+    assert getattr(without.effects, name) is None
+    assert getattr(with_it.effects, name) is not None
     assert all(value is None for value in without.effects)
     assert not [key for key in without.layout.flat() if "." in key]
-    assert [key for key in with_it.layout.flat() if key.startswith(f"{argument}.")]
-    others = [a for _, a in CHOICES.values() if a != argument]
-    assert all(getattr(with_it.effects, other) is None for other in others)
+    assert [key for key in with_it.layout.flat() if key.startswith(f"{name}.")]
+    assert all(getattr(with_it.effects, other) is None for other in CHOICES if other != name)
 
 
 def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -> None:
@@ -62,7 +60,7 @@ def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -
 
 @pytest.mark.parametrize("name", [name for name in CHOICES if name != "several_tools"])
 def test_an_effect_changes_the_result_when_on(phantom_vademecum: Vademecum, name: str) -> None:
-    effect, _ = CHOICES[name]
+    effect = CHOICES[name]
     path = push_and_drag(phantom_vademecum)
     bare = forces(prepare(phantom_vademecum, (TIP,), cloud="off", effects=()), path)
     changed = forces(prepare(phantom_vademecum, (TIP,), cloud="off", effects=(effect,)), path)
@@ -75,7 +73,7 @@ def test_the_list_of_effects_is_complete() -> None:
 
 
 def test_a_layout_survives_being_flat(phantom_vademecum: Vademecum) -> None:
-    effects = tuple(effect for effect, _ in CHOICES.values())
+    effects = tuple(CHOICES.values())
     layout = lay_out(phantom_vademecum, (TIP,), effects=effects)
     again = Layout.of(layout.flat())
     for a, b in zip(layout.effects, again.effects, strict=True):
@@ -95,7 +93,7 @@ def test_two_tools_without_the_effect_are_refused(phantom_vademecum: Vademecum) 
 def test_everything_at_once_stays_sane(phantom_vademecum: Vademecum) -> None:
     """Two tools, all effects, ten seconds of touching: finite, bounded, and at rest in the end."""
     v = phantom_vademecum
-    effects = tuple(effect for effect, _ in CHOICES.values())
+    effects = tuple(CHOICES.values())
     model = prepare(v, (TIP, TIP), cloud="surface", effects=effects)
     inner = inner_positions(v)
     rng = np.random.default_rng(0)

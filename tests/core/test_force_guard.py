@@ -51,7 +51,7 @@ def test_ordinary_forces_go_through_to_the_bit() -> None:
     for k in range(1000):  # 15 N, 5 times a second, as of a palpating hand
         force = 7.5 * (1.0 - math.cos(2 * math.pi * 5 * k * PERIOD)) * np.array([0.6, 0.0, 0.8])
         np.testing.assert_array_equal(drive.step(force)[:3], force)
-        assert not drive.guard.limited and drive.guard.share == 1.0
+        assert not drive.guard.limited and drive.guard.sent_fraction == 1.0
 
 
 def test_a_force_that_is_too_large_keeps_its_direction() -> None:
@@ -61,7 +61,7 @@ def test_a_force_that_is_too_large_keeps_its_direction() -> None:
     np.testing.assert_allclose(drive.sent[-1][:3], force / 10.0)
     np.testing.assert_allclose(drive.sent[-1][3:], force / 1000.0)
     assert drive.guard.limited
-    assert drive.guard.share == pytest.approx(0.1)
+    assert drive.guard.sent_fraction == pytest.approx(0.1)
 
 
 def test_engagement_is_soft() -> None:

@@ -152,7 +152,7 @@ def test_while_it_comes_back_the_status_says_so(cell: Cell) -> None:
     cell.hold(SOON)
     coming = cell.hold(round(1e3 * ENGAGEMENT) - 15)
     assert (coming[:, 0] == ENGAGING).all()
-    assert 0.0 < cell.loop.guards[0].share < 1.0
+    assert 0.0 < cell.loop.guards[0].sent_fraction < 1.0
     assert cell.hold(40)[-1, 0] == OK
 
 
@@ -169,7 +169,7 @@ def test_large_forces_are_limited_and_the_state_says_how_much(
     cell = Cell(bench(20e-3), touch, replace(SAFETY, limits=ForceLimits(1.5, 200.0)))
     assert np.linalg.norm(cell.force) == pytest.approx(1.5)
     whole = np.linalg.norm(cell.loop.active.model.out.force[0])
-    assert cell.loop.guards[0].share == pytest.approx(1.5 / whole)
+    assert cell.loop.guards[0].sent_fraction == pytest.approx(1.5 / whole)
     away = cell.hold(30, lambda: pose(cell.tip + 15e-3 * cell.normal))
     change = np.linalg.norm(np.diff(np.vstack([cell.force, away[:, 1:]]), axis=0), axis=1)
     assert change.max() < 200.0 * 1.001e-3

@@ -11,7 +11,7 @@ class Through:
     """In place of ForceGuard."""
 
     def __init__(self) -> None:
-        self.limits, self.share, self.limited = DEVICES["sigma"], 1.0, False
+        self.limits, self.sent_fraction, self.limited = DEVICES["sigma"], 1.0, False
         self.engaged = self.silent = True
 
     def update(self, now: float, sound: bool, force: Any, torque: Any) -> None:

@@ -1,8 +1,8 @@
-"""The effects that a scene may call for: one file each, and nothing of it runs unless it is called.
+"""The effects that a scene may name: one file each, and none of it runs unless a scene names it.
 
-Each has two halves. Offline, a frozen dataclass that is checked and turned into the arrays the step
-needs; online, compiled functions on these arrays. The step takes one argument for each effect;
-where it is None, numba compiles the step without it: no branch, no array.
+Each has two halves. Offline, a frozen dataclass is checked and turned into the arrays that the step
+needs; online, compiled functions work on these arrays. The step takes one argument for each effect;
+where it is None, numba compiles the step without the effect: no branch, no array.
 """
 
 from __future__ import annotations

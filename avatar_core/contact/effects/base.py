@@ -1,4 +1,4 @@
-"""What all effects have in common: a name, checked quantities, what they need of a vademecum."""
+"""The base class of effects: a name, checked quantities, requirements on the vademecum."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Effect(ABC):
         check_numbers(self, f"{self.name}.")
 
     def require(self, vademecum: Vademecum) -> None:  # noqa: B027 (most need nothing)
-        """Refuse a vademecum that lacks what the effect needs.
+        """Refuse a vademecum that cannot serve the effect.
 
         Raises
         ------
@@ -41,7 +41,7 @@ class Effect(ABC):
 
 
 def direction(values: tuple[float, ...], owner: str, key: str) -> tuple[float, float, float]:
-    """Three numbers as a unit vector, however small; one that is one already is not changed."""
+    """Three numbers as a unit vector; a unit vector stays the same bit by bit."""
     largest = max(map(abs, values)) if len(values) == 3 else 0.0
     if largest == 0.0:
         raise SceneError(f"{owner}.{key} is {list(values)}; give three numbers, not all zero")
@@ -54,7 +54,7 @@ def direction(values: tuple[float, ...], owner: str, key: str) -> tuple[float, f
 
 
 def require_body(vademecum: Vademecum, effect: str) -> None:
-    """Refuse a vademecum that does not know the organ's mass."""
+    """Refuse a vademecum without the mass of the organ."""
     if vademecum.body is None:
         raise SceneError(
             f"{effect}: the vademecum does not know the organ's mass; build it again with 'avatar "

@@ -1,16 +1,16 @@
 """Coulomb friction with stick and slip, coupled with the normal contact through the organ.
 
-A tip that touches holds a point s_a of the organ's surface, its *anchor*. While it sticks, that
-point goes with the tip's own contact point c = p - r n: the displacement of the patch is
+A tip in contact has an *anchor*, a material point s_a of the organ's surface at rest. While the tip
+sticks, the anchor moves with the tip's contact point c = p - r n: the displacement of the patch is
 
     U = y + n (gap - n . y),    y = c - s_a,
 
 and the force on the tissue g = C^-1 U has a normal part lambda = -n . g >= 0 and a tangential one
-tau, |tau| <= mu_s lambda. Where it would be more, the anchor slides until |tau| = mu_k lambda,
-along tau: of all slips the one that dissipates most (Moreau). Both parts are found together, tip
-after tip, by projection (Alart & Curnier, CMAME 92:353, 1991). The rest is the elastic energy
-W(p, s_a), whose derivative at a fixed anchor is the force, so that of the work done on a closed
-path nothing is left but mu_k lambda |slip| >= 0. What a turn of the tool does to c is ``spin``.
+tau, |tau| <= mu_s lambda. Where it would exceed that, the anchor slides along tau until
+|tau| = mu_k lambda, the slip of maximum dissipation (Moreau). Both parts are found together, tip
+after tip, by projection (Alart & Curnier, CMAME 92:353, 1991). The force is the derivative of the
+elastic energy W(p, s_a) at a fixed anchor, so that the work on a closed path is the dissipation
+mu_k lambda |slip| >= 0. ``spin`` moves the contact point when the tool turns.
 """
 
 from __future__ import annotations
@@ -50,17 +50,17 @@ class Friction(Effect):
 
 
 MAX_SWEEPS = 1000
-PATIENCE = 8  # sweeps before Newton's steps are worth their time,
-MAX_NEWTON = 64  # and after which they have not helped
+PATIENCE = 8  # sweeps before Newton steps are tried,
+MAX_NEWTON = 64  # and after which they are no longer tried
 GAP_TOLERANCE = 1e-9  # [m]
-NONE, STICKS, SLIPS = range(3)  # what a tip did in the last period
+NONE, STICKS, SLIPS = range(3)  # state of a tip in the last period
 
 FrictionArrays = namedtuple("FrictionArrays", ["coefficients"])
 FrictionState = namedtuple(
     "FrictionState",
     [
         "coefficients",  # (2,) mu_s, mu_k
-        "spin",  # (T, 3) turn of the tool in this period [rad]; used up by it
+        "spin",  # (T, 3) rotation of the tool in this period [rad]; the step resets it
         "anchor",  # (T, 3) s_a [m]
         "motion",  # (T,) NONE, STICKS, SLIPS
         "limit",  # (T,) mu in force
@@ -69,21 +69,21 @@ FrictionState = namedtuple(
         "near",  # (T, T, 3, 3) near part of w . C w
         "compliance",  # (T, T, 3, 3) C
         "offset",  # (T, 3) c - s_a
-        "slipped",  # (T,) way of the anchor in this period [m]
-        "matrix",  # (3T, 3T) of Newton's steps
+        "slipped",  # (T,) distance that the anchor slid in this period [m]
+        "matrix",  # (3T, 3T) of the Newton steps
         "rhs",  # (3T,) [N]
-        "best",  # (T, 3) push nearest to the solution among them [N]
+        "best",  # (T, 3) push of the Newton step with the least residual [N]
     ],
 )
 
 
 def friction_arrays(effect: Friction) -> FrictionArrays:
-    """What the step needs of the effect."""
+    """Constant arrays of the effect."""
     return FrictionArrays(np.array([effect.static, effect.kinetic]))
 
 
 def friction_state(arrays: FrictionArrays, n_tools: int, n_modes: int) -> FrictionState:
-    """No tip touches."""
+    """State without any contact."""
     return FrictionState(
         *arrays,
         spin=np.zeros((n_tools, 3)),
@@ -104,7 +104,7 @@ def friction_state(arrays: FrictionArrays, n_tools: int, n_modes: int) -> Fricti
 
 @fast
 def gather_friction(model, state, friction, t):  # type: ignore[no-untyped-def]
-    """How forces along x, y and z drive the modes, and the near part of the tip's compliance."""
+    """Modal loads of unit forces along x, y and z, and the near part of the tip's compliance."""
     if friction is None:
         return
     mode = friction.mode[t]
@@ -119,7 +119,7 @@ def gather_friction(model, state, friction, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _near_between(model, state, friction, t, s):  # type: ignore[no-untyped-def]
-    """sum_ij w_i B_ij w_j: displacement of the first tip's patch by forces of the second."""
+    """sum_ij w_i B_ij w_j: displacement of tip t's patch by unit forces of tip s."""
     near = friction.near[t, s]
     near[:] = 0.0
     for i in range(state.n_nodes[s]):
@@ -135,7 +135,7 @@ def _near_between(model, state, friction, t, s):  # type: ignore[no-untyped-def]
 
 @fast
 def _assemble(model, state, superposition, several_tools, friction):  # type: ignore[no-untyped-def]
-    """C between all tips that touch, three by three."""
+    """The 3 x 3 blocks of C between all tips in contact."""
     for t in range(state.passage.shape[0]):
         for s in range(t + 1):
             if not (state.active[t] and state.active[s]):
@@ -163,7 +163,7 @@ def _assemble(model, state, superposition, several_tools, friction):  # type: ig
 
 @inlined
 def solve_friction(model, state, tips, superposition, several_tools, large_deformation, friction):  # type: ignore[no-untyped-def]
-    """Stick where friction can hold the tip, slip where it cannot."""
+    """Stick where friction can hold the tip, slip elsewhere; whether the last sweeps converged."""
     _assemble(model, state, superposition, several_tools, friction)
     mu_s, mu_k = friction.coefficients[0], friction.coefficients[1]
     for t in range(state.passage.shape[0]):
@@ -171,7 +171,7 @@ def solve_friction(model, state, tips, superposition, several_tools, large_defor
             friction.motion[t] = NONE
             friction.push[t] = 0.0
             continue
-        if state.force[t] <= 0.0:  # none before, or it was taken from a tip that leapt
+        if state.force[t] <= 0.0:  # no contact before, or a discontinuous motion
             friction.motion[t] = NONE
             friction.push[t] = 0.0
         _set_offset(model, state, friction, tips, t)
@@ -196,7 +196,7 @@ def solve_friction(model, state, tips, superposition, several_tools, large_defor
 
 @inlined
 def _set_offset(model, state, friction, tips, t):  # type: ignore[no-untyped-def]
-    """y = c - s_a; a turn of the tool takes the anchor's partner along."""
+    """y = c - s_a, the anchor first moved by the tool's rotation."""
     n, r, spin = state.normal[t], model.tip_radius[t], friction.spin[t]
     if friction.motion[t] != NONE:
         a = friction.anchor[t]
@@ -210,7 +210,7 @@ def _set_offset(model, state, friction, tips, t):  # type: ignore[no-untyped-def
 
 @inlined
 def _sweep(state, superposition, several_tools, large_deformation, friction):  # type: ignore[no-untyped-def]
-    """Gauss-Seidel over the tips, the normal and then the tangential force of each."""
+    """Gauss-Seidel over the tips, normal then tangential force of each; whether it converged."""
     for sweep in range(MAX_SWEEPS):
         if several_tools is not None and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
             start = (sweep // PATIENCE) % (state.passage.shape[0] + 1)
@@ -258,7 +258,7 @@ def _update_normal(state, superposition, several_tools, large_deformation, frict
 
 @fast
 def _update_tangential(state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
-    """tau <- tau + (what is asked - U) / stiffness, not beyond mu lambda."""
+    """tau <- tau + (y - U)_t / c_t, projected to |tau| <= mu lambda."""
     n, c, g, y = state.normal[t], friction.compliance[t, t], friction.push[t], friction.offset[t]
     u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
@@ -272,9 +272,9 @@ def _update_tangential(state, superposition, several_tools, friction, t):  # typ
     t0 = g[0] - normal * n[0] + (x0 - along * n[0]) / across
     t1 = g[1] - normal * n[1] + (x1 - along * n[1]) / across
     t2 = g[2] - normal * n[2] + (x2 - along * n[2]) / across
-    size, most = np.sqrt(t0 * t0 + t1 * t1 + t2 * t2), friction.limit[t] * state.force[t]
-    if size > most:
-        part = most / size
+    size, bound = np.sqrt(t0 * t0 + t1 * t1 + t2 * t2), friction.limit[t] * state.force[t]
+    if size > bound:
+        part = bound / size
         t0, t1, t2 = part * t0, part * t1, part * t2
     change = abs(t0 + normal * n[0] - g[0])
     change = max(change, abs(t1 + normal * n[1] - g[1]), abs(t2 + normal * n[2] - g[2]))
@@ -292,13 +292,13 @@ def tangential_force(state, friction, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def _sticks(state, friction, t):  # type: ignore[no-untyped-def]
-    """Whether friction stays below its limit."""
+    """Whether friction is below its limit."""
     return tangential_force(state, friction, t) < (1.0 - 1e-9) * friction.limit[t] * state.force[t]
 
 
 @fast
 def _slide_anchor(state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
-    """Let the anchor slide to where the tissue under the tip is; note what the tip does."""
+    """Move the anchor of a slipping tip with it, and set the state of the tip."""
     friction.slipped[t] = 0.0
     if state.force[t] <= 0.0:
         friction.motion[t] = NONE
@@ -325,7 +325,7 @@ def _slide_anchor(state, superposition, several_tools, friction, t):  # type: ig
 
 @fast
 def add_modal_load(state, friction, t, total):  # type: ignore[no-untyped-def]
-    """Y^T of the loads of a tip, added."""
+    """Add Y^T of the loads of a tip."""
     a, g, mode = state.scale[t], friction.push[t], friction.mode[t]
     for k in range(total.shape[0]):
         total[k] += a * (g[0] * mode[0, k] + g[1] * mode[1, k] + g[2] * mode[2, k])
@@ -333,7 +333,7 @@ def add_modal_load(state, friction, t, total):  # type: ignore[no-untyped-def]
 
 @fast
 def add_near_friction(model, state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
-    """Near displacement at the nodes of a tip by the pushes of all, into ``joint``."""
+    """Add the near displacement at the nodes of a tip by the pushes of all tips."""
     for s in range(state.passage.shape[0]):
         if state.force[s] <= 0.0:
             continue

@@ -1,15 +1,17 @@
-"""Contact with friction of tips side by side, by Newton's method on the projections.
+"""Frictional contact of tips close to each other, by Newton's method on the projections.
 
-Tips that are close share their forces by small differences of their compliance, and sweeps from tip
-to tip change these shares little. The pushes sought are where each projection changes nothing,
+How close tips divide their load depends on small differences in compliance, which Gauss-Seidel
+resolves slowly. The solution is the fixed point of all projections,
 
     g_t = - n a + P_D(z),    a = max(0, lambda - w / c_n),    z = tau + (y - U)_t / c_t,
 
-D the disc of radius mu a, c_n and c_t the tip's own compliances, w its gap; that is solved in all
-directions of all tips at once (Alart & Curnier, CMAME 92:353, 1991). Far from the solution Newton's
-steps may lead away: of a few, those are kept that come nearest. Of two tips in nearly one place one
-may have to give its whole push to the other, which steps from the present pushes do not find; so
-they are tried from each tip alone as well.
+with D the disc of radius mu a, c_n and c_t the tip's own compliances and w its gap, solved for all
+tips together (Alart & Curnier, CMAME 92:353, 1991). Far from the solution Newton steps may diverge:
+the step of least residual is kept. Where two tips nearly coincide, one may have to pass its whole
+load to the other, which steps from the present pushes do not find; therefore each tip alone serves
+as a start, too.
+
+The steps only propose a start: convergence is decided by the sweeps that follow.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ LEAST_PIVOT = 1e-9
 
 @fast
 def patch_displacement(state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
-    """U of a tip's patch under the present pushes and all that is there without them."""
+    """U of a tip's patch: the displacement by the present pushes and without them."""
     u0, u1, u2 = (
         superposition.free_displacement[t, 0],
         superposition.free_displacement[t, 1],
@@ -43,9 +45,9 @@ def patch_displacement(state, superposition, several_tools, friction, t):  # typ
 
 @inlined
 def newton_steps(state, superposition, several_tools, large_deformation, friction, start):  # type: ignore[no-untyped-def]
-    """Bring all pushes nearer to the solution, or leave them.
+    """Replace all pushes by those of the Newton step with the least residual.
 
-    start : 0 from the present pushes, t from the t-th tip alone
+    start : 0 from the present pushes, t from tip t - 1 alone
     """
     push, best, n_tools = friction.push, friction.best, state.passage.shape[0]
     least = np.inf
@@ -74,7 +76,7 @@ def newton_steps(state, superposition, several_tools, large_deformation, frictio
 
 @inlined
 def _start_from_one_tip(state, superposition, friction, t):  # type: ignore[no-untyped-def]
-    """What a tip pushes if no other touches and it is dragged at its limit."""
+    """Push of a tip if no other is in contact and it slips."""
     n, y, c = state.normal[t], friction.offset[t], friction.compliance[t, t]
     gap, stiff, along = state.gap[t], 0.0, 0.0
     for i in range(3):
@@ -93,7 +95,7 @@ def _start_from_one_tip(state, superposition, friction, t):  # type: ignore[no-u
 
 @inlined
 def _linearise(state, superposition, several_tools, large_deformation, friction, t):  # type: ignore[no-untyped-def]
-    """A tip's rows of Newton's system; returns the square of what it is off [N^2]."""
+    """A tip's rows of the Newton system; returns its squared residual [N^2]."""
     matrix, rhs, n_tools = friction.matrix, friction.rhs, state.passage.shape[0]
     for i in range(3):
         rhs[3 * t + i] = 0.0
@@ -120,20 +122,20 @@ def _linearise(state, superposition, several_tools, large_deformation, friction,
     z0 = g[0] + force * n[0] + (x0 - along * n[0]) / across
     z1 = g[1] + force * n[1] + (x1 - along * n[1]) / across
     z2 = g[2] + force * n[2] + (x2 - along * n[2]) / across
-    size, most = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2), friction.limit[t] * max(0.0, pressed)
-    part, limit = 1.0, 0.0  # of dz and of da, in what is kept of z
+    size, bound = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2), friction.limit[t] * max(0.0, pressed)
+    part, limit = 1.0, 0.0  # factors of dz and of da
     e0 = e1 = e2 = 0.0
-    if size > most:
-        part, limit = most / size, friction.limit[t]
+    if size > bound:
+        part, limit = bound / size, friction.limit[t]
         e0, e1, e2 = z0 / size, z1 / size, z2 / size
     if pressed <= 0.0:
         pressed = part = limit = 0.0
     kept = (part * z0, part * z1, part * z2)
     e, square = (e0, e1, e2), 0.0
     for i in range(3):
-        off = -n[i] * max(0.0, pressed) + kept[i] - g[i]
-        rhs[3 * t + i] = off
-        square += off * off
+        residual = -n[i] * max(0.0, pressed) + kept[i] - g[i]
+        rhs[3 * t + i] = residual
+        square += residual * residual
     if pressed <= 0.0:
         return square
     for s in range(n_tools):
@@ -158,7 +160,7 @@ def _linearise(state, superposition, several_tools, large_deformation, friction,
 
 @inlined
 def _gauss(a, b):  # type: ignore[no-untyped-def]
-    """a x = b by Gauss with row exchange; x in place of b. Pivots that vanish get a small one."""
+    """Solve a x = b by elimination with partial pivoting, in place; tiny pivots are replaced."""
     n = b.shape[0]
     for k in range(n):
         p = k

@@ -1,17 +1,17 @@
-"""Inertia: the organ's mass in its own modes, for fast pulls and for what happens after release.
+"""Inertia: the organ's mass in its modes of vibration, for fast motion and after release.
 
-The modes are orthonormal in the energy; turned so that the mass rho X^T M X is diagonal too (m_k,
-with the frequencies 1 / sqrt(m_k)), each is an oscillator of its own,
+The modes are orthonormal in energy. Rotated so that the mass rho X^T M X is diagonal too (m_k, with
+the angular frequencies 1 / sqrt(m_k)), each is an independent oscillator,
 
-    m_k q'' + d_k q' + R_k(q) = Y_k . f,        R = q, or what viscoelasticity makes of it,
+    m_k q'' + d_k q' + R_k(q) = Y_k . f,        R = q, or relaxed by viscoelasticity,
 
-advanced by the midpoint rule,
+integrated by the midpoint rule,
 
     2 m (v_mid - v) / dt + (R + R_new) / 2 + d v_mid = Y . f,     q_new = q + dt v_mid,
 
-which conserves energy but for d v_mid^2 dt (Simo & Tarnow, ZAMP 43:757, 1992). The loads f of the
-period keep the tips from lying inside at its end: on a tip at rest they do no work but
--lambda gap <= 0, so that no contact gains energy. The near field has no mass.
+which conserves energy up to d v_mid^2 dt (Simo & Tarnow, ZAMP 43:757, 1992). The loads f of a
+period satisfy the contact conditions at its end: on a tip at rest their work is -lambda gap <= 0,
+so contact never adds energy. The near field has no mass.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Inertia(Effect):
-    """The organ's own mass: it swings when it is let go."""
+    """The organ's mass: it vibrates after release."""
 
     name: ClassVar[str] = "inertia"
     text: ClassVar[str] = "the organ has mass and swings"
@@ -60,9 +60,9 @@ InertiaState = namedtuple(
 
 
 def vibration_modes(vademecum: Vademecum, density: float) -> tuple[Vademecum, np.ndarray]:
-    """The vademecum in modes of free vibration, slowest first, and their masses (k,) [s^2]."""
+    """The vademecum in its modes of vibration, slowest first, and their masses (k,) [s^2]."""
     far, body = vademecum.far, vademecum.body
-    assert body is not None  # `require` has seen it
+    assert body is not None  # by `require`
     values, turn = np.linalg.eigh(body.mass)
     values, turn = density * np.maximum(values[::-1], 0.0), turn[:, ::-1]
     single = turn.astype(far.space.dtype)
@@ -78,7 +78,7 @@ def inertia_arrays(effect: Inertia, mass: np.ndarray, period: float) -> InertiaA
 def inertia_state(
     arrays: InertiaArrays, n_modes: int, self_weight: SelfWeightArrays | None
 ) -> InertiaState:
-    """At rest, hanging where there is gravity."""
+    """State of an organ at rest, deformed by its weight if that is simulated."""
     still = np.zeros(n_modes) if self_weight is None else self_weight.amplitude.copy()
     padding = n_modes - len(arrays.mass)
     mass, drag = np.pad(arrays.mass, (0, padding)), np.pad(arrays.damping, (0, padding))
@@ -87,18 +87,18 @@ def inertia_state(
 
 @fast
 def predict_inertia(superposition, inertia, viscoelasticity, self_weight):  # type: ignore[no-untyped-def]
-    """Modes at the end of the period without any load of a tool, and what a load adds."""
+    """Modes at the end of the period without any load, and their gain by a unit load."""
     dt = inertia.period[0]
     for k in range(superposition.free.shape[0]):
         m, q, v = inertia.mass[k], inertia.modes[k], inertia.velocity[k]
-        stiff, before, after = 1.0, q, q  # dR/dq of the period, R now, R at its end if q stays
+        stiff, before, after = 1.0, q, q  # dR/dq, R now, R at the end for constant q
         if viscoelasticity is not None:
             stiff = 1.0 / viscoelasticity.gain[0]
             before, after = viscoelasticity.rest[0] * viscoelasticity.elastic[k], 0.0
             for i in range(viscoelasticity.decay.shape[0]):
                 before += viscoelasticity.past[i, k]
             after = viscoelasticity.held[k] + stiff * viscoelasticity.elastic[k]
-        elif self_weight is not None:  # R counts from where the organ hangs
+        elif self_weight is not None:  # R is relative to the sagged organ
             before -= self_weight.amplitude[k]
             after -= self_weight.amplitude[k]
         whole = 2.0 * m / dt + 0.5 * stiff * dt + inertia.damping[k]
@@ -109,7 +109,7 @@ def predict_inertia(superposition, inertia, viscoelasticity, self_weight):  # ty
 
 @fast
 def advance_inertia(superposition, inertia):  # type: ignore[no-untyped-def]
-    """Complete the period."""
+    """Complete the period: modes and their velocities at its end."""
     if inertia is None:
         return
     dt = inertia.period[0]

@@ -1,8 +1,8 @@
-"""Large deformation in the step: the depth of a tip bends with the load.
+"""Large deformation in the step: the depth of a tip is a nonlinear function of its load.
 
 See :mod:`avatar_core.vademecum.large_deformation`.
-To C_tt lambda_t comes h(a_t), a_t = gamma lambda_t, to the energy what belongs to it, and to the
-force its derivative. h ends as its tangent beyond the reach that was computed.
+It adds h(a_t) to C_tt lambda_t, with a_t = gamma lambda_t, the matching term to the energy, and its
+derivative to the force. Beyond the reach that was computed, h continues as its tangent.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LargeDeformationEffect(Effect):
-    """Large pushes: the force's magnitude as a coordinate instead of linear scaling."""
+    """Large deformation: the response depends nonlinearly on the magnitude of the force."""
 
     name: ClassVar[str] = "large_deformation"
     text: ClassVar[str] = "the response bends with the depth of the push"
@@ -59,7 +59,7 @@ LargeDeformationState = namedtuple(
 
 
 def large_deformation_state(arrays: LargeDeformationArrays, n_tools: int) -> LargeDeformationState:
-    """With scratch for the tools."""
+    """The constant arrays, with scratch for the tools."""
     return LargeDeformationState(
         *arrays, np.zeros((n_tools, 3)), np.zeros((n_tools, 3, 3)), np.zeros((n_tools, 4))
     )
@@ -67,7 +67,7 @@ def large_deformation_state(arrays: LargeDeformationArrays, n_tools: int) -> Lar
 
 @inlined
 def sample_coefficients(model, large_deformation, t, tip):  # type: ignore[no-untyped-def]
-    """beta_2, beta_3 and the reach of a tip."""
+    """beta_2, beta_3 and the reach at a tip, with their gradients."""
     if large_deformation is None:
         return
     cell = cell_at(model.origin, model.spacing[0], tip)
@@ -79,7 +79,7 @@ def sample_coefficients(model, large_deformation, t, tip):  # type: ignore[no-un
 
 @fast
 def evaluate_added_depth(state, large_deformation, t):  # type: ignore[no-untyped-def]
-    """h(a) = beta_2 a^2 + beta_3 a^3 at the present force, its slope and integral."""
+    """h(a) = beta_2 a^2 + beta_3 a^3 at the present force, its derivative and integral."""
     a = state.self_compliance[t] * state.force[t]
     b2, b3, reach = (
         large_deformation.coefficient[t, 0],
@@ -129,7 +129,7 @@ def add_nonlinear_force(state, large_deformation, out, t):  # type: ignore[no-un
 
 @fast
 def powers_of_depth(state, large_deformation, t):  # type: ignore[no-untyped-def]
-    """a^2 and a^3 of a tip's linear depth, tangential beyond the reach."""
+    """a^2 and a^3 of a tip's linear depth a, continued by their tangents beyond the reach."""
     a = state.self_compliance[t] * state.force[t]
     inside = min(a, large_deformation.coefficient[t, 2])
     over = a - inside
@@ -138,7 +138,7 @@ def powers_of_depth(state, large_deformation, t):  # type: ignore[no-untyped-def
 
 @fast
 def add_nonlinear_amplitudes(state, large_deformation, t, amplitude):  # type: ignore[no-untyped-def]
-    """Far part of what a tip bends, into the last amplitudes of the cloud."""
+    """Amplitudes of the nonlinear modes, the last of the cloud, for one tip."""
     n_nonlinear = large_deformation.load.shape[2]
     nonlinear = amplitude[amplitude.shape[0] - n_nonlinear :]
     second, third = powers_of_depth(state, large_deformation, t)
@@ -152,7 +152,7 @@ def add_nonlinear_amplitudes(state, large_deformation, t, amplitude):  # type: i
 
 @fast
 def add_nonlinear_near(model, state, large_deformation, j, w, second, third):  # type: ignore[no-untyped-def]
-    """Near part of it, around one load position."""
+    """Nonlinear near field around one load position."""
     u = state.field
     w2, w3 = np.float32(w * second), np.float32(w * third)
     for e in range(model.near_start[j], model.near_start[j + 1]):

@@ -2,8 +2,8 @@
 
     x(t) = A e (1 - cos^2n(pi t / T)),    p in the organ's frame = p in the world's - x(t)
 
-from the end of a breath out (Lujan et al., Medical Physics 26:715, 1999). The acceleration of a
-breath (12 mm in 4 s: 0.03 m/s^2) is three thousandths of gravity's and left out.
+starting at the end of exhalation (Lujan et al., Medical Physics 26:715, 1999). Its acceleration
+(12 mm in 4 s: 0.03 m/s^2) is 0.3 % of gravity and neglected.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ RespirationState = namedtuple(
     [
         "stroke",  # (3,) A e [m]
         "timing",  # (3,) period of the breath [s], n, period of the step [s]
-        "clock",  # (1,) time into the breath [s]
+        "clock",  # (1,) time since the end of exhalation [s]
         "shift",  # (3,) x(t) [m]
     ],
 )
 
 
 def respiration_arrays(effect: Respiration, period: float) -> RespirationArrays:
-    """What the step needs of the breath."""
+    """Constant arrays for steps of a period [s]."""
     return RespirationArrays(
         effect.amplitude * np.array(effect.axis),
         np.array([effect.period, float(effect.dwell), period]),
@@ -59,28 +59,28 @@ def respiration_arrays(effect: Respiration, period: float) -> RespirationArrays:
 
 
 def respiration_state(arrays: RespirationArrays) -> RespirationState:
-    """At the end of a breath out."""
+    """State at the end of exhalation."""
     return RespirationState(*arrays, np.zeros(1), np.zeros(3))
 
 
 @inlined
 def to_organ_frame(respiration, tips):  # type: ignore[no-untyped-def]
-    """Advance the breath by a period, and take the tips into the organ's frame."""
+    """Advance the breath by a period, and transform the tips to the organ's frame."""
     if respiration is None:
         return
     period = respiration.timing[0]
     respiration.clock[0] = (respiration.clock[0] + respiration.timing[2]) % period
     out = np.cos(np.pi * respiration.clock[0] / period) ** 2
-    part = 1.0 - out ** respiration.timing[1]
+    inhaled = 1.0 - out ** respiration.timing[1]
     for d in range(3):
-        respiration.shift[d] = part * respiration.stroke[d]
+        respiration.shift[d] = inhaled * respiration.stroke[d]
         for t in range(tips.shape[0]):
             tips[t, d] -= respiration.shift[d]
 
 
 @inlined
 def to_world_frame(respiration, out):  # type: ignore[no-untyped-def]
-    """Contacts back into the world's frame; forces are the same in both."""
+    """Contacts back to the world's frame; the frames do not rotate, so forces stay the same."""
     if respiration is None:
         return
     for i in range(out.n_contacts[0]):
@@ -90,7 +90,7 @@ def to_world_frame(respiration, out):  # type: ignore[no-untyped-def]
 
 @fast
 def shift_cloud(respiration, cloud):  # type: ignore[no-untyped-def]
-    """Deformed positions too; the displacement stays that within the organ."""
+    """Deformed positions to the world's frame; displacements stay relative to the organ."""
     if respiration is None:
         return
     x, y, z = (

@@ -1,7 +1,7 @@
-"""Gravity: the organ sags under its own weight, as one more load that was computed beforehand.
+"""Gravity: the organ sags under its own weight, a constant load.
 
-The modes X are orthonormal in the energy, so that Galerkin's answer to a body force rho g is
-X^T M 1 rho g, M the mass of a unit density: one amplitude each. What relaxes has relaxed.
+The modes X are orthonormal in energy; the Galerkin solution for a body force rho g therefore has
+the amplitudes X^T M 1 rho g, M the mass matrix of unit density. Viscoelastic tissue has relaxed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SelfWeight(Effect):
-    """The organ hangs under its own weight."""
+    """The organ deforms under its own weight."""
 
     name: ClassVar[str] = "self_weight"
     text: ClassVar[str] = "the organ sags under gravity"
@@ -43,18 +43,16 @@ class SelfWeight(Effect):
 
 
 def body_first(vademecum: Vademecum) -> Vademecum:
-    """The vademecum with the body's own functions, which are its last modes, before the others."""
+    """The vademecum with the modes of body forces, which are its last, before the others."""
     far, body = vademecum.far, vademecum.body
-    assert body is not None  # `require` has seen it
+    assert body is not None  # by `require`
     order = np.roll(np.arange(far.rank), N_BODY)
     turned = BodyResponse(body.mass[np.ix_(order, order)], body.weight[order])
     far = SeparatedField(far.space[:, order], far.load[:, order])
     return replace(vademecum, far=far, body=turned)
 
 
-SelfWeightArrays = namedtuple(
-    "SelfWeightArrays", ["amplitude"]
-)  # (k,) of the modes, the organ hanging
+SelfWeightArrays = namedtuple("SelfWeightArrays", ["amplitude"])  # (k,) of the modes, under gravity
 
 
 def self_weight_arrays(
@@ -62,8 +60,8 @@ def self_weight_arrays(
 ) -> SelfWeightArrays:
     """Amplitudes of the modes.
 
-    softened : Young's modulus of a touch over that after a long time
+    softened : instantaneous over relaxed Young's modulus
     """
-    assert vademecum.body is not None  # `require` has seen it
+    assert vademecum.body is not None  # by `require`
     force = effect.density * effect.gravity * np.array(effect.direction)
     return SelfWeightArrays(softened * (vademecum.body.weight @ force))

@@ -19,8 +19,8 @@ from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.large_deformation import evaluate_added_depth
 from avatar_core.reduction.near_field import find_block
 
-MAX_EXCHANGES = 4  # for each tool, of the tips that are held
-INSIDE = 1e-9  # [m] deeper inside, a tip has to be held
+MAX_EXCHANGES = 4  # of the active set, for each tool
+INSIDE = 1e-9  # [m] of penetration that makes a tip active
 LEAST_PIVOT = 1e-8  # of a tip's own compliance
 
 
@@ -39,13 +39,13 @@ SeveralToolsState = namedtuple(
         "reach",  # (1,) of the near field [m]
         "column",  # (T, T, MAX_STENCIL, 3) near displacement at the nodes of the second tip by a
         # unit normal force of the first
-        "near",  # (T, T) whether it is any
+        "near",  # (T, T) whether near fields overlap
         "extent",  # (T,) radius of a tip's nodes [m]
-        "matrix",  # (T, T) C, with what large deformation adds
+        "matrix",  # (T, T) C, with the tangent of large deformation
         "factor",  # (T, T) its Cholesky factor
-        "free_gap",  # (T,) the gap without any force [m]
-        "trial",  # (T,) forces that close the gaps of the tips that are held [N]
-        "active_set",  # (T,)
+        "free_gap",  # (T,) gap without any force [m]
+        "trial",  # (T,) forces that close the gaps of the active set [N]
+        "active_set",  # (T,) tips whose gap is closed
     ],
 )
 
@@ -53,7 +53,7 @@ SeveralToolsState = namedtuple(
 def several_tools_state(
     arrays: SeveralToolsArrays, n_tools: int, n_nodes: int
 ) -> SeveralToolsState:
-    """With scratch for the pairs of tools."""
+    """The constant arrays, with scratch for the pairs of tools."""
     return SeveralToolsState(
         *arrays,
         np.zeros((n_tools, n_tools, n_nodes, 3), np.float32),
@@ -69,7 +69,7 @@ def several_tools_state(
 
 @inlined
 def couple_near_fields(model, state, several_tools, friction):  # type: ignore[no-untyped-def]
-    """Near fields between all pairs of tips that touch; with friction, whether there are any."""
+    """Near fields between all pairs of tips in contact; with friction, whether they overlap."""
     if several_tools is None:
         return
     n_tools = state.passage.shape[0]
@@ -109,7 +109,7 @@ def _are_near(state, several_tools, t, s):  # type: ignore[no-untyped-def]
 
 @fast
 def _couple_pair(model, state, several_tools, t, s):  # type: ignore[no-untyped-def]
-    """By Maxwell and Betti the block from m to j is that from j to m transposed."""
+    """By Maxwell and Betti the block from m to j is the transpose of that from j to m."""
     there, back = several_tools.column[t, s], several_tools.column[s, t]
     there[: state.n_nodes[s]] = np.float32(0.0)
     back[: state.n_nodes[t]] = np.float32(0.0)
@@ -160,12 +160,13 @@ def assemble_coupling(state, superposition, several_tools):  # type: ignore[no-u
 
 @inlined
 def solve_active_set(state, superposition, several_tools, large_deformation):  # type: ignore[no-untyped-def]
-    """The forces that solve the contact, by exchange of the tips that are held.
+    """Contact forces by the active-set method, as a start for the sweeps that follow.
 
-    Nonnegative least squares in the energy (Lawson & Hanson, Solving Least Squares Problems,
-    Sec. 23.3): solve for the tips that are held; where one would be pulled, go as far as none is
-    and let it go; else hold the one that is inside deepest. Forces stay >= 0 and the energy falls,
-    however close the tips are. Of large deformation it is one step of Newton's.
+    Nonnegative least squares in energy (Lawson & Hanson, Solving Least Squares Problems, Sec.
+    23.3): solve for the active tips; if a force would become negative, go only as far as it
+    vanishes and release that tip; else activate the tip that penetrates deepest. Forces stay >= 0
+    and the energy decreases, however close the tips are. With large deformation this is one Newton
+    step. It may end after its last exchange without the solution: the sweeps decide on convergence.
     """
     _linearise(state, superposition, several_tools, large_deformation)
     n_tools, force, trial, active_set = (
@@ -202,7 +203,7 @@ def solve_active_set(state, superposition, several_tools, large_deformation):  #
 
 @inlined
 def _linearise(state, superposition, several_tools, large_deformation):  # type: ignore[no-untyped-def]
-    """Gap without forces and compliance, about the present forces; who has one is held."""
+    """Gap without forces and compliance at the present forces; tips with a force are active."""
     for t in range(state.passage.shape[0]):
         several_tools.active_set[t] = False
         if not state.active[t]:
@@ -222,10 +223,10 @@ def _linearise(state, superposition, several_tools, large_deformation):  # type:
 
 @inlined
 def _close_gaps(several_tools):  # type: ignore[no-untyped-def]
-    """matrix trial = - asked among the tips that are held, by Cholesky.
+    """Solve matrix trial = - free_gap within the active set, by Cholesky.
 
-    Of two tips in one place the second has no pivot: it gets a small one, and what is left of its
-    gap goes to the force of whoever is deeper.
+    If two tips coincide, the pivot of the second vanishes and is replaced by a small one: the
+    deeper tip takes the load.
     """
     active_set, c, root, x = (
         several_tools.active_set,
@@ -260,7 +261,7 @@ def _close_gaps(several_tools):  # type: ignore[no-untyped-def]
 
 @fast
 def add_near_of_others(state, superposition, several_tools, t):  # type: ignore[no-untyped-def]
-    """Near displacement at the nodes of a tip by the others' normal forces, into ``joint``."""
+    """Add the near displacement at the nodes of a tip by the others' normal forces."""
     for s in range(state.passage.shape[0]):
         if s == t or state.force[s] <= 0.0 or not several_tools.near[s, t]:
             continue

@@ -1,4 +1,4 @@
-"""A tumour: another stiffness inside a second surface, chosen before the step."""
+"""A tumour: another stiffness inside a second surface. It acts through the vademecum alone."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ class Tumour(Effect):
 
 
 def at_contrast(vademecum: Vademecum, effect: Tumour | None) -> Vademecum:
-    """The vademecum with the contrast of a scene, or without a tumour where it can do without.
+    """The vademecum at the contrast of the effect; at contrast 1 if there is none.
 
-    A tumour is a choice of the material: the step itself does not know of it.
+    Unchanged if the vademecum does not cover that contrast.
     """
     coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
     ranges = [(c.low, c.high) for c in coordinates if c.name == "contrast"]

@@ -1,20 +1,19 @@
 """Viscoelasticity: a generalised Maxwell model at constant Poisson's ratio.
 
-With E(t) / E = g(t) = g_inf + sum_i g_i exp(-t / tau_i) the organ's response keeps its shape in
-space (Christensen, Theory of Viscoelasticity, 1982): loads f that act on the tissue are those of an
-elastic organ, e, relaxed,
+With E(t) / E = g(t) = g_inf + sum_i g_i exp(-t / tau_i) the response separates in space and time
+(Christensen, Theory of Viscoelasticity, 1982): the loads f on the tissue are the relaxed loads e of
+an elastic organ with the same displacement,
 
     f(t) = int g(t - t') de(t') = g_inf e + sum_i h_i,      u = C e,
 
-for e linear in time over a period exactly (Simo & Hughes, Computational Inelasticity, Sec. 10.3)
+and exactly, for e linear in time over a period (Simo & Hughes, Computational Inelasticity, 10.3),
 
     h_i <- exp(-dt / tau_i) h_i + r_i (e_new - e),    r_i = g_i (tau_i / dt) (1 - exp(-dt / tau_i)),
 
-so that within a period the organ has the compliance C / A, A = g_inf + sum_i r_i, and what has
-passed is the load -(sum_i exp(-dt / tau_i) h_i - e sum_i r_i) / A that no tool holds: where a tool
-has been, the tissue comes back slowly. e and h_i are kept as what they do to the modes, and, for
-the near field, as loads on the positions that were touched (the *trail*): at most TRAIL of them,
-the weakest leave first.
+Within a period the organ therefore has the compliance C / A, A = g_inf + sum_i r_i, and its history
+acts as the load -(sum_i exp(-dt / tau_i) h_i - e sum_i r_i) / A: tissue that was touched recovers
+slowly. For the far field, e and h_i are stored as modal loads; for the near field, as loads on the
+positions that were touched, at most ``MAX_HISTORY``, of which the weakest are dropped first.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from avatar_core.errors import SceneError
 class Viscoelasticity(Effect):
     """Relaxation by a Prony series: E(t) / E = 1 - sum_i g_i (1 - exp(-t / tau_i)).
 
-    E is the Young's modulus of the vademecum, that of a fast touch; Poisson's ratio is constant.
+    E is the vademecum's Young's modulus, which holds for fast contact; Poisson's ratio is constant.
     """
 
     name: ClassVar[str] = "viscoelasticity"
@@ -58,9 +57,9 @@ class Viscoelasticity(Effect):
             )
 
 
-MAX_HISTORY = 160  # load positions whose past is kept for the near field
-_FORGOTTEN = 1e-7  # [N] a past that is as good as none
-_SHOWN = 0.04  # part of the strongest load below which the trail is not seen in the cloud
+MAX_HISTORY = 160  # load positions whose history is kept for the near field
+_NEGLIGIBLE = 1e-7  # [N] of a history that is dropped
+_SHOWN = 0.04  # of the strongest load, below which near history is left out of the cloud
 
 ViscoelasticityArrays = namedtuple("ViscoelasticityArrays", ["decay", "ramp", "rest"])
 ViscoelasticityState = namedtuple(
@@ -72,20 +71,20 @@ ViscoelasticityState = namedtuple(
         "gain",  # (1,) 1 / A
         "elastic",  # (k,) Y^T e
         "past",  # (n, k) Y^T h_i
-        "held",  # (k,) Y^T of the load that would hold e as it is
-        "slot",  # (n_positions,) where in the trail a load position is, or -1
-        "position",  # (TRAIL,) load position
-        "count",  # (1,) length of the trail
-        "near_elastic",  # (TRAIL, 3) e [N]
+        "held",  # (k,) Y^T of the load that keeps e constant, by `predict_history`
+        "slot",  # (n_positions,) of a load position in the near history, or -1
+        "position",  # (MAX_HISTORY,) load position of a slot
+        "count",  # (1,) slots in use
+        "near_elastic",  # (MAX_HISTORY, 3) e [N]
         "near_past",  # (n, TRAIL, 3) h_i [N]
-        "near_held",  # (TRAIL, 3) [N]
-        "near_load",  # (TRAIL, 3) f of this period [N]
+        "near_held",  # (MAX_HISTORY, 3) load that keeps e constant [N]
+        "near_load",  # (MAX_HISTORY, 3) f of this period [N]
     ],
 )
 
 
 def viscoelasticity_arrays(effect: Viscoelasticity, period: float) -> ViscoelasticityArrays:
-    """The factors of one period [s]."""
+    """Factors for one period [s]."""
     g, tau = np.array(effect.g, float), np.array(effect.tau, float)
     ramp = g * (tau / period) * -np.expm1(-period / tau)
     return ViscoelasticityArrays(np.exp(-period / tau), ramp, np.array([1.0 - g.sum()]))
@@ -94,7 +93,7 @@ def viscoelasticity_arrays(effect: Viscoelasticity, period: float) -> Viscoelast
 def viscoelasticity_state(
     arrays: ViscoelasticityArrays, n_modes: int, n_positions: int
 ) -> ViscoelasticityState:
-    """Of an organ that was never touched."""
+    """State of an organ that was never touched."""
     n = len(arrays.decay)
     return ViscoelasticityState(
         *arrays,
@@ -114,27 +113,25 @@ def viscoelasticity_state(
 
 @fast
 def predict_history(viscoelasticity):  # type: ignore[no-untyped-def]
-    """sum_i exp(-dt / tau_i) h_i - e sum_i r_i, of the modes and along the trail."""
-    ramp = 0.0
-    for i in range(viscoelasticity.ramp.shape[0]):
-        ramp += viscoelasticity.ramp[i]
-    for k in range(viscoelasticity.held.shape[0]):
-        viscoelasticity.held[k] = -ramp * viscoelasticity.elastic[k]
-        for i in range(viscoelasticity.decay.shape[0]):
-            viscoelasticity.held[k] += viscoelasticity.decay[i] * viscoelasticity.past[i, k]
-    for m in range(viscoelasticity.count[0]):
+    """sum_i exp(-dt / tau_i) h_i - e sum_i r_i, of the modes and of the near field."""
+    v, ramp = viscoelasticity, 0.0
+    for i in range(v.ramp.shape[0]):
+        ramp += v.ramp[i]
+    for k in range(v.held.shape[0]):
+        v.held[k] = -ramp * v.elastic[k]
+        for i in range(v.decay.shape[0]):
+            v.held[k] += v.decay[i] * v.past[i, k]
+    for m in range(v.count[0]):
         for d in range(3):
-            viscoelasticity.near_held[m, d] = -ramp * viscoelasticity.near_elastic[m, d]
-            viscoelasticity.near_load[m, d] = 0.0
-            for i in range(viscoelasticity.decay.shape[0]):
-                viscoelasticity.near_held[m, d] += (
-                    viscoelasticity.decay[i] * viscoelasticity.near_past[i, m, d]
-                )
+            v.near_held[m, d] = -ramp * v.near_elastic[m, d]
+            v.near_load[m, d] = 0.0
+            for i in range(v.decay.shape[0]):
+                v.near_held[m, d] += v.decay[i] * v.near_past[i, m, d]
 
 
 @fast
 def predict_modes(superposition, viscoelasticity, self_weight):  # type: ignore[no-untyped-def]
-    """Modes at the end of the period without any load, where there is no mass."""
+    """Modes at the end of the period without any load, and their gain, without inertia."""
     gain = viscoelasticity.gain[0]
     for k in range(superposition.free.shape[0]):
         free = -gain * viscoelasticity.held[k]
@@ -146,7 +143,7 @@ def predict_modes(superposition, viscoelasticity, self_weight):  # type: ignore[
 
 @fast
 def near_free_displacement(model, state, viscoelasticity, t, near_free):  # type: ignore[no-untyped-def]
-    """Near displacement at the nodes of a tip by the trail, into (MAX_STENCIL, 3)."""
+    """Near displacement at the nodes of a tip by the load history, into (MAX_STENCIL, 3)."""
     gain = viscoelasticity.gain[0]
     for i in range(state.n_nodes[t]):
         j = state.nodes[t, i]
@@ -170,24 +167,24 @@ def near_free_displacement(model, state, viscoelasticity, t, near_free):  # type
 
 
 @fast
-def advance_history(state, superposition, viscoelasticity, friction, self_weight):  # type: ignore[no-untyped-def]
+def advance_history(  # type: ignore[no-untyped-def]
+    state, superposition, viscoelasticity, friction, self_weight
+):
     """Complete the period: e and h_i at its end."""
     if viscoelasticity is None:
         return
-    for k in range(viscoelasticity.elastic.shape[0]):
+    v = viscoelasticity
+    for k in range(v.elastic.shape[0]):
         new = superposition.total[k]
         if self_weight is not None:
             new -= self_weight.amplitude[k]
         if abs(new) < 1e-30:
             new = 0.0
-        change = new - viscoelasticity.elastic[k]
-        for i in range(viscoelasticity.decay.shape[0]):
-            past = (
-                viscoelasticity.decay[i] * viscoelasticity.past[i, k]
-                + viscoelasticity.ramp[i] * change
-            )
-            viscoelasticity.past[i, k] = past if abs(past) > 1e-30 else 0.0
-        viscoelasticity.elastic[k] = new
+        change = new - v.elastic[k]
+        for i in range(v.decay.shape[0]):
+            past = v.decay[i] * v.past[i, k] + v.ramp[i] * change
+            v.past[i, k] = past if abs(past) > 1e-30 else 0.0
+        v.elastic[k] = new
     for t in range(state.passage.shape[0]):
         if state.force[t] <= 0.0:
             continue
@@ -198,94 +195,79 @@ def advance_history(state, superposition, viscoelasticity, friction, self_weight
         for i in range(state.n_nodes[t]):
             w = a * state.weight[t, i, 0]
             if w != 0.0:
-                m = _slot_of(viscoelasticity, state.nodes[t, i])
-                viscoelasticity.near_load[m, 0] += w * f0
-                viscoelasticity.near_load[m, 1] += w * f1
-                viscoelasticity.near_load[m, 2] += w * f2
-    _advance_trail(viscoelasticity)
+                m = _slot_of(v, state.nodes[t, i])
+                v.near_load[m, 0] += w * f0
+                v.near_load[m, 1] += w * f1
+                v.near_load[m, 2] += w * f2
+    _advance_near_history(v)
 
 
 @fast
-def _advance_trail(viscoelasticity):  # type: ignore[no-untyped-def]
+def _advance_near_history(v):  # type: ignore[no-untyped-def]
     m = 0
-    while m < viscoelasticity.count[0]:
+    while m < v.count[0]:
         left = 0.0
         for d in range(3):
-            new = viscoelasticity.gain[0] * (
-                viscoelasticity.near_load[m, d] - viscoelasticity.near_held[m, d]
-            )
-            change = new - viscoelasticity.near_elastic[m, d]
-            viscoelasticity.near_elastic[m, d] = new
-            left = max(left, abs(new), abs(viscoelasticity.near_load[m, d]))
-            for i in range(viscoelasticity.decay.shape[0]):
-                past = (
-                    viscoelasticity.decay[i] * viscoelasticity.near_past[i, m, d]
-                    + viscoelasticity.ramp[i] * change
-                )
-                viscoelasticity.near_past[i, m, d] = past
+            new = v.gain[0] * (v.near_load[m, d] - v.near_held[m, d])
+            change = new - v.near_elastic[m, d]
+            v.near_elastic[m, d] = new
+            left = max(left, abs(new), abs(v.near_load[m, d]))
+            for i in range(v.decay.shape[0]):
+                past = v.decay[i] * v.near_past[i, m, d] + v.ramp[i] * change
+                v.near_past[i, m, d] = past
                 left = max(left, abs(past))
-        if left < _FORGOTTEN:
-            _remove(viscoelasticity, m)
+        if left < _NEGLIGIBLE:
+            _remove(v, m)
         else:
             m += 1
 
 
 @inlined
-def _slot_of(viscoelasticity, position):  # type: ignore[no-untyped-def]
-    """Where a load position is in the trail, in the weakest one's place if the trail is full."""
-    m = viscoelasticity.slot[position]
+def _slot_of(v, position):  # type: ignore[no-untyped-def]
+    """Slot of a load position in the near history, replacing the weakest if all are taken."""
+    m = v.slot[position]
     if m >= 0:
         return m
-    if viscoelasticity.count[0] == MAX_HISTORY:
+    if v.count[0] == MAX_HISTORY:
         weakest, least = 0, np.inf
         for q in range(MAX_HISTORY):
-            e, f = viscoelasticity.near_elastic[q], viscoelasticity.near_load[q]
+            e, f = v.near_elastic[q], v.near_load[q]
             size = abs(e[0]) + abs(e[1]) + abs(e[2]) + abs(f[0]) + abs(f[1]) + abs(f[2])
             if size < least:
                 weakest, least = q, size
-        _remove(viscoelasticity, weakest)
-    m = viscoelasticity.count[0]
-    viscoelasticity.count[0] = m + 1
-    viscoelasticity.slot[position], viscoelasticity.position[m] = m, position
+        _remove(v, weakest)
+    m = v.count[0]
+    v.count[0] = m + 1
+    v.slot[position], v.position[m] = m, position
     for d in range(3):
-        viscoelasticity.near_elastic[m, d] = viscoelasticity.near_held[
-            m, d
-        ] = viscoelasticity.near_load[m, d] = 0.0
-        for i in range(viscoelasticity.decay.shape[0]):
-            viscoelasticity.near_past[i, m, d] = 0.0
+        v.near_elastic[m, d] = v.near_held[m, d] = v.near_load[m, d] = 0.0
+        for i in range(v.decay.shape[0]):
+            v.near_past[i, m, d] = 0.0
     return m
 
 
 @inlined
-def _remove(viscoelasticity, m):  # type: ignore[no-untyped-def]
-    """Take a place out of the trail; the last one moves there."""
-    last = viscoelasticity.count[0] - 1
-    viscoelasticity.slot[viscoelasticity.position[m]] = -1
+def _remove(v, m):  # type: ignore[no-untyped-def]
+    """Free a slot of the near history; the last one moves there."""
+    last = v.count[0] - 1
+    v.slot[v.position[m]] = -1
     if m != last:
-        viscoelasticity.position[m] = viscoelasticity.position[last]
-        viscoelasticity.slot[viscoelasticity.position[m]] = m
+        v.position[m] = v.position[last]
+        v.slot[v.position[m]] = m
         for d in range(3):
-            viscoelasticity.near_elastic[m, d] = viscoelasticity.near_elastic[last, d]
-            viscoelasticity.near_held[m, d] = viscoelasticity.near_held[last, d]
-            viscoelasticity.near_load[m, d] = viscoelasticity.near_load[last, d]
-            for i in range(viscoelasticity.decay.shape[0]):
-                viscoelasticity.near_past[i, m, d] = viscoelasticity.near_past[i, last, d]
-    viscoelasticity.count[0] = last
+            v.near_elastic[m, d] = v.near_elastic[last, d]
+            v.near_held[m, d] = v.near_held[last, d]
+            v.near_load[m, d] = v.near_load[last, d]
+            for i in range(v.decay.shape[0]):
+                v.near_past[i, m, d] = v.near_past[i, last, d]
+    v.count[0] = last
 
 
 @fast
 def least_shown(viscoelasticity):  # type: ignore[no-untyped-def]
-    """Load below which a place of the trail is not seen in the cloud [N]."""
+    """Load below which near history is left out of the cloud [N]."""
     strongest = 0.0
     for m in range(viscoelasticity.count[0]):
         e = viscoelasticity.near_elastic[m]
         strongest = max(strongest, e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
     return _SHOWN * np.sqrt(strongest)
-
-
-def forget_all(viscoelasticity: ViscoelasticityState) -> None:
-    """The organ was never touched."""
-    viscoelasticity.elastic[:] = 0.0
-    viscoelasticity.past[:] = 0.0
-    viscoelasticity.slot[:] = -1
-    viscoelasticity.count[:] = 0

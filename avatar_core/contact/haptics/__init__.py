@@ -1,4 +1,4 @@
-"""What stands between the contact model and a hand. Forces and poses come in; forces within the
-device's limits go out, with soft engagement after faults, passivity observed and controlled in
-the time domain, and fewer modes shown while the machine is busy.
+"""The safety of a haptic loop. Poses and forces of the contact model come in; forces within the
+device's limits go out, engaged smoothly after faults and passive in the time domain. While the
+machine is overloaded, fewer modes are shown.
 """

@@ -1,11 +1,12 @@
-"""A haptic loop to try forces on: a tool in a hand, its pose sampled, the answer late and held.
+"""A simulated haptic loop in one dimension: tool, operator's grip, sampling, delay and hold.
 
-Along one axis, the organ below zero, a spring; the tool and the hand that grips it are linear,
+The organ is a spring below zero; the tool and the operator's grip are linear,
 
     m x'' + b x' + k x = F + p,
 
-F the organ's force and p the hand's push, both held over a period, so that the motion is exact: the
-exponential of the matrix. So is the energy that the tool puts into the port, sum - F (x' - x).
+with F the organ's force and p the operator's push. Both are constant over a period, so that the
+matrix exponential gives the motion exactly, and with it the energy that the tool puts into the
+port, sum - F (x' - x).
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ from avatar_core.common.arrays import FloatArray
 from avatar_core.common.jit import compiled
 from avatar_core.contact.haptics.passivity import Passivity, limit
 from avatar_core.contact.layout import PERIOD
+from avatar_core.errors import ContactError
 
-FLOWN_OFF = 1.0  # [m] from the organ's surface, where a run ends
+MAX_POSITION = 1.0  # [m] from the organ's surface; a run that exceeds it has diverged and ends
 
 
 @dataclass(frozen=True)
 class Device:
-    """Tool and hand: mass [kg], damping of both [N s/m], stiffness of the grip [N/m]."""
+    """Tool and grip: mass [kg], damping [N s/m], stiffness of the operator's grip [N/m]."""
 
     mass: float
     damping: float
@@ -43,9 +45,10 @@ class Device:
 
 @dataclass(frozen=True)
 class Loop:
-    """A device on an organ of some stiffness [N/m], the force some periods late.
+    """A device on an organ.
 
-    resolution : step of the pose's readings [m]
+    stiffness : of the organ [N/m]; delay : of the force [periods]
+    resolution : quantisation step of the pose [m]
     """
 
     device: Device
@@ -55,10 +58,10 @@ class Loop:
 
 
 class Trace(NamedTuple):
-    """What a loop did, period by period.
+    """The course of a loop, period by period.
 
     position : x before each period [m]
-    organ, held : the organ's force at x, and F, which the tool felt [N]
+    organ, held : the organ's force at x, and F, which acts on the tool [N]
     energy : that the tool has put into the port, after each period [J]
     """
 
@@ -71,31 +74,40 @@ class Trace(NamedTuple):
 def run_loop(
     loop: Loop, push: FloatArray, start: float = 0.0, passivity: Passivity | None = None
 ) -> Trace:
-    """The loop from rest at ``start`` under the hand's push, shape (n_periods,) [N]."""
+    """The loop from rest at ``start`` under the operator's push, shape (n_periods,) [N]."""
     trace = Trace(*(np.zeros(len(push)) for _ in Trace._fields))
     transition = loop.device.transition(PERIOD)
     _run(*transition, loop.stiffness, loop.delay, loop.resolution, push, start, passivity, trace)
     return trace
 
 
-def settling(loop: Loop, depth: float = 5e-3, offset: float = 1e-3, n: int = 4000) -> float:
-    """Growth of a swing about a push into the organ: its last peaks over its first ones."""
+def oscillation_growth(
+    loop: Loop, depth: float = 5e-3, offset: float = 1e-3, n: int = 4000
+) -> float:
+    """Growth of an oscillation about a constant push: its last peaks over its first ones."""
     push = np.full(n, -loop.stiffness * depth)
-    swing = np.abs(run_loop(loop, push, offset - depth).position + depth)
-    return float(swing[-n // 4 :].max() / swing[: n // 4].max())
+    deviation = np.abs(run_loop(loop, push, offset - depth).position + depth)
+    return float(deviation[-n // 4 :].max() / deviation[: n // 4].max())
 
 
 def stability_border(stiffness: float, delay: int, mass: float = 1.0) -> float:
-    """Damping of a tool without grip at which its swings neither grow nor fade [N s/m].
+    """Damping of a tool without grip at which oscillations neither grow nor decay [N s/m].
 
-    By bisection; near K (T / 2 + delay T) if m is large (Gil et al., J. Comput. Inf. Sci. Eng.
-    9:011005, 2009), as is the damping that passivity asks for (Colgate & Schenkel, J. Robotic
+    By bisection to 0.1 %; near K (T / 2 + delay T) if m is large (Gil et al., J. Comput. Inf. Sci.
+    Eng. 9:011005, 2009), as is the damping that passivity requires (Colgate & Schenkel, J. Robotic
     Systems 14:37, 1997).
+
+    Raises
+    ------
+    ContactError
+        If oscillations grow even at four times that damping.
     """
     low, high = 0.0, 4.0 * expected_border(stiffness, delay)
+    if oscillation_growth(Loop(Device(mass, high), stiffness, delay)) > 1.0:
+        raise ContactError(f"no stable damping up to {high:g} N s/m; give a larger mass")
     while high - low > 1e-3 * high:
         middle = 0.5 * (low + high)
-        if settling(Loop(Device(mass, middle), stiffness, delay)) > 1.0:
+        if oscillation_growth(Loop(Device(mass, middle), stiffness, delay)) > 1.0:
             low = middle
         else:
             high = middle
@@ -127,7 +139,7 @@ def _run(  # type: ignore[no-untyped-def]
         energy -= held * (new - x)
         x = new
         trace.held[k], trace.energy[k] = held, energy
-        if abs(x) > FLOWN_OFF:
+        if abs(x) > MAX_POSITION:
             for i in range(k + 1, push.shape[0]):
                 trace.position[i], trace.energy[i] = x, energy
             break

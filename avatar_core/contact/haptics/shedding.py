@@ -1,29 +1,29 @@
-"""How many modes to show while a machine is busy: fewer at once, more again with patience.
+"""Load shedding: show fewer modes as soon as the machine is overloaded, more again with hysteresis.
 
 A window of steps is *overloaded* if too many periods were missed or steps took longer than the
-deadline, *calm* if next to none were and there is room. One overloaded window sheds a level, a row
-of calm ones takes one back; if that one was too many, the next row must be twice as long. The last
-level is never shed, and the near field is on every level: under a tip the organ looks right even
-then, and the force does not depend on what is shown.
+deadline, *calm* if almost none were and there is a margin. One overloaded window sheds a level, a
+number of calm ones in a row restores one; if the machine is then overloaded again, that number
+doubles. The lowest level is never shed, and every level has the near field: under a tip the organ
+looks right, and the force does not depend on what is shown.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-OVERLOADED = 0.01  # part of the periods that were missed
+OVERLOADED = 0.01  # fraction of periods that were missed
 CALM = 0.001
 ROOM = 0.8  # of the deadline
-PATIENCE = 5  # calm windows before a level is taken back
+PATIENCE = 5  # calm windows before a level is restored
 _LONGEST = 80  # windows
 
 
 class Shedder:
-    """Chooses among numbers of modes, from one window to the next.
+    """Chooses the number of modes from one window to the next.
 
     Parameters
     ----------
-    levels : numbers of modes, the last is shown when there is room
+    levels : numbers of modes, the largest for a machine that is not overloaded
     deadline : of a step [s]; infinity for none
     """
 
@@ -33,7 +33,7 @@ class Shedder:
         self._level = len(self._levels) - 1
         self._calm = 0
         self._patience = PATIENCE
-        self._regained = False  # the last change took a level back
+        self._restored = False  # the last change restored a level
 
     @property
     def modes(self) -> int:
@@ -46,11 +46,11 @@ class Shedder:
         return self._level < len(self._levels) - 1
 
     def update(self, missed: float, step_p99: float) -> int:
-        """Modes to show after a window.
+        """Modes to show after a window. Real-time safe, though meant for once a window.
 
         Parameters
         ----------
-        missed : part of its periods that were missed
+        missed : fraction of its periods that were missed
         step_p99 : 99th percentile of its steps' times [s]; NaN of none
         """
         if missed > OVERLOADED or step_p99 > self.deadline:
@@ -60,12 +60,12 @@ class Shedder:
         else:
             self._calm += 1
             if self._calm >= self._patience and self.is_shedding:
-                self._level, self._calm, self._regained = self._level + 1, 0, True
-            elif self._calm >= self._patience and self._regained:
-                self._patience, self._regained = PATIENCE, False  # it was not too many
+                self._level, self._calm, self._restored = self._level + 1, 0, True
+            elif self._calm >= self._patience and self._restored:
+                self._patience, self._restored = PATIENCE, False  # the machine can serve it
         return self.modes
 
     def _shed(self) -> None:
-        if self._regained:
+        if self._restored:
             self._patience = min(2 * self._patience, _LONGEST)
-        self._level, self._calm, self._regained = max(0, self._level - 1), 0, False
+        self._level, self._calm, self._restored = max(0, self._level - 1), 0, False

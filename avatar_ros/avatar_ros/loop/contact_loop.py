@@ -297,7 +297,7 @@ class ContactLoop:
                 active.model.out.force_error[i],
             )
         self._publishers.state.handle.publish_raw(
-            template.serialise(tool.stamp, status, n, error, guard.share)
+            template.serialise(tool.stamp, status, n, error, guard.sent_fraction)
         )
 
 

@@ -110,7 +110,7 @@ def tool_status(
     """Of one tool: faults of the window, what is let through, and energies if they are watched."""
     values: dict[str, Any] = {
         "publishers of poses": tool.publishers,
-        "share of the force sent": guard.share,
+        "share of the force sent": guard.sent_fraction,
         "limited": guard.limited,
         "largest force [N]": guard.limits.force,
         "largest slew [N/s]": guard.limits.slew,
