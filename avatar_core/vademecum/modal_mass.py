@@ -81,7 +81,9 @@ def body_functions(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
     value, vector = np.linalg.eigh((energy + energy.T) / 2.0)
     new = value > _DEPENDENT
     own = np.asarray((functions - space @ held) @ (vector[:, new] / np.sqrt(value[new])))
-    require_orthonormal(np.hstack([space, own]), elasticity.apply(own), "modes and body functions")
+    modes = np.hstack([space, own])
+    tolerance = 10.0 * _EIGEN_TOLERANCE
+    require_orthonormal(modes, elasticity.apply(own), "modes and body functions", tolerance)
     return own
 
 
