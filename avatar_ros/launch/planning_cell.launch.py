@@ -1,8 +1,8 @@
 """A planning cell: `ros2 launch avatar_ros planning_cell.launch.py params:=FILE.yaml`.
 
-All that the nodes are told stands in ``params``; ``library_dir``, ``vademecum``, ``scene``,
-``atlas`` and ``state_dir`` go before what it says of them. The node that makes patients runs with
-an atlas only.
+The file ``params`` holds the parameters of all nodes; the arguments ``library_dir``,
+``vademecum``, ``scene``, ``atlas`` and ``state_dir`` override those of the same name. The node
+patient_interpolation runs only if there is an atlas.
 """
 
 from launch import LaunchContext, LaunchDescription
@@ -11,7 +11,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-TAKES = {
+OVERRIDES = {
     "vademecum_loader": ("library_dir", "vademecum", "state_dir"),
     "contact": ("scene", "state_dir"),
     "patient_interpolation": ("library_dir", "atlas"),
@@ -23,12 +23,20 @@ def generate_launch_description() -> LaunchDescription:
     default = PathJoinSubstitution([share, "params", "planning_cell.yaml"])
     return LaunchDescription(
         [
-            DeclareLaunchArgument("params", default_value=default, description="of all nodes"),
-            DeclareLaunchArgument("library_dir", default_value="", description="of vademecums"),
-            DeclareLaunchArgument("vademecum", default_value="", description="file to load"),
-            DeclareLaunchArgument("scene", default_value="", description="effects to simulate"),
-            DeclareLaunchArgument("atlas", default_value="", description="empty: no patients"),
-            DeclareLaunchArgument("state_dir", default_value="", description="empty: none is kept"),
+            DeclareLaunchArgument(
+                "params", default_value=default, description="parameters of all nodes"
+            ),
+            DeclareLaunchArgument(
+                "library_dir", default_value="", description="directory of the vademecums"
+            ),
+            DeclareLaunchArgument("vademecum", default_value="", description="vademecum to load"),
+            DeclareLaunchArgument("scene", default_value="", description="scene to simulate"),
+            DeclareLaunchArgument(
+                "atlas", default_value="", description="atlas; empty: no patient_interpolation"
+            ),
+            DeclareLaunchArgument(
+                "state_dir", default_value="", description="directory of saved state; empty: none"
+            ),
             OpaqueFunction(function=nodes),
         ]
     )
@@ -44,6 +52,6 @@ def nodes(context: LaunchContext) -> list[Node]:
             executable=node,
             parameters=[given("params"), {name: given(name) for name in names if given(name)}],
         )
-        for node, names in TAKES.items()
+        for node, names in OVERRIDES.items()
         if node != "patient_interpolation" or given("atlas")
     ]

@@ -1,3 +1,3 @@
-"""Measuring a whole cell of real processes: a scripted tool at 1 kHz, a viewer of the clouds, and
-what periods, latencies, memory, files and threads came to.
+"""Measures a whole cell of real processes with a scripted tool at 1 kHz and a viewer of clouds:
+periods, latencies, memory, files and threads.
 """

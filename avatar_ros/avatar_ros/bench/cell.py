@@ -1,10 +1,10 @@
-"""Does this machine hold 1 kHz? Measures a whole cell of real processes over real DDS.
+"""Does this machine keep 1 kHz? Measures a whole cell of real processes over real DDS.
 
-Loader, contact node, a palpating tool, a cloud viewer, on request a slider of the material, and
-beside them a loop that only sleeps:
-what it misses, the machine misses. Of every process it says what memory, files and threads it has
-at the begin and at the end: ten minutes of it are a soak. ``avatar bench cell`` and ``avatar demo``
-run it as ``python -m avatar_ros.bench.cell VADEMECUM SECONDS``.
+The cell consists of loader, contact node, a palpating tool, a cloud viewer and, on request, a
+slider of the material. A loop that only sleeps runs beside it and shows which periods the machine
+itself misses. The memory, files and threads of every process are compared between begin and end,
+so a run of ten minutes is a soak test. ``avatar bench cell`` and ``avatar demo`` run it as
+``python -m avatar_ros.bench.cell VADEMECUM SECONDS``.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ PERIOD = 1e-3  # [s]
 ON_TIME = 1.5e-3  # longest period that is on time [s]
 PRIORITY = 80  # of contact node, tool and sleeping loop in the real-time mode
 _START_TIMEOUT = 120.0  # compilation included [s]
-_WARM = 0.1  # part of a run, before what the processes have is noted for the first time
-_LAST = 1.5  # before its end, when the tool is still there, it is noted again [s]
+_WARM = 0.1  # part of a run before the first comparison of the processes
+_LAST = 1.5  # before the end, while the tool still runs, for the second one [s]
 _STOP_TIMEOUT = 2.0  # a node ends within [s]
 _DOMAINS = range(1, 102)  # of DDS, those that work on every platform
 
 
 class CellError(AvatarError):
-    """A process of the measured cell did not do its part."""
+    """A process of the measured cell failed."""
 
 
 def run_cell(
@@ -128,7 +128,7 @@ def _measure(
 
 
 def _growths(seconds: float, processes: dict[str, Module]) -> tuple[Growth, ...]:
-    """Of all processes over a run that begins now; returns shortly before its end."""
+    """The growth of all processes over a run that begins now; returns shortly before its end."""
     begin = time.monotonic()
     pids = {name: process.pid for name, process in processes.items()}
     helpers = footprint.children(pids["contact"])
@@ -138,7 +138,7 @@ def _growths(seconds: float, processes: dict[str, Module]) -> tuple[Growth, ...]
         first = footprints(pids)
         time.sleep(max(0.0, begin + seconds - _LAST - time.monotonic()))
         return footprint.growths(first, footprints(pids))
-    except OSError:  # one ended, and who looks after it will say so
+    except OSError:  # one ended, which the caller reports
         return ()
 
 
@@ -209,7 +209,7 @@ def isolated_environment() -> dict[str, str]:
 def cell(
     vademecum: Path, tip_radius: float = 0.005, priority: int = 0
 ) -> Iterator[tuple[dict[str, str], dict[str, Module]]]:
-    """Loader and contact node as processes; gives the environment to join them, and them.
+    """Loader and contact node as processes; yields the environment to join them, and both.
 
     Raises
     ------
@@ -248,14 +248,14 @@ class Module(ModuleProcess):
         )
 
     def said(self) -> str:
-        """All of standard error so far; where the process writes next is left alone."""
+        """All of standard error so far, without moving the file's position."""
         number = self._said.fileno()
         return os.pread(number, os.fstat(number).st_size, 0).decode(errors="replace")
 
     def last_line(self) -> str:
         """The last line of standard error."""
         lines = [line.strip() for line in self.said().splitlines() if line.strip()]
-        return lines[-1] if lines else f"it said nothing, exit code {self.poll()}"
+        return lines[-1] if lines else f"no output, exit code {self.poll()}"
 
     def finish(self, seconds: float = _STOP_TIMEOUT, number: int = signal.SIGINT) -> int:
         """End it as Ctrl-C would; returns its exit code."""

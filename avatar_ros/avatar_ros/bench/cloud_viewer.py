@@ -1,4 +1,4 @@
-"""The third process of a measured cell: takes every cloud, and keeps the loop's statistics.
+"""A process of a measured cell that takes every cloud and collects the loop's statistics.
 
 Run as ``python -m avatar_ros.bench.cloud_viewer FILE.json``; the file is written at SIGINT or
 SIGTERM.
@@ -27,7 +27,7 @@ def main() -> int:
     stop = StopSignal()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("cloud_viewer", enable_rosout=False, start_parameter_services=False)
-    clouds: Counter[int] = Counter()  # by second: a list of all would grow as a leak does
+    clouds: Counter[int] = Counter()  # by second: a list of all would look like a leak
     n_bytes = [0]
     statistics: list[dict[str, Any]] = []
 

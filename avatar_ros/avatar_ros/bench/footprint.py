@@ -1,4 +1,4 @@
-"""What processes take of the machine, and what of it they take more and more of."""
+"""Memory, files and threads of processes, and their growth."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-MOST_GROWTH = 5.0  # of a process in a run, that is none [MB]
+MAX_GROWTH = 5.0  # of a process in a run that is not a leak [MB]
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """Of one process at one moment.
+    """Resources of one process at one moment.
 
-    memory_mb : that the system cannot take back: neither code nor pages of files
+    memory_mb : that the system cannot reclaim: without code and pages of files
     files : open descriptors, sockets among them
     """
 
@@ -24,7 +24,7 @@ class Footprint:
 
     @staticmethod
     def of(pid: int) -> Footprint:
-        """Raises OSError where there is no such process, or it is not ours to look at."""
+        """Raises OSError if there is no such process or it may not be inspected."""
         lines = (line.split(":") for line in Path(f"/proc/{pid}/status").read_text().splitlines())
         status = {name: text.split() for name, text in lines}
         if "RssAnon" not in status:
@@ -37,7 +37,7 @@ class Footprint:
 
 @dataclass(frozen=True)
 class Growth:
-    """Of one process over a run."""
+    """The growth of one process over a run."""
 
     process: str
     begin: Footprint
@@ -49,9 +49,9 @@ class Growth:
 
     @property
     def complaint(self) -> str:
-        """What it took more of, in words; empty if nothing."""
+        """What has grown, in words; empty if nothing has."""
         found = []
-        if self.memory_mb >= MOST_GROWTH:
+        if self.memory_mb >= MAX_GROWTH:
             found.append(f"{self.memory_mb:.1f} MB")
         for name in ("files", "threads"):
             more = getattr(self.end, name) - getattr(self.begin, name)
@@ -71,7 +71,7 @@ HEADER = f"{'process':34}{'MB':>10} {'growth':>6}{'files':>10}{'threads':>10}"
 
 
 def footprints(pids: dict[str, int]) -> dict[str, Footprint]:
-    """Of processes by name."""
+    """Footprints of processes, by name."""
     return {name: Footprint.of(pid) for name, pid in pids.items()}
 
 
@@ -80,7 +80,7 @@ def growths(begin: dict[str, Footprint], end: dict[str, Footprint]) -> tuple[Gro
 
 
 def children(pid: int) -> Iterable[int]:
-    """Processes that a process started and that run."""
+    """Running processes that a process has started."""
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             parent = int(stat.read_text().rsplit(")", 1)[1].split()[1])

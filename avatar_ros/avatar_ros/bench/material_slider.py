@@ -1,4 +1,4 @@
-"""A slider of a planning page that somebody drags: the material changes while the tool moves.
+"""Changes the material while the tool moves, as a dragged slider of the planning page does.
 
 Run as ``python -m avatar_ros.bench.material_slider FILE.h5 RATE COUNT.json``: sets Young's modulus
 and every coordinate that the vademecum has to random values, RATE times a second, until SIGINT or

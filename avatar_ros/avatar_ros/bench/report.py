@@ -1,4 +1,4 @@
-"""What a measured cell came to, and how it is printed and written."""
+"""The results of a measured cell, and how they are printed and written."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class CellMeasurement:
 
     @property
     def complaints(self) -> list[str]:
-        """What a run of any length must not show on a quiet machine, a line each."""
+        """What must not happen in a run of any length on a quiet machine, one line each."""
         late = f"{1.0 - self.on_time_fraction:.2%} of the periods were late"
         found = [late] if self.on_time_fraction < PROMISED_ON_TIME else []
         return found + [growth.complaint for growth in self.growths if growth.complaint]
@@ -119,7 +119,7 @@ class CellReport:
             said = "; ".join(run.complaints) or "kept"
             lines.append(
                 f"{name}, {PROMISED_ON_TIME:.0%} on time, nothing grows by "
-                f"{footprint.MOST_GROWTH:g} MB, a file or a thread: {said}"
+                f"{footprint.MAX_GROWTH:g} MB, a file or a thread: {said}"
             )
         return "\n".join(lines)
 

@@ -27,7 +27,7 @@ from avatar_ros.framework.managed_node import StopSignal
 from avatar_ros.framework.templates import PoseTemplate, WrenchReader, stamp_bytes
 from avatar_ros.msg import ContactState
 
-READY = "palpating"  # said on standard output when the measured part begins
+READY = "palpating"  # printed when the measured part begins
 _CLEARANCE = 0.020  # above the surface before and after a touch [m]
 _SLIDE = 0.040  # [m]
 _SLIDE_DEPTH = 0.003  # [m]
@@ -40,7 +40,7 @@ _SETTLE = 1.0  # poses sent before the measured part [s]
 
 @dataclass(frozen=True)
 class RoundTrips:
-    """What a tool sent and got back, one entry a pose.
+    """The poses that a tool sent and the answers, one entry per pose.
 
     tips : (n, 3) [m]; forces : (n, 3) [N], NaN where no answer came
     latencies : (n,), from publishing the pose to its wrench in hand [s]; NaN without answer
@@ -66,7 +66,7 @@ class RoundTrips:
         return RoundTrips(**values)
 
 
-# --- Where the tool goes ---------------------------------------------------------------------
+# --- The path of the tool --------------------------------------------------------------------
 
 
 def palpation(
@@ -91,8 +91,8 @@ def _touch(
     """One touch, shape (_TOUCH * rate, 3) [m]."""
     phase = (np.arange(round(_TOUCH * rate)) + 0.5) / round(_TOUCH * rate)
     approach, push, slide, leave = (
-        np.clip((phase - start) / share, 0.0, 1.0)
-        for start, share in ((0.0, 0.15), (0.15, 0.35), (0.50, 0.35), (0.85, 0.15))
+        np.clip((phase - start) / length, 0.0, 1.0)
+        for start, length in ((0.0, 0.15), (0.15, 0.35), (0.50, 0.35), (0.85, 0.15))
     )
     pushed = depth * np.sin(np.pi * _PUSHES * push) ** 2
     sunk = _SLIDE_DEPTH * np.clip(8.0 * np.minimum(slide, 1.0 - slide), 0.0, 1.0)

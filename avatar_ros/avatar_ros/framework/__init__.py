@@ -1,4 +1,3 @@
-"""What every node shares: managed life cycle, declared parameters, quality of service,
-conversions between arrays and messages, real-time priority, kept state, and the confined reading
-of files.
+"""What the nodes have in common: managed life cycle, declared parameters, quality of service,
+message templates and conversions, real-time priority, saved state, and confined reading of files.
 """

@@ -1,13 +1,13 @@
-"""Who reaches a node, and by which way: this machine only, unless the user says otherwise.
+"""Who can reach a node, and over which transport: this machine only, unless the user opens it.
 
-Nothing in this project authenticates anybody. Who wants other machines to take part exports
+Nothing in this project authenticates anybody. To let other machines take part, export
 ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET; see msg_docs/security.md.
 
-What must keep time does without shared memory. With it, Fast DDS looks whether the port of a
-process that joins is alive (``Port::healthy_check``), now and then sleeps a third of a second until
-it is, and holds a lock meanwhile that all publishers need: the contact loop stood still in 3 of 40
-starts of another node. Over the loopback a wrench comes as soon. The other nodes keep it, for
-vademecums of 50 MB.
+A node that must keep time does not use shared memory. With shared memory, Fast DDS checks whether
+the port of a joining process is alive (``Port::healthy_check``), sometimes sleeps for a third of a
+second until it is, and meanwhile holds a lock that all publishers need: the contact loop stood
+still in 3 of 40 starts of another node. Over the loopback, a wrench arrives as fast. The other
+nodes keep shared memory, for vademecums of 50 MB.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class DiscoveryError(AvatarError):
 
 
 def stay_local(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Keep this process and those that it starts on this machine; before ``rclpy.init()``.
+    """Restrict this process and those that it starts to this machine; before ``rclpy.init()``.
 
     The range keeps nodes from looking for others, the profile from hearing them: with the range
-    alone, who knows a node's address is answered. What the user has set stays as it is: another
-    range, peers or a profile of the user's own.
+    alone, a node answers anybody who knows its address. A range, peers or a profile that the user
+    has set stay as they are.
 
     Raises
     ------
@@ -58,10 +58,10 @@ def stay_local(environment: MutableMapping[str, str] = os.environ) -> None:
 def udp_alone(
     middleware: str, environment: MutableMapping[str, str] = os.environ
 ) -> Iterator[None]:
-    """While a node is made that must keep time; processes that it starts later are not affected.
+    """Use UDP alone while a time-critical node is made, but not in processes started later.
 
-    After ``stay_local``. A profile or transports of the user's own stay as they are, and so does
-    what another middleware than Fast DDS is given: the range LOCALHOST is all that it obeys.
+    Call ``stay_local`` first. A profile or transports that the user has set stay as they are.
+    Middleware other than Fast DDS is left alone: it obeys nothing but the range LOCALHOST.
 
     middleware : identifier of the one in use, as ``rmw_fastrtps_cpp``
 

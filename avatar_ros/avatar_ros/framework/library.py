@@ -1,8 +1,8 @@
-"""The one directory that names from the network may reach.
+"""The only directory that names from the network can reach.
 
-A name in a request is a path inside ``library_dir``: what it leads to is an ordinary file there,
-whatever links say. It is looked at once more after it was opened, so that nobody who changes the
-library meanwhile can lead out of it.
+A name in a request is a path inside ``library_dir`` and has to lead to a regular file there, also
+through links. The file is checked again after it was opened, so that changing the library in
+between cannot lead outside.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from typing import BinaryIO
 from avatar_core.common.files import FileError, content_of, opened
 from avatar_core.errors import AvatarError
 
-LONGEST_NAME = 200  # of a file, with room for what is added while it is written [bytes]
+LONGEST_NAME = 200  # of a file, leaving room for the suffix of a temporary file [bytes]
 LONGEST_PATH = 1000  # [letters]
 
 
 class RefusedError(AvatarError):
-    """A request for what this node does not give or take."""
+    """A request that this node does not serve."""
 
 
 def find_in_library(name: str, library_dir: str, max_bytes: int) -> Path:
-    """The file ``name`` of the library, for who opens it by its path.
+    """The file ``name`` of the library, to be opened by its path.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What every node of the cell shares: managed transitions, start, signals, exit code."""
+"""What all nodes have in common: managed transitions, start, signals, exit code."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from avatar_ros.framework.parameters import Parameter, ParameterError, declare
 from avatar_ros.framework.ports import Ports
 
 _SIGNAL_LATENCY = 0.1  # longest until a signal is noticed [s]
-_LAST_ANSWERS = 1.0  # for what is still to be answered when the node ends [s]
+_LAST_ANSWERS = 1.0  # for requests that are pending when the node ends [s]
 
 
 class ManagedNode(LifecycleNode, ABC):
-    """A lifecycle node whose transitions may raise, and that says why it refused one.
+    """A lifecycle node whose transitions may raise; the error is the reason of the refusal.
 
-    A subclass gives ``configure``, ``activate``, ``deactivate``, ``clean_up``; the last two may
-    be called in any state. Parameters are declared here, so that a wrong value is refused
+    A subclass implements ``configure``, ``activate``, ``deactivate`` and ``clean_up``; the last two
+    may be called in any state. Parameters are declared here, so that a wrong value is refused
     before anything starts.
 
     refusal : why the last transition failed
@@ -57,16 +57,16 @@ class ManagedNode(LifecycleNode, ABC):
 
     @abstractmethod
     def clean_up(self) -> None:
-        """Give back what ``configure`` took."""
+        """Release what ``configure`` acquired."""
 
     @property
     def failure(self) -> str:
-        """Why the node cannot go on, else empty."""
+        """Why the node cannot continue; empty otherwise."""
         return ""
 
     @property
     def has_pending_answers(self) -> bool:
-        """Whether a request is still to be answered, for which the node is kept a moment."""
+        """Whether requests are still to be answered before the node is destroyed."""
         return False
 
     def bring_up(self) -> bool:
@@ -110,7 +110,7 @@ class ManagedNode(LifecycleNode, ABC):
 
 
 class StopSignal:
-    """True once SIGINT or SIGTERM came."""
+    """True once SIGINT or SIGTERM was received."""
 
     def __init__(self) -> None:
         self._came = False
@@ -125,7 +125,7 @@ class StopSignal:
 
 
 def spin_until(stop: StopSignal, node: Node) -> None:
-    """Serve a plain node until the signal came, then take it and rclpy down."""
+    """Serve a plain node until the signal is received, then shut it and rclpy down."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
@@ -138,12 +138,12 @@ def spin_until(stop: StopSignal, node: Node) -> None:
 
 
 def run(make_node: Callable[[], ManagedNode], keeps_time: bool = False) -> int:
-    """Bring a node up, spin it until SIGINT or SIGTERM, take it down; returns the exit code.
+    """Bring a node up, spin it until SIGINT or SIGTERM, shut it down; returns the exit code.
 
-    keeps_time : no other process may hold up what it publishes
+    keeps_time : no other process may delay what the node publishes
 
-    The signal handlers of rclpy are not used: they pull the middleware away from under a loop
-    that still has a last message to send.
+    The signal handlers of rclpy are not used: they shut the middleware down while the loop still
+    has a last message to send.
     """
     stop = StopSignal()
     try:
@@ -176,5 +176,5 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
         end = time.monotonic() + _LAST_ANSWERS
         while node.has_pending_answers and time.monotonic() < end:
             executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
-        executor.shutdown(timeout_sec=_LAST_ANSWERS)  # without, it waits for ever for what is open
+        executor.shutdown(timeout_sec=_LAST_ANSWERS)  # else it waits forever for open requests
         node.destroy_node()

@@ -34,7 +34,7 @@ POLICIES = (
 )
 
 
-_MOST_TOLD = 100  # lines; then diagnostics alone tell
+_MAX_LOGGED = 100  # lines; from then on, mismatches are in the diagnostics only
 
 
 class PolledSubscriptions(CallbackGroup):
@@ -55,7 +55,7 @@ class PolledSubscriptions(CallbackGroup):
 
 
 class Ports:
-    """Makes those of a node, and tells of ends elsewhere that do not match them.
+    """Makes publishers and subscriptions, and reports incompatible ends in other nodes.
 
     Raises
     ------
@@ -64,9 +64,9 @@ class Ports:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._suspects: dict[tuple[str, str], QoSProfile] = {}  # that once had an end not matching
-        self._silent: set[str] = set()  # topics whose events nobody hears: always suspect
-        self._told: set[str] = set()
+        self._suspects: dict[tuple[str, str], QoSProfile] = {}  # that have had an incompatible end
+        self._silent: set[str] = set()  # topics without events: always suspect
+        self._logged: set[str] = set()
 
     def publisher(self, kind: type, topic: str, quality: Quality) -> Any:
         profile, name = quality.fresh(), self._node.resolve_topic_name(topic)
@@ -76,7 +76,7 @@ class Ports:
                 topic,
                 profile,
                 event_callbacks=PublisherEventCallbacks(
-                    incompatible_qos=lambda event: self._tell("publisher", name, profile, event)
+                    incompatible_qos=lambda event: self._log("publisher", name, profile, event)
                 ),
                 qos_overriding_options=options,
             ),
@@ -94,10 +94,10 @@ class Ports:
         silent: bool = False,
         **how: Any,
     ) -> Any:
-        """``how`` goes on to rclpy; ``silent``: its events are not waited for."""
+        """``how`` is passed to rclpy; ``silent``: no executor waits for its events."""
         profile, name = quality.fresh(), self._node.resolve_topic_name(topic)
         events = SubscriptionEventCallbacks(
-            incompatible_qos=lambda event: self._tell("subscription", name, profile, event)
+            incompatible_qos=lambda event: self._log("subscription", name, profile, event)
         )
         if silent:
             events = SubscriptionEventCallbacks(use_default_callbacks=False)
@@ -119,9 +119,9 @@ class Ports:
         )
 
     def mismatches(self) -> list[str]:
-        """Who, of those known now, gets or sends nothing for its quality of service; a line each.
+        """Ends in other nodes that are incompatible with those of this node, one line each.
 
-        Looks at nothing where there never was one, unless it is silent.
+        Only topics that have had an incompatible end are checked, and silent ones.
         """
         found = []
         for (side, topic), own in list(self._suspects.items()):
@@ -136,7 +136,7 @@ class Ports:
                     cause = " ".join(reason.removeprefix("ERROR: ").split()).rstrip(";")
                     found.append(f"{topic}: not matched with {end.node_name} ({cause})")
                     if topic in self._silent:
-                        self._tell_once(topic, end.node_name, cause)
+                        self._log_once(topic, end.node_name, cause)
         return found
 
     def _made(
@@ -161,16 +161,16 @@ class Ports:
                 "and deadline [ns] as whole numbers"
             ) from error
 
-    def _tell_once(self, topic: str, name: str, cause: str) -> None:
+    def _log_once(self, topic: str, name: str, cause: str) -> None:
         line = (
             f"{topic}: {name} is not heard here ({cause}); change its policy, or "
             f"qos_overrides.{topic}.subscription.* of this node"
         )
-        if line not in self._told and len(self._told) < _MOST_TOLD:
-            self._told.add(line)
+        if line not in self._logged and len(self._logged) < _MAX_LOGGED:
+            self._logged.add(line)
             self._node.get_logger().warning(line)
 
-    def _tell(self, side: str, topic: str, profile: QoSProfile, event: Any) -> None:
+    def _log(self, side: str, topic: str, profile: QoSProfile, event: Any) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind).split(".")[-1].lower()
         self._suspects[side, topic] = profile
         what = "gets nothing from here" if side == "publisher" else "is not heard here"

@@ -1,4 +1,4 @@
-"""Quality of service of every topic, and what parameters may make of it; reasons in msg_docs/."""
+"""Quality of service of every topic, and how parameters may change it; reasons in msg_docs/."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 _NONE = Duration()  # no deadline
-_DEADLINE = 10  # periods without a message that are offered never to pass
-_SHORTEST = 2  # periods, of a deadline that a parameter gives
+_DEADLINE = 10  # offered by publishers [periods]
+_MIN_DEADLINE = 2  # that a parameter may set [periods]
 
-# The newest value, said again to whoever comes late.
+# The newest value, sent again to late joiners.
 LATCHED = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-# Poses in and clouds out: the newest counts, nothing is sent twice.
+# Poses in and clouds out: only the newest counts, nothing is sent again.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-# Wrenches: the newest counts, and subscribers of either kind are served.
+# Wrenches: only the newest counts, and subscribers of either reliability are served.
 COMMAND = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def state(n_tools: int) -> QoSProfile:
-    """One message a tool a step on the same topic."""
+    """For one message per tool and step on the same topic."""
     return QoSProfile(depth=2 * n_tools, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -34,11 +34,11 @@ STATISTICS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 @dataclass(frozen=True)
 class Quality:
-    """A profile, and what parameters may make of it: history and durability never change.
+    """A profile and the limits of its overrides; history and durability cannot be overridden.
 
-    period : of the messages [s], which bounds a deadline; infinity: none can be given
-    depths : fewest and most
-    has_deadline : one of ten periods is offered
+    period : of the messages [s], a lower bound of deadlines; infinity: no deadline is possible
+    depths : smallest and largest
+    has_deadline : a deadline of ten periods is offered by default
     """
 
     profile: QoSProfile
@@ -58,7 +58,7 @@ class Quality:
         )
 
     def refusal(self, given: QoSProfile) -> str:
-        """The policy that may not be so, why, and what it takes; empty if all is well."""
+        """The first policy that is refused, why, and what it takes; empty if all pass."""
         own, (fewest, most) = self.profile, self.depths
         latched = own.durability == DurabilityPolicy.TRANSIENT_LOCAL
         kinds = (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT)[: 1 if latched else 2]
@@ -77,9 +77,9 @@ class Quality:
             return ""
         if math.isinf(self.period):
             return "deadline: messages come on demand; give 0, for none"
-        shortest = round(_SHORTEST * self.period * 1e9)
+        shortest = round(_MIN_DEADLINE * self.period * 1e9)
         if given.deadline.nanoseconds < shortest:
-            return f"deadline: give at least {shortest} ns, {_SHORTEST} periods, or 0 for none"
+            return f"deadline: give at least {shortest} ns, {_MIN_DEADLINE} periods, or 0 for none"
         return ""
 
 
@@ -87,14 +87,14 @@ ONCE = Quality(LATCHED)
 
 
 def poses(period: float) -> Quality:
-    """One is taken a step: a queue would only make them late. No deadline is asked for, which
-    would shut out every driver that offers none."""
+    """One pose is taken per step: a queue would only make poses late. No deadline is requested,
+    because that would exclude every driver that offers none."""
     return Quality(NEWEST, period)
 
 
 def wrenches(period: float) -> Quality:
-    """A driver that asks for a deadline learns that the stream is lost. It costs the loop 30 us a
-    step, so that it is offered nowhere else."""
+    """With a deadline, a driver learns that the stream has stopped. It costs the loop 30 us a step,
+    so no other topic offers one."""
     return Quality(COMMAND, period, has_deadline=True)
 
 
@@ -103,7 +103,7 @@ def states(n_tools: int, period: float) -> Quality:
 
 
 def clouds(period: float) -> Quality:
-    """No deadline is offered: how often they come changes while they do."""
+    """No deadline is offered, because the rate may change at run time."""
     return Quality(NEWEST, period, (1, 10))
 
 

@@ -1,4 +1,4 @@
-"""Files of others, read in a process that may die of them: the node goes on."""
+"""Reads untrusted files in a process of its own, so that a damaged file cannot end the node."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _OWN = 1 << 30  # address space of the process and its libraries [bytes]
-_SECONDS = 4.0  # for any file, and so much for its size:
-_SLOWEST = 20e6  # [byte/s]
+_SECONDS = 4.0  # for a file of any size, plus its size divided by
+_MIN_SPEED = 20e6  # [byte/s]
 
 
 class Reader:
-    """Reads files of at most ``max_bytes``, which may be in memory four times meanwhile."""
+    """Reads files of at most ``max_bytes``, which may be in memory four times during that."""
 
     def __init__(self, max_bytes: int) -> None:
         self._confined = Confined(_OWN + 4 * max_bytes)
 
     @property
     def pid(self) -> int | None:
-        """Of the process that reads, if there is one."""
+        """Id of the reading process, if there is one."""
         return self._confined.pid
 
     def read(
@@ -44,7 +44,7 @@ class Reader:
         RefusedError
             If it ends its process, or takes much longer or more memory than such a file needs.
         """
-        seconds = _SECONDS + n_bytes / _SLOWEST
+        seconds = _SECONDS + n_bytes / _MIN_SPEED
         try:
             return self._confined.call(seconds, function, *args, **kwargs)
         except ConfinedError as error:

@@ -1,4 +1,4 @@
-"""What the operating system does for a loop that must keep time: priority, core, memory, clock."""
+"""Services of the operating system for a real-time loop: priority, core, memory, clock."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _MADV_POPULATE_READ = 22
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
-_THREAD_SWITCH_INTERVAL = 1e-4  # longest another Python thread may keep the lock from the loop [s]
+_THREAD_SWITCH_INTERVAL = 1e-4  # longest wait of the loop for the global lock [s]
 
 
 class _Timespec(ctypes.Structure):
@@ -32,7 +32,7 @@ class _Timespec(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Privileges:
-    """What was granted, and for all that was refused one line that says how to get it.
+    """What was granted; for everything that was refused, one line that says how to get it.
 
     priority : of SCHED_FIFO, 0 without
     cpu : core the loop is bound to, -1 for any
@@ -89,17 +89,17 @@ def bind_thread(cpu: int) -> None:
 
 
 def release() -> None:
-    """Back to ordinary scheduling, at low priority: for a helper started by a real-time process."""
+    """Return to ordinary scheduling at low priority; for a process started by a real-time one."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     os.nice(10)
 
 
 def tune_interpreter() -> None:
-    """No garbage collection on its own account, and quick hand-over of the global lock.
+    """Disable automatic garbage collection, and shorten the switch interval of the global lock.
 
-    Whoever calls this calls ``gc.collect()`` from time to time outside the loop; what exists now
-    is never looked at again, so that takes well below a millisecond.
+    The caller has to call ``gc.collect()`` from time to time outside the loop. Objects that exist
+    now are frozen and never examined again, so that takes well below a millisecond.
     """
     gc.collect()
     gc.freeze()
@@ -108,14 +108,14 @@ def tune_interpreter() -> None:
 
 
 def sleep_until(deadline: int) -> None:
-    """Sleep until ``time.monotonic_ns()`` reaches ``deadline`` [ns]; at once if it has passed."""
+    """Sleep until ``time.monotonic_ns()`` reaches ``deadline`` [ns]. Real-time safe."""
     when = _Timespec(deadline // 1_000_000_000, deadline % 1_000_000_000)
     while _libc.clock_nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(when), None) != 0:
         pass  # interrupted by a signal
 
 
 def wake_up_periods(seconds: float, period: float = 1e-3) -> np.ndarray:
-    """Periods of a loop that only sleeps: what this machine can keep at all, shape (n,) [s]."""
+    """Periods of a loop that only sleeps, the best this machine can do; shape (n,) [s]."""
     step = round(period * 1e9)
     wakes = np.empty(max(2, round(seconds / period)), dtype=np.int64)
     start = time.monotonic_ns()

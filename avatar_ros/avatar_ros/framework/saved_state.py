@@ -1,7 +1,7 @@
-"""What was changed while a node ran, kept in a file: started again, it goes on with that.
+"""Changes made while a node ran, saved in a file for its next start.
 
-It holds for a node that is started with the same values as the last time. With others, somebody
-chose anew, and nothing of it is used.
+They are used only if the node is started with the same values as the last time. With other values,
+somebody has made a new choice, and the file is ignored.
 """
 
 from __future__ import annotations
@@ -19,15 +19,14 @@ from avatar_ros.framework.parameters import Parameter, ParameterError
 STATE_DIR = Parameter(
     "state_dir",
     "",
-    "directory where what is changed while the node runs is kept for its next start; empty: none",
+    "directory where changes made at run time are saved for the next start; empty: none",
 )
 
 
 class SavedState:
-    """The file of one node; without a directory, nothing is kept and nothing comes back.
+    """The file of one node; without a directory, nothing is saved or loaded.
 
-    started : what the node is started with, by name; values as JSON has them
-    tell : takes one line on a file that cannot be used; the node goes on
+    started : values that the node is started with, by name; of JSON's types
 
     Raises
     ------
@@ -36,7 +35,7 @@ class SavedState:
 
     def __init__(self, node: Node, started: dict[str, Any]) -> None:
         self._started = started
-        self._tell: Callable[[str], object] = node.get_logger().error
+        self._log: Callable[[str], object] = node.get_logger().error
         self._path: Path | None = None
         self._written = ""
         folder = os.path.expanduser(node.get_parameter(STATE_DIR.name).value)
@@ -50,21 +49,21 @@ class SavedState:
         self._path = Path(folder).resolve() / f"{name}.json"
 
     def load(self) -> dict[str, Any]:
-        """What had been changed, unless the node is started with other values now."""
+        """The saved changes; empty if the node is started with other values now."""
         if self._path is None or not self._path.exists():
             return {}
         try:
             stored = json.loads(self._path.read_text())
             return dict(stored["changed"]) if stored["started"] == self._started else {}
         except (OSError, ValueError, TypeError, KeyError) as error:
-            self._tell(
-                f"{self._path} not used ({type(error).__name__}); remove it, the node goes on with "
-                "its parameters"
+            self._log(
+                f"{self._path} not used ({type(error).__name__}); remove it, the node continues "
+                "with its parameters"
             )
             return {}
 
     def save(self, now: dict[str, Any]) -> None:
-        """Write what differs from the start, whole or not at all; nothing where nothing is new."""
+        """Write the values that differ from the start, atomically; nothing if nothing is new."""
         if self._path is None:
             return
         changed = {name: value for name, value in now.items() if value != self._started[name]}
@@ -77,4 +76,4 @@ class SavedState:
             part.replace(self._path)
             self._written = text
         except OSError as error:
-            self._tell(f"state_dir: {self._path} not written ({error.strerror}); free some space")
+            self._log(f"state_dir: {self._path} not written ({error.strerror}); free some space")

@@ -1,4 +1,4 @@
-"""What an operator should know of the contact node, for `/diagnostics`: levels, texts, numbers."""
+"""Diagnostics of the contact node: levels, texts and numbers for `/diagnostics`."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 
 @dataclass(frozen=True)
 class Faults:
-    """Of one tool in a window: how often each status was entered, and what it has now."""
+    """Faults of one tool in a window: how often each status was entered, and the present status."""
 
     counts: dict[int, int]
     status: int
 
     @property
     def text(self) -> str:
-        """One line with cause and remedy; empty without a fault."""
+        """Cause and remedy in one line; empty without a fault."""
         status = self.status
         if status == ContactState.STATUS_OK and self.counts:
             status = max(self.counts, key=lambda key: self.counts[key])
@@ -35,14 +35,14 @@ class Faults:
 
 
 class FaultCounter:
-    """How many faults each tool had since it was last asked."""
+    """Counts the faults of each tool from call to call."""
 
     def __init__(self, tools: Sequence[ToolChannel]) -> None:
         self._tools = tools
         self._seen = [tool.faults.copy() for tool in tools]
 
     def window(self) -> list[Faults]:
-        """One for each tool."""
+        """The faults of each tool since the last call."""
         found = []
         for i, tool in enumerate(self._tools):
             now = tool.faults.copy()
@@ -56,7 +56,7 @@ class FaultCounter:
 def loop_status(
     name: str, window: LoopStatistics, nominal: float, limits: dict[str, float]
 ) -> DiagnosticStatus:
-    """Of the loop's rate and its step; ``limits`` are the parameters ``THRESHOLDS``."""
+    """Status of the loop's rate and step; ``limits`` are the values of ``THRESHOLDS``."""
     missed = window.missed / max(window.periods, 1)
     measured = {
         "periodicity.mean_error": abs(window.rate - nominal),
@@ -107,7 +107,7 @@ def tool_status(
     energies: Passivity | None,
     i: int,
 ) -> DiagnosticStatus:
-    """Of one tool: faults of the window, what is let through, and energies if they are watched."""
+    """Status of one tool: its faults, limits of the force, and energies if they are observed."""
     values: dict[str, Any] = {
         "publishers of poses": tool.publishers,
         "share of the force sent": guard.sent_fraction,
@@ -128,14 +128,14 @@ def tool_status(
 
 
 def vademecum_status(name: str, identity: str, promise: str) -> DiagnosticStatus:
-    """Of what is loaded, and what it promises."""
+    """Status of the loaded vademecum, with what it promises."""
     if not identity:
         return _status(f"{name}: vademecum", WARN, "none: no force; load one", {})
     return _status(f"{name}: vademecum", OK, promise, {"id": identity})
 
 
 def qos_status(name: str, mismatches: list[str]) -> DiagnosticStatus:
-    """Of ends elsewhere that get or send nothing; ``mismatches`` are one line each."""
+    """Status of incompatible ends in other nodes; ``mismatches`` are one line each."""
     text = "; ".join(mismatches)
     if not text:
         return _status(f"{name}: quality of service", OK, "no other end was found not to match", {})
@@ -148,7 +148,7 @@ def qos_status(name: str, mismatches: list[str]) -> DiagnosticStatus:
 
 
 def accuracy_status(name: str, text: str, shedding: bool, window: LoopStatistics) -> Any:
-    """Of what is shown, promised and held."""
+    """Status of the shown modes, and of the promised and measured times."""
     return _status(
         f"{name}: accuracy",
         WARN if shedding else OK,

@@ -1,4 +1,4 @@
-"""The parameters of the contact node, and the settings that its loop works by."""
+"""The parameters of the contact node, and the settings of its loop."""
 
 from __future__ import annotations
 
@@ -20,44 +20,46 @@ def _threshold(name: str, warn: float, error: float, what: str) -> tuple[Paramet
     )
 
 
-# The first two as ros2_control's controller manager has them.
+# The first two are those of ros2_control's controller manager.
 THRESHOLDS = (
-    *_threshold("periodicity.mean_error", 5.0, 10.0, "rate off the nominal one [Hz]"),
-    *_threshold("execution_time.mean", 1000.0, 2000.0, "mean time of a step with messages [us]"),
-    *_threshold("missed", 0.01, 0.05, "share of periods longer than 1.5 nominal ones"),
+    *_threshold("periodicity.mean_error", 5.0, 10.0, "deviation from the nominal rate [Hz]"),
+    *_threshold(
+        "execution_time.mean", 1000.0, 2000.0, "mean time of a step, including messages [us]"
+    ),
+    *_threshold("missed", 0.01, 0.05, "fraction of periods longer than 1.5 nominal ones"),
 )
 
 CONTACT = (
     AUTOSTART,
     FRAME_ID,
-    Parameter("tools", ["tool"], "names of the tools; each has its topics below NAME/"),
+    Parameter("tools", ["tool"], "names of the tools; the topics of each are below NAME/"),
     Parameter(
         "tip_radius",
         0.005,
         f"radius of the spherical tool tips [m], {TIP_RADIUS_RANGE[0]:g} to "
-        f"{TIP_RADIUS_RANGE[1]:g}; one number or one per tool",
+        f"{TIP_RADIUS_RANGE[1]:g}; one number, or one for each tool",
         any_type=True,
     ),
     Parameter(
         "scene",
         "",
-        "scene in params/scenes, or the path of one (with a /); its tips, cloud and modes go "
-        "before those here; empty: the natural effects of the vademecum",
+        "a scene in params/scenes, or a path (with a /); its tips, cloud and modes override those "
+        "given here; empty: the natural effects of the vademecum",
     ),
     Parameter("rate", 1000.0, "steps per second [Hz]", range=(100.0, 2000.0)),
     Parameter("cloud", "surface", "vertices in deformation: surface, volume or off"),
     Parameter(
         "cloud_divisor",
         1,
-        "deformation is published every so many steps",
+        "number of steps from one deformation message to the next",
         range=(1, 1000),
         read_only=False,
     ),
-    Parameter("modes", 0, "modes of the far field in use; 0: all", range=(0, 100_000)),
+    Parameter("modes", 0, "far-field modes of the displacement; 0: all", range=(0, 100_000)),
     Parameter(
         "pose_timeout",
         0.02,
-        "age of the last pose, by the time it came in, from which force is zero [s]",
+        "time since the last pose arrived, after which the force is zero [s]",
         range=(0.002, 1.0),
         read_only=False,
     ),
@@ -86,35 +88,39 @@ CONTACT = (
     Parameter(
         "accuracy.tolerance",
         0.0,
-        "relative error that 95 % of touches must keep; 0: as exact as the vademecum is",
+        "relative error that 95 % of touches must not exceed; 0: as exact as the vademecum",
         range=(0.0, 1.0),
         read_only=False,
     ),
     Parameter(
         "accuracy.quantity",
         "l2",
-        "whose error that is: l2 (displacement) or force",
+        "quantity whose error that is: l2 (displacement) or force",
         read_only=False,
     ),
     Parameter(
         "accuracy.deadline",
         0.0,
-        "processor time that 99 % of steps must keep, forces and deformation [s]; 0: none",
+        "processor time that 99 % of steps must not exceed, with forces and cloud [s]; 0: no limit",
         range=(0.0, 0.01),
         read_only=False,
     ),
-    Parameter("realtime.priority", 0, "SCHED_FIFO priority asked for; 0: ordinary", range=(0, 98)),
+    Parameter(
+        "realtime.priority",
+        0,
+        "requested SCHED_FIFO priority; 0: ordinary scheduling",
+        range=(0, 98),
+    ),
     Parameter("realtime.cpu", -1, "core the loop is bound to; -1: any", range=(-1, 1023)),
     Parameter("realtime.lock_memory", True, "keep the process in memory; needs a priority"),
     *SAFETY,
     *THRESHOLDS,
     STATE_DIR,
 )
-# Of the contact node: what a node that is started again goes on with, and the scene.
+# What a restarted contact node restores, besides the scene.
 CHANGEABLE = tuple(p.name for p in CONTACT if not p.read_only)
 
-
-# Names that the core gives to what these parameters choose.
+# The core's names of the coordinates that these parameters set.
 MATERIAL = {
     "material.young_modulus": "young",
     "material.poisson_ratio": "poisson",
@@ -149,12 +155,12 @@ class ContactSettings:
 
 
 def chosen_material(value: dict[str, Any]) -> dict[str, float]:
-    """The values of the material that are not left to the vademecum."""
+    """The values of the material that differ from the vademecum's, by coordinate."""
     return {name: value[key] for key, name in MATERIAL.items() if value[key] != 0.0}
 
 
 def chosen_budget(value: dict[str, Any]) -> Budget | None:
-    """What accuracy.* asks for; None if nothing.
+    """The budget of the parameters accuracy.*; None if they set none.
 
     Raises
     ------

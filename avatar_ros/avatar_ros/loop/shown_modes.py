@@ -1,4 +1,4 @@
-"""What the model in use promises of error and time, and how many of its modes are shown."""
+"""Errors and times promised for the model in use, and how many of its modes are shown."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _NAN = float("nan")
 
 @dataclass(frozen=True)
 class ShownModesReport:
-    """One line on what is shown, for logs and diagnostics.
+    """One line on the shown modes, for logs and diagnostics.
 
-    shedding : fewer modes are shown than there would be time for on a quiet machine
-    changed : since the window before
+    shedding : modes are left out because the machine is busy
+    changed : the number of modes differs from that of the last window
     """
 
     text: str
@@ -28,7 +28,7 @@ class ShownModesReport:
 
 
 class ShownModes:
-    """Of one model in use; belongs to the node, which calls it once a window.
+    """The shown modes of one model; the node calls it once for each window.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class ShownModes:
 
     @property
     def promise(self) -> str:
-        """What is promised while nothing is shed, in words."""
+        """The errors and times promised while all modes are shown, in words."""
         point = self._points.get(self._model.n_modes)
         text = f"{self._model.n_modes} modes"
         if point is not None:
@@ -62,17 +62,17 @@ class ShownModes:
         return text
 
     def set_times(self, curve: AccuracyCurve) -> None:
-        """Promise the times of the same points, timed on this machine since."""
+        """Promise the same errors with times that were measured on this machine."""
         self._points = {p.detail.modes: p for p in curve.points}
 
     def set_deadline(self, deadline: float) -> None:
-        """Shed by another deadline from now on [s]."""
+        """Leave out modes by another deadline from now on [s]."""
         self._shedder.deadline = deadline
 
     def update(self, statistics: LoopStatistics) -> ShownModesReport:
-        """Choose the modes for the next window, and write into a window's statistics what it had.
+        """Complete a window's statistics with its modes, and choose those of the next window.
 
-        The change is a single number that the loop reads at its next step.
+        The loop reads the new number at its next step.
         """
         before = self._model.n_shown
         self._describe(statistics, before)
@@ -89,7 +89,7 @@ class ShownModes:
 
     def _describe(self, statistics: LoopStatistics, shown: int) -> None:
         measured = [n for n in self._points if n <= shown]
-        point = self._points[max(measured)] if measured else None  # more modes are not worse
+        point = self._points[max(measured)] if measured else None  # more modes are no less accurate
         statistics.modes_shown, statistics.modes = shown, self._model.n_modes
         statistics.promised_l2 = point.l2 if point else _NAN
         statistics.promised_force = point.force if point else _NAN

@@ -19,22 +19,22 @@ from avatar_ros.framework.managed_node import StopSignal
 _POLL = 0.1  # [s]
 _STOP_TIMEOUT = 5.0  # for a node to end by itself [s]
 
-# What goes before the file of parameters, by node.
-TAKES = {
+# Parameters that override those of the file, by node.
+OVERRIDES = {
     "vademecum_loader": ("library_dir", "vademecum", "state_dir"),
     "contact": ("scene", "state_dir"),
     "patient_interpolation": ("library_dir", "atlas"),
     "planning_ui": ("library_dir", "host", "port"),
 }
-# Nodes that run only where this was given.
-ASKED_FOR = {"patient_interpolation": "atlas", "planning_ui": "ui"}
+# Nodes that run only if this was given.
+REQUIRED = {"patient_interpolation": "atlas", "planning_ui": "ui"}
 
 
 def node_arguments(params: Path | None, given: dict[str, str]) -> dict[str, list[str]]:
     """The arguments of each node that runs, by name; some run only if they are asked for."""
     found = {}
-    for node, names in TAKES.items():
-        if ASKED_FOR.get(node, node) not in {node, *given}:
+    for node, names in OVERRIDES.items():
+        if REQUIRED.get(node, node) not in {node, *given}:
             continue
         own = [f"{name}:={given[name]}" for name in names if name in given]
         arguments = ["--params-file", str(params)] if params is not None else []
@@ -44,7 +44,7 @@ def node_arguments(params: Path | None, given: dict[str, str]) -> dict[str, list
 
 
 def run(arguments: dict[str, list[str]]) -> int:
-    """Keep the nodes running until one ends or a signal comes; the exit code."""
+    """Keep the nodes running until one ends or a signal comes; returns the exit code."""
     stop = StopSignal()
     processes = {
         name: ModuleProcess(
@@ -75,7 +75,7 @@ def run(arguments: dict[str, list[str]]) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m avatar_ros.nodes.cell")
     parser.add_argument("--params", type=Path)
-    for name in sorted({name for names in TAKES.values() for name in names}):
+    for name in sorted({name for names in OVERRIDES.values() for name in names}):
         parser.add_argument(f"--{name}")
     parser.add_argument("--ui", action="store_const", const="yes")
     chosen = vars(parser.parse_args())

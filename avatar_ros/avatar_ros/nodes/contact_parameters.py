@@ -1,4 +1,4 @@
-"""Reading the contact node's parameters, checked against one another and against the scene."""
+"""Reads the contact node's parameters and checks them against one another and the scene."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from avatar_ros.prepare import scenes
 CLOUDS = get_args(Cloud)
 
 
-def read_contact(node: Node, kept_scene: str = "") -> ContactSettings:
+def read_contact(node: Node, saved_scene: str = "") -> ContactSettings:
     """The contact node's parameters, checked against one another.
 
-    kept_scene : YAML, which goes before the parameter ``scene``
+    saved_scene : YAML, which overrides the parameter ``scene``
 
     Raises
     ------
@@ -60,8 +60,8 @@ def read_contact(node: Node, kept_scene: str = "") -> ContactSettings:
         lock_memory=value["realtime.lock_memory"],
         safety=chosen_safety(value),
     )
-    if kept_scene:
-        kept = _with_scene(settings, lambda: parse_scene(kept_scene, "kept"))
+    if saved_scene:
+        kept = _with_scene(settings, lambda: parse_scene(saved_scene, "kept"))
         return replace(kept, cloud_divisor=settings.cloud_divisor)  # may have changed since
     if value["scene"]:
         return _with_scene(settings, lambda: read_scene(scenes.scene_file(value["scene"])))
@@ -69,7 +69,7 @@ def read_contact(node: Node, kept_scene: str = "") -> ContactSettings:
 
 
 def _with_scene(settings: ContactSettings, read: Callable[[], Scene]) -> ContactSettings:
-    """Settings with what a scene says of tips and outputs."""
+    """The settings with the tips and outputs of a scene."""
     try:
         scene = read()
         scenes.require_tools(scene, len(settings.tools))

@@ -17,15 +17,15 @@ from avatar_ros.msg import VademecumInfo
 from avatar_ros.ui.colours import colours
 from avatar_ros.ui.display import NewestCloud, TriangleTemplate
 
-_REST_SHADE = (0.6, 0.6, 0.6, 0.25)  # grey, seen through
+_REST_SHADE = (0.6, 0.6, 0.6, 0.25)  # grey, transparent
 
 ORGAN_MARKERS = (
     AUTOSTART,
-    Parameter("rate", 30.0, "of organ_deformed, at most [Hz]", range=(0.1, 100.0)),
+    Parameter("rate", 30.0, "largest rate of organ_deformed [Hz]", range=(0.1, 100.0)),
     Parameter(
         "full_scale",
         0.01,
-        "displacement that has the last colour [m]",
+        "displacement at the end of the colour scale [m]",
         range=(1e-4, 1.0),
         read_only=False,
     ),
@@ -33,11 +33,11 @@ ORGAN_MARKERS = (
 
 
 class MarkersNode(ManagedNode):
-    """Subscribes what the loader and the contact node send; publishes two markers."""
+    """Subscribes the topics of loader and contact node; publishes two markers."""
 
     def __init__(self) -> None:
-        self._subscriptions_of_loader: list[Any] = []
-        self._publishers_of_mine: list[Any] = []
+        self._own_subscriptions: list[Any] = []
+        self._own_publishers: list[Any] = []
         self._frame = ""
         self._surface: Mesh | None = None
         self._faces = np.zeros(0, np.int64)
@@ -47,11 +47,11 @@ class MarkersNode(ManagedNode):
         super().__init__("organ_markers", ORGAN_MARKERS)
 
     def configure(self) -> None:
-        self._publishers_of_mine = [
+        self._own_publishers = [
             self.create_publisher(Marker, "organ_rest", qos.LATCHED),
             self.create_publisher(Marker, "organ_deformed", qos.COMMAND),
         ]
-        self._subscriptions_of_loader = [
+        self._own_subscriptions = [
             self.create_subscription(
                 VademecumInfo, "vademecum_info", self._take_frame, qos.LATCHED
             ),
@@ -68,11 +68,11 @@ class MarkersNode(ManagedNode):
             self._timer = None
 
     def clean_up(self) -> None:
-        for subscription in self._subscriptions_of_loader:
+        for subscription in self._own_subscriptions:
             self.destroy_subscription(subscription)
-        for publisher in self._publishers_of_mine:
+        for publisher in self._own_publishers:
             self.destroy_publisher(publisher)
-        self._subscriptions_of_loader, self._publishers_of_mine = [], []
+        self._own_subscriptions, self._own_publishers = [], []
         self._forget()
 
     def _forget(self) -> None:
@@ -89,7 +89,7 @@ class MarkersNode(ManagedNode):
         self._lay_out()
 
     def _lay_out(self) -> None:
-        """Both messages have come, in either order: the surface itself has no frame."""
+        """Once both messages have arrived, in either order; the surface itself has no frame."""
         if not self._frame or self._surface is None:
             return
         self._forget()
@@ -98,13 +98,13 @@ class MarkersNode(ManagedNode):
         rest = TriangleTemplate(self._frame, "organ at rest", len(faces))
         rest.corners[:] = vertices[self._faces]
         rest.colours[:] = _REST_SHADE
-        self._publishers_of_mine[0].publish(rest.serialise(NO_STAMP))
+        self._own_publishers[0].publish(rest.serialise(NO_STAMP))
         self._template = TriangleTemplate(self._frame, "organ", len(faces))
         self._template.colours[:, 3] = 1.0
         self._cloud = NewestCloud(self, self._frame, len(vertices))
 
     def _show(self) -> None:
-        template, publisher = self._template, self._publishers_of_mine[1]
+        template, publisher = self._template, self._own_publishers[1]
         if template is None or self._cloud is None:
             return
         taken = self._cloud.take()

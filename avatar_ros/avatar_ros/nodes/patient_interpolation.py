@@ -33,7 +33,7 @@ _DEFAULT_FIDELITY = "interpolated"
 
 
 def patient_request(request: Any, settings: InterpolationSettings) -> PatientRequest:
-    """What a request or a goal asks for, as far as that shows without the atlas.
+    """The checked request of a service call or a goal; the atlas is not needed for it.
 
     Raises
     ------
@@ -87,10 +87,10 @@ def _require_metres(request: Any, max_bytes: int) -> None:
 
 
 class PatientInterpolationNode(ManagedNode):
-    """Builds one patient at a time, asked for by the service or the action.
+    """Builds one patient at a time, for the service or the action.
 
-    Both are there as long as the node, and refuse while it is inactive. A thread of its own waits
-    for the patient; what is said to others is said from the executor's.
+    Both exist as long as the node, and refuse requests while it is inactive. A separate thread
+    waits for the patient; answers are sent from the executor's thread.
     """
 
     def __init__(self) -> None:
@@ -155,7 +155,7 @@ class PatientInterpolationNode(ManagedNode):
         """
         if self._settings is None or self._builder is None or not self._active:
             raise RefusedError("the node is inactive; activate it first")
-        self._builder.require_idle()  # before a large mesh is looked at
+        self._builder.require_idle()  # before a large mesh is converted
         patient = patient_request(request, self._settings)
         built = self._builder.build(patient, on_stage, cancelled)
         self.get_logger().info(
@@ -194,7 +194,7 @@ class PatientInterpolationNode(ManagedNode):
         return result
 
     async def _beside(self, work: Callable[[], Built]) -> Built:
-        """Wait for some work in a thread of its own while the executor goes on."""
+        """Wait for work in a separate thread while the executor keeps running."""
         executor = self.executor
         assert executor is not None  # which runs this
         done = Future(executor=executor)
@@ -220,7 +220,7 @@ class PatientInterpolationNode(ManagedNode):
         text = f"{what}: {answer.message}"
         if isinstance(error, BusyError | CancelledError):
             self.get_logger().warning(text)
-        else:  # each on a line of its own: rclpy allows a line of code but one severity
+        else:  # on a line of its own: rclpy allows only one severity for each line of code
             self.get_logger().error(text)
 
 

@@ -1,8 +1,8 @@
-"""The planning page: an organ in the browser, pressed with the mouse, felt at 1 kHz.
+"""The planning page: an organ in the browser that is pressed with the mouse, simulated at 1 kHz.
 
-Needs the extra ``ui``. The page is served by viser; poses are sent, and answers noted, by a process
-of its own (:mod:`avatar_ros.ui.tool_driver`), and clouds are looked at 30 times a second, so that
-neither the page nor its users ever hold up the contact loop.
+Needs the extra ``ui``. viser serves the page. A process of its own
+(:mod:`avatar_ros.ui.tool_driver`) sends the poses and reads the answers, and clouds are shown 30
+times a second, so neither the page nor its users can delay the contact loop.
 """
 
 from __future__ import annotations
@@ -41,23 +41,27 @@ from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess
 from avatar_ros.ui.view import OrganView
 
 FRAME = "organ"
-_SLOW = 6  # frames from one point of the plots to the next
-_LOOK = 30  # frames from one look at library and nodes to the next
-_SILENCE = 1.0  # after which the contact node does not answer [s]
+_PLOT_FRAMES = 6  # between two points of the plots
+_POLL_FRAMES = 30  # between two checks of library and nodes
+_SILENCE = 1.0  # after which the contact node counts as not answering [s]
 _OF_CONTACT = ("tip_radius", "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
 
 PLANNING_UI = (
     AUTOSTART,
-    Parameter("host", "127.0.0.1", "address to listen on; 0.0.0.0: any, without a password"),
-    Parameter("port", 8080, "to listen on; the next free one if it is taken", range=(1, 65535)),
-    Parameter("library_dir", ".", "of the loader too; recordings are written there"),
-    Parameter("tool", "tool", "name of the tool that is moved, of those of contact"),
-    Parameter("tumour", "", "its surface in library_dir, shown in the organ; empty: none"),
+    Parameter("host", "127.0.0.1", "address to listen on; 0.0.0.0: all; there is no password"),
+    Parameter(
+        "port", 8080, "port to listen on; the next free one if it is in use", range=(1, 65535)
+    ),
+    Parameter("library_dir", ".", "directory of the loader's files; recordings are written there"),
+    Parameter("tool", "tool", "name of the tool to move, one of those of contact"),
+    Parameter(
+        "tumour", "", "surface of the tumour in library_dir, shown in the organ; empty: none"
+    ),
 )
 
 
 class PlanningNode(ManagedNode):
-    """Serves the page, and passes between it and the cell."""
+    """Serves the page and connects it with the cell."""
 
     def __init__(self) -> None:
         self._server: viser.ViserServer | None = None
@@ -73,7 +77,7 @@ class PlanningNode(ManagedNode):
         self._was_missing, self._is_to_restore = True, False
         self._frame, self._frame_id = 0, FRAME
         self._began = time.monotonic()
-        self._subscriptions_of_mine: list[Any] = []
+        self._own_subscriptions: list[Any] = []
         self._timer: Any = None
         super().__init__("planning_ui", PLANNING_UI)
 
@@ -105,7 +109,7 @@ class PlanningNode(ManagedNode):
             ),
         )
         self._panels.offer_scenes(scene_texts())
-        self._subscriptions_of_mine = [
+        self._own_subscriptions = [
             self.create_subscription(
                 VademecumInfo, "vademecum_info", self._take_frame, qos.LATCHED
             ),
@@ -127,9 +131,9 @@ class PlanningNode(ManagedNode):
         self._driver.end()
 
     def clean_up(self) -> None:
-        for subscription in self._subscriptions_of_mine:
+        for subscription in self._own_subscriptions:
             self.destroy_subscription(subscription)
-        self._subscriptions_of_mine = []
+        self._own_subscriptions = []
         if self._cloud is not None:
             self._cloud.close()
             self._cloud = None
@@ -159,7 +163,7 @@ class PlanningNode(ManagedNode):
             return
         try:
             data = bytes(message.data)
-            name = "the vademecum that was announced"
+            name = "the announced vademecum"
             organ = Organ.of(self._reader.read(name, len(data), parse_vademecum, data, name))
             tumour = read_tumour(self._library.folder / self._tumour) if self._tumour else None
         except AvatarError as error:
@@ -181,18 +185,18 @@ class PlanningNode(ManagedNode):
         self._panels.show_loop(now, window.step_p99, window.missed / max(window.window, 1e-3))
 
     def _radius(self) -> float:
-        """Of the tool's tip [m]."""
+        """Radius of the tool's tip [m]."""
         if self._scene:
             return read_scene(shipped_scenes()[self._scene]).tools[0].tip_radius
         given = self._contact.get("tip_radius", 0.005)
         return float(given if isinstance(given, float) else given[0])
 
     def _show(self) -> None:
-        """One frame of the page."""
+        """Update the page; called for every frame."""
         live, organ = self._state.live[0], self._organ
         self._frame += 1
-        if self._frame % _LOOK == 1:
-            self._look_around()
+        if self._frame % _POLL_FRAMES == 1:
+            self._poll_cell()
         if organ is None or self._cloud is None:
             return
         taken = self._cloud.take()
@@ -203,7 +207,7 @@ class PlanningNode(ManagedNode):
                 self._recorder.note_cloud(taken[1][:, 3:])
         force = live["force"] if self._answers() else np.zeros(3)
         self._view.place_tool(live["tip"].copy(), force)
-        if self._frame % _SLOW == 0:
+        if self._frame % _PLOT_FRAMES == 0:
             size = float(np.linalg.norm(force))
             error = float(live["error"]) if np.isfinite(live["error"]) else 0.0
             n_kept = self._recorder.n_periods if self._recorder.is_on else None
@@ -212,36 +216,38 @@ class PlanningNode(ManagedNode):
             self._panels.show_force(time.monotonic() - self._began, size, error)
 
     def _answers(self) -> bool:
-        """Whether the contact node answered lately."""
+        """Whether the contact node answered recently."""
         silence = time.monotonic_ns() - int(self._state.live["heard"][0])
         return silence < _SILENCE * 1e9
 
-    def _look_around(self) -> None:
-        """Who is there, what the library holds, and whether the hand lives."""
+    def _poll_cell(self) -> None:
+        """Check which nodes run, what the library holds, and that the tool driver runs."""
         missing = self._requests.missing
         status = int(self._state.live["status"][0]) if self._answers() else None
         self._panels.warnings.content = warnings(missing, self._organ is not None, status)
         self._panels.offer(*self._library.offer())
         if self._organ is not None:
-            self._driver.keep(self._tool, self._frame_id)
+            self._driver.ensure_running(self._tool, self._frame_id)
         if "contact" in missing:
             if not self._was_missing:
                 self._stop_recording("the contact node ended")
             self._was_missing = True
         elif self._was_missing:
             self._was_missing = False
-            self._requests.parameters_of_contact((*_OF_CONTACT, *MATERIAL), self._meet_contact)
+            self._requests.parameters_of_contact(
+                (*_OF_CONTACT, *MATERIAL), self._on_contact_started
+            )
         elif self._is_to_restore and status not in (None, ContactState.STATUS_NO_MODEL):
             self._restore()
 
-    def _meet_contact(self, values: dict[str, Any]) -> None:
-        """The contact node is there, for the first time or again."""
+    def _on_contact_started(self, values: dict[str, Any]) -> None:
+        """The contact node runs, for the first time or again."""
         self._contact, self._is_to_restore = values, True
         self._view.resize_tool(self._radius())
         self._panels.show_material(self._in_force())
 
     def _note_material(self, values: dict[str, Any]) -> None:
-        """What the contact node has, also if another client chose it."""
+        """Show the material in force, even if another client chose it."""
         self._contact |= values
         self._panels.show_material(self._in_force())
 
@@ -253,7 +259,7 @@ class PlanningNode(ManagedNode):
         )
 
     def _restore(self) -> None:
-        """What was chosen here, once the contact node has an organ again."""
+        """Send what was chosen here to a restarted contact node, once it has an organ."""
         self._is_to_restore = False
         if self._scene:
             self._choose_scene(self._scene)

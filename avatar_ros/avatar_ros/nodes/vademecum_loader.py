@@ -1,4 +1,4 @@
-"""The loader: verifies a vademecum file and announces it, whole, to whoever needs it."""
+"""The loader: verifies a vademecum file and publishes its complete content."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def read_loader(node: Node) -> LoaderSettings:
 
 
 class LoaderNode(ManagedNode):
-    """Announces one vademecum at a time; a refused file leaves the one before in place."""
+    """Announces one vademecum at a time; a refused file does not replace the last one."""
 
     def __init__(self) -> None:
         self._settings: LoaderSettings | None = None
@@ -103,7 +103,7 @@ class LoaderNode(ManagedNode):
         self._outlets = {}
 
     def _load_first(self, name: str) -> None:
-        """What was loaded last, else the parameter's."""
+        """Load the saved vademecum, or else that of the parameter."""
         kept = self._state.load().get("vademecum", name)
         if kept != name:
             try:

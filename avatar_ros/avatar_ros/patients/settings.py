@@ -1,4 +1,4 @@
-"""The parameters of the patient_interpolation node, and the settings that they come to."""
+"""The parameters of the patient_interpolation node, and its settings."""
 
 from __future__ import annotations
 
@@ -14,19 +14,29 @@ WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
 
 PATIENT_INTERPOLATION = (
     AUTOSTART,
-    Parameter("atlas", "", "base of anatomies with responses (.h5), of 'avatar atlas create'"),
-    Parameter("library_dir", ".", "directory of surfaces and results; nothing outside is touched"),
+    Parameter(
+        "atlas", "", "atlas of anatomies with responses (.h5), made by 'avatar atlas create'"
+    ),
+    Parameter(
+        "library_dir",
+        ".",
+        "directory of surfaces and results; nothing outside it is read or written",
+    ),
     Parameter("max_megabytes", 256, "largest surface file or mesh that is read [MB]", (1, 1999)),
-    Parameter("vertices", 2850, "of a patient's own mesh, about", range=(100, 50_000)),
-    Parameter("modes", 100, "far-field modes at most", range=(1, 1000)),
-    Parameter("weighting", "kriging", "of the neighbours: kriging, lle-template or lle-grid"),
+    Parameter(
+        "vertices", 2850, "approximate number of vertices of a patient's mesh", range=(100, 50_000)
+    ),
+    Parameter("modes", 100, "largest number of far-field modes", range=(1, 1000)),
+    Parameter(
+        "weighting", "kriging", "weights of the neighbours: kriging, lle-template or lle-grid"
+    ),
     Parameter(
         "certify",
         -1,
-        "unseen loads of the certificate; -1: 24, or 200 of solved",
+        "unseen loads of the certificate; -1: 24, or 200 with fidelity solved",
         range=(-1, 10_000),
     ),
-    Parameter("threads", 1, "of the numerical libraries", range=(1, 64)),
+    Parameter("threads", 1, "threads of the numerical libraries", range=(1, 64)),
 )
 
 
@@ -49,7 +59,9 @@ def read_interpolation(node: Node) -> InterpolationSettings:
     """
     value = values(node, PATIENT_INTERPOLATION)
     if not value["atlas"]:
-        raise ParameterError("parameter atlas: give the file of an atlas, of 'avatar atlas create'")
+        raise ParameterError(
+            "parameter atlas: give the file of an atlas, made by 'avatar atlas create'"
+        )
     if value["weighting"] not in WEIGHTINGS:
         raise ParameterError(f"parameter weighting: give one of {', '.join(WEIGHTINGS)}")
     return InterpolationSettings(

@@ -1,4 +1,3 @@
-"""The planning page in the browser, part by part: panels, the view of the organ, the driver of
-its tool, recordings, and the requests it makes of the other nodes. It only looks on; the loop
-never waits for it.
+"""The parts of the planning page in the browser: panels, the view of the organ, the driver of its
+tool, recordings, and requests to the other nodes. The contact loop never waits for any of them.
 """

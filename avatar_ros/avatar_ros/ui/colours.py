@@ -1,4 +1,4 @@
-"""From a displacement to a colour that the colour-blind can tell apart, too."""
+"""Colours of displacements, distinguishable with colour vision deficiency."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from functools import cache
 
 import numpy as np
 
-MAP = "viridis"  # of the pictures as well; even in lightness, readable in grey
-TOPS = (1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3)  # that a scale may end on [m]
+MAP = "viridis"  # as in the pictures; perceptually uniform, readable in grey
+TOPS = (1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3)  # possible ends of the scale [m]
 
 
 @cache
 def table() -> np.ndarray:
-    """The map, shape (256, 3), from none to the top of a scale; 0 to 1."""
+    """The colour map, shape (256, 3), from zero to the end of the scale; 0 to 1."""
     from matplotlib import colormaps
 
     return np.asarray(colormaps[MAP](np.arange(256))[:, :3], np.float32)
@@ -24,7 +24,7 @@ def colours(displacement: np.ndarray, top: float) -> np.ndarray:
     Parameters
     ----------
     displacement : ndarray, shape (n, 3) [m]
-    top : magnitude of the last colour [m]
+    top : end of the scale [m]
     """
     size = np.sqrt(np.einsum("ij,ij->i", displacement, displacement))
     return table()[np.clip(size * (255.0 / top), 0, 255).astype(np.intp)]

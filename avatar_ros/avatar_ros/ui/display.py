@@ -1,7 +1,7 @@
-"""What programs that show the organ need: the newest cloud when they ask, triangles as a message.
+"""What programs that show the organ need: the newest cloud on request, triangles as a message.
 
-Nothing here is called back: a cloud that nobody looks at costs no time, so that a viewer takes
-30 of the 1,000 that come a second.
+There are no callbacks, so a cloud that is not shown costs no time: a viewer takes 30 of the 1,000
+that arrive each second.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from avatar_ros.framework.templates import (
     find_number,
 )
 
-RATE = 30.0  # as fast as eyes need [Hz]
+RATE = 30.0  # of pictures [Hz]
 
 
 class NewestCloud:
-    """Subscribes `deformation` and hands out the newest cloud, once."""
+    """Subscribes `deformation` and returns each newest cloud once."""
 
     def __init__(self, node: Node, frame_id: str, n_points: int) -> None:
         template = CloudTemplate(frame_id, n_points)
@@ -50,7 +50,7 @@ class NewestCloud:
         )
 
     def take(self) -> tuple[bytes, np.ndarray] | None:
-        """Stamp and points (n_points, 6) float32 of a cloud of this organ [m]; None without."""
+        """Stamp and points (n_points, 6) float32 [m] of a new cloud of this organ, or None."""
         with self._subscription.handle:
             taken = self._subscription.handle.take_message(PointCloud2, True)
         if taken is None or not 0 <= len(taken[0]) - self._length < POINT_BYTES:
@@ -65,7 +65,7 @@ class NewestCloud:
 
 
 class TriangleTemplate(StampedTemplate):
-    """A serialised Marker of triangles; each time only stamp, corners and colours are written.
+    """A serialised Marker of triangles, of which only stamp, corners and colours are overwritten.
 
     corners : view, shape (3 n_triangles, 3) float64 [m]
     colours : view, shape (3 n_triangles, 4) float32, red, green, blue, opacity, 0 to 1

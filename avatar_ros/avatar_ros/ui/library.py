@@ -10,7 +10,7 @@ SURFACES = (".obj", ".stl", ".ply", ".vtk", ".off")
 
 
 class Library:
-    """A folder, looked at from time to time; a file is opened once for each time it changes."""
+    """A folder that is listed from time to time; a file is opened only when it has changed."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -18,9 +18,9 @@ class Organ:
 
     vertices : ndarray, shape (n, 3) float32 [m]; faces : (m, 3)
     clamped : ndarray of bool, shape (m,)
-    centre : of the box around it [m]; size : the longest side of that [m]
+    centre : of the bounding box [m]; size : its longest side [m]
     start, normal : a point in the middle of the accessible surface [m], and the normal there
-    ranges : of the material's coordinates by the core's name: lowest, highest, in force
+    ranges : lowest, highest and present value of each coordinate of the material, by name
     """
 
     id: str
@@ -37,7 +37,7 @@ class Organ:
 
     @staticmethod
     def of(v: Vademecum) -> Organ:
-        """That of a vademecum."""
+        """The organ of a vademecum."""
         vertices = v.surface_vertices
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         j = middle_of_access(v)
@@ -70,8 +70,8 @@ class Organ:
         j = int(np.argmin(np.linalg.norm(surface.centers - point, axis=1)))
         return np.asarray(surface.normals[j] / np.linalg.norm(surface.normals[j]))
 
-    def says(self) -> str:
-        """What it is and how wrong it may be, in a line or two."""
+    def summary(self) -> str:
+        """Name, volume, material and certified errors, as Markdown."""
         info = self.vademecum.info()
         errors = (
             f"Errors certified: displacement {info.l2_mean:.1%} (worst {info.l2_worst:.1%}), "

@@ -1,4 +1,4 @@
-"""The panel of the planning page: what is chosen, what is felt, what is wrong in plain words."""
+"""The panel of the planning page: choices, forces, and warnings in plain words."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SLIDERS = {
     "poisson": ("Poisson's ratio nu [-]", 1.0),
     "contrast": ("Tumour, E inside / outside [-]", 1.0),
 }
-# Keys and where they move the tool: along patient's axes, or into the organ and out.
+# Keys and the axis along which they move the tool; None: the surface normal.
 KEYS = {
     "J": ("Tool to the patient's right", (-1.0, 0.0, 0.0)),
     "L": ("Tool to the patient's left", (1.0, 0.0, 0.0)),
@@ -41,14 +41,14 @@ KEYS = {
 
 @dataclass(frozen=True)
 class Actions:
-    """What the user may want; called in threads of the page's server."""
+    """Callbacks of the controls; called in threads of the page's server."""
 
     vademecum: Callable[[str], None]
     material: Callable[[str, float], None]
     scene: Callable[[str], None]
     build: Callable[[str, str, float], None]
     cancel: Callable[[], None]
-    nudge: Callable[[Any, float], None]  # an axis or None for the normal, and a way [m]
+    nudge: Callable[[Any, float], None]  # along an axis, None for the normal, by a distance [m]
     lift: Callable[[], None]
     record: Callable[[bool], None]
 
@@ -117,7 +117,7 @@ class Panels:
         self._actions.nudge(axis, way)
 
     def _on_slider(self, name: str, unit: float, bounds: tuple[float, float], event: Any) -> None:
-        if event.client is None:  # nobody moved it: show_material did
+        if event.client is None:  # not moved by a user, but by show_material
             return
         self._actions.material(name, float(np.clip(event.target.value * unit, *bounds)))
 
@@ -167,7 +167,7 @@ class Panels:
         )
 
     def _plot(self, what: str, height: int, *curves: Any) -> Any:
-        """Of some curves over time, still empty; its height [px]."""
+        """An empty plot of some curves over time; height [px]."""
         return self._gui.add_uplot(
             tuple(np.zeros(2) for _ in range(1 + len(curves))),
             (uplot.Series(label="time [s]"), *curves),
@@ -178,15 +178,15 @@ class Panels:
             padding=_PADDING,
         )
 
-    # --- What others have to say -------------------------------------------------------------
+    # --- What the node shows -----------------------------------------------------------------
 
     def offer(self, files: list[str], surfaces: list[str]) -> None:
-        """What the library holds."""
+        """Offer the files of the library."""
         _set_options(self._files, files)
         _set_options(self._surfaces, surfaces)
 
     def offer_scenes(self, texts: dict[str, str]) -> None:
-        """Scenes by name, with what they say of themselves and their effects."""
+        """Offer scenes by name, with their descriptions."""
         self._scene_texts = texts
         _set_options(self._scenes, list(texts))
         self._describe_scene()
@@ -195,8 +195,8 @@ class Panels:
         self._scene_text.content = self._scene_texts.get(self._scenes.value, "")
 
     def show_organ(self, organ: Organ) -> None:
-        """Name, certificate, and a slider for each coordinate that the file has."""
-        self._about.content = organ.says()
+        """Show name and certificate, and a slider for each coordinate of the vademecum."""
+        self._about.content = organ.summary()
         for slider in self._sliders.values():
             slider.remove()
         self._sliders = {}
@@ -214,7 +214,7 @@ class Panels:
                 self._sliders[name] = slider
 
     def show_material(self, values: dict[str, float]) -> None:
-        """What is in force, by coordinate [SI]; those of the sliders that there are."""
+        """Set the sliders to the values in force, by coordinate [SI]."""
         for name, value in values.items():
             if name in self._sliders:
                 slider = self._sliders[name]
@@ -222,38 +222,38 @@ class Panels:
                 slider.value = round(shown, 6)
 
     def show_scale(self, top: float) -> None:
-        """The colour bar up to a displacement [m]."""
+        """Show the colour bar up to a displacement [m]."""
         content = colour_bar(top)
         if self._bar.content != content:
             self._bar.content = content
 
     def show_force(self, now: float, force: float, error: float) -> None:
-        """A point of the live plot [s, N]; five times a second are enough."""
+        """Add a point to the plot of the force [s, N]; five per second are enough."""
         self._times.append(now)
         self._forces.append((force, error))
         values = np.array(self._forces)
         self._force_plot.data = (np.array(self._times), values[:, 0].copy(), values[:, 1].copy())
 
     def show_loop(self, now: float, step: float, missed: float) -> None:
-        """Of the last second: 99 of 100 steps took less [s], periods missed."""
+        """Plot the 99th percentile of step times [s] and the missed periods of the last second."""
         self._loop.append((now, 1e3 * step, missed))
         values = np.array(self._loop)
         self._step_plot.data = (values[:, 0].copy(), values[:, 1].copy())
         self._missed_plot.data = (values[:, 0].copy(), values[:, 2].copy())
 
     def show_progress(self, stage: str, fraction: float, error: float) -> None:
-        """Of a patient that is built."""
+        """Show how far the build of a patient is."""
         known = "" if np.isnan(error) else f", error {error:.1%}"
         self.stage.content = f"{stage}: {fraction:.0%}{known}"
         self._progress.value = float(np.clip(100.0 * fraction, 0.0, 100.0))
 
     def show_recording(self, is_on: bool) -> None:
-        """The button says what it does."""
+        """Label the button with what it does next."""
         self._recording.label = "Stop and save" if is_on else "Record"
 
 
 def colour_bar(top: float) -> str:
-    """The colours with their displacements, as HTML."""
+    """The colour bar with its displacements, as HTML."""
     shades = [f"rgb({r},{g},{b})" for r, g, b in band_shades().tolist()]
     stops = ", ".join(
         f"{shade} {100 * i / N_BANDS:g}% {100 * (i + 1) / N_BANDS:g}%"

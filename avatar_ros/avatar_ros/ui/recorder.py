@@ -1,4 +1,4 @@
-"""Keeps what the tool does and feels, and how the organ looks, until it is saved."""
+"""Records poses, forces and clouds of a session at the planning page."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def scene_in_force(
     cloud: Cloud = "surface",
     cloud_divisor: int = 1,
 ) -> Scene:
-    """The scene that does what runs now, its material included: for one tool.
+    """The scene of one tool that reproduces what runs now, including its material.
 
-    chosen : None for the natural effects of the vademecum, with the other three
-    material : values by coordinate that go before those of the scene
+    chosen : None for the natural effects of the vademecum, with tip_radius and cloud as given
+    material : values by coordinate, which override those of the scene
     """
     scene = chosen or Scene(
         name="natural effects",
@@ -51,9 +51,9 @@ def scene_in_force(
 
 
 class Recorder:
-    """One recording at a time, from ``open`` over ``begin`` to ``save``.
+    """One recording at a time: ``open``, ``begin``, ``save``.
 
-    is_on : periods are kept
+    is_on : periods are being recorded
     """
 
     def __init__(self, state: SharedToolState) -> None:
@@ -69,11 +69,11 @@ class Recorder:
 
     @property
     def n_periods(self) -> int:
-        """Kept so far."""
+        """Periods recorded so far."""
         return int(self._state.live["n_rows"][0]) - max(self._begin, 0)
 
     def open(self, vademecum: Vademecum, scene: Scene, rate: float) -> str:
-        """Keep periods from now on, before a new model comes; returns the scene's text."""
+        """Record from now on, before the new model is in use; returns the scene's text."""
         text = write_scene(scene)
         self._about = (vademecum.id, vademecum.name, text, rate)
         self._clouds, self._after, self._begin = [], [], -1
@@ -82,23 +82,23 @@ class Recorder:
         return text
 
     def begin(self) -> None:
-        """The new model is in use: what was kept before does not count."""
+        """The new model is in use: discard what was recorded before."""
         self._begin = int(self._state.live["n_rows"][0])
 
     def note_cloud(self, displacement: np.ndarray) -> None:
-        """A cloud that was shown, (n_points, 3) [m]."""
+        """Record a cloud that was shown, (n_points, 3) [m]."""
         n = int(self._state.live["n_rows"][0])
         if self._begin >= 0 and n > self._begin:
             self._clouds.append(displacement.astype(np.float32))
             self._after.append(int(self._state.rows["number"][n - 1]))
 
     def drop(self) -> None:
-        """Keep nothing."""
+        """Stop and discard the recording."""
         self._state.live["recording"][0] = 0
         self._begin = -1
 
     def save(self, folder: Path) -> tuple[Path, Recording] | None:
-        """Stop and write a file named by the time; None if nothing was kept.
+        """Stop and write a file named by the time; None if nothing was recorded.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class Recorder:
 
 
 def _periods(rows: np.ndarray) -> Periods:
-    """Of one tool."""
+    """The recorded periods of one tool."""
     return Periods(
         number=rows["number"].copy(),
         stamp=rows["stamp"].copy(),

@@ -1,6 +1,7 @@
-"""What the planning page asks of the other nodes; answers come as a line of text.
+"""Requests of the planning page to the other nodes.
 
-Every request returns at once and says in one line what came of it, also that a node is not there.
+Every method returns at once; it reports the outcome in one line of text, also when the node does
+not run.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from avatar_ros.action import BuildPatient
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.srv import LoadScene, LoadVademecum
 
-# How to start what is not there.
+# How to start a node that does not run.
 START = {
     "contact": "the contact node is not running, so there is no force: "
     "start it with `ros2 run avatar_ros contact`",
@@ -29,7 +30,7 @@ START = {
 }
 _PARAMETERS = {name: key for key, name in MATERIAL.items()}  # of the contact node, by coordinate
 
-Say = Callable[[str], None]
+Report = Callable[[str], None]
 Progress = Callable[[str, float, float], None]
 
 
@@ -47,12 +48,12 @@ class Requests:
         self._setting = False
 
     def close(self) -> None:
-        """Give back what the middleware keeps for the action."""
+        """Release what the middleware holds for the action."""
         self._build.destroy()
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Nodes whose services are not there."""
+        """Names of the nodes whose services are not available."""
         ready = {
             "vademecum_loader": self._load_vademecum.service_is_ready(),
             "contact": self._load_scene.service_is_ready(),
@@ -60,41 +61,45 @@ class Requests:
         }
         return tuple(name for name, is_ready in ready.items() if not is_ready)
 
-    def load_vademecum(self, name: str, say: Say) -> None:
+    def load_vademecum(self, name: str, report: Report) -> None:
         """Have the loader announce a file of its library."""
         if not self._load_vademecum.service_is_ready():
-            say(START["vademecum_loader"])
+            report(START["vademecum_loader"])
             return
-        say(f"loading {name} ...")
+        report(f"loading {name} ...")
         future = self._load_vademecum.call_async(LoadVademecum.Request(name=name))
-        future.add_done_callback(lambda done: say(_outcome(done, f"{name} loaded")))
+        future.add_done_callback(lambda done: report(_outcome(done, f"{name} loaded")))
 
     def load_scene(
-        self, name: str, say: Say, yaml: str = "", then: Callable[[bool], None] = lambda _: None
+        self,
+        name: str,
+        report: Report,
+        yaml: str = "",
+        then: Callable[[bool], None] = lambda _: None,
     ) -> None:
-        """Switch the scene, by name or by its text; ``then`` is told whether it was."""
+        """Switch the scene, by name or by its text; calls ``then`` with the success."""
         if not self._load_scene.service_is_ready():
-            say(START["contact"])
+            report(START["contact"])
             then(False)
             return
-        say(f"switching to {name}; effects that never ran here take half a minute ...")
+        report(f"switching to {name}; effects that never ran here take half a minute ...")
         request = LoadScene.Request(yaml=yaml) if yaml else LoadScene.Request(name=name)
 
         def answered(done: Any) -> None:
             answer = done.result()
             effects = ", ".join(answer.effects) if answer is not None else ""
-            say(_outcome(done, f"{name} runs, with {effects or 'no effects'}"))
+            report(_outcome(done, f"{name} runs, with {effects or 'no effects'}"))
             then(answer is not None and answer.success)
 
         self._load_scene.call_async(request).add_done_callback(answered)
 
-    def set_material(self, values: dict[str, float], say: Say) -> None:
-        """Values by coordinate, the newest only while an earlier one is on its way."""
+    def set_material(self, values: dict[str, float], report: Report) -> None:
+        """Set values by coordinate; while a request is pending, only the newest are kept."""
         self._waiting |= values
         if self._setting or not self._waiting:
             return
         if not self._set.service_is_ready():
-            say(START["contact"])
+            report(START["contact"])
             return
         chosen, self._waiting, self._setting = self._waiting, {}, True
         parameters = [_double(_PARAMETERS[name], value) for name, value in chosen.items()]
@@ -103,8 +108,8 @@ class Requests:
             self._setting = False
             results = done.result().results if done.result() is not None else []
             refusals = [result.reason for result in results if not result.successful]
-            say("; ".join(refusals) if refusals else "")
-            self.set_material({}, say)
+            report("; ".join(refusals) if refusals else "")
+            self.set_material({}, report)
 
         request = SetParameters.Request(parameters=parameters)
         self._set.call_async(request).add_done_callback(answered)
@@ -112,7 +117,7 @@ class Requests:
     def parameters_of_contact(
         self, names: Sequence[str], then: Callable[[dict[str, Any]], None]
     ) -> None:
-        """Values of parameters of the contact node; nothing happens where it is not there."""
+        """Call ``then`` with parameters of the contact node, if it runs."""
         if not self._get.service_is_ready():
             return
 
@@ -129,12 +134,12 @@ class Requests:
         fidelity: str,
         tolerance: float,
         progress: Progress,
-        say: Say,
+        report: Report,
         then: Callable[[str], None],
     ) -> None:
-        """Build a patient; ``then`` gets the name of the file, empty if there is none."""
+        """Build a patient; calls ``then`` with the file's name, empty if there is none."""
         if not self._build.server_is_ready():
-            say(START["patient_interpolation"])
+            report(START["patient_interpolation"])
             then("")
             return
         goal = BuildPatient.Goal(surface=surface, fidelity=fidelity, tolerance=tolerance)
@@ -147,7 +152,7 @@ class Requests:
             self._goal = None
             result = done.result().result
             for_all = f"{result.file} built in {result.seconds:.0f} s"
-            say(for_all if result.success else result.message)
+            report(for_all if result.success else result.message)
             then(result.file if result.success else "")
 
         def accepted(done: Any) -> None:
@@ -157,7 +162,7 @@ class Requests:
         self._build.send_goal_async(goal, note).add_done_callback(accepted)
 
     def cancel_patient(self) -> None:
-        """Stop building, if something is built."""
+        """Cancel the build that is under way, if any."""
         if self._goal is not None:
             self._goal.cancel_goal_async()
 

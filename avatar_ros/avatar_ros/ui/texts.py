@@ -1,4 +1,4 @@
-"""What the planning page says of the cell's state, in plain words."""
+"""Texts of the planning page about the state of the cell."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NO_ORGAN = "no organ yet: choose a vademecum under Organ"
 
 
 def warnings(missing: Sequence[str], has_organ: bool, status: int | None) -> str:
-    """All that keeps the page from working, as Markdown; one line if nothing does.
+    """Everything that keeps the page from working, as Markdown; one line if nothing does.
 
     status : of the last ContactState; None if none came lately
     """
@@ -26,12 +26,12 @@ def warnings(missing: Sequence[str], has_organ: bool, status: int | None) -> str
         lines.append(explanation(status))
     if not lines:
         engaging = status == ContactState.STATUS_ENGAGING
-        return "**All nodes answer.**" + (" The force comes back softly." if engaging else "")
+        return "**All nodes answer.**" + (" The force is being faded in." if engaging else "")
     return "\n\n".join(f"⚠ {line[0].upper()}{line[1:]}." for line in lines)
 
 
 def frame_text(force: float, error: float, largest: float, n_kept: int | None) -> str:
-    """Force and how wrong it may be [N], largest displacement [m]; periods recorded, or None."""
+    """Force and its error [N], largest displacement [m], recorded periods or None, as Markdown."""
     recorded = "" if n_kept is None else f"; recording, {n_kept} periods"
     return (
         f"Force **{force:.2f} N** ± {error:.2f} N, largest displacement "
@@ -40,7 +40,7 @@ def frame_text(force: float, error: float, largest: float, n_kept: int | None) -
 
 
 def scene_texts() -> dict[str, str]:
-    """What each shipped scene for one tool says of itself, with its effects, as Markdown."""
+    """The descriptions of the shipped scenes for one tool, with their effects, as Markdown."""
     texts = {}
     for name, path in shipped_scenes().items():
         scene = read_scene(path)

@@ -1,10 +1,10 @@
-"""Moves the tool of the planning page: 1,000 poses a second towards where the mouse dragged it.
+"""Drives the tool of the planning page: 1,000 poses a second towards the target of the mouse.
 
-A process of its own, since a page is served in bursts. Every state that the contact node answers is
-noted, and on request kept, with the pose that the step used.
+It is a process of its own, because the page is served in bursts. It reads every state that the
+contact node answers, and on request records it with the pose that the step used.
 
 Run as ``python -m avatar_ros.ui.tool_driver TOOL FRAME`` by ``planning_ui``, never by hand; the
-memory that both share comes as standard input.
+shared memory comes as standard input.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from avatar_ros.msg import ContactState
 from avatar_ros.ui.tool_state import N_ROWS, SharedToolState
 
 PERIOD = 1_000_000  # [ns]
-_SHARE = 0.04  # of the way to the target that is left, in a period: 25 ms behind the mouse
-_FASTEST = 0.5e-3  # a period [m]
-_N_SENT = 4096  # poses that a state may answer
-_LATE = 20 * PERIOD  # from which the rhythm starts anew
-# A state of one of these had the pose of its stamp, one of INVALID_POSE none, others far away.
+_APPROACH = 0.04  # part of the remaining distance moved in a period: lags the mouse by 25 ms
+_MAX_STEP = 0.5e-3  # in a period [m]
+_N_SENT = 4096  # recent poses, one of which a state answers
+_LATE = 20 * PERIOD  # delay from which missed poses are skipped
+# With these, the step used the pose of the stamp; with INVALID_POSE none; with others FAR_AWAY.
 _PLACED = frozenset(
     int(status)
     for status in (
@@ -45,12 +45,12 @@ _PLACED = frozenset(
         ContactState.STATUS_ENGAGING,
     )
 )
-# Read deeper than what is sent: a period that was lost cannot be replayed.
+# Deeper than the publisher's queue: a recording that lost a period cannot be replayed.
 _STATES = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class ToolDriver:
-    """Publishes the tool's poses and listens to what is answered."""
+    """Publishes the tool's poses and reads the answers."""
 
     def __init__(self, node: Any, tool: str, frame_id: str, state: SharedToolState) -> None:
         self._tool = tool
@@ -70,7 +70,7 @@ class ToolDriver:
         self._first = 0  # stamp of pose 0 [ns]
 
     def run(self, stop: StopSignal) -> None:
-        """Until the signal."""
+        """Run until the signal comes."""
         offset = time.time_ns() - time.monotonic_ns()
         tick = time.monotonic_ns() + PERIOD
         self._first = tick + offset
@@ -84,17 +84,17 @@ class ToolDriver:
             self._live["tip"][0] = self._tip
             self._live["n_poses"][0] += 1
             while (taken := self._states.handle.take_message(ContactState, True)) is not None:
-                self._note(deserialize_message(taken[0], ContactState), taken[1])
+                self._read(deserialize_message(taken[0], ContactState), taken[1])
             behind = time.monotonic_ns() - tick
             tick += PERIOD * (1 + (behind // PERIOD if behind > _LATE else 0))
 
     def _move(self) -> None:
         way = self._live["target"][0] - self._tip
-        step = _SHARE * way
+        step = _APPROACH * way
         length = float(np.sqrt(step @ step))
-        self._tip += step if length <= _FASTEST else step * (_FASTEST / length)
+        self._tip += step if length <= _MAX_STEP else step * (_MAX_STEP / length)
 
-    def _note(self, state: Any, info: Any) -> None:
+    def _read(self, state: Any, info: Any) -> None:
         if state.tool != self._tool:
             return
         live = self._live
@@ -117,7 +117,7 @@ class ToolDriver:
             live["n_rows"][0] = n + 1
 
     def _used(self, status: int, stamp: int) -> Any:
-        """Where the tip was for the step [m]."""
+        """Position of the tip that the step used [m]."""
         if status == ContactState.STATUS_INVALID_POSE:
             return np.nan
         if status not in _PLACED:

@@ -1,8 +1,8 @@
-"""The process that moves the tool of the planning page, and the memory both have in common.
+"""The process that drives the tool of the planning page, and the memory it shares with the node.
 
-One side writes each field, the other reads it: where the tool is wanted and whether to record go
-to the hand; where it is, what it feels, and the recorded periods come back. The last row that
-counts is said after it was written.
+Each field is written by one side and read by the other: the node writes the target and whether to
+record, the driver writes the tool's state and the recorded periods. The driver increases the
+number of rows after it has written a row.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ N_ROWS = SECONDS * 1000
 
 LIVE = np.dtype(
     [
-        ("target", np.float64, 3),  # to the hand: centre of the tip [m]
+        ("target", np.float64, 3),  # from the node: centre of the tip [m]
         ("recording", np.int64),
-        ("tip", np.float64, 3),  # from the hand: as sent last [m]
-        ("force", np.float64, 3),  # as sent by the contact node: its share of what was computed [N]
+        ("tip", np.float64, 3),  # from the driver: as sent last [m]
+        ("force", np.float64, 3),  # as sent by the contact node [N]
         ("error", np.float64),  # [N]
         ("sent_fraction", np.float64),
         ("status", np.int64),  # of avatar_ros/msg/ContactState
@@ -52,7 +52,7 @@ ROW = np.dtype(
 
 
 class SharedToolState:
-    """The memory as two arrays, ``live`` of one entry and ``rows``; pages are there when used."""
+    """The shared memory as two arrays: ``live``, of one entry, and the recorded ``rows``."""
 
     def __init__(self, handle: int) -> None:
         self.handle = handle
@@ -66,10 +66,10 @@ class SharedToolState:
     @staticmethod
     def make() -> SharedToolState:
         """New memory, all zero."""
-        return SharedToolState(os.memfd_create("avatar-hand", os.MFD_CLOEXEC))
+        return SharedToolState(os.memfd_create("avatar-tool", os.MFD_CLOEXEC))
 
     def recorded(self, begin: int = 0) -> np.ndarray:
-        """A copy of the rows that count, from one on."""
+        """A copy of the recorded rows from ``begin`` on."""
         return self.rows[begin : int(self.live["n_rows"][0])].copy()
 
 
@@ -80,8 +80,8 @@ class ToolDriverProcess:
         self._state = state
         self._process: ModuleProcess | None = None
 
-    def keep(self, tool: str, frame_id: str) -> None:
-        """Start it, if it does not run; the memory says where the tool is."""
+    def ensure_running(self, tool: str, frame_id: str) -> None:
+        """Start the driver unless it runs; it continues from the target in the shared memory."""
         if self._process is not None and self._process.poll() is None:
             return
         self._process = ModuleProcess(
@@ -93,7 +93,7 @@ class ToolDriverProcess:
         )
 
     def end(self) -> None:
-        """Returns when it has ended."""
+        """End the driver; returns when it has ended."""
         if self._process is not None:
             self._process.send_signal(signal.SIGINT)
             self._process.wait()

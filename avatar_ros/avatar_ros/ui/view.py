@@ -12,15 +12,15 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_ros.ui.colours import table, top_for
 from avatar_ros.ui.organ import Organ
 
-N_BANDS = 10  # of the colour scale: the client has one colour for each mesh
+N_BANDS = 10  # of the colour scale; a mesh has a single colour
 CLAMP = (90, 90, 90)
-TUMOUR = (213, 94, 0)  # vermilion and blue of Okabe and Ito, which the colour-blind tell apart
+TUMOUR = (213, 94, 0)  # vermilion and blue of Okabe and Ito, distinguishable for all
 TOOL = (0, 114, 178)
 ARROW = (213, 94, 0)
-FORCE_SCALE = 0.004  # length of the arrow [m/N], up to
-LONGEST = 0.06  # [m]
-_NO_FACE = np.zeros((1, 3), np.uint32)  # of a band without faces: a mesh cannot be empty
-_VIEW = 0.5  # of the view along the normal, the rest from the side: a drag presses
+FORCE_SCALE = 0.004  # length of the arrow per force [m/N]
+MAX_ARROW = 0.06  # [m]
+_NO_FACE = np.zeros((1, 3), np.uint32)  # of a band without faces; a mesh must not be empty
+_VIEW = 0.5  # part of the view along the normal; the rest is from the side
 _DISTANCE = 1.8  # of the camera, in lengths of the organ
 
 
@@ -60,14 +60,14 @@ class OrganView:
         server.scene.add_light_ambient("/light", intensity=1.2)  # the first colours are dark
 
     def show(self, organ: Organ, tumour: SurfaceMesh | None, tip_radius: float) -> None:
-        """Another organ, at rest."""
+        """Show another organ, at rest."""
         scene, first = self._server.scene, self._organ is None
         self._organ, self.top = organ, top_for(0.0)
         clamp = organ.faces[organ.clamped]
-        # beside the moving surface, a hair outside, so that it is seen
+        # slightly outside the moving surface, so that it is visible
         lifted = organ.centre + 1.003 * (organ.vertices - organ.centre)
         scene.add_mesh_simple("/clamp", lifted, clamp, color=CLAMP, side="double")
-        seen_through = tumour is not None
+        is_transparent = tumour is not None
         self._bands = [
             scene.add_mesh_simple(
                 f"/organ/{i}",
@@ -75,7 +75,7 @@ class OrganView:
                 _NO_FACE if i else organ.faces,
                 color=tuple(shade),
                 side="double",
-                opacity=0.55 if seen_through else None,
+                opacity=0.55 if is_transparent else None,
                 cast_shadow=False,
             )
             for i, shade in enumerate(band_shades().tolist())
@@ -112,16 +112,16 @@ class OrganView:
         camera.position, camera.look_at, camera.fov = camera_of(organ)
 
     def _dragged(self, event: Any) -> None:
-        way = np.array(event.end_position) - np.array(event.start_position)  # as it is shown
+        way = np.array(event.end_position) - np.array(event.start_position)
         self._on_drag(np.array(self._tool.position) + way)
 
     def resize_tool(self, radius: float) -> None:
-        """Another tip [m]."""
+        """Change the radius of the tip [m]."""
         if self._tool is not None:
             self._tool.radius = radius
 
     def move(self, points: np.ndarray) -> float:
-        """The surface as a cloud says, (n, 6) [m]; returns the largest displacement [m]."""
+        """Move the surface as in a cloud, (n, 6) [m]; returns the largest displacement [m]."""
         organ = self._organ
         if organ is None or len(points) != len(organ.vertices):
             return 0.0
@@ -134,20 +134,20 @@ class OrganView:
             for i, mesh in enumerate(self._bands):
                 faces = organ.faces[band == i]
                 if len(faces) == 0 and len(mesh.faces) == 1:
-                    continue  # was empty, is empty
+                    continue  # still empty
                 mesh.vertices = np.ascontiguousarray(points[:, :3])
                 mesh.faces = faces.astype(np.uint32) if len(faces) else _NO_FACE
         return largest
 
     def place_tool(self, tip: np.ndarray, force: np.ndarray) -> None:
-        """Where the tool is [m], and what it feels [N]."""
+        """Show the tool at its tip [m], with the force on it [N]."""
         if self._tool is None:
             return
         with self._server.atomic():
             self._tool.position = tuple(tip)
             size = float(np.linalg.norm(force))
             if size > 1e-3:
-                length = min(FORCE_SCALE * size, LONGEST)
+                length = min(FORCE_SCALE * size, MAX_ARROW)
                 self._arrow.points = np.stack([tip, tip + force * (length / size)])[None]
             if self._arrow.visible != (size > 1e-3):
                 self._arrow.visible = size > 1e-3
