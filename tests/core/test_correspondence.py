@@ -213,9 +213,7 @@ def test_a_shrunken_target_is_refused_with_the_unit_as_remedy(template):
 def test_what_does_not_converge_says_so(template, phantom, warped):
     """A tolerance out of reach, and an alignment cut off after one step."""
     target = replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT)
-    found = register(
-        template, target, RegistrationRule(tolerance=1e-6, n_stages=3)
-    )
+    found = register(template, target, RegistrationRule(tolerance=1e-6, n_stages=3))
     assert not found.converged and warped.converged and warped.notices == ()
     assert "not converged" in found.notices[0]
     sampled = sample_target(target, 4000)

@@ -63,11 +63,11 @@ class Quality:
         latched = own.durability == DurabilityPolicy.TRANSIENT_LOCAL
         kinds = (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT)[: 1 if latched else 2]
         if given.reliability not in kinds:
-            why = "who needs this file needs all of it; " if latched else ""
+            why = "a subscriber needs all of it; " if latched else ""
             return f"reliability: {why}give {' or '.join(kind.name.lower() for kind in kinds)}"
         if given.durability != own.durability:
             late = "needs the newest" if latched else "must not get an old one"
-            return f"durability: who comes late {late}; give {own.durability.name.lower()}"
+            return f"durability: a late joiner {late}; give {own.durability.name.lower()}"
         if not fewest <= given.depth <= most:
             numbers = (
                 f"{fewest} to {most}" if most > fewest else f"{fewest}, as only the newest counts"

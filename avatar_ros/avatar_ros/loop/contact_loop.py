@@ -225,7 +225,7 @@ class ContactLoop:
             stamp = self._tools[0].stamp
             self._publishers.deformation.handle.publish_raw(active.cloud.serialise(stamp))
         if self._blend == 1.0:
-            self._outgoing = None  # whoever exchanged the model frees it, outside the loop
+            self._outgoing = None  # freed outside the loop, by the thread that exchanged the model
 
     def _begin_change(self, active: ActiveModel) -> None:
         """Begin to fade in another model, from the same contacts if the organ is the same.

@@ -12,7 +12,7 @@ from avatar_ros.prepare.supplier import SUPERSEDED, Answer
 
 
 class BudgetRequests:
-    """Has the detail chosen anew for each budget; if one cannot be met, the last stays in force.
+    """Has the detail chosen for each new budget; if it cannot be met, the last stays in force.
 
     A new budget is compared with the one requested last, not with the one in force: it takes some
     tenths of a second from one to the other, in which a budget may be withdrawn. Answers come in

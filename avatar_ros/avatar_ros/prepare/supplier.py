@@ -156,7 +156,7 @@ class ModelSupplier:
                     self._conclude(number, {}, None, reason)
 
     def _use(self, ready: ModelReady, handle: int) -> bool:
-        """Have a model put into use; false if that failed: the node goes on with what it has."""
+        """Have a model put into use; false if that failed and the last one stays."""
         try:
             model = ready.map(handle)
             self._on_model(model)

@@ -84,7 +84,7 @@ class ModelPreparer:
             try:
                 vademecum = _verified(message.id, bytes(message.data), self._reader)
                 sent = self._prepare(vademecum, self._request, 0, {})
-            except Exception as error:  # whatever a foreign file provokes, the worker goes on
+            except Exception as error:  # whatever an untrusted file provokes
                 name = message.name[:_MAX_NAME]
                 self._send(Refused(0, f"vademecum {name!r} refused: {one_line(error)}"))
                 return

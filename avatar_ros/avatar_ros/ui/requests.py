@@ -145,8 +145,8 @@ class Requests:
         goal = BuildPatient.Goal(surface=surface, fidelity=fidelity, tolerance=tolerance)
 
         def note(message: Any) -> None:
-            told = message.feedback
-            progress(told.stage, told.fraction, told.error)
+            stage = message.feedback
+            progress(stage.stage, stage.fraction, stage.error)
 
         def finished(done: Any) -> None:
             self._goal = None
