@@ -103,7 +103,7 @@ def test_the_contact_node_is_managed(own_domain: dict[str, str], probe: Any) -> 
         ("contact", ["tools:=[a b]"], "topic's name"),
         ("contact", ["cloud:=fog"], "surface, volume, off"),
         ("contact", ["frame_id:=''"], "frame_id"),
-        ("contact", ["scene:=nowhere"], "there are breathing"),
+        ("contact", ["scene:=nowhere"], "come with avatar: breathing"),
         ("contact", ["scene:=/nowhere.yaml"], "No such file"),
         ("contact", ["scene:=two_tools"], "set the parameter tools"),
         ("vademecum_loader", ["library_dir:=/nowhere"], "not a directory"),
