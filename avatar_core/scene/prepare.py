@@ -1,6 +1,6 @@
 """From a vademecum and a scene to a contact model, as exact as a budget allows.
 
-``vademecum, scene -> specify -> ModelSpec -> prepare -> ContactModel``
+``vademecum, scene -> scene_spec -> ModelSpec -> layout -> ContactModel``
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from avatar_core.contact.effects import Effect
+from avatar_core.contact.effects import Effect, Tumour
 from avatar_core.contact.effects.selection import default_effects
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
 from avatar_core.contact.model import ContactModel, make_model
@@ -41,6 +41,11 @@ class ModelSpec:
         return Detail(self.modes or self.vademecum.far.rank, self.cloud)
 
     @property
+    def effect_names(self) -> tuple[str, ...]:
+        """Of the effects, in their order."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
     def curve(self) -> AccuracyCurve | None:
         """Errors of all details of this cloud, as certified; None if they were not measured."""
         certificate = self.vademecum.certificate
@@ -69,10 +74,25 @@ class ModelSpec:
         return lay_out(self.vademecum, self.tip_radii, detail, self.effects, period)
 
 
-def specify(
-    vademecum: Vademecum, scene: Scene | None, values: Mapping[str, float] | None = None
+def default_spec(
+    vademecum: Vademecum,
+    tip_radii: tuple[float, ...] = (5e-3,),
+    modes: int | None = None,
+    cloud: Cloud = "surface",
+    values: Mapping[str, float] | None = None,
 ) -> ModelSpec:
-    """What a scene makes of a vademecum; without one, one tool and the default effects.
+    """Without a scene: the default effects of the vademecum and the number of tools.
+
+    values : of the material, by coordinate
+    """
+    chosen = at_values(vademecum, values or {})
+    return ModelSpec(chosen, tip_radii, modes, cloud, default_effects(chosen, len(tip_radii)))
+
+
+def scene_spec(
+    vademecum: Vademecum, scene: Scene, values: Mapping[str, float] | None = None
+) -> ModelSpec:
+    """What a scene makes of a vademecum.
 
     values : of the material, by coordinate; they override those of the scene
 
@@ -81,11 +101,12 @@ def specify(
     AvatarError
         What the vademecum cannot serve, with the remedy.
     """
-    if scene is None:
-        chosen = at_values(vademecum, values or {})
-        return ModelSpec(chosen, (5e-3,), None, "surface", default_effects(chosen, 1))
+    given = dict(values or {})
+    if "contrast" in given:
+        others = [effect for effect in scene.effects if effect.name != Tumour.name]
+        scene = replace(scene, effects=(*others, Tumour(given.pop("contrast"))))
     scene.require(vademecum)
-    chosen = at_values(vademecum, {**scene.values, **(values or {})})
+    chosen = at_values(vademecum, scene.values | given)
     radii = tuple(tool.tip_radius for tool in scene.tools)
     return ModelSpec(chosen, radii, scene.modes, scene.cloud, scene.effects)
 
@@ -111,6 +132,6 @@ def prepare(
     AvatarError
         What the vademecum cannot serve, or a budget that no detail meets, with the nearest two.
     """
-    spec = specify(vademecum, scene)
+    spec = scene_spec(vademecum, scene) if scene else default_spec(vademecum)
     detail = choose(spec.timed_curve(period), budget).detail if budget else spec.finest
     return make_model(spec.layout(detail, period))

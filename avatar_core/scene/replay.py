@@ -25,7 +25,7 @@ from avatar_core.contact.model import Status, make_model
 from avatar_core.errors import StorageError
 from avatar_core.scene.file import parse_scene
 from avatar_core.scene.model import Scene
-from avatar_core.scene.prepare import specify
+from avatar_core.scene.prepare import scene_spec
 from avatar_core.scene.recording import Periods, Recording
 from avatar_core.vademecum.model import Vademecum
 
@@ -75,7 +75,7 @@ def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
             f"the recording has {periods.tip.shape[1]} tools, its scene {len(scene.tools)}; "
             "record again"
         )
-    spec = specify(vademecum, replace(scene, cloud="off"))
+    spec = scene_spec(vademecum, replace(scene, cloud="off"))
     model = make_model(spec.layout(spec.finest, 1.0 / recording.rate), halves=True)
     force = np.empty(periods.force.shape)
     friction = model.effects.friction

@@ -63,7 +63,7 @@ def press(model: Any, vademecum: Vademecum) -> Sequence[float]:
 def test_the_lines_of_the_readme_give_the_numbers_beside_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each ``# -> number`` is what its line prints, to 10 %: meshes differ from run to run."""
+    """Each ``# -> number`` is what its line prints, to 10 %, on the recorded mesh."""
     block = re.search(r"<!-- python-example -->\n```python\n(.*?)```", README.read_text(), re.S)
     assert block is not None
     code = block[1]

@@ -18,8 +18,8 @@ from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
 from avatar_ros.nodes.contact_reports import log_shown_modes
 from avatar_ros.prepare.budget_requests import BudgetRequests
 from avatar_ros.prepare.detail_chooser import DetailChooser
-from avatar_ros.prepare.model_spec import model_spec
 from avatar_ros.prepare.requests import Change, PreparationRequest
+from avatar_ros.prepare.scenes import model_spec
 from avatar_ros.prepare.supplier import Answer
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue

@@ -13,7 +13,7 @@ from avatar_core.contact.layout import PERIOD
 from avatar_core.contact.model import ContactModel, make_model, step
 from avatar_core.contact.tool_path import push_and_slide, starts_apart
 from avatar_core.scene.model import Scene
-from avatar_core.scene.prepare import specify
+from avatar_core.scene.prepare import scene_spec
 from avatar_core.studies.bench.methods import PASSES, one_pass
 from avatar_core.vademecum.model import Vademecum
 
@@ -106,7 +106,7 @@ class _Prepared:
 
 def _prepared(vademecum: Vademecum, scene: Scene, name: str) -> _Prepared:
     start = time.perf_counter()
-    spec = specify(vademecum, scene)
+    spec = scene_spec(vademecum, scene)
     layout = spec.layout(spec.finest, PERIOD)
     laid_out = time.perf_counter()
     model = make_model(layout)

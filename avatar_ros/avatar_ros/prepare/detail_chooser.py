@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from avatar_core.contact.model import ContactModel
+    from avatar_core.scene.prepare import ModelSpec
     from avatar_core.vademecum.accuracy import AccuracyCurve, Detail
-    from avatar_ros.prepare.model_spec import ModelSpec
     from avatar_ros.prepare.requests import PreparationRequest
 
 
@@ -38,29 +38,14 @@ class DetailChooser:
         AccuracyError
             No detail meets the budget (with the two nearest), or the vademecum was never measured.
         """
-        from avatar_core.contact.timing import timed
-        from avatar_core.errors import AccuracyError
-        from avatar_core.vademecum.accuracy import Budget, Detail, choose
+        from avatar_core.vademecum.accuracy import Budget, choose
 
         self._keep_for(spec)
-        most = spec.modes or spec.vademecum.far.rank
         if not request.budget:
-            return Detail(most, spec.cloud)
-        curve = _curve_of(spec)
-        if curve is None:
-            raise AccuracyError(
-                "this vademecum has no accuracy curve for a budget to choose from; build it again "
-                "with this version of 'avatar vademecum', or leave accuracy.* at 0"
-            )
+            return spec.finest
         if self._timed is None:
-            # single precision shows nothing that 16 bits do not, and is slower
-            usual = replace(
-                curve, points=tuple(p for p in curve.points if p.detail.precision != "float32")
-            )
-            self._timed = timed(
-                spec.vademecum, usual, spec.tip_radii, spec.effects, request.period, halves=True
-            )
-        some = tuple(p for p in self._timed.points if p.detail.modes <= most)
+            self._timed = spec.timed_curve(request.period, halves=True)
+        some = tuple(p for p in self._timed.points if p.detail.modes <= spec.finest.modes)
         return choose(replace(self._timed, points=some), Budget(**request.budget)).detail
 
     def curve(self, spec: ModelSpec, detail: Detail) -> dict[str, Any] | None:
@@ -102,7 +87,7 @@ class DetailChooser:
         return self._rows[detail]
 
     def _row(self, spec: ModelSpec, detail: Detail) -> AccuracyCurve | None:
-        curve = self._timed or _curve_of(spec)
+        curve = self._timed or spec.curve
         if curve is None:
             return None
         row = curve.like(detail)
@@ -113,10 +98,3 @@ class DetailChooser:
         key = (spec.vademecum.id, spec.tip_radii, spec.cloud, spec.effect_names)
         if key != self._key:
             self._key, self._timed, self._rows = key, None, {}
-
-
-def _curve_of(spec: ModelSpec) -> AccuracyCurve | None:
-    certificate = spec.vademecum.certificate
-    if certificate is None or certificate.curve is None:
-        return None
-    return certificate.curve.of(spec.cloud)

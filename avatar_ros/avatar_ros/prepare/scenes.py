@@ -1,14 +1,19 @@
-"""Where the contact node finds its scenes, and which of them fit its tools."""
+"""Scenes of the contact node: where they are found, and the models that they specify."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from avatar_core.errors import SceneError
 from avatar_core.scene.file import shipped_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.yaml_lines import MAX_BYTES
+
+if TYPE_CHECKING:
+    from avatar_core.scene.prepare import ModelSpec
+    from avatar_core.vademecum.model import Vademecum
+    from avatar_ros.prepare.requests import PreparationRequest
 
 
 def scene_file(value: str) -> Path:
@@ -37,6 +42,24 @@ def change_of(request: Any) -> dict[str, Any]:
             f"yaml: has {len(request.yaml)} letters; at most {MAX_BYTES} are read: is it a scene?"
         )
     return {"scene": request.yaml}
+
+
+def model_spec(vademecum: Vademecum, request: PreparationRequest, scene: Scene | None) -> ModelSpec:
+    """What a request and a scene make of a vademecum; the request's material overrides the scene's.
+
+    Raises
+    ------
+    AvatarError
+        The vademecum cannot serve this; with the remedy.
+    """
+    # Here, because the contact node imports this file and needs none of that.
+    from avatar_core.scene.prepare import default_spec, scene_spec
+
+    if scene is not None:
+        require_tools(scene, len(request.tip_radii))
+        return scene_spec(vademecum, scene, request.material)
+    radii = tuple(request.tip_radii)
+    return default_spec(vademecum, radii, request.modes, request.cloud, request.material)
 
 
 def require_tools(scene: Scene, n_tools: int) -> None:

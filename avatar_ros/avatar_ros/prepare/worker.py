@@ -128,12 +128,12 @@ class ModelPreparer:
         from avatar_core.contact.layout import Layout
         from avatar_core.contact.model import make_model
         from avatar_core.scene.file import parse_scene
-        from avatar_ros.prepare.model_spec import lay_out, model_spec
+        from avatar_ros.prepare.scenes import model_spec
 
         scene = parse_scene(request.scene, "scene") if request.scene else None
         spec = model_spec(vademecum, request, scene)
         detail = self._chooser.detail(spec, request)
-        handle, contents = write_shared(lay_out(spec, detail, request.period).flat())
+        handle, contents = write_shared(spec.layout(detail, request.period).flat())
         coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
         try:
             # Compiles the step for these effects, if that was never done on this machine, from
