@@ -1,4 +1,4 @@
-"""One organ of an atlas, and what can be said of two of them."""
+"""The members of an atlas."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ FloatArray = NDArray[np.float64]
 
 
 class AtlasError(AvatarError):
-    """An atlas cannot take, or does not hold, what was asked."""
+    """An atlas cannot do what was asked of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Response(CompactResponse):
     """The response of one anatomy on the registered template, in the anatomy's own RAS axes.
 
-    material, element, patch_radius [m] : what it was computed with
+    material, element, patch_radius [m] : with which it was computed
     """
 
     material: Material
@@ -38,13 +38,14 @@ class Anatomy:
     """One organ of an atlas.
 
     name : unique in the atlas
-    surface : SurfaceMesh, in its own place, with unit, axes and hash of its file
+    surface : SurfaceMesh in its own coordinates, with unit, axes and hash of its file
     volume : [m3]
     alignment : SimilarityTransform from the template to the organ
     distances : ndarray, shape (n_points,), signed distance on the atlas's box [m]
-    registered : ndarray, shape (n_template_vertices, 3), the template on the organ [m]
-    quality : RegistrationQuality; converged : whether the registration met its tolerance
-    response : Response, or None if none was computed
+    registered : ndarray, shape (n_template_vertices, 3), the template registered to the organ [m]
+    quality : RegistrationQuality
+    converged : whether the registration converged
+    response : Response; None if it was not computed
     """
 
     name: str
@@ -60,10 +61,10 @@ class Anatomy:
 
 @dataclass(frozen=True)
 class Duplicate:
-    """A member that is an earlier one once more; it counts in no barycenter.
+    """A member that repeats an earlier one; it has no weight in any barycenter.
 
-    name, of : of the member and of the earlier one
-    same_file : whether their files have the same bytes; otherwise their distances are equal
+    name, of : names of the member and of the earlier one
+    same_file : whether their files are identical; otherwise their distances are equal
     """
 
     name: str
@@ -76,7 +77,7 @@ class Duplicate:
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
-    """The name, with a number if it is taken."""
+    """The name, with a number appended if it is taken."""
     if name not in taken:
         return name
     number = 2
@@ -86,7 +87,7 @@ def free_name(name: str, taken: Collection[str]) -> str:
 
 
 def require_shapes(anatomy: Anatomy, n_points: int, n_vertices: int) -> None:
-    """Raise AtlasError unless the arrays fit the box, the template and one another."""
+    """Raise AtlasError unless the arrays fit the box, the template and each other."""
     response = anatomy.response
     fits = anatomy.distances.shape == (n_points,) and anatomy.registered.shape == (n_vertices, 3)
     if response is not None:

@@ -1,4 +1,4 @@
-"""What a new patient needs of a base of anatomies, and where an atlas keeps it."""
+"""The anatomies of an atlas from which a new patient's vademecum is made."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from avatar_core.shapes.registration import Registration, RegistrationRule, Temp
 
 
 class PatientError(AvatarError):
-    """A patient's vademecum cannot be made from the base as it was asked for."""
+    """A patient's vademecum cannot be made from the base as requested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +29,13 @@ class PatientBase:
     template, loads : Template and the load positions of its mesh and regions
     material : Material of all responses
     names : of the anatomies
-    vertices : ndarray, shape (n, n_template, 3) [m], the template laid on each anatomy
-    responses : one CompactResponse an anatomy; a lazy sequence will do
-    copies : numbers of anatomies that are an earlier one once more, and count in no weights
+    vertices : ndarray, shape (n, n_template, 3) [m], the template registered to each anatomy
+    responses : one CompactResponse per anatomy; may be a lazy sequence
+    copies : numbers of anatomies that repeat an earlier one, and get no weight
     distances : signed distances of each anatomy on a common grid, shape (n, n_grid), or None
     distance_of : signed distances of a new surface on the same grid, or None
     rule : RegistrationRule of all registrations
-    registrations : of the anatomies by the hash of their file
+    registrations : of the anatomies, by the hash of their file
     """
 
     template: Template
@@ -57,7 +57,7 @@ def base_of(atlas: Atlas) -> PatientBase:
     Raises
     ------
     PatientError
-        If none has one, or they were not computed for one material and patch radius.
+        If none has one, or they differ in material, element or patch radius.
     """
     kept = [i for i, anatomy in enumerate(atlas.anatomies) if anatomy.response is not None]
     responses = [atlas.anatomies[i].response for i in kept]
@@ -97,7 +97,7 @@ def base_of(atlas: Atlas) -> PatientBase:
 
 
 def leave_one_out(base: PatientBase, name: str, same: Collection[Collection[str]]) -> list[int]:
-    """Anatomies that must not help a patient: itself and those of the same person."""
+    """Numbers of the anatomies to leave out for a patient: itself and those of the same person."""
     persons = [set(group) for group in same if name in group]
     return [
         i

@@ -1,4 +1,4 @@
-"""Anatomies that an unfinished build has finished, one file each, beside the atlas."""
+"""Finished anatomies of an unfinished build, one file each, in a folder beside the atlas."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.storage import load_anatomy, load_atlas, save_anatomy, save_atlas
 from avatar_core.errors import StorageError
 
-EMPTY = "empty-"  # begins the name of an atlas without members
+EMPTY = "empty-"  # prefix of files that hold an atlas without members
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The folder ``ATLAS.h5.parts``; keys say what went into a part."""
+    """The folder ``ATLAS.h5.parts``; the key of an anatomy is a hash of its inputs."""
 
     folder: Path
 
     def load(self, key: str | None) -> Anatomy | None:
-        """A part, None if there is none that can be read."""
+        """An anatomy; None if there is none, or its file cannot be read."""
         with suppress(StorageError):
             return load_anatomy(self._file(key)) if key and self._file(key).exists() else None
         return None
 
     def save(self, key: str | None, anatomy: Anatomy) -> None:
-        """Keep a part; without a key it is not kept."""
+        """Save an anatomy, if it has a key."""
         if key:
             save_anatomy(anatomy, self._file(key))
 
     def load_empty(self, key: str) -> Atlas | None:
-        """The atlas without members that the build began with, None if it did not."""
+        """The atlas without members that the build began with; None if there is none."""
         with suppress(StorageError):
             return load_atlas(self._file(EMPTY + key))
         return None
 
     def save_empty(self, key: str, atlas: Atlas) -> None:
-        """Keep the atlas without members: its mesh would not come out the same again."""
+        """Save the atlas without members: meshing its template again would give another mesh."""
         save_atlas(atlas, self._file(EMPTY + key))
 
     def clear(self, keys: Iterable[str | None] | None = None) -> None:
-        """Remove some parts, or all."""
+        """Remove some anatomies, or everything."""
         chosen = self.folder.iterdir() if keys is None else (self._file(k) for k in keys if k)
         for file in list(chosen):
             file.unlink(missing_ok=True)
@@ -55,9 +55,9 @@ class Checkpoint:
 
 @contextmanager
 def checkpoint_of(path: Path) -> Iterator[Checkpoint]:
-    """The parts of the atlas at a path, for one build at a time; gone afterwards if empty.
+    """The checkpoint of the atlas at a path, locked for one build; removed afterwards if empty.
 
-    Raises AtlasError if another build has them, StorageError if there can be no folder.
+    Raises AtlasError if another build holds it, StorageError if the folder cannot be made.
     """
     folder = path.with_name(f"{path.name}.parts")
     try:
@@ -78,7 +78,7 @@ def checkpoint_of(path: Path) -> Iterator[Checkpoint]:
 
 
 def _tidy(folder: Path) -> None:
-    """Remove the folder unless it holds anatomies; a dot begins what a killed write left."""
+    """Remove the folder unless it holds anatomies; files with a dot are left by killed writes."""
     rest = list(folder.iterdir())
     if all(file.name.startswith((EMPTY, ".")) for file in rest):
         for file in rest:
@@ -87,10 +87,12 @@ def _tidy(folder: Path) -> None:
 
 
 def _lock(handle: int, path: Path) -> None:
-    """Held until the handle is closed, by the system if need be."""
+    """Lock the folder until the handle is closed, by the system if the process is killed."""
     import fcntl
 
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise AtlasError(f"another build is at work on {path}; wait until it is done") from error
+        raise AtlasError(
+            f"another build is at work on {path}; wait until it has finished"
+        ) from error

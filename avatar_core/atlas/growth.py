@@ -1,7 +1,7 @@
-"""Building an atlas from surfaces: on all cores or a cluster, and going on where it stopped.
+"""Building an atlas from surfaces, on all cores or a cluster; an interrupted build is resumed.
 
-Each finished anatomy is saved at once in the folder ``ATLAS.h5.parts`` under a name made of what
-went into it; the atlas itself is written in the end, in one step, and the folder removed.
+Each finished anatomy is saved at once in the folder ``ATLAS.h5.parts``, under a hash of its inputs.
+The atlas itself is written at the end, in one step, and the folder is removed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class SurfaceFile:
-    """A surface that is read where it is worked on; see `read_surface`."""
+    """A surface that is read by the worker that builds the anatomy; see `read_surface`."""
 
     path: Path
     unit: str = "mm"
@@ -49,11 +49,11 @@ class SurfaceFile:
 
     @property
     def name(self) -> str:
-        """What the surface will be called."""
+        """Name of the anatomy: that of the file without suffixes."""
         return self.path.name.split(".")[0]
 
     def read(self) -> SurfaceMesh:
-        """The surface; SurfaceError if it is none."""
+        """Read the surface; raises SurfaceError if the file holds none."""
         return read_surface(self.path, self.unit, self.axes, self.label)
 
 
@@ -62,12 +62,12 @@ Source = SurfaceFile | SurfaceMesh
 
 @dataclass(frozen=True)
 class AtlasOptions:
-    """What is fixed when an atlas is created.
+    """Settings that are fixed when an atlas is created.
 
-    template_vertices : of the template's mesh, about; the template is the built-in liver
-    largest : organ that the box holds, along x, y, z [m]
-    spacing : of the box's grid [m]
-    rule : of the registrations
+    template_vertices : approximate number, of the mesh of the built-in liver, the template
+    largest : size of the largest organ that fits into the box, along x, y, z [m]
+    spacing : of the grid in the box [m]
+    rule : RegistrationRule of all registrations
     """
 
     template_vertices: int = 2500
@@ -78,7 +78,7 @@ class AtlasOptions:
 
 @dataclass(frozen=True)
 class Skipped:
-    """A surface that did not become a member, and why in one line."""
+    """A surface that was not added, and the reason in one line."""
 
     name: str
     reason: str
@@ -86,12 +86,13 @@ class Skipped:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """What became of a build.
+    """Result of a build.
 
     atlas : with the new members; not on disk if there are none
-    added : names of the new members; skipped : surfaces that are not among them
-    resumed : how many of the new members an interrupted build had left
-    notices : duplicates among the new members, one line each
+    added : names of the new members
+    skipped : surfaces that were not added
+    resumed : number of new members that an interrupted build had finished
+    notices : new members that are duplicates or whose registration did not converge, one line each
     """
 
     atlas: Atlas
@@ -126,11 +127,11 @@ def create_atlas(
     solve_response: SolveResponse | None = None,
     progress: Progress | None = None,
 ) -> Growth:
-    """Build an atlas; nothing is written to the path if no surface can be used.
+    """Build an atlas; nothing is written if no surface can be used.
 
     template : None for the built-in liver with ``options.template_vertices``
-    respond : also computes a Response from each registration; must be picklable
-    progress : called with (surfaces done, surfaces, name) after each surface
+    solve_response : computes the Response of each registration; must be picklable
+    progress : called with (surfaces done, number of surfaces, name) after each surface
 
     Raises AtlasError if the file exists or another build is at work on it, StorageError if it
     cannot be written.
@@ -145,7 +146,7 @@ def create_atlas(
         )
         if growth.added:
             save_atlas(growth.atlas, path)
-            checkpoint.clear()  # what is left was for other templates
+            checkpoint.clear()  # what is left belongs to other templates
     return growth
 
 
@@ -157,14 +158,14 @@ def extend_atlas(
     solve_response: SolveResponse | None = None,
     progress: Progress | None = None,
 ) -> Growth:
-    """Add surfaces to an atlas on disk, which stays as it is until all are done.
+    """Add surfaces to an atlas on disk; the old file stays until the new one is complete.
 
-    Arguments as of `create_atlas`. Raises StorageError if there is no atlas at the path or it
-    cannot be written, AtlasError if another build is at work on it.
+    Arguments are those of `create_atlas`. Raises StorageError if there is no atlas at the path or
+    it cannot be written, AtlasError if another build is at work on it.
     """
     path = Path(path)
     if not path.is_file():
-        load_atlas(path)  # which says what is missing
+        load_atlas(path)  # raises, and says what is missing
     with checkpoint_of(path) as checkpoint:
         atlas = load_atlas(path)
         growth, keys = _grow(
@@ -177,7 +178,7 @@ def extend_atlas(
 
 
 def _empty_atlas(checkpoint: Checkpoint, options: AtlasOptions, template: Template | None) -> Atlas:
-    """The one an interrupted build began with, or a new one."""
+    """The empty atlas that an interrupted build began with, or a new one."""
     if template is not None:
         return new_atlas(template, options)
     asked = json.dumps(asdict(options), sort_keys=True)
@@ -197,7 +198,7 @@ def _grow(
     solve_response: SolveResponse | None,
     progress: Progress | None,
 ) -> tuple[Growth, list[str | None]]:
-    """What becomes of the surfaces, and the keys under which their parts are kept."""
+    """Result of the build, and the checkpoint keys of the surfaces."""
     builder = AnatomyBuilder(atlas.without_anatomies(), solve_response)
     keys = checkpoint_keys(builder, sources)
     results: dict[int, Anatomy | Skipped] = {}
@@ -227,7 +228,7 @@ def _grow(
 
 
 def _growth(atlas: Atlas, results: Sequence[Anatomy | Skipped], resumed: int) -> Growth:
-    """In the order of the surfaces, whatever the order in which they were done."""
+    """Result with members in the order of the surfaces, whatever the order of completion."""
     grown = atlas.with_anatomies(one for one in results if isinstance(one, Anatomy))
     added = grown.names[len(atlas) :]
     notices = tuple(str(one) for one in grown.duplicates if one.name in added) if added else ()
@@ -245,13 +246,13 @@ def _growth(atlas: Atlas, results: Sequence[Anatomy | Skipped], resumed: int) ->
 
 @dataclass(frozen=True, eq=False)
 class AnatomyBuilder:
-    """What all anatomies of a build have in common: an atlas without members, and a response."""
+    """Builds the anatomies of an atlas; picklable, so that workers can do it."""
 
     atlas: Atlas
     solve_response: SolveResponse | None = None
 
     def __call__(self, source: Source | Skipped) -> Anatomy | Skipped:
-        """An anatomy, or why there is none: one bad organ must not cost the others."""
+        """The anatomy of a surface, or the reason why there is none; never raises."""
         if isinstance(source, Skipped):
             return source
         try:
@@ -265,12 +266,12 @@ class AnatomyBuilder:
 def build_anatomy(
     atlas: Atlas, source: Source, solve_response: SolveResponse | None = None
 ) -> Anatomy:
-    """Read, register and measure one organ.
+    """Read and register one organ, and compute its distances and, if asked, its response.
 
     Raises
     ------
     AvatarError
-        Of the stage that refused, with the remedy.
+        Of the stage that failed, with the remedy.
     """
     surface = source.read() if isinstance(source, SurfaceFile) else source
     atlas.require_room(surface)
@@ -280,7 +281,7 @@ def build_anatomy(
 
 
 def checkpoint_keys(builder: AnatomyBuilder, sources: Sequence[Source]) -> list[str | None]:
-    """Hashes of all that goes into each anatomy, None for a file that cannot be read."""
+    """Hash of all inputs of each anatomy; None for a file that cannot be read."""
     atlas, mesh = builder.atlas, builder.atlas.template.mesh
     common = hashlib.sha256()
     for array in (mesh.vertices, mesh.tets, atlas.template.regions.accessible):
@@ -298,7 +299,7 @@ def _checkpoint_key(common: bytes, source: Source) -> str | None:
         try:
             digest.update(content_of(source.path))
         except AvatarError:
-            return None  # reading it again will say why
+            return None  # building it will say why
         digest.update(repr((source.unit, source.axes, source.label)).encode())
     else:
         digest.update(source.vertices.tobytes())

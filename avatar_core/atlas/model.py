@@ -1,8 +1,8 @@
-"""A base of anatomies on one grid and one template, which grows liver by liver.
+"""An atlas: anatomies compared on one grid and one template.
 
-Every organ is laid beside the template by the rigid part of its registration (its size is kept),
-and is there a vector: its signed distances at the points of one box. Inner products of the vectors
-are kept, so that one more organ costs one registration, one vector and one row of products.
+Every organ is moved to the template by the rigid part of its registration, which keeps its size,
+and represented by its signed distances at the points of one box. The inner products of these
+vectors are stored: adding an organ costs one registration, one vector and one row of products.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LARGEST_ORGAN = (0.33, 0.26, 0.26)  # along x, y, z [m]
-SPACING = 0.009  # with the largest organ above about 49,000 points, as many as in the paper [m]
-SLACK = 0.018  # on every side: organs are laid by shape, and then do not share a centre [m]
+SPACING = 0.009  # gives about 49,000 points with LARGEST_ORGAN, as many as in the paper [m]
+SLACK = 0.018  # on every side, since organs are aligned by shape and not by their centres [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +46,10 @@ class Atlas:
     """Anatomies that can be compared.
 
     template : Template, registered to every anatomy
-    box : GridBox in the template's place; fixed, as the template is, when the atlas is created
+    box : GridBox around the template; like the template, fixed when the atlas is created
     rule : RegistrationRule of all registrations
-    anatomies : in the order in which they came
-    gram : Gram, inner products of their distance vectors; of none, if there are none
+    anatomies : in the order in which they were added
+    gram : Gram, inner products of their distance vectors
 
     Raises AtlasError if names repeat or shapes do not fit.
     """
@@ -78,7 +78,7 @@ class Atlas:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the anatomies, in their order."""
+        """Names of the anatomies, in their order."""
         return tuple(anatomy.name for anatomy in self.anatomies)
 
     @property
@@ -98,7 +98,7 @@ class Atlas:
     # --- growing ------------------------------------------------------------------------------
 
     def with_anatomies(self, newcomers: Iterable[Anatomy]) -> Atlas:
-        """The atlas with more members; those it has are not computed again.
+        """The atlas with more members; nothing is computed again for those it has.
 
         A name that is taken gets a number: liver, liver-2, ...
 
@@ -116,14 +116,14 @@ class Atlas:
         return replace(self, anatomies=tuple(members), gram=gram)
 
     def without_anatomies(self) -> Atlas:
-        """The atlas as it was created."""
+        """The atlas as it was created, without members."""
         return Atlas(self.template, self.box, self.rule)
 
     # --- what is the same ---------------------------------------------------------------------
 
     @cached_property
     def same_as(self) -> IntArray:
-        """First member with the same file or the same shape, mostly itself, shape (n,)."""
+        """Number of the first member with the same file or shape, mostly its own, shape (n,)."""
         if not self.anatomies:
             return np.zeros(0, dtype=np.int64)
         same = fit(self.vectors, 1, gram=self.gram).same_as.copy()
@@ -135,7 +135,7 @@ class Atlas:
 
     @property
     def duplicates(self) -> tuple[Duplicate, ...]:
-        """Members that are an earlier one once more."""
+        """Members that repeat an earlier one."""
         found = []
         for i in np.flatnonzero(self.same_as != np.arange(len(self))):
             one, other = self.anatomies[i], self.anatomies[self.same_as[i]]
@@ -147,7 +147,7 @@ class Atlas:
     # --- comparing ----------------------------------------------------------------------------
 
     def place(self, surface: SurfaceMesh, alignment: SimilarityTransform) -> SurfaceMesh:
-        """The organ laid beside the template, turned and shifted, its size kept.
+        """The organ moved to the template by rotation and translation; its size is kept.
 
         alignment : of its registration, from the template to the organ
         """
@@ -171,12 +171,12 @@ class Atlas:
         return signed_distance(self.box.points, placed)
 
     def require_room(self, surface: SurfaceMesh) -> None:
-        """Raise AtlasError, before any work, if the organ is too long for the box."""
+        """Raise AtlasError if the organ is too long for the box; needs no registration."""
         if not surface.extent.max() < (self.box.upper - self.box.origin).max():
             raise AtlasError(_too_large(surface, self.box))
 
     def grid(self, vector: ArrayLike) -> DistanceGrid:
-        """A distance vector, or a combination of some, on the box."""
+        """A distance vector, or a combination of some, as a grid on the box."""
         box = self.box
         values = np.asarray(vector, dtype=np.float64).reshape(box.shape)
         return DistanceGrid(np.array(box.origin), box.spacing, values)
@@ -193,7 +193,7 @@ class Atlas:
         """Weights of an organ in terms of its neighbours (Eq. 15); numbers as in `anatomies`.
 
         vector : ndarray, shape (n_points,), of `distance_vector` [m]
-        leave_out : names of members that do not count, and neither do their duplicates
+        leave_out : names of members that get no weight, nor do their duplicates
 
         Raises AtlasError for an unknown name, LLEError if nothing is left or k <= 0.
         """
@@ -215,7 +215,7 @@ class Atlas:
         regularization: float = DEFAULT_REGULARIZATION,
         convex: bool = False,
     ) -> LLE:
-        """Weights of every member in terms of the others, from the products that are kept.
+        """Weights of every member in terms of the others, from the stored inner products.
 
         Raises LLEError if the atlas is empty or k <= 0.
         """
@@ -228,7 +228,7 @@ class Atlas:
         )
 
     def registered(self, names: Sequence[str] | None = None) -> FloatArray:
-        """The template's vertices on some anatomies, each in its own place; all if not named.
+        """The template registered to some anatomies, or to all, each in its own coordinates.
 
         Returns ndarray, shape (n, n_template_vertices, 3) [m].
         """
@@ -237,7 +237,7 @@ class Atlas:
         return np.array(rows).reshape(len(rows), len(self.template.mesh.vertices), 3)
 
     def registration(self, name: str) -> Registration:
-        """The registration of an anatomy as it was, without its history."""
+        """The registration of an anatomy, without its history."""
         one = self[name]
         mesh = TetMesh(one.registered, self.template.mesh.tets)
         return Registration(self.template, mesh, one.alignment, one.quality, (), one.converged)
@@ -248,7 +248,7 @@ def box_around(
     largest: tuple[float, float, float] = LARGEST_ORGAN,
     spacing: float = SPACING,
 ) -> GridBox:
-    """Box about the template that holds organs up to a size [m], with some slack.
+    """Box around the template that holds organs up to a size [m], with some slack.
 
     Raises AtlasError if a size or the spacing is not positive, or the grid is unreasonable.
     """
@@ -288,7 +288,7 @@ def anatomy_of(atlas: Atlas, surface: SurfaceMesh, registration: Registration) -
 
 
 def _grown(gram: Gram, vectors: Sequence[FloatArray]) -> Gram:
-    """With the rows of the vectors it does not have yet."""
+    """The Gram matrix with rows for the vectors that it lacks."""
     n = len(gram.products)
     if n == 0:
         return Gram.of(vectors) if vectors else gram

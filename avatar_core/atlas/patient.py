@@ -1,9 +1,9 @@
 """A new patient's vademecum from a base of anatomies, at three fidelities.
 
-``interpolated`` combines the neighbours' responses (Eq. 18); ``reduced`` lets their load functions
-span a Galerkin space on the patient's own mesh and enriches it; ``solved`` is the full build. All
-share the patient's mesh, and the clamp and accessible region carried over from the template, so
-that they differ by nothing but the response.
+``interpolated`` combines the neighbours' responses (Eq. 18). ``reduced`` uses their load functions
+to span a Galerkin space on the patient's own mesh, and enriches it. ``solved`` is the full build.
+All share the patient's mesh, and the clamp and accessible region transferred from the template, so
+that they differ in the response only.
 """
 
 from __future__ import annotations
@@ -53,24 +53,24 @@ Fidelity = Literal["interpolated", "reduced", "solved"]
 Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
 
 _CERTIFIED = {"interpolated": 24, "reduced": 24, "solved": 200}  # each is a fine solution
-RESIDUAL_SUPPORT = 2.0  # reach of interpolated residual compliance, in patch radii
-_FAR_HULL = 0.5  # hull distance over the neighbours' mean distance that is worth a warning
+RESIDUAL_SUPPORT = 2.0  # support of interpolated residual compliance, in patch radii
+_FAR_HULL = 0.5  # hull distance over the mean distance to the neighbours, above which to warn
 
 
 def _silent(stage: str, fraction: float, error: float) -> None:
-    """Report nothing."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True)
 class PatientOptions:
-    """How a patient's vademecum is made.
+    """Settings of a patient's vademecum.
 
-    n_vertices : of the patient's own mesh, about
-    weighting : of the neighbours; ``n_neighbors`` None for all (10 on the grid)
-    tolerance : mean relative L2 error of displacement that ``reduced`` and ``solved`` aim at
-    max_modes : far-field modes of the vademecum, the rest becomes near field
-    n_certified : unseen loads of the certificate, 0 for none; None for 24, or 200 of ``solved``
-    leave_out : anatomies of the base that do not count, such as other scans of the patient
+    n_vertices : approximate number, of the patient's own mesh
+    weighting, n_neighbors : see `patient_weights`
+    tolerance : target of ``reduced`` for the mean relative L2 error of displacement
+    max_modes : far-field modes of the vademecum; the rest becomes near field
+    n_certified : unseen loads of the certificate; None for 24, or 200 with ``solved``; 0 for none
+    leave_out : numbers of anatomies that get no weight, such as other scans of the patient
     """
 
     n_vertices: int = 2850
@@ -90,7 +90,7 @@ class PatientOptions:
 
 @dataclass(frozen=True)
 class StageSeconds:
-    """CPU seconds (user + system) of this process by stage."""
+    """CPU time (user + system) of this process by stage [s]."""
 
     registration: float
     mesh: float
@@ -99,21 +99,22 @@ class StageSeconds:
 
     @property
     def total(self) -> float:
-        """From the surface on."""
+        """CPU time of all stages [s]."""
         return self.registration + self.mesh + self.response + self.certificate
 
 
 @dataclass(frozen=True, eq=False)
 class Patient:
-    """A patient's vademecum and where it comes from.
+    """A patient's vademecum and how it was made.
 
     vademecum : Vademecum
-    fidelity : how it was made; a member of the base may have brought its own
+    fidelity : "interpolated", "reduced" or "solved"
     neighbours : names, nearest first; weights : ndarray, shape (n,)
     barycenter : Barycenter, with sum |w| and hull distance
-    estimates : GalerkinErrorEstimate of each enrichment (``reduced`` only), the last one holds
-    solutions : fine solutions that the response took
-    notices : one line each
+    estimates : GalerkinErrorEstimate after each enrichment (``reduced`` only); the last one is that
+        of the result
+    solutions : number of full finite element solutions
+    notices : what did not converge, and where the patient lies in the base, one line each
     seconds : StageSeconds
     """
 
@@ -130,7 +131,7 @@ class Patient:
 
 @dataclass(frozen=True, eq=False)
 class PatientProblem:
-    """A patient's own mesh, with clamp and loads carried over from the template.
+    """A patient's own mesh, with clamp and load positions transferred from the template.
 
     surface : of the patient; registration : of the template to it
     mesh, regions, loads, elasticity : the patient's
@@ -147,7 +148,7 @@ class PatientProblem:
 def patient_problem(
     surface: SurfaceMesh, base: PatientBase, registration: Registration, mesh: TetMesh
 ) -> PatientProblem:
-    """Carry clamp, accessible region and patch radius of the base to a patient's mesh.
+    """Transfer clamp, accessible region and patch radius of the base to a patient's mesh.
 
     Raises
     ------
@@ -163,7 +164,7 @@ def patient_problem(
 def member_problem(
     surface: SurfaceMesh, base: PatientBase, member: int, registration: Registration
 ) -> PatientProblem:
-    """An anatomy of the base on the registered template, where its own response was computed."""
+    """An anatomy of the base on the registered template, on which its response was computed."""
     template = base.template
     mesh = TetMesh(np.asarray(base.vertices[member], float), template.mesh.tets)
     own = replace(registration, mesh=mesh)
@@ -180,22 +181,22 @@ def patient_vademecum(
     options: PatientOptions | None = None,
     progress: Progress = _silent,
 ) -> Patient:
-    """Register, mesh, respond and certify a new patient.
+    """Build the vademecum of a new patient: register, mesh, solve and certify.
 
     Parameters
     ----------
     surface : SurfaceMesh of the patient [m, RAS]
-    atlas : Atlas with responses, or what :func:`avatar_core.atlas.base.base_of` makes of one
+    atlas : Atlas with responses, or the result of :func:`avatar_core.atlas.base.base_of`
     fidelity : "interpolated", "reduced" or "solved"
     options : PatientOptions
-    progress : called with stage, fraction of it, and the error so far
+    progress : called with stage, completed fraction of it, and current error (NaN: unknown)
 
     Raises
     ------
     PatientError
         For an unknown fidelity or weighting, or an atlas without responses.
     AvatarError
-        Of the stage that refused, with the remedy.
+        Of the stage that failed, with the remedy.
     """
     require_fidelity(fidelity)
     base = base_of(atlas) if isinstance(atlas, Atlas) else atlas
@@ -271,9 +272,9 @@ def interpolated(
 ) -> Vademecum:
     """Eq. 18: no equation of the patient is solved.
 
-    ``lle-grid`` combines at common places as the paper does, the others nodewise on the template.
-    The near field is that of the modes alone; the contact compliance gets the
-    residual compliance that the base holds for each patch.
+    ``lle-grid`` combines at common positions, as in the paper, the others nodewise on the template.
+    The near field is that of the modes alone. The contact compliance includes the residual
+    compliance that the base holds for each patch.
     """
     response = interpolated_response(problem, base, weights, options)
     support = RESIDUAL_SUPPORT * problem.loads.patch_radius
@@ -301,7 +302,7 @@ def reduced(
     options: PatientOptions,
     progress: Progress = _silent,
 ) -> tuple[Vademecum, tuple[GalerkinErrorEstimate, ...]]:
-    """The vademecum of :func:`reduced_response`, and the estimates on the way."""
+    """The vademecum of :func:`reduced_response`, and the error estimate after each enrichment."""
     found = reduced_response(problem, base, weights, options, progress)
     return vademecum_of_reduced(problem, found, options), found.history
 
@@ -364,7 +365,7 @@ def solved(
 def certified(
     vademecum: Vademecum, problem: PatientProblem, n_loads: int, progress: Progress = _silent
 ) -> Vademecum:
-    """The vademecum with its errors on unseen loads against full finite elements."""
+    """The vademecum with a certificate: its errors on unseen loads against full finite elements."""
     return vademecum.with_certificate(
         certify(
             vademecum,
@@ -382,7 +383,7 @@ def _assembled(
     convergence: Convergence,
     options: PatientOptions,
 ) -> Vademecum:
-    """A vademecum of a compact response: its best modes far, the others near their load."""
+    """The vademecum of a compact response: leading modes as far field, the rest as near field."""
     rule, loads = options.build, problem.loads
     radius = loads.patch_radius
     far = _sorted_by_norm(response, problem.mesh)

@@ -1,4 +1,4 @@
-"""The response of an anatomy, computed once on the registered template when it joins an atlas."""
+"""The response of an anatomy, computed on the registered template when it is added."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from avatar_core.shapes.registration import Registration
 
 @dataclass(frozen=True)
 class ResponseSolver:
-    """Computes responses; can be sent to other processes.
+    """Computes the response of an anatomy; picklable.
 
     material : of all anatomies
-    rank : modes kept of each
+    rank : number of modes that are kept
     """
 
     material: Material = field(default_factory=Material)
     rank: int = 120
 
     def __call__(self, registration: Registration) -> Response:
-        """Patches of the template's radius at its load positions on the registered organ."""
+        """The response to patch loads at the template's load positions on the registered organ."""
         template = registration.template
         loads = load_surface(template.mesh, template.regions)
         centers = registered_positions(registration, loads)

@@ -1,14 +1,14 @@
-"""From a base of anatomies to a patient: weights, and the response they combine to (Eq. 18).
+"""From a base of anatomies to a patient: weights, and the combined response (Eq. 18).
 
-All anatomies share one template mesh, laid on each of them. Their elastic responses are stored on
-it as u_i(x, s) = X_i(x) Y_i(s)^T with C_i = Y_i Y_i^T the compliance between load positions. With
-weights w the compliance of a patient is
+The same template mesh is registered to all anatomies. Their elastic responses are stored on it as
+u_i(x, s) = X_i(x) Y_i(s)^T, with C_i = Y_i Y_i^T the compliance between load positions. With
+weights w, the compliance of a patient is
 
     C = sum_i w_i C_i ~ Y Y^T,    its leading positive part,
     u = sum_i w_i u_i ~ X Y^T,    X = sum_i w_i X_i Y_i^T Y (Y^T Y)^-1,
 
-so that the combined response is separated, its contact compliance symmetric positive, also where
-weights are negative.
+so that the combined response is separated, and its contact compliance symmetric and positive, even
+if weights are negative.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from avatar_core.shapes.registration import Registration
 Weighting = Literal["lle-grid", "lle-template", "kriging"]
 GRID_NEIGHBORS = 10  # of the paper, Sec. 3.3
 _OVERSAMPLING = 20  # random columns beyond the rank of a combination
-# Exponent of kriging, leave-one-out on 46 livers: displacement 13.7 % off, 16.2 % with 1.
+# Exponent of kriging: leave-one-out error of displacement of 46 livers 13.7 %, with 1 16.2 %.
 _VARIOGRAM = 1.8
 
 
@@ -52,15 +52,14 @@ def patient_weights(
 ) -> Barycenter:
     """Weights of the anatomies of a base for a patient.
 
-    ``lle-grid`` are those of the paper, Eq. 15 on the distances at the common grid;
-    ``lle-template`` the same on the centred registered vertices; ``kriging`` see :func:`kriging`.
-
-    n_neighbors : k; None for 10 on the grid (the paper), all on the template
+    weighting : "lle-grid", Eq. 15 on the distances at the common grid, as in the paper;
+        "lle-template", the same on the centred registered vertices; "kriging", see :func:`kriging`
+    n_neighbors : k; None for 10 on the grid, as in the paper, and all on the template
 
     Raises
     ------
     PatientError
-        For an unknown weighting, or a base without grid distances where these are asked for.
+        For an unknown weighting, or "lle-grid" with a base that has no grid distances.
     LLEError
         For k <= 0 or a base with no anatomy left.
     """
@@ -100,13 +99,13 @@ def kriging(
         [ -D  1 ] [ w ]   [ -d ]
         [ 1^T 0 ] [ m ] = [  1 ],    D_ij = |X_i - X_j|^1.8, d_i = |X_i - x|^1.8
 
-    Real livers have no low dimension: unlike the weights of Eq. 15, these do not blow up to
-    reproduce x, and fall back to the mean far from the base.
+    Real livers do not lie on a manifold of low dimension. Unlike the weights of Eq. 15, these stay
+    bounded where x cannot be reproduced, and tend to the mean far from the base.
 
     Parameters
     ----------
     vectors : ndarray, shape (n, D); point : ndarray, shape (D,)
-    n_neighbors : k nearest that take part
+    n_neighbors : number of nearest anatomies that get weights
     """
     found = barycenter(vectors, point, n_neighbors, leave_out=leave_out)
     if found.member is not None:
@@ -131,12 +130,12 @@ def kriging(
 def combine(
     responses: Sequence[CompactResponse], weights: Barycenter, rank: int = 100
 ) -> CompactResponse:
-    """Eq. 18 nodewise on the template; a member of the base keeps its own response bit for bit.
+    """Eq. 18 nodewise on the template; a member of the base keeps its own response exactly.
 
-    The leading part of C is found by a subspace iteration on random columns (Halko, Martinsson &
-    Tropp, SIAM Review 53, 2011), which touches every response three times and never forms C.
+    The leading part of C is found by two subspace iterations on random columns (Halko, Martinsson &
+    Tropp, SIAM Review 53, 2011), which use every response three times and never form C.
 
-    rank : modes kept at most
+    rank : maximum number of modes
     """
     if weights.member is not None:
         return responses[weights.member]
@@ -198,9 +197,9 @@ def carried(
     elasticity: Elasticity,
     surface: LoadSurface,
 ) -> CompactResponse:
-    """A response on the template, at the vertices and load positions of a patient's own mesh.
+    """A response on the template, interpolated to the vertices and load positions of a patient.
 
-    Displacements of the clamped vertices are set to the zero that they are.
+    Displacements of the clamped vertices are set to zero.
 
     loads : LoadSurface of the template; surface : that of the patient
     """
@@ -218,11 +217,11 @@ def carried_by_place(
     surface: LoadSurface,
     rank: int = 100,
 ) -> CompactResponse:
-    """Eq. 18 on common coordinates, as in the paper: x and s are places, not material points.
+    """Eq. 18 at common coordinates, as in the paper: x and s are positions, not material points.
 
-    Organs are laid over one another by their centroids; a point outside an anatomy takes the
-    displacement of its closest point. Sampled at the patient's own points, where the paper's grid
-    would add its own interpolation error.
+    The centroids of all organs coincide; a point outside an anatomy takes the displacement of its
+    closest point. Evaluated at the patient's own points, which avoids the interpolation error of
+    the paper's grid.
     """
     mesh, here = elasticity.mesh, _centroid(registration.mesh)
     moved = []

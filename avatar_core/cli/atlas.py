@@ -21,27 +21,38 @@ SUFFIXES = (".obj", ".stl", ".ply", ".vtk", ".off", ".nii", ".nii.gz")
 
 EXIT_STOPPED = 130
 
-atlas = typer.Typer(help="A base of anatomies for new patients.", no_args_is_help=True)
+atlas = typer.Typer(
+    help="Build and inspect atlases: known organs from which patients are made.",
+    no_args_is_help=True,
+)
 
-File = Annotated[Path, typer.Argument(metavar="ATLAS.h5", help="the atlas")]
+File = Annotated[Path, typer.Argument(metavar="ATLAS.h5", help="file of the atlas")]
 Surfaces = Annotated[
     list[str],
     typer.Argument(
         metavar="SURFACE...",
-        help="OBJ, STL, PLY, VTK, OFF or label maps, folders of them, or 'phantom'",
+        help="surface files (OBJ, STL, PLY, VTK, OFF), label maps (.nii, .nii.gz), folders of "
+        "these, or 'phantom', the built-in liver",
     ),
 ]
-Unit = Annotated[str, typer.Option(help="unit of the files: mm, cm or m")]
+Unit = Annotated[str, typer.Option(help="unit of length in the files: mm, cm or m")]
 Axes = Annotated[
-    str, typer.Option(help="axes of the files: RAS, LPS, or 16 numbers of a 4x4 matrix to RAS")
+    str,
+    typer.Option(
+        help="coordinate axes of the files: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS"
+    ),
 ]
-Label = Annotated[int | None, typer.Option(help="label of the organ in label maps")]
-Jobs = Annotated[int | None, typer.Option(help="processes on this machine; default one a CPU")]
+Label = Annotated[int | None, typer.Option(help="value that marks the organ in label maps")]
+Jobs = Annotated[
+    int | None, typer.Option(help="number of processes on this machine; default: one per CPU")
+]
 ShapesOnly = Annotated[
-    bool, typer.Option("--shapes-only", help="leave out the mechanical responses")
+    bool,
+    typer.Option("--shapes-only", help="compare shapes only: do not compute mechanical responses"),
 ]
 Scheduler = Annotated[
-    str | None, typer.Option(help="address of a Dask scheduler to use instead, tcp://HOST:PORT")
+    str | None,
+    typer.Option(help="build on a Dask cluster instead: address of its scheduler, tcp://HOST:PORT"),
 ]
 
 
@@ -53,20 +64,23 @@ def create(
     axes: Axes = "RAS",
     label: Label = None,
     template_vertices: Annotated[
-        int, typer.Option(help="vertices of the template's mesh, about")
+        int, typer.Option(help="approximate number of vertices of the template's mesh")
     ] = 2500,
-    spacing: Annotated[float, typer.Option(help="of the grid [m]")] = 0.009,
+    spacing: Annotated[
+        float, typer.Option(help="spacing of the grid on which shapes are compared [m]")
+    ] = 0.009,
     box: Annotated[
         tuple[float, float, float],
-        typer.Option(help="largest organ the atlas shall hold, along x, y, z [m]"),
+        typer.Option(help="size of the largest organ that fits, along x, y, z [m]"),
     ] = (0.33, 0.26, 0.26),
     shapes_only: ShapesOnly = False,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Build an atlas. Interrupted, it goes on when called again; bad surfaces are skipped.
+    """Build an atlas from surfaces. Bad surfaces are skipped, with the reason.
 
-    Exit code 1 if no surface can be used, and then nothing is written.
+    After an interruption, the same command resumes the build. Exit code 1: no surface could be
+    used, and nothing was written.
     """
     from avatar_core.atlas.growth import AtlasOptions, create_atlas
     from avatar_core.atlas.response import ResponseSolver
@@ -97,9 +111,9 @@ def add(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Add surfaces to an atlas; what it holds is not computed again.
+    """Add surfaces to an atlas. Members that it has are not computed again.
 
-    The old file stays until the new one is complete. Exit code 1 if no surface can be used.
+    The old file stays until the new one is complete. Exit code 1: no surface could be used.
     """
     from avatar_core.atlas.growth import extend_atlas
     from avatar_core.atlas.response import ResponseSolver
@@ -120,9 +134,9 @@ def add(
 @atlas.command()
 def show(
     file: File,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print as JSON")] = False,
 ) -> None:
-    """Say what an atlas holds."""
+    """Show the members of an atlas, with the quality of their registrations."""
     from avatar_core.atlas.storage import load_atlas
 
     loaded = load_atlas(file)
@@ -196,7 +210,7 @@ def _show_text(file: Path, atlas: Atlas) -> None:
 
 
 def _report(file: Path, growth: Growth) -> None:
-    """What was added and what was not; an error if nothing was."""
+    """Print what was added and skipped; raises AvatarError if nothing was added."""
     for one in growth.skipped:
         print(f"skipped: {one.name}: {one.reason.removeprefix(f'{one.name}: ')}", file=sys.stderr)
     for notice in growth.notices:
@@ -219,7 +233,7 @@ def _sources(surfaces: Sequence[str], unit: str, axes: str, label: int | None) -
     from avatar_core.geometry.surface import METRES, axes_matrix
 
     parsed = parsed_axes(axes)
-    axes_matrix(parsed)  # what is wrong for all is no reason to skip each
+    axes_matrix(parsed)  # an error in the options, not in each file
     if unit not in METRES:
         raise AvatarError(f"--unit is '{unit}'; use one of {', '.join(METRES)}")
     frozen = parsed if isinstance(parsed, str) else tuple(map(tuple, parsed))
@@ -261,5 +275,5 @@ def _bar(total: int) -> Iterator[Callable[[int, int, str], None]]:
             yield advance
         except KeyboardInterrupt:
             bar.close()
-            print("avatar: the same command goes on with what is done", file=sys.stderr)
+            print("avatar: run the same command again to resume", file=sys.stderr)
             raise typer.Exit(EXIT_STOPPED) from None

@@ -1,4 +1,4 @@
-"""``avatar bench step | effects | cell``: what this machine can hold."""
+"""``avatar bench step | effects | cell``: whether this machine holds 1 kHz."""
 
 from __future__ import annotations
 
@@ -29,9 +29,11 @@ if TYPE_CHECKING:
     from avatar_core.studies.bench.effects import EffectRow
     from avatar_core.studies.bench.methods import StepRow
 
-bench = typer.Typer(help="Does this machine hold 1 kHz?", no_args_is_help=True)
+bench = typer.Typer(help="Measure whether this machine holds 1 kHz.", no_args_is_help=True)
 
-Json = Annotated[Path | None, typer.Option("-o", "--output", help="write the table as JSON")]
+Json = Annotated[
+    Path | None, typer.Option("-o", "--output", help="also write the table to this file, as JSON")
+]
 
 
 @bench.command("step")
@@ -40,11 +42,15 @@ def bench_step(
     unit: Unit = "mm",
     axes: Axes = "RAS",
     label: Label = None,
-    small: Annotated[int, typer.Option(help="vertices of the small mesh, about")] = 2850,
-    large: Annotated[int, typer.Option(help="vertices of the large mesh (P1); 0: none")] = 20000,
+    small: Annotated[
+        int, typer.Option(help="approximate number of vertices of the small mesh")
+    ] = 2850,
+    large: Annotated[
+        int, typer.Option(help="the same of the large mesh (P1 elements); 0: none")
+    ] = 20000,
     output: Json = None,
 ) -> None:
-    """Time the contact step beside a dense table and a direct solve (minutes to build)."""
+    """Time the contact step, a dense table and a direct solve (building takes minutes)."""
     from avatar_core.studies.bench.methods import load_average
     from avatar_core.studies.bench.step import run_step_bench
 
@@ -69,7 +75,7 @@ def bench_effects(
     axes: Axes = "RAS",
     label: Label = None,
     vertices: Vertices = 2850,
-    modes: Annotated[int, typer.Option(help="of the far field")] = 50,
+    modes: Annotated[int, typer.Option(help="number of far-field modes")] = 50,
     fused: Annotated[
         Path | None,
         typer.Option(
@@ -81,7 +87,7 @@ def bench_effects(
     ] = None,
     output: Json = None,
 ) -> None:
-    """Time the step bare, with each effect alone, and with everything (minutes to build)."""
+    """Time the step without effects, with each one, and with all (building takes minutes)."""
     from avatar_core.studies.bench.effects import build_for_effects, run_effects_bench
     from avatar_core.studies.bench.methods import load_average
 
@@ -118,17 +124,17 @@ def _effects_table(rows: list[EffectRow]) -> str:
 @bench.command("cell")
 def bench_cell(
     surface: Surface = "phantom",
-    seconds: Annotated[float, typer.Option(help="of each run [s]")] = 60.0,
+    seconds: Annotated[float, typer.Option(help="duration of each run [s]")] = 60.0,
     vertices: Vertices = 2850,
     changes: Annotated[
-        float, typer.Option(help="times a second that the material is changed meanwhile [Hz]")
+        float, typer.Option(help="rate at which the material is changed meanwhile [Hz]")
     ] = 0.0,
     output: Json = None,
 ) -> None:
     """Time the whole ROS 2 cell: tool, contact and cloud subscriber as separate processes.
 
-    Says, too, whether one of them takes more and more memory, files or threads: a soak, with
-    --seconds 600.
+    Also reports whether memory, open files or threads of a process keep growing; run it with
+    --seconds 600 for a soak test.
     """
     import tempfile
 
@@ -151,7 +157,7 @@ def bench_cell(
 
 
 def require_ros() -> None:
-    """Refuse before anything is built where the cell could not be started."""
+    """Raise AvatarError, before anything is built, if ROS 2 is not installed."""
     missing = [name for name in ("avatar_ros", "rclpy") if find_spec(name) is None]
     if missing:
         raise AvatarError(
@@ -163,11 +169,11 @@ def require_ros() -> None:
 def run_cell(
     vademecum: Path, seconds: float, output: Path | None = None, changes: float = 0.0
 ) -> None:
-    """Measure the cell in a process of its own, which prints its table or one line of error."""
+    """Measure the cell in a separate process, which prints the table or a one-line error."""
     command = [sys.executable, "-m", "avatar_ros.bench.cell", str(vademecum), f"{seconds:g}"]
     command += ["--changes", f"{changes:g}"]
     command += ["--output", str(output)] if output is not None else []
-    sys.stdout.flush()  # what was said before comes first in a file too
+    sys.stdout.flush()  # keeps the order of output in a file
     code = subprocess.run(command, check=False).returncode
     if code != 0:
         raise typer.Exit(code)

@@ -17,42 +17,52 @@ from avatar_core.cli.bench import require_ros
 from avatar_core.common.processes import ModuleProcess
 from avatar_core.errors import AvatarError
 
-_AGAIN = 1.0  # until a cell that does not end is told again [s]
+_AGAIN = 1.0  # after which a cell that has not ended is interrupted again [s]
 
 Host = Annotated[
-    str, typer.Option(help="address that the page is served on; 0.0.0.0: any, without a password")
+    str, typer.Option(help="network address to serve the page on; 0.0.0.0: all, without a password")
 ]
-Port = Annotated[int, typer.Option(help="of the page; the next free one if it is taken")]
+Port = Annotated[int, typer.Option(help="port of the page; if it is taken, the next free one")]
 
 
 def cell(
     params: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="YAML for all nodes, as params/planning_cell.yaml"
+            exists=True,
+            dir_okay=False,
+            help="parameters of all nodes (YAML), such as params/planning_cell.yaml",
         ),
     ] = None,
     library_dir: Annotated[
-        Path | None, typer.Option(exists=True, file_okay=False, help="of the vademecums")
+        Path | None, typer.Option(exists=True, file_okay=False, help="folder of the vademecums")
     ] = None,
-    vademecum: Annotated[str, typer.Option(help="file in it to load")] = "",
+    vademecum: Annotated[str, typer.Option(help="file in that folder to load")] = "",
     atlas: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="for the node that makes patients"),
+        typer.Option(
+            exists=True, dir_okay=False, help="atlas for the node that builds patients (.h5)"
+        ),
     ] = None,
-    scene: Annotated[str, typer.Option(help="effects to simulate")] = "",
+    scene: Annotated[
+        str, typer.Option(help="scene to simulate: name of a shipped one, or a path")
+    ] = "",
     state_dir: Annotated[
         Path | None,
-        typer.Option(exists=True, file_okay=False, help="where nodes keep their state, if any"),
+        typer.Option(
+            exists=True,
+            file_okay=False,
+            help="folder in which nodes keep their state over restarts; default: none is kept",
+        ),
     ] = None,
-    ui: Annotated[bool, typer.Option("--ui", help="serve the planning page, too")] = False,
+    ui: Annotated[bool, typer.Option("--ui", help="also serve the planning page")] = False,
     host: Host = "127.0.0.1",
     port: Port = 8080,
 ) -> None:
-    """Run loader, contact node and, with an atlas, the node that makes patients, until Ctrl-C.
+    """Run the loader, the contact node and, with an atlas, the patient node, until Ctrl-C.
 
-    Options go before what the file says. Does what `ros2 launch avatar_ros
-    planning_cell.launch.py` does; all end when one of them does.
+    Options override the parameter file. When one node ends, all end. Equivalent to `ros2 launch
+    avatar_ros planning_cell.launch.py`.
     """
     require_ros()
     page = {"host": host, "port": str(port)} if ui else {}
@@ -77,7 +87,7 @@ def cell(
 
 
 def require_ui() -> None:
-    """Refuse where the planning page could not be served."""
+    """Raise AvatarError if the planning page cannot be served."""
     if find_spec("viser") is None:
         raise AvatarError("the planning page needs viser; install it with pip install '.[ui]'")
 

@@ -11,18 +11,23 @@ from avatar_core.cli.vademecum import require
 
 
 def export(
-    file: Annotated[Path, typer.Argument(help="a vademecum (.h5)")],
+    file: Annotated[Path, typer.Argument(help="vademecum to export (.h5)")],
     output: Annotated[Path, typer.Option("-o", "--output", help="mesh to write (.vtu or .xdmf)")],
     at: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="where the load acts [m]; default the middle of the accessible surface"),
+        typer.Option(
+            help="point of the load, x y z [m]; default: middle of the accessible surface"
+        ),
     ] = None,
     force: Annotated[
-        str, typer.Option(help="inward along the normal, or three numbers as 0,-1,0.5 [N]")
+        str,
+        typer.Option(
+            help="load [N]: one number, inward along the normal, or a vector such as 0,-1,0.5"
+        ),
     ] = "1",
-    modes: Annotated[int, typer.Option(help="modes of the far field to write")] = 10,
+    modes: Annotated[int, typer.Option(help="number of far-field modes to write")] = 10,
 ) -> None:
-    """Write the organ at rest, its first modes and its displacement under a load."""
+    """Export an organ for ParaView: at rest, with its first modes and its displacement."""
     from avatar_core.contact.tool_path import middle_of_access
     from avatar_core.scene.export import export as exported
     from avatar_core.vademecum.storage import load_vademecum

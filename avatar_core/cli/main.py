@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -25,14 +25,11 @@ from avatar_core.cli.vademecum import (
 )
 from avatar_core.errors import AvatarError
 
-if TYPE_CHECKING:
-    pass
-
 EXIT_STOPPED = 130  # by Ctrl-C, as shells count it
 
 app = typer.Typer(
-    help="Computational patient avatars: an organ's mechanical response, computed once, "
-    "answered at 1 kHz.",
+    help="Computational patient avatars: compute the mechanical response of an organ once, and "
+    "evaluate it at 1 kHz.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -50,7 +47,7 @@ app.command()(cell)
 
 
 def main() -> int:
-    """Entry point: errors of the user become one line and exit code 1."""
+    """Entry point: errors of the input become one line and exit code 1."""
     try:
         code = app(standalone_mode=False)
     except AvatarError as error:
@@ -64,7 +61,7 @@ def main() -> int:
 
 
 def _usage(error: Exception) -> int:
-    """Show a usage error of the command line; anything else is a bug and is raised."""
+    """Show a usage error of the command line; any other error is a bug and is raised."""
     show = getattr(error, "show", None)
     if show is None:
         raise error
@@ -74,18 +71,21 @@ def _usage(error: Exception) -> int:
 
 @app.command()
 def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", help="picture to draw")] = Path(
+    output: Annotated[Path, typer.Option("-o", "--output", help="file of the picture")] = Path(
         "avatar_demo.png"
     ),
-    seconds: Annotated[float, typer.Option(help="of palpation over ROS 2 [s]")] = 10.0,
+    seconds: Annotated[float, typer.Option(help="duration of the palpation over ROS 2 [s]")] = 10.0,
     vertices: Vertices = 1200,
     ui: Annotated[
-        bool, typer.Option("--ui", help="a page for the browser instead of script and picture")
+        bool,
+        typer.Option(
+            "--ui", help="serve the planning page in the browser instead of the scripted palpation"
+        ),
     ] = False,
     host: Host = "127.0.0.1",
     port: Port = 8080,
 ) -> None:
-    """Phantom -> vademecum -> ROS 2 nodes at 1 kHz under a scripted tool -> table, picture."""
+    """Demonstrate everything: build the phantom, press it at 1 kHz over ROS 2, draw a picture."""
     import tempfile
 
     from avatar_core.cli.picture import palpation_picture
@@ -96,7 +96,7 @@ def demo(
     require_ros()
     if ui:
         require_ui()
-    print("1. a liver that the code generates becomes a vademecum")
+    print("1. building the vademecum of the built-in liver")
     with BuildBar() as progress:
         built = build(phantom_liver(), OrganOptions(n_vertices=vertices), progress)
     with tempfile.TemporaryDirectory(prefix="avatar_demo_") as folder:
@@ -105,12 +105,12 @@ def demo(
         v = load_vademecum(file)
         show_text(v)
         if ui:
-            print(f"2. the cell, and its page on http://{host}:{port} (open it; Ctrl-C ends both)")
+            print(f"2. running the cell; open its page at http://{host}:{port} (Ctrl-C ends both)")
             run_page(file, host, port)
             return
-        print(f"2. loader, contact and tool as real ROS 2 processes for {seconds:g} s")
+        print(f"2. running loader, contact and tool as ROS 2 processes for {seconds:g} s")
         run_cell(file, seconds)
-    print("3. the picture")
+    print("3. drawing the picture")
     palpation_picture(v, output)
     print(f"   {output}")
 

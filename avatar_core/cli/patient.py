@@ -29,37 +29,48 @@ WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
 
 def patient(
     surface: Surface,
-    atlas: Annotated[Path, typer.Option(help="base of anatomies (.h5), of 'avatar atlas create'")],
+    atlas: Annotated[Path, typer.Option(help="atlas (.h5) made by 'avatar atlas create'")],
     output: Annotated[Path, typer.Option("-o", "--output", help="vademecum to write (.h5)")],
     fidelity: Annotated[
         str,
         typer.Option(
-            help="interpolated: the neighbours' responses, seconds; reduced: they span a Galerkin "
-            "space on the patient's own mesh; solved: full finite elements"
+            help="interpolated: from the responses of known organs, in seconds; reduced: solved on "
+            "the patient's own mesh in a space that these span; solved: full finite elements"
         ),
     ] = "reduced",
     tolerance: Annotated[
-        float, typer.Option(help="mean relative displacement error that 'reduced' aims at [-]")
+        float,
+        typer.Option(help="target of 'reduced' for the mean relative error of displacement [-]"),
     ] = 0.03,
     weighting: Annotated[
-        str, typer.Option(help="of the neighbours: kriging, lle-template or lle-grid (the paper)")
+        str,
+        typer.Option(
+            help="how known organs are weighted: kriging, lle-template, or lle-grid as in the paper"
+        ),
     ] = "kriging",
     neighbors: Annotated[
-        int | None, typer.Option(help="anatomies that take part; default all, 10 for lle-grid")
+        int | None,
+        typer.Option(
+            help="number of known organs that are used; default: all, or 10 with lle-grid"
+        ),
     ] = None,
     leave_out: Annotated[
-        list[str] | None, typer.Option(help="anatomy that does not count; may be repeated")
+        list[str] | None,
+        typer.Option(help="name of a known organ that is not used; may be repeated"),
     ] = None,
     unit: Unit = "mm",
     axes: Axes = "RAS",
     label: Label = None,
     vertices: Vertices = 2850,
-    modes: Annotated[int, typer.Option(help="far-field modes at most")] = 100,
+    modes: Annotated[int, typer.Option(help="maximum number of far-field modes")] = 100,
     certify: Annotated[
-        int | None, typer.Option(help="unseen loads of the certificate; default by fidelity")
+        int | None,
+        typer.Option(
+            help="number of unseen loads for the certificate; default: 24, or 200 if solved"
+        ),
     ] = None,
 ) -> None:
-    """Find a patient among known anatomies. Exit code 3: complete, but not converged."""
+    """Build a patient's vademecum from an atlas. Exit code 3: written, but not converged."""
     from avatar_core.atlas.base import base_of, numbers_of
     from avatar_core.atlas.patient import PatientOptions, patient_vademecum, require_fidelity
     from avatar_core.atlas.storage import load_atlas
@@ -90,15 +101,15 @@ def patient(
     _show_origin(found)
     if fidelity != "interpolated" and not found.vademecum.convergence.converged:
         print(
-            "avatar: not converged; the file is complete and marked; choose --fidelity solved or "
-            "a larger --tolerance",
+            "avatar: not converged; the file is complete, and marked as not converged; choose "
+            "--fidelity solved or a larger --tolerance",
             file=sys.stderr,
         )
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
 def _show_origin(found: Patient) -> None:
-    """Neighbours, weights and time; warnings to standard error."""
+    """Print neighbours, weights and time, and notices to standard error."""
     nearest = ", ".join(
         f"{name} {weight:+.3f}"
         for name, weight in zip(found.neighbours[:5], found.weights[:5], strict=True)
@@ -121,7 +132,7 @@ def _show_origin(found: Patient) -> None:
 
 
 class _StageBar:
-    """One line for the stages of a patient, with the current error where there is one."""
+    """A progress bar for the stages of a build, with the current error if it is known."""
 
     def __enter__(self) -> _StageBar:
         from tqdm import tqdm
@@ -138,7 +149,7 @@ class _StageBar:
         self._bar.close()
 
     def __call__(self, stage: str, fraction: float, error: float) -> None:
-        """Stage ``stage`` is done to ``fraction``; NaN: no error is known."""
+        """Show the completed fraction of a stage, and the error (NaN: unknown)."""
         text = stage if math.isnan(error) else f"{stage}, error {error:.1%}"
         self._bar.set_description_str(text, refresh=False)
         self._bar.n = min(fraction, 1.0)

@@ -1,4 +1,4 @@
-"""``avatar replay``: a recording of the planning page, computed once more."""
+"""``avatar replay``: compute a recording of the planning page again."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from avatar_core.errors import AvatarError
 
 
 def replay(
-    file: Annotated[Path, typer.Argument(help="a recording (.h5) of the planning page")],
-    vademecum: Annotated[Path, typer.Option(help="that it was made with (.h5)")],
+    file: Annotated[Path, typer.Argument(help="recording of the planning page (.h5)")],
+    vademecum: Annotated[Path, typer.Option(help="vademecum with which it was recorded (.h5)")],
     tolerance: Annotated[
-        float, typer.Option(help="largest difference of a force that passes [N]")
+        float, typer.Option(help="largest permitted difference of a force [N]")
     ] = 1e-9,
 ) -> None:
-    """Step through a recorded path again and compare the forces with those recorded."""
+    """Compute the forces along a recorded path again, and compare them with the recorded ones."""
     from avatar_core.scene.recording import load_recording
     from avatar_core.scene.replay import replay as replayed
     from avatar_core.scene.replay import why_not

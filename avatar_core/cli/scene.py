@@ -1,4 +1,4 @@
-"""``avatar scene check`` and ``avatar scene list``: what a scene is, and what it costs."""
+"""``avatar scene check`` and ``avatar scene list``: content and cost of scenes."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
 scene = typer.Typer(
-    help="A scene names organ, tools, outputs and effects; what it does not name does not run.",
+    help="Inspect scenes: YAML files that name organ, tools, outputs and effects.",
     no_args_is_help=True,
 )
 
 
 @scene.command("list")
 def list_scenes() -> None:
-    """The scenes that come with avatar."""
+    """List the scenes that come with avatar."""
     from avatar_core.scene.file import read_scene, shipped_scenes
 
     shipped = shipped_scenes()
@@ -44,12 +44,15 @@ def list_scenes() -> None:
 
 @scene.command()
 def check(
-    file: Annotated[str, typer.Argument(help="YAML, or the name of a shipped scene")],
+    file: Annotated[
+        str, typer.Argument(help="YAML file, or name of a scene that comes with avatar")
+    ],
     vademecum: Annotated[
-        Path | None, typer.Option(help="vademecum (.h5) that it is to run on; steps are timed")
+        Path | None,
+        typer.Option(help="vademecum (.h5) to check the scene against; its step is then timed"),
     ] = None,
 ) -> None:
-    """Say what a scene is, how well its effects go together, and what a step of it costs."""
+    """Show what a scene contains, how its effects combine, and what a step costs."""
     from avatar_core.scene.file import read_scene, scene_path
     from avatar_core.vademecum.storage import load_vademecum
 
@@ -100,7 +103,7 @@ def _outputs(one: Scene) -> str:
 
 
 def _show_effect(effect: Effect) -> None:
-    """Its line, then every number with unit and meaning."""
+    """Print the effect, then every number with unit and meaning."""
     print(f"    {effect.name:18s} {effect.text}")
     for field in fields(effect):
         meant = field.metadata["quantity"]
@@ -117,12 +120,12 @@ def _number(value: Any, unit: str) -> str:
 
 
 def _show_combinations(one: Scene, v: Vademecum | None) -> None:
-    """How effects go together, and what it costs in accuracy."""
+    """Print how the effects combine, and with what error."""
     from avatar_core.scene.model import combinations
 
     found = combinations(one, v)
     if found:
-        hint = "" if v else "; how wrong that is, a vademecum says: --vademecum FILE.h5"
+        hint = "" if v else "; for the error of it, give --vademecum FILE.h5"
         print(f"  combined (the others superpose){hint}")
     elif len(one.effects) > 1:
         print("  combined: all superpose")
@@ -131,12 +134,12 @@ def _show_combinations(one: Scene, v: Vademecum | None) -> None:
         if v is not None:
             measured = "not measured in this file"
             if pair.error is not None:
-                measured = f"{pair.error:.1%} wrong in the mean"
+                measured = f"mean error {pair.error:.1%}"
             print(f"      {measured}")
 
 
 def _show_cost(one: Scene, v: Vademecum) -> None:
-    """Times of this machine, now."""
+    """Time the scene's step on this machine."""
     from avatar_core.studies.bench.methods import load_average
     from avatar_core.studies.bench.scene import DEPTH, PUSH, time_scene
 
@@ -162,7 +165,7 @@ def _show_cost(one: Scene, v: Vademecum) -> None:
 
 @contextmanager
 def _waiting(text: str) -> Iterator[None]:
-    """A line that counts the seconds on a terminal, and stands elsewhere."""
+    """Print a line, on a terminal with a count of the seconds."""
     if not sys.stderr.isatty():
         print(f"{text} ...", file=sys.stderr, flush=True)
         yield

@@ -1,4 +1,4 @@
-"""``avatar study NAME``: the paper's experiments and ours, one table, JSON and picture each."""
+"""``avatar study NAME``: the experiments of the paper and ours, as table, JSON and picture."""
 
 from __future__ import annotations
 
@@ -29,15 +29,17 @@ USAGE = 2
 def study(
     name: Annotated[str, typer.Argument(help=f"one of {', '.join(STUDIES)}")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="folder for NAME.json and NAME.png")
+        Path, typer.Option("-o", "--output", help="folder to write NAME.json and NAME.png to")
     ],
     surfaces: Annotated[
         Path | None,
-        typer.Option(help="folder of liver surfaces [mm]; default ../shared/data/livers"),
+        typer.Option(help="folder of liver surfaces [mm]; default: ../shared/data/livers"),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="small form, minutes")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="smaller version that takes minutes")
+    ] = False,
 ) -> None:
-    """Repeat one of the paper's experiments: its figure beside ours, as table, JSON, picture."""
+    """Repeat an experiment of the paper, and write its figures beside ours."""
     from avatar_core.studies.study import write_study
 
     if name not in STUDIES:
@@ -57,7 +59,7 @@ def study(
 
 
 def _require_folder(output: Path) -> None:
-    """Fail before the hours, not after them."""
+    """Raise StorageError before the study runs, not hours later."""
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""``avatar vademecum`` and ``avatar show``, and what commands that build share."""
+"""``avatar vademecum`` and ``avatar show``, and options and output of all commands that build."""
 
 from __future__ import annotations
 
@@ -24,15 +24,19 @@ EXIT_NOT_CONVERGED = 3
 Surface = Annotated[
     str,
     typer.Argument(
-        help="OBJ, STL, PLY, VTK, OFF or label map (.nii, .nii.gz); 'phantom' is the built-in liver"
+        help="surface file (OBJ, STL, PLY, VTK, OFF) or label map (.nii, .nii.gz); 'phantom': the "
+        "built-in liver"
     ),
 ]
-Unit = Annotated[str, typer.Option(help="unit of the file: mm, cm or m")]
+Unit = Annotated[str, typer.Option(help="unit of length in the file: mm, cm or m")]
 Axes = Annotated[
-    str, typer.Option(help="axes of the file: RAS, LPS, or 16 numbers of a 4x4 matrix to RAS")
+    str,
+    typer.Option(
+        help="coordinate axes of the file: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS"
+    ),
 ]
-Label = Annotated[int | None, typer.Option(help="label of the organ in a label map")]
-Vertices = Annotated[int, typer.Option(help="number of mesh vertices, about")]
+Label = Annotated[int | None, typer.Option(help="value that marks the organ in a label map")]
+Vertices = Annotated[int, typer.Option(help="approximate number of mesh vertices")]
 
 
 def vademecum(
@@ -46,60 +50,71 @@ def vademecum(
     poisson: Annotated[float, typer.Option(help="Poisson's ratio, 0 to below 0.5 [-]")] = 0.48,
     patch_radius: Annotated[
         float | None,
-        typer.Option(help="radius of a tool's load patch [m]; default max(12 mm, 1.2 edges)"),
+        typer.Option(
+            help="radius of the patch through which a tool presses [m]; default: 12 mm, or 1.2 "
+            "mesh edges if that is larger"
+        ),
     ] = None,
     modes: Annotated[
-        int | None, typer.Option(help="far-field modes at most; default 100, 200 for large pushes")
+        int | None,
+        typer.Option(
+            help="maximum number of far-field modes; default: 100, or 200 with large deformation"
+        ),
     ] = None,
     tolerance: Annotated[
         float | None,
         typer.Option(
-            help="mean relative displacement error over the build's loads [-]; default 0.045, 0.02 "
-            "for large pushes"
+            help="target for the mean relative error of displacement [-]; default: 0.045, or 0.02 "
+            "with large deformation"
         ),
     ] = None,
     groups: Annotated[
         Path | None,
-        typer.Option(help=".npz with points 'clamped' and 'accessible' [m], instead of the rule"),
+        typer.Option(
+            help=".npz file with points 'clamped' and 'accessible' [m], instead of the rule"
+        ),
     ] = None,
     element: Annotated[
-        str | None, typer.Option(help="P1, P2 or Taylor-Hood; default by Poisson's ratio")
+        str | None,
+        typer.Option(help="finite element: P1, P2 or Taylor-Hood; default: by Poisson's ratio"),
     ] = None,
     coordinate: Annotated[
         list[str] | None,
         typer.Option(
-            help="keep a property of the material free, as poisson=0.40:0.49 or contrast=0.5:20 "
-            "(of the tumour); may be repeated"
+            help="material property that can be changed later, with its range: poisson=0.40:0.49, "
+            "or contrast=0.5:20 of a tumour; may be repeated"
         ),
     ] = None,
     tumour: Annotated[
-        Path | None, typer.Option(help="surface of the tumour, in unit and axes of the organ")
+        Path | None, typer.Option(help="surface file of a tumour, in unit and axes of the organ")
     ] = None,
     contrast: Annotated[
         float, typer.Option(help="Young's modulus inside the tumour over that outside [-]")
     ] = 1.0,
     material: Annotated[
         str,
-        typer.Option(
-            help="linear, neo-hookean or st-venant-kirchhoff; the last two keep the force's "
-            "magnitude as a coordinate, for large pushes"
-        ),
+        typer.Option(help="linear, or neo-hookean or st-venant-kirchhoff for large deformation"),
     ] = "linear",
-    max_push: Annotated[float, typer.Option(help="depth of a large push aimed at [m]")] = 20e-3,
+    max_push: Annotated[
+        float, typer.Option(help="depth up to which large deformation is built [m]")
+    ] = 20e-3,
     pushed: Annotated[
         int,
         typer.Option(
-            help="unseen sites to certify large pushes at, some 15 s each; two of them also "
-            "together with other effects, some 90 s each"
+            help="number of unseen sites at which large deformation is certified, about 15 s "
+            "each; at two of them also with other effects, about 90 s each"
         ),
     ] = 12,
-    certify: Annotated[int, typer.Option(help="unseen loads of the certificate")] = 200,
-    seed: Annotated[int, typer.Option(help="of the unseen loads")] = 0,
+    certify: Annotated[int, typer.Option(help="number of unseen loads for the certificate")] = 200,
+    seed: Annotated[int, typer.Option(help="random seed of the unseen loads")] = 0,
     mesh_error: Annotated[
-        bool, typer.Option("--mesh-error", help="also measure the mesh's own error (slow)")
+        bool,
+        typer.Option(
+            "--mesh-error", help="also measure the discretisation error of the mesh (slow)"
+        ),
     ] = False,
 ) -> None:
-    """Build the certified vademecum of an organ. Exit code 3: complete, but not converged."""
+    """Build the certified vademecum of an organ. Exit code 3: written, but not converged."""
     from avatar_core.fem.elasticity import Material
     from avatar_core.geometry.tumour import read_tumour
     from avatar_core.offline.large_deformation import LINEAR_RULE, LargeRule
@@ -159,7 +174,8 @@ def vademecum(
         best = built.convergence.rank_errors[-1]
         print(
             f"avatar: not converged: {best.rank} modes leave {best.mean:.1%} mean, "
-            f"{best.worst:.1%} worst; the file is complete and marked; raise --modes or "
+            f"{best.worst:.1%} worst; the file is complete, and marked as not converged; "
+            "raise --modes or "
             "--tolerance",
             file=sys.stderr,
         )
@@ -177,10 +193,10 @@ def _timed(built: Vademecum, progress: Progress) -> Vademecum:
 
 
 def show(
-    file: Annotated[Path, typer.Argument(help="a vademecum (.h5)")],
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    file: Annotated[Path, typer.Argument(help="vademecum (.h5)")],
+    as_json: Annotated[bool, typer.Option("--json", help="print as JSON")] = False,
 ) -> None:
-    """Say what a vademecum is, how wrong it may be, and what it cost."""
+    """Show what a vademecum contains, its certified errors, and what it cost to build."""
     from avatar_core.vademecum.storage import load_vademecum
 
     v = load_vademecum(file)
@@ -213,7 +229,7 @@ def show(
 
 
 def _large_summary(v: Vademecum) -> dict[str, Any] | None:
-    """What ``avatar show --json`` says of large deformation."""
+    """Large deformation, for ``avatar show --json``."""
     if v.large is None:
         return None
     certificate = asdict(v.large.certificate) if v.large.certificate else None
@@ -231,7 +247,7 @@ def read_organ(surface: str, unit: str, axes: str, label: int | None) -> Surface
 
 
 def parsed_axes(axes: str) -> Any:
-    """A name of axes, or the 4x4 matrix that 16 numbers are."""
+    """A name of axes, or 16 numbers as a 4x4 matrix."""
     numbers = axes.replace(",", " ").split()
     if len(numbers) != 16:
         return axes
@@ -249,7 +265,7 @@ def require(condition: bool, message: str) -> None:
 
 
 def show_text(v: Vademecum) -> None:
-    """What ``avatar show`` prints."""
+    """Print what ``avatar show`` shows."""
     info, c = v.info(), v.certificate
     print(f"{info.name}  (from {info.source}, {v.provenance.unit}, axes {info.axes})")
     print(
@@ -289,7 +305,7 @@ def show_text(v: Vademecum) -> None:
 
 
 def _show_curve(curve: AccuracyCurve) -> None:
-    """Fewer modes beside all of them, and the force beside both."""
+    """Print the error of displacement by number of modes, and that of the force."""
     from avatar_core.vademecum.accuracy import Detail
 
     row = curve.like(Detail(1, "surface")).points
@@ -354,7 +370,7 @@ def finite(value: Any) -> Any:
 
 
 class BuildBar:
-    """One progress bar over the stages of a build."""
+    """A progress bar over the stages of a build."""
 
     _LINEAR: ClassVar = {"mesh": 0.1, "solve": 0.35, "modes": 0.3, "certify": 0.15, "time": 0.1}
     _LARGE: ClassVar = {
@@ -385,7 +401,7 @@ class BuildBar:
         self._bar.close()
 
     def __call__(self, stage: str, fraction: float, error: float) -> None:
-        """Stage ``stage`` is done to ``fraction``; NaN: no error is known."""
+        """Show the completed fraction of a stage, and the error (NaN: unknown)."""
         before = 0.0
         for name, length in self._stages.items():
             if name == stage:

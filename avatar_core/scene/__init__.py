@@ -1,3 +1,3 @@
-"""What is to be simulated, and what was. YAML comes in, a checked scene goes out: organ, tools,
-outputs and effects. Recordings of a tool are kept and replayed, vademecums exported for ParaView.
+"""Scenes and recordings. YAML comes in; a checked scene goes out: organ, tools, outputs and
+effects. Recordings of a tool are stored and replayed, vademecums exported for ParaView.
 """

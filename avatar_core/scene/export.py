@@ -14,8 +14,8 @@ from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import StorageError, one_line
 from avatar_core.vademecum.model import Vademecum
 
-# By suffix: how meshio writes it into one file. XDMF beside HDF5 would be two, and the second
-# would be called as the vademecum is.
+# Options of meshio by suffix, each for a single file: XDMF with HDF5 would write a second one, with
+# the name of the vademecum.
 FORMATS = {
     ".vtu": {"file_format": "vtu"},
     ".xdmf": {"file_format": "xdmf", "data_format": "XML"},
@@ -74,7 +74,7 @@ def organ_mesh(
 
 
 def write_mesh(mesh: meshio.Mesh, path: str | Path) -> None:
-    """Write a mesh as its suffix says; the file appears complete or not at all.
+    """Write a mesh in the format of the suffix; the file appears complete or not at all.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def write_mesh(mesh: meshio.Mesh, path: str | Path) -> None:
     """
     path = Path(path)
     if path.suffix not in FORMATS:
-        raise StorageError(f"{path} ends on '{path.suffix}'; choose {' or '.join(FORMATS)}")
+        raise StorageError(f"{path} ends in '{path.suffix}'; choose {' or '.join(FORMATS)}")
     if not path.parent.is_dir():
         raise StorageError(f"folder {path.parent} does not exist; create it first")
     try:

@@ -1,6 +1,6 @@
-"""Scenes as YAML: read with the line of every mistake, written so that they read back equal.
+"""Scenes as YAML. Errors name the line; what is written reads back equal.
 
-Names, types, ranges and units are those of the dataclasses: a new effect needs nothing here.
+Names, types, ranges and units come from the dataclasses: a new effect needs no change here.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from avatar_core.scene.yaml_lines import (
     shown,
 )
 
-# Which fields of a Scene stand below which key; name, text, tools and effects stand by themselves.
+# Fields of a Scene by the key that groups them in YAML; the other keys have no group.
 SECTIONS = {
     "organ": ("vademecum",),
     "material": ("young_modulus", "poisson_ratio"),
@@ -86,24 +86,24 @@ def scene_path(name: str) -> Path:
 
 
 def read_scene(path: str | Path) -> Scene:
-    """Read a scene; see :func:`parse_scene`. A file of Prony terms is looked for beside it."""
+    """Read a scene; see :func:`parse_scene`. Files of Prony terms must lie in the same folder."""
     path = Path(path)
     return parse_scene(read_text(path), str(path), path.parent)
 
 
 def parse_scene(text: str, source: str, folder: Path | None = None) -> Scene:
-    """The scene that YAML text describes; a key with nothing after it keeps its default.
+    """The scene that YAML text describes; a key without a value keeps its default.
 
     Parameters
     ----------
     text : YAML
     source : its name in error messages
-    folder : where files that it names may lie; None: it may name none
+    folder : in which files that it names must lie; None if it may name none
 
     Raises
     ------
     SceneError
-        One line: source, line, key, value, and what is allowed.
+        In one line: source, line number, key, value, and what is allowed.
     """
     root = compose(text, source)
     entries = entries_of(root, "", _KEYS)
@@ -124,7 +124,7 @@ def parse_scene(text: str, source: str, folder: Path | None = None) -> Scene:
 
 
 def write_scene(scene: Scene) -> str:
-    """YAML text that :func:`parse_scene` reads as an equal scene, without a file beside it."""
+    """YAML text that :func:`parse_scene` reads as an equal scene; it names no other file."""
     document: dict[str, Any] = {"name": scene.name, "text": scene.text}
     for section, keys in SECTIONS.items():
         values = {key: getattr(scene, key) for key in keys}
@@ -141,14 +141,14 @@ def _plain_fields(one: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers of numpy are numbers, but YAML does not know them."""
+    """Plain Python types: YAML does not know those of numpy."""
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
     return float(value) if isinstance(value, float) else value
 
 
 def _fields(owner: type, entries: Entries, path: str) -> dict[str, Any]:
-    """Values of fields of a dataclass; those with nothing are left out."""
+    """Values of the fields of a dataclass; fields without a value are left out."""
     return {
         key: _value(node, below(path, key), owner, key)
         for key, (_, node) in entries.items()
@@ -157,7 +157,7 @@ def _fields(owner: type, entries: Entries, path: str) -> dict[str, Any]:
 
 
 def _value(node: Node, path: str, owner: type, key: str) -> Any:
-    """A node as the type of a field says."""
+    """The value of a node, of the type that the field has."""
     kind = get_type_hints(owner)[key]
     if kind is str:
         return _line(node, path)
@@ -172,7 +172,7 @@ def _value(node: Node, path: str, owner: type, key: str) -> Any:
 
 
 def _number(node: Node, path: str, allowed: Any, whole: bool) -> float:
-    """A number, also as 20e-3, which is a word to YAML 1.1; quotes make a word of any number."""
+    """A number, also one such as 20e-3, which is text in YAML 1.1; in quotes, it is refused."""
     value = math.nan
     is_number = isinstance(node, ScalarNode) and node.style is None
     try:
@@ -197,7 +197,7 @@ def _line(node: Node, path: str) -> str:
 
 
 def _choice(node: Node, path: str, choices: Sequence[str]) -> str:
-    """One of several words; as written, since YAML 1.1 takes off for false."""
+    """One of several words, as written: YAML 1.1 reads off as false."""
     if not isinstance(node, ScalarNode) or node.value not in choices:
         raise refused(node, f"{path} is {shown(node)}; it must be one of {', '.join(choices)}")
     return node.value
@@ -217,7 +217,7 @@ def _tool(node: Node, path: str, known: Sequence[str]) -> Tool:
 
 
 def _effects(node: Node, folder: Path | None) -> tuple[Effect, ...]:
-    """From a mapping, or a list of names and of mappings of one key."""
+    """Effects from a mapping, or from a list of names and mappings of one key."""
     if isinstance(node, SequenceNode):
         pairs = [_named(item) for item in node.value]
     elif isinstance(node, MappingNode):

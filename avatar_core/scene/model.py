@@ -1,4 +1,4 @@
-"""A scene: organ, tools, outputs, and the effects that run. What it does not name does not run.
+"""A scene: organ, tools, outputs and effects. Effects that it does not name do not run.
 
 :mod:`avatar_core.scene.file` reads and writes scenes as YAML.
 """
@@ -33,7 +33,7 @@ CONFLICTS = (
     ),
 )
 
-# Part of the names of topics, so that ROS 2 decides what it may hold.
+# Part of topic names, so the rules are those of ROS 2.
 _TOOL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 
@@ -64,15 +64,15 @@ class Tool:
 class Scene:
     """What is simulated, in SI units.
 
-    vademecum : file in the library's folder; "" is whichever is loaded
-    young_modulus, poisson_ratio, modes : None leaves them to the vademecum
-    cloud : which vertices are sent
+    vademecum : file in the library's folder; "" for the one that is loaded
+    young_modulus, poisson_ratio, modes : None for those of the vademecum
+    cloud : vertices that are sent
     effects : each at most once, in any order
 
     Raises
     ------
     SceneError
-        For a value out of range, or what contradicts itself.
+        For a value out of range, or a contradiction.
     """
 
     name: str = "palpation"
@@ -150,9 +150,9 @@ class Scene:
 
 @dataclass(frozen=True)
 class Combination:
-    """Two effects that share the response, and how they are put together.
+    """Two effects that do not simply superpose, and how they are combined.
 
-    error : of that, in the mean over unseen cases [-]; None: not measured
+    error : mean error of the combination over unseen cases [-]; None if not measured
     """
 
     effects: tuple[str, str]
@@ -175,9 +175,9 @@ _WITH_LARGE = (
 
 
 def combinations(scene: Scene, vademecum: Vademecum | None) -> tuple[Combination, ...]:
-    """The effects of a scene that share the response, all by pairs; without an organ, no figures.
+    """Pairs of effects of a scene that do not superpose, with errors if an organ is given.
 
-    Only large deformation does not superpose. Several tools count where there are several.
+    Only large deformation does not superpose. With one tool, several_tools is ignored.
     """
     chosen = {effect.name for effect in scene.effects}
     if len(scene.tools) == 1:
@@ -193,7 +193,7 @@ def combinations(scene: Scene, vademecum: Vademecum | None) -> tuple[Combination
 
 
 def _figure(certificate: Any, key: str | None) -> float | None:
-    """A figure of a certificate; None where it was not measured, as in files of older versions."""
+    """A figure of a certificate; None if it was not measured, as in files of older versions."""
     value = getattr(certificate, key, None) if key else None
     return None if value is None or math.isnan(value) else float(value)
 

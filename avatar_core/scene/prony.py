@@ -11,9 +11,9 @@ from avatar_core.errors import SceneError
 
 
 def parse_prony(text: str, source: str) -> dict[str, tuple[float, ...]]:
-    """``g`` and ``tau`` of comma-separated text; empty lines and those from # on are passed over.
+    """``g`` and ``tau`` of comma-separated text; empty lines, and text after #, are ignored.
 
-    A first line of words must say ``g, tau``, so that columns the other way round are noticed.
+    A header must read ``g, tau``, so that exchanged columns are noticed.
 
     Raises
     ------

@@ -1,17 +1,16 @@
-"""A recording once more: the same tips through the same step, and whether the forces are the same.
+"""Replay of a recording: the same tool path through the same step, and a comparison of the forces.
 
-What a step answers depends on the tips of this period and on what the model remembers: whether a
-tip came in through the surface, the last force to start from, held points of friction, relaxation,
-swing, breath. A period is *known* when all of that is in the recording:
+The force in a period depends on the tips in it and on the state of the model: whether a tip entered
+through the surface, the previous force, anchors of friction, relaxation, modal velocities, phase of
+the breath. A period is *known* if this state follows from the recording:
 
-- without effects, or with friction, large deformation, self-weight and several tools, a model
-  forgets everything as soon as no tip touches: from the first such period on, and again after
-  periods that were lost;
+- without effects, or with friction, large deformation, self-weight and several tools, the state is
+  reset whenever no tip touches: known from the first such period on, and again after lost periods;
 - with viscoelasticity or inertia, only in a recording from rest, up to the first lost period;
 - with respiration never, since the phase of the breath is not recorded.
 
-Known periods are the same to the bit on the machine that recorded them. Compared is what the organ
-answers, before the force guard, whose state (limits, ramps, engagement) is not recorded.
+Forces in known periods are identical to the last bit on the machine that recorded them. They are
+compared before the force guard, whose state (limits, ramps, engagement) is not recorded.
 """
 
 from __future__ import annotations
@@ -36,17 +35,17 @@ _MAY_BE_INSIDE = (int(Status.OUT_OF_RANGE), int(Status.INVALID_POSE))
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """What the organ answers to the recorded tips.
+    """Forces of the organ on the recorded tips.
 
     force : ndarray, shape (n, n_tools, 3) [N]
-    known : ndarray of bool, shape (n,), where it has to be what was recorded
+    known : ndarray of bool, shape (n,), where they must equal the recorded ones
     """
 
     force: np.ndarray
     known: np.ndarray
 
     def difference(self, recording: Recording) -> float:
-        """Largest difference of a force in known periods [N]; NaN where none is known."""
+        """Largest difference of a force in known periods [N]; NaN if no period is known."""
         if not self.known.any():
             return float("nan")
         gap = self.force[self.known] - recording.periods.force[self.known]
@@ -54,12 +53,12 @@ class Replayed:
 
 
 def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
-    """Step a new model through all tips of a recording.
+    """Compute the forces along the path of a recording with a new model.
 
     Raises
     ------
     StorageError
-        If the recording is of another vademecum.
+        If the recording was made with another vademecum.
     SceneError, ContactError, CoordinateError
         If the scene in it does not fit the vademecum.
     """
@@ -88,7 +87,7 @@ def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
 
 
 def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray:
-    """Whether all that the model remembers is in the recording, shape (n,)."""
+    """Whether the state of the model in each period follows from the recording, shape (n,)."""
     names = {effect.name for effect in scene.effects}
     known = np.zeros(len(periods), bool)
     if _RECORDED_NOWHERE in names:
@@ -104,10 +103,10 @@ def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray
 
 
 def why_not(recording: Recording) -> str:
-    """Why no period of a recording is known, and what to do."""
+    """Why no period of a recording is known, and the remedy."""
     names = {effect.name for effect in parse_scene(recording.scene, "scene").effects}
     if _RECORDED_NOWHERE in names:
         return "the phase of the breath is not recorded; record without respiration"
     if names & set(_REMEMBER_FOR_EVER):
-        return "what the organ remembers from before is not recorded; start with the tool off it"
+        return "the state of the organ at the start is not recorded; start with the tool off it"
     return "the tool was never off the organ; start with the tool off it"

@@ -1,7 +1,7 @@
-"""YAML as nodes that know their file and line, for errors that name them.
+"""YAML as nodes with file and line, which error messages name.
 
-Only the tree of nodes is taken from the YAML library; nothing in a file chooses what is
-constructed. Files are small: what is larger than ``MAX_BYTES`` is not even opened.
+The YAML library only builds the tree of nodes; nothing in a file chooses what is constructed. Files
+larger than ``MAX_BYTES`` are not even opened.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Entries = dict[str, tuple[Node, Node]]  # by key: the nodes of the key and of it
 
 
 def read_text(path: Path) -> str:
-    """The text of a small file; a large one, or what is no file, is not opened.
+    """The text of a small, ordinary file; others are not opened.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def compose(text: str, source: str) -> Node:
 
 
 class _Loader(yaml.SafeLoader):
-    """Composes nodes, but no aliases, which may stand for billions of them, and no deep nesting."""
+    """Composes nodes; refuses aliases, which can expand to billions of nodes, and deep nesting."""
 
     depth = 0
 
@@ -105,14 +105,14 @@ class _Loader(yaml.SafeLoader):
 
 
 def refused(place: Any, message: str) -> SceneError:
-    """The error of a node or an event."""
+    """An error that names file and line of a node or an event."""
     mark = place.start_mark
     return SceneError(f"{mark.name}:{mark.line + 1}: {message}")
 
 
 @contextmanager
 def placed_at(node: Node) -> Iterator[None]:
-    """Say where, for errors of what does not know of files."""
+    """Add file and line of a node to errors raised inside."""
     try:
         yield
     except SceneError as error:
@@ -130,7 +130,7 @@ def entries_of(node: Node, owner: str, known: Sequence[str]) -> Entries:
 
 
 def checked(pairs: Iterable[tuple[Node, Node]], owner: str, known: Sequence[str]) -> Entries:
-    """Entries whose keys are known and come once."""
+    """Entries; raises SceneError for an unknown key or one that is given twice."""
     found: Entries = {}
     for key, value in pairs:
         path = below(owner, shown(key))
@@ -157,17 +157,17 @@ def below(owner: str, key: str) -> str:
 
 
 def nothing_at(node: Node) -> Node:
-    """A node of no value, in the place of another."""
+    """A node without a value, at the position of another."""
     return ScalarNode(_NULL, "", node.start_mark, node.end_mark)
 
 
 def is_nothing(node: Node) -> bool:
-    """Whether nothing stands after a key."""
+    """Whether a key has no value."""
     return bool(node.tag == _NULL)
 
 
 def shown(node: Node) -> str:
-    """A node in an error message: short and in one line."""
+    """A node for an error message: short and in one line."""
     if not isinstance(node, ScalarNode):
         return "a list" if isinstance(node, SequenceNode) else "a mapping"
     text = " ".join(node.value.split())[:40]

@@ -17,23 +17,24 @@ from avatar_core.errors import LLEError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-Vectors = Sequence[FloatArray] | FloatArray  # one row, or one array, a shape
+Vectors = Sequence[FloatArray] | FloatArray  # one row or one array per shape
 
-DEFAULT_REGULARIZATION = 1e-6  # real livers: leave-one-out Dice .94, with the usual 1e-3 less
-SAME = 1e-6  # vectors closer than this part of the base's size are one: 0.1 um between livers
+DEFAULT_REGULARIZATION = 1e-6  # real livers: a better leave-one-out Dice than the usual 1e-3
+SAME = 1e-6  # vectors closer than this times the size of the base are equal: 0.1 um for livers
 
 
 @dataclass(frozen=True, eq=False)
 class Barycenter:
-    """One shape written as x ~ sum_j w_j X_j, sum_j w_j = 1, and how far that can be trusted.
+    """One shape as x ~ sum_j w_j X_j with sum_j w_j = 1, and measures of how far to trust it.
 
     neighbors : ndarray of int, shape (k,), nearest first; weights : ndarray, shape (k,)
     distances : ndarray, shape (k,), |x - X_j|, in the unit of the vectors (2-norm)
     residual : |x - sum_j w_j X_j|
-    hull_distance : of x to the convex hull of the neighbours; 0 inside
-    condition : of the local Gram matrix before regularisation, inf if singular; 1 for a member
-    member : the member of the base that x is, with weight 1, or None
-    notices : what was changed of the request, one line each
+    hull_distance : distance of x from the convex hull of the neighbours; 0 inside
+    condition : number of the local Gram matrix before regularisation; inf if singular, 1 for a
+        member
+    member : number of the member that equals x and has weight 1; None if there is none
+    notices : how the result differs from the request, one line each
     """
 
     neighbors: IntArray
@@ -47,13 +48,13 @@ class Barycenter:
 
     @property
     def absolute_sum(self) -> float:
-        """sum |w|: 1 if convex; errors of the neighbours are amplified by up to this."""
+        """sum |w|, which bounds the amplification of errors of the neighbours; 1 if convex."""
         return float(np.abs(self.weights).sum())
 
     def combine(self, values: Sequence[ArrayLike] | FloatArray) -> FloatArray:
-        """Eq. 18, sum_j w_j values[j]; a member of the base gets its own value bit for bit.
+        """Eq. 18, sum_j w_j values[j]; a member of the base gets exactly its own value.
 
-        values : one array per member of the base, all of one shape
+        values : one array per member of the base, all of the same shape
         """
         if self.member is not None:
             return np.array(values[self.member], dtype=np.float64)
@@ -68,7 +69,7 @@ def local_gram(point: FloatArray, neighbors: Vectors) -> FloatArray:
     """C_jk = (X_j - x) . (X_k - x), from differences, shape (k, k)."""
     difference = np.empty((len(neighbors), len(point)))
     for row, neighbor in zip(difference, neighbors, strict=True):
-        np.subtract(neighbor, point, out=row)  # five times faster than stacking temporaries
+        np.subtract(neighbor, point, out=row)  # five times faster than stacking differences
     return difference @ difference.T
 
 
@@ -76,14 +77,14 @@ def barycenter_weights(gram: FloatArray, regularization: float) -> FloatArray:
     """Weights of Eq. 15: min w^T C w with sum w = 1, from (C + r tr(C) I) w ~ 1.
 
     gram : ndarray, shape (..., k, k), local Gram matrices C
-    regularization : r > 0, part of the trace added to the diagonal; it splits the weight of
-        equal neighbours evenly and keeps the condition below 1 / r
+    regularization : r > 0, part of the trace added to the diagonal; divides weight evenly among
+        equal neighbours, and keeps the condition number below 1 / r
 
     Returns ndarray, shape (..., k). Raises LLEError if r lies outside (0, 1].
     """
     require_regularization(regularization)
     k = gram.shape[-1]
-    # by a power of two, which changes no digit, to a trace from 1/2 to 1, or 0: nothing underflows
+    # scaled by a power of two, which is exact, to a trace of 1/2 to 1, so that nothing underflows
     trace, exponent = np.frexp(np.trace(gram, axis1=-2, axis2=-1)[..., None, None])
     shift = regularization * np.where(trace > 0, trace, 1.0)
     right = np.ones((*gram.shape[:-1], 1))
@@ -123,9 +124,9 @@ def barycenter(
     vectors : the base, n arrays of shape (D,); point : shape (D,)
     n_neighbors : k, truncated to the size of the base with a notice
     convex : non-negative weights; regularization is then not used
-    leave_out : members that do not count, such as other scans of the same patient
+    leave_out : members that get no weight, such as other scans of the same patient
 
-    A point equal to a member gets weight 1 on it (the first of several), 0 on the others.
+    A point equal to a member has weight 1 on it (the first, if several are equal), 0 on the others.
 
     Raises LLEError if the base is empty, k <= 0, a value is not finite or lengths differ.
     """
@@ -134,7 +135,9 @@ def barycenter(
     candidates = np.array([j for j in range(len(vectors)) if j not in leave_out], dtype=np.int64)
     k, notices = _truncated(n_neighbors, len(candidates))
     distance = _distances(vectors, candidates, x)
-    size = distance.max()  # of the base, seen from the point; not of the vectors: their zero is any
+    size = (
+        distance.max()
+    )  # of the base, as seen from the point; the origin of the vectors is arbitrary
     order = np.argsort(distance, kind="stable")[:k]
     chosen, distance = candidates[order], distance[order]
     if distance[0] <= SAME * size:
@@ -171,7 +174,7 @@ def _distance_to(x: FloatArray, neighbors: list[FloatArray], weights: FloatArray
 
 
 def _condition(gram: FloatArray) -> float:
-    """Largest over smallest eigenvalue, inf if the smallest is rounding."""
+    """Condition number; inf if the smallest eigenvalue is within rounding of 0."""
     values = np.linalg.eigvalsh(gram)
     noise = len(gram) * np.finfo(float).eps * values[-1]
     return float(values[-1] / values[0]) if values[0] > noise else float("inf")
@@ -181,7 +184,7 @@ def _condition(gram: FloatArray) -> float:
 
 
 def checked_vector(point: ArrayLike, vectors: Vectors) -> FloatArray:
-    """The point as array, if it is finite and as long as the vectors of a base."""
+    """The point as an array; raises LLEError unless it is finite and as long as the vectors."""
     x = np.asarray(point, dtype=np.float64)
     if len(vectors) == 0:
         raise LLEError("lle: the base is empty; add at least one anatomy")
@@ -196,7 +199,7 @@ def checked_vector(point: ArrayLike, vectors: Vectors) -> FloatArray:
 
 
 def require_regularization(regularization: float) -> None:
-    """Raise LLEError unless it lies above 0, up to 1."""
+    """Raise LLEError unless 0 < regularization <= 1."""
     if not 0.0 < regularization <= 1.0:
         raise LLEError(
             f"lle: regularisation {regularization:g}; choose above 0 (1e-12 is almost none) to 1"
@@ -204,7 +207,7 @@ def require_regularization(regularization: float) -> None:
 
 
 def _truncated(n_neighbors: int, available: int) -> tuple[int, tuple[str, ...]]:
-    """Neighbours that there are, and a notice if that is fewer than asked for."""
+    """Number of neighbours to use, and a notice if it is less than requested."""
     if n_neighbors <= 0:
         raise LLEError(f"lle: {n_neighbors} neighbours asked for; choose at least 1")
     if available == 0:

@@ -1,11 +1,11 @@
-"""How far a tetrahedral mesh is from its reference shape: the symmetric Dirichlet energy.
+"""Distortion of a tetrahedral mesh against a reference: the symmetric Dirichlet energy.
 
     W(x) = sum_t V_t / V  sum_i 1/2 (s_i^2 + s_i^-2 - 2)
 
 with s_i the singular values of the deformation gradient F of tetrahedron t (Smith and Schaefer,
-"Bijective parameterization with free boundaries", 2015). W is blind to rigid motions, measures
-stretch and compression alike, and grows beyond bounds as a tetrahedron flattens: a line search on
-it never inverts one.
+"Bijective parameterization with free boundaries", 2015). W is invariant to rigid motions, penalises
+stretch and compression equally, and is unbounded as a tetrahedron flattens: a line search on it
+never inverts one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
-_LEAST_CURVATURE = 1e-3  # of a mode in which the energy is concave, against 4 of a stretch
+_LEAST_CURVATURE = 1e-3  # replaces that of concave modes; a stretch has 4
 
 
 class Distortion:
@@ -42,7 +42,7 @@ class Distortion:
         self._pattern()
 
     def _pattern(self) -> None:
-        """Sparsity of the Hessian and the place of each element entry in it."""
+        """Sparsity of the Hessian, and position of each element entry in it."""
         n = 3 * self.n_vertices
         key = np.repeat(self._dofs, 12, axis=1).ravel() * n + np.tile(self._dofs, (1, 12)).ravel()
         entry, self._place = np.unique(key, return_inverse=True)
@@ -68,11 +68,11 @@ class Distortion:
     def derivatives(self, positions: FloatArray) -> tuple[FloatArray, sp.csr_matrix]:
         """Gradient (3 n_vertices,) and positive definite Hessian (3 n_vertices, 3 n_vertices).
 
-        In the frame of the singular vectors the Hessian of an isotropic energy is diagonal but
-        for the stretches, and these do not couple here: f''(s_i) for stretches,
-        (f'(a) - f'(b)) / (a - b) for shears, (f'(a) + f'(b)) / (a + b) for twists, the only ones
-        that can be negative and are cut (Smith, De Goes, Kim, "Analytic eigensystems for
-        isotropic distortion energies", 2019).
+        In the frame of the singular vectors, the Hessian of an isotropic energy is diagonal except
+        for the stretches, which do not couple here: f''(s_i) for stretches,
+        (f'(a) - f'(b)) / (a - b) for shears, (f'(a) + f'(b)) / (a + b) for twists. Only twists
+        can be negative, and are then raised to a small positive value (Smith, De Goes, Kim,
+        "Analytic eigensystems for isotropic distortion energies", 2019).
         """
         left, s, right = np.linalg.svd(self.deformation_gradient(positions))
         stress = (left * (s - s**-3)[:, None, :]) @ right * self._weight[:, None, None]
@@ -92,7 +92,7 @@ class Distortion:
 def _eigenmodes(
     left: FloatArray, s: FloatArray, right: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Nine orthonormal changes of F and the energy's curvature in each, (n, 9, 3, 3), (n, 9)."""
+    """Nine orthonormal modes of F and the curvature of the energy in each, (n, 9, 3, 3), (n, 9)."""
     outer: FloatArray = np.einsum("tai,tjb->tijab", left, right)
     modes = [outer[:, i, i] for i in range(3)]
     curvature: list[FloatArray] = [1.0 + 3.0 * s[:, i] ** -4 for i in range(3)]

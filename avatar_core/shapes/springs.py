@@ -1,7 +1,7 @@
-"""Springs between a template's surface and a target's: from every point to the nearest, both ways.
+"""Springs between the surfaces of a template and a target, from each point to the nearest.
 
-"Nearest" is meant in position and normal, |x - y|^2 + length^2 |n_x - n_y|^2, which keeps the two
-faces of a thin lobe apart; without a length it is the distance field itself.
+The nearest point minimises |x - y|^2 + length^2 |n_x - n_y|^2 over position and normal, which keeps
+the two faces of a thin lobe apart; without a length, it is the closest point.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from avatar_core.geometry.surface import SurfaceMesh, winding_number
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-RETURN_NORMAL_LENGTH = 0.03  # of samples when the vertices heed none [m]
-_NEAR = 0.5e-3  # distance from a face at which its two sides are told apart [m]
+RETURN_NORMAL_LENGTH = 0.03  # of springs from samples when those from vertices use none [m]
+_NEAR = 0.5e-3  # distance from a face at which its two sides are distinguished [m]
 _PIECES = 3  # a template face is sampled at the centroids of this number squared of triangles
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A surface as evenly spread samples.
+    """A surface with evenly distributed samples.
 
     surface : SurfaceMesh
-    points, normals : ndarray, shape (n, 3) [m], outward by the winding number
-    volume : enclosed [m^3]
-    center : of the volume, shape (3,) [m]
+    points, normals : ndarray, shape (n, 3) [m]; normals point outward, by the winding number
+    volume : enclosed volume [m^3]
+    center : its centroid, shape (3,) [m]
     """
 
     surface: SurfaceMesh
@@ -43,14 +43,14 @@ class Target:
     center: FloatArray
 
     def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distance to the surface and nearest point of it, (k,) and (k, 3) [m]."""
+        """Distances to the surface and closest points of it, shapes (k,) and (k, 3) [m]."""
         squared, _, nearest = igl.point_mesh_squared_distance(
             np.ascontiguousarray(points), self.surface.vertices, self.surface.faces.astype(np.int64)
         )
         return np.sqrt(squared), nearest
 
     def distance_to(self, vertices: FloatArray, faces: IntArray) -> FloatArray:
-        """Distance of the samples to another triangulation, shape (n,) [m]."""
+        """Distances of the samples from another triangulation, shape (n,) [m]."""
         squared, _, _ = igl.point_mesh_squared_distance(
             self.points, vertices, faces.astype(np.int64)
         )
@@ -58,9 +58,9 @@ class Target:
 
 
 def sample_target(surface: SurfaceMesh, n: int) -> Target:
-    """Spread about n samples over a surface by area, in a low-discrepancy sequence.
+    """Distribute about n samples over a surface by area, in a low-discrepancy sequence.
 
-    Sheets inside the organ hold no samples, and normals of flipped faces are turned.
+    Sheets inside the organ get no samples; normals of flipped faces are turned outward.
 
     Raises
     ------
@@ -93,10 +93,10 @@ def sample_target(surface: SurfaceMesh, n: int) -> Target:
 def _facing(
     surface: SurfaceMesh, points: FloatArray, normals: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Outward normals of samples, and which samples part inside from outside.
+    """Outward normals of samples, and which samples separate inside from outside.
 
-    The winding number jumps at a face by the face's own orientation: only half an edge away the
-    neighbours outvote a flipped face.
+    At a face, the winding number jumps according to the orientation of that face; half an edge
+    away, its neighbours outweigh a flipped face.
     """
 
     def inside(offset: float) -> NDArray[np.bool_]:
@@ -110,10 +110,11 @@ def _facing(
 
 @dataclass(frozen=True, eq=False)
 class Springs:
-    """Pairs of a template surface point, sum_k weight_k x_node_k, and its anchor on the target.
+    """Pairs of a point on the template, sum_k barycentric_k x_node_k, and its anchor on the target.
 
     nodes : ndarray of int, shape (m, 3); barycentric : shape (m, 3)
-    anchors, normals : shape (m, 3) [m]; weights : shape (m,), one in all from each side
+    anchors, normals : shape (m, 3) [m]
+    weights : stiffness of each spring, shape (m,); those from each surface sum to one
     """
 
     nodes: IntArray
@@ -123,7 +124,7 @@ class Springs:
     weights: FloatArray
 
     def points(self, positions: FloatArray) -> FloatArray:
-        """The template's side of the springs, shape (m, 3) [m]."""
+        """Ends of the springs on the template, shape (m, 3) [m]."""
         return np.einsum("ik,ikd->id", self.barycentric, positions[self.nodes])
 
     def system(self, n_vertices: int, tangential: float) -> tuple[sp.csr_matrix, FloatArray]:
@@ -144,13 +145,13 @@ class Springs:
 def surface_springs(
     positions: FloatArray, mesh: TetMesh, target: Target, normal_length: float | None
 ) -> Springs:
-    """Springs from the template's surface vertices to the target and from every third sample back.
+    """Springs from the template's surface vertices to the target, and from every third sample back.
 
     Parameters
     ----------
-    positions : ndarray, shape (n_vertices, 3) [m], where the template is now
-    normal_length : what opposite normals add to a distance, halved [m]; None ties the vertices
-        to the nearest point of the target's triangles whatever its normal
+    positions : ndarray, shape (n_vertices, 3) [m], current positions of the template's vertices
+    normal_length : weight of the normals in the distance [m]; None connects the vertices to the
+        closest point of the target's triangles, whatever its normal
     """
     faces, own = mesh.boundary_faces, mesh.surface_vertices
     face_normals = _area_normals(positions, faces)
@@ -179,23 +180,23 @@ def surface_springs(
 
 
 def _on_triangles(points: FloatArray, target: Target) -> tuple[FloatArray, FloatArray]:
-    """Nearest point of the target and gradient of the distance there, each (n, 3)."""
+    """Closest points of the target and gradients of the distance there, each (n, 3)."""
     distance, anchor = target.closest(points)
     near = cKDTree(target.points).query(anchor)[1]
-    gradient = _unit(points - anchor)  # noise where the distance is small
+    gradient = _unit(points - anchor)  # dominated by rounding where the distance is small
     return anchor, np.where(distance[:, None] > 2e-4, gradient, target.normals[near])
 
 
 def _nearest(
     among: tuple[FloatArray, FloatArray], of: tuple[FloatArray, FloatArray], length: float
 ) -> IntArray:
-    """Index of the (position, normal) nearest to each given one, shape (k,)."""
+    """Indices of the nearest pairs of position and normal, shape (k,)."""
     tree = cKDTree(np.hstack([among[0], length * among[1]]))
     return tree.query(np.hstack([of[0], length * of[1]]))[1]
 
 
 def barycentric_centroids(n: int) -> FloatArray:
-    """Barycentric centroids of n^2 equal pieces of a triangle, shape (n^2, 3)."""
+    """Barycentric coordinates of the centroids of n^2 equal pieces of a triangle, (n^2, 3)."""
     up = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
     down = [(i + 2 / 3, j + 2 / 3) for i in range(n) for j in range(n - 1 - i)]
     second = np.array(up + down) / n

@@ -1,9 +1,9 @@
-"""What accuracy costs in time, online and offline, with the rivals in the same run.
+"""Accuracy against time, online and offline, with rivals in the same run.
 
-Online: every detail that a step can show the displacement with, timed here and judged on loads that
-neither the build nor the certificate drew. Offline: the mesh, the grid of a level set, who writes a
-shape, and how a patient is made. And whether promises were kept: errors, times, and the error that
-goes with each force.
+Online: every level of detail of the displacement, timed on this machine, with errors on loads that
+neither the build nor the certificate used. Offline: mesh size, grid of a level set, interpolation
+of shapes, and fidelity of a patient. Also whether certified errors and times, and the estimated
+error of each force, hold.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ FRESH = 1001  # seed of loads that no certificate draws
 
 @dataclass(frozen=True)
 class AccuracyTimeSettings:
-    """Vertices, unseen loads of the certificate and fresh ones, contacts; the offline sweeps."""
+    """Numbers of vertices, certified and fresh loads, and contacts; sizes of the offline sweeps."""
 
     n_vertices: int = 2850
     n_certified: int = 200

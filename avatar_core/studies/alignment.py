@@ -1,4 +1,4 @@
-"""How to lay one organ surface on another, and how far apart the two then are."""
+"""Alignment of one organ surface to another by a similarity transform."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TOLERANCE = 1e-7  # relative change of the sum of squares that ends the least sq
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Similarity x' = s R x + t that lays a surface on a reference.
+    """Similarity x' = s R x + t from a surface to a reference.
 
     rotation : ndarray R, shape (3, 3); scale : s; translation : ndarray t, shape (3,) [m]
     residual : root mean square distance of either surface to the other [m]
@@ -50,7 +50,7 @@ class Alignment:
         return (points - self.translation) @ self.rotation / self.scale
 
     def moved(self, surface: SurfaceMesh) -> SurfaceMesh:
-        """The surface laid on the reference."""
+        """The surface aligned to the reference."""
         return replace(surface, vertices=self.apply(surface.vertices))
 
 
@@ -58,8 +58,8 @@ def align(surface: SurfaceMesh, reference: SurfaceMesh, *, scale: bool = True) -
     """Similarity (or, without scale, rigid motion) that brings the surface onto the reference.
 
     min over s, R, t of sum_p phi_ref(s R p + t)^2 + sum_q [s phi(R^T (q - t) / s)]^2, p and q on
-    the two surfaces: one sum alone is least for an organ shrunk to a point. Started from the
-    best of about 200 rotations, centroids and volumes matched, which no flip survives.
+    the two surfaces: one sum alone is smallest for an organ shrunk to a point. The start is the
+    best of about 200 rotations, with centroids and volumes matched, which excludes flips.
     """
     fit = _Fit.of(surface, reference)
     ratio = (fit.target.volume / fit.grid.volume) ** (1 / 3) if scale else 1.0

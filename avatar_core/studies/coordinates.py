@@ -1,4 +1,4 @@
-"""What each extra coordinate costs and how wrong it is: Poisson's ratio, tumour, large pushes.
+"""Cost and error of each extra coordinate: Poisson's ratio, tumour, large deformation.
 
 All errors are on loads at face centroids and on values that no build has seen, against full finite
 elements on the same mesh. Beside the default (one space basis and a small Galerkin system for every

@@ -1,4 +1,4 @@
-"""Does the error that goes with the force cover the true one? The step, on fresh contacts."""
+"""Whether the estimated error of the force covers the true one, for unseen contacts."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from avatar_core.offline.certify.unseen_contacts import HEIGHTS, draw_contacts
 from avatar_core.vademecum.model import Vademecum
 
 _RADIUS = 8e-3  # of the tip, larger than it is ever above the surface [m]
-_APPROACH = 4  # steps in which it comes in
+_APPROACH = 4  # steps of its approach
 
 
 @dataclass(frozen=True, eq=False)
 class ForceErrors:
     """Forces of unseen contacts, each (n,) [N].
 
-    force : what the step gives; error : how far it is from the truth; estimate : what it says
+    force : of the step; error : its true error; estimate : its estimated error
     """
 
     force: np.ndarray
@@ -28,7 +28,7 @@ class ForceErrors:
 
     @property
     def coverage(self) -> float:
-        """Part of the contacts whose error is no more than estimated."""
+        """Fraction of the contacts whose error does not exceed the estimate."""
         return float(np.mean(self.error <= self.estimate))
 
     @property
@@ -40,7 +40,7 @@ class ForceErrors:
 def force_errors(
     vademecum: Vademecum, elasticity: Elasticity, n: int, seed: int = 0
 ) -> ForceErrors:
-    """Press a tip at ``n`` random points; the truth is full finite elements at the same depth."""
+    """Press a tip at ``n`` random points; the reference is full finite elements at equal depth."""
     contacts = draw_contacts(vademecum, n, seed)
     model = prepare(vademecum, (_RADIUS,), cloud="off", effects=())
     force, depth, relative = np.zeros((3, n))

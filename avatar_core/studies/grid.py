@@ -1,15 +1,16 @@
-"""What passing through a level set costs (paper, Sec. 3.3.1 and Fig. 9): h = 10, 5, 2.5, 1 mm.
+"""Error of the level-set grid (paper, Sec. 3.3.1 and Fig. 9), with h = 10, 5, 2.5 and 1 mm.
 
-A member of the base has weight one on itself, so all of its error comes from the grid:
+A member of the base has weight one on itself, so that all of its error comes from the grid:
 
 - volume: of the level set (as the library computes it) and of its marching-cubes surface;
 - distance: phi at random points of the organ, read from the grid trilinearly, against the exact
   one, relative L2 (Fig. 9d);
-- displacement: the finite element answers kept at grid points, where the paper keeps u(x, s), and
-  read back at the mesh's vertices, relative L2 over the organ, mean and worst over patch loads;
+- displacement: finite element solutions stored at grid points, as the paper stores u(x, s), and
+  interpolated back to the mesh's vertices, relative L2 over the organ, mean and worst over patch
+  loads;
 - remeshed displacement: finite elements on a new mesh of the marching-cubes surface against the
-  mesh of the original one, same clamp and loads. Its floor is what another mesh of the original
-  surface does (h = 0).
+  mesh of the original one, same clamp and loads. Its floor is the error of another mesh of the
+  original surface (h = 0).
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ PAPER: dict[str, Value] = {"displacement_error_1mm": 0.09}
 
 @dataclass(frozen=True)
 class GridSettings:
-    """Livers; of them at 1 mm; of them with displacements; mesh, loads, points of the distance."""
+    """Numbers of livers, of those at 1 mm and with displacements; mesh, loads, sample points."""
 
     n_livers: int | None = None
     n_fine: int = 6
@@ -139,7 +140,7 @@ def grid_row(
 def other_mesh_row(
     surface: SurfaceMesh, reference: Reference, settings: GridSettings
 ) -> dict[str, Value]:
-    """What a second mesh of the same surface does to the displacement."""
+    """Change of the displacement with another mesh of the same surface."""
     found = remeshed_errors(surface, reference, round(OTHER_MESH * settings.n_vertices))
     return {
         "liver": surface.name,

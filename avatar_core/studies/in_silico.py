@@ -1,8 +1,8 @@
-"""Fifty livers from one by Eq. 17 (paper, Sec. 3.2): does LLE find the six parameters, and how
-well does it interpolate shape and displacement?
+"""Fifty livers generated from one by Eq. 17 (paper, Sec. 3.2): whether LLE finds the six
+parameters, and how well it interpolates shape and displacement.
 
-All livers share the connectivity of one mesh, moved by the maps, so "the same node" has a meaning:
-Eq. 18 is tried nodewise and, as in the paper, at the points of the common grid.
+All livers have the same mesh, moved by the maps of Eq. 17, so that nodes correspond: Eq. 18 is
+evaluated nodewise and, as in the paper, at the points of the common grid.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ PAPER = {"volume_error": 0.05, "displacement_grid": 0.0903, "from_gap_k12": PARA
 
 @dataclass(frozen=True)
 class InSilicoSettings:
-    """How large: livers in the base and held out, mesh vertices, load positions, grid, phantom."""
+    """Number of livers in the base and held out, mesh vertices, load positions, grid, phantom."""
 
     n_base: int = 45
     n_held_out: int = 5
@@ -194,7 +194,7 @@ def _through_grid(livers: Population, point: Barycenter, mesh: TetMesh) -> Float
 
 
 def _passage(livers: Population, i: int, mesh: TetMesh) -> FloatArray:
-    """The patient's own field carried to the grid and back: what the grid alone costs."""
+    """The patient's own field interpolated to the grid and back: the error of the grid alone."""
     corners, back = trilinear(mesh.vertices, np.array(livers.box.origin), livers.box.spacing)
     return carried((back @ interpolation_matrix(mesh, corners)).tocsr(), livers.responses[i])
 

@@ -79,9 +79,9 @@ def grid_rows(surface: SurfaceMesh, spacings: tuple[float, ...]) -> list[dict[st
 
 
 def shape_rows(folder: Path | None, n_livers: int) -> list[dict[str, Value]]:
-    """Each liver written by the others: LLE with more and fewer neighbours, and its rivals.
+    """Each liver interpolated from the others: LLE with several numbers of neighbours, and rivals.
 
-    The error is 1 - Dice, the time that of the weights of one liver.
+    The error is 1 - Dice; the time is that of the weights of one liver.
     """
     settings = LeaveOneOutSettings(
         n_livers, (5, 10, 20, 0), (1e-3,), (), (5, 10, 20, 0), (29, 21, 25), 16
@@ -148,7 +148,7 @@ def _row(stage: str, method: str, setting: str, error: float, seconds: float) ->
 
 
 def _cpu(call: Callable[[], object], n: int) -> float:
-    """CPU time of one call, of many [s]."""
+    """Mean CPU time of a call [s]."""
     start = time.process_time()
     for _ in range(n):
         call()

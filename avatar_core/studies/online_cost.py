@@ -1,6 +1,6 @@
-"""Online accuracy against time: every detail of the curve, and its rivals, in one run.
+"""Online accuracy against time: every point of the accuracy curve, and rivals, in one run.
 
-Errors are those that 95 % of fresh loads keep; times are whole steps on this machine.
+Errors are the 95 % quantile over fresh loads; times are whole steps on this machine.
 
     vademecum      far field by PGD, exact near field, as a step shows it
     SVD optimum    the best basis for 150 solved loads, judged on others; no near field
@@ -44,11 +44,11 @@ TOLERANCES, DEADLINES = (0.01, 0.05, 0.20), (100e-6, 1e-3)  # [-], [s]
 
 @dataclass(frozen=True, eq=False)
 class Promises:
-    """What was promised, and what fresh loads and fresh timings came to.
+    """How far certified errors and times held for fresh loads and timings.
 
-    errors_kept : part of the pairs of a point and a fresh load within the promised error
-    points_kept : part of the points that 95 % of the fresh loads keep
-    times_kept : part of the points whose fresh p99 is within 1.3 of the promised one
+    errors_kept : fraction of all pairs of a point and a fresh load within the certified error
+    points_kept : fraction of the points whose certified error holds for 95 % of the fresh loads
+    times_kept : fraction of the points whose new p99 is within 1.3 times the certified one
     """
 
     errors_kept: float

@@ -1,4 +1,4 @@
-"""A study as a page that stands alone: pictures with a sentence each, and all rows as a table."""
+"""A study as one HTML file: plots with a sentence each, and all rows as a table."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ th:first-child, td:first-child { text-align: left }
 class Panel:
     """One plot of a report.
 
-    name : of its file; sentence : what it shows, under the plot
-    draw : draws into one pair of axes
+    name : of its file
+    sentence : caption
+    draw : draws into a pair of axes
     """
 
     name: str
@@ -97,7 +98,7 @@ def _page(
 
 
 def _columns(rows: Sequence[Mapping[str, Value]]) -> tuple[str, ...]:
-    """Keys of all rows, in the order in which they come."""
+    """Keys of all rows, in order of appearance."""
     return tuple(dict.fromkeys(key for row in rows for key in row))
 
 

@@ -1,8 +1,8 @@
-"""Finite element answers of an organ, and fields carried through a grid.
+"""Finite element responses of an organ, and their interpolation through a grid.
 
-The paper keeps displacements u(x, s) at the points of one grid common to all organs. Carried there
-and back, u(x) ~ sum_c t_c(x) sum_k l_k(x_c) u_k: barycentric coordinates l of the mesh at the grid
-points x_c (beyond the surface those of its closest point), then trilinear weights t.
+The paper stores displacements u(x, s) at the points of one grid common to all organs. Interpolated
+to the grid and back, u(x) ~ sum_c t_c(x) sum_k l_k(x_c) u_k, with barycentric coordinates l of the
+mesh at the grid points x_c (outside, those of the closest point) and trilinear weights t.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BoolArray = NDArray[np.bool_]
 def unit_load_response(
     mesh: TetMesh, clamped: BoolArray, centers: FloatArray, radius: float
 ) -> FloatArray:
-    """Displacements under unit patch loads along x, y, z at each centre, material of the paper.
+    """Displacements under unit patch loads along x, y, z at each centre, with the default material.
 
     clamped : ndarray of bool, shape (n_faces,), over mesh.boundary_faces
     centers : ndarray, shape (n, 3) [m]; radius : of the patches [m]
@@ -54,9 +54,9 @@ def carried(matrix: sp.csr_matrix, field: FloatArray) -> FloatArray:
 def trilinear(
     points: FloatArray, origin: FloatArray, spacing: float
 ) -> tuple[FloatArray, sp.csr_matrix]:
-    """The points of an endless grid around some points, and the interpolation from them.
+    """Points of an infinite grid around some points, and the trilinear interpolation from them.
 
-    Only these are needed, however fine the grid.
+    However fine the grid, only these are needed.
 
     Returns corners, ndarray, shape (m, 3) [m], and a sparse matrix, shape (n, m).
     """

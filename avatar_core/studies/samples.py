@@ -1,9 +1,9 @@
-"""More anatomies, smaller error (paper, Fig. 7), and what LLE costs beside scikit-learn.
+"""Error against the number of anatomies (paper, Fig. 7), and time of LLE beside scikit-learn.
 
-One liver that is not in the base is written by its twelve nearest of n livers of Eq. 17, n from 12
-to 500; the error is that of the distance field within the organ. Times start from the vectors of
-49,321 distances in memory and end with weights and embedding; linear algebra has one thread in
-both programs.
+A liver that is not in the base is interpolated from its twelve nearest of n livers of Eq. 17, n
+from 12 to 500; the error is that of the distance field within the organ. Times are from vectors of
+49,321 distances in memory to weights and embedding, with one thread for linear algebra in both
+programs.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ NAN = math.nan
 
 @dataclass(frozen=True)
 class SamplesSettings:
-    """Sizes of the base, livers to be written by it, grid, phantom, runs of each timing."""
+    """Sizes of the base, number of targets, grid, phantom, repetitions of each timing."""
 
     sizes: tuple[int, ...] = (12, 25, 50, 100, 200, 350, 500)
     n_targets: int = 20
@@ -54,9 +54,9 @@ QUICK = SamplesSettings(sizes=(12, 50, 150, 500), n_targets=5, phantom_spacing=1
 
 @dataclass(frozen=True)
 class Timing:
-    """Best of several runs [s] on n vectors, and how far the programs agree; NaN if not there.
+    """Shortest of several runs [s] on n vectors; NaN without scikit-learn.
 
-    weights_difference : largest difference of two weights at equal regularisation
+    weights_difference : largest difference of a weight from scikit-learn's
     """
 
     n_samples: int

@@ -1,4 +1,4 @@
-"""What the studies work on: folders of livers, who is who among them, and the paper's grid."""
+"""Data of the studies: folders of livers, scans of the same person, and the grid of the paper."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SUFFIXES = (".obj", ".stl", ".ply", ".vtk", ".off")
 PAPER_GRID = (43, 31, 37)  # 49,321 values
 PADDING = 0.02  # of the common box beyond all organs [m]
 
-# Scans of one person under several names (LiTS). They must never stand on both sides of a split.
+# Scans of one person under several names (LiTS). They must never be on both sides of a split.
 SAME_SUBJECT = (
     ("LiTS-6", "LiTS-7", "LiTS-8", "LiTS-9", "LiTS-10"),
     ("LiTS-14", "LiTS-15"),
@@ -49,10 +49,11 @@ class Livers:
 
 
 def read_livers(folder: Path | None, n: int | None, phantoms: int) -> Livers:
-    """All surfaces of a folder, or every so many of them.
+    """Surfaces of a folder: all, or n evenly chosen ones.
 
-    folder : None for ../shared/data/livers, and without it bent phantoms
-    n : at most, None for all; phantoms : how many stand in for a missing folder
+    folder : None for ../shared/data/livers, or bent phantoms if that does not exist
+    n : maximum number; None for all
+    phantoms : number that replace a missing folder
 
     Raises SurfaceError if the folder does not exist or holds fewer than three surfaces.
     """
@@ -83,7 +84,7 @@ def read_livers(folder: Path | None, n: int | None, phantoms: int) -> Livers:
 
 
 def read_liver(folder: Path | None, name: str) -> SurfaceMesh:
-    """One liver of a folder, its first if it has none of that name; the phantom without a folder.
+    """One liver of a folder; the first one if none has that name, the phantom without a folder.
 
     folder : None for ../shared/data/livers
     """
@@ -96,14 +97,14 @@ def read_liver(folder: Path | None, name: str) -> SurfaceMesh:
 
 
 def subject_numbers(names: Sequence[str]) -> IntArray:
-    """One number a person, shape (n,): known scans of one person share it."""
+    """Number of the person of each scan, shape (n,)."""
     person = {name: scans[0] for scans in SAME_SUBJECT for name in scans}
     _, number = np.unique([person.get(name, name) for name in names], return_inverse=True)
     return number.astype(np.int64)
 
 
 def paper_box(surfaces: Sequence[SurfaceMesh], shape: tuple[int, int, int]) -> GridBox:
-    """The box of this many points around all surfaces, the same spacing along each axis."""
+    """Box around all surfaces with a number of points along each axis and equal spacing."""
     low = np.min([surface.bounding_box[0] for surface in surfaces], axis=0)
     high = np.max([surface.bounding_box[1] for surface in surfaces], axis=0)
     cells = np.array(shape) - 1
@@ -126,7 +127,7 @@ def as_grid(vector: FloatArray, box: GridBox) -> DistanceGrid:
 
 
 def centred(surface: SurfaceMesh) -> SurfaceMesh:
-    """The surface with its centre of volume in the origin."""
+    """The surface with its centroid of volume at the origin."""
     grid = distance_grid(surface, spacing=float(surface.extent.max()) / 24, padding=0.0)
     middle = grid.points[grid.values.ravel() < 0].mean(axis=0)
     return replace(surface, vertices=surface.vertices - middle)

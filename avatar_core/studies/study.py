@@ -1,4 +1,4 @@
-"""What every study returns, writes and prints: the paper's figure beside ours, on which machine."""
+"""Results of a study: what it prints and writes, with the paper's figures and the machine."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ PACKAGES = ("avatar", "numpy", "scipy", "libigl", "scikit-fem", "rslab", "scikit
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """One of the paper's experiments, repeated.
+    """Result of an experiment.
 
     name : of the files it is written to
-    sentence : what was found, for the picture
-    summary : flat; errors are fractions, times seconds, a length says its unit in its name
-    rows : flat, one a measurement
-    paper : the paper's values, under the summary's keys where they can be compared
+    sentence : the finding, in one sentence, for the picture
+    summary : key figures; errors are fractions, times seconds, lengths have their unit in the key
+    rows : one mapping per measurement
+    paper : values of the paper, under the same keys as in the summary
     draw : draws the picture
-    notices : what was skipped or done otherwise than asked, one line each
+    notices : what was skipped or done differently from the request, one line each
     """
 
     name: str
@@ -49,7 +49,7 @@ class Study:
     notices: tuple[str, ...] = ()
 
     def table(self) -> str:
-        """The summary with the paper's values beside it."""
+        """The summary beside the values of the paper."""
         width = max(len(key) for key in self.summary)
         lines = [f"{'':{width}s} {'paper':>24s} {'here':>12s}"]
         for key, value in self.summary.items():
@@ -94,7 +94,7 @@ def machine() -> dict[str, Value]:
 
 
 def follow(items: Iterable[Item], text: str) -> Iterator[Item]:
-    """Iterate behind a progress bar, shown on a terminal only."""
+    """Iterate with a progress bar, which is shown on a terminal only."""
     from tqdm import tqdm
 
     yield from tqdm(items, desc=f"{text:28s}", file=sys.stderr, disable=None, leave=False)
@@ -130,7 +130,7 @@ class ProgressBar:
 
 @contextmanager
 def one_blas_thread() -> Iterator[tuple[str, ...]]:
-    """Limit linear algebra to one thread, the same for every method; yields notices."""
+    """Limit linear algebra to one thread, for all methods alike; yields notices."""
     try:
         from threadpoolctl import threadpool_limits
     except ImportError:
@@ -141,7 +141,7 @@ def one_blas_thread() -> Iterator[tuple[str, ...]]:
 
 
 def mean_and_worst(key: str, values: Iterable[float]) -> dict[str, float]:
-    """``key`` with the mean and ``key_worst`` with the largest, NaN of nothing."""
+    """Mean under ``key`` and maximum under ``key_worst``; NaN if there are no values."""
     found = [float(value) for value in values]
     if not found:
         return {key: math.nan, f"{key}_worst": math.nan}
@@ -168,7 +168,7 @@ def _text(value: Value) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """numpy scalars become Python's; JSON has no NaN: null instead."""
+    """Plain Python scalars; NaN, which JSON does not have, becomes null."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

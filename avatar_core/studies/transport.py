@@ -1,10 +1,10 @@
-"""How well a base of real livers answers for a new one: three fidelities, leave-one-out.
+"""Errors of a new patient's response from a base of real livers: three fidelities, leave-one-out.
 
-The truth is the full finite element solution for all accessible loads on the patient's own mesh,
-with clamp and accessible region carried over from the template; errors are relative mass-weighted
-L2 norms of displacement, the three directions of a load together. Scans of one person never help
-one another. ``solved`` solves exactly these problems, so its error is zero by construction; its
-time is that of all solutions, before any of them is separated.
+The reference is the full finite element solution for all accessible loads on the patient's mesh,
+with clamp and accessible region transferred from the template; errors are relative mass-weighted
+L2 norms of displacement, with the three directions of a load together. Other scans of the same
+person are left out. ``solved`` solves exactly these problems, so that its error is zero by
+construction; its time is that of all solutions, without their separation.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def test_check_says_units_outputs_and_what_combines(run: Any) -> None:
         r"large_deformation with friction: forces off the normal are added linearly",
     ):
         assert re.search(line, out)
-    assert "wrong in the mean" not in out
+    assert "mean error" not in out
 
 
 def test_check_reads_a_scene_of_ones_own(run: Any, tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_check_says_how_wrong_a_combination_is(run: Any, monkeypatch: pytest.Mon
     organ = SimpleNamespace(large=large, body=object(), parametric=None, contrast=None)
     monkeypatch.setattr(storage, "load_vademecum", lambda path: organ)
     code, out, err = run("check", "everything", "--vademecum", "large.h5")
-    assert re.search(r"large_deformation with friction: .*\n +7\.1% wrong in the mean", out)
+    assert re.search(r"large_deformation with friction: .*\n +mean error 7\.1%", out)
     assert re.search(r"with several_tools: .*\n +not measured in this file", out)
     assert re.search(r"with inertia: .*\n +not measured in this file", out)
     assert code == 1

@@ -1,7 +1,7 @@
-"""``avatar bench effects``: what each effect of a scene costs in a step, all in one run.
+"""``avatar bench effects``: time of a step with each effect of a scene, all in one run.
 
-Every effect stands alone against the bare scene, in alternating slides so that both see the same
-machine; the bare scene stands against a linear step that was fused by hand into one function
+Each effect is compared with the bare scene in alternating slides, so that both see the same load of
+the machine. The bare scene can be compared with a linear step written by hand as one function
 (:mod:`avatar_core.studies.bench.fused`).
 """
 
@@ -99,7 +99,7 @@ def run_effects_bench(
 
     Parameters
     ----------
-    fused : file with the step fused by hand; None leaves ``bare_ratio`` out
+    fused : file with the step written by hand; None leaves ``bare_ratio`` out
     """
     rows = effect_rows(vademecum, (*CASES, ("everything", 2, EVERYTHING)), progress)
     summary = {

@@ -1,4 +1,4 @@
-"""Does this machine hold 1 kHz? Step times beside the honest rivals, in one run.
+"""Step times of a vademecum and of its rivals, in one run.
 
 Rivals: the dense table (all columns stored, same contact solve) and a prefactored direct solve.
 """

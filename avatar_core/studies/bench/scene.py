@@ -1,4 +1,4 @@
-"""What a step of a scene costs on this machine, beside the bare step of the same vademecum."""
+"""Time of a scene's step on this machine, beside the bare step of the same vademecum."""
 
 from __future__ import annotations
 

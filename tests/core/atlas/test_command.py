@@ -92,7 +92,7 @@ def test_a_stopped_command_goes_on(
 
     monkeypatch.setattr(atlas_build, "register", stopped)
     code, _, err = run("create", file, *files, "--spacing", 0.02, "--jobs", 1)
-    assert code == 130 and "the same command goes on" in err and not file.exists()
+    assert code == 130 and "run the same command again" in err and not file.exists()
     monkeypatch.setattr(atlas_build, "register", register)
     code, out, _ = run("create", file, *files, "--spacing", 0.02, "--jobs", 1)
     assert code == 0 and "1 of them from an interrupted build" in out
