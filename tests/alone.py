@@ -26,6 +26,7 @@ class Turns:
         self._timing: set[Path] = set()
         self._held: IO[Any] | None = None
 
+    @pytest.hookimpl(trylast=True)  # of those that are selected
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         self._timing = {item.path for item in items if is_timing(item)}
         items.sort(key=lambda item: item.path in self._timing)

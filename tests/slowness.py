@@ -2,27 +2,52 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
-_WORK = 0.1  # processor time of one measurement [s]
+_WORK = 0.2  # processor time of one measurement [s]
 
 
 def slowness() -> float:
-    """How many times longer a fixed amount of work takes here and now than its processor time."""
+    """How many times longer work takes than on a machine that nothing else uses.
+
+    By a fixed amount of work here and now, and by the load of the last minute.
+    """
     begin, used = time.monotonic(), time.thread_time()
     while time.thread_time() - used < _WORK:
         pass
-    return max(1.0, (time.monotonic() - begin) / _WORK)
+    here = (time.monotonic() - begin) / _WORK
+    return max(1.0, here, os.getloadavg()[0] / len(os.sched_getaffinity(0)))
+
+
+class Deadline:
+    """An end of waiting, ``seconds`` from now on a machine that nothing else uses."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds, self._begin = seconds, time.monotonic()
+
+    def __bool__(self) -> bool:
+        """Whether it has passed."""
+        took = time.monotonic() - self._begin
+        return took > self._seconds and took > self._seconds * slowness()
 
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
     """Fails if its body takes longer than ``seconds`` of a machine that nothing else uses."""
-    before, begin = slowness(), time.monotonic()
+    passed = Deadline(seconds)
     yield
-    took = time.monotonic() - begin
-    if took > seconds:
-        slow = max(before, slowness())
-        assert took <= slow * seconds, f"took {took:.1f} s, more than {seconds:g} s x {slow:.1f}"
+    assert not passed, f"took longer than {seconds:g} s"
+
+
+def end_of(process: subprocess.Popen[Any], seconds: float) -> int:
+    """Exit code of a process that has to end within ``seconds`` of such a machine."""
+    passed = Deadline(seconds)
+    while process.poll() is None:
+        assert not passed, f"did not end within {seconds:g} s"
+        time.sleep(0.01)
+    return int(process.returncode)

@@ -13,6 +13,7 @@ import pytest
 from avatar_core.common.confined import Confined, ConfinedError
 from avatar_core.errors import StorageError
 from avatar_core.vademecum.storage import load_vademecum
+from tests.slowness import within
 
 SECONDS = 20.0
 
@@ -48,10 +49,8 @@ def test_a_crash_is_an_error_and_the_next_call_works(confined: Confined) -> None
 
 def test_a_hang_is_an_error_and_the_next_call_works(confined: Confined) -> None:
     confined.call(SECONDS, os.getpid)
-    begin = time.monotonic()
-    with pytest.raises(ConfinedError, match="longer than 1 s"):
+    with within(10.0), pytest.raises(ConfinedError, match="longer than 1 s"):
         confined.call(1.0, time.sleep, 60.0)
-    assert time.monotonic() - begin < 10.0
     assert confined.call(SECONDS, os.getpid) == confined.pid
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from avatar_core.scene.file import parse_scene, read_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.yaml_lines import MAX_BYTES
 from tests.core.scene_cases import PRONY, refusal
+from tests.slowness import within
 
 # --- YAML: what it means --------------------------------------------------------------------------
 
@@ -243,10 +243,9 @@ def test_a_hundred_megabytes_are_refused_without_a_look(tmp_path: Path) -> None:
     path = tmp_path / "large.yaml"
     path.touch()
     os.truncate(path, 100 * 2**20)
-    start = time.perf_counter()
-    with pytest.raises(SceneError, match=rf"large\.yaml: has 104857600 bytes; at most {MAX_BYTES}"):
+    said = rf"large\.yaml: has 104857600 bytes; at most {MAX_BYTES}"
+    with within(1.0), pytest.raises(SceneError, match=said):
         read_scene(path)
-    assert time.perf_counter() - start < 1.0
 
 
 @pytest.mark.usefixtures("closed_files")
@@ -269,9 +268,8 @@ def test_an_alias_bomb_is_refused_at_its_first_alias() -> None:
     """Nine levels of nine aliases would stand for 9^9 words."""
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join(9 * [f'*a{i - 1}'])}]" for i in range(1, 10)]
-    start = time.perf_counter()
-    assert "aliases" in refusal("\n".join(lines), 2)
-    assert time.perf_counter() - start < 1.0
+    with within(1.0):
+        assert "aliases" in refusal("\n".join(lines), 2)
 
 
 def test_a_file_in_another_encoding_is_refused_with_its_line(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.slowness import Deadline
 from tests.stored import stored
 
 TIP_RADIUS = 0.005  # [m]
@@ -45,11 +46,12 @@ class Probe:
         self.until(lambda: False, seconds, fail=False)
 
     def until(self, reached: Callable[[], bool], timeout: float, fail: bool = True) -> None:
-        deadline = time.monotonic() + timeout
+        passed = Deadline(timeout) if fail else None
+        end = time.monotonic() + timeout
         while not reached():
-            if time.monotonic() > deadline:
-                assert not fail, f"not reached within {timeout:g} s"
+            if passed is None and time.monotonic() > end:
                 return
+            assert not passed, f"not reached within {timeout:g} s"
             self._executor.spin_once(timeout_sec=0.01)
 
     def next(
@@ -66,10 +68,10 @@ class Probe:
         subscription = self.node.create_subscription(
             kind, topic, lambda message: found.append(message) if wanted(message) else None, qos
         )
-        deadline = time.monotonic() + timeout
+        passed = Deadline(timeout)
         try:
             while not found:
-                assert time.monotonic() < deadline, f"no such {topic} within {timeout:g} s"
+                assert not passed, f"no such {topic} within {timeout:g} s"
                 meanwhile()
                 self._executor.spin_once(timeout_sec=0.002)
         finally:

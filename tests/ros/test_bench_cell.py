@@ -30,6 +30,7 @@ def test_a_broken_vademecum_ends_the_measurement(library: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timing
 def test_the_cell_keeps_time(library: Path, tmp_path: Path) -> None:
     report = run_cell(library / "liver.h5", 10.0, tmp_path / "cell.json")
     data = json.loads((tmp_path / "cell.json").read_text())
@@ -56,6 +57,7 @@ def test_the_cell_keeps_time(library: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timing
 def test_the_cell_keeps_time_while_the_material_changes(library: Path) -> None:
     report = run_cell(library / "liver.h5", 6.0, ordinary=False, changes=2.0)
     run = report.real_time
@@ -67,6 +69,7 @@ def test_the_cell_keeps_time_while_the_material_changes(library: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timing
 def test_nothing_grows_in_a_minute(library: Path) -> None:
     """The times of a soak are measured by `avatar bench cell --seconds 600` on a quiet machine."""
     report = run_cell(library / "liver.h5", 60.0, real_time=False)

@@ -13,6 +13,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.framework import qos
+from avatar_ros.framework.realtime import wake_up_periods
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
@@ -191,11 +192,12 @@ def test_a_pose_that_stops_coming_is_stale(
 
 
 def test_the_loop_keeps_its_rate_without_poses(cell: Any, probe: Any) -> None:
-    statistics = probe.next(LoopStatistics, "statistics", qos.STATISTICS)
+    probe.next(LoopStatistics, "statistics", qos.STATISTICS)
+    on_time = np.mean(wake_up_periods(1.0) < 1.5e-3)  # of a loop that only sleeps, meanwhile
     statistics = probe.next(LoopStatistics, "statistics", qos.STATISTICS)
     # The design rate is 1000 Hz; the bound only tells a working loop from a broken one, since
     # these tests share their cores with whatever else runs. `avatar bench cell` measures it.
-    assert 700.0 < statistics.rate < 1100.0
+    assert 700.0 * on_time < statistics.rate < 1100.0
     assert math.isnan(statistics.pose_age_p50)
 
 

@@ -29,7 +29,7 @@ from tests.ros.conftest import Probe
 from tests.ros.fault_cell import MOST, FaultCell, Harm, Silence
 from tests.ros.test_patient_interpolation import folder, livers
 
-pytestmark = [pytest.mark.ros, pytest.mark.long]
+pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
 __all__ = ["folder", "livers"]  # fixtures
 
 STOPPED = 2.0  # [s]

@@ -16,6 +16,8 @@ from avatar_ros.prepare.protocol import Channel
 from avatar_ros.prepare.requests import PreparationRequest
 from avatar_ros.prepare.shared_arrays import map_shared, write_shared
 
+from tests.slowness import end_of
+
 pytestmark = pytest.mark.ros
 
 
@@ -64,6 +66,6 @@ def test_the_receiving_process_ends_with_the_node(own_domain: dict[str, str]) ->
         )
     ours.close()
     try:
-        assert process.wait(60.0) == 0
+        assert end_of(process, 60.0) == 0
     finally:
         process.kill()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import time
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,6 +17,8 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
 from avatar_ros.msg import ContactState
+from tests.ros.refusals import refusal
+from tests.slowness import end_of
 
 pytestmark = pytest.mark.ros
 
@@ -43,9 +43,7 @@ def test_a_signal_ends_a_node_cleanly(
     probe.until(lambda: False, 1.0, fail=False)
     assert _state(probe, node) == "active"
     process.send_signal(number)
-    begin = time.monotonic()
-    assert process.wait(10.0) == 0
-    assert time.monotonic() - begin < 2.0
+    assert end_of(process, 2.0) == 0
     assert "rror" not in process.said()
 
 
@@ -63,6 +61,7 @@ def test_without_vademecum_the_wrench_is_zero(own_domain: dict[str, str], probe:
         assert process.finish() == 0
 
 
+@pytest.mark.long  # their step is compiled
 def test_two_tools_have_topics_of_their_own(own_domain: dict[str, str], probe: Any) -> None:
     arguments = ["-p", "tools:=[left,right]", "-p", "tip_radius:=[0.004,0.008]"]
     process = Module("contact", ["--ros-args", *arguments], own_domain)
@@ -93,30 +92,38 @@ def test_the_contact_node_is_managed(own_domain: dict[str, str], probe: Any) -> 
         assert process.finish() == 0
 
 
-@pytest.mark.parametrize(
-    ("node", "arguments", "reason"),
-    [
-        ("contact", ["rate:=5.0"], "from 100 to 2000"),
-        ("contact", ["rate:=fast"], "rate"),
-        ("contact", ["tip_radius:=0.5"], "0.002 to 0.02"),
-        ("contact", ["tip_radius:=[0.005,0.005]"], "tip_radius"),
-        ("contact", ["tools:=[a b]"], "topic's name"),
-        ("contact", ["cloud:=fog"], "surface, volume, off"),
-        ("contact", ["frame_id:=''"], "frame_id"),
-        ("contact", ["scene:=nowhere"], "come with avatar: breathing"),
-        ("contact", ["scene:=/nowhere.yaml"], "No such file"),
-        ("contact", ["scene:=two_tools"], "set the parameter tools"),
-        ("vademecum_loader", ["library_dir:=/nowhere"], "not a directory"),
-        ("vademecum_loader", ["vademecum:=missing.h5"], "No such file"),
-        ("vademecum_loader", ["max_megabytes:=0"], "from 1 to 65536"),
-    ],
-)
+WRONG = [
+    ("contact", ["rate:=5.0"], "from 100 to 2000"),
+    ("contact", ["rate:=fast"], "rate"),
+    ("contact", ["tip_radius:=0.5"], "0.002 to 0.02"),
+    ("contact", ["tip_radius:=[0.005,0.005]"], "tip_radius"),
+    ("contact", ["tools:=[a b]"], "topic's name"),
+    ("contact", ["cloud:=fog"], "surface, volume, off"),
+    ("contact", ["frame_id:=''"], "frame_id"),
+    ("contact", ["scene:=nowhere"], "come with avatar: breathing"),
+    ("contact", ["scene:=/nowhere.yaml"], "No such file"),
+    ("contact", ["scene:=two_tools"], "set the parameter tools"),
+    ("vademecum_loader", ["library_dir:=/nowhere"], "not a directory"),
+    ("vademecum_loader", ["vademecum:=missing.h5"], "No such file"),
+    ("vademecum_loader", ["max_megabytes:=0"], "from 1 to 65536"),
+]
+
+
+@pytest.mark.parametrize(("node", "arguments", "reason"), WRONG)
+def test_a_wrong_parameter_is_refused(
+    own_domain: dict[str, str], node: str, arguments: list[str], reason: str
+) -> None:
+    assert reason in refusal(node, *arguments)
+
+
+# refused when it is declared, and when the node is configured
+@pytest.mark.parametrize(("node", "arguments", "reason"), [WRONG[0], WRONG[7], WRONG[11]])
 def test_a_wrong_parameter_ends_the_node(
-    own_domain: dict[str, str], tmp_path: Path, node: str, arguments: list[str], reason: str
+    own_domain: dict[str, str], node: str, arguments: list[str], reason: str
 ) -> None:
     options = [word for argument in arguments for word in ("-p", argument)]
     process = Module(node, ["--ros-args", *options], own_domain)
-    assert process.wait(60.0) == 1
+    assert end_of(process, 60.0) == 1
     assert reason in process.last_line()
 
 

@@ -22,6 +22,7 @@ from avatar_ros.nodes.cell import node_arguments
 from avatar_ros.msg import ContactState
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.pages import ROOT
+from tests.slowness import end_of
 
 pytestmark = pytest.mark.ros
 
@@ -59,7 +60,7 @@ def test_one_file_of_parameters_starts_a_cell_that_a_signal_ends(
         )
         begin = time.monotonic()
         process.send_signal(number)
-        assert process.wait(15.0) == 0
+        assert end_of(process, 15.0) == 0
         print(f"ended in {time.monotonic() - begin:.1f} s")
 
 

@@ -39,7 +39,8 @@ from tests.ros.conftest import PATIENT, Probe
 
 pytestmark = [
     pytest.mark.ros,
-    pytest.mark.long,  # it measures time
+    pytest.mark.long,
+    pytest.mark.timing,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
 ]
 

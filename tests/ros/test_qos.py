@@ -25,6 +25,8 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from avatar_ros.msg import ContactState, LoopStatistics
+from tests.ros.refusals import refusal
+from tests.slowness import slowness
 
 pytestmark = pytest.mark.ros
 
@@ -80,10 +82,9 @@ def diagnosis(probe: Any, wanted: Any) -> DiagnosticStatus:
 def test_what_would_harm_is_refused_in_one_line(
     own_domain: dict[str, str], node: str, value: str, reason: str
 ) -> None:
-    process = Module(node, ["--ros-args", "-p", value], own_domain)
-    assert process.wait(60.0) == 1
-    assert reason in process.last_line()
-    assert f"parameter {value.split(':=')[0].rsplit('.', 1)[0]}" in process.last_line()
+    said = refusal(node, value)
+    assert reason in said and "\n" not in said
+    assert f"parameter {value.split(':=')[0].rsplit('.', 1)[0]}" in said
 
 
 def test_an_override_is_what_others_see(own_domain: dict[str, str], probe: Any) -> None:
@@ -198,4 +199,4 @@ def test_reliable_subscribers_that_stand_still_do_not_hold_up_the_loop(
     )
     # tells a loop that goes on from one that waits for them, a tenth of a second each time
     assert asleep.rate > 0.5 * awake.rate
-    assert asleep.compute_p99 < 0.05
+    assert asleep.compute_p99 < 0.05 * slowness()

@@ -28,6 +28,8 @@ from avatar_ros.framework.discovery import (
 )
 from lifecycle_msgs.srv import GetState
 
+from tests.slowness import end_of
+
 pytestmark = pytest.mark.ros
 
 FAST_DDS = "rmw_fastrtps_cpp"
@@ -151,7 +153,7 @@ def test_a_node_receives_on_the_loopback_alone(
         assert ("dds.shm" in _threads(node.pid)) == shared_memory
     finally:
         node.terminate()
-        assert node.wait(10.0) == 0
+        assert end_of(node, 10.0) == 0
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,7 @@ def test_another_machine_reaches_a_node_only_if_told(
         assert node.poll() is None
     finally:
         node.terminate()
-        assert node.wait(10.0) == 0
+        assert end_of(node, 10.0) == 0
 
 
 def test_security_that_is_not_there_lets_nothing_run(

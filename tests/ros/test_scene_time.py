@@ -19,7 +19,7 @@ from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import PATIENT
 from tests.ros.test_scene import Palpation
 
-pytestmark = [pytest.mark.ros, pytest.mark.long]
+pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
 
 
 def test_the_loop_goes_on_while_a_scene_is_compiled(

@@ -27,7 +27,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState
 
-pytestmark = [pytest.mark.ros, pytest.mark.long]
+pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
 
 HERE = Path(__file__).parent
 LOAD = """
