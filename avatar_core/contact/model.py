@@ -248,10 +248,8 @@ def _out(layout: Layout) -> Out:
 
 def _n_far(layout: Layout) -> int:
     """Modes of the far field that the cloud can show."""
-    large_deformation = layout.effects.large_deformation
-    return len(layout.arrays.space_scale) - (
-        0 if large_deformation is None else large_deformation.load.shape[2]
-    )
+    nonlinear, n_modes = layout.effects.large_deformation, len(layout.arrays.space_scale)
+    return n_modes if nonlinear is None else n_modes - nonlinear.load.shape[2]
 
 
 def _effects(layout: Layout) -> Selection:

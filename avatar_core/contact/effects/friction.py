@@ -218,15 +218,12 @@ def _sweep(state, superposition, several_tools, large_deformation, friction):  #
         worst = 0.0
         for t in range(state.passage.shape[0]):
             if state.active[t]:
-                worst = max(
-                    worst,
-                    _update_normal(
-                        state, superposition, several_tools, large_deformation, friction, t
-                    ),
+                change = _update_normal(
+                    state, superposition, several_tools, large_deformation, friction, t
                 )
-                worst = max(
-                    worst, _update_tangential(state, superposition, several_tools, friction, t)
-                )
+                worst = max(worst, change)
+                change = _update_tangential(state, superposition, several_tools, friction, t)
+                worst = max(worst, change)
         if worst < GAP_TOLERANCE:
             return True
     return False

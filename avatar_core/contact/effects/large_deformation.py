@@ -70,31 +70,27 @@ def sample_coefficients(model, large_deformation, t, tip):  # type: ignore[no-un
     """beta_2, beta_3 and the reach at a tip, with their gradients."""
     if large_deformation is None:
         return
+    grid, value = large_deformation.grid, large_deformation.coefficient[t]
     cell = cell_at(model.origin, model.spacing[0], tip)
     for k in range(3):
-        large_deformation.coefficient[t, k] = in_cell(
-            large_deformation.grid[k], cell, large_deformation.coefficient_gradient[t, k]
-        )
+        value[k] = in_cell(grid[k], cell, large_deformation.coefficient_gradient[t, k])
 
 
 @fast
 def evaluate_added_depth(state, large_deformation, t):  # type: ignore[no-untyped-def]
     """h(a) = beta_2 a^2 + beta_3 a^3 at the present force, its derivative and integral."""
+    added, coefficient = large_deformation.added_depth[t], large_deformation.coefficient[t]
     a = state.self_compliance[t] * state.force[t]
-    b2, b3, reach = (
-        large_deformation.coefficient[t, 0],
-        large_deformation.coefficient[t, 1],
-        large_deformation.coefficient[t, 2],
-    )
+    b2, b3, reach = coefficient[0], coefficient[1], coefficient[2]
     inside = min(a, reach)
     over = a - inside
     h = inside * inside * (b2 + b3 * inside)
     slope = inside * (2.0 * b2 + 3.0 * b3 * inside)
-    whole = inside**3 * (b2 / 3.0 + b3 * inside / 4.0)
-    large_deformation.added_depth[t, 0] = h + slope * over
-    large_deformation.added_depth[t, 1] = slope
-    large_deformation.added_depth[t, 2] = whole + over * (h + 0.5 * slope * over)
-    large_deformation.added_depth[t, 3] = 2.0 * b2 + 6.0 * b3 * reach
+    integral = inside**3 * (b2 / 3.0 + b3 * inside / 4.0)
+    added[0] = h + slope * over
+    added[1] = slope
+    added[2] = integral + over * (h + 0.5 * slope * over)
+    added[3] = 2.0 * b2 + 6.0 * b3 * reach
 
 
 @fast
@@ -103,6 +99,7 @@ def add_nonlinear_force(state, large_deformation, out, t):  # type: ignore[no-un
     if large_deformation is None:
         return False
     evaluate_added_depth(state, large_deformation, t)
+    added, gradient = large_deformation.added_depth[t], large_deformation.coefficient_gradient[t]
     gamma, reach = state.self_compliance[t], large_deformation.coefficient[t, 2]
     a = gamma * state.force[t]
     inside = min(a, reach)
@@ -110,19 +107,11 @@ def add_nonlinear_force(state, large_deformation, out, t):  # type: ignore[no-un
     # derivatives of int h by beta_2, beta_3 and the reach, and of H by gamma
     by2 = inside**3 / 3.0 + over * (inside**2 + inside * over)
     by3 = inside**4 / 4.0 + over * (inside**3 + 1.5 * inside**2 * over)
-    by_reach = 0.5 * large_deformation.added_depth[t, 3] * over * over
-    by_gamma = (
-        large_deformation.added_depth[t, 0] * a - large_deformation.added_depth[t, 2]
-    ) / gamma
+    by_reach = 0.5 * added[3] * over * over
+    by_gamma = (added[0] * a - added[2]) / gamma
     for d in range(3):
-        change = (
-            by2 * large_deformation.coefficient_gradient[t, 0, d]
-            + by3 * large_deformation.coefficient_gradient[t, 1, d]
-        )
-        change += (
-            by_reach * large_deformation.coefficient_gradient[t, 2, d]
-            + by_gamma * state.self_slope[t, d]
-        )
+        change = by2 * gradient[0, d] + by3 * gradient[1, d]
+        change += by_reach * gradient[2, d] + by_gamma * state.self_slope[t, d]
         out.force[t, d] += change / gamma
     return a > reach
 

@@ -90,10 +90,10 @@ def couple_near_fields(model, state, several_tools, friction):  # type: ignore[n
 def _measure_extent(model, state, several_tools, t):  # type: ignore[no-untyped-def]
     farthest = 0.0
     for i in range(state.n_nodes[t]):
-        j, force_squared = state.nodes[t, i], 0.0
+        j, square = state.nodes[t, i], 0.0
         for d in range(3):
-            force_squared += (model.position[j, d] - state.point[t, d]) ** 2
-        farthest = max(farthest, force_squared)
+            square += (model.position[j, d] - state.point[t, d]) ** 2
+        farthest = max(farthest, square)
     several_tools.extent[t] = np.sqrt(farthest)
 
 
@@ -102,9 +102,8 @@ def _are_near(state, several_tools, t, s):  # type: ignore[no-untyped-def]
     apart = 0.0
     for d in range(3):
         apart += (state.point[s, d] - state.point[t, d]) ** 2
-    return (
-        np.sqrt(apart) < several_tools.reach[0] + several_tools.extent[t] + several_tools.extent[s]
-    )
+    extent = several_tools.extent
+    return np.sqrt(apart) < several_tools.reach[0] + extent[t] + extent[s]
 
 
 @fast
@@ -169,36 +168,32 @@ def solve_active_set(state, superposition, several_tools, large_deformation):  #
     step. It may end after its last exchange without the solution: the sweeps decide on convergence.
     """
     _linearise(state, superposition, several_tools, large_deformation)
-    n_tools, force, trial, active_set = (
-        state.passage.shape[0],
-        state.force,
-        several_tools.trial,
-        several_tools.active_set,
-    )
+    n_tools, force, trial = state.passage.shape[0], state.force, several_tools.trial
+    active = several_tools.active_set
     for _ in range(MAX_EXCHANGES * n_tools):
         _close_gaps(several_tools)
         part, pulled = 1.0, -1
         for t in range(n_tools):
-            if active_set[t] and trial[t] < 0.0 and force[t] <= part * (force[t] - trial[t]):
+            if active[t] and trial[t] < 0.0 and force[t] <= part * (force[t] - trial[t]):
                 part, pulled = force[t] / (force[t] - trial[t]), t
         for t in range(n_tools):
-            if active_set[t]:
+            if active[t]:
                 force[t] += part * (trial[t] - force[t])
         if pulled >= 0:
-            force[pulled], active_set[pulled] = 0.0, False
+            force[pulled], active[pulled] = 0.0, False
             continue
         least, deepest = -INSIDE, -1
         for t in range(n_tools):
-            if state.active[t] and not active_set[t]:
+            if state.active[t] and not active[t]:
                 gap = several_tools.free_gap[t]
                 for s in range(n_tools):
-                    if active_set[s]:
+                    if active[s]:
                         gap += several_tools.matrix[t, s] * force[s]
                 if gap < least:
                     least, deepest = gap, t
         if deepest < 0:
             return
-        active_set[deepest] = True
+        active[deepest] = True
 
 
 @inlined
@@ -228,22 +223,18 @@ def _close_gaps(several_tools):  # type: ignore[no-untyped-def]
     If two tips coincide, the pivot of the second vanishes and is replaced by a small one: the
     deeper tip takes the load.
     """
-    active_set, c, root, x = (
-        several_tools.active_set,
-        several_tools.matrix,
-        several_tools.factor,
-        several_tools.trial,
-    )
-    for t in range(active_set.shape[0]):
-        if not active_set[t]:
+    active, x = several_tools.active_set, several_tools.trial
+    c, root = several_tools.matrix, several_tools.factor
+    for t in range(active.shape[0]):
+        if not active[t]:
             continue
         x[t] = -several_tools.free_gap[t]
         for s in range(t + 1):
-            if not active_set[s]:
+            if not active[s]:
                 continue
             value = c[t, s]
             for k in range(s):
-                if active_set[k]:
+                if active[k]:
                     value -= root[t, k] * root[s, k]
             if s < t:
                 root[t, s] = value / root[s, s]
@@ -251,10 +242,10 @@ def _close_gaps(several_tools):  # type: ignore[no-untyped-def]
             else:
                 root[t, t] = np.sqrt(max(value, LEAST_PIVOT * c[t, t]))
         x[t] /= root[t, t]
-    for t in range(active_set.shape[0] - 1, -1, -1):
-        if active_set[t]:
-            for k in range(t + 1, active_set.shape[0]):
-                if active_set[k]:
+    for t in range(active.shape[0] - 1, -1, -1):
+        if active[t]:
+            for k in range(t + 1, active.shape[0]):
+                if active[k]:
                     x[t] -= root[k, t] * x[k]
             x[t] /= root[t, t]
 
