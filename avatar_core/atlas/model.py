@@ -14,13 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from avatar_core.atlas.anatomy import (
-    Anatomy,
-    AtlasError,
-    Duplicate,
-    free_name,
-    require_shapes,
-)
+from avatar_core.atlas.anatomy import Anatomy, AtlasError, Duplicate, free_name, require_shapes
 from avatar_core.geometry.level_set import DistanceGrid, GridBox, signed_distance
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh

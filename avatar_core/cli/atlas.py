@@ -133,8 +133,7 @@ def add(
 
 @atlas.command()
 def show(
-    file: File,
-    as_json: Annotated[bool, typer.Option("--json", help="print as JSON")] = False,
+    file: File, as_json: Annotated[bool, typer.Option("--json", help="print as JSON")] = False
 ) -> None:
     """Show the members of an atlas, with the quality of their registrations."""
     from avatar_core.atlas.storage import load_atlas

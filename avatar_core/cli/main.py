@@ -16,13 +16,7 @@ from avatar_core.cli.patient import patient
 from avatar_core.cli.replay import replay
 from avatar_core.cli.scene import scene
 from avatar_core.cli.study import study
-from avatar_core.cli.vademecum import (
-    BuildBar,
-    Vertices,
-    show,
-    show_text,
-    vademecum,
-)
+from avatar_core.cli.vademecum import BuildBar, Vertices, show, show_text, vademecum
 from avatar_core.errors import AvatarError
 
 EXIT_STOPPED = 130  # by Ctrl-C, as shells count it

@@ -85,10 +85,7 @@ def _organ(one: Scene, given: Path | None) -> str:
 def _material(one: Scene) -> str:
     chosen = [
         f"{name} {value:g}{unit}"
-        for name, value, unit in (
-            ("E", one.young_modulus, " Pa"),
-            ("nu", one.poisson_ratio, ""),
-        )
+        for name, value, unit in (("E", one.young_modulus, " Pa"), ("nu", one.poisson_ratio, ""))
         if value is not None
     ]
     return ", ".join(chosen) or "its own material"

@@ -25,14 +25,7 @@ import numpy as np
 import rslab
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
-from skfem import (
-    Basis,
-    BilinearForm,
-    ElementTetP1,
-    ElementTetP2,
-    ElementVector,
-    MeshTet,
-)
+from skfem import Basis, BilinearForm, ElementTetP1, ElementTetP2, ElementVector, MeshTet
 from skfem.helpers import div
 
 from avatar_core.errors import ConvergenceError, MaterialError, MeshError

@@ -93,11 +93,7 @@ class FarFieldResidual:
     """Error that the modes found so far leave in the sampled columns, outside the near field."""
 
     def __init__(
-        self,
-        elasticity: Elasticity,
-        surface: LoadSurface,
-        response: ExactResponse,
-        rule: BuildRule,
+        self, elasticity: Elasticity, surface: LoadSurface, response: ExactResponse, rule: BuildRule
     ) -> None:
         distance = np.linalg.norm(
             elasticity.mesh.vertices[:, None] - surface.centers[response.samples][None], axis=2

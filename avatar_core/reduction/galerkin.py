@@ -347,10 +347,7 @@ def _root(blocks: FloatArray) -> FloatArray:
 
 
 def compact_response(
-    elasticity: Elasticity,
-    loads: sp.csr_matrix,
-    rank: int = 120,
-    n_probes: int = 8,
+    elasticity: Elasticity, loads: sp.csr_matrix, rank: int = 120, n_probes: int = 8
 ) -> CompactResponse:
     """The response of one anatomy in few modes, for a base: two sweeps of a subspace iteration.
 

@@ -16,10 +16,7 @@ from avatar_core.vademecum.model import Vademecum
 
 # Options of meshio by suffix, each for a single file: XDMF with HDF5 would write a second one, with
 # the name of the vademecum.
-FORMATS = {
-    ".vtu": {"file_format": "vtu"},
-    ".xdmf": {"file_format": "xdmf", "data_format": "XML"},
-}
+FORMATS = {".vtu": {"file_format": "vtu"}, ".xdmf": {"file_format": "xdmf", "data_format": "XML"}}
 
 
 def export(

@@ -118,10 +118,7 @@ def study(surfaces: Path | None, settings: AccuracyTimeSettings, folder: Path) -
         rows=tuple(rows),
         paper=PAPER,
         draw=partial(_overview, panels),
-        notices=(
-            *short_table(rows),
-            f"the page with all plots: {folder / 'accuracy-time.html'}",
-        ),
+        notices=(*short_table(rows), f"the page with all plots: {folder / 'accuracy-time.html'}"),
     )
 
 

@@ -21,12 +21,7 @@ from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.shapes.lle import CLEAR_GAP, estimate_dimension, fit, locally_linear_embedding
-from avatar_core.studies.response import (
-    carried,
-    relative_errors,
-    trilinear,
-    unit_load_response,
-)
+from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
 from avatar_core.studies.shapes import PAPER_GRID, as_grid, distance_vectors, paper_box
 from avatar_core.studies.study import Study, Value, follow, mean_and_worst, one_blas_thread
 

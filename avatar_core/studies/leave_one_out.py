@@ -69,11 +69,7 @@ class LeaveOneOutSettings:
 
 FULL = LeaveOneOutSettings()
 QUICK = LeaveOneOutSettings(
-    n_livers=24,
-    neighbors=(5, 10, 0),
-    components=(5, 10, 0),
-    shape=(29, 21, 25),
-    phantoms=16,
+    n_livers=24, neighbors=(5, 10, 0), components=(5, 10, 0), shape=(29, 21, 25), phantoms=16
 )
 
 

@@ -140,10 +140,7 @@ def _sklearn(vectors: FloatArray) -> Callable[[], object] | None:
 
     def embedded() -> object:
         return LocallyLinearEmbedding(
-            n_neighbors=NEIGHBORS,
-            n_components=DIMENSION,
-            reg=TIMED_REGULARIZATION,
-            random_state=0,
+            n_neighbors=NEIGHBORS, n_components=DIMENSION, reg=TIMED_REGULARIZATION, random_state=0
         ).fit(vectors)
 
     return embedded

@@ -257,12 +257,7 @@ def _guess(
         return None
     chosen = replace(options, weighting=kind)
     weights = patient_weights(
-        base,
-        problem.registration,
-        problem.surface,
-        kind,
-        options.n_neighbors,
-        options.leave_out,
+        base, problem.registration, problem.surface, kind, options.n_neighbors, options.leave_out
     )
     return interpolated_response(problem, base, weights, chosen)
 

@@ -176,10 +176,9 @@ def _refusal(curve: AccuracyCurve, budget: Budget) -> str:
     quantity = budget.quantity
     exact = [p for p in curve.points if p.error(quantity) <= budget.tolerance]
     fast = [p for p in curve.points if p.p99 <= budget.deadline and not np.isnan(p.error(quantity))]
-    near = [
-        *_first(exact, lambda p: p.p99),
-        *_first(fast, lambda p: p.error(quantity)),
-    ] or list(_first(curve.points, lambda p: p.error(quantity)))
+    near = [*_first(exact, lambda p: p.p99), *_first(fast, lambda p: p.error(quantity))] or list(
+        _first(curve.points, lambda p: p.error(quantity))
+    )
     nearest = " or ".join(
         f"{p.error(quantity):.3g} in {p.p99 * 1e6:.0f} us ({p.detail})" for p in near
     )

@@ -45,12 +45,7 @@ import numpy as np
 
 from avatar_core.common.dataclass_json import of_plain, parsed, require_name
 from avatar_core.common.files import FileError, opened
-from avatar_core.common.hdf5 import (
-    format_of,
-    replace_file,
-    require_schema,
-    verified,
-)
+from avatar_core.common.hdf5 import format_of, replace_file, require_schema, verified
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface

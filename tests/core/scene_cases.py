@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from avatar_core.contact.effects import (
-    Viscoelasticity,
-)
+from avatar_core.contact.effects import Viscoelasticity
 from avatar_core.errors import SceneError
 from avatar_core.scene.file import parse_scene
 from avatar_core.scene.model import Tool

@@ -7,24 +7,13 @@ import pytest
 import scipy.sparse.linalg as sla
 from skfem import Basis, ElementTetP1, ElementTetP2, ElementVector, MeshTet
 
-from avatar_core.contact.effects import (
-    Inertia,
-    Respiration,
-    SelfWeight,
-)
+from avatar_core.contact.effects import Inertia, Respiration, SelfWeight
 from avatar_core.contact.effects.inertia import kinetic_energy, vibration_modes
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.contact.tool_path import inner_positions, middle_of_access
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.vademecum.model import Vademecum
-from tests.core.effect_cases import (
-    TIP,
-    density,
-    elasticity_of,
-    forces,
-    full_sag,
-    push_and_drag,
-)
+from tests.core.effect_cases import TIP, density, elasticity_of, forces, full_sag, push_and_drag
 
 # --- Inertia ------------------------------------------------------------------------------------
 

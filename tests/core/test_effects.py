@@ -20,12 +20,7 @@ from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
 from avatar_core.vademecum.model import Vademecum
-from tests.core.effect_cases import (
-    CHOICES,
-    TIP,
-    forces,
-    push_and_drag,
-)
+from tests.core.effect_cases import CHOICES, TIP, forces, push_and_drag
 
 # --- Absent when off ----------------------------------------------------------------------------
 
@@ -127,10 +122,7 @@ def test_everything_at_once_stays_sane(phantom_vademecum: Vademecum) -> None:
             "friction.static is -0.1; it must lie in 0 to 1",
         ),
         (lambda: Friction(0.2, 0.3), "kinetic is 0.3, above static 0.2"),
-        (
-            lambda: Viscoelasticity((0.3,), (0.0,)),
-            "viscoelasticity.tau is 0.0; it must lie",
-        ),
+        (lambda: Viscoelasticity((0.3,), (0.0,)), "viscoelasticity.tau is 0.0; it must lie"),
         (lambda: Viscoelasticity((-0.3,), (1.0,)), "viscoelasticity.g is -0.3"),
         (lambda: Viscoelasticity((0.6, 0.5), (1.0, 2.0)), "sum of g is 1.1"),
         (lambda: Viscoelasticity((0.3,), (1.0, 2.0)), "1 g and 2 tau"),

@@ -5,17 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.contact.effects import (
-    Friction,
-)
+from avatar_core.contact.effects import Friction
 from avatar_core.contact.model import Status, prepare, step
 from avatar_core.contact.tool_path import inner_positions, middle_of_access
 from avatar_core.vademecum.model import Vademecum
-from tests.core.effect_cases import (
-    TIP,
-    forces,
-    push_and_drag,
-)
+from tests.core.effect_cases import TIP, forces, push_and_drag
 from tests.core.flat_organ import COMPLIANCE, RADIUS, at_depth, flat_organ
 
 

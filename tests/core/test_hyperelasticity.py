@@ -16,14 +16,7 @@ from avatar_core.fem.hyperelastic_materials import (
     StVenantKirchhoff,
 )
 from avatar_core.fem.hyperelasticity import Hyperelasticity
-from avatar_core.fem.newton import (
-    NewtonRule,
-    State,
-    _LoadControl,
-    _LostError,
-    press,
-    solve,
-)
+from avatar_core.fem.newton import NewtonRule, State, _LoadControl, _LostError, press, solve
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import Regions, TetMesh
 

@@ -33,11 +33,7 @@ from avatar_core.offline.certify.large_deformation import (
     summary,
     with_combinations,
 )
-from avatar_core.offline.large_deformation import (
-    LargeRule,
-    economised,
-    hyperelastic_problem,
-)
+from avatar_core.offline.large_deformation import LargeRule, economised, hyperelastic_problem
 from avatar_core.offline.pipeline import OrganOptions
 from avatar_core.offline.rule import silent
 from avatar_core.reduction.asymptotic_series import path_series
@@ -163,9 +159,7 @@ def test_reach_shrinks_with_the_tolerance(straight: Vademecum, bent: Vademecum) 
 
     problem = hyperelastic_problem(straight, "st-venant-kirchhoff")
     few = replace(
-        straight.surface,
-        centers=straight.surface.centers[:4],
-        normals=straight.surface.normals[:4],
+        straight.surface, centers=straight.surface.centers[:4], normals=straight.surface.normals[:4]
     )
     strict = _follow(problem, few, LargeRule(tolerance=1e-3), silent).reach
     loose = _follow(problem, few, LargeRule(tolerance=3e-2), silent).reach

@@ -7,12 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from avatar_core.errors import LLEError
-from avatar_core.shapes.barycenter import (
-    barycenter,
-    barycenter_weights,
-    convex_weights,
-    local_gram,
-)
+from avatar_core.shapes.barycenter import barycenter, barycenter_weights, convex_weights, local_gram
 from avatar_core.shapes.lle import (
     LLE,
     Gram,

@@ -28,8 +28,7 @@ def test_a_mesh_that_lacks_a_part_of_the_organ_is_refused() -> None:
     organ = phantom_liver(12e-3)
     apart = organ.vertices + np.array([0.5, 0.0, 0.0])
     both = SurfaceMesh(
-        np.vstack([organ.vertices, apart]),
-        np.vstack([organ.faces, organ.faces + len(apart)]),
+        np.vstack([organ.vertices, apart]), np.vstack([organ.faces, organ.faces + len(apart)])
     )
     with pytest.raises(MeshError, match="49% of the volume"):
         tetrahedralize(both, 1000)

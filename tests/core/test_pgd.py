@@ -113,12 +113,7 @@ def test_a_product_leaves_no_residual_in_its_own_directions() -> None:
         stiffness = theta[0] * terms[0] + theta[1] * terms[1]
         residual[a, b] = force - stiffness @ field.at((a, b))
     p, c = (w * f[:, -1] for w, f in zip(problem.weights, field.parameters, strict=True))
-    tests = {
-        "a": p,
-        "b": c,
-        "x": field.space[:, -1],
-        "s": problem.load_weights * field.load[:, -1],
-    }
+    tests = {"a": p, "b": c, "x": field.space[:, -1], "s": problem.load_weights * field.load[:, -1]}
     for free in tests:
         others = [letter for letter in tests if letter != free]
         pattern = f"abxs,{','.join(others)}->{free}"

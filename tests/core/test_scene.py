@@ -146,8 +146,7 @@ def test_every_effect_is_asked_what_it_needs() -> None:
 def test_a_tumour_has_the_contrast_that_the_vademecum_holds() -> None:
     own = organ(contrast=5.0)
     free = organ(
-        contrast=5.0,
-        parametric=SimpleNamespace(coordinates=(Coordinate("contrast", 0.5, 20.0),)),
+        contrast=5.0, parametric=SimpleNamespace(coordinates=(Coordinate("contrast", 0.5, 20.0),))
     )
     for held in (own, free):
         Scene(effects=(Tumour(),)).require(held)

@@ -9,13 +9,7 @@ from typing import Any
 
 import pytest
 
-from avatar_core.contact.effects import (
-    EFFECTS,
-    Friction,
-    Inertia,
-    SeveralTools,
-    Tumour,
-)
+from avatar_core.contact.effects import EFFECTS, Friction, Inertia, SeveralTools, Tumour
 from avatar_core.errors import SceneError
 from avatar_core.scene.file import parse_scene, read_scene
 from avatar_core.scene.model import Scene, Tool

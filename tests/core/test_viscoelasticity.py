@@ -5,16 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.contact.effects import (
-    Viscoelasticity,
-)
+from avatar_core.contact.effects import Viscoelasticity
 from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.vademecum.model import Vademecum
-from tests.core.effect_cases import (
-    TIP,
-    push_and_drag,
-)
+from tests.core.effect_cases import TIP, push_and_drag
 from tests.core.flat_organ import COMPLIANCE, at_depth, flat_organ
 
 PRONY = Viscoelasticity((0.3, 0.2), (0.05, 0.7))

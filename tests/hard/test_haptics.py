@@ -279,11 +279,7 @@ BORDER: list[float] = []
 
 
 @examples(12)
-@given(
-    stiffness=st.floats(100.0, 2500.0),
-    delay=st.integers(0, 2),
-    mass=st.floats(0.7, 1.0),
-)
+@given(stiffness=st.floats(100.0, 2500.0), delay=st.integers(0, 2), mass=st.floats(0.7, 1.0))
 @example(stiffness=2500.0, delay=2, mass=0.7)
 @example(stiffness=100.0, delay=0, mass=1.0)
 def check_border(stiffness: float, delay: int, mass: float) -> None:

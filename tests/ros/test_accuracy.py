@@ -212,8 +212,7 @@ def test_an_infeasible_budget_gives_way_to_the_one_before(probe: Any, hand: Hand
 
 
 @pytest.mark.parametrize(
-    ("values", "reason"),
-    [({"quantity": "taste"}, "l2 or force"), ({"tolerance": -1.0}, "range")],
+    ("values", "reason"), [({"quantity": "taste"}, "l2 or force"), ({"tolerance": -1.0}, "range")]
 )
 def test_a_budget_without_meaning_is_refused_at_once(
     probe: Any, hand: Hand, values: dict[str, Any], reason: str

@@ -14,12 +14,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.framework import conversions, library
-from avatar_ros.framework.library import (
-    RefusedError,
-    file_name,
-    find_in_library,
-    read_in_library,
-)
+from avatar_ros.framework.library import RefusedError, file_name, find_in_library, read_in_library
 from avatar_ros.framework.reader import Reader
 from avatar_ros.nodes.patient_interpolation import patient_request
 from avatar_ros.patients.builder import BuildError

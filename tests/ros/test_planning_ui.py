@@ -227,11 +227,7 @@ def test_a_new_patient_is_built_and_shown(page: Any, shots: Path) -> None:
     open_tab(page, "Patient")
     choose(page, "Surface", "liver3.obj")
     press(page, "Build patient")
-    until(
-        page,
-        lambda: bool(PROGRESS.search(page.inner_text("body"))),
-        "progress",
-    )
+    until(page, lambda: bool(PROGRESS.search(page.inner_text("body"))), "progress")
     page.screenshot(path=shots / "patient.png")
     page.get_by_text("liver3 is shown").wait_for(timeout=SLOW)
     open_tab(page, "Organ")

@@ -21,11 +21,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 import rclpy
 from avatar_ros.framework.state_template import StateTemplate
-from avatar_ros.framework.templates import (
-    PoseReader,
-    stamp_bytes,
-    stamp_nanoseconds,
-)
+from avatar_ros.framework.templates import PoseReader, stamp_bytes, stamp_nanoseconds
 from avatar_ros.loop import contact_loop
 from avatar_ros.loop.contact_loop import ActiveModel, ContactLoop
 from avatar_ros.loop.safety import Safety

@@ -171,10 +171,7 @@ def test_reliable_subscribers_that_stand_still_do_not_hold_up_the_loop(
 ) -> None:
     files = [f"library_dir:={library}", "vademecum:=liver.h5"]
     reliable = "qos_overrides./deformation.publisher.reliability:=reliable"
-    with (
-        running("vademecum_loader", own_domain, *files),
-        running("contact", own_domain, reliable),
-    ):
+    with running("vademecum_loader", own_domain, *files), running("contact", own_domain, reliable):
         probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
         sleeper = subprocess.Popen(
             [sys.executable, "-c", LISTEN],

@@ -167,11 +167,7 @@ class Machines:
         inside = 'mount -t tmpfs tmpfs /dev/shm && exec "$@"'
         there = f"ip netns exec {self.names[machine]} unshare -m sh -c".split()
         return subprocess.Popen(
-            [*there, inside, "sh", *command],
-            env=env,
-            cwd="/",
-            stdout=subprocess.PIPE,
-            text=True,
+            [*there, inside, "sh", *command], env=env, cwd="/", stdout=subprocess.PIPE, text=True
         )
 
 

@@ -228,9 +228,7 @@ def test_with_viscoelasticity_the_force_falls(palpation: Palpation) -> None:
     assert after == pytest.approx(0.5 * before, rel=0.02)
 
 
-def test_a_scene_brings_its_material_and_a_parameter_goes_before_it(
-    palpation: Palpation,
-) -> None:
+def test_a_scene_brings_its_material_and_a_parameter_goes_before_it(palpation: Palpation) -> None:
     probe = palpation.probe
     before = np.linalg.norm(palpation.hold())
     assert palpation.load(f"material: {{young_modulus: {2 * YOUNG}}}").success

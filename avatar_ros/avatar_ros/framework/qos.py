@@ -14,9 +14,7 @@ _MIN_DEADLINE = 2  # that a parameter may set [periods]
 
 # The newest value, sent again to late joiners.
 LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 # Poses in and clouds out: only the newest counts, nothing is sent again.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -28,12 +28,7 @@ class Reader:
         return self._confined.pid
 
     def read(
-        self,
-        name: str,
-        n_bytes: int,
-        function: Callable[P, R],
-        *args: P.args,
-        **kwargs: P.kwargs,
+        self, name: str, n_bytes: int, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """``function(*args, **kwargs)``, which reads ``n_bytes`` of the file ``name``.
 

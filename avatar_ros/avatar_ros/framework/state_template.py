@@ -97,9 +97,7 @@ def _contact_numbers(contact: Contact) -> list[float]:
 
 
 def _find_byte(
-    message: ContactState,
-    set_byte: Callable[[int], None],
-    read_byte: Callable[[ContactState], int],
+    message: ContactState, set_byte: Callable[[int], None], read_byte: Callable[[ContactState], int]
 ) -> int:
     """Byte offset of what ``set_byte`` sets: the only byte that follows it and is read back.
 

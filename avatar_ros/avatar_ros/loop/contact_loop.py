@@ -27,11 +27,7 @@ from avatar_core.contact.haptics import passivity
 from avatar_core.contact.haptics.force_guard import ForceGuard
 from avatar_ros.framework import realtime
 from avatar_ros.framework.state_template import StateTemplate
-from avatar_ros.framework.templates import (
-    NO_STAMP,
-    CloudTemplate,
-    stamp_nanoseconds,
-)
+from avatar_ros.framework.templates import NO_STAMP, CloudTemplate, stamp_nanoseconds
 from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.loop.shown_modes import ShownModes
 from avatar_ros.loop.statistics import TimingRecord

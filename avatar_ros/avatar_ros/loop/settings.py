@@ -178,10 +178,7 @@ def of_budget(budget: Budget | None) -> dict[str, Any]:
     """The inverse of :func:`chosen_budget`."""
     if budget is None:
         return {"accuracy.tolerance": 0.0, "accuracy.deadline": 0.0}
-    finite = {
-        "accuracy.tolerance": budget.tolerance,
-        "accuracy.deadline": budget.deadline,
-    }
+    finite = {"accuracy.tolerance": budget.tolerance, "accuracy.deadline": budget.deadline}
     return {
         "accuracy.quantity": budget.quantity,
         **{name: 0.0 if math.isinf(value) else value for name, value in finite.items()},

@@ -32,10 +32,7 @@ EXPLANATIONS: dict[int, tuple[str, str]] = {
         "the tool presses deeper than the vademecum was built for; the force is extrapolated",
         "press less deeply",
     ),
-    ContactState.STATUS_LEAP: (
-        "the tool's pose jumped",
-        "check its driver, or raise safety.leap",
-    ),
+    ContactState.STATUS_LEAP: ("the tool's pose jumped", "check its driver, or raise safety.leap"),
     ContactState.STATUS_SEVERAL_PUBLISHERS: (
         "several nodes send poses of the tool",
         "stop all but one",

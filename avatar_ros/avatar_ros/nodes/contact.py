@@ -32,12 +32,7 @@ from avatar_ros.framework import qos, realtime
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
-from avatar_ros.loop.contact_loop import (
-    BLEND,
-    ActiveModel,
-    ContactLoop,
-    Publishers,
-)
+from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop, Publishers
 from avatar_ros.loop.safety import SAFETY, chosen_safety
 from avatar_ros.loop.settings import (
     CHANGEABLE,

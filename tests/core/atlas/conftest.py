@@ -8,10 +8,7 @@ import pytest
 
 from avatar_core.atlas import growth as atlas_build
 from avatar_core.atlas.anatomy import Anatomy
-from avatar_core.atlas.growth import (
-    build_anatomy,
-    new_atlas,
-)
+from avatar_core.atlas.growth import build_anatomy, new_atlas
 from avatar_core.atlas.model import Atlas
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule
 from avatar_core.geometry.phantom import phantom_liver, population

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar_core.atlas.growth import (
-    AtlasOptions,
-)
+from avatar_core.atlas.growth import AtlasOptions
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.workers import Workers
 from avatar_core.geometry.surface import SurfaceMesh

@@ -13,9 +13,7 @@ import numpy as np
 import pytest
 
 from avatar_core.atlas import growth as atlas_build
-from avatar_core.atlas.growth import (
-    AtlasOptions,
-)
+from avatar_core.atlas.growth import AtlasOptions
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.storage import save_atlas
 from avatar_core.cli import main as cli

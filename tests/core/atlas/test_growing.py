@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 from avatar_core.atlas.anatomy import Anatomy, AtlasError, Response
-from avatar_core.atlas.growth import (
-    build_anatomy,
-    create_atlas,
-    extend_atlas,
-    new_atlas,
-)
+from avatar_core.atlas.growth import build_anatomy, create_atlas, extend_atlas, new_atlas
 from avatar_core.atlas.model import Atlas, box_around
 from avatar_core.atlas.storage import load_atlas, save_atlas
 from avatar_core.errors import LLEError

@@ -15,10 +15,7 @@ import pytest
 
 from avatar_core.atlas import growth as atlas_build
 from avatar_core.atlas.anatomy import Anatomy, AtlasError
-from avatar_core.atlas.growth import (
-    SurfaceFile,
-    create_atlas,
-)
+from avatar_core.atlas.growth import SurfaceFile, create_atlas
 from avatar_core.atlas.storage import load_atlas
 from avatar_core.atlas.workers import Workers
 from avatar_core.geometry.surface import SurfaceMesh
