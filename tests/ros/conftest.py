@@ -6,8 +6,10 @@ import os
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -164,6 +166,70 @@ def library(organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "flipped.h5").write_bytes(content[:middle] + flipped + content[middle + 1 :])
     (folder / "text.h5").write_text("not an HDF5 file")
     (folder / "folder.h5").mkdir()
+    return folder
+
+
+N_ATLAS = 3  # anatomies
+
+
+@pytest.fixture(scope="session")
+def livers() -> list[Any]:
+    """Surfaces of the atlas, and one more."""
+    return _livers()
+
+
+def _livers() -> list[Any]:
+    from avatar_core.geometry.phantom import phantom_liver, population
+
+    coarse = phantom_liver(12e-3)
+    maps = population(N_ATLAS + 1, seed=3, bend=0.01)
+    return [replace(shape.moved(coarse), name=f"liver{i}") for i, shape in enumerate(maps)]
+
+
+@stored
+def _patients() -> dict[str, bytes]:
+    """The livers as files, and an atlas of all but the last; what matters is not how exact."""
+    from avatar_core.atlas.growth import AtlasOptions, SurfaceFile, create_atlas
+    from avatar_core.atlas.response import ResponseSolver
+    from avatar_core.atlas.workers import Workers
+    from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
+    from avatar_core.geometry.phantom import phantom_liver
+    from avatar_core.shapes.registration import RegistrationRule, Template
+
+    rough = RegistrationRule(
+        n_stages=5, sweeps=1, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
+    )
+    mesh = tetrahedralize(phantom_liver(12e-3), 300)
+    with TemporaryDirectory() as name:
+        files = []
+        for liver in _livers():
+            lines = [f"v {x} {y} {z}" for x, y, z in liver.vertices * 1e3]
+            lines += [f"f {a} {b} {c}" for a, b, c in liver.faces + 1]
+            files.append(Path(name, f"{liver.name}.obj"))
+            files[-1].write_text("\n".join(lines) + "\n")
+        growth = create_atlas(
+            Path(name, "atlas.h5"),
+            [SurfaceFile(path) for path in files[:N_ATLAS]],
+            AtlasOptions(spacing=0.02, rule=rough),
+            template=Template("phantom", mesh, regions_by_rule(mesh)),
+            workers=Workers(jobs=1),
+            solve_response=ResponseSolver(rank=30),
+        )
+        assert len(growth.added) == N_ATLAS
+        return {path.name: path.read_bytes() for path in (*files, Path(name, "atlas.h5"))}
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A library with surfaces, good and bad, and an atlas of all but the last one."""
+    folder = tmp_path_factory.mktemp("patients")
+    outside = tmp_path_factory.mktemp("elsewhere") / "liver.obj"
+    for name, content in _patients().items():
+        (folder / name).write_bytes(content)
+    outside.write_bytes((folder / "liver0.obj").read_bytes())
+    (folder / "link.obj").symlink_to(outside)
+    (folder / "text.obj").write_text("not a surface")
+    (folder / "large.obj").write_bytes(b"#" * 1_100_000)
     return folder
 
 

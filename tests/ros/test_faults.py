@@ -27,10 +27,8 @@ from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.ros.conftest import Probe
 from tests.ros.fault_cell import MOST, FaultCell, Harm, Silence
-from tests.ros.test_patient_interpolation import folder, livers
 
 pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
-__all__ = ["folder", "livers"]  # fixtures
 
 STOPPED = 2.0  # [s]
 RECOVERY = 1.0  # [s]
@@ -58,13 +56,6 @@ def cell(
     cell = FaultCell(library, folder, touch, own_domain)
     yield cell
     cell.close()
-
-
-@pytest.fixture(scope="module")
-def asker(own_domain: dict[str, str]) -> Iterator[Probe]:
-    probe = Probe()
-    yield probe
-    probe.close()
 
 
 @pytest.fixture(autouse=True)
@@ -187,10 +178,12 @@ def test_processes_join(tool: FaultCell, own_domain: dict[str, str]) -> None:
 # --- Files, requests, parameters ----------------------------------------------------------------
 
 
-def test_broken_vademecums_are_offered(tool: FaultCell, asker: Probe) -> None:
+def test_broken_vademecums_are_offered(tool: FaultCell, lasting_probe: Probe) -> None:
     def offer(cell: FaultCell) -> None:
         for name in ("short.h5", "flipped.h5", "text.h5"):
-            answer = asker.call(LoadVademecum, "load_vademecum", LoadVademecum.Request(name=name))
+            answer = lasting_probe.call(
+                LoadVademecum, "load_vademecum", LoadVademecum.Request(name=name)
+            )
             assert not answer.success and answer.message
 
     harm = tool.suffer("corrupted and truncated vademecums offered", offer)
@@ -198,22 +191,22 @@ def test_broken_vademecums_are_offered(tool: FaultCell, asker: Probe) -> None:
     assert harm.recovery == 0.0
 
 
-def test_vademecums_are_swapped_all_the_time(tool: FaultCell, asker: Probe) -> None:
+def test_vademecums_are_swapped_all_the_time(tool: FaultCell, lasting_probe: Probe) -> None:
     """Between the same organ under two names: what is felt stays the same."""
 
     def swap(cell: FaultCell) -> None:
-        client = asker.client(LoadVademecum, "load_vademecum")
+        client = lasting_probe.client(LoadVademecum, "load_vademecum")
         begin = time.monotonic()
         for k in range(300):
             name = ("twin.h5", "liver.h5")[k % 2]
             client.call_async(LoadVademecum.Request(name=name))
-            asker.until(lambda k=k: time.monotonic() > begin + 0.1 * (k + 1), 10.0)
+            lasting_probe.until(lambda k=k: time.monotonic() > begin + 0.1 * (k + 1), 10.0)
 
     harm = tool.suffer("a swap every 100 ms for 30 s", swap)
     accept(harm)
 
 
-def test_malformed_requests(tool: FaultCell, asker: Probe) -> None:
+def test_malformed_requests(tool: FaultCell, lasting_probe: Probe) -> None:
     rng = np.random.default_rng(0)
     letters = list("abc/.\\\0\n\t'\"{}[]:,&*#%\u00e9\u4e2d-0123456789")
 
@@ -232,13 +225,13 @@ def test_malformed_requests(tool: FaultCell, asker: Probe) -> None:
 
     def ask(cell: FaultCell) -> None:
         for k in range(1000):
-            answer = asker.call(*asks[k % 3]())
+            answer = lasting_probe.call(*asks[k % 3]())
             assert not answer.success and answer.message and "\n" not in answer.message
 
     accept(tool.suffer("1,000 malformed requests", ask))
 
 
-def test_a_storm_of_parameters(tool: FaultCell, asker: Probe) -> None:
+def test_a_storm_of_parameters(tool: FaultCell, lasting_probe: Probe) -> None:
     rng = np.random.default_rng(1)
 
     def number(name: str, low: float, high: float) -> Parameter:
@@ -255,7 +248,7 @@ def test_a_storm_of_parameters(tool: FaultCell, asker: Probe) -> None:
                 number("accuracy.tolerance", -1.0, 2.0),
                 number("no.such", 0.0, 1.0),
             ]
-            asker.call(SetParameters, "/contact/set_parameters", _set(many))
+            lasting_probe.call(SetParameters, "/contact/set_parameters", _set(many))
         still = [
             Parameter(name=name, value=_double(value))
             for name, value in (
@@ -264,7 +257,7 @@ def test_a_storm_of_parameters(tool: FaultCell, asker: Probe) -> None:
                 ("accuracy.tolerance", 0.0),
             )
         ]
-        answers = asker.call(SetParameters, "/contact/set_parameters", _set(still)).results
+        answers = lasting_probe.call(SetParameters, "/contact/set_parameters", _set(still)).results
         assert all(answer.successful for answer in answers)
 
     accept(tool.suffer("4,000 parameters set, half of them wrong", storm))

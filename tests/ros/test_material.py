@@ -28,6 +28,7 @@ from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import PATIENT
 from tests.ros.test_cell import Hand, _force, felt
+from tests.stored import stored
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]  # an organ with coordinates is solved first
 
@@ -35,6 +36,11 @@ pytestmark = [pytest.mark.ros, pytest.mark.long]  # an organ with coordinates is
 @pytest.fixture(scope="module")
 def soft_organ() -> Any:
     """A coarse phantom over Poisson's ratio."""
+    return _soft_organ()
+
+
+@stored
+def _soft_organ() -> Any:
     options = OrganOptions(
         n_vertices=800,
         rule=BuildRule(max_modes=20, most_oversampling=1.2),

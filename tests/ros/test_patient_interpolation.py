@@ -27,14 +27,8 @@ from rclpy.action import ActionClient, get_action_server_names_and_types_by_node
 from rclpy.parameter import parameter_value_to_python
 from shape_msgs.msg import Mesh
 
-from avatar_core.atlas.growth import AtlasOptions, SurfaceFile, create_atlas
-from avatar_core.atlas.response import ResponseSolver
 from avatar_core.atlas.storage import load_atlas, save_atlas
-from avatar_core.atlas.workers import Workers
-from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
-from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.registration import RegistrationRule, Template
 from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.action import BuildPatient
 from avatar_ros.msg import ContactState
@@ -46,51 +40,9 @@ from tests.slowness import end_of, within
 pytestmark = pytest.mark.ros
 
 NODE = "patient_interpolation"
-# What matters here is not how exact these are.
-ROUGH = RegistrationRule(
-    n_stages=5, sweeps=1, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
-)
-N_ATLAS = 3
 # A member of the atlas that does not count: registered already, meshed and combined anew.
 PATIENT: dict[str, Any] = {"surface": "liver0.obj", "leave_out": ["liver0"]}
 TIMEOUT = 60.0  # of one patient, on a busy machine [s]
-
-
-def _write_obj(path: Path, surface: SurfaceMesh) -> Path:
-    lines = [f"v {x} {y} {z}" for x, y, z in surface.vertices * 1e3]
-    lines += [f"f {a} {b} {c}" for a, b, c in surface.faces + 1]
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-@pytest.fixture(scope="session")
-def livers() -> list[SurfaceMesh]:
-    coarse = phantom_liver(12e-3)
-    maps = population(N_ATLAS + 1, seed=3, bend=0.01)
-    return [replace(shape.moved(coarse), name=f"liver{i}") for i, shape in enumerate(maps)]
-
-
-@pytest.fixture(scope="session")
-def folder(livers: list[SurfaceMesh], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A library with surfaces, good and bad, and an atlas of all but the last one."""
-    folder = tmp_path_factory.mktemp("patients")
-    outside = tmp_path_factory.mktemp("elsewhere")
-    files = [_write_obj(folder / f"{liver.name}.obj", liver) for liver in livers]
-    mesh = tetrahedralize(phantom_liver(12e-3), 300)
-    growth = create_atlas(
-        folder / "atlas.h5",
-        [SurfaceFile(path) for path in files[:N_ATLAS]],
-        AtlasOptions(spacing=0.02, rule=ROUGH),
-        template=Template("phantom", mesh, regions_by_rule(mesh)),
-        workers=Workers(jobs=1),
-        solve_response=ResponseSolver(rank=30),
-    )
-    assert len(growth.added) == N_ATLAS
-    (outside / "liver.obj").write_bytes(files[0].read_bytes())
-    (folder / "link.obj").symlink_to(outside / "liver.obj")
-    (folder / "text.obj").write_text("not a surface")
-    (folder / "large.obj").write_bytes(b"#" * 1_100_000)
-    return folder
 
 
 def _values(folder: Path, *more: str) -> list[str]:

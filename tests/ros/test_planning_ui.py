@@ -41,9 +41,6 @@ from tests.ros.browser import (
 )
 from tests.ros.conftest import PATIENT
 from tests.ros.pages import parameter_rows
-from tests.ros.test_patient_interpolation import folder, livers
-
-__all__ = ["folder", "livers"]  # fixtures
 
 pytestmark = [
     pytest.mark.ros,

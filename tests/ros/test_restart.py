@@ -30,10 +30,8 @@ from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.fault_cell import FaultCell
 from tests.ros.test_cell import _force, _stamp
-from tests.ros.test_patient_interpolation import folder, livers
 
 pytestmark = pytest.mark.ros
-__all__ = ["folder", "livers"]  # fixtures
 
 CHOSEN = {"material.young_modulus": 0.25e6, "safety.max_force": 4.0}
 SCENE = "{name: blunt, tools: [{name: tool, tip_radius: 4e-3}]}"
