@@ -23,7 +23,7 @@ def choose(config: pytest.Config) -> None:
     settings.load_profile(chosen or (ALL if _is_long(config) else FEW))
 
 
-def examples(n: int, least: int = 2, **more: Any) -> settings:
+def examples(n: int, least: int = 1, **more: Any) -> settings:
     """Settings for ``n`` examples, of which the quick suite draws the first few."""
     few = settings.get_current_profile_name() == FEW
     return settings(max_examples=min(n, max(least, n // _PART)) if few else n, **more)

@@ -193,6 +193,7 @@ def test_fewer_modes_leave_the_force_as_it_is(phantom_vademecum: Vademecum) -> N
     assert errors[0] > 0.1 and errors[-1] == 0.0
 
 
+@pytest.mark.long
 def test_sag_stays_when_modes_are_left_out(
     phantom_vademecum: Vademecum, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -152,7 +152,7 @@ def _patient() -> Door:
 
     from avatar_ros.framework import conversions
     from avatar_ros.framework.reader import Reader
-    from avatar_ros.nodes.patient_interpolation import order_of
+    from avatar_ros.nodes.patient_interpolation import patient_request
     from avatar_ros.patients.surface import read_confined
 
     from avatar_ros.srv import InterpolatePatient
@@ -168,7 +168,7 @@ def _patient() -> Door:
             soup = altered_soup(seed)
             request = InterpolatePatient.Request(name="patient")
             request.mesh = conversions.surface_mesh(soup.vertices * 1e-3, soup.faces % 2**32)
-        return read_confined(order_of(request, settings), reader)  # type: ignore[arg-type]
+        return read_confined(patient_request(request, settings), reader)  # type: ignore[arg-type]
 
     return Door(mutant, read, _require_surface, lambda: reader.pid)
 

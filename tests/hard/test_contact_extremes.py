@@ -38,7 +38,7 @@ from .touching import (
 )
 
 Figure = Callable[[str], None]
-often = examples(40)
+often = examples(40, least=16)  # some do not touch, or touch with one tool
 PERIOD = 1e-3
 FAST = 5.0  # [m/s]
 FRICTION = Friction(static=0.4, kinetic=0.3)

@@ -111,6 +111,7 @@ def test_two_bodies_stay_two(figure, tmp_path_factory, gap, shift, turned):
 # --- 8. the border of the grid ----------------------------------------------------------------
 
 
+@pytest.mark.long
 @few
 @given(height=st.floats(-0.9, 1.0), axis=st.integers(0, 2), low=st.booleans())
 @example(height=0.5, axis=2, low=True)

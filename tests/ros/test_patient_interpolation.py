@@ -280,7 +280,7 @@ def test_a_wrong_parameter_is_refused(
 # --- while one is built -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stage", ["", "mesh", "response"])
+@pytest.mark.parametrize("stage", ["", "mesh", pytest.param("response", marks=pytest.mark.long)])
 def test_a_goal_can_be_cancelled_in_every_stage(
     node: Module, probe: Any, files: Any, stage: str
 ) -> None:
@@ -337,7 +337,9 @@ def test_the_end_of_the_building_process_is_said_and_survived(
     assert _ask(probe, surface="liver1.obj").success
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.long)]
+)
 def test_ending_the_node_half_way_leaves_nothing_behind(
     own_domain: dict[str, str], probe: Any, files: Any, folder: Path, number: int
 ) -> None:
@@ -368,8 +370,13 @@ def test_ending_the_node_half_way_leaves_nothing_behind(
 def test_services_and_actions_are_those_of_the_pages(node: Module, probe: Any) -> None:
     rows = [row for row in index() if row["node"] == NODE]
     named = {row["interface"]: row["type"] for row in rows if row["kind"] == "service"}
-    found = {name: kind for name, kind, _ in offered(probe.node, NODE) if "_action" not in name}
-    assert found == {f"/{name}": kind for name, kind in named.items()}
+    documented = {f"/{name}": kind for name, kind in named.items()}
+
+    def found() -> dict[str, str]:
+        return {name: kind for name, kind, _ in offered(probe.node, NODE) if "_action" not in name}
+
+    probe.until(lambda: found() == documented, 20.0, fail=False)  # discovery takes its time
+    assert found() == documented
     (action,) = (row for row in rows if row["kind"] == "action")
     assert get_action_server_names_and_types_by_node(probe.node, NODE, "/") == [
         (f"/{action['interface']}", [action["type"]])

@@ -45,7 +45,9 @@ def started(arguments: list[str], domain: dict[str, str]) -> Iterator[subprocess
             process.wait()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
+)
 def test_one_file_of_parameters_starts_a_cell_that_a_signal_ends(
     own_domain: dict[str, str], library: Path, tmp_path: Path, probe: Any, number: int
 ) -> None:

@@ -33,7 +33,6 @@ from tests.ros.test_cell import Hand
 pytestmark = pytest.mark.ros
 
 REQUEST = PreparationRequest("vademecum", "handover", "/", (5e-3,), None, "surface", 1e-3)
-SWAPS = 6
 
 
 @pytest.fixture(scope="module")
@@ -114,10 +113,13 @@ def hand(
     assert [contact.finish(), loader.finish()] == [0, 0]
 
 
-def test_another_vademecum_is_felt_soon_and_timed_later(probe: Any, hand: Hand) -> None:
+@pytest.mark.parametrize("n_swaps", [2, pytest.param(6, marks=pytest.mark.long)])
+def test_another_vademecum_is_felt_soon_and_timed_later(
+    probe: Any, hand: Hand, n_swaps: int
+) -> None:
     probe.client(LoadVademecum, "load_vademecum")
     seconds = []
-    for k in range(SWAPS):
+    for k in range(n_swaps):
         name = ("two.h5", "one.h5")[k % 2]
         wanted = probe.call(LoadVademecum, "load_vademecum", LoadVademecum.Request(name=name))
         asked = time.monotonic()
@@ -140,5 +142,5 @@ def test_another_vademecum_is_felt_soon_and_timed_later(probe: Any, hand: Hand) 
         )
     print(
         f"\nfrom the answer of load_vademecum to the first force of the new one: median "
-        f"{np.median(seconds):.2f} s, worst {max(seconds):.2f} s of {SWAPS}"
+        f"{np.median(seconds):.2f} s, worst {max(seconds):.2f} s of {n_swaps}"
     )
