@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 
-import avatar_core
-
-CORE = Path(avatar_core.__file__).resolve().parent
-NODES = CORE.parent / "avatar_ros" / "avatar_ros"  # as they lie in the repository
+ROOT = Path(__file__).resolve().parents[2]
+CORE, NODES = ROOT / "avatar_core", ROOT / "avatar_ros" / "avatar_ros"
 
 ORDER = {
     "avatar_core": (
@@ -71,8 +69,6 @@ def room(module: str) -> str:
 
 @pytest.fixture(params=["avatar_core", "avatar_ros"])
 def package(request: pytest.FixtureRequest) -> str:
-    if not FOLDERS[request.param].is_dir():
-        pytest.skip(f"no {request.param} beside avatar_core: not in a checkout")
     return str(request.param)
 
 
