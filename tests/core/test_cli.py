@@ -120,6 +120,7 @@ def test_missing_output_folder(
     assert "create it first" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_tolerance_out_of_reach_is_written_and_marked(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -37,6 +37,7 @@ def run(package: Path, cache: Path, factor: float) -> list[str]:
     (contact / "helper_of_test.py").write_text(HELPER.format(factor=factor))
     (contact / "user_of_test.py").write_text(USER)
     environment = {**os.environ, "PYTHONPATH": str(package), "NUMBA_CACHE_DIR": str(cache)}
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # which knows a file by its second and size
     command = [sys.executable, "-m", "avatar_core.contact.user_of_test"]
     found = subprocess.run(command, env=environment, cwd="/", capture_output=True, text=True)
     assert not found.returncode, found.stderr

@@ -100,6 +100,7 @@ def test_unknown_material_is_refused() -> None:
 # --- what is stored ---------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(bent: Vademecum) -> None:
     """There nothing is interpolated: what is left is of the terms and the modes.
 

@@ -204,9 +204,8 @@ def liver_level_set(path: Path) -> tuple[float, float, float]:
 FOUR = ("Amos-007", "LiTS-27", "LiTS-52", "LiTS-74")  # two closed, two with slits between edges
 
 
-@pytest.mark.parametrize(
-    "names", [pytest.param(FOUR, id="four"), pytest.param((), id="all", marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("names", [pytest.param(FOUR, id="four"), pytest.param((), id="all")])
 def test_level_sets_of_real_livers(figure, livers_dir, names):
     paths = [path for path in sorted(livers_dir.glob("*.obj")) if path.stem in names or not names]
     assert len(paths) == (len(names) or 64)

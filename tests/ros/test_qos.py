@@ -166,6 +166,7 @@ rclpy.spin(node)
 """
 
 
+@pytest.mark.long
 def test_reliable_subscribers_that_stand_still_do_not_hold_up_the_loop(
     own_domain: dict[str, str], library: Any, probe: Any
 ) -> None:
