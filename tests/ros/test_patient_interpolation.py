@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -341,8 +342,9 @@ def test_the_end_of_the_building_process_is_said_and_survived(
     "number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.long)]
 )
 def test_ending_the_node_half_way_leaves_nothing_behind(
-    own_domain: dict[str, str], probe: Any, files: Any, folder: Path, number: int
+    own_domain: dict[str, str], probe: Any, files: Any, folder: Path, library: Path, number: int
 ) -> None:
+    loadable = Path(shutil.copy(library / "liver.h5", folder / "there-before.h5"))
     process = _start(own_domain, folder, remap="__ns:=/other")
     loader = Module("vademecum_loader", ["--ros-args", "-p", f"library_dir:={folder}"], own_domain)
     try:
@@ -357,9 +359,10 @@ def test_ending_the_node_half_way_leaves_nothing_behind(
         assert end_of(process, 3.0) == (0 if number == signal.SIGINT else -number)
         probe.until(lambda: not Path(f"/proc/{helper}").exists(), 5.0)
         assert files() == before
-        request = LoadVademecum.Request(name="liver1-interpolated.h5")
+        request = LoadVademecum.Request(name=loadable.name)
         assert probe.call(LoadVademecum, "load_vademecum", request).success
     finally:
+        loadable.unlink()
         process.finish()
         assert loader.finish() == 0
 
