@@ -67,6 +67,11 @@ class Material:
         return young * nu / ((1 + nu) * (1 - 2 * nu)), young / (2 * (1 + nu))
 
     @property
+    def plane_strain_modulus(self) -> float:
+        """E* = E / (1 - nu^2) [Pa], which a rigid tip feels (Hertz 1882)."""
+        return self.young_modulus / (1.0 - self.poisson_ratio**2)
+
+    @property
     def element(self) -> Element:
         """The element that does not lock at this Poisson's ratio."""
         return "P2" if self.poisson_ratio <= POISSON_RATIO_P2 else "Taylor-Hood"

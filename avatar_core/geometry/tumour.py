@@ -1,4 +1,4 @@
-"""A tumour: which part of each tetrahedron of an organ it fills.
+"""A tumour: which part of each tetrahedron of an organ it fills, and of what a tip strains.
 
 Its level set is the second one of the organ (paper, Sec. 4): the signed distance to its surface,
 which may have several bodies. The mesh does not conform to it; a tetrahedron that it cuts has the
@@ -14,10 +14,13 @@ import numpy as np
 
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.level_set import signed_distance
+from avatar_core.geometry.local_profile import tangents
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 
 _LATTICE = 6  # points per edge of a tetrahedron
+_POLAR, _AZIMUTHS, _DEPTHS = 4, 8, 8  # directions and distances of points under a tip
+_CORE = 0.25  # part of the energy within the contact's own radius
 
 
 def read_tumour(path: str | Path, unit: str = "mm", axes: Any = "RAS") -> SurfaceMesh:
@@ -60,6 +63,61 @@ def volume_fraction_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:
             "surface of the tumour alone"
         )
     return volume_fraction
+
+
+def strained_fraction(
+    tumour: SurfaceMesh, points: np.ndarray, normals: np.ndarray, radius: float, reach: float
+) -> np.ndarray:
+    """Fraction of the energy under a normal force that a half-space would store in the tumour.
+
+    At the distance r and the angle t from the axis a point force on an incompressible half-space
+    stores (Boussinesq; Johnson, Contact Mechanics, 1985, Sec. 3.2)
+
+        W = sigma_rr^2 / (2 E),      sigma_rr = 3 F cos(t) / (2 pi r^2),
+
+    here constant in r within the contact's radius. By first-order perturbation a tumour of
+    contrast c there changes the compliance to 1 - f + f / c of what it was, f this fraction.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), on the surface [m]
+    normals : ndarray, shape (n, 3), unit vectors, outward
+    radius : of the contact [m]
+    reach : distance beyond which energy does not count [m]
+
+    Returns
+    -------
+    ndarray, shape (n,), from 0 to 1
+    """
+    fraction = np.zeros(len(points))
+    middle = tumour.vertices.mean(axis=0)
+    size = np.linalg.norm(tumour.vertices - middle, axis=1).max()
+    near = np.linalg.norm(points - middle, axis=1) < size + reach
+    if not near.any():
+        return fraction
+    direction, distance, weight = _beneath(radius, reach)
+    first, second = tangents(normals[near])
+    frame = np.stack([first, second, -normals[near]], axis=1)
+    rays = np.einsum("kc,ncd->nkd", direction, frame)
+    at = points[near, None, None] + distance[:, None] * rays[:, :, None]
+    inside = signed_distance(at.reshape(-1, 3), tumour).reshape(at.shape[:3]) < 0.0
+    fraction[near] = inside.mean(axis=1) @ weight
+    return fraction
+
+
+def _beneath(radius: float, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions that stand for equal energies (k, 3), the last component inward; distances (m,)
+    [m] and their weights, which sum to one."""
+    cosine = ((np.arange(_POLAR) + 0.5) / _POLAR) ** (1.0 / 3.0)  # of the density cos^2
+    angle = 2.0 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
+    c, a = (each.ravel() for each in np.meshgrid(cosine, angle))
+    sine = np.sqrt(1.0 - c**2)
+    most = 1.0 - radius / reach  # r = radius / (1 - t) has the density 1 / r^2 for even t
+    t = most * (np.arange(_DEPTHS) + 0.5) / _DEPTHS
+    beyond = (1.0 - _CORE) * most
+    weight = np.append(_CORE, np.full(_DEPTHS, beyond / _DEPTHS)) / (_CORE + beyond)
+    direction = np.stack([sine * np.cos(a), sine * np.sin(a), c], axis=1)
+    return direction, np.append(0.8 * radius, radius / (1.0 - t)), weight
 
 
 def _lattice() -> np.ndarray:

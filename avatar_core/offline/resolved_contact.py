@@ -1,0 +1,157 @@
+"""Resolved contacts at one place of an organ: the forces an online law is judged against.
+
+The organ's own mesh is refined around the place for the smallest and the largest contact at once,
+fitted there to the surface, factorized once, and condensed to what all tips together can reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar_core.errors import MeshError
+from avatar_core.fem.elasticity import Elasticity, Inclusion, Material
+from avatar_core.fem.signorini import CondensedContact, Contact, Push, half_space_radius
+from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.geometry.refinement import Grading, onto_surface, refine
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tumour import volume_fraction_inside
+
+SPHERES = tuple(Tip("sphere", radius) for radius in (1.5e-3, 3e-3, 5e-3, 10e-3))
+DEPTHS = (1e-3, 2e-3, 5e-3)
+_FITTED = (2.0, 1.5, 1.2)  # radii of the mesh fitted to the surface, over the largest contact's
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Size of the elements around a contact, :class:`avatar_core.geometry.refinement.Grading`.
+
+    core : longest edge at the centre, over the radius of the smallest contact
+    inner : its growth over the distance from the axis, up to the largest contact
+    outer : its growth beyond and below
+    reach : radius of the candidate surface over that of the contact on a half-space; a hollow
+        place needs more than a flat one
+    """
+
+    core: float = 0.3
+    inner: float = 0.25
+    outer: float = 0.5
+    reach: float = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedPlace:
+    """What tips feel at one place.
+
+    elasticity : the organ, refined there
+    condensed : CondensedContact, of the tips one by one
+    contacts : contacts[i][k] of tip i at depth k
+    """
+
+    elasticity: Elasticity
+    condensed: CondensedContact
+    contacts: tuple[tuple[Contact, ...], ...]
+
+    @property
+    def forces(self) -> np.ndarray:
+        """Along the normal, shape (n_tips, n_depths) [N]."""
+        return np.array([[contact.forces[0] for contact in row] for row in self.contacts])
+
+
+def contacts_at(
+    surface: SurfaceMesh | None,
+    mesh: TetMesh,
+    regions: Regions,
+    material: Material,
+    place: np.ndarray,
+    normal: np.ndarray,
+    tips: Sequence[Tip] = SPHERES,
+    depths: Sequence[float] = DEPTHS,
+    resolution: Resolution = Resolution(),
+    progress: Callable[[float], None] | None = None,
+    tumour: tuple[SurfaceMesh, float] | None = None,
+) -> ResolvedPlace:
+    """Contacts of several tips, one by one, at several depths along the normal of one place.
+
+    Parameters
+    ----------
+    surface : SurfaceMesh, to which the mesh is fitted around the place; None to keep its facets
+    mesh : TetMesh, of the organ
+    regions : Regions, of the mesh
+    material : Material
+    place : ndarray, shape (3,), on the surface (or the facets), where depths are zero [m]
+    normal : ndarray, shape (3,), pointing out; the direction in which tips are pushed in, reversed
+    tips : sequence of Tip
+    depths : of a tip's lowest point below the place [m]
+    resolution : Resolution
+    progress : as of :class:`avatar_core.fem.signorini.CondensedContact`
+    tumour : its surface and the contrast of Young's moduli
+
+    Raises
+    ------
+    MeshError
+        If the mesh would become too large, or cannot be fitted to the surface.
+    ContactError, ConvergenceError
+        As :class:`avatar_core.fem.signorini.CondensedContact`.
+    """
+    normal = np.asarray(normal, float) / np.linalg.norm(normal)
+    elasticity = refined_organ(
+        surface, mesh, regions, material, [place], [normal], tips, depths, resolution, tumour
+    )
+    pushes = [Push(tip, np.asarray(place, float), normal) for tip in tips]
+    condensed = CondensedContact(elasticity, pushes, max(depths), resolution.reach, progress)
+    contacts = tuple(
+        tuple(condensed.solve([i], [depth]) for depth in depths) for i in range(len(pushes))
+    )
+    return ResolvedPlace(elasticity, condensed, contacts)
+
+
+def refined_organ(
+    surface: SurfaceMesh | None,
+    mesh: TetMesh,
+    regions: Regions,
+    material: Material,
+    places: Sequence[np.ndarray],
+    normals: Sequence[np.ndarray],
+    tips: Sequence[Tip] = SPHERES,
+    depths: Sequence[float] = DEPTHS,
+    resolution: Resolution = Resolution(),
+    tumour: tuple[SurfaceMesh, float] | None = None,
+) -> Elasticity:
+    """The organ's elastic problem on a mesh that resolves contacts at some places.
+
+    Parameters as in :func:`contacts_at`, with shape (n, 3) for places and normals, on which all
+    tips and depths are expected.
+
+    Raises
+    ------
+    MeshError
+        If the mesh would become too large, or cannot be fitted to the surface.
+    """
+    radii = [half_space_radius(tip, depth) for tip in tips for depth in (min(depths), max(depths))]
+    core, largest = resolution.core * min(radii), max(radii)
+    gradings = [
+        Grading(place, normal, core, largest, resolution.inner, resolution.outer)
+        for place, normal in zip(places, normals, strict=True)
+    ]
+    mesh, regions = refine(mesh, regions, gradings)
+    if surface is not None:
+        for place in places:
+            mesh = _fitted(mesh, surface, place, largest)
+    inclusion = None
+    if tumour is not None:
+        inclusion = Inclusion(volume_fraction_inside(mesh, tumour[0]), tumour[1])
+    return Elasticity(mesh, material, regions.clamped, inclusion=inclusion)
+
+
+def _fitted(mesh: TetMesh, surface: SurfaceMesh, place: np.ndarray, largest: float) -> TetMesh:
+    """The mesh on the surface around a place: as far out as no tetrahedron turns inside out."""
+    for factor in _FITTED[:-1]:
+        try:
+            return onto_surface(mesh, surface, place, factor * largest)
+        except MeshError:
+            continue
+    return onto_surface(mesh, surface, place, _FITTED[-1] * largest)
