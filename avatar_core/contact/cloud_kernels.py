@@ -4,6 +4,7 @@
 
 with f_t = w(p_t) n_t as in :mod:`avatar_core.contact.kernels`, N_j the exact near field of load
 position j, and for large deformation the terms of :mod:`avatar_core.vademecum.large_deformation`.
+That is an organ under patches; near a tip, :mod:`avatar_core.contact.dent` shows the tip's dent.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.cloud import BLOCK
+from avatar_core.contact.dent import add_dents
 from avatar_core.contact.effects.large_deformation import (
     add_nonlinear_amplitudes,
     add_nonlinear_near,
@@ -30,6 +32,7 @@ def deform(model, state, out, effects):  # type: ignore[no-untyped-def]
     _displace(
         model, state, out, e.superposition, e.large_deformation, e.friction, e.viscoelasticity
     )
+    add_dents(model, state, e.tip_law, e.dent)
     write_cloud(model.rest, state.field, out.cloud)
     shift_cloud(e.respiration, out.cloud)
 

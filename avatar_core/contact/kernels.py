@@ -1,7 +1,10 @@
 """The compiled contact step: no allocation, no exception, no I/O.
 
-Each tool tip (sphere, centre p, radius r) presses through one patch, at the surface point below
-it, along the normal n = grad phi / |grad phi|. Forces lambda solve the Signorini conditions
+Each tool tip (a sphere of centre p and radius r; of other tips, p lies r above the lowest point)
+presses at the surface point below it, along the normal n = grad phi / |grad phi|. Its force deforms
+the organ as that of a patch would, but for the dent right under the tip, which
+:mod:`avatar_core.contact.effects.tip_law` adds. Forces lambda of patches solve the Signorini
+conditions
 
     gap_t = phi(p_t) - r_t,   gap_t + sum_t' C_tt' lambda_t' >= 0,   lambda >= 0,  complementary,
 
@@ -29,7 +32,7 @@ from collections import namedtuple
 import numpy as np
 
 from avatar_core.common.jit import entry, fast, inlined
-from avatar_core.common.splines import cell_at, in_cell, on_grid, value_in_cell
+from avatar_core.common.splines import cell_at, value_in_cell
 from avatar_core.contact.cloud_kernels import deform
 from avatar_core.contact.effects.friction import (
     force_squared,
@@ -38,22 +41,28 @@ from avatar_core.contact.effects.friction import (
     write_torque,
 )
 from avatar_core.contact.effects.inertia import advance_inertia, predict_inertia
-from avatar_core.contact.effects.large_deformation import (
-    add_nonlinear_force,
-    evaluate_added_depth,
-    sample_coefficients,
-)
+from avatar_core.contact.effects.large_deformation import add_nonlinear_force, sample_coefficients
 from avatar_core.contact.effects.respiration import to_organ_frame, to_world_frame
 from avatar_core.contact.effects.several_tools import (
     assemble_coupling,
     couple_near_fields,
     solve_active_set,
 )
+from avatar_core.contact.effects.tip_law import (
+    add_tip_force,
+    added_depth,
+    advance_tips,
+    law_error,
+    predict_tips,
+    sample_surface,
+    solve_tip,
+)
 from avatar_core.contact.effects.viscoelasticity import (
     advance_history,
     predict_history,
     predict_modes,
 )
+from avatar_core.contact.locate import EXTRAPOLATED, NOT_CONVERGED, OK, locate
 from avatar_core.contact.superposition import (
     free_tip_displacement,
     superpose_modes,
@@ -66,26 +75,13 @@ from avatar_core.contact.tip_compliance import (
     near_column,
     near_gram,
 )
-from avatar_core.contact.tip_response import gather
 
 MAX_TOOLS = 8
 MAX_SWEEPS = 1000
 
-OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
-UNKNOWN_FRAME, EXTRAPOLATED = 8, 9
-
-# A tip that did not enter through the surface is barred until it is outside again: a contact that
-# began at depth would release energy that no tool has put in.
-OUTSIDE, ENTERED, BARRED = range(3)
-
 PATIENCE = 8  # sweeps before the active-set solution is tried,
 MAX_EXACT = 64  # and after which it is no longer tried
 GAP_TOLERANCE = 1e-9  # [m] of gap change that ends Gauss-Seidel
-ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not enter through the surface
-LEAP = 50e-3  # [m] in a period; a tip that is farther from its last pose makes a new contact
-MAX_DEPTH = 25e-3  # [m] of the centre below the surface at rest
-MIN_ACCESS = 1e-2  # below, the tip is off the accessible surface
-FULL_ACCESS = 0.99  # below, the force fades
 
 # What the step reads; `prepare` fills it once. Shapes in avatar_core.contact.layout.Layout.
 ModelArrays = namedtuple(
@@ -112,7 +108,7 @@ ModelArrays = namedtuple(
         "near_target",
         "near_block",
         "rest",
-        "tip_radius",
+        "tip_offset",
     ],
 )
 
@@ -190,10 +186,11 @@ def contact_deform(model, state, out, effects):  # type: ignore[no-untyped-def]
 
 
 @entry
-def force_error(model, out, tips):  # type: ignore[no-untyped-def]
+def force_error(model, state, out, tips, tip_law):  # type: ignore[no-untyped-def]
     """Expected error of the forces: the relative error at the tip, times the force.
 
-    Real-time safe, as :func:`contact_step`.
+    Of a real tip, the patch's error counts with the part of the depth that is the patch's, and that
+    of the law is added. Real-time safe, as :func:`contact_step`.
     """
     for t in range(tips.shape[0]):
         force = out.force[t]
@@ -201,7 +198,11 @@ def force_error(model, out, tips):  # type: ignore[no-untyped-def]
         out.force_error[t] = 0.0
         if size > 0.0:
             cell = cell_at(model.origin, model.spacing[0], tips[t])
-            out.force_error[t] = size * value_in_cell(model.force_error, cell)
+            relative = value_in_cell(model.force_error, cell)
+            if tip_law is not None:
+                part = state.self_compliance[t] * state.force[t] / max(-state.gap[t], 1e-6)
+                relative = law_error(tip_law, t) + min(part, 1.0) * relative
+            out.force_error[t] = size * relative
 
 
 @inlined
@@ -209,12 +210,22 @@ def _solve_period(model, state, out, tips, effects):  # type: ignore[no-untyped-
     """Locate, assemble, solve, differentiate, advance. ``tips`` may change."""
     e = effects
     to_organ_frame(e.respiration, tips)
-    status = _locate_tips(model, state, out, tips, e.superposition, e.large_deformation, e.friction)
+    status = _locate_tips(
+        model, state, out, tips, e.superposition, e.large_deformation, e.friction, e.tip_law
+    )
     couple_near_fields(model, state, e.several_tools, e.friction)
     _predict(e.superposition, e.viscoelasticity, e.inertia, e.self_weight)
+    predict_tips(e.tip_law, e.viscoelasticity)
     _assemble_incremental(model, state, e.superposition, e.viscoelasticity, e.inertia)
     converged = solve_contact(
-        model, state, tips, e.superposition, e.several_tools, e.large_deformation, e.friction
+        model,
+        state,
+        tips,
+        e.superposition,
+        e.several_tools,
+        e.large_deformation,
+        e.friction,
+        e.tip_law,
     )
     if not converged:
         for t in range(tips.shape[0]):
@@ -223,6 +234,7 @@ def _solve_period(model, state, out, tips, effects):  # type: ignore[no-untyped-
     superpose_modes(state, e.superposition, e.friction)
     write_forces(model, state, out, tips, e)
     advance_history(state, e.superposition, e.viscoelasticity, e.friction, e.self_weight)
+    advance_tips(state, e.tip_law, e.viscoelasticity)
     advance_inertia(e.superposition, e.inertia)
     to_world_frame(e.respiration, out)
     for t in range(tips.shape[0]):
@@ -232,7 +244,7 @@ def _solve_period(model, state, out, tips, effects):  # type: ignore[no-untyped-
 
 @inlined
 def _locate_tips(  # type: ignore[no-untyped-def]
-    model, state, out, tips, superposition, large_deformation, friction
+    model, state, out, tips, superposition, large_deformation, friction, tip_law
 ):
     """Gap and compliance of each tip on its own; returns the worst status."""
     status = OK
@@ -249,68 +261,10 @@ def _locate_tips(  # type: ignore[no-untyped-def]
         else:
             near = near_gram(model, state, t)
         assemble_own(model, state, t, near)
-        sample_coefficients(model, large_deformation, t, tips[t])
+        sample_surface(model, tip_law, t, tips[t])
+        sample_coefficients(model, state, tip_law, large_deformation, t, tips[t])
         gather_friction(model, state, friction, t)
     return status
-
-
-@inlined
-def locate(model, state, t, tip, superposition):  # type: ignore[no-untyped-def]
-    """Gap, normal, access, compliance, surface point and load positions of a tip in contact."""
-    before, continuous = state.passage[t], _is_continuous(state, t, tip)
-    state.active[t] = False
-    state.access[t] = 1.0
-    if not np.isfinite(tip[0] + tip[1] + tip[2]):
-        return INVALID_POSE  # keeps its passage: the tip may still be where it was
-    state.passage[t] = OUTSIDE
-    if not on_grid(model.distance.shape, model.origin, model.spacing[0], tip):
-        return OK
-    cell = cell_at(model.origin, model.spacing[0], tip)
-    phi = in_cell(model.distance, cell, state.slope[t])
-    state.gap[t] = phi - model.tip_radius[t]
-    if state.gap[t] >= 0.0:
-        return OK
-    access = in_cell(model.access, cell, state.access_slope[t])
-    state.access[t] = min(access, 1.0)
-    if access < MIN_ACCESS:
-        return OUT_OF_RANGE
-    deepest = MAX_DEPTH if before == ENTERED and continuous else ENTRY_DEPTH
-    if before == BARRED or phi < -deepest:
-        state.passage[t] = BARRED
-        return OUT_OF_RANGE
-    state.passage[t] = ENTERED
-    state.active[t] = True
-    for d in range(3):
-        state.seen[t, d] = tip[d]
-    if not continuous:
-        state.force[t] = 0.0
-    _set_normal(state, t, tip, phi)
-    state.self_compliance[t] = in_cell(model.self_compliance, cell, state.self_slope[t])
-    gather(model, state, t, cell, superposition)
-    return OK if access >= FULL_ACCESS else OUT_OF_RANGE
-
-
-@inlined
-def _is_continuous(state, t, tip):  # type: ignore[no-untyped-def]
-    """Whether the tip can have moved here from its last contact.
-
-    After invalid poses its motion is unknown; then no more than ``ENTRY_DEPTH`` is believed.
-    """
-    square = 0.0
-    for d in range(3):
-        square += (tip[d] - state.seen[t, d]) ** 2
-    farthest = LEAP if state.active[t] else ENTRY_DEPTH
-    return square < farthest * farthest
-
-
-@inlined
-def _set_normal(state, t, p, phi):  # type: ignore[no-untyped-def]
-    """n = g / |g| with g = grad phi, and s = p - phi n."""
-    g = state.slope[t]
-    state.steepness[t] = max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
-    for d in range(3):
-        state.normal[t, d] = g[d] / state.steepness[t]
-        state.point[t, d] = p[d] - phi * state.normal[t, d]
 
 
 @inlined
@@ -352,64 +306,77 @@ def _assemble_incremental(  # type: ignore[no-untyped-def]
 
 @inlined
 def solve_contact(  # type: ignore[no-untyped-def]
-    model, state, tips, superposition, several_tools, large_deformation, friction
+    model, state, tips, superposition, several_tools, large_deformation, friction, tip_law
 ):
     """Forces of all tips, by the cheapest solver for the effects; whether it converged."""
     if friction is not None:
         return solve_friction(
-            model, state, tips, superposition, several_tools, large_deformation, friction
+            model, state, tips, superposition, several_tools, large_deformation, friction, tip_law
         )
     if several_tools is not None:
         assemble_coupling(state, superposition, several_tools)
-    if several_tools is not None or large_deformation is not None:
-        return solve_together(state, superposition, several_tools, large_deformation)
-    return solve_alone(state, superposition)
+    if several_tools is not None or (large_deformation is not None and tip_law is None):
+        return solve_together(state, superposition, several_tools, large_deformation, tip_law)
+    return solve_alone(state, superposition, large_deformation, tip_law)
 
 
 @inlined
-def solve_alone(state, superposition):  # type: ignore[no-untyped-def]
-    """0 <= lambda  perp  gap + C lambda >= 0, each tip on its own, in closed form."""
+def solve_alone(state, superposition, large_deformation, tip_law):  # type: ignore[no-untyped-def]
+    """0 <= lambda  perp  gap + C lambda >= 0, each tip on its own; a patch in closed form."""
     for t in range(state.passage.shape[0]):
         if state.active[t]:
             gap = state.gap[t]
             if superposition is not None:
                 gap -= superposition.free_normal[t]
-            state.force[t] = max(0.0, -gap / state.compliance[t, t])
+            own = state.compliance[t, t]
+            if tip_law is not None:
+                tip_law.place[t] = 0.0  # to the bit, the force knows nothing of the last pose
+                state.force[t] = solve_tip(
+                    state, superposition, tip_law, large_deformation, t, -gap, own
+                )
+            else:
+                state.force[t] = max(0.0, -gap / own)
     return True
 
 
 @inlined
 def solve_together(  # type: ignore[no-untyped-def]
-    state, superposition, several_tools, large_deformation
+    state, superposition, several_tools, large_deformation, tip_law
 ):
     """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda + h >= 0, from the last forces.
 
-    With large deformation each update is a Newton step. Sweeps hardly change how tips close to
-    each other share their load; then they restart from the active-set solution. Returns whether
-    the last sweep changed every gap by less than ``GAP_TOLERANCE``.
+    With large deformation each update of a patch is a Newton step. Sweeps hardly change how tips
+    close to each other share their load; then they restart from the active-set solution. Returns
+    whether the last sweep changed every gap by less than ``GAP_TOLERANCE``.
     """
     n_tools = state.passage.shape[0]
     for sweep in range(MAX_SWEEPS):
         if several_tools is not None and sweep < MAX_EXACT and sweep % PATIENCE == PATIENCE - 1:
-            solve_active_set(state, superposition, several_tools, large_deformation)
+            solve_active_set(state, superposition, several_tools, large_deformation, tip_law)
         worst = 0.0
         for t in range(n_tools):
             if not state.active[t]:
                 continue
-            compliance = state.compliance[t, t]
-            gap = state.gap[t] + compliance * state.force[t]
+            compliance, before = state.compliance[t, t], state.force[t]
+            gap = state.gap[t]
             if superposition is not None:
                 gap -= superposition.free_normal[t]
             if several_tools is not None:
                 for s in range(n_tools):
                     if s != t and state.active[s]:
                         gap += state.compliance[t, s] * state.force[s]
-            if large_deformation is not None:
-                evaluate_added_depth(state, large_deformation, t)
-                gap += large_deformation.added_depth[t, 0]
-                compliance += large_deformation.added_depth[t, 1] * state.self_compliance[t]
-            new = max(0.0, state.force[t] - gap / compliance)
-            worst = max(worst, abs(new - state.force[t]) * compliance)
+            if tip_law is not None:
+                new = solve_tip(
+                    state, superposition, tip_law, large_deformation, t, -gap, compliance
+                )
+            else:
+                gap += compliance * before
+                if large_deformation is not None:
+                    added, tangent = added_depth(state, superposition, None, large_deformation, t)
+                    gap += added
+                    compliance += tangent
+                new = max(0.0, before - gap / compliance)
+            worst = max(worst, abs(new - before) * compliance)
             state.force[t] = new
         if worst < GAP_TOLERANCE:
             return True
@@ -436,11 +403,13 @@ def write_forces(model, state, out, tips, effects):  # type: ignore[no-untyped-d
             e.large_deformation,
             e.friction,
             e.viscoelasticity,
+            e.tip_law,
             t,
         )
         _add_fading_force(model, state, out, e.friction, t)
         if add_nonlinear_force(state, e.large_deformation, out, t) and out.status[t] == OK:
             out.status[t] = EXTRAPOLATED
+        add_tip_force(state, e.tip_law, e.large_deformation, out, t)
         write_torque(model, state, e.friction, out, t)
         out.contact_tool[n] = t
         fade = model.softness[0] * (1.0 / state.access[t] - 1.0)
@@ -448,7 +417,7 @@ def write_forces(model, state, out, tips, effects):  # type: ignore[no-untyped-d
         for d in range(3):
             out.contact_force[n, d] = out.force[t, d]
             out.contact_normal[n, d] = state.normal[t, d]
-            out.contact_position[n, d] = tips[t, d] - model.tip_radius[t] * state.normal[t, d]
+            out.contact_position[n, d] = tips[t, d] - model.tip_offset[t] * state.normal[t, d]
         n += 1
     out.n_contacts[0] = n
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud import cloud_arrays
+from avatar_core.contact.dent import dent_arrays
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.large_deformation import (
     LargeDeformationArrays,
@@ -27,9 +28,13 @@ from avatar_core.contact.effects.selection import (
     selected_arrays,
 )
 from avatar_core.contact.effects.several_tools import SeveralTools
+from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, RIDGE, tip_law_arrays
+from avatar_core.contact.effects.tip_profile import BETA, KAPPA, STIFFNESS, TAKEN
 from avatar_core.contact.kernels import ModelArrays
+from avatar_core.contact.locate import MAX_DEPTH
 from avatar_core.contact.tip_response import TipResponse, make_tip_response, sampled_at_tip
 from avatar_core.errors import ContactError, SceneError
+from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.near_field import LocalBlocks, hash_rows
 from avatar_core.vademecum.accuracy import Cloud, Detail, Precision
 from avatar_core.vademecum.certificate import Certificate
@@ -39,7 +44,6 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
 LANES = 32  # float32 numbers that a vectorised loop processes at once
-TIP_RADIUS_RANGE = (2e-3, 20e-3)  # [m]
 PERIOD = 1e-3  # of the steps [s]
 
 
@@ -55,7 +59,7 @@ class Layout:
         [m/N];
         space (n_blocks, rank, BLOCK) int16, displacement modes of the cloud in units of
         space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 6), the cloud without
-        displacement [m]; tip_radius (n_tools,) [m]
+        displacement [m]; tip_offset (n_tools,), of a pose above the lowest point of the tip [m]
     effects : Constants, None for each effect that was not chosen
     """
 
@@ -89,7 +93,7 @@ class Layout:
 
 def lay_out(
     vademecum: Vademecum,
-    tip_radii: tuple[float, ...] = (5e-3,),
+    tips: Sequence[Tip] = (Tip(),),
     detail: Detail | None = None,
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
@@ -99,23 +103,22 @@ def lay_out(
     detail : of the displacement; by default all modes at the surface
     """
     detail = detail or Detail(vademecum.far.rank)
-    _check(vademecum, tip_radii, detail)
+    _check(vademecum, tips, detail)
     if effects is None:
-        effects = default_effects(vademecum, len(tip_radii))
+        effects = default_effects(vademecum, len(tips))
     for effect in effects:
         effect.require(vademecum)
-    if len(tip_radii) > 1 and find(effects, SeveralTools) is None:
+    if len(tips) > 1 and find(effects, SeveralTools) is None:
         raise SceneError(
-            f"{len(tip_radii)} tools without several_tools; add it to the effects, or name one tool"
+            f"{len(tips)} tools without several_tools; add it to the effects, or name one tool"
         )
     modes = None if detail.modes == vademecum.far.rank else detail.modes
     vademecum, mass = adapted_vademecum(vademecum, effects)
     surface, contact = vademecum.surface, vademecum.contact_near
     contact_start, contact_slot = hash_rows(contact)
     load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
-    response = make_tip_response(
-        surface, vademecum.tip_field, load, contact, kernels.MAX_DEPTH, max(tip_radii)
-    )
+    field, offset = vademecum.tip_field, np.array([tip.offset for tip in tips])
+    response = make_tip_response(surface, field, load, contact, MAX_DEPTH, max(offset))
     large = vademecum.large if find(effects, LargeDeformationEffect) is not None else None
     shown = cloud_arrays(
         vademecum,
@@ -125,8 +128,12 @@ def lay_out(
         detail.near,
         large.space if large else None,
     )
+    points = vademecum.mesh.vertices[shown.points]
     arrays = ModelArrays(
-        *vademecum.tip_field,
+        distance=field.distance,
+        access=field.access,
+        origin=field.origin,
+        spacing=field.spacing,
         row=response.row,
         carrier=response.carrier,
         carrier_weight=response.carrier_weight,
@@ -143,12 +150,40 @@ def lay_out(
         near_start=shown.near.start,
         near_target=shown.near.target,
         near_block=shown.near.block,
-        rest=np.pad(vademecum.mesh.vertices[shown.points], ((0, 0), (0, 3))).astype(np.float32),
-        tip_radius=np.array(tip_radii, float),
+        rest=np.pad(points, ((0, 0), (0, 3))).astype(np.float32),
+        tip_offset=offset,
     )
     nonlinear = _nonlinear_arrays(vademecum, large, response, shown.fade) if large else None
     reach = _reach(contact, surface.centers)
-    return Layout(arrays, selected_arrays(vademecum, effects, mass, nonlinear, reach, period))
+    law = tip_law_arrays(
+        tips,
+        vademecum.material,
+        _local(vademecum, response.self_compliance),
+        (vademecum.certificate or Certificate.unknown()).contact_sites.factor,
+        large is not None and large.material == "neo-hookean",
+    )
+    dent = dent_arrays(tips, points, surface.centers, surface.patch_radius) if law else None
+    return Layout(
+        arrays, selected_arrays(vademecum, effects, mass, nonlinear, reach, period, law, dent)
+    )
+
+
+def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
+    """kappa, beta, E* and c on the grid of the tip field, shape (4, nx, ny, nz) float32.
+
+    Over a tumour of contrast q that stores the fraction f of the energy under a tip, E* is that of
+    the organ over 1 - f + f / q.
+    """
+    stiffness = vademecum.material.plane_strain_modulus
+    radius = vademecum.surface.patch_radius
+    field, local = vademecum.tip_field, np.zeros((4, *self_compliance.shape), np.float32)
+    if field.curvature is not None:  # as in files since schema 2.3
+        local[KAPPA], local[BETA] = field.curvature, RIDGE * field.ridge
+    local[STIFFNESS] = stiffness
+    if field.tumour is not None and vademecum.contrast is not None:
+        local[STIFFNESS] /= 1.0 - field.tumour + field.tumour / vademecum.contrast
+    local[TAKEN] = np.minimum(PATCH_ON_MESH / (local[STIFFNESS] * radius), self_compliance)
+    return local
 
 
 def _nonlinear_arrays(
@@ -184,13 +219,9 @@ def _padded(load: np.ndarray) -> np.ndarray:
     return np.pad(load, ((0, 0), (0, 0), (0, -load.shape[2] % LANES)))
 
 
-def _check(vademecum: Vademecum, tip_radii: tuple[float, ...], detail: Detail) -> None:
-    low, high = TIP_RADIUS_RANGE
-    if not 1 <= len(tip_radii) <= kernels.MAX_TOOLS:
-        raise ContactError(f"{len(tip_radii)} tools; give 1 to {kernels.MAX_TOOLS} tip radii")
-    for radius in tip_radii:
-        if not low <= radius <= high:
-            raise ContactError(f"tip radius {radius:g} m; it must lie in {low:g} to {high:g} m")
+def _check(vademecum: Vademecum, tips: Sequence[Tip], detail: Detail) -> None:
+    if not 1 <= len(tips) <= kernels.MAX_TOOLS:
+        raise ContactError(f"{len(tips)} tools; give 1 to {kernels.MAX_TOOLS} tips")
     modes, rank = detail.modes, vademecum.far.rank
     if not 1 <= modes <= rank:
         raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {rank}")

@@ -1,4 +1,4 @@
-"""Contact between spherical tool tips and an organ at 1 kHz: offline ``prepare``, online ``step``.
+"""Contact between tool tips and an organ at 1 kHz: offline ``prepare``, online ``step``.
 
 ``prepare`` allocates, compiles and may fail; ``step`` does none of it and returns a status.
 The compiled code is in :mod:`avatar_core.contact.kernels`.
@@ -14,14 +14,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numba
 import numpy as np
 
-from avatar_core.contact import kernels
+from avatar_core.contact import kernels, locate
 from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.selection import NO_EFFECTS, Selection, allocate
 from avatar_core.contact.effects.several_tools import SeveralToolsArrays
+from avatar_core.contact.effects.tip_law import dent_energy
 from avatar_core.contact.kernels import ModelArrays, Out, State
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
 from avatar_core.contact.tip_response import MAX_STENCIL
+from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.accuracy import Cloud, Detail, Precision
 
 if TYPE_CHECKING:
@@ -33,16 +35,16 @@ FAR_AWAY = 1e3  # coordinate of a tool without a pose [m]
 class Status(IntEnum):
     """Result of a step; the numbers of avatar_ros/msg/ContactState."""
 
-    OK = kernels.OK
-    NO_MODEL = kernels.NO_MODEL
-    NO_POSE = kernels.NO_POSE
-    STALE_POSE = kernels.STALE_POSE
-    INVALID_POSE = kernels.INVALID_POSE
-    NOT_CONVERGED = kernels.NOT_CONVERGED
-    TOO_MANY_CONTACTS = kernels.TOO_MANY
-    OUT_OF_RANGE = kernels.OUT_OF_RANGE
-    UNKNOWN_FRAME = kernels.UNKNOWN_FRAME
-    EXTRAPOLATED = kernels.EXTRAPOLATED
+    OK = locate.OK
+    NO_MODEL = locate.NO_MODEL
+    NO_POSE = locate.NO_POSE
+    STALE_POSE = locate.STALE_POSE
+    INVALID_POSE = locate.INVALID_POSE
+    NOT_CONVERGED = locate.NOT_CONVERGED
+    TOO_MANY_CONTACTS = locate.TOO_MANY
+    OUT_OF_RANGE = locate.OUT_OF_RANGE
+    UNKNOWN_FRAME = locate.UNKNOWN_FRAME
+    EXTRAPOLATED = locate.EXTRAPOLATED
 
 
 class Compiled(NamedTuple):
@@ -89,7 +91,7 @@ class ContactModel:
     @property
     def n_tools(self) -> int:
         """Number of tools."""
-        return len(self.arrays.tip_radius)
+        return len(self.arrays.tip_offset)
 
     @property
     def nbytes(self) -> int:
@@ -130,7 +132,7 @@ class ContactModel:
 
     def reset(self) -> None:
         """Return to the organ at rest, without contacts or history. Not real-time safe."""
-        self.state.passage[:] = kernels.OUTSIDE
+        self.state.passage[:] = locate.OUTSIDE
         self.state.force[:] = 0.0
         fresh = _effects(self.layout)
         for mine, new in zip(self.effects, fresh, strict=True):
@@ -142,7 +144,7 @@ class ContactModel:
 
 def prepare(
     vademecum: Vademecum,
-    tip_radii: tuple[float, ...] = (5e-3,),
+    tips: Sequence[Tip] = (Tip(),),
     modes: int | None = None,
     cloud: Cloud = "surface",
     effects: Sequence[Effect] | None = None,
@@ -156,7 +158,7 @@ def prepare(
     Parameters
     ----------
     vademecum : Vademecum
-    tip_radii : radius of each tool's spherical tip, 2 to 20 mm [m]
+    tips : the tip of each tool
     modes : far-field modes of the *displacement*; None for all. Fewer modes leave the force
         exact, since the contact compliance keeps all of them.
     cloud : "surface" or "volume" vertices, or "off"
@@ -169,10 +171,10 @@ def prepare(
     Raises
     ------
     ContactError, SceneError
-        For radii, modes or clouds out of range; for effects that the vademecum cannot serve.
+        For modes or clouds out of range; for effects that the vademecum cannot serve.
     """
     detail = Detail(vademecum.far.rank if modes is None else modes, cloud, precision, near)
-    return make_model(lay_out(vademecum, tip_radii, detail, effects, period), halves)
+    return make_model(lay_out(vademecum, tips, detail, effects, period), halves)
 
 
 def make_model(layout: Layout, halves: bool = False) -> ContactModel:
@@ -181,8 +183,8 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     halves : compile :func:`solve` and :func:`deform` instead of :func:`step`
     """
     arrays, state, out, effects = layout.arrays, _state(layout), _out(layout), _effects(layout)
-    far_away = np.full((len(arrays.tip_radius), 3), FAR_AWAY)
-    kernels.force_error(arrays, out, far_away)
+    far_away = np.full((len(arrays.tip_offset), 3), FAR_AWAY)
+    kernels.force_error(arrays, state, out, far_away, effects.tip_law)
     if halves:
         first = _compiled(kernels.contact_solve, arrays, state, out, far_away, effects)
         second = _compiled(kernels.contact_deform, arrays, state, out, effects)
@@ -198,7 +200,7 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
 def _state(layout: Layout) -> State:
     """Without any contact."""
     arrays, single = layout.arrays, np.float32
-    n_tools, n_modes = len(arrays.tip_radius), arrays.load.shape[2]
+    n_tools, n_modes = len(arrays.tip_offset), arrays.load.shape[2]
     return State(
         passage=np.zeros(n_tools, np.int64),
         seen=np.zeros((n_tools, 3)),
@@ -230,7 +232,7 @@ def _state(layout: Layout) -> State:
 
 def _out(layout: Layout) -> Out:
     """Without any force."""
-    n_tools = len(layout.arrays.tip_radius)
+    n_tools = len(layout.arrays.tip_offset)
     return Out(
         force=np.zeros((n_tools, 3)),
         torque=np.zeros((n_tools, 3)),
@@ -254,7 +256,7 @@ def _n_far(layout: Layout) -> int:
 
 def _effects(layout: Layout) -> Selection:
     n_positions, _, n_modes = layout.arrays.load.shape
-    return allocate(layout.effects, len(layout.arrays.tip_radius), n_modes, n_positions)
+    return allocate(layout.effects, len(layout.arrays.tip_offset), n_modes, n_positions)
 
 
 def _compiled(kernel: Any, *arguments: Any) -> Any:
@@ -310,7 +312,9 @@ def estimate_error(model: ContactModel) -> None:
     vademecum was not measured. Real-time safe, as :func:`step`; separate, so that it can follow
     the sending of the forces.
     """
-    kernels.force_error(model.layout.arrays, model.out, model.tips)
+    kernels.force_error(
+        model.layout.arrays, model.state, model.out, model.tips, model.effects.tip_law
+    )
 
 
 def warm_up(n_tools: int = 1) -> None:
@@ -340,7 +344,7 @@ def warm_up(n_tools: int = 1) -> None:
         near_target=blocks[1],
         near_block=blocks[2],
         rest=np.zeros((points, 6), single),
-        tip_radius=np.full(n_tools, 5e-3, double),
+        tip_offset=np.full(n_tools, 5e-3, double),
     )
     several_tools = SeveralToolsArrays(np.ones(1)) if n_tools > 1 else None
     make_model(Layout(arrays, NO_EFFECTS._replace(several_tools=several_tools)), halves=True)
@@ -361,6 +365,8 @@ def stored_energy(model: ContactModel) -> float:
     else:
         force = state.force[active]
         energy = 0.5 * force @ state.compliance[np.ix_(active, active)] @ force
+    if effects.tip_law is not None:
+        energy += sum(dent_energy(effects.tip_law, int(t)) for t in active)
     if effects.large_deformation is not None:
         for t in active:
             h, _, whole, _ = effects.large_deformation.added_depth[t]

@@ -157,6 +157,7 @@ def write_superposed_force(  # type: ignore[no-untyped-def]
     large_deformation,
     friction,
     viscoelasticity,
+    tip_law,
     t,
 ):
     """F of the module's docstring, without the terms of large deformation and fading access."""
@@ -192,7 +193,7 @@ def write_superposed_force(  # type: ignore[no-untyped-def]
         value = a * (joint + change * (g0 * u0 + g1 * u1 + g2 * u2))
         if friction is not None:
             value -= target_derivative(
-                model, state, superposition, large_deformation, friction, t, d
+                model, state, superposition, large_deformation, friction, tip_law, t, d
             )
         else:
             turned = turn0 * u0 + turn1 * u1 + turn2 * u2

@@ -17,17 +17,18 @@ from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.layout import PERIOD, lay_out
 from avatar_core.contact.model import ContactModel, deform, make_model, solve, step
 from avatar_core.contact.tool_path import slide, starts_apart
+from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.accuracy import AccuracyCurve, CurvePoint, Detail
 from avatar_core.vademecum.model import Vademecum
 
-_TIP, _DEPTH = 10e-3, 5e-3  # [m] of the slide that is timed
+_TIP, _DEPTH = Tip("sphere", 10e-3), 5e-3  # [m] of the slide that is timed
 _STEPS, _WARM, _ROUNDS = 300, 50, 7
 
 
 def timed(
     vademecum: Vademecum,
     curve: AccuracyCurve,
-    tip_radii: tuple[float, ...] = (_TIP,),
+    tips: Sequence[Tip] = (_TIP,),
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
     halves: bool = False,
@@ -37,11 +38,11 @@ def timed(
 
     halves : time :func:`avatar_core.contact.model.solve` and ``deform``, as a node calls them
     """
-    paths = slides(vademecum, tip_radii)
+    paths = slides(vademecum, tips)
     pairs: list[tuple[ContactModel, CurvePoint]] = []
     for group in _same_arrays(curve):
         whole = replace(group[0].detail, modes=vademecum.far.rank)
-        model = make_model(lay_out(vademecum, tip_radii, whole, effects, period), halves)
+        model = make_model(lay_out(vademecum, tips, whole, effects, period), halves)
         pairs += [(model, point) for point in group]
         progress(0.5 * len(pairs) / len(curve.points))
     points = _timed(pairs, paths, lambda fraction: progress(0.5 + 0.5 * fraction))
@@ -61,12 +62,12 @@ def timed_points(
     return found
 
 
-def slides(vademecum: Vademecum, tip_radii: tuple[float, ...]) -> np.ndarray:
+def slides(vademecum: Vademecum, tips: Sequence[Tip]) -> np.ndarray:
     """Ways of tips that start far apart, 5 mm deep, shape (n, n_tools, 3) [m]."""
-    starts = starts_apart(vademecum, len(tip_radii))
+    starts = starts_apart(vademecum, len(tips))
     paths = [
-        slide(vademecum, radius, min(_DEPTH, radius), _STEPS * 1e-4, position=start)
-        for radius, start in zip(tip_radii, starts, strict=True)
+        slide(vademecum, tip.offset, min(_DEPTH, tip.radius), _STEPS * 1e-4, position=start)
+        for tip, start in zip(tips, starts, strict=True)
     ]
     return np.ascontiguousarray(np.stack(paths, axis=1))
 

@@ -9,7 +9,7 @@ field and evaluated by the same B-splines B_q(p), twice differentiable almost ev
     gamma(p) = sum_q B_q(p) [K gamma_0](x_q)    gamma_0 = n . C(s, s) n at s = s(x_q)
 
 with n = grad phi / |grad phi| the direction of pressing and K the kernel of the tip field, with a
-fifth of the patch radius. gamma is the compliance of a single tip; between tips t and t' it is
+tenth of the patch radius. gamma is the compliance of a single tip; between tips t and t' it is
 
     C_tt' = a_t a_t' f_t . C f_t',    f_t = w(p_t) n(p_t),    a_t^2 = gamma(p_t) / (f_t . C f_t),
 
@@ -25,11 +25,11 @@ import numpy as np
 
 from avatar_core.common.jit import compiled, fast
 from avatar_core.fem.patch_loads import LoadSurface
-from avatar_core.reduction.near_field import LocalBlocks
-from avatar_core.vademecum.tip_field import TipField, smoothed
+from avatar_core.reduction.near_field import LocalBlocks, find_block, hash_rows
+from avatar_core.vademecum.tip_field import TipField, grid_normals, smoothed
 
-SMOOTHING = 0.2  # standard deviation of K, in patch radii
-MAX_STENCIL = 128  # load positions that carry one tip, at most
+SMOOTHING = 0.1  # standard deviation of K, in patch radii
+MAX_STENCIL = 27 * 6  # load positions that carry one tip, at most: six at each grid point of a cell
 
 # row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
 # 6) int32 load positions and carrier_weight (n_rows, 3 or 6) float32;
@@ -61,12 +61,12 @@ def make_tip_response(
     margin = 3.0 * spacing  # half the splines' support, along its diagonal
     shell = (field.distance > -depth - margin) & (field.distance < height + margin)
     shell &= _dilated(field.access > 0.0)
+    normal = grid_normals(field.distance, spacing)[shell]
     points = field.origin + spacing * np.argwhere(shell)
     carrier, carrier_weight = closest_weights(surface, points)
-    normal = _normals(field)[shell]
     compliance = np.zeros(shell.shape)
     compliance[shell] = _self_compliance(
-        carrier, carrier_weight, normal, load, near.start, near.target, near.block
+        carrier, carrier_weight, normal, load, *hash_rows(near), near.block
     )
     deviation = SMOOTHING * surface.patch_radius / spacing
     smooth = smoothed(compliance, deviation, shell)
@@ -81,13 +81,6 @@ def make_tip_response(
         smooth.astype(np.float32),
         smoothed(change, deviation, shell).astype(np.float32),
     )
-
-
-def _normals(field: TipField) -> np.ndarray:
-    """grad phi / |grad phi| at the grid points, shape (nx, ny, nz, 3)."""
-    spacing = float(field.spacing[0])
-    slope = np.stack(np.gradient(field.distance.astype(float), spacing), axis=-1)
-    return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-3)
 
 
 def sampled_at_tip(
@@ -130,7 +123,7 @@ def _dilated(mask: np.ndarray, steps: int = 3) -> np.ndarray:
 
 
 @compiled(fastmath=True)
-def _self_compliance(carrier, carrier_weight, normal, load, start, target, block):  # type: ignore[no-untyped-def]
+def _self_compliance(carrier, carrier_weight, normal, load, start, slot, block):  # type: ignore[no-untyped-def]
     """n_s . C(s, s) n_s at every sample, C interpolated from both sides."""
     out = np.zeros(len(carrier))
     rank, n_carriers = load.shape[2], carrier.shape[1]
@@ -148,15 +141,16 @@ def _self_compliance(carrier, carrier_weight, normal, load, start, target, block
             value += mode[k] * mode[k]
         for i in range(n_carriers):
             j = carrier[q, i]
-            for e in range(start[j], start[j + 1]):
-                for m in range(n_carriers):
-                    if target[e] == carrier[q, m]:
-                        b = block[e]
-                        value += (carrier_weight[q, i] * carrier_weight[q, m]) * (
-                            n0 * (b[0, 0] * n0 + b[0, 1] * n1 + b[0, 2] * n2)
-                            + n1 * (b[1, 0] * n0 + b[1, 1] * n1 + b[1, 2] * n2)
-                            + n2 * (b[2, 0] * n0 + b[2, 1] * n1 + b[2, 2] * n2)
-                        )
+            for m in range(n_carriers):
+                e = find_block(start, slot, j, carrier[q, m])
+                if e < 0:
+                    continue
+                b = block[e]
+                value += (carrier_weight[q, i] * carrier_weight[q, m]) * (
+                    n0 * (b[0, 0] * n0 + b[0, 1] * n1 + b[0, 2] * n2)
+                    + n1 * (b[1, 0] * n0 + b[1, 1] * n1 + b[1, 2] * n2)
+                    + n2 * (b[2, 0] * n0 + b[2, 1] * n1 + b[2, 2] * n2)
+                )
         out[q] = value
     return out
 
@@ -187,8 +181,6 @@ def gather(model, state, t, cell, superposition):  # type: ignore[no-untyped-def
                     carrier = model.carrier[row, e]
                     q = state.local[carrier]
                     if q < 0:
-                        if n == nodes.shape[0]:
-                            continue
                         q = n
                         state.local[carrier], nodes[q] = q, carrier
                         weight[q] = 0.0

@@ -25,7 +25,7 @@ from avatar_core.common.jit import fast, inlined
 from avatar_core.common.quantities import quantity
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.friction_newton import newton_steps, patch_displacement
-from avatar_core.contact.effects.large_deformation import evaluate_added_depth
+from avatar_core.contact.effects.tip_law import added_depth, solve_tip, tangential_compliance
 from avatar_core.errors import SceneError
 from avatar_core.reduction.near_field import find_block
 
@@ -53,6 +53,7 @@ MAX_SWEEPS = 1000
 PATIENCE = 8  # sweeps before Newton steps are tried,
 MAX_NEWTON = 64  # and after which they are no longer tried
 GAP_TOLERANCE = 1e-9  # [m]
+LEAST_ACROSS = 0.05  # part of the patch's tangential compliance that a large tip leaves
 NONE, STICKS, SLIPS = range(3)  # state of a tip in the last period
 
 FrictionArrays = namedtuple("FrictionArrays", ["coefficients"])
@@ -72,6 +73,8 @@ FrictionState = namedtuple(
         "slipped",  # (T,) distance that the anchor slid in this period [m]
         "matrix",  # (3T, 3T) of the Newton steps
         "rhs",  # (3T,) [N]
+        "give",  # (T,) tangential compliance of the dent, less that of the patch [m/N]
+        "stiffened",  # (T,) by how much it fell in this period, at least 0 [m/N]
         "best",  # (T, 3) push of the Newton step with the least residual [N]
     ],
 )
@@ -98,6 +101,8 @@ def friction_state(arrays: FrictionArrays, n_tools: int, n_modes: int) -> Fricti
         slipped=np.zeros(n_tools),
         matrix=np.zeros((3 * n_tools, 3 * n_tools)),
         rhs=np.zeros(3 * n_tools),
+        give=np.zeros(n_tools),
+        stiffened=np.zeros(n_tools),
         best=np.zeros((n_tools, 3)),
     )
 
@@ -134,7 +139,9 @@ def _near_between(model, state, friction, t, s):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _assemble(model, state, superposition, several_tools, friction):  # type: ignore[no-untyped-def]
+def _assemble(  # type: ignore[no-untyped-def]
+    model, state, superposition, several_tools, large_deformation, friction, tip_law
+):
     """The 3 x 3 blocks of C between all tips in contact."""
     for t in range(state.passage.shape[0]):
         for s in range(t + 1):
@@ -159,12 +166,43 @@ def _assemble(model, state, superposition, several_tools, friction):  # type: ig
             fade = model.softness[0] * (1.0 / state.access[t] - 1.0)
             for d in range(3):
                 friction.compliance[t, t, d, d] += fade
+            if tip_law is not None:
+                _press_alone(state, superposition, large_deformation, tip_law, t)
+                _add_tangential_dent(state, friction, tip_law, t)
+
+
+@fast
+def _press_alone(state, superposition, large_deformation, tip_law, t):  # type: ignore[no-untyped-def]
+    """The contact radius that the tip would have without friction and other tips."""
+    depth, kept = superposition.free_normal[t] - state.gap[t], state.force[t]
+    own = state.compliance[t, t]
+    solve_tip(state, superposition, tip_law, large_deformation, t, depth, own)
+    state.force[t] = kept
+
+
+@fast
+def _add_tangential_dent(state, friction, tip_law, t):  # type: ignore[no-untyped-def]
+    """The tip's own tangential compliance in place of the patch's, at that contact radius."""
+    n, c, across = state.normal[t], friction.compliance[t, t], 0.0
+    for i in range(3):
+        across += 0.5 * c[i, i]
+        for j in range(3):
+            across -= 0.5 * n[i] * c[i, j] * n[j]
+    added = max(tangential_compliance(tip_law, t), (LEAST_ACROSS - 1.0) * across)
+    for i in range(3):
+        for j in range(3):
+            c[i, j] += added * ((1.0 if i == j else 0.0) - n[i] * n[j])
+    # A contact that grows adds area without stress: the force stays, the anchor follows.
+    friction.stiffened[t] = max(0.0, friction.give[t] - added)
+    friction.give[t] = added
 
 
 @inlined
-def solve_friction(model, state, tips, superposition, several_tools, large_deformation, friction):  # type: ignore[no-untyped-def]
+def solve_friction(  # type: ignore[no-untyped-def]
+    model, state, tips, superposition, several_tools, large_deformation, friction, tip_law
+):
     """Stick where friction can hold the tip, slip elsewhere; whether the last sweeps converged."""
-    _assemble(model, state, superposition, several_tools, friction)
+    _assemble(model, state, superposition, several_tools, large_deformation, friction, tip_law)
     mu_s, mu_k = friction.coefficients[0], friction.coefficients[1]
     for t in range(state.passage.shape[0]):
         if not state.active[t]:
@@ -180,14 +218,16 @@ def solve_friction(model, state, tips, superposition, several_tools, large_defor
             friction.limit[t] = mu_s
         elif friction.motion[t] == SLIPS:
             friction.limit[t] = mu_k
-    converged = _sweep(state, superposition, several_tools, large_deformation, friction)
+    converged = _sweep(state, superposition, several_tools, large_deformation, friction, tip_law)
     again = False
     for t in range(state.passage.shape[0]):
         if state.active[t] and friction.motion[t] == STICKS and not _sticks(state, friction, t):
             friction.limit[t] = mu_k
             again = True
     if again:
-        converged = _sweep(state, superposition, several_tools, large_deformation, friction)
+        converged = _sweep(
+            state, superposition, several_tools, large_deformation, friction, tip_law
+        )
     for t in range(state.passage.shape[0]):
         if state.active[t]:
             _slide_anchor(state, superposition, several_tools, friction, t)
@@ -197,7 +237,7 @@ def solve_friction(model, state, tips, superposition, several_tools, large_defor
 @inlined
 def _set_offset(model, state, friction, tips, t):  # type: ignore[no-untyped-def]
     """y = c - s_a, the anchor first moved by the tool's rotation."""
-    n, r, spin = state.normal[t], model.tip_radius[t], friction.spin[t]
+    n, r, spin = state.normal[t], model.tip_offset[t], friction.spin[t]
     if friction.motion[t] != NONE:
         a = friction.anchor[t]
         a[0] += r * (spin[1] * n[2] - spin[2] * n[1])
@@ -206,20 +246,29 @@ def _set_offset(model, state, friction, tips, t):  # type: ignore[no-untyped-def
     for d in range(3):
         spin[d] = 0.0
         friction.offset[t, d] = tips[t, d] - r * n[d] - friction.anchor[t, d]
+    if friction.stiffened[t] > 0.0 and friction.motion[t] != NONE:
+        y, g = friction.offset[t], friction.push[t]
+        along = g[0] * n[0] + g[1] * n[1] + g[2] * n[2]
+        for d in range(3):
+            moved = friction.stiffened[t] * (g[d] - along * n[d])
+            friction.anchor[t, d] += moved
+            y[d] -= moved
 
 
 @inlined
-def _sweep(state, superposition, several_tools, large_deformation, friction):  # type: ignore[no-untyped-def]
+def _sweep(state, superposition, several_tools, large_deformation, friction, tip_law):  # type: ignore[no-untyped-def]
     """Gauss-Seidel over the tips, normal then tangential force of each; whether it converged."""
     for sweep in range(MAX_SWEEPS):
         if several_tools is not None and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
             start = (sweep // PATIENCE) % (state.passage.shape[0] + 1)
-            newton_steps(state, superposition, several_tools, large_deformation, friction, start)
+            newton_steps(
+                state, superposition, several_tools, large_deformation, friction, tip_law, start
+            )
         worst = 0.0
         for t in range(state.passage.shape[0]):
             if state.active[t]:
                 change = _update_normal(
-                    state, superposition, several_tools, large_deformation, friction, t
+                    state, superposition, several_tools, large_deformation, friction, tip_law, t
                 )
                 worst = max(worst, change)
                 change = _update_tangential(state, superposition, several_tools, friction, t)
@@ -230,7 +279,9 @@ def _sweep(state, superposition, several_tools, large_deformation, friction):  #
 
 
 @fast
-def _update_normal(state, superposition, several_tools, large_deformation, friction, t):  # type: ignore[no-untyped-def]
+def _update_normal(  # type: ignore[no-untyped-def]
+    state, superposition, several_tools, large_deformation, friction, tip_law, t
+):
     """0 <= lambda  perp  gap - n . U + h >= 0."""
     n, c = state.normal[t], friction.compliance[t, t]
     u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
@@ -241,12 +292,16 @@ def _update_normal(state, superposition, several_tools, large_deformation, frict
             stiff += n[i] * c[i, j] * n[j]
     g = friction.push[t]
     force = -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
-    state.force[t] = max(0.0, force)
-    if large_deformation is not None:
-        evaluate_added_depth(state, large_deformation, t)
-        gap += large_deformation.added_depth[t, 0]
-        stiff += large_deformation.added_depth[t, 1] * state.self_compliance[t]
-    change = max(0.0, force - gap / stiff) - force
+    if tip_law is not None:
+        depth = stiff * force - gap
+        change = (
+            solve_tip(state, superposition, tip_law, large_deformation, t, depth, stiff) - force
+        )
+    else:
+        state.force[t] = max(0.0, force)
+        added, tangent = added_depth(state, superposition, tip_law, large_deformation, t)
+        stiff += tangent
+        change = max(0.0, force - (gap + added) / stiff) - force
     for d in range(3):
         g[d] -= n[d] * change
     state.force[t] = force + change
@@ -352,20 +407,23 @@ def add_near_friction(model, state, superposition, several_tools, friction, t): 
 
 
 @fast
-def target_derivative(model, state, superposition, large_deformation, friction, t, d):  # type: ignore[no-untyped-def]
-    """g . d(target)/dp_d of U = y + n (gap - n . y), y = p - r n - s_a."""
-    n, g, y, r = state.normal[t], friction.push[t], friction.offset[t], model.tip_radius[t]
-    gap = state.gap[t]
-    if large_deformation is not None:
-        evaluate_added_depth(state, large_deformation, t)
-        gap += large_deformation.added_depth[t, 0]
+def target_derivative(  # type: ignore[no-untyped-def]
+    model, state, superposition, large_deformation, friction, tip_law, t, d
+):
+    """g . d(target)/dp_d of U = y + n (gap - n . y), y = p - r n - s_a.
+
+    The dent's own tangential displacement, give tau, turns with n: - give lambda tau . dn/dp_d.
+    """
+    n, g, y, r = state.normal[t], friction.push[t], friction.offset[t], model.tip_offset[t]
+    added, _ = added_depth(state, superposition, tip_law, large_deformation, t)
+    gap = state.gap[t] + added
     gap -= n[0] * y[0] + n[1] * y[1] + n[2] * y[2]
     slope = state.slope[t, d]
     value = pulled = 0.0
     for i in range(3):
         turn = superposition.normal_gradient[i, d]
         step = (1.0 if i == d else 0.0) - r * turn  # dy_i / dp_d
-        value += g[i] * (step + turn * gap)
+        value += g[i] * (step + turn * (gap - friction.give[t] * state.force[t]))
         slope -= turn * y[i] + n[i] * step
         pulled += g[i] * n[i]
     return value + pulled * slope
@@ -383,7 +441,7 @@ def write_torque(model, state, friction, out, t):  # type: ignore[no-untyped-def
     """Moment about the tip's centre of the force at its contact point, -r n x F."""
     if friction is None:
         return
-    n, r, f = state.normal[t], model.tip_radius[t], out.force[t]
+    n, r, f = state.normal[t], model.tip_offset[t], out.force[t]
     out.torque[t, 0] = -r * (n[1] * f[2] - n[2] * f[1])
     out.torque[t, 1] = -r * (n[2] * f[0] - n[0] * f[2])
     out.torque[t, 2] = -r * (n[0] * f[1] - n[1] * f[0])

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from avatar_core.common.jit import fast, inlined
-from avatar_core.contact.effects.large_deformation import evaluate_added_depth
+from avatar_core.contact.effects.tip_law import added_depth
 
 STEPS = 7
 LEAST_PIVOT = 1e-9
@@ -44,7 +44,9 @@ def patch_displacement(state, superposition, several_tools, friction, t):  # typ
 
 
 @inlined
-def newton_steps(state, superposition, several_tools, large_deformation, friction, start):  # type: ignore[no-untyped-def]
+def newton_steps(  # type: ignore[no-untyped-def]
+    state, superposition, several_tools, large_deformation, friction, tip_law, start
+):
     """Replace all pushes by those of the Newton step with the least residual.
 
     start : 0 from the present pushes, t from tip t - 1 alone
@@ -54,7 +56,9 @@ def newton_steps(state, superposition, several_tools, large_deformation, frictio
     for k in range(STEPS + 1):
         size = 0.0
         for t in range(n_tools):
-            size += _linearise(state, superposition, several_tools, large_deformation, friction, t)
+            size += _linearise(
+                state, superposition, several_tools, large_deformation, friction, tip_law, t
+            )
         if size < least:
             least = size
             for t in range(n_tools):
@@ -94,7 +98,9 @@ def _start_from_one_tip(state, superposition, friction, t):  # type: ignore[no-u
 
 
 @inlined
-def _linearise(state, superposition, several_tools, large_deformation, friction, t):  # type: ignore[no-untyped-def]
+def _linearise(  # type: ignore[no-untyped-def]
+    state, superposition, several_tools, large_deformation, friction, tip_law, t
+):
     """A tip's rows of the Newton system; returns its squared residual [N^2]."""
     matrix, rhs, n_tools = friction.matrix, friction.rhs, state.passage.shape[0]
     for i in range(3):
@@ -111,11 +117,10 @@ def _linearise(state, superposition, several_tools, large_deformation, friction,
     u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
     force = -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
     w, bending = state.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2), 0.0
-    if large_deformation is not None:
+    if large_deformation is not None or tip_law is not None:
         state.force[t] = max(0.0, force)
-        evaluate_added_depth(state, large_deformation, t)
-        w += large_deformation.added_depth[t, 0]
-        bending = large_deformation.added_depth[t, 1] * state.self_compliance[t]
+        added, bending = added_depth(state, superposition, tip_law, large_deformation, t)
+        w += added
     pressed = force - w / (normal + bending)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
     along = x0 * n[0] + x1 * n[1] + x2 * n[2]

@@ -1,8 +1,10 @@
 """Large deformation in the step: the depth of a tip is a nonlinear function of its load.
 
 See :mod:`avatar_core.vademecum.large_deformation`.
-It adds h(a_t) to C_tt lambda_t, with a_t = gamma lambda_t, the matching term to the energy, and its
-derivative to the force. Beyond the reach that was computed, h continues as its tangent.
+It adds k h(a_t) to C_tt lambda_t, with a_t = gamma lambda_t, the matching term to the energy, and
+its derivative to the force. Beyond the reach that was computed, h continues as its tangent. k is
+what a tip leaves of the patch's compliance, 1 - c / gamma of
+:mod:`avatar_core.contact.effects.tip_law`, and 1 for the patch itself.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import numpy as np
 from avatar_core.common.jit import fast, inlined
 from avatar_core.common.splines import cell_at, in_cell
 from avatar_core.contact.effects.base import Effect
+from avatar_core.contact.effects.tip_profile import TAKEN
 from avatar_core.errors import SceneError
 
 if TYPE_CHECKING:
@@ -53,7 +56,9 @@ LargeDeformationState = namedtuple(
         "near",
         "coefficient",  # (T, 3) beta_2, beta_3 and the reach
         "coefficient_gradient",  # (T, 3, 3) their gradients
-        "added_depth",  # (T, 4) h, dh/da, its integral, d2h/da2 at the reach
+        "added_depth",  # (T, 4) k h, k dh/da, the integral of k h, k d2h/da2 at the reach
+        "kept",  # (T,) k
+        "kept_gradient",  # (T, 3)
     ],
 )
 
@@ -61,15 +66,26 @@ LargeDeformationState = namedtuple(
 def large_deformation_state(arrays: LargeDeformationArrays, n_tools: int) -> LargeDeformationState:
     """The constant arrays, with scratch for the tools."""
     return LargeDeformationState(
-        *arrays, np.zeros((n_tools, 3)), np.zeros((n_tools, 3, 3)), np.zeros((n_tools, 4))
+        *arrays,
+        np.zeros((n_tools, 3)),
+        np.zeros((n_tools, 3, 3)),
+        np.zeros((n_tools, 4)),
+        np.ones(n_tools),
+        np.zeros((n_tools, 3)),
     )
 
 
 @inlined
-def sample_coefficients(model, large_deformation, t, tip):  # type: ignore[no-untyped-def]
-    """beta_2, beta_3 and the reach at a tip, with their gradients."""
+def sample_coefficients(model, state, law, large_deformation, t, tip):  # type: ignore[no-untyped-def]
+    """beta_2, beta_3, the reach and k at a tip, with their gradients."""
     if large_deformation is None:
         return
+    if law is not None:
+        gamma, taken = state.self_compliance[t], law.value[t, TAKEN]
+        large_deformation.kept[t] = 1.0 - taken / gamma
+        for d in range(3):
+            change = taken / gamma * state.self_slope[t, d] - law.gradient[t, TAKEN, d]
+            large_deformation.kept_gradient[t, d] = change / gamma
     grid, value = large_deformation.grid, large_deformation.coefficient[t]
     cell = cell_at(model.origin, model.spacing[0], tip)
     for k in range(3):
@@ -87,10 +103,11 @@ def evaluate_added_depth(state, large_deformation, t):  # type: ignore[no-untype
     h = inside * inside * (b2 + b3 * inside)
     slope = inside * (2.0 * b2 + 3.0 * b3 * inside)
     integral = inside**3 * (b2 / 3.0 + b3 * inside / 4.0)
-    added[0] = h + slope * over
-    added[1] = slope
-    added[2] = integral + over * (h + 0.5 * slope * over)
-    added[3] = 2.0 * b2 + 6.0 * b3 * reach
+    kept = large_deformation.kept[t]
+    added[0] = kept * (h + slope * over)
+    added[1] = kept * slope
+    added[2] = kept * (integral + over * (h + 0.5 * slope * over))
+    added[3] = kept * (2.0 * b2 + 6.0 * b3 * reach)
 
 
 @fast
@@ -109,9 +126,12 @@ def add_nonlinear_force(state, large_deformation, out, t):  # type: ignore[no-un
     by3 = inside**4 / 4.0 + over * (inside**3 + 1.5 * inside**2 * over)
     by_reach = 0.5 * added[3] * over * over
     by_gamma = (added[0] * a - added[2]) / gamma
+    kept = large_deformation.kept[t]
+    by_kept = added[2] / max(kept, 1e-12)
     for d in range(3):
-        change = by2 * gradient[0, d] + by3 * gradient[1, d]
+        change = kept * (by2 * gradient[0, d] + by3 * gradient[1, d])
         change += by_reach * gradient[2, d] + by_gamma * state.self_slope[t, d]
+        change += by_kept * large_deformation.kept_gradient[t, d]
         out.force[t, d] += change / gamma
     return a > reach
 

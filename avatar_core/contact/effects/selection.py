@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from avatar_core.contact.dent import DentArrays, dent_state
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.friction import (
     Friction,
@@ -47,6 +48,7 @@ from avatar_core.contact.effects.several_tools import (
     SeveralToolsArrays,
     several_tools_state,
 )
+from avatar_core.contact.effects.tip_law import TipLawArrays, tip_law_state
 from avatar_core.contact.effects.tumour import Tumour, at_contrast
 from avatar_core.contact.effects.viscoelasticity import (
     Viscoelasticity,
@@ -62,7 +64,10 @@ if TYPE_CHECKING:
 
 
 class Constants(NamedTuple):
-    """Constant arrays of each effect, in the order of the step's arguments; None if not chosen."""
+    """Constant arrays of each effect, in the order of the step's arguments; None if not chosen.
+
+    tip_law, dent : no effects, but absent where the load is the vademecum's own patch
+    """
 
     several_tools: Any = None
     large_deformation: Any = None
@@ -71,6 +76,8 @@ class Constants(NamedTuple):
     inertia: Any = None
     self_weight: Any = None
     respiration: Any = None
+    tip_law: Any = None
+    dent: Any = None
 
 
 class Selection(NamedTuple):
@@ -87,6 +94,8 @@ class Selection(NamedTuple):
     inertia: Any
     self_weight: Any
     respiration: Any
+    tip_law: Any
+    dent: Any
 
 
 ARRAYS: dict[str, Any] = {
@@ -97,6 +106,8 @@ ARRAYS: dict[str, Any] = {
     "inertia": InertiaArrays,
     "self_weight": SelfWeightArrays,
     "respiration": RespirationArrays,
+    "tip_law": TipLawArrays,
+    "dent": DentArrays,
 }
 NO_EFFECTS = Constants()
 
@@ -143,8 +154,10 @@ def selected_arrays(
     large_deformation: LargeDeformationArrays | None,
     contact_reach: float,
     period: float,
+    tip_law: TipLawArrays | None = None,
+    dent: DentArrays | None = None,
 ) -> Constants:
-    """Constant arrays of the chosen effects; those of large deformation come in complete.
+    """Constant arrays of the chosen effects; those of large deformation and tips come in complete.
 
     mass : of each mode, from :func:`adapted_vademecum`
     contact_reach : longest distance that the near field of contact spans [m]
@@ -161,14 +174,16 @@ def selected_arrays(
         inertia_arrays(inertia, mass, period) if inertia and mass is not None else None,
         self_weight_arrays(self_weight, vademecum, softened) if self_weight else None,
         respiration_arrays(respiration, period) if respiration else None,
+        tip_law,
+        dent,
     )
 
 
 def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int) -> Selection:
     """State and scratch around the constant arrays: the organ at rest, no tool near it."""
-    several_tools, large_deformation, friction, viscoelasticity, inertia, weight, respiration = (
-        constants
-    )
+    several_tools, large_deformation, friction, viscoelasticity, inertia, weight = constants[:6]
+    respiration, tip_law, dent = constants[6:]
+    n_terms = len(viscoelasticity.decay) if viscoelasticity else 0
     if weight is not None:
         weight = SelfWeightArrays(np.pad(weight.amplitude, (0, n_modes - len(weight.amplitude))))
     superposed = (several_tools, friction, viscoelasticity, inertia, weight)
@@ -181,4 +196,6 @@ def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int)
         inertia_state(inertia, n_modes, weight) if inertia else None,
         weight,
         respiration_state(respiration) if respiration else None,
+        tip_law_state(tip_law, n_terms) if tip_law else None,
+        dent_state(dent) if dent else None,
     )

@@ -16,7 +16,7 @@ import numpy as np
 
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.large_deformation import evaluate_added_depth
+from avatar_core.contact.effects.tip_law import added_depth
 from avatar_core.reduction.near_field import find_block
 
 MAX_EXCHANGES = 4  # of the active set, for each tool
@@ -158,7 +158,7 @@ def assemble_coupling(state, superposition, several_tools):  # type: ignore[no-u
 
 
 @inlined
-def solve_active_set(state, superposition, several_tools, large_deformation):  # type: ignore[no-untyped-def]
+def solve_active_set(state, superposition, several_tools, large_deformation, tip_law):  # type: ignore[no-untyped-def]
     """Contact forces by the active-set method, as a start for the sweeps that follow.
 
     Nonnegative least squares in energy (Lawson & Hanson, Solving Least Squares Problems, Sec.
@@ -167,7 +167,7 @@ def solve_active_set(state, superposition, several_tools, large_deformation):  #
     and the energy decreases, however close the tips are. With large deformation this is one Newton
     step. It may end after its last exchange without the solution: the sweeps decide on convergence.
     """
-    _linearise(state, superposition, several_tools, large_deformation)
+    _linearise(state, superposition, several_tools, large_deformation, tip_law)
     n_tools, force, trial = state.passage.shape[0], state.force, several_tools.trial
     active = several_tools.active_set
     for _ in range(MAX_EXCHANGES * n_tools):
@@ -197,7 +197,7 @@ def solve_active_set(state, superposition, several_tools, large_deformation):  #
 
 
 @inlined
-def _linearise(state, superposition, several_tools, large_deformation):  # type: ignore[no-untyped-def]
+def _linearise(state, superposition, several_tools, large_deformation, tip_law):  # type: ignore[no-untyped-def]
     """Gap without forces and compliance at the present forces; tips with a force are active."""
     for t in range(state.passage.shape[0]):
         several_tools.active_set[t] = False
@@ -207,13 +207,10 @@ def _linearise(state, superposition, several_tools, large_deformation):  # type:
         for s in range(state.passage.shape[0]):
             several_tools.matrix[t, s] = state.compliance[t, s]
         several_tools.free_gap[t] = state.gap[t] - superposition.free_normal[t]
-        if large_deformation is not None:
-            evaluate_added_depth(state, large_deformation, t)
-            stiff = large_deformation.added_depth[t, 1] * state.self_compliance[t]
-            several_tools.matrix[t, t] += stiff
-            several_tools.free_gap[t] += (
-                large_deformation.added_depth[t, 0] - stiff * state.force[t]
-            )
+        if large_deformation is not None or tip_law is not None:
+            added, tangent = added_depth(state, superposition, tip_law, large_deformation, t)
+            several_tools.matrix[t, t] += tangent
+            several_tools.free_gap[t] += added - tangent * state.force[t]
 
 
 @inlined

@@ -1,0 +1,409 @@
+"""The contact law of a tip: how deep it sinks into the tissue right under it.
+
+A vademecum knows the organ's response to a smooth patch of radius R_p, whatever the size of the
+tip. What the patch dents its own neighbourhood is that of a half-space; it is taken off, and what
+the tip dents is put in its place. With F the normal force and d the depth of the tip,
+
+    d = delta(F) + F [gamma - c],      c = 0.7665 / (E* R_p),      E* = E / (1 - nu^2),
+
+gamma the organ's compliance for the patch and c at most gamma. A tip on a surface that falls off
+around it as beta r + kappa r^2 / 2 (a mean over all directions) touches within a radius a where
+(Popov & Hess, Method of Dimensionality Reduction, 2015, Sec. 3.2; g in ``geometry.tip``)
+
+    delta = g(a) + pi/2 beta a + kappa a^2,      F = 2 E* int_0^a x delta'(x) dx.
+
+That is Sneddon's solution for every body of revolution on a half-space, and Hertz's for small a.
+The dent stores the energy E* Phi, Phi = int_0^a (delta(a) - delta(x))^2 dx, and the force on the
+tip is the derivative of all energy: at constant F, with M_n = int_0^a x^n / n delta'(x) dx,
+
+    dF_tip = 2 E* M_3 grad kappa + pi E* M_2 grad beta - Phi grad E* - F^2 / 2 grad c.
+
+Where the scene chooses large deformation, a sphere in a neo-Hookean organ sinks by eta deeper than
+delta, which may be negative (:mod:`avatar_core.contact.effects.large_dent`),
+
+    eta(F) = R e(w),      w = (3 F / (4 E* R^2))^(2/3),      Psi = int_0^(F / E*) L d eta(L),
+
+w being Hertz's depth over R, e fitted to our own finite elements. It depends on the force alone,
+whatever kappa and beta are, and adds its Psi to Phi: the force stays the derivative of one energy.
+
+c is the Hankel transform 48 J_3(x) / x^3 of the patch's profile (1 - r^2 / R_p^2)^2, squared and
+integrated over x, over pi E* R_p, less what the organ's elements are too wide to show of it. In
+viscoelastic tissue F is replaced by the force on an elastic organ that is dented alike (Lee &
+Radok, J. Appl. Mech. 27:438, 1960), which the tip carries along.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from collections.abc import Sequence
+
+import numpy as np
+
+from avatar_core.common.jit import fast, inlined
+from avatar_core.common.splines import cell_at, in_cell
+from avatar_core.contact.effects.large_deformation import evaluate_added_depth
+from avatar_core.contact.effects.large_dent import LEAST, evaluate_large_dent, large_dent_of
+from avatar_core.contact.effects.tip_profile import (
+    BETA,
+    INTERVALS,
+    KAPPA,
+    STIFFNESS,
+    TAKEN,
+    least_kappa,
+    profile_of,
+)
+from avatar_core.errors import ContactError
+from avatar_core.fem.elasticity import Material
+from avatar_core.geometry.tip import Tip
+
+PATCH = 0.7665  # c E* R_p on a half-space,
+# and on the elements of a liver: at 38 places of five livers the same patch sank 0.03 to 0.12 of
+# 1 / (E* R_p) deeper on elements that resolve it. 0.67 to 0.75 fit resolved contacts alike.
+PATCH_ON_MESH = 0.72
+# Part of beta that counts: a tip on a ridge touches along it, and is carried better than its mean
+# over all directions says. 0.2 to 0.5 fit resolved contacts alike.
+RIDGE = 0.35
+# Of the force, on plane places, per kappa and per beta: with the patch's error they cover 91 % of
+# 403 contacts resolved on five livers, drawn ones and ridges and hollows at the share of two to
+# one, and are 3.6 times the true error in the median. Wide tips on ridges err most.
+LAW_ERROR, BENT_ERROR, RIDGE_ERROR = 0.025, 1e-3, 3.0  # [-], [m], [-]
+TUMOUR_ERROR = 0.25  # of the force, per relative change of E* by a tumour underneath
+LEAST_CONTACT = 0.02  # contact radius over the tip's, where the tangent of a light touch is taken
+MOST_TAKEN = 0.9  # part of a dent's least compliance, 1 / (2 E* radius), that may be taken off
+MAX_STEPS = 60  # of Newton's method, with bisection where it leaves its bracket
+TOLERANCE = 1e-13  # [m] of depth, or relative of the force
+
+TipLawArrays = namedtuple(
+    "TipLawArrays",
+    [
+        "profile",  # (T, INTERVALS + 1, 8) a, da/ds, g, dg/ds, M_1, M_2, M_3, Phi over s in [0, 1]
+        "radius",  # (T,) of the tip [m]
+        "least_kappa",  # (T,) below which a concave surface is not followed [1/m]
+        "mindlin",  # (1,) tangential over normal compliance of a dent, (2 - nu) / (2 (1 - nu))
+        "error_factor",  # (1,) of the organ, on the law's error; 1 where it was not calibrated
+        "modulus",  # (1,) E* without a tumour [Pa]
+        "large_dent",  # (T, 6) of :func:`large_dent_of`
+        "local",  # (4, nx, ny, nz) kappa [1/m], beta [-], E* [Pa], c [m/N] on the tip's grid
+    ],
+)
+TipLawState = namedtuple(
+    "TipLawState",
+    [
+        "profile",
+        "radius",
+        "least_kappa",
+        "mindlin",
+        "error_factor",
+        "modulus",
+        "large_dent",
+        "local",
+        "value",  # (T, 4) kappa, beta, E*, c at the tip
+        "gradient",  # (T, 4, 3)
+        "place",  # (T,) s of the contact; above 1 the tip has sunk in to its full radius
+        "elastic",  # (T,) F, or the force on an elastic organ that is dented alike [N]
+        "past",  # (n, T) of viscoelasticity [N]
+        "last",  # (T,) ``elastic`` at the end of the last period [N]
+        "held",  # (T,) load that keeps it constant [N]
+    ],
+)
+
+
+def tip_law_arrays(
+    tips: Sequence[Tip],
+    material: Material,
+    local: np.ndarray,
+    error_factor: float = 1.0,
+    neo_hookean: bool = False,
+) -> TipLawArrays | None:
+    """Tables of the tips; None where all are patches.
+
+    material : of the organ
+    local : ndarray float32, shape (4, nx, ny, nz), kappa, beta, E* and c
+    error_factor : :attr:`avatar_core.vademecum.certificate.ContactSites.factor`
+    neo_hookean : whether the dents of spheres are those of large strain
+
+    Raises
+    ------
+    ContactError
+        If patches and tips are mixed.
+    """
+    if all(tip.shape == "patch" for tip in tips):
+        return None
+    if any(tip.shape == "patch" for tip in tips):
+        raise ContactError("a patch and a tip press together; give all tools tips, or all patches")
+    nu = material.poisson_ratio
+    return TipLawArrays(
+        np.stack([profile_of(tip) for tip in tips]),
+        np.array([tip.radius for tip in tips]),
+        np.array([least_kappa(tip) for tip in tips]),
+        np.array([(2.0 - nu) / (2.0 * (1.0 - nu))]),
+        np.array([error_factor]),
+        np.array([material.plane_strain_modulus]),
+        np.stack([large_dent_of(tip, nu, neo_hookean) for tip in tips]),
+        local,
+    )
+
+
+def tip_law_state(arrays: TipLawArrays, n_terms: int) -> TipLawState:
+    """Without any contact; ``n_terms`` of viscoelasticity."""
+    n = len(arrays.radius)
+    return TipLawState(
+        profile=arrays.profile,
+        radius=arrays.radius,
+        least_kappa=arrays.least_kappa,
+        mindlin=arrays.mindlin,
+        error_factor=arrays.error_factor,
+        modulus=arrays.modulus,
+        large_dent=arrays.large_dent,
+        local=arrays.local,
+        value=np.ones((n, 4)),
+        gradient=np.zeros((n, 4, 3)),
+        place=np.zeros(n),
+        elastic=np.zeros(n),
+        past=np.zeros((n_terms, n)),
+        last=np.zeros(n),
+        held=np.zeros(n),
+    )
+
+
+@inlined
+def sample_surface(model, law, t, tip):  # type: ignore[no-untyped-def]
+    """kappa, beta, E* and c at a tip, with their gradients."""
+    if law is None:
+        return
+    cell = cell_at(model.origin, model.spacing[0], tip)
+    for k in range(4):
+        law.value[t, k] = in_cell(law.local[k], cell, law.gradient[t, k])
+    if law.value[t, KAPPA] < law.least_kappa[t]:
+        law.value[t, KAPPA] = law.least_kappa[t]
+        law.gradient[t, KAPPA] = 0.0
+    if law.value[t, BETA] < 0.0:
+        law.value[t, BETA] = 0.0
+        law.gradient[t, BETA] = 0.0
+
+
+@fast
+def _at_place(law, t):  # type: ignore[no-untyped-def]
+    """Weights of cubic Hermite interpolation and both ends of the table's interval at ``place``,
+    the place within it, and the depth beyond the tip's full radius."""
+    s = law.place[t]
+    i = min(int(min(s, 1.0) * INTERVALS), INTERVALS - 1)
+    u = min(s, 1.0) * INTERVALS - i
+    rest, h = 1.0 - u, 1.0 / INTERVALS
+    weights = (
+        (1.0 + 2.0 * u) * rest * rest,
+        u * u * (3.0 - 2.0 * u),
+        u * rest * rest * h,
+        -u * u * rest * h,
+    )
+    return weights, law.profile[t, i], law.profile[t, i + 1], u, max(0.0, s - 1.0) * law.radius[t]
+
+
+@fast
+def _hermite(weights, p, q, p_slope, q_slope):  # type: ignore[no-untyped-def]
+    """Between two ends p and q, by their slopes."""
+    return weights[0] * p + weights[1] * q + weights[2] * p_slope + weights[3] * q_slope
+
+
+@fast
+def dent(law, t):  # type: ignore[no-untyped-def]
+    """delta [m], its slope by s, F / E* [m^2] and the contact radius a [m] at ``place``."""
+    w, p, q, u, wall = _at_place(law, t)
+    a = _hermite(w, p[0], q[0], p[1], q[1])
+    g = _hermite(w, p[2], q[2], p[3], q[3])
+    first = _hermite(w, p[4], q[4], p[0] * p[3], q[0] * q[3])
+    kappa, ridge = law.value[t, KAPPA], 0.5 * np.pi * law.value[t, BETA]
+    delta = g + (ridge + kappa * a) * a + wall
+    load = 2.0 * (first + (0.5 * ridge + kappa * a / 1.5) * a * a + a * wall)
+    if law.place[t] > 1.0:
+        return delta, law.radius[t], load, a
+    slope = (1.0 - u) * p[3] + u * q[3]
+    slope += (ridge + 2.0 * kappa * a) * ((1.0 - u) * p[1] + u * q[1])
+    return delta, slope, load, a
+
+
+@fast
+def _find_place(state, law, large_deformation, t, of_depth, of_load, target):  # type: ignore[no-untyped-def]
+    """The place where of_depth [delta + eta + h] + of_load F / E* is ``target``.
+
+    Safeguarded Newton; eta is added by large strain at the tip, h by large deformation.
+    """
+    s = law.place[t] if law.place[t] > 0.0 else 0.3
+    low, high = 0.0, 0.0  # not bounded from above yet
+    tolerance = TOLERANCE if of_depth > 0.0 else TOLERANCE * target
+    for _ in range(MAX_STEPS):
+        law.place[t] = s
+        delta, slope, load, a = dent(law, t)
+        value = of_depth * delta + of_load * load - target
+        rise = slope * (of_depth + 2.0 * a * of_load)
+        if large_deformation is not None and of_depth > 0.0:
+            state.force[t] = law.value[t, STIFFNESS] * load
+            evaluate_added_depth(state, large_deformation, t)
+            added, bend = large_deformation.added_depth[t, 0], large_deformation.added_depth[t, 1]
+            deeper, tangent, _ = evaluate_large_dent(law, t, load)
+            value += added + deeper
+            tangent += law.value[t, STIFFNESS] * bend * state.self_compliance[t]
+            rise += 2.0 * a * slope * tangent
+        if abs(value) <= tolerance:
+            return
+        if value > 0.0:
+            high = s
+        else:
+            low = s
+        new = s - value / rise if rise > 0.0 else -1.0
+        if not (low < new and (high == 0.0 or new < high)):
+            new = 0.5 * (low + high) if high > 0.0 else max(2.0 * s, 1.0 + 1e-9)
+        if abs(new - s) <= 1e-15 * s:
+            return
+        s = new
+
+
+@inlined
+def solve_tip(state, superposition, law, large_deformation, t, depth, compliance):  # type: ignore[no-untyped-def]
+    """The force of a tip at a depth [m], the organ's own compliance in this period being known.
+
+    For viscoelastic tissue the force is e / gain + held, e that on an elastic organ. Of modes with
+    mass hardly any compliance is left in a period: it may be less than c, but the depth still grows
+    with the force.
+    """
+    if depth - compliance * law.held[t] <= 0.0:
+        law.elastic[t], law.place[t] = 0.0, 0.0
+        return max(0.0, law.held[t])
+    gain = superposition.near_gain[0] if superposition is not None else 1.0
+    stiffness = law.value[t, STIFFNESS]
+    most = 0.5 * MOST_TAKEN / (stiffness * law.radius[t]) * law.large_dent[t, LEAST]
+    own = max(-most, compliance / gain - law.value[t, TAKEN])
+    target = depth - compliance * law.held[t]
+    _find_place(state, law, large_deformation, t, 1.0, stiffness * own, target)
+    _, _, load, _ = dent(law, t)
+    law.elastic[t] = stiffness * load
+    return max(0.0, law.elastic[t] / gain + law.held[t])
+
+
+@fast
+def evaluate_tip(state, superposition, law, large_deformation, t):  # type: ignore[no-untyped-def]
+    """delta + eta - c e at the present force, and its derivative by the force."""
+    gain = superposition.near_gain[0] if superposition is not None else 1.0
+    elastic, taken = gain * (state.force[t] - law.held[t]), law.value[t, TAKEN]
+    law.elastic[t] = max(0.0, elastic)
+    delta, a = 0.0, 0.0
+    load = law.elastic[t] / law.value[t, STIFFNESS]
+    if elastic > 0.0:
+        _find_place(state, law, None, t, 0.0, 1.0, load)
+        delta, _, _, a = dent(law, t)
+    a = max(a, LEAST_CONTACT * law.radius[t])
+    tangent = 1.0 / (2.0 * law.value[t, STIFFNESS] * a) - taken
+    if large_deformation is not None:
+        deeper, slope, _ = evaluate_large_dent(law, t, load)
+        delta += deeper
+        tangent += slope / law.value[t, STIFFNESS]
+    return delta - taken * law.elastic[t], gain * tangent
+
+
+@fast
+def added_depth(state, superposition, law, large_deformation, t):  # type: ignore[no-untyped-def]
+    """Depth beside C lambda at the present force: of the dent and of large deformation.
+
+    Returns it [m] and its derivative by the force [m/N].
+    """
+    depth = tangent = 0.0
+    if law is not None:
+        depth, tangent = evaluate_tip(state, superposition, law, large_deformation, t)
+    if large_deformation is not None:
+        evaluate_added_depth(state, large_deformation, t)
+        depth += large_deformation.added_depth[t, 0]
+        tangent += large_deformation.added_depth[t, 1] * state.self_compliance[t]
+    return depth, tangent
+
+
+@fast
+def tangential_compliance(law, t):  # type: ignore[no-untyped-def]
+    """Of the dent for a tangential force, less that of the patch [m/N].
+
+    rho / (2 E* a) with rho = (2 - nu) / (2 (1 - nu)), 1 / (8 G a) of Mindlin (J. Appl. Mech.
+    16:259, 1949) for a contact that sticks everywhere; the patch's is rho c.
+    """
+    _, _, _, a = dent(law, t)
+    a = max(a, LEAST_CONTACT * law.radius[t])
+    return law.mindlin[0] * (0.5 / (law.value[t, STIFFNESS] * a) - law.value[t, TAKEN])
+
+
+@fast
+def add_tip_force(state, law, large_deformation, out, t):  # type: ignore[no-untyped-def]
+    """The derivative of the dent's energy at constant force, relaxed as the force has."""
+    if law is None:
+        return
+    e = law.elastic[t]
+    if e <= 0.0:
+        return
+    second, third, stored = _moments(law, t)
+    stiffness, gradient = law.value[t, STIFFNESS], law.gradient[t]
+    if large_deformation is not None:
+        stored += evaluate_large_dent(law, t, e / stiffness)[2]
+    relaxed = state.force[t] / e
+    for d in range(3):
+        change = 2.0 * stiffness * third * gradient[KAPPA, d] - stored * gradient[STIFFNESS, d]
+        change += np.pi * stiffness * second * gradient[BETA, d]
+        out.force[t, d] += (change - 0.5 * e * e * gradient[TAKEN, d]) * relaxed
+
+
+@inlined
+def law_error(law, t):  # type: ignore[no-untyped-def]
+    """Relative error of the force by the law alone, larger on bent surfaces and over tumours."""
+    more = TUMOUR_ERROR * abs(law.value[t, STIFFNESS] / law.modulus[0] - 1.0)
+    more += BENT_ERROR * abs(law.value[t, KAPPA]) + RIDGE_ERROR * law.value[t, BETA]
+    return law.error_factor[0] * (LAW_ERROR + more)
+
+
+@fast
+def _moments(law, t):  # type: ignore[no-untyped-def]
+    """M_2 [m^3], M_3 [m^4] and Phi [m^3] at ``place``."""
+    w, p, q, _, wall = _at_place(law, t)
+    a = _hermite(w, p[0], q[0], p[1], q[1])
+    m1 = _hermite(w, p[4], q[4], p[0] * p[3], q[0] * q[3])
+    m2 = _hermite(w, p[5], q[5], 0.5 * p[0] ** 2 * p[3], 0.5 * q[0] ** 2 * q[3])
+    m3 = _hermite(w, p[6], q[6], p[0] ** 3 * p[3] / 3.0, q[0] ** 3 * q[3] / 3.0)
+    phi = _hermite(w, p[7], q[7], 2.0 * p[4] * p[3], 2.0 * q[4] * q[3])
+    b, k = 0.5 * np.pi * law.value[t, BETA], law.value[t, KAPPA]
+    # of the ridge and the curvature: b x + k x^2 beside g
+    extra = (b + k * a) * a
+    phi += 2.0 * (b * m2 + 2.0 * k * m3) + 2.0 * (m1 * extra - 2.0 * b * m2 - 3.0 * k * m3)
+    phi += a**3 * (b * b / 3.0 + 5.0 / 6.0 * b * k * a + 8.0 / 15.0 * k * k * a * a)
+    load = 2.0 * (m1 + (0.5 * b + k * a / 1.5) * a * a)
+    m2 += a**3 * (b / 6.0 + 0.25 * k * a)
+    m3 += a**4 * (b / 12.0 + 2.0 / 15.0 * k * a)
+    return m2 + 0.5 * a * a * wall, m3 + a**3 * wall / 3.0, phi + (load + a * wall) * wall
+
+
+@inlined
+def predict_tips(law, viscoelasticity):  # type: ignore[no-untyped-def]
+    """The load that would keep each dent as it is, sum_i exp(-dt / tau_i) h_i - e sum_i r_i."""
+    if law is None or viscoelasticity is None:
+        return
+    for t in range(law.held.shape[0]):
+        law.held[t] = 0.0
+        for i in range(viscoelasticity.decay.shape[0]):
+            law.held[t] += viscoelasticity.decay[i] * law.past[i, t]
+            law.held[t] -= viscoelasticity.ramp[i] * law.last[t]
+
+
+@inlined
+def advance_tips(state, law, viscoelasticity):  # type: ignore[no-untyped-def]
+    """The history that each tip carries along, at the end of a period; it ends with the contact."""
+    if law is None or viscoelasticity is None:
+        return
+    v = viscoelasticity
+    for t in range(law.held.shape[0]):
+        new = max(0.0, v.gain[0] * (state.force[t] - law.held[t])) if state.active[t] else 0.0
+        for i in range(v.decay.shape[0]):
+            past = v.decay[i] * law.past[i, t] + v.ramp[i] * (new - law.last[t])
+            law.past[i, t] = past if state.active[t] else 0.0
+        law.last[t] = new
+
+
+def dent_energy(law: TipLawState, t: int) -> float:
+    """E* (Phi + Psi) - c F^2 / 2 of a tip at rest [J]."""
+    _, _, stored = _moments(law, t)
+    stiffness, taken = law.value[t, STIFFNESS], law.value[t, TAKEN]
+    stored += evaluate_large_dent(law, t, law.elastic[t] / stiffness)[2]
+    return float(stiffness * stored - 0.5 * taken * law.elastic[t] ** 2)
