@@ -62,7 +62,7 @@ def bench_step(
     )
     print(_step_table(rows))
     for key, value in summary.items():
-        print(f"{key:22s} {value:10.1f}")
+        print(f"{key:22s} {value:10.4g}")
     if output is not None:
         document = {"name": "step", "summary": summary, "rows": [asdict(row) for row in rows]}
         output.write_text(json.dumps(finite(document), indent=2))

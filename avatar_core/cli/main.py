@@ -91,8 +91,9 @@ def demo(
     if ui:
         require_ui()
     print("1. building the vademecum of the built-in liver")
+    surface = phantom_liver()
     with BuildBar() as progress:
-        built = build(phantom_liver(), OrganOptions(n_vertices=vertices), progress)
+        built = build(surface, OrganOptions(n_vertices=vertices), progress)
     with tempfile.TemporaryDirectory(prefix="avatar_demo_") as folder:
         file = Path(folder) / "phantom.h5"
         save_vademecum(built, file)
@@ -104,8 +105,9 @@ def demo(
             return
         print(f"2. running loader, contact and tool as ROS 2 processes for {seconds:g} s")
         run_cell(file, seconds)
-    print("3. drawing the picture")
-    palpation_picture(v, output)
+    print("3. resolving a contact and drawing the picture")
+    with BuildBar.of("contacts") as progress:
+        palpation_picture(v, surface, output, lambda done: progress("contacts", done, float("nan")))
     print(f"   {output}")
 
 

@@ -2,44 +2,107 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from avatar_core.contact.model import prepare, step
-from avatar_core.contact.tool_path import palpation
+from avatar_core.contact.model import ContactModel, prepare
+from avatar_core.contact.tool_path import middle_of_access
+from avatar_core.errors import ContactError, ConvergenceError, MeshError
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
+from avatar_core.offline.certify.contact_sites import Site, hertz_force, nearest_sites, pressed
+from avatar_core.offline.resolved_contact import contacts_at
 from avatar_core.vademecum.model import Vademecum
+
+TIP = Tip("sphere", 5e-3)
+RESOLVED = (1e-3, 2e-3, 3e-3, 4e-3, 5e-3)  # depths at which contact is resolved [m]
+
+
+@dataclass(frozen=True)
+class ForceCurve:
+    """Normal forces on ``TIP`` at one place, over its depth.
+
+    depth : (n,) [m]; force, error, hertz : (n,) of the step, its error as it is said, and of a
+    half-space [N]; resolved : (len(RESOLVED),) of resolved contact [N], None where there is none
+    """
+
+    depth: np.ndarray
+    force: np.ndarray
+    error: np.ndarray
+    hertz: np.ndarray
+    resolved: np.ndarray | None
+
+    def misses(self, force: np.ndarray) -> float:
+        """Largest relative difference of some forces from the resolved ones."""
+        assert self.resolved is not None
+        found = np.interp(RESOLVED, self.depth, force)
+        return float(np.abs(found / self.resolved - 1.0).max())
 
 
 def palpation_picture(
-    vademecum: Vademecum, path: str | Path, radius: float = 5e-3, depth: float = 10e-3
+    vademecum: Vademecum,
+    surface: SurfaceMesh,
+    path: str | Path,
+    progress: Callable[[float], None] | None = None,
 ) -> None:
-    """Draw the organ under a push in the middle of its accessible surface, and the force curve.
+    """Draw the organ under a push in the middle of its accessible surface, and the force there.
 
-    Left: deformed boundary seen from the front, coloured by displacement. Right: normal force
-    over indentation, as the 1 kHz step computes it.
+    Left: deformed boundary seen from the front, coloured by displacement. Right: normal force over
+    depth by the 1 kHz step, on a half-space (Hertz 1882), and of resolved contact.
+
+    Parameters
+    ----------
+    surface : that the vademecum was built of
+    progress : is told which part of the resolved contact is done
     """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    model = prepare(vademecum, (radius,))
-    tips = palpation(vademecum, radius, depth, 400)
-    indentation, force = [], []
-    deepest = int(np.argmin(np.linalg.norm(tips - tips[len(tips) // 2], axis=1)))
-    cloud = model.out.cloud.copy()
-    for k, tip in enumerate(tips[: deepest + 1]):
-        step(model, tip[None].copy())
-        indentation.append(-1e3 * model.state.gap[0])
-        force.append(np.linalg.norm(model.out.force[0]))
-        if k == deepest:
-            cloud = model.out.cloud.copy()
-    figure = plt.figure(figsize=(11, 4.6), layout="constrained")
-    _draw_organ(figure, vademecum, cloud, tips[deepest])
-    _draw_curve(figure, vademecum, np.array(indentation), np.array(force))
+    middle = vademecum.surface.centers[[middle_of_access(vademecum)]]
+    (site,) = nearest_sites(vademecum, surface, middle)
+    model = prepare(vademecum, (TIP,))
+    curve = force_curve(vademecum, surface, site, model, progress)
+    figure = plt.figure(figsize=(12, 4.8), layout="constrained")
+    _draw_organ(figure, vademecum, model.out.cloud, site.point)
+    _draw_curve(figure, curve)
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def force_curve(
+    vademecum: Vademecum,
+    surface: SurfaceMesh,
+    site: Site,
+    model: ContactModel,
+    progress: Callable[[float], None] | None = None,
+) -> ForceCurve:
+    """The forces at a place; the model is left at the largest depth."""
+    depth = np.linspace(0.0, max(RESOLVED), 51)
+    force, error = np.empty_like(depth), np.empty_like(depth)
+    for k, at in enumerate(depth):
+        force[k] = pressed(model, site, TIP, at)
+        error[k] = model.out.force_error[0]
+    hertz = hertz_force(vademecum.material, TIP.radius, depth)
+    return ForceCurve(depth, force, error, hertz, _resolved(vademecum, surface, site, progress))
+
+
+def _resolved(
+    vademecum: Vademecum, surface: SurfaceMesh, site: Site, progress: Callable[[float], None] | None
+) -> np.ndarray | None:
+    """Forces of resolved contact at ``RESOLVED``; None where the mesh does not allow it."""
+    organ = (surface, vademecum.mesh, vademecum.regions, vademecum.material)
+    place = (site.point, site.normal, (TIP,), RESOLVED)
+    try:
+        return contacts_at(*organ, *place, progress=progress).forces[0]
+    except (MeshError, ContactError, ConvergenceError) as error:
+        print(f"notice: the picture is without resolved contact: {error}", file=sys.stderr)
+        return None
 
 
 def _draw_organ(figure, vademecum: Vademecum, cloud: np.ndarray, tip: np.ndarray) -> None:  # type: ignore[no-untyped-def]
@@ -72,28 +135,39 @@ def _draw_organ(figure, vademecum: Vademecum, cloud: np.ndarray, tip: np.ndarray
     figure.colorbar(scale, ax=axes, label="displacement [mm]", shrink=0.8)
 
 
-def _draw_curve(figure, vademecum: Vademecum, indentation: np.ndarray, force: np.ndarray) -> None:  # type: ignore[no-untyped-def]
+def _draw_curve(figure, curve: ForceCurve) -> None:  # type: ignore[no-untyped-def]
     axes = figure.add_subplot(1, 2, 2)
-    certificate = vademecum.certificate
-    axes.plot(indentation, force, lw=2, label="1 kHz step")
-    if certificate is not None:
-        for error, alpha, label in (
-            (certificate.force_worst, 0.15, "worst"),
-            (certificate.force_mean, 0.35, "mean"),
-        ):
-            axes.fill_between(
-                indentation,
-                force * (1 - error),
-                force * (1 + error),
-                alpha=alpha,
-                color="C0",
-                lw=0,
-                label=f"{label} certified error ({100 * error:.1f} %)",
-            )
-    axes.set_xlim(left=min(0.0, indentation.min()))
+    depth, force = 1e3 * curve.depth, curve.force
+    axes.plot(depth, force, lw=2, color="C0", label="1 kHz step")
+    axes.fill_between(
+        depth,
+        force - curve.error,
+        force + curve.error,
+        alpha=0.25,
+        color="C0",
+        lw=0,
+        label="its error as it is said",
+    )
+    axes.plot(depth, curve.hertz, "--", lw=1.5, color="gray", label="Hertz, on a half-space")
+    if curve.resolved is not None:
+        axes.plot(
+            1e3 * np.array(RESOLVED), curve.resolved, "o", color="crimson", label="resolved contact"
+        )
+    axes.set_xlim(left=0.0)
     axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("indentation of the tip [mm]")
-    axes.set_ylabel("force on the tool [N]")
-    axes.set_title("force over indentation, linear elastic")
+    axes.set_xlabel("depth of the tip [mm]")
+    axes.set_ylabel("normal force [N]")
+    axes.set_title(_sentence(curve))
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper left", fontsize=8)
+    axes.legend(loc="upper left", fontsize=9)
+
+
+def _sentence(curve: ForceCurve) -> str:
+    tip = f"a {TIP.shape} of {1e3 * TIP.radius:g} mm"
+    if curve.resolved is None:
+        return f"The force on {tip}, pressed in at the circled place"
+    step, hertz = (100 * curve.misses(force) for force in (curve.force, curve.hertz))
+    return (
+        f"On {tip}, the step misses resolved contact\n"
+        f"by at most {step:.0f} %, Hertz by up to {hertz:.0f} %."
+    )

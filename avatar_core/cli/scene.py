@@ -17,6 +17,7 @@ from avatar_core.errors import SceneError
 
 if TYPE_CHECKING:
     from avatar_core.contact.effects import Effect
+    from avatar_core.geometry.tip import Tip
     from avatar_core.scene.model import Scene
     from avatar_core.vademecum.model import Vademecum
 
@@ -63,7 +64,7 @@ def check(
     print(f"  {path}")
     print(f"  organ: {_organ(one, vademecum)}; {_material(one)}")
     for tool in one.tools:
-        print(f"  tool {tool.name}: tip radius {tool.tip_radius:g} m")
+        print(f"  tool {tool.name}: {_tip(tool.tip)}")
     print(f"  outputs: {_outputs(one)}")
     print("  effects" if one.effects else "  effects: none")
     for effect in one.effects:
@@ -89,6 +90,16 @@ def _material(one: Scene) -> str:
         if value is not None
     ]
     return ", ".join(chosen) or "its own material"
+
+
+def _tip(tip: Tip) -> str:
+    """Its shape, and the numbers that the shape uses."""
+    numbers = [
+        f"{field.name} {_number(value, field.metadata['quantity'].unit)}"
+        for field in fields(tip)
+        if "quantity" in field.metadata and (value := getattr(tip, field.name)) is not None
+    ]
+    return ", ".join([tip.shape, *numbers])
 
 
 def _outputs(one: Scene) -> str:

@@ -22,6 +22,8 @@ STUDIES = {
     "coordinates": "avatar_core.studies.coordinates",
     "accuracy-time": "avatar_core.studies.accuracy_time",
     "passivity": "avatar_core.studies.passivity",
+    "contact": "avatar_core.studies.contact",
+    "indentation": "avatar_core.studies.indentation",
 }
 USAGE = 2
 

@@ -17,6 +17,7 @@ import scipy.sparse as sp
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
+from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.exact_response import (
     ExactResponse,
     FarFieldResidual,
@@ -52,8 +53,12 @@ def build_vademecum(
     rule: BuildRule,
     provenance: Provenance,
     progress: Progress = silent,
+    outline: SurfaceMesh | None = None,
 ) -> Vademecum:
     """Compute the vademecum of one organ; see the module docstring for the stages.
+
+    ``outline`` is the surface of which the mesh was made, which tools touch; None for the mesh's
+    own boundary.
 
     A tolerance that is not met within ``max_modes`` still gives a complete vademecum, whose
     ``convergence.converged`` is False.
@@ -91,7 +96,7 @@ def build_vademecum(
         far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
         near=displacement_near(far, response, surface, rule, outliers),
         contact_near=contact_near(far, response, surface, rule),
-        tip_field=make_tip_field(elasticity.mesh, regions, surface.patch_radius),
+        tip_field=make_tip_field(elasticity.mesh, regions, surface.patch_radius, outline),
         body=body,
         convergence=Convergence(converged, rule.tolerance, solution.history, errors),
         provenance=provenance,

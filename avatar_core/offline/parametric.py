@@ -24,6 +24,7 @@ import scipy.sparse as sp
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
+from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import certificate_of, measured
 from avatar_core.offline.exact_response import (
     ExactResponse,
@@ -42,7 +43,7 @@ from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.modal_mass import LEAST_MODES, BodyResponse, body_response
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.parametric import ParametricResponse, galerkin_field
-from avatar_core.vademecum.tip_field import make_tip_field
+from avatar_core.vademecum.tip_field import TipField, make_tip_field
 
 _BASIS_OVER_RANK = 4.0  # functions of the basis over the modes used at given values
 _DRAWN = 6  # random values that a certificate is made at
@@ -83,6 +84,7 @@ def build_parametric_vademecum(
     rule: BuildRule,
     provenance: Provenance,
     progress: Progress = silent,
+    outline: SurfaceMesh | None = None,
 ) -> Vademecum:
     """Compute the vademecum of one organ over a range of materials.
 
@@ -92,6 +94,7 @@ def build_parametric_vademecum(
     ----------
     elasticity : with an element that serves the whole range, and the inclusion if the contrast
         is a coordinate
+    outline : of which the mesh was made, which tools touch; None for the mesh's own boundary
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     nodes = node_values(coordinates)
@@ -107,8 +110,9 @@ def build_parametric_vademecum(
         rule = rule.with_wider_near_field()
         snapshots = [_with_near_field(snapshot, surface, rule) for snapshot in snapshots]
         error = _rank_error(_errors(snapshots, reduced), rule)
+    field = make_tip_field(elasticity.mesh, regions, surface.patch_radius, outline)
     whole = _assemble(
-        name, elasticity, regions, surface, tuple(coordinates), rule, snapshots, reduced
+        name, elasticity, regions, surface, tuple(coordinates), rule, snapshots, reduced, field
     )
     history = tuple(report for snapshot in snapshots for report in snapshot.history)
     converged = is_met(error.mean, error.worst, rule)
@@ -245,6 +249,7 @@ def _assemble(
     rule: BuildRule,
     snapshots: Sequence[_Snapshot],
     reduced: _Reduced,
+    tip_field: TipField,
 ) -> Vademecum:
     """Near fields at all nodes; the vademecum's own fields are those of the first."""
     none = np.empty(0, np.int64)
@@ -265,7 +270,7 @@ def _assemble(
         far=reduced.fields[0],
         near=near[0],
         contact_near=contact[0],
-        tip_field=make_tip_field(elasticity.mesh, regions, surface.patch_radius),
+        tip_field=tip_field,
         convergence=Convergence(False, rule.tolerance),
         provenance=Provenance(name, ""),
         parametric=ParametricResponse(

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from avatar_core.errors import CoordinateError, MaterialError, MeshError
+from avatar_core.errors import ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.level_set import orientation_offset
@@ -22,6 +22,7 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tumour import volume_fraction_inside
 from avatar_core.offline.certify.combinations import COMBINATIONS, DEPTH_FRACTIONS, push_errors
+from avatar_core.offline.certify.contact_sites import with_contact_sites
 from avatar_core.offline.certify.large_deformation import certify_large, with_combinations
 from avatar_core.offline.certify.linear import certify, mesh_error
 from avatar_core.offline.large_deformation import (
@@ -35,6 +36,7 @@ from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.tip_field import with_tumour
 
 COMBINED_SITES = 2  # at which large pushes are certified together with other effects
 _RECORDED = ("avatar", "numpy", "scipy", "scikit-fem", "libigl", "pytetwild", "rslab", "h5py")
@@ -58,11 +60,13 @@ class OrganOptions:
     n_pushed : unseen sites at which large deformation is certified, four nonlinear solutions each;
         at the first ``COMBINED_SITES`` together with other effects too, nine more each
     n_certified : unseen load positions of the certificate; ``seed`` draws them
+    n_contact_sites : places, 0 or at least 3, at which contacts of real tips are resolved for the
+        certificate; ``seed`` draws them too
     with_mesh_error : also solve on the same mesh refined once (slow)
 
     Raises
     ------
-    CoordinateError, MaterialError, MeshError
+    ContactError, CoordinateError, MaterialError, MeshError
         For options that exclude each other, and for a file that does not exist, before any work.
     """
 
@@ -79,6 +83,7 @@ class OrganOptions:
     large_rule: LargeRule = field(default_factory=LargeRule)
     n_pushed: int = 12
     n_certified: int = 200
+    n_contact_sites: int = 0
     seed: int = 0
     with_mesh_error: bool = False
 
@@ -94,6 +99,16 @@ class OrganOptions:
             raise CoordinateError(
                 "large deformation is not combined with a tumour or coordinates of the material; "
                 "build two vademecums"
+            )
+        if self.n_contact_sites and (self.large or self.coordinates or self.tumour):
+            raise CoordinateError(
+                "contact sites are resolved on one linear material; leave them out, or tumour, "
+                "coordinates and large deformation"
+            )
+        if self.n_contact_sites != 0 and self.n_contact_sites < 3:
+            raise ContactError(
+                f"{self.n_contact_sites} contact sites; ask for at least 3, of which one is a "
+                "ridge and one a hollow, or 0 for none"
             )
         if self.large and (self.element or self.material.element) != "P2":
             raise MaterialError(
@@ -134,12 +149,15 @@ def build(
 
     if options.coordinates:
         vademecum = build_parametric_vademecum(
-            *common, options.coordinates, options.rule, provenance, progress
+            *common, options.coordinates, options.rule, provenance, progress, surface
         )
         certificate = certify_range(vademecum, elasticity, options.n_certified, options.seed, count)
     else:
-        vademecum = build_vademecum(*common, options.rule, provenance, progress)
+        vademecum = build_vademecum(*common, options.rule, provenance, progress, surface)
         certificate = certify(vademecum, elasticity, options.n_certified, options.seed, count)
+    if options.tumour is not None:
+        field = with_tumour(vademecum.tip_field, options.tumour, loads.patch_radius)
+        vademecum = replace(vademecum, tip_field=field)
     if options.large:
         vademecum = _with_large(vademecum, options, progress)
     if options.with_mesh_error:
@@ -147,6 +165,12 @@ def build(
         l2, contact = mesh_error(vademecum, elasticity)
         certificate = replace(certificate, mesh_l2=l2, mesh_contact=contact)
     progress("certify", 1.0, certificate.l2_mean)
+    vademecum = vademecum.with_certificate(certificate)
+    if options.n_contact_sites:
+        vademecum = with_contact_sites(
+            vademecum, surface, options.n_contact_sites, options.seed, progress
+        )
+    certificate = vademecum.certificate or certificate
     return vademecum.with_certificate(replace(certificate, build_cpu_seconds=cpu_seconds()))
 
 

@@ -80,7 +80,7 @@ QUICK = CoordinatesSettings(1000, 700, 48, 20, 3, 1)
 class Organ:
     """A meshed organ, ready for a build."""
 
-    name: str
+    outline: SurfaceMesh
     regions: Regions
     loads: LoadSurface
     elasticity: Elasticity
@@ -143,7 +143,7 @@ def _organ(
         )
     material = Material()
     elasticity = Elasticity(mesh, material, regions.clamped, element, inclusion)
-    return Organ(surface.name, regions, load_surface(mesh, regions), elasticity)
+    return Organ(surface, regions, load_surface(mesh, regions), elasticity)
 
 
 # --- coordinates of the material ----------------------------------------------------------------
@@ -159,14 +159,15 @@ def _parametric(
     """Errors of the default against modes, and the time of its build."""
     start = time.process_time()
     vademecum = build_parametric_vademecum(
-        organ.name,
+        organ.outline.name,
         organ.elasticity,
         organ.regions,
         organ.loads,
         coordinates,
         BuildRule(),
-        Provenance(organ.name, ""),
+        Provenance(organ.outline.name, ""),
         progress,
+        organ.outline,
     )
     seconds = time.process_time() - start
     assert vademecum.parametric is not None
@@ -259,7 +260,7 @@ def _row(
 ) -> dict[str, Value]:
     return {
         "coordinate": name,
-        "organ": organ.name,
+        "organ": organ.outline.name,
         "method": method,
         "modes": modes,
         **found,
@@ -276,13 +277,14 @@ def _large(
     """One material: its summary, every push, and combinations of neo-Hookean ones."""
     start = time.process_time()
     linear = build_vademecum(
-        organ.name,
+        organ.outline.name,
         organ.elasticity,
         organ.regions,
         organ.loads,
         LINEAR_RULE,
         Provenance("", ""),
         progress,
+        organ.outline,
     )
     problem = hyperelastic_problem(linear, material)
     bent = with_large_deformation(linear, problem, material, LargeRule(), LINEAR_RULE, progress)
@@ -294,7 +296,7 @@ def _large(
     certificate, found = certify_large(bent, problem, settings.n_pushed, seed=1, progress=pushed)
     summary: dict[str, Value] = {
         "coordinate": f"large, {material}",
-        "organ": organ.name,
+        "organ": organ.outline.name,
         "method": "default",
         "modes": bent.large.space.shape[1] if bent.large else 0,
         "build_cpu_seconds": seconds,

@@ -8,6 +8,7 @@ import numpy as np
 
 from avatar_core.contact.model import Status, estimate_error, prepare, step
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.geometry.tip import Tip
 from avatar_core.offline.certify.unseen_contacts import HEIGHTS, draw_contacts
 from avatar_core.vademecum.model import Vademecum
 
@@ -42,7 +43,7 @@ def force_errors(
 ) -> ForceErrors:
     """Press a tip at ``n`` random points; the reference is full finite elements at equal depth."""
     contacts = draw_contacts(vademecum, n, seed)
-    model = prepare(vademecum, (_RADIUS,), cloud="off", effects=())
+    model = prepare(vademecum, (Tip("patch", _RADIUS),), cloud="off", effects=())
     force, depth, relative = np.zeros((3, n))
     for k, (tip, normal) in enumerate(zip(contacts.tip, contacts.normal, strict=True)):
         model.reset()

@@ -23,12 +23,11 @@ from avatar_core.atlas.growth import AtlasOptions, create_atlas
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.patient import (
     PatientOptions,
-    PatientProblem,
     interpolated_response,
-    patient_problem,
     reduced_response,
     vademecum_of_reduced,
 )
+from avatar_core.atlas.patient_problem import PatientProblem, patient_problem
 from avatar_core.atlas.response import ResponseSolver
 from avatar_core.atlas.storage import load_atlas
 from avatar_core.atlas.transfer import Weighting, patient_weights

@@ -87,7 +87,9 @@ def build_for_effects(
     elasticity = Elasticity(mesh, Material(), regions.clamped)
     loads = load_surface(mesh, regions)
     provenance = Provenance(surface.name, surface.source_sha256)
-    linear = build_vademecum(surface.name, elasticity, regions, loads, rule, provenance, progress)
+    linear = build_vademecum(
+        surface.name, elasticity, regions, loads, rule, provenance, progress, surface
+    )
     problem = hyperelastic_problem(linear, "neo-hookean")
     return with_large_deformation(linear, problem, "neo-hookean", LargeRule(), rule, progress)
 

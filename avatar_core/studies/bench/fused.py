@@ -21,7 +21,7 @@ import numba
 import numpy as np
 
 from avatar_core.contact.model import ContactModel, prepare, step
-from avatar_core.studies.bench.methods import SPHERE
+from avatar_core.studies.bench.methods import PATCH
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 
@@ -50,7 +50,7 @@ def fused_ratios(vademecum: Vademecum, path: np.ndarray, fused: Path) -> list[fl
 
 
 def _of_process(stored: Path, path: np.ndarray, fused: Path) -> float:
-    bare = prepare(load_vademecum(stored), (SPHERE,), cloud="volume", effects=())
+    bare = prepare(load_vademecum(stored), (PATCH,), cloud="volume", effects=())
     return fused_ratio(bare, module_of(fused).fused_step, path)
 
 

@@ -15,15 +15,20 @@ import numpy as np
 from avatar_core.common.jit import compiled
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud_kernels import write_cloud
+from avatar_core.contact.dent import add_dents
+from avatar_core.contact.effects.tip_law import sample_surface
+from avatar_core.contact.locate import locate
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.contact.tip_compliance import assemble_own, near_along_normal
 from avatar_core.contact.tool_path import slide, starts_apart
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.vademecum.model import Vademecum
 
-SPHERE, DEPTH = 10e-3, 5e-3  # [m] the benchmark's tip and how deep it slides
+RADIUS, DEPTH = 10e-3, 5e-3  # [m] of the benchmark's tip, and how deep it slides
+SPHERE, PATCH = Tip("sphere", RADIUS), Tip("patch", RADIUS)
 PASSES = 5  # slides that are timed; other processes disturb some of them
 MAX_TABLE_BYTES = 2_000_000_000
 
@@ -55,6 +60,20 @@ def time_steps(vademecum: Vademecum, n_tools: int) -> StepRow:
     model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume")
     rank = vademecum.far.rank
     return _timed("vademecum", vademecum, model, rank, n_tools, lambda tips: step(model, tips))
+
+
+def time_tip_over_patch(vademecum: Vademecum, clock: Clock = time.process_time) -> float:
+    """Median step with a sphere over that with the patch alone, whose response is all linear.
+
+    Both slide in turn; the median over the pairs of slides.
+    """
+    tips = tool_paths(vademecum, 1)
+    models = [prepare(vademecum, (tip,), cloud="volume") for tip in (SPHERE, PATCH)]
+
+    def p50(model: ContactModel) -> float:
+        return float(np.median(one_pass(model, tips, lambda at: step(model, at), clock)[0]))
+
+    return float(np.median([p50(models[0]) / p50(models[1]) for _ in range(PASSES)]))
 
 
 def time_dense_table(
@@ -161,7 +180,7 @@ def one_pass(
 def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000) -> np.ndarray:
     """Slides that start far apart, shape (n, n_tools, 3)."""
     starts = starts_apart(vademecum, n_tools)
-    paths = [slide(vademecum, SPHERE, DEPTH, n * 1e-4, position=start) for start in starts]
+    paths = [slide(vademecum, RADIUS, DEPTH, n * 1e-4, position=start) for start in starts]
     return np.ascontiguousarray(np.stack(paths, axis=1))
 
 
@@ -180,7 +199,7 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
     """:func:`avatar_core.contact.kernels.contact_step` with stored columns instead of modes."""
     e = effects
     for t in range(tips.shape[0]):
-        kernels.locate(model, state, t, tips[t], e.superposition)
+        locate(model, state, t, tips[t], e.superposition)
         state.mode[t] = np.float32(0.0)
         if not state.active[t]:
             state.force[t] = 0.0
@@ -188,8 +207,11 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
         _dense_column(state, t, t, compliance, state.column[t])
         near = near_along_normal(state, t, state.column[t])
         assemble_own(model, state, t, near)
+        sample_surface(model, e.tip_law, t, tips[t])
     _couple_dense(state, e.several_tools, compliance)
-    kernels.solve_contact(model, state, tips, e.superposition, e.several_tools, None, None)
+    kernels.solve_contact(
+        model, state, tips, e.superposition, e.several_tools, None, None, e.tip_law
+    )
     kernels.write_forces(model, state, out, tips, e)
     u = state.field[: 3 * out.cloud.shape[0]]
     u[:] = np.float32(0.0)
@@ -200,6 +222,7 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
                 row, f = columns[state.nodes[t, i], c], np.float32(force * state.normal[t, c])
                 for k in range(u.shape[0]):
                     u[k] += f * row[k]
+    add_dents(model, state, e.tip_law, e.dent)
     write_cloud(model.rest, u, out.cloud)
 
 

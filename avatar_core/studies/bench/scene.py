@@ -111,10 +111,10 @@ def _prepared(vademecum: Vademecum, scene: Scene, name: str) -> _Prepared:
     laid_out = time.perf_counter()
     model = make_model(layout)
     compiled = time.perf_counter()
-    starts = starts_apart(vademecum, len(spec.tip_radii))
+    starts = starts_apart(vademecum, len(spec.tips))
     paths = [
-        push_and_slide(vademecum, radius, PUSH, DEPTH, STEPS, at)
-        for radius, at in zip(spec.tip_radii, starts, strict=True)
+        push_and_slide(vademecum, tip.offset, PUSH, DEPTH, STEPS, at)
+        for tip, at in zip(spec.tips, starts, strict=True)
     ]
     tips = _followed(model, np.ascontiguousarray(np.stack(paths, axis=1)))
     return _Prepared(name, model, tips, laid_out - start, compiled - laid_out)

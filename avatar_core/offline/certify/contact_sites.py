@@ -1,0 +1,317 @@
+"""Contacts of real tips against resolved ones, at some places of an organ.
+
+The step presses spheres of several radii to several depths; the truth is Signorini's contact of the
+same sphere in the same pose with the organ itself, on a mesh that resolves the contact and lies on
+the surface that was read (:mod:`avatar_core.offline.resolved_contact`).
+
+The error that the step says is e_patch + e_law. On an organ with resolved contacts, e_law is
+multiplied by the factor with which e_patch + factor e_law covers nine in ten of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import igl
+import numpy as np
+
+from avatar_core.common.splines import evaluate
+from avatar_core.contact.effects.tip_law import law_error
+from avatar_core.contact.model import ContactModel, Status, estimate_error, prepare, step
+from avatar_core.errors import ContactError, ConvergenceError, MeshError
+from avatar_core.fem.norms import relative_l2
+from avatar_core.geometry.tip import Tip
+from avatar_core.offline.certify.unseen_contacts import draw_contacts
+from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, ResolvedPlace, contacts_at
+from avatar_core.offline.rule import NO_ERROR, Progress, silent
+from avatar_core.vademecum.certificate import Certificate, ContactSites
+from avatar_core.vademecum.force_error import PROMISED
+
+if TYPE_CHECKING:
+    from avatar_core.fem.elasticity import Material
+    from avatar_core.geometry.surface import SurfaceMesh
+    from avatar_core.vademecum.model import Vademecum
+
+DRAWN = 60  # places among which the sharpest and the most hollow one are found
+FITS = 1e-3  # overlap of a tip and the hollow around the place, above which it is left out [m]
+OPEN = 0.99  # access at the largest depth, below which the force fades
+FAR = 15e-3  # distance from the place beyond which displacements are compared [m]
+TINY = 1e-12  # [N]
+LEAST_FACTOR = 0.5  # of the law's error: a few places by luck all well met prove no more
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A place on the organ's surface.
+
+    kind : "drawn", "ridge" or "hollow"
+    point, normal : ndarray, shape (3,) [m], normal pointing out
+    kappa, beta : local shape [1/m], [-]; see :mod:`avatar_core.geometry.local_profile`
+    """
+
+    kind: str
+    point: np.ndarray
+    normal: np.ndarray
+    kappa: float
+    beta: float
+
+
+@dataclass(frozen=True)
+class SiteContact:
+    """One contact: a sphere of a radius at a depth at a site; forces along the normal [N].
+
+    truth : of the resolved contact; force : of the step; estimate : its error as it is said, of
+    which law_estimate is the law's part
+    patch : of the vademecum's own patch; hertz : of a sphere on a flat half-space (Hertz 1882)
+    far_l2 : relative L2 error of the displacement more than 15 mm away
+    """
+
+    site: Site
+    radius: float
+    depth: float
+    truth: float
+    force: float
+    estimate: float
+    law_estimate: float
+    patch: float
+    hertz: float
+    far_l2: float
+
+    @property
+    def error(self) -> float:
+        """Relative error of the force."""
+        return abs(self.force / self.truth - 1.0)
+
+
+def with_contact_sites(
+    vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int, progress: Progress = silent
+) -> Vademecum:
+    """The vademecum, its certificate with the errors of resolved contacts at ``n`` places.
+
+    What could not be resolved is counted in a notice of the provenance.
+    """
+    sites = draw_sites(vademecum, surface, n, seed)
+    contacts, notices = contacts_at_sites(vademecum, surface, _reported(sites, progress))
+    if len(sites) < n:
+        notices.insert(0, f"only {len(sites)} of {n} places are far enough from the border")
+    found = summarized(contacts, law_factor(contacts))
+    certificate = replace(vademecum.certificate or Certificate.unknown(), contact_sites=found)
+    said = (*vademecum.provenance.notices, *(f"contact sites: {notice}" for notice in notices))
+    return replace(
+        vademecum, certificate=certificate, provenance=replace(vademecum.provenance, notices=said)
+    )
+
+
+def _reported(sites: Sequence[Site], progress: Progress) -> Iterator[Site]:
+    for k, site in enumerate(sites):
+        progress("contacts", k / len(sites), NO_ERROR)
+        yield site
+    progress("contacts", 1.0, NO_ERROR)
+
+
+def contacts_at_sites(
+    vademecum: Vademecum,
+    surface: SurfaceMesh,
+    sites: Iterable[Site],
+    tips: Sequence[Tip] = SPHERES,
+    depths: Sequence[float] = DEPTHS,
+) -> tuple[list[SiteContact], list[str]]:
+    """The contacts of all sites, and notices that count what is missing.
+
+    Left out are places that the reference cannot resolve, and poses that the step refuses.
+    """
+    contacts: list[SiteContact] = []
+    lost: list[str] = []
+    for site in sites:
+        try:
+            (found,) = compared(vademecum, surface, [site], tips, depths)
+        except (MeshError, ContactError, ConvergenceError) as error:
+            lost.append(f"a {site.kind} place: {error}")
+            continue
+        contacts += found
+    felt = [contact for contact in contacts if np.isfinite(contact.force)]
+    notices = []
+    if lost:
+        notices.append(f"left out {len(lost)} that could not be resolved; the first, {lost[0]}")
+    if len(felt) < len(contacts):
+        notices.append(f"left out {len(contacts) - len(felt)} poses that the step refused")
+    return felt, notices
+
+
+def law_factor(contacts: Sequence[SiteContact]) -> float:
+    """The least factor on the law's error with which ``PROMISED`` of the contacts are covered.
+
+    By split conformal prediction, as in :mod:`avatar_core.vademecum.force_error`; at least
+    ``LEAST_FACTOR``, and 1 without any contact.
+    """
+    if not contacts:
+        return 1.0
+    needed = sorted(
+        1.0 + (abs(c.force - c.truth) - c.estimate) / max(c.law_estimate, TINY) for c in contacts
+    )
+    rank = min(int(np.ceil(PROMISED * (len(needed) + 1))), len(needed))
+    return float(max(LEAST_FACTOR, needed[rank - 1] * (1.0 + 1e-9)))
+
+
+def summarized(contacts: Sequence[SiteContact], factor: float = 1.0) -> ContactSites:
+    """Key figures of contacts, with the law's part of the error that is said times a factor."""
+    if not contacts:
+        return ContactSites()
+    error = np.array([contact.error for contact in contacts])
+    said = np.array([(c.estimate + (factor - 1.0) * c.law_estimate) / c.truth for c in contacts])
+    return ContactSites(
+        n_contacts=len(contacts),
+        n_places=len({contact.site for contact in contacts}),
+        mean=float(error.mean()),
+        p95=float(np.quantile(error, 0.95)),
+        worst=float(error.max()),
+        coverage=float(np.mean(error <= said)),
+        overestimate=float(np.median(said / np.maximum(error, 1e-6))),
+        factor=factor,
+    )
+
+
+def draw_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) -> list[Site]:
+    """Places drawn evenly over the accessible surface; the last two a ridge and a hollow.
+
+    Not those at the border of the accessible surface, where the step's force fades on purpose: if
+    most of it is border, there may be fewer than ``n``.
+
+    Parameters
+    ----------
+    surface : that the vademecum was built of
+    n : at least 3
+    """
+    drawn = draw_contacts(vademecum, max(DRAWN, 2 * n), seed)
+    sites = nearest_sites(vademecum, surface, drawn.place)
+    sites = [site for site in sites if _access(vademecum, site) > OPEN]
+    rest = sites[n - 2 :]
+    if len(rest) < 2:
+        return sites
+    ridge = max(rest, key=lambda site: site.beta)
+    hollow = min(rest, key=lambda site: site.kappa)
+    return [*sites[: n - 2], replace(ridge, kind="ridge"), replace(hollow, kind="hollow")]
+
+
+def nearest_sites(vademecum: Vademecum, surface: SurfaceMesh, near: np.ndarray) -> list[Site]:
+    """The places of the surface nearest to some points, shape (n, 3) [m]."""
+    faces = surface.faces.astype(np.int64)
+    points = igl.point_mesh_squared_distance(near, surface.vertices, faces)[2].reshape(-1, 3)
+    return [_site(vademecum, point) for point in points]
+
+
+def _site(vademecum: Vademecum, point: np.ndarray) -> Site:
+    field, slope = vademecum.tip_field, np.zeros(3)
+
+    def at(values: np.ndarray) -> float:
+        return float(evaluate(values, field.origin, field.spacing[0], point, slope, np.nan))
+
+    kappa, beta = at(field.curvature), at(field.ridge)
+    at(field.distance)
+    return Site("drawn", point, slope / np.linalg.norm(slope), kappa, beta)
+
+
+def _access(vademecum: Vademecum, site: Site) -> float:
+    """Access at the largest depth below a site."""
+    field, below = vademecum.tip_field, site.point - max(DEPTHS) * site.normal
+    return float(evaluate(field.access, field.origin, field.spacing[0], below, np.zeros(3), 0.0))
+
+
+def compared(
+    vademecum: Vademecum,
+    surface: SurfaceMesh,
+    sites: Sequence[Site],
+    tips: Sequence[Tip] = SPHERES,
+    depths: Sequence[float] = DEPTHS,
+) -> Iterator[list[SiteContact]]:
+    """The contacts of each site, one site after the other.
+
+    Parameters
+    ----------
+    vademecum : linear, at its own material
+    tips : spheres
+    depths : of their lowest point below the surface [m]
+
+    A tip whose sides touch a hollow before it reaches the place is left out there.
+
+    Raises
+    ------
+    MeshError, ContactError, ConvergenceError
+        As :func:`avatar_core.offline.resolved_contact.contacts_at`.
+    """
+    models = [prepare(vademecum, (tip,), cloud="volume", effects=()) for tip in tips]
+    patches = [
+        prepare(vademecum, (Tip("patch", tip.radius),), cloud="off", effects=()) for tip in tips
+    ]
+    for site in sites:
+        truth = contacts_at(
+            surface,
+            vademecum.mesh,
+            vademecum.regions,
+            vademecum.material,
+            site.point,
+            site.normal,
+            tips,
+            depths,
+        )
+        yield _at_site(vademecum, site, truth, models, patches, tips, depths)
+
+
+def _at_site(
+    vademecum: Vademecum,
+    site: Site,
+    truth: ResolvedPlace,
+    models: Sequence[ContactModel],
+    patches: Sequence[ContactModel],
+    tips: Sequence[Tip],
+    depths: Sequence[float],
+) -> list[SiteContact]:
+    vertices, mass = vademecum.mesh.vertices, vademecum.mesh.lumped_mass
+    far = np.linalg.norm(vertices - site.point, axis=1) > FAR
+    kept = np.repeat(far, 3)
+    out = []
+    fits = truth.condensed.first_depths > -FITS
+    for i, tip in enumerate(tips):
+        if not fits[i]:
+            continue
+        moved = truth.condensed.displacements(truth.contacts[i])[:, : len(vertices)]
+        for k, depth in enumerate(depths):
+            force = pressed(models[i], site, tip, depth)
+            shown = models[i].out.cloud[:, 3:].astype(float).ravel()
+            out.append(
+                SiteContact(
+                    site,
+                    tip.radius,
+                    depth,
+                    float(truth.forces[i, k]),
+                    force,
+                    float(models[i].out.force_error[0]),
+                    float(
+                        law_error(models[i].effects.tip_law, 0)
+                        * np.linalg.norm(models[i].out.force[0])
+                    ),
+                    pressed(patches[i], site, tip, depth),
+                    float(hertz_force(vademecum.material, tip.radius, depth)),
+                    float(relative_l2(shown[kept], moved[k].ravel()[kept], mass[kept])),
+                )
+            )
+    return out
+
+
+def hertz_force(material: Material, radius: float, depth: np.ndarray | float) -> np.ndarray:
+    """4/3 E* sqrt(R d^3) on a sphere in a half-space, at depths of any shape [N]."""
+    stiffness = material.plane_strain_modulus
+    return np.asarray(4.0 / 3.0 * stiffness * np.sqrt(radius * np.asarray(depth) ** 3))
+
+
+def pressed(model: ContactModel, site: Site, tip: Tip, depth: float) -> float:
+    """The step's force along the normal at a depth, after an approach from outside [N]."""
+    model.reset()
+    for at in (*np.arange(-0.5e-3, depth, 1e-3), depth):
+        status = step(model, (site.point + (tip.offset - at) * site.normal)[None])
+    if status not in (Status.OK, Status.EXTRAPOLATED):
+        return float("nan")
+    estimate_error(model)
+    return float(model.out.force[0] @ site.normal)

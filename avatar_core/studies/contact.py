@@ -1,0 +1,199 @@
+"""Contact: the force of a real tip against resolved contact, Hertz, and the vademecum's own patch.
+
+Spheres of 1.5 to 10 mm press 1 to 5 mm deep at places drawn over each liver, a ridge and a hollow
+among them. The truth is Signorini's contact on the same organ, resolved
+(:mod:`avatar_core.offline.resolved_contact`), which is itself compared with Sneddon's exact sphere
+on a box. None of the livers took part in the calibration of the error that the step says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from skfem import MeshTet
+
+from avatar_core.fem.elasticity import Material
+from avatar_core.fem.signorini import half_space_radius
+from avatar_core.geometry.mesh import Regions, make_mesh
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.tip import Tip
+from avatar_core.offline.certify.contact_sites import (
+    SiteContact,
+    contacts_at_sites,
+    draw_sites,
+    summarized,
+)
+from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, contacts_at
+from avatar_core.offline.rule import BuildRule
+from avatar_core.studies.shapes import DEFAULT_FOLDER
+from avatar_core.studies.study import Study, Value, follow
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LIVERS = ("LiTS-1", "LiTS-50", "Amos-052", "Amos-086")  # not those of the calibration
+_SHOWN = ("drawn", "ridge", "hollow")
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """Size of the study: livers by name, places on each, spheres and depths [m]."""
+
+    livers: tuple[str, ...] = LIVERS
+    n_places: int = 6
+    tips: tuple[Tip, ...] = SPHERES
+    depths: tuple[float, ...] = DEPTHS
+    options: OrganOptions = field(default_factory=OrganOptions)
+
+
+QUICK = ContactSettings(
+    livers=LIVERS[:1],
+    n_places=3,
+    options=OrganOptions(rule=BuildRule(max_modes=60), n_certified=40),
+)
+
+
+def run(surfaces: Path | None, quick: bool, output: Path) -> Study:
+    """The study; ``surfaces`` is the folder of the livers."""
+    settings = QUICK if quick else ContactSettings()
+    folder = surfaces or DEFAULT_FOLDER
+    livers = [read_surface(folder / f"{name}.obj") for name in settings.livers]
+    notices: list[str] = []
+    found = {liver.name: contacts_of(liver, settings, notices) for liver in livers}
+    contacts = [contact for several in found.values() for contact in several]
+    summary = {**summary_of(contacts), "reference_vs_sneddon": reference_error()}
+    return Study(
+        "contact",
+        _sentence(summary, contacts),
+        summary,
+        tuple(_row(name, contact) for name, several in found.items() for contact in several),
+        {},
+        lambda figure: _draw(figure, found),
+        tuple(notices),
+    )
+
+
+def contacts_of(
+    surface: SurfaceMesh, settings: ContactSettings, notices: list[str]
+) -> list[SiteContact]:
+    """All contacts on one liver; what could not be resolved is counted in a notice."""
+    vademecum = build(surface, settings.options)
+    sites = follow(
+        draw_sites(vademecum, surface, settings.n_places, seed=7), f"{surface.name}: places"
+    )
+    contacts, missing = contacts_at_sites(vademecum, surface, sites, settings.tips, settings.depths)
+    notices += [f"{surface.name}, contact sites: {notice}" for notice in missing]
+    return contacts
+
+
+def reference_error() -> float:
+    """Worst relative error of the reference for a sphere of 3 mm, 1 and 2 mm deep in a cube.
+
+    Against Sneddon's half-space; the cube of 200 mm is clamped at its bottom.
+    """
+    tip, depths, material = Tip("sphere", 3e-3), (1e-3, 2e-3), Material()
+    ticks = np.linspace(0.0, 0.2, 5)
+    cube = MeshTet.init_tensor(ticks, ticks, ticks)
+    mesh = make_mesh(cube.p.T.copy(), cube.oriented().t.T.copy())
+    height = mesh.vertices[mesh.boundary_faces][:, :, 2]
+    regions = Regions((height < 1e-9).all(axis=1), (height > 0.2 - 1e-9).all(axis=1))
+    top, up = np.array([0.1, 0.1, 0.2]), np.array([0.0, 0.0, 1.0])
+    found = contacts_at(None, mesh, regions, material, top, up, (tip,), depths).forces[0]
+    exact = np.array([sneddon(tip, material, depth) for depth in depths])
+    return float(np.abs(found / exact - 1.0).max())
+
+
+def sneddon(tip: Tip, material: Material, depth: float) -> float:
+    """Force on a sphere in a half-space (Sneddon 1965) [N]."""
+    a, r = half_space_radius(tip, depth), tip.radius
+    stiffness = material.plane_strain_modulus
+    return float(stiffness * (0.5 * (a * a + r * r) * np.log((r + a) / (r - a)) - a * r))
+
+
+def summary_of(contacts: Sequence[SiteContact]) -> dict[str, float]:
+    """Key figures; errors are relative, of the force along the normal."""
+    found = summarized(contacts)
+    patch = np.array([abs(contact.patch / contact.truth - 1.0) for contact in contacts])
+    hertz = np.array([abs(contact.hertz / contact.truth - 1.0) for contact in contacts])
+    return {
+        "contacts": float(found.n_contacts),
+        "force_mean": found.mean,
+        "force_p95": found.p95,
+        "force_worst": found.worst,
+        "far_field_l2": float(max(contact.far_l2 for contact in contacts)),
+        "far_field_l2_mean": float(np.mean([contact.far_l2 for contact in contacts])),
+        "coverage": found.coverage,
+        "median_overestimate": found.overestimate,
+        "patch_mean": float(patch.mean()),
+        "hertz_mean": float(hertz.mean()),
+    }
+
+
+def _row(name: str, contact: SiteContact) -> dict[str, Value]:
+    site = contact.site
+    return {
+        "liver": name,
+        "place": site.kind,
+        "kappa_per_m": site.kappa,
+        "beta": site.beta,
+        "radius_m": contact.radius,
+        "depth_m": contact.depth,
+        "true_n": contact.truth,
+        "force_n": contact.force,
+        "said_error_n": contact.estimate,
+        "patch_n": contact.patch,
+        "hertz_n": contact.hertz,
+        "far_l2": contact.far_l2,
+    }
+
+
+def _sentence(summary: dict[str, float], contacts: Sequence[SiteContact]) -> str:
+    return (
+        f"Of {len(contacts)} resolved contacts the force misses {summary['force_mean']:.1%} in the "
+        f"mean, 95 % of them by less than {summary['force_p95']:.1%}, the worst by "
+        f"{summary['force_worst']:.1%}; the patch alone misses {summary['patch_mean']:.0%}, Hertz "
+        f"on a half-space {summary['hertz_mean']:.0%}. The error that is said covers "
+        f"{summary['coverage']:.0%}."
+    )
+
+
+def _draw(figure: Figure, found: dict[str, list[SiteContact]]) -> None:
+    left, right = figure.subplots(1, 2)
+    contacts = [contact for several in found.values() for contact in several]
+    _draw_depths(left, contacts)
+    colours = {"drawn": "steelblue", "ridge": "crimson", "hollow": "seagreen"}
+    for kind in _SHOWN:
+        own = [contact for contact in contacts if contact.site.kind == kind]
+        truth = [contact.truth for contact in own]
+        ratio = [contact.force / contact.truth for contact in own]
+        right.semilogx(truth, ratio, "o", ms=3, color=colours[kind], label=kind)
+    right.axhspan(0.9, 1.1, color="gray", alpha=0.15)
+    right.set(xlabel="resolved force [N]", ylabel="force / resolved force")
+    right.set_title("all contacts; grey: within 10 %")
+    right.legend()
+
+
+def _draw_depths(axes: Axes, contacts: Sequence[SiteContact]) -> None:
+    """Force over depth at the first place, for the smallest and the largest sphere."""
+    first = [contact for contact in contacts if contact.site is contacts[0].site]
+    radii = sorted({contact.radius for contact in first})
+    for radius, colour in ((radii[0], "crimson"), (radii[-1], "steelblue")):
+        own = sorted((c for c in first if c.radius == radius), key=lambda c: c.depth)
+        depth = [1e3 * contact.depth for contact in own]
+        for name, text, style in (
+            ("truth", "resolved", "o"),
+            ("force", "step", "-"),
+            ("hertz", "Hertz", ":"),
+            ("patch", "patch", "--"),
+        ):
+            force = [getattr(contact, name) for contact in own]
+            label = f"{text}, R {1e3 * radius:g} mm"
+            axes.plot(depth, force, style, color=colour, label=label)
+    axes.set(xlabel="depth [mm]", ylabel="force [N]", title="one place")
+    axes.legend(fontsize=8)
