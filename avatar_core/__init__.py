@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from avatar_core.geometry.phantom import phantom_liver as phantom_liver
     from avatar_core.geometry.surface import SurfaceMesh as SurfaceMesh
     from avatar_core.geometry.surface import read_surface as read_surface
+    from avatar_core.geometry.tip import Tip as Tip
     from avatar_core.offline.pipeline import OrganOptions as OrganOptions
     from avatar_core.offline.pipeline import build as build
     from avatar_core.scene.export import export as export
@@ -66,6 +67,7 @@ _ORIGIN = {
     "Scene": "scene.model",
     "Status": "contact.model",
     "SurfaceMesh": "geometry.surface",
+    "Tip": "geometry.tip",
     "Tool": "scene.model",
     "Vademecum": "vademecum.model",
     "at_values": "vademecum.at_values",

@@ -12,6 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
+from avatar_core.contact import layout
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry import mesh
 from avatar_core.geometry.phantom import phantom_liver
@@ -21,8 +22,9 @@ from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
 
-from . import examples
+from . import examples, kept_meshes
 from .alone import Turns
+from .kept_responses import kept
 from .recorded_meshes import recorded
 from .stored import stored
 
@@ -41,9 +43,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session", autouse=True)
 def same_meshes() -> Iterator[None]:
-    """The same meshes of the built-in liver in every run."""
+    """The same meshes of the built-in liver in every run, and of others in one of the same code."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mesh, "_fill", recorded(mesh._fill))
+        patch.setattr(mesh, "_fill", recorded(kept_meshes.kept))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def same_responses() -> Iterator[None]:
+    """The response of one organ to a tip is computed once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layout, "make_tip_response", kept(layout.make_tip_response))
         yield
 
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 _WORK = 0.2  # processor time of one measurement [s]
+_AGAIN = 5.0  # seconds between two: who waits has other things to do
 
 
 def slowness() -> float:
@@ -29,11 +30,17 @@ class Deadline:
 
     def __init__(self, seconds: float) -> None:
         self._seconds, self._begin = seconds, time.monotonic()
+        self._end = self._begin + seconds
 
     def __bool__(self) -> bool:
         """Whether it has passed."""
+        if time.monotonic() < self._end:
+            return False
         took = time.monotonic() - self._begin
-        return took > self._seconds and took > self._seconds * slowness()
+        if took > self._seconds * slowness():
+            return True
+        self._end = time.monotonic() + _AGAIN
+        return False
 
 
 @contextmanager

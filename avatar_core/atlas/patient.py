@@ -18,6 +18,7 @@ import numpy as np
 
 from avatar_core.atlas.base import PatientBase, PatientError, base_of
 from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.patient_problem import PatientProblem, member_problem, patient_problem
 from avatar_core.atlas.transfer import (
     Weighting,
     by_component,
@@ -26,9 +27,8 @@ from avatar_core.atlas.transfer import (
     combine,
     patient_weights,
 )
-from avatar_core.fem.elasticity import Elasticity
-from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads, patch_normals
-from avatar_core.geometry.mesh import Regions, TetMesh, tetrahedralize
+from avatar_core.fem.patch_loads import LoadSurface, patch_loads
+from avatar_core.geometry.mesh import TetMesh, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import certify
 from avatar_core.offline.linear import build_vademecum, with_rank
@@ -44,7 +44,7 @@ from avatar_core.reduction.galerkin import (
 from avatar_core.reduction.near_field import LocalBlocks, near_pairs
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.shapes.barycenter import Barycenter
-from avatar_core.shapes.correspondence import carry_regions, load_map, registered_positions
+from avatar_core.shapes.correspondence import load_map
 from avatar_core.shapes.registration import Registration, register
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.tip_field import make_tip_field
@@ -127,51 +127,6 @@ class Patient:
     solutions: int
     notices: tuple[str, ...]
     seconds: StageSeconds
-
-
-@dataclass(frozen=True, eq=False)
-class PatientProblem:
-    """A patient's own mesh, with clamp and load positions transferred from the template.
-
-    surface : of the patient; registration : of the template to it
-    mesh, regions, loads, elasticity : the patient's
-    """
-
-    surface: SurfaceMesh
-    registration: Registration
-    mesh: TetMesh
-    regions: Regions
-    loads: LoadSurface
-    elasticity: Elasticity
-
-
-def patient_problem(
-    surface: SurfaceMesh, base: PatientBase, registration: Registration, mesh: TetMesh
-) -> PatientProblem:
-    """Transfer clamp, accessible region and patch radius of the base to a patient's mesh.
-
-    Raises
-    ------
-    RegistrationError, MeshError
-        If the mesh lies elsewhere, or is too coarse for the regions or the patch.
-    """
-    regions = carry_regions(registration, mesh)
-    loads = load_surface(mesh, regions, base.loads.patch_radius)
-    elasticity = Elasticity(mesh, base.material, regions.clamped)
-    return PatientProblem(surface, registration, mesh, regions, loads, elasticity)
-
-
-def member_problem(
-    surface: SurfaceMesh, base: PatientBase, member: int, registration: Registration
-) -> PatientProblem:
-    """An anatomy of the base on the registered template, on which its response was computed."""
-    template = base.template
-    mesh = TetMesh(np.asarray(base.vertices[member], float), template.mesh.tets)
-    own = replace(registration, mesh=mesh)
-    loads = replace(base.loads, centers=registered_positions(own, base.loads))
-    loads = replace(loads, normals=patch_normals(mesh, loads.centers, loads.patch_radius))
-    elasticity = Elasticity(mesh, base.material, template.regions.clamped)
-    return PatientProblem(surface, own, mesh, template.regions, loads, elasticity)
 
 
 def patient_vademecum(
@@ -356,6 +311,7 @@ def solved(
         replace(options.build, max_modes=options.max_modes),
         _provenance(problem),
         lambda stage, fraction, error: progress(f"response: {stage}", fraction, error),
+        problem.outline,
     )
 
 
@@ -399,7 +355,7 @@ def _assembled(
         contact_near=residual_compliance_blocks(
             response.residual_compliance, support, loads, rule.contact_support * radius
         ),
-        tip_field=make_tip_field(problem.mesh, problem.regions, radius),
+        tip_field=make_tip_field(problem.mesh, problem.regions, radius, problem.outline),
         convergence=convergence,
         provenance=_provenance(problem),
     )

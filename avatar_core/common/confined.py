@@ -21,6 +21,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -34,7 +35,9 @@ R = TypeVar("R")
 
 MAX_BYTES = 2 << 30
 RETURNED, RAISED, FAILED = "returned", "raised", "failed"  # with a value, our error, a line
-_START_SECONDS = 60.0  # to import what is called, on a machine that has much else to do
+_START_SECONDS = 60.0  # to import what is called
+_WAITING = 10.0  # times what a call may compute, after which it waits for something in vain
+_LOOK = 0.2  # at the time it has computed [s]
 
 
 class ConfinedError(AvatarError):
@@ -70,7 +73,8 @@ class Confined:
 
         Parameters
         ----------
-        seconds : that it may take; what it imports while it is loaded does not count [s]
+        seconds : of processor time that it may take, whatever else the machine has to do; what it
+            imports while it is loaded does not count [s]
 
         Raises
         ------
@@ -104,9 +108,18 @@ class Confined:
             self._start()
         assert self._line is not None
         self._line.send(order)
-        if not self._line.poll(seconds):
-            raise TimeoutError
+        end, most = time.monotonic() + _WAITING * seconds, self._computed() + seconds
+        while not self._line.poll(_LOOK):
+            if time.monotonic() > end or self._computed() > most:
+                raise TimeoutError
         return self._line.recv()
+
+    def _computed(self) -> float:
+        """Processor time of the process since its start [s]."""
+        assert self._process is not None
+        stat = Path(f"/proc/{self._process.pid}/stat").read_text()
+        user, system = stat.rpartition(")")[2].split()[11:13]
+        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
     def _start(self) -> None:
         ours, theirs = socket.socketpair()

@@ -295,7 +295,7 @@ class _SurfacePoints:
 def _surface_points(mesh: TetMesh, radius: float) -> _SurfacePoints:
     _require_resolved(mesh, radius)
     pieces = max(1, int(np.ceil(1.5 * mesh.mean_surface_edge / radius)))
-    barycentric, weight = _subdivided_rule(pieces)
+    barycentric, weight = subdivided_rule(pieces)
     corners = mesh.vertices[mesh.boundary_faces]
     unit = mesh.face_area_normals / mesh.face_areas[:, None]
     return _SurfacePoints(
@@ -329,7 +329,7 @@ def _trace(elasticity: Elasticity, points: _SurfacePoints) -> sp.csr_matrix:
     )
 
 
-def _subdivided_rule(pieces: int) -> tuple[np.ndarray, np.ndarray]:
+def subdivided_rule(pieces: int) -> tuple[np.ndarray, np.ndarray]:
     """A rule of degree 5 on each of pieces^2 equal sub-triangles; weights sum to one."""
     local, weight = get_quadrature(RefTri, 5)
     bary = np.stack([1.0 - local[0] - local[1], local[0], local[1]], axis=1)

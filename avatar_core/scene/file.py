@@ -18,6 +18,7 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from avatar_core.common.quantities import check_line, is_whole, lies_in
 from avatar_core.contact.effects import EFFECTS, Effect, Viscoelasticity
 from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.prony import parse_prony
 from avatar_core.scene.yaml_lines import (
@@ -41,6 +42,7 @@ SECTIONS = {
     "outputs": ("cloud", "cloud_divisor", "modes"),
 }
 SHIPPED = Path("params") / "scenes"  # in a checkout; installed below share/avatar_ros
+_OLD_TIP = "tip_radius"  # a key of earlier versions
 _KEYS = ("name", "text", "organ", "material", "tools", "outputs", "effects")
 
 
@@ -129,7 +131,9 @@ def write_scene(scene: Scene) -> str:
     for section, keys in SECTIONS.items():
         values = {key: getattr(scene, key) for key in keys}
         document[section] = {key: _plain(v) for key, v in values.items() if v is not None}
-    document["tools"] = [_plain_fields(tool) for tool in scene.tools]
+    document["tools"] = [
+        {"name": tool.name, "tip": _plain_fields(tool.tip)} for tool in scene.tools
+    ]
     document["effects"] = {effect.name: _plain_fields(effect) for effect in scene.effects}
     return yaml.safe_dump(
         document, sort_keys=False, allow_unicode=True, default_flow_style=None, width=math.inf
@@ -137,7 +141,9 @@ def write_scene(scene: Scene) -> str:
 
 
 def _plain_fields(one: Any) -> dict[str, Any]:
-    return {field.name: _plain(getattr(one, field.name)) for field in fields(one)}
+    """The fields of a dataclass that have a value."""
+    values = {field.name: getattr(one, field.name) for field in fields(one)}
+    return {name: _plain(value) for name, value in values.items() if value is not None}
 
 
 def _plain(value: Any) -> Any:
@@ -211,9 +217,23 @@ def _tools(node: Node) -> tuple[Tool, ...]:
 
 
 def _tool(node: Node, path: str, known: Sequence[str]) -> Tool:
-    values = _fields(Tool, entries_of(node, path, known), path)
+    entries = entries_of(node, path, (*known, _OLD_TIP))
+    if _OLD_TIP in entries:
+        key, radius = entries[_OLD_TIP]
+        instead = f"tip: {{shape: sphere, radius: {shown(radius)}}}"
+        raise refused(key, f"{below(path, _OLD_TIP)} is of an earlier version; write {instead}")
+    _, tip = entries.pop("tip", (None, None))
+    values = _fields(Tool, entries, path)
+    if tip is not None and not is_nothing(tip):
+        values["tip"] = _tip(tip, below(path, "tip"))
     with placed_at(node):
         return Tool(**values)
+
+
+def _tip(node: Node, path: str) -> Tip:
+    values = _fields(Tip, entries_of(node, path, [field.name for field in fields(Tip)]), path)
+    with placed_at(node):
+        return Tip(**values)
 
 
 def _effects(node: Node, folder: Path | None) -> tuple[Effect, ...]:

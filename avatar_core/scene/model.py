@@ -8,14 +8,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, get_args
 
 from avatar_core.common.quantities import check_line, check_numbers, quantity
 from avatar_core.contact.effects import Effect
 from avatar_core.contact.kernels import MAX_TOOLS
-from avatar_core.contact.layout import TIP_RADIUS_RANGE
 from avatar_core.errors import CoordinateError, SceneError
+from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.coordinates import require_known
 from avatar_core.vademecum.accuracy import Cloud
 
@@ -39,16 +39,16 @@ _TOOL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 @dataclass(frozen=True)
 class Tool:
-    """A tool with a spherical tip.
+    """A tool: a name and the tip that touches.
 
     Raises
     ------
     SceneError
-        For a name that cannot be part of a topic's, or a radius out of range.
+        For a name that cannot be part of a topic's.
     """
 
     name: str = "tool"
-    tip_radius: float = quantity("m", *TIP_RADIUS_RANGE, "of the spherical tip", 5e-3)
+    tip: Tip = field(default_factory=Tip)
 
     def __post_init__(self) -> None:
         check_line("tools.name", self.name)
@@ -57,7 +57,6 @@ class Tool:
                 f"tools.name is '{self.name}'; give a name for ROS topics: letters, digits, single "
                 "_ and / between, a letter first"
             )
-        check_numbers(self, f"{self.name}.")
 
 
 @dataclass(frozen=True)

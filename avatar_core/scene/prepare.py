@@ -14,6 +14,7 @@ from avatar_core.contact.layout import PERIOD, Layout, lay_out
 from avatar_core.contact.model import ContactModel, make_model
 from avatar_core.contact.timing import timed
 from avatar_core.errors import AccuracyError
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.model import Scene
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget, Cloud, Detail, choose
 from avatar_core.vademecum.at_values import at_values
@@ -25,12 +26,12 @@ class ModelSpec:
     """What a scene makes of a vademecum.
 
     vademecum : at the values chosen for its material
-    tip_radii : of the tools [m]
+    tips : of the tools
     modes : of the displacement at most; None for all
     """
 
     vademecum: Vademecum
-    tip_radii: tuple[float, ...]
+    tips: tuple[Tip, ...]
     modes: int | None
     cloud: Cloud
     effects: tuple[Effect, ...]
@@ -67,16 +68,16 @@ class ModelSpec:
         # Single precision shows nothing that 16 bits do not, and is slower.
         usual = tuple(p for p in self.curve.points if p.detail.precision != "float32")
         curve = replace(self.curve, points=usual)
-        return timed(self.vademecum, curve, self.tip_radii, self.effects, period, halves)
+        return timed(self.vademecum, curve, self.tips, self.effects, period, halves)
 
     def layout(self, detail: Detail, period: float) -> Layout:
         """Constant arrays of a contact model that shows a detail."""
-        return lay_out(self.vademecum, self.tip_radii, detail, self.effects, period)
+        return lay_out(self.vademecum, self.tips, detail, self.effects, period)
 
 
 def default_spec(
     vademecum: Vademecum,
-    tip_radii: tuple[float, ...] = (5e-3,),
+    tips: tuple[Tip, ...] = (Tip(),),
     modes: int | None = None,
     cloud: Cloud = "surface",
     values: Mapping[str, float] | None = None,
@@ -86,7 +87,7 @@ def default_spec(
     values : of the material, by coordinate
     """
     chosen = at_values(vademecum, values or {})
-    return ModelSpec(chosen, tip_radii, modes, cloud, default_effects(chosen, len(tip_radii)))
+    return ModelSpec(chosen, tips, modes, cloud, default_effects(chosen, len(tips)))
 
 
 def scene_spec(
@@ -107,8 +108,8 @@ def scene_spec(
         scene = replace(scene, effects=(*others, Tumour(given.pop("contrast"))))
     scene.require(vademecum)
     chosen = at_values(vademecum, scene.values | given)
-    radii = tuple(tool.tip_radius for tool in scene.tools)
-    return ModelSpec(chosen, radii, scene.modes, scene.cloud, scene.effects)
+    tips = tuple(tool.tip for tool in scene.tools)
+    return ModelSpec(chosen, tips, scene.modes, scene.cloud, scene.effects)
 
 
 def prepare(

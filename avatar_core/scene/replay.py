@@ -21,7 +21,7 @@ import numpy as np
 
 from avatar_core.contact import model as contact
 from avatar_core.contact.model import Status, make_model
-from avatar_core.errors import StorageError
+from avatar_core.errors import SceneError, StorageError
 from avatar_core.scene.file import parse_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.prepare import scene_spec
@@ -58,7 +58,7 @@ def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
     Raises
     ------
     StorageError
-        If the recording was made with another vademecum.
+        If the recording was made with another vademecum, or by another version of avatar.
     SceneError, ContactError, CoordinateError
         If the scene in it does not fit the vademecum.
     """
@@ -67,7 +67,7 @@ def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
             f"the recording is of {recording.vademecum_name!r} ({recording.vademecum_id[:12]}), "
             f"this is {vademecum.name!r} ({vademecum.id[:12]}); give the file it was made with"
         )
-    scene = parse_scene(recording.scene, "scene of the recording")
+    scene = _scene_of(recording)
     periods = recording.periods
     if len(scene.tools) != periods.tip.shape[1]:
         raise StorageError(
@@ -84,6 +84,17 @@ def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
         contact.solve(model, periods.tip[k])
         force[k] = model.out.force
     return Replayed(force, known_periods(periods, scene, recording.from_rest))
+
+
+def _scene_of(recording: Recording) -> Scene:
+    """The scene in a recording, which nobody can correct: what is wrong with it, is recorded."""
+    try:
+        return parse_scene(recording.scene, "scene of the recording")
+    except SceneError as error:
+        cause, _, _ = str(error).partition(";")
+        raise StorageError(
+            f"{cause}; record again, or replay with the version of avatar that recorded"
+        ) from error
 
 
 def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray:

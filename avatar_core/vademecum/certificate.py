@@ -2,10 +2,44 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
+from avatar_core.errors import StorageError
 from avatar_core.vademecum.accuracy import AccuracyCurve
 from avatar_core.vademecum.force_error import ForceError
+
+
+@dataclass(frozen=True)
+class ContactSites:
+    """Relative errors (fractions) of the force on real tips against resolved contacts.
+
+    The contacts are those of spheres of several radii at several depths at some places of the
+    organ; :mod:`avatar_core.offline.certify.contact_sites`.
+
+    n_contacts, n_places : resolved; 0: not asked for
+    mean, p95, worst : |F / F_resolved - 1| along the normal; p95 is that which 5 % exceed
+    coverage : part of the contacts whose error is at most the one that the step says
+    overestimate : median of the error that is said over the true one
+    factor : by which the law's part of the error that is said is multiplied, so that these contacts
+        are covered; 1 where there are none
+    """
+
+    n_contacts: int = 0
+    n_places: int = 0
+    mean: float = float("nan")
+    p95: float = float("nan")
+    worst: float = float("nan")
+    coverage: float = float("nan")
+    overestimate: float = float("nan")
+    factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.factor) and self.factor > 0.0):
+            raise StorageError(
+                f"the factor of the contact sites is {self.factor:g}, not above 0; build the file "
+                "again"
+            )
 
 
 @dataclass(frozen=True)
@@ -22,6 +56,7 @@ class Certificate:
     build_cpu_seconds : user + system time of everything, meshing and this certificate included
     mesh_l2, mesh_contact : change of the reference when the mesh is refined once (NaN: not asked)
     force_error : estimate of the force error at a place, calibrated on the same loads
+    contact_sites : errors of real tips against resolved contact, if asked for
     curve : the same errors for coarser details of the displacement, and the time of a step
     """
 
@@ -41,6 +76,7 @@ class Certificate:
     mesh_l2: float = float("nan")
     mesh_contact: float = float("nan")
     force_error: ForceError = field(default_factory=ForceError)
+    contact_sites: ContactSites = field(default_factory=ContactSites)
     curve: AccuracyCurve | None = None
 
     @classmethod

@@ -100,7 +100,7 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "2.2"
+SCHEMA_VERSION = "2.3"
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Vademecum:
     near : LocalBlocks, exact remainder at mesh vertices [m/N]
     contact_near : LocalBlocks, tapered remainder of the contact compliance at load positions,
         symmetric [m/N]
-    tip_field : TipField, smooth distance and access that a tool tip feels
+    tip_field : TipField, smooth distance, shape and access that a tool tip feels
     parametric : ParametricResponse or None, the coordinates of the material: all fields above
         are those of one choice of their values (:func:`avatar_core.vademecum.at_values.at_values`)
     contrast : Young's modulus inside the tumour over that outside; None without a tumour

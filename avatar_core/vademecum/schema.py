@@ -55,6 +55,8 @@ _PARAMETRIC_BODY: Shapes = {
     "parametric/body/mass": "f: basis basis",
     "parametric/body/weight": "f: basis 3",
 }
+_PROFILE: Shapes = {"tip_field/curvature": "f: nx ny nz", "tip_field/ridge": "f: nx ny nz"}
+_TUMOUR: Shapes = {"tip_field/tumour": "f: nx ny nz"}
 _LARGE: Shapes = {
     "large/space": "f: 3*vertices large",
     "large/load": "f: 2 positions large",
@@ -66,9 +68,11 @@ BODY_KEYS = tuple(_BODY)
 PARAMETRIC_KEYS = tuple(_PARAMETRIC)
 PARAMETRIC_BODY_KEYS = tuple(_PARAMETRIC_BODY)
 LARGE_KEYS = tuple(_LARGE)
+PROFILE_KEYS = tuple(_PROFILE)
+TUMOUR_KEYS = tuple(_TUMOUR)
 
 # Each is present or absent as a whole; its first key decides.
-_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE)
+_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE, _PROFILE, _TUMOUR)
 
 
 def shapes_of(held: Container[str]) -> dict[str, str]:

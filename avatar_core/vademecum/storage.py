@@ -1,9 +1,10 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 2.2), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 2.3), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
-``provenance``, ``convergence``, ``certificate``, and from schema 2.2 ``accuracy``, its curve.
+``provenance``, ``convergence``, ``certificate`` (from schema 2.3 with ``contact_sites``), and from
+schema 2.2 ``accuracy``, its curve.
 Datasets:
 
     mesh/vertices (n_v, 3) [m]          mesh/tets (n_t, 4)
@@ -14,6 +15,7 @@ Datasets:
     near/start, near/target, near/block [m/N]
     contact_near/start, contact_near/target, contact_near/block [m/N]
     tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
+    tip_field/curvature [1/m], tip_field/ridge, from schema 2.3; tip_field/tumour over a tumour
 
 A vademecum with coordinates of the material (from schema 2.0) has
 the JSON attributes ``coordinates``, ``contrast``, and
@@ -68,6 +70,8 @@ from avatar_core.vademecum.schema import (
     LARGE_KEYS,
     PARAMETRIC_BODY_KEYS,
     PARAMETRIC_KEYS,
+    PROFILE_KEYS,
+    TUMOUR_KEYS,
     require_sound,
     shapes_of,
 )
@@ -168,6 +172,8 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
     arrays = {}
     held = PARAMETRIC_KEYS[:1] * bool(v.parametric) + LARGE_KEYS[:1] * bool(v.large)
     held += BODY_KEYS[:1] * bool(v.body)
+    held += PROFILE_KEYS[:1] * (v.tip_field.curvature is not None)
+    held += TUMOUR_KEYS[:1] * (v.tip_field.tumour is not None)
     held += PARAMETRIC_BODY_KEYS[:1] * bool(v.parametric and v.parametric.body)
     for key in shapes_of(held):
         value: Any = v
@@ -223,7 +229,7 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         far=SeparatedField(arrays["far/space"], arrays["far/load"]),
         near=blocks("near"),
         contact_near=blocks("contact_near"),
-        tip_field=TipField(*(arrays[f"tip_field/{name}"] for name in TipField._fields)),
+        tip_field=TipField(*(arrays.get(f"tip_field/{name}") for name in TipField._fields)),
         convergence=of_plain(Convergence, plain["convergence"], "convergence"),
         provenance=of_plain(Provenance, plain["provenance"], "provenance"),
         certificate=_certificate(plain["certificate"], plain["accuracy"]),

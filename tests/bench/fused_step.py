@@ -102,7 +102,7 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
                 g0 += sx[i] * plane
                 g1 += wx[i] * along_y
                 g2 += wx[i] * along_z
-            gap = phi - model.tip_radius[0]
+            gap = phi - model.tip_offset[0]
             if gap < 0.0:
                 deepest = 25e-3 if before == ENTERED and continuous else 5e-3
                 if chi < 1e-2:
@@ -196,7 +196,7 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
         out.force[0, 0], out.force[0, 1], out.force[0, 2] = f0, f1, f2
         out.contact_force[0, 0], out.contact_force[0, 1], out.contact_force[0, 2] = f0, f1, f2
         out.contact_normal[0, 0], out.contact_normal[0, 1], out.contact_normal[0, 2] = n0, n1, n2
-        r = model.tip_radius[0]
+        r = model.tip_offset[0]
         out.contact_position[0, 0] = x - r * n0
         out.contact_position[0, 1] = y - r * n1
         out.contact_position[0, 2] = z - r * n2

@@ -11,11 +11,13 @@ import pytest
 from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import slide
 from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.tip import Tip
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.studies.bench.fused import module_of
 from avatar_core.vademecum.model import Vademecum
 
 TIP = 10e-3
+PATCH = Tip("patch", TIP)
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +35,8 @@ def test_the_bare_step_agrees_with_the_one_fused_by_hand(
     fused: ModuleType, organ: Vademecum
 ) -> None:
     """To 1e-12 on and off the surface, past the rim of access, in the depth and far away."""
-    bare = prepare(organ, (TIP,), cloud="volume", effects=())
-    other = prepare(organ, (TIP,), cloud="volume", effects=())
+    bare = prepare(organ, (PATCH,), cloud="volume", effects=())
+    other = prepare(organ, (PATCH,), cloud="volume", effects=())
     path = slide(organ, TIP, 5e-3, 60e-3, step=5e-4)
     rng = np.random.default_rng(0)
     low, high = organ.mesh.vertices.min(axis=0), organ.mesh.vertices.max(axis=0)

@@ -18,9 +18,11 @@ from avatar_core.contact.effects import (
 from avatar_core.contact.model import ContactModel, step
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
 
 TIP = 10e-3
+SPHERE, PATCH = Tip("sphere", TIP), Tip("patch", TIP)
 CHOICES: dict[str, Effect] = {
     effect.name: effect
     for effect in (
@@ -62,13 +64,12 @@ def elasticity_of(v: Vademecum) -> Elasticity:
     return Elasticity(v.mesh, v.material, v.regions.clamped, v.element)
 
 
-def full_sag(v: Vademecum, acceleration: np.ndarray, rho: float) -> np.ndarray:
-    """Full finite elements under gravity, at all nodes (3 n_nodes,)."""
+def full_sag(v: Vademecum, rho: float) -> np.ndarray:
+    """Full finite elements under 1 m/s^2 along each axis, at all nodes (3 n_nodes, 3)."""
     elasticity = elasticity_of(v)
     mesh = MeshTet(v.mesh.vertices.T.copy(), v.mesh.tets.T.copy())
     shape = ElementTetP1() if v.element == "P1" else ElementTetP2()
     basis = Basis(mesh, ElementVector(shape), intorder=4)
     order = np.concatenate([basis.nodal_dofs.T.ravel(), basis.edge_dofs.T.ravel()])
     mass = rho * density.assemble(basis).tocsr()[order][:, order]
-    load = mass @ np.tile(acceleration, elasticity.n_nodes)
-    return np.asarray(elasticity.solve(load[:, None])[:, 0])
+    return np.asarray(elasticity.solve(mass @ np.tile(np.eye(3), (elasticity.n_nodes, 1))))

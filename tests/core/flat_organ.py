@@ -7,30 +7,60 @@ that contact, friction and relaxation have closed forms.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from avatar_core.contact.cloud_kernels import BLOCK
+from avatar_core.contact.dent import dent_arrays
 from avatar_core.contact.effects.base import Effect
+from avatar_core.contact.effects.large_deformation import LargeDeformationArrays
 from avatar_core.contact.effects.selection import selected_arrays
+from avatar_core.contact.effects.tip_law import PATCH, tip_law_arrays
+from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
 from avatar_core.contact.kernels import ModelArrays
 from avatar_core.contact.layout import LANES, Layout
 from avatar_core.contact.model import ContactModel, make_model
+from avatar_core.fem.elasticity import Material
+from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.near_field import LocalBlocks, hash_rows
 
 FAR, NEAR = 3e-4, 1e-4  # [m/N]
 COMPLIANCE = FAR + NEAR
 RADIUS = 5e-3
+PATCH_TIP = Tip("patch", RADIUS)
+MATERIAL = Material(0.17e6, 0.48)
+E_STAR = MATERIAL.young_modulus / (1.0 - MATERIAL.poisson_ratio**2)  # [Pa]
+PATCH_RADIUS = 12e-3
 
 
 BALL = 40e-3  # radius of the ball [m]
+ORIGIN = np.zeros((1, 3))
 
 
 def flat_organ(
-    effects: Sequence[Effect] = (), period: float = 1e-3, compliance: float = COMPLIANCE
+    effects: Sequence[Effect] = (),
+    period: float = 1e-3,
+    compliance: float = COMPLIANCE,
+    tip: Tip = PATCH_TIP,
+    points: np.ndarray = ORIGIN,
+    neo_hookean: float | None = None,
 ) -> ContactModel:
-    """The contact model of the flat organ, one tool."""
-    return _organ((41, 41, 21), lambda x, y, z: z + 0 * x + 0 * y, effects, period, compliance)
+    """The contact model of the flat organ, one tool.
+
+    points : ndarray, shape (n, 3), whose displacement is shown: of the patch's nothing [m]
+    neo_hookean : Poisson's ratio of an organ of large strain, whose patches respond linearly
+    """
+    return _organ(
+        (41, 41, 21),
+        lambda x, y, z: z + 0 * x + 0 * y,
+        effects,
+        period,
+        compliance,
+        tip,
+        points,
+        neo_hookean,
+    )
 
 
 def ball_organ(compliance: float = COMPLIANCE) -> ContactModel:
@@ -46,6 +76,9 @@ def _organ(
     effects: Sequence[Effect],
     period: float,
     compliance: float,
+    tip: Tip = PATCH_TIP,
+    points: np.ndarray = ORIGIN,
+    neo_hookean: float | None = None,
 ) -> ContactModel:
     spacing, single = 3e-3, np.float32
     origin = -0.5 * spacing * (np.array(shape) - 1)
@@ -75,15 +108,25 @@ def _organ(
         contact_slot=slot,
         contact_block=blocks.block,
         softness=np.ones(1),
-        space=np.zeros((1, LANES, BLOCK), np.int16),
+        space=np.zeros((-(-3 * len(points) // BLOCK), LANES, BLOCK), np.int16),
         space_scale=np.zeros(LANES, single),
         near_start=np.zeros(2, np.int64),
         near_target=np.zeros(0, np.int32),
         near_block=np.zeros((0, 3, 3), single),
-        rest=np.zeros((1, 6), single),
-        tip_radius=np.array([RADIUS]),
+        rest=np.pad(points, ((0, 0), (0, 3))).astype(single),
+        tip_offset=np.array([tip.offset]),
     )
-    constants = selected_arrays(None, effects, None, None, 0.1, period)  # type: ignore[arg-type]
+    local = np.zeros((4, *shape), single)
+    local[STIFFNESS], local[TAKEN] = E_STAR, PATCH / (E_STAR * PATCH_RADIUS)
+    law, large = tip_law_arrays((tip,), MATERIAL, local), None
+    if neo_hookean is not None:
+        soft = replace(MATERIAL, poisson_ratio=neo_hookean)
+        law = tip_law_arrays((tip,), soft, local, neo_hookean=True)
+        large = LargeDeformationArrays(
+            np.zeros((3, *shape), single), np.zeros((2, 1, 0), single), np.zeros((2, 0, 3), single)
+        )
+    dent = dent_arrays((tip,), points, arrays.position, PATCH_RADIUS) if law else None
+    constants = selected_arrays(None, effects, None, large, 0.1, period, law, dent)  # type: ignore[arg-type]
     return make_model(Layout(arrays, constants))
 
 

@@ -219,7 +219,7 @@ def test_timing_finds_more_modes_slower(phantom_vademecum: Vademecum) -> None:
     """Medians over ten times the modes, so that no machine's noise decides."""
     v = phantom_vademecum
     assert v.certificate is not None and v.certificate.curve is not None
-    curve = v.certificate.curve.of("volume").like(Detail(1, "volume", "float32", 1.0))
+    curve = v.certificate.curve.like(Detail(1, "volume"))
     few, many = curve.points[0], curve.points[-1]
     found = timed(v, replace(curve, points=(few, many)))
     assert found.machine

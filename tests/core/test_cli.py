@@ -99,6 +99,8 @@ def test_wrong_unit(
         (["--material", "neo-hookean", "--element", "P1"], "P2"),
         (["--material", "neo-hookean", "--coordinate", "poisson=0.4:0.49"], "two vademecums"),
         (["--coordinate", "poisson=0.4:0.6"], "0.4999"),
+        (["--contact-sites", "2"], "at least 3"),
+        (["--contact-sites", "3", "--material", "neo-hookean"], "one linear material"),
     ],
 )
 def test_bad_option(

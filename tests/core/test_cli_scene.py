@@ -16,6 +16,7 @@ from avatar_core.contact.effects import Respiration
 from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import middle_of_access, push_and_slide
 from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene import file as scene_file
 from avatar_core.scene.file import read_scene, scene_path, shipped_scene, shipped_scenes
 from avatar_core.scene.model import Scene, Tool
@@ -105,10 +106,15 @@ def test_check_says_every_number_with_its_unit(run: Any, name: str) -> None:
     assert (code, err) == (0, "")
     one = read_scene(scene_path(name))
     for tool in one.tools:
-        assert f"tool {tool.name}: tip radius {tool.tip_radius:g} m\n" in out
+        assert f"tool {tool.name}: {tool.tip.shape}, radius {tool.tip.radius:g} m" in out
     for effect in one.effects:
         assert f"{effect.name} " in out and effect.text in out
     assert "give --vademecum FILE.h5" in out
+
+
+def test_check_says_every_number_of_a_tip(run: Any) -> None:
+    _, out, _ = run("check", "needle_probe")
+    assert "tool tool: rounded_cone, radius 0.004 m, half_angle 30 deg, rounding 0.0015 m\n" in out
 
 
 def test_check_says_units_outputs_and_what_combines(run: Any) -> None:
@@ -249,7 +255,7 @@ def test_tools_push_and_slide_without_a_jump(phantom_vademecum: Vademecum) -> No
     )
     assert path.shape == (600, 3)
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 0.5e-3
-    model = prepare(phantom_vademecum, (radius,), cloud="off", effects=())
+    model = prepare(phantom_vademecum, (Tip("sphere", radius),), cloud="off", effects=())
     gaps = []
     for tip in path:
         assert step(model, tip[None]) == 0
@@ -261,7 +267,7 @@ def test_tools_push_and_slide_without_a_jump(phantom_vademecum: Vademecum) -> No
 
 def test_tools_follow_the_breath(phantom_vademecum: Vademecum) -> None:
     """What they feel on an organ that moves is what they feel on one at rest."""
-    tools = (Tool("tool", 5e-3),)
+    tools = (Tool("tool"),)
     breath = Respiration(period=0.5)
     still = _prepared(phantom_vademecum, Scene(tools=tools, cloud="off"), "bare")
     moved = _prepared(

@@ -19,16 +19,24 @@ from avatar_core.contact.model import (
 from avatar_core.contact.tip_response import closest_weights
 from avatar_core.contact.tool_path import inner_positions, middle_of_access, palpation, slide
 from avatar_core.errors import ContactError
+from avatar_core.geometry.tip import Tip
 from avatar_core.offline.linear import with_rank
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
 
 RADIUS = 5e-3
+SPHERE, PATCH = Tip("sphere", RADIUS), Tip("patch", RADIUS)
 
 
 @pytest.fixture()
 def model(phantom_vademecum: Vademecum) -> ContactModel:
-    return prepare(phantom_vademecum, (RADIUS,), cloud="volume")
+    return prepare(phantom_vademecum, (SPHERE,), cloud="volume")
+
+
+@pytest.fixture()
+def patch(phantom_vademecum: Vademecum) -> ContactModel:
+    """The load that a vademecum was computed for, and its certificate is about."""
+    return prepare(phantom_vademecum, (PATCH,), cloud="volume")
 
 
 def push(v: Vademecum, depth: float, position: int | None = None) -> np.ndarray:
@@ -43,8 +51,8 @@ def test_no_force_without_contact(phantom_vademecum: Vademecum, model: ContactMo
     np.testing.assert_array_equal(model.out.cloud[:, 3:], 0.0)
 
 
-def test_force_equals_full_finite_elements(
-    phantom_vademecum: Vademecum, model: ContactModel
+def test_force_of_a_patch_equals_full_finite_elements(
+    phantom_vademecum: Vademecum, patch: ContactModel
 ) -> None:
     """lambda = indentation / (n . C n), C from fresh solves, as well as the certificate says."""
     from avatar_core.fem.elasticity import Elasticity
@@ -54,13 +62,13 @@ def test_force_equals_full_finite_elements(
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
     errors = []
     for j in np.random.default_rng(3).choice(inner_positions(v), 8, replace=False):
-        model.reset()
-        assert step(model, push(v, 3e-3, j)) == Status.OK
-        s = model.state.point
+        patch.reset()
+        assert step(patch, push(v, 3e-3, j)) == Status.OK
+        s = patch.state.point
         n = patch_normals(v.mesh, s, v.surface.patch_radius)[0]
         load = patch_loads(problem, s, v.surface.patch_radius)
         compliance = n @ (load.T @ problem.solve(load)) @ n
-        errors.append(abs(model.state.force[0] * compliance / -model.state.gap[0] - 1.0))
+        errors.append(abs(patch.state.force[0] * compliance / -patch.state.gap[0] - 1.0))
     assert v.certificate is not None
     assert np.mean(errors) < 2.0 * v.certificate.tip_force_mean
     assert np.max(errors) < 1.5 * v.certificate.tip_force_worst
@@ -72,24 +80,24 @@ def test_patch_does_not_penetrate(phantom_vademecum: Vademecum, model: ContactMo
         assert model.out.contact_penetration[0] < 1e-5
 
 
-def test_action_is_reaction(phantom_vademecum: Vademecum, model: ContactModel) -> None:
+def test_action_is_reaction(phantom_vademecum: Vademecum, patch: ContactModel) -> None:
     """The organ is displaced by the opposite of the normal force on the tool."""
     v = phantom_vademecum
-    step(model, push(v, 5e-3))
-    n, force = model.state.normal[0], model.out.force[0]
+    step(patch, push(v, 5e-3))
+    n, force = patch.state.normal[0], patch.out.force[0]
     # the rest is tangential: towards softer tissue
-    assert force @ n == pytest.approx(model.state.force[0], rel=0.02)
+    assert force @ n == pytest.approx(patch.state.force[0], rel=0.02)
     # the load on the organ is scaled so that its patch moves by the indentation
-    scale = model.state.scale[0]
+    scale = patch.state.scale[0]
     assert scale == pytest.approx(1.0, abs=0.05)
-    load = -n * model.state.force[0] * scale
-    cloud = model.out.cloud[:, 3:].ravel()
+    load = -n * patch.state.force[0] * scale
+    cloud = patch.out.cloud[:, 3:].ravel()
     # the step's own weights; its near field leaves out those below 2 %
-    field = v.displacement(*carriers(model)) @ load
+    field = v.displacement(*carriers(patch)) @ load
     assert np.linalg.norm(cloud - field) < 0.005 * np.linalg.norm(field)
     np.testing.assert_allclose(cloud, field, atol=0.05 * np.abs(field).max())
     # the surface point below: the tip's weights are blurred over 1.5 mm around it
-    field = v.displacement(*at_closest_point(v, model)) @ load
+    field = v.displacement(*at_closest_point(v, patch)) @ load
     assert np.linalg.norm(cloud - field) < 0.01 * np.linalg.norm(field)
 
 
@@ -140,7 +148,7 @@ def test_closed_paths_do_no_work(phantom_vademecum: Vademecum, model: ContactMod
 
 @pytest.mark.long
 def test_closed_paths_on_real_livers_do_no_work(real_vademecum: Vademecum) -> None:
-    worst = closed_path_work(real_vademecum, prepare(real_vademecum, (RADIUS,)), 300, seed=1)
+    worst = closed_path_work(real_vademecum, prepare(real_vademecum, (SPHERE,)), 300, seed=1)
     print(f"{real_vademecum.name}: work at most {worst:.2%} of the peak stored energy")
     assert worst < 0.01
 
@@ -148,21 +156,22 @@ def test_closed_paths_on_real_livers_do_no_work(real_vademecum: Vademecum) -> No
 @pytest.mark.long
 @pytest.mark.parametrize("depth", [2e-3, 5e-3])
 def test_sliding_force_on_real_livers_has_no_steps(real_vademecum: Vademecum, depth: float) -> None:
-    """99 % change by less than 2 % of the peak per 0.1 mm; a sharp fold may be steeper.
+    """99 % change by less than 2 % of the peak per 0.1 mm, besides turning as the surface does.
 
-    How steep is the mesh's: once in many slides 3 to 6 %. A slope, walked ten times finer, changes
-    by a tenth per step; a step by all of it.
+    Facets meet at edges, over which the normal turns by up to 0.05 a step and the force with it. A
+    slope, walked ten times finer, changes by a tenth per step; a step by all of it.
     """
-    v, model = real_vademecum, prepare(real_vademecum, (RADIUS,))
+    v, model = real_vademecum, prepare(real_vademecum, (SPHERE,))
     others = np.random.default_rng(3).choice(inner_positions(v, 20e-3), 4, replace=False)
     slides = [force_steps(v, model, depth, j) for j in (None, *others)]
-    coarse, fine, peak = (np.array(values) for values in zip(*slides, strict=True))
+    size, coarse, fine, peak = (np.array(values) for values in zip(*slides, strict=True))
     print(
         f"{v.name}: largest force step {coarse.max():.2%} of the peak per 0.1 mm, 99 % within "
-        f"{np.quantile(coarse, 0.99):.2%}; {fine.max():.2%} per 0.01 mm"
+        f"{np.quantile(coarse, 0.99):.2%}, in size {np.quantile(size, 0.99):.2%}; "
+        f"{fine.max():.2%} per 0.01 mm"
     )
-    assert (peak > 0.5).all()
-    assert np.quantile(coarse, 0.99) < 0.02
+    assert (peak > 0.3).all()
+    assert np.quantile(size, 0.99) < 0.02
     steepest = np.maximum(coarse.max(axis=1), 0.02)
     assert (fine.max(axis=1) < steepest / 4).all()
 
@@ -170,7 +179,7 @@ def test_sliding_force_on_real_livers_has_no_steps(real_vademecum: Vademecum, de
 @pytest.mark.long
 def test_a_tip_may_press_at_every_inner_position(real_vademecum: Vademecum) -> None:
     """5 mm deep, straight in along the normal of the undeformed surface."""
-    v, model = real_vademecum, prepare(real_vademecum, (RADIUS,))
+    v, model = real_vademecum, prepare(real_vademecum, (SPHERE,))
     refused = []
     for j in inner_positions(v, 20e-3):
         model.reset()
@@ -182,18 +191,21 @@ def test_a_tip_may_press_at_every_inner_position(real_vademecum: Vademecum) -> N
 
 def force_steps(
     v: Vademecum, model: ContactModel, depth: float, position: int | None = None
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Force steps over 200 mm at constant depth, 0.1 mm each; and 0.01 mm where it changes most.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Force steps over 200 mm at constant depth, 0.1 mm each, in size alone and in all; and 0.01
+    mm where it changes most.
 
-    Both as part of the peak, and the peak [N].
+    All as part of the peak, and the peak [N].
     """
     path = slide(v, RADIUS, depth, 0.2, position=position)
     forces = forces_along(model, path)
-    peak = np.linalg.norm(forces, axis=1).max()
+    size = np.linalg.norm(forces, axis=1)
+    peak = size.max()
     steps = np.linalg.norm(np.diff(forces, axis=0), axis=1) / peak
     k = int(steps.argmax())
     fine = forces_along(model, np.concatenate([path[:k], refined(path[k : k + 2], 10)]))[k:]
-    return steps, np.linalg.norm(np.diff(fine, axis=0), axis=1) / peak, float(peak)
+    finer = np.linalg.norm(np.diff(fine, axis=0), axis=1) / peak
+    return np.abs(np.diff(size)) / peak, steps, finer, float(peak)
 
 
 def forces_along(model: ContactModel, path: np.ndarray) -> np.ndarray:
@@ -259,8 +271,8 @@ def test_sliding_force_has_no_steps(
     phantom_vademecum: Vademecum, model: ContactModel, depth: float
 ) -> None:
     """200 mm at constant depth in steps of 0.1 mm: no step above 2 % of the peak force."""
-    coarse, fine, peak = force_steps(phantom_vademecum, model, depth)
-    assert peak > 1.0
+    _, coarse, fine, peak = force_steps(phantom_vademecum, model, depth)
+    assert peak > 0.3  # a sphere on a half-space: 0.6 and 7 N
     assert coarse.max() < 0.02
     assert fine.max() < 0.02 / 4
 
@@ -268,7 +280,7 @@ def test_sliding_force_has_no_steps(
 def test_small_tip_is_felt_between_vertices(phantom_vademecum: Vademecum) -> None:
     """A 2 mm tip over face centroids: as much force as over the vertices around."""
     v = phantom_vademecum
-    small = prepare(v, (2e-3,))
+    small = prepare(v, (Tip("sphere", 2e-3),))
     inner = set(inner_positions(v).tolist())
     for corners in v.surface.corners[::15]:
         if not inner.issuperset(corners.tolist()):
@@ -282,7 +294,7 @@ def test_small_tip_is_felt_between_vertices(phantom_vademecum: Vademecum) -> Non
 def test_two_tools_share_the_organ(phantom_vademecum: Vademecum) -> None:
     """With a second tool pressing beside, the organ has sunk and the first force is smaller."""
     v = phantom_vademecum
-    two = prepare(v, (RADIUS, RADIUS))
+    two = prepare(v, (SPHERE,) * 2)
     a = middle_of_access(v)
     inner = inner_positions(v)
     distance = np.linalg.norm(v.surface.centers[inner] - v.surface.centers[a], axis=1)
@@ -302,7 +314,7 @@ def test_coupled_forces_are_the_derivative_of_the_energy(
     phantom_vademecum: Vademecum, distance: float
 ) -> None:
     v = phantom_vademecum
-    two = prepare(v, (RADIUS, RADIUS))
+    two = prepare(v, (SPHERE,) * 2)
     a, inner = middle_of_access(v), inner_positions(v)
     apart = np.linalg.norm(v.surface.centers[inner] - v.surface.centers[a], axis=1)
     b = int(inner[np.argmin(abs(apart - distance))])
@@ -345,7 +357,7 @@ def test_compliance_between_tips_on_real_livers(real_vademecum: Vademecum) -> No
 def active_set_spectrum(v: Vademecum, n_sets: int, seed: int) -> tuple[float, float]:
     """Of 2 to 8 tips at random: least eigenvalue and largest asymmetry over the mean diagonal."""
     rng = np.random.default_rng(seed)
-    model = prepare(v, (RADIUS,) * 8, cloud="off")
+    model = prepare(v, (SPHERE,) * 8, cloud="off")
     faces = v.surface.corners
     smallest, asymmetry, seen = np.inf, 0.0, 0
     for _ in range(n_sets):
@@ -369,15 +381,15 @@ def active_set_spectrum(v: Vademecum, n_sets: int, seed: int) -> tuple[float, fl
     return smallest, asymmetry
 
 
-def test_force_is_proportional_to_indentation(
-    phantom_vademecum: Vademecum, model: ContactModel
+def test_force_of_a_patch_is_proportional_to_its_depth(
+    phantom_vademecum: Vademecum, patch: ContactModel
 ) -> None:
     """Linear elasticity: lambda / (-gap) does not depend on depth at one surface point."""
     v = phantom_vademecum
     ratio = []
     for depth in (0.5e-3, 1e-3, 2e-3):
-        step(model, push(v, depth))
-        ratio.append(model.state.force[0] / -model.state.gap[0])
+        step(patch, push(v, depth))
+        ratio.append(patch.state.force[0] / -patch.state.gap[0])
     np.testing.assert_allclose(ratio, ratio[0], rtol=5e-3)  # s moves with the tip by < 0.1 mm
 
 
@@ -425,9 +437,8 @@ def test_clamped_side_is_out_of_range(phantom_vademecum: Vademecum, model: Conta
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tip_radii": ()}, "tools"),
-        ({"tip_radii": (1e-3,)}, "tip radius"),
-        ({"tip_radii": (float("nan"),)}, "tip radius"),
+        ({"tips": ()}, "tools"),
+        ({"tips": (SPHERE, PATCH)}, "all tools tips, or all patches"),
         ({"modes": 0}, "modes"),
         ({"modes": 10**6}, "modes"),
         ({"cloud": "fog"}, "cloud"),
@@ -441,7 +452,7 @@ def test_impossible_model_is_refused(
 
 
 def test_each_tool_has_its_own_status(phantom_vademecum: Vademecum) -> None:
-    two = prepare(phantom_vademecum, (RADIUS, RADIUS))
+    two = prepare(phantom_vademecum, (SPHERE,) * 2)
     tips = np.concatenate([push(phantom_vademecum, 3e-3), [[np.nan, 0.0, 0.0]]])
     assert step(two, tips) == Status.INVALID_POSE
     assert two.out.status.tolist() == [Status.OK, Status.INVALID_POSE]
@@ -451,7 +462,7 @@ def test_each_tool_has_its_own_status(phantom_vademecum: Vademecum) -> None:
 def test_solve_then_deform_is_a_step(phantom_vademecum: Vademecum, model: ContactModel) -> None:
     tip = push(phantom_vademecum, 4e-3)
     step(model, tip)
-    halves = prepare(phantom_vademecum, (RADIUS,), cloud="volume", halves=True)
+    halves = prepare(phantom_vademecum, (SPHERE,), cloud="volume", halves=True)
     halves.out.cloud[:] = 0.0
     assert solve(halves, tip) == Status.OK
     np.testing.assert_allclose(halves.out.force, model.out.force, rtol=1e-14)
@@ -468,7 +479,7 @@ def test_warm_up_compiles_what_a_vademecum_needs(phantom_vademecum: Vademecum) -
 
     warm_up(1)
     before = len(contact_kernels.contact_solve.signatures)
-    prepare(phantom_vademecum, (RADIUS,), cloud="volume", halves=True)
+    prepare(phantom_vademecum, (SPHERE,), cloud="volume", halves=True)
     assert len(contact_kernels.contact_solve.signatures) == before
 
 

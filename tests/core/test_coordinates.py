@@ -17,6 +17,7 @@ from avatar_core.fem.elasticity import Elasticity, Inclusion, Material
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
 from avatar_core.geometry.tumour import volume_fraction_inside
 from avatar_core.offline.certify.linear import certify
 from avatar_core.offline.pipeline import OrganOptions, build
@@ -250,7 +251,7 @@ def _point(position: int) -> tuple[np.ndarray, np.ndarray]:
 def test_a_stiffer_organ_pushes_back_harder(organ: Vademecum) -> None:
     force = []
     for values in ({"young": 0.1e6}, {"young": 0.3e6}):
-        model = prepare(at_values(organ, values), (5e-3,))
+        model = prepare(at_values(organ, values), (Tip("sphere", 5e-3),))
         path = palpation(organ, 5e-3, 4e-3, 9)
         step(model, path[4][None])
         force.append(np.linalg.norm(model.out.force))
@@ -260,7 +261,10 @@ def test_a_stiffer_organ_pushes_back_harder(organ: Vademecum) -> None:
 def test_a_hard_inclusion_is_felt(
     organ: Vademecum, problem: Elasticity, tumour: SurfaceMesh
 ) -> None:
-    """The force rises over the tumour as full finite elements say, and only if the scene has it."""
+    """The force rises over the tumour as full finite elements say, and only if the scene has it.
+
+    Of the patch, which full finite elements are loaded by.
+    """
     surface = organ.surface
     distance = np.linalg.norm(surface.centers - tumour.vertices.mean(axis=0), axis=1)
     j = min(inner_positions(organ), key=lambda i: distance[i])
@@ -268,7 +272,7 @@ def test_a_hard_inclusion_is_felt(
     felt, full = [], []
     for contrast in (1.0, 10.0):
         effects = (Tumour(contrast),) if contrast != 1.0 else ()
-        model = prepare(organ, (5e-3,), cloud="off", effects=effects)
+        model = prepare(organ, (Tip("patch", 5e-3),), cloud="off", effects=effects)
         assert step(model, tip) == Status.OK
         felt.append(model.state.force[0])
         here = problem_at(problem, {"poisson": organ.material.poisson_ratio, "contrast": contrast})
@@ -286,12 +290,12 @@ def test_a_tumour_that_no_file_has_is_refused(organ: Vademecum) -> None:
 
 
 def test_tips_stay_in_contact_when_the_material_changes(organ: Vademecum) -> None:
-    before = prepare(organ, (5e-3,))
+    before = prepare(organ, (Tip("sphere", 5e-3),))
     path = palpation(organ, 5e-3, 15e-3, 400)
     for tip in path[:200]:
         step(before, tip[None].copy())
     assert before.out.force.any()
-    after = prepare(at_values(organ, {"young": 0.3e6}), (5e-3,))
+    after = prepare(at_values(organ, {"young": 0.3e6}), (Tip("sphere", 5e-3),))
     after.resume(before)
     step(after, path[200][None].copy())
     assert np.linalg.norm(after.out.force) > np.linalg.norm(before.out.force)

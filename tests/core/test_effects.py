@@ -20,7 +20,7 @@ from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
 from avatar_core.vademecum.model import Vademecum
-from tests.core.effect_cases import CHOICES, TIP, forces, push_and_drag
+from tests.core.effect_cases import CHOICES, PATCH, SPHERE, TIP, forces, push_and_drag
 
 # --- Absent when off ----------------------------------------------------------------------------
 
@@ -30,8 +30,8 @@ def test_an_effect_is_absent_from_the_step_when_off(
     phantom_vademecum: Vademecum, name: str
 ) -> None:
     """No argument of the compiled step, no array in the model: only None."""
-    without = prepare(phantom_vademecum, (TIP,), cloud="off", effects=())
-    with_it = prepare(phantom_vademecum, (TIP,), cloud="off", effects=(CHOICES[name],))
+    without = prepare(phantom_vademecum, (PATCH,), cloud="off", effects=())
+    with_it = prepare(phantom_vademecum, (PATCH,), cloud="off", effects=(CHOICES[name],))
     assert getattr(without.effects, name) is None
     assert getattr(with_it.effects, name) is not None
     assert all(value is None for value in without.effects)
@@ -41,24 +41,27 @@ def test_an_effect_is_absent_from_the_step_when_off(
 
 
 def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -> None:
-    """Its last argument is eight times none."""
+    """Its last argument is none, but for the law of a tip that is no patch."""
     import numba
 
     from avatar_core.contact import kernels
 
-    model = prepare(phantom_vademecum, (TIP,), cloud="off", effects=())
-    arguments = (model.arrays, model.state, model.out, model.tips, model.effects)
-    signature = tuple(numba.typeof(argument) for argument in arguments)
-    assert [str(kind) for kind in signature[4]] == ["none"] * 8
-    assert signature in kernels.contact_step.overloads
+    for tip in (PATCH, SPHERE):
+        model = prepare(phantom_vademecum, (tip,), cloud="off", effects=())
+        arguments = (model.arrays, model.state, model.out, model.tips, model.effects)
+        signature = tuple(numba.typeof(argument) for argument in arguments)
+        *others, law, dent = (str(kind) for kind in signature[4])
+        assert others == ["none"] * 8
+        assert (law == "none") == (dent == "none") == (tip is PATCH)
+        assert signature in kernels.contact_step.overloads
 
 
 @pytest.mark.parametrize("name", [name for name in CHOICES if name != "several_tools"])
 def test_an_effect_changes_the_result_when_on(phantom_vademecum: Vademecum, name: str) -> None:
     effect = CHOICES[name]
     path = push_and_drag(phantom_vademecum)
-    bare = forces(prepare(phantom_vademecum, (TIP,), cloud="off", effects=()), path)
-    changed = forces(prepare(phantom_vademecum, (TIP,), cloud="off", effects=(effect,)), path)
+    bare = forces(prepare(phantom_vademecum, (SPHERE,), cloud="off", effects=()), path)
+    changed = forces(prepare(phantom_vademecum, (SPHERE,), cloud="off", effects=(effect,)), path)
     assert np.abs(bare).max() > 1.0
     assert np.abs(changed - bare).max() > 1e-3 * np.abs(bare).max()
 
@@ -69,7 +72,7 @@ def test_the_list_of_effects_is_complete() -> None:
 
 def test_a_layout_survives_being_flat(phantom_vademecum: Vademecum) -> None:
     effects = tuple(CHOICES.values())
-    layout = lay_out(phantom_vademecum, (TIP,), effects=effects)
+    layout = lay_out(phantom_vademecum, (SPHERE,), effects=effects)
     again = Layout.of(layout.flat())
     for a, b in zip(layout.effects, again.effects, strict=True):
         assert (a is None) == (b is None)
@@ -81,7 +84,7 @@ def test_a_layout_survives_being_flat(phantom_vademecum: Vademecum) -> None:
 
 def test_two_tools_without_the_effect_are_refused(phantom_vademecum: Vademecum) -> None:
     with pytest.raises(SceneError, match="2 tools without several_tools"):
-        prepare(phantom_vademecum, (TIP, TIP), effects=())
+        prepare(phantom_vademecum, (SPHERE,) * 2, effects=())
 
 
 @pytest.mark.long
@@ -89,7 +92,7 @@ def test_everything_at_once_stays_sane(phantom_vademecum: Vademecum) -> None:
     """Two tools, all effects, ten seconds of touching: finite, bounded, and at rest in the end."""
     v = phantom_vademecum
     effects = tuple(CHOICES.values())
-    model = prepare(v, (TIP, TIP), cloud="surface", effects=effects)
+    model = prepare(v, (SPHERE,) * 2, cloud="surface", effects=effects)
     inner = inner_positions(v)
     rng = np.random.default_rng(0)
     peak = 0.0
@@ -144,4 +147,4 @@ def test_a_vademecum_without_the_organs_mass_says_what_builds_one(
     old = replace(phantom_vademecum, body=None)
     for effect in (SelfWeight(), Inertia()):
         with pytest.raises(SceneError, match="avatar vademecum"):
-            prepare(old, (TIP,), effects=(effect,))
+            prepare(old, (SPHERE,), effects=(effect,))

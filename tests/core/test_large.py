@@ -20,6 +20,7 @@ from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.newton import NewtonRule, solve
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.geometry.tip import Tip
 from avatar_core.offline import pipeline as organ
 from avatar_core.offline.certify.combinations import (
     COMBINATIONS,
@@ -47,12 +48,13 @@ from tests.core.test_contact import carriers, energy_slope
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 RADIUS = 5e-3
+SPHERE, PATCH = Tip("sphere", RADIUS), Tip("patch", RADIUS)
 both = pytest.mark.parametrize("material", ["neo-hookean", "st-venant-kirchhoff"])
 
 
 @pytest.fixture()
 def model(bent: Vademecum) -> ContactModel:
-    return prepare(bent, (RADIUS,), cloud="volume")
+    return prepare(bent, (PATCH,), cloud="volume")
 
 
 def tip_at(v: Vademecum, depth: float, position: int) -> np.ndarray:
@@ -329,7 +331,7 @@ def test_a_scene_is_refused_where_the_file_says_that_its_effects_combine_badly(
 # --- contact ----------------------------------------------------------------------------------
 
 
-def test_tip_feels_the_bent_force(bent: Vademecum, model: ContactModel) -> None:
+def test_a_patch_feels_the_bent_force(bent: Vademecum, model: ContactModel) -> None:
     """As the file says at the load position, but for the smoothing of what a tip feels."""
     middle = bent.surface.centers[middle_of_access(bent)]
     distance = np.linalg.norm(bent.surface.centers - middle, axis=1)
@@ -349,6 +351,28 @@ def test_tip_feels_the_bent_force(bent: Vademecum, model: ContactModel) -> None:
         assert felt == pytest.approx(depth, rel=1e-6)
 
 
+def test_a_deep_push_is_as_right_as_a_light_one(bent: Vademecum, model: ContactModel) -> None:
+    """At all depths the step feels what the vademecum itself says of the load position.
+
+    A wider kernel would take the response of faces beside and behind into that of a deep tip,
+    which would then be too stiff.
+    """
+    ratio = []
+    for j in inner_positions(bent)[::4]:
+        row = []
+        for depth in (2e-3, 15e-3):
+            model.reset()
+            step(model, tip_at(bent, 1e-3, j))
+            step(model, tip_at(bent, depth, j))
+            own, _ = bent.push_to(np.array([j]), np.ones(1), -model.state.gap[0])
+            row.append(model.state.force[0] / own)
+        ratio.append(row)
+    light, deep = np.array(ratio).T
+    assert np.median(light) == pytest.approx(1.0, abs=0.03)
+    assert np.median(deep / light) == pytest.approx(1.0, abs=0.03)
+    assert np.quantile(np.abs(deep / light - 1.0), 0.8) < 0.1
+
+
 def test_cloud_is_the_bent_field(bent: Vademecum, model: ContactModel) -> None:
     """Linear under the force, and bent as at the depth that the tip feels."""
     v, state = bent, model.state
@@ -358,7 +382,8 @@ def test_cloud_is_the_bent_field(bent: Vademecum, model: ContactModel) -> None:
     positions, weights = carriers(model)
     linear = replace(v, large=None)
     force = state.force[0] * state.scale[0]
-    straight = linear.push(positions, weights, force).displacement
+    # along the normal of the step, which is not quite that of the patch
+    straight = v.displacement(positions, weights) @ (-state.normal[0] * force)
     felt = state.self_compliance[0] * state.force[0]
     same = force * felt / linear.push(positions, weights, force).depth  # as deep, on the surface
     bend = v.push(positions, weights, same).displacement
@@ -373,7 +398,7 @@ def test_force_is_the_derivative_of_the_energy(bent: Vademecum, share: float) ->
     """Within the stored range, and where it goes on tangentially."""
     assert bent.large is not None
     short = replace(bent, large=replace(bent.large, reach=np.full_like(bent.large.reach, 8e-3)))
-    model = prepare(short, (RADIUS,), cloud="volume")  # the compiled step of the other tests
+    model = prepare(short, (PATCH,), cloud="volume")  # the compiled step of the other tests
     rng = np.random.default_rng(2)
     for j in rng.choice(inner_positions(bent), 4):
         model.reset()
@@ -388,7 +413,7 @@ def test_force_is_the_derivative_of_the_energy(bent: Vademecum, share: float) ->
 
 @pytest.mark.long
 def test_two_tips_stay_coupled(bent: Vademecum) -> None:
-    model = prepare(bent, (RADIUS, RADIUS), cloud="off")
+    model = prepare(bent, (SPHERE,) * 2, cloud="off")
     one, other = inner_positions(bent)[[0, 20]]
     tips = np.vstack([tip_at(bent, 4e-3, one), tip_at(bent, 4e-3, other)])
     assert step(model, tips) in (Status.OK, Status.EXTRAPOLATED)

@@ -204,7 +204,7 @@ def test_too_narrow_a_band_raises(phantom):
 # --- real livers ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("step", [5, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("step", [10, pytest.param(1, marks=pytest.mark.long)])
 def test_no_wrong_sign_on_real_livers(livers_dir, step):
     rng = np.random.default_rng(7)
     for path in sorted(livers_dir.glob("*.obj"))[::step]:
@@ -216,7 +216,14 @@ def test_no_wrong_sign_on_real_livers(livers_dir, step):
         assert np.array_equal(signed_distance(points, surface) < 0, winding > 0.5), path.stem
 
 
-@pytest.mark.parametrize("name", ["LiTS-4", "LiTS-16", "LiTS-60", "LiTS-23"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "LiTS-16",
+        "LiTS-23",
+        *(pytest.param(n, marks=pytest.mark.long) for n in ("LiTS-4", "LiTS-60")),
+    ],
+)
 def test_volume_of_a_real_liver(livers_dir, name):
     surface = read_surface(livers_dir / f"{name}.obj")
     assert surface.is_watertight  # otherwise its own volume is a quadrature
@@ -417,7 +424,7 @@ def test_orientation_ignores_place_and_size(phantom):
 
 
 TURNED = {f"LiTS-{n}" for n in (6, 7, 8, 9, 10)}
-UPRIGHT = ("Amos-007", "LiTS-4")  # of two sources
+UPRIGHT = "Amos-007"  # of another source
 
 
 def turns(files, phantom):
@@ -428,10 +435,10 @@ def turns(files, phantom):
 
 
 def test_turned_livers_warn_and_upright_ones_do_not(livers_dir, phantom):
-    """Two of each kind; the long test below asks all."""
-    some = sorted(TURNED)[:2]
-    files = [livers_dir / f"{name}.obj" for name in (*some, *UPRIGHT)]
-    assert turns(files, phantom)[1] == set(some)
+    """One of each kind; the long test below asks all."""
+    some = sorted(TURNED)[0]
+    files = [livers_dir / f"{name}.obj" for name in (some, UPRIGHT)]
+    assert turns(files, phantom)[1] == {some}
 
 
 @pytest.mark.long

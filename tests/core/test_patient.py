@@ -9,19 +9,15 @@ import pytest
 import scipy.sparse as sp
 
 from avatar_core.atlas.base import PatientBase, PatientError, leave_one_out
-from avatar_core.atlas.patient import (
-    PatientOptions,
-    PatientProblem,
-    build_patient,
-    patient_problem,
-    patient_vademecum,
-)
+from avatar_core.atlas.patient import PatientOptions, build_patient, patient_vademecum
+from avatar_core.atlas.patient_problem import PatientProblem, patient_problem
 from avatar_core.atlas.transfer import combine, kriging, patient_weights
 from avatar_core.errors import LLEError
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.patch_loads import load_surface, patch_loads
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver, population
+from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.reduction.galerkin import (
     GalerkinBasis,
     ReductionRule,
@@ -36,6 +32,7 @@ from avatar_core.shapes.registration import (
     SimilarityTransform,
     Template,
 )
+from tests.stored import stored
 
 N_BASE = 5
 ROOMY = ReductionRule(n_start=20, n_block=6, n_probes=8, max_solution_fraction=0.6)
@@ -66,23 +63,37 @@ def case() -> Case:
     loads = load_surface(mesh, template.regions)
     maps = population(N_BASE + 1, seed=3, bend=0.01)
     vertices = np.array([shape(mesh.vertices) for shape in maps])
-    responses = []
-    for placed in vertices[:-1]:
-        elasticity = Elasticity(TetMesh(placed, mesh.tets), Material(), template.regions.clamped)
-        middle = maps[len(responses)](loads.centers)
-        responses.append(
-            compact_response(elasticity, patch_loads(elasticity, middle, loads.patch_radius), 40)
-        )
     names = tuple(f"phantom-{i}" for i in range(N_BASE))
-    base = PatientBase(template, loads, Material(), names, vertices[:-1], responses)
+    base = PatientBase(template, loads, Material(), names, vertices[:-1], _responses())
     surface = replace(maps[-1].moved(organ), name="patient")
     registration = _registration(template, vertices[-1])
-    problem = patient_problem(surface, base, registration, tetrahedralize(surface, 350))
+    problem = patient_problem(surface, base, registration, _patient_mesh())
     patches = patch_loads(
         problem.elasticity, problem.loads.centers, problem.loads.patch_radius
     ).tocsr()
     exact = problem.elasticity.at_vertices(problem.elasticity.solve(patches))
     return Case(base, problem, patches, exact)
+
+
+@stored
+def _responses() -> list[CompactResponse]:
+    """Of the anatomies of the base."""
+    mesh = tetrahedralize(phantom_liver(0.012), 300)
+    regions = regions_by_rule(mesh)
+    loads, responses = load_surface(mesh, regions), []
+    for shape in population(N_BASE + 1, seed=3, bend=0.01)[:-1]:
+        elasticity = Elasticity(
+            TetMesh(shape(mesh.vertices), mesh.tets), Material(), regions.clamped
+        )
+        patches = patch_loads(elasticity, shape(loads.centers), loads.patch_radius)
+        responses.append(compact_response(elasticity, patches, 40))
+    return responses
+
+
+@stored
+def _patient_mesh() -> TetMesh:
+    surface = population(N_BASE + 1, seed=3, bend=0.01)[-1].moved(phantom_liver(0.012))
+    return tetrahedralize(surface, 350)
 
 
 def _error(case: Case, estimate: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from avatar_core.contact.effects.selection import default_effects
 from avatar_core.contact.model import FAR_AWAY, prepare
 from avatar_core.contact.tool_path import push_and_slide
 from avatar_core.errors import StorageError
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.recording import Clouds, Periods, Recording, load_recording, save_recording
@@ -26,6 +27,7 @@ from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 
 RADIUS = 5e-3
+SPHERE = Tip("sphere", RADIUS)
 SAME = 1e-9  # [N], as promised; the difference is 0 in fact
 VISCOUS = Viscoelasticity(g=(0.3,), tau=(0.1,))
 
@@ -43,7 +45,7 @@ def recorded(vademecum: Vademecum, effects: Sequence[Effect], skipped: int = 0) 
     tips = np.concatenate([np.full((20, 1, 3), FAR_AWAY), tips, np.full((5, 1, 3), FAR_AWAY)])
     turn = np.zeros(tips.shape)
     turn[500:600] = [0.0, 1e-3, 0.0]
-    model = prepare(vademecum, (RADIUS,), cloud="off", effects=effects, halves=True)
+    model = prepare(vademecum, (SPHERE,), cloud="off", effects=effects, halves=True)
     force, status = np.empty(tips.shape), np.empty((len(tips), 1), np.uint8)
     for k, tip in enumerate(tips):
         if model.effects.friction is not None:
@@ -165,6 +167,12 @@ def test_another_vademecum_is_refused(organ: Vademecum) -> None:
     other = replace(recorded(organ, ()), vademecum_id="0" * 64)
     with pytest.raises(StorageError, match="give the file it was made with"):
         replay(other, organ)
+
+
+def test_a_scene_of_an_earlier_version_is_refused(organ: Vademecum) -> None:
+    old = replace(recorded(organ, ()), scene="tools: [{name: tool, tip_radius: 0.005}]")
+    with pytest.raises(StorageError, match=r"tip_radius is of an earlier version; record again, "):
+        replay(old, organ)
 
 
 def test_a_spoilt_file_is_refused(organ: Vademecum, tmp_path: Path) -> None:

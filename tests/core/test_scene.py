@@ -19,6 +19,7 @@ from avatar_core.contact.effects import (
     Tumour,
 )
 from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.scene.model import REFUSED, Combination, Scene, Tool, combinations
 from avatar_core.vademecum.at_values import at_values
@@ -83,10 +84,32 @@ def test_a_tool_has_a_name_that_ros_takes(name: str) -> None:
         Tool(name)
 
 
-@pytest.mark.parametrize("radius", [0.0019, 0.0201, float("inf"), "5 mm"])
-def test_a_tool_has_a_tip_that_the_step_can_carry(radius: Any) -> None:
-    with pytest.raises(SceneError, match=r"probe\.tip_radius is .* 0\.002 to 0\.02 m"):
-        Tool("probe", radius)
+@pytest.mark.parametrize("radius", [0, 0.00099, 0.0201, float("inf"), float("nan"), True, "5 mm"])
+def test_a_tip_has_a_radius_that_the_step_can_carry(radius: Any) -> None:
+    with pytest.raises(SceneError, match=r"^tip: radius is .* 0\.001 to 0\.02 m$"):
+        Tip(radius=radius)
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"shape": "ball"}, "tip shape 'ball' is unknown; choose sphere, flat, cone, rounded_cone"),
+        ({"shape": "cone"}, "shape cone needs half_angle; give one"),
+        ({"shape": "cone", "half_angle": 90.0}, "half_angle is 90.0; it must lie in 10 to 85 deg"),
+        ({"shape": "cone", "half_angle": 9.0}, "half_angle is 9.0; it must lie in 10 to 85 deg"),
+        ({"shape": "cone", "half_angle": 60.0, "rounding": 1e-3}, "cone does not use rounding"),
+        ({"shape": "flat", "half_angle": 60.0}, "flat does not use half_angle; leave it out"),
+        ({"shape": "rounded_cone", "half_angle": 60.0}, "rounded_cone needs rounding"),
+        (
+            {"shape": "rounded_cone", "radius": 2e-3, "half_angle": 10.0, "rounding": 3e-3},
+            "hides the cone of radius 0.002 m; take a smaller rounding, or a sphere",
+        ),
+    ],
+)
+def test_a_tip_has_the_numbers_of_its_shape(given: dict[str, Any], reason: str) -> None:
+    with pytest.raises(SceneError) as caught:
+        Tip(**given)
+    assert reason in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_several_tools_may_be_called_for_with_one() -> None:

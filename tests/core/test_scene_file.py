@@ -11,6 +11,7 @@ import pytest
 
 from avatar_core.contact.effects import EFFECTS, Friction, Inertia, SeveralTools, Tumour
 from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import parse_scene, read_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.yaml_lines import MAX_BYTES
@@ -30,7 +31,7 @@ text: >
 organ: {vademecum: liver.h5}
 material: {young_modulus: 0.17e6, poisson_ratio: 0.45}
 tools:
-  - {name: left, tip_radius: 2e-3}
+  - {name: left, tip: {shape: rounded_cone, radius: 4e-3, half_angle: 30, rounding: 1e-3}}
   - name: right
 outputs: {cloud: off, cloud_divisor: 2, modes: 50}
 effects:
@@ -46,7 +47,10 @@ effects:
         vademecum="liver.h5",
         young_modulus=0.17e6,
         poisson_ratio=0.45,
-        tools=(Tool("left", 2e-3), Tool("right", 5e-3)),
+        tools=(
+            Tool("left", Tip("rounded_cone", 4e-3, 30.0, 1e-3)),
+            Tool("right", Tip("sphere", 5e-3)),
+        ),
         cloud="off",
         cloud_divisor=2,
         modes=50,
@@ -69,9 +73,9 @@ def test_effects_may_be_a_list_or_a_mapping(effects: str) -> None:
 
 @pytest.mark.parametrize("text", ["20e-3", "2.e-2", "0.02", ".02", "+20E-3"])
 def test_a_number_is_a_number_however_it_is_written(text: str) -> None:
-    (tool,) = parse_scene(f"tools: [{{tip_radius: {text}}}]", "x").tools
-    assert tool.tip_radius == 0.02
-    assert isinstance(tool.tip_radius, float)
+    (tool,) = parse_scene(f"tools: [{{tip: {{radius: {text}}}}}]", "x").tools
+    assert tool.tip == Tip("sphere", 0.02)
+    assert isinstance(tool.tip.radius, float)
 
 
 def test_a_whole_number_stays_one() -> None:
@@ -97,6 +101,7 @@ def test_words_that_yaml_takes_for_other_things_stay_words() -> None:
 
 # --- YAML: what is refused ------------------------------------------------------------------------
 
+TIP = "tools:\n- name: a\n  tip: {{{}}}\n"
 FRICTION = "name: a\neffects:\n  friction:\n    static: {}\n"
 
 
@@ -136,7 +141,7 @@ FRICTION = "name: a\neffects:\n  friction:\n    static: {}\n"
         ("effects:\n  friction: false\n", 2, ["friction is false", "key: value"]),
         ("effects:\n  large_deformation: true\n", 2, ["large_deformation is true", "no settings"]),
         ("tools: {name: a}\n", 1, ["tools is a mapping", "write a list"]),
-        ("tools: [a]\n", 1, ["tools[0] is a", "name, tip_radius"]),
+        ("tools: [a]\n", 1, ["tools[0] is a", "name, tip"]),
         ("organ: liver.h5\n", 1, ["organ is liver.h5", "vademecum"]),
         ("name: [a]\n", 1, ["name is a list", "one line of text"]),
         ("text: |\n  a\n  b\n", 1, ["text must be one line"]),
@@ -162,7 +167,23 @@ FRICTION = "name: a\neffects:\n  friction:\n    static: {}\n"
         ("outputs: {cloud: on}\n", 1, ["outputs.cloud is on; it must be one of surface, vol"]),
         ("material:\n  young_modulus: -1\n", 2, ["material.young_modulus is -1", "Pa"]),
         ("material: {poisson_ratio: 0.5}\n", 1, ["material.poisson_ratio is 0.5", "0.4999"]),
-        ("tools:\n- {tip_radius: 5}\n", 2, ["tools[0].tip_radius is 5", "0.002 to 0.02 m"]),
+        # tips
+        (TIP.format("radius: 5"), 3, ["tools[0].tip.radius is 5", "0.001 to 0.02 m"]),
+        (TIP.format("radius: 0"), 3, ["tools[0].tip.radius is 0; it must lie in 0.001 to"]),
+        (TIP.format("radius: .nan"), 3, ["tip.radius is .nan; it must be a number in 0.001"]),
+        (TIP.format("radius: -1e-3"), 3, ["tip.radius is -1e-3"]),
+        (TIP.format("shape: ball"), 3, ["tip.shape is ball; it must be one of sphere, flat, con"]),
+        (TIP.format("shape: [cone]"), 3, ["tip.shape is a list"]),
+        (TIP.format("shape: cone, half_angle: 90"), 3, ["half_angle is 90", "10 to 85 deg"]),
+        (TIP.format("shape: cone"), 3, ["tip: shape cone needs half_angle; give one"]),
+        (TIP.format("shape: flat, half_angle: 60"), 3, ["flat does not use half_angle; leave it"]),
+        (TIP.format("shape: cone, angle: 60"), 3, ["tip.angle", "did you mean 'half_angle'?"]),
+        ("tools:\n- name: a\n  tip: 5e-3\n", 3, ["tools[0].tip is 5e-3", "shape, radius"]),
+        (
+            "tools:\n- name: a\n  tip_radius: 5e-3\n",
+            3,
+            ["tip_radius is of an earlier version; write tip: {shape: sphere, radius: 5e-3}"],
+        ),
         # what contradicts itself
         (FRICTION.format("0.2"), 3, ["kinetic is 0.3, above static 0.2"]),
         ("name: a\ntools:\n- name: a\n- name: b\n", 2, ["2 tools without several_tools"]),

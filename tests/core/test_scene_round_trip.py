@@ -20,6 +20,7 @@ from avatar_core.contact.effects import (
     Viscoelasticity,
 )
 from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import parse_scene, read_scene, write_scene
 from avatar_core.scene.model import CONFLICTS, Scene, Tool
 from tests.core.scene_cases import SHIPPED
@@ -50,12 +51,14 @@ def test_the_shipped_scenes_are_those_and_show_every_effect() -> None:
     }
     assert set().union(*names.values()) == set(EFFECTS)
     assert scenes["palpation"] == Scene(text=scenes["palpation"].text)
-    assert scenes["needle_probe"].tools[0].tip_radius == 2e-3
+    assert scenes["needle_probe"].tools[0].tip == Tip("rounded_cone", 4e-3, 30.0, 1.5e-3)
     assert len({scene.name for scene in scenes.values()}) == len(scenes)
 
 
 def test_numbers_of_numpy_are_written_as_numbers() -> None:
-    scene = Scene(young_modulus=np.float64(1e5), tools=(Tool("a", np.float64(5e-3)),))
+    scene = Scene(
+        young_modulus=np.float64(1e5), tools=(Tool("a", Tip("sphere", np.float64(5e-3))),)
+    )
     assert parse_scene(write_scene(scene), "x") == scene
 
 
@@ -93,6 +96,13 @@ def made(kind: type[Effect]) -> st.SearchStrategy[Effect]:
 
 
 LINES = st.text(max_size=40).filter(str.isprintable)
+RADII = st.floats(1e-3, 20e-3)
+ANGLES = st.floats(10.0, 85.0)
+TIPS = st.one_of(
+    st.builds(Tip, st.sampled_from(["sphere", "flat", "patch"]), RADII),
+    st.builds(Tip, st.just("cone"), RADII, ANGLES),
+    st.builds(Tip, st.just("rounded_cone"), RADII, ANGLES, st.floats(2e-4, 1e-3)),
+)
 TOOL_NAMES = st.from_regex(r"[a-z][a-z0-9]{0,5}(/[A-Z][a-z]_[0-9])?", fullmatch=True)
 
 
@@ -111,7 +121,7 @@ def scenes(draw: st.DrawFn) -> Scene:
         vademecum=draw(LINES),
         young_modulus=draw(st.none() | st.floats(1.0, 1e8)),
         poisson_ratio=draw(st.none() | st.floats(0.0, 0.4999)),
-        tools=tuple(Tool(name, draw(st.floats(2e-3, 20e-3))) for name in names),
+        tools=tuple(Tool(name, draw(TIPS)) for name in names),
         cloud=draw(st.sampled_from(["surface", "volume", "off"])),
         cloud_divisor=draw(st.integers(1, 1000)),
         modes=draw(st.none() | st.integers(1, 100_000)),

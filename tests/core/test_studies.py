@@ -24,6 +24,7 @@ from avatar_core.studies import (
     coordinates,
     grid,
     in_silico,
+    indentation,
     leave_one_out,
     passivity,
     pgd,
@@ -144,6 +145,17 @@ def test_coordinates(tmp_path: Path) -> None:
     assert summary["linear_over_large_15mm"] > 1.0
     # An oblique push bends both less and otherwise: at one site in six the linear one is nearer.
     assert summary["gravity_contact_mean"] < summary["gravity_linear_contact_mean"]
+
+
+@pytest.mark.long
+def test_indentation(tmp_path: Path) -> None:
+    settings = replace(indentation.QUICK, halved=())
+    found = indentation.study(settings)
+    summary = checked_files(found, tmp_path)
+    assert summary["small_strain_vs_sneddon"] < 0.02  # on the wide elements of the quick version
+    assert summary["stored_law_worst"] < 0.02
+    assert summary["ratio_nu_0.49_depth_1"] < 0.95 < 1.04 < summary["ratio_nu_0.3_depth_1"]
+    assert sum(row["kind"] == "coefficients" for row in found.rows) == len(settings.ratios)
 
 
 def test_passivity(tmp_path: Path) -> None:

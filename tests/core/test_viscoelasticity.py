@@ -9,7 +9,7 @@ from avatar_core.contact.effects import Viscoelasticity
 from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.vademecum.model import Vademecum
-from tests.core.effect_cases import TIP, push_and_drag
+from tests.core.effect_cases import SPHERE, push_and_drag
 from tests.core.flat_organ import COMPLIANCE, at_depth, flat_organ
 
 PRONY = Viscoelasticity((0.3, 0.2), (0.05, 0.7))
@@ -96,7 +96,7 @@ def test_creep_under_a_held_force_is_of_second_order() -> None:
 def test_tissue_comes_back_slowly_where_a_tool_has_been(phantom_vademecum: Vademecum) -> None:
     """The cloud keeps a dent after release, which fades with the relaxation times."""
     v = phantom_vademecum
-    model = prepare(v, (TIP,), cloud="surface", effects=(Viscoelasticity((0.5,), (0.1,)),))
+    model = prepare(v, (SPHERE,), cloud="surface", effects=(Viscoelasticity((0.5,), (0.1,)),))
     path = push_and_drag(v)
     for _ in range(5):
         for tip in path:
@@ -118,8 +118,8 @@ def test_tissue_comes_back_slowly_where_a_tool_has_been(phantom_vademecum: Vadem
 def test_fresh_tissue_is_stiffer_than_tissue_that_was_held(phantom_vademecum: Vademecum) -> None:
     """A long hold relaxes the force to the part that is left, 1 - sum g."""
     v = phantom_vademecum
-    model = prepare(v, (TIP,), cloud="off", effects=(Viscoelasticity((0.4,), (0.02,)),))
-    bare = prepare(v, (TIP,), cloud="off", effects=())
+    model = prepare(v, (SPHERE,), cloud="off", effects=(Viscoelasticity((0.4,), (0.02,)),))
+    bare = prepare(v, (SPHERE,), cloud="off", effects=())
     tip = push_and_drag(v)[20]
     step(bare, tip[None])
     elastic = np.linalg.norm(bare.out.force[0])

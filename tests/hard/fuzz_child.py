@@ -75,18 +75,22 @@ def _step() -> Door:
     import numpy as np
 
     from avatar_core.contact.model import prepare, step
+    from avatar_core.geometry.tip import Tip
     from avatar_core.vademecum.storage import load_vademecum
     from tests.hard.small_files import RADIUS, small_vademecum
 
     directions = small_vademecum().surface.normals
     for large in (False, True):  # compiled before the clock starts
-        step(prepare(small_vademecum(False, large), (5e-3,), cloud="volume"), directions[:1])
+        step(
+            prepare(small_vademecum(False, large), (Tip("sphere", 5e-3),), cloud="volume"),
+            directions[:1],
+        )
 
     def touch(vademecum: Any) -> None:
         _require_vademecum(vademecum)
         with np.errstate(all="ignore"):
             try:
-                model = prepare(vademecum, (5e-3,), cloud="volume")
+                model = prepare(vademecum, (Tip("sphere", 5e-3),), cloud="volume")
             except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError):
                 return  # a contact node refuses it with what this says
         for direction in directions:

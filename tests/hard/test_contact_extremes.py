@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.effects import Friction, Inertia, Viscoelasticity
 from avatar_core.contact.effects.friction import tangential_force
-from avatar_core.contact.kernels import LEAP, MAX_DEPTH
+from avatar_core.contact.locate import LEAP, MAX_DEPTH
 from avatar_core.contact.model import ContactModel, Status, step, stored_energy
 from tests.examples import examples
 

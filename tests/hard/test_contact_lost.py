@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from avatar_core.contact.effects import Friction, Viscoelasticity
-from avatar_core.contact.kernels import ENTRY_DEPTH, LEAP, MAX_DEPTH
+from avatar_core.contact.locate import ENTRY_DEPTH, LEAP, MAX_DEPTH
 from avatar_core.contact.model import Status, make_model, step
 
 from .touching import AWAY, RADIUS, enter, spots, touched

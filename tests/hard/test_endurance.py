@@ -98,6 +98,7 @@ def stretch(
     touching = np.zeros(n_tools, bool)
     contacts = 0
     before, pressed = np.tile(AWAY, (n_tools, 1)), np.zeros((n_tools, 3))
+    rise = np.zeros((n_tools, 3))  # of the force in the last period
     for k, tips in enumerate(wander(spot, n_tools, n, rng)):
         if k % 1999 == 1998:  # a pose that is none; the rule spans its period
             seen.add(step(model, np.full((n_tools, 3), np.nan)))
@@ -108,13 +109,16 @@ def stretch(
             way = tips - before
             work -= 0.5 * float(((force + pressed) * way).sum())
             now = force.any(axis=1)
-            if (now != touching).any():
-                changed = now != touching
+            changed = now != touching
+            if changed.any():
                 bound += stiff * float((way[changed] ** 2).sum()) / 8.0
                 touching = now
+            # F'' h^3 / 12 of the trapezoidal rule, of a force that is curved over the depth
+            bent = np.linalg.norm(force - pressed - rise, axis=1) * np.linalg.norm(way, axis=1)
+            bound += float(bent[~changed].sum()) / 12.0
             contacts += int(now.any())
         lowest, least = min(lowest, work), min(least, work + bound)
-        before, pressed = tips, force.copy()
+        before, pressed, rise = tips, force.copy(), force - pressed
     return Stretch(lowest, least, bound, contacts / n, 0.0)
 
 

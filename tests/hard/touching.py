@@ -12,11 +12,14 @@ from hypothesis import strategies as st
 
 from avatar_core.contact.effects import Effect, SeveralTools
 from avatar_core.contact.effects.selection import Constants, selected_arrays
-from avatar_core.contact.kernels import ENTERED
+from avatar_core.contact.effects.tip_law import dent
+from avatar_core.contact.effects.tip_profile import TAKEN
 from avatar_core.contact.layout import Layout
+from avatar_core.contact.locate import ENTERED
 from avatar_core.contact.model import FAR_AWAY, ContactModel, Status, make_model, prepare, step
 from avatar_core.contact.tool_path import access, inner_positions
 from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.tip import Shape, Tip
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
@@ -37,17 +40,21 @@ def liver(scale: float = 1.0) -> Vademecum:
 
 
 @cache
-def _layout(effects: tuple[Effect, ...], n_tools: int, radius: float, scale: float) -> ContactModel:
-    return prepare(liver(scale), (radius,) * n_tools, effects=effects)
+def _layout(effects: tuple[Effect, ...], n_tools: int, tip: Tip, scale: float) -> ContactModel:
+    return prepare(liver(scale), (tip,) * n_tools, effects=effects)
 
 
 def touched(
-    effects: tuple[Effect, ...] = (), n_tools: int = 1, radius: float = RADIUS, scale: float = 1.0
+    effects: tuple[Effect, ...] = (),
+    n_tools: int = 1,
+    radius: float = RADIUS,
+    scale: float = 1.0,
+    shape: Shape = "sphere",
 ) -> ContactModel:
     """A model of the liver, at rest; several tools bring their effect along."""
     if n_tools > 1:
         effects = (SeveralTools(), *effects)
-    model = _layout(effects, n_tools, radius, scale)
+    model = _layout(effects, n_tools, Tip(shape, radius), scale)
     model.reset()
     return model
 
@@ -56,7 +63,7 @@ def with_tools(model: ContactModel, radii: Sequence[float], effects: Sequence[Ef
     """An organ in closed form with other tools and effects."""
     several = (SeveralTools(),) if len(radii) > 1 else ()
     chosen = selected_arrays(None, (*several, *effects), None, None, 0.1, 1e-3)  # type: ignore[arg-type]
-    return make_model(Layout(model.arrays._replace(tip_radius=np.array(radii, float)), chosen))
+    return make_model(Layout(model.arrays._replace(tip_offset=np.array(radii, float)), chosen))
 
 
 def stiffened(model: ContactModel, factor: float, several: bool) -> ContactModel:
@@ -147,9 +154,11 @@ def line(start: np.ndarray, end: np.ndarray, spacing: float) -> np.ndarray:
 
 def complementarity(model: ContactModel) -> tuple[float, float]:
     """Of Signorini: deepest penetration, and largest gap under a force [m]."""
-    s = model.state
+    s, law = model.state, model.effects.tip_law
     active = np.flatnonzero(s.active)
     left = s.gap[active] + s.compliance[np.ix_(active, active)] @ s.force[active]
+    if law is not None:
+        left += [dent(law, t)[0] - law.value[t, TAKEN] * law.elastic[t] for t in active]
     pressed = s.force[active] > 0.0
     return float(max(0.0, -left.min())), float(np.abs(left[pressed]).max(initial=0.0))
 

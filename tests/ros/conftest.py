@@ -23,6 +23,7 @@ TIP_RADIUS = 0.005  # [m]
 PATIENT = ["--ros-args", "-p", "pose_timeout:=0.5"]
 START_TIMEOUT = 120.0  # of a process, its compilation included, on a busy machine [s]
 DISCOVERY = 0.3  # of a client by its service [s]
+ASK_AGAIN = 2.0  # after which an answer is taken for lost [s]
 TOUCH_DEPTH = 0.004  # [m]
 
 
@@ -88,13 +89,15 @@ class Probe:
         return answer.result()
 
     def ask(self, kind: type, name: str, request: Any) -> Any:
-        """The answer to a question: it is asked again if the first answer was lost."""
-        client = self.client(kind, name)
-        for _ in range(5):
-            answer = client.call_async(request)
-            self.until(answer.done, START_TIMEOUT / 5, fail=False)
-            if answer.done():
-                return answer.result()
+        """The answer to a question: it is asked again as long as no answer came."""
+        client, asked = self.client(kind, name), []
+        passed = Deadline(START_TIMEOUT)
+        while not passed:
+            asked.append(client.call_async(request))
+            self.until(lambda: any(answer.done() for answer in asked), ASK_AGAIN, fail=False)
+            for answer in asked:
+                if answer.done():
+                    return answer.result()
         raise AssertionError(f"{name} did not answer within {START_TIMEOUT:g} s")
 
     def client(self, kind: type, name: str) -> Any:

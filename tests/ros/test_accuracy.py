@@ -76,7 +76,9 @@ def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> No
 
 
 def test_a_budget_chooses_what_keeps_it(organ: Any) -> None:
-    order = PreparationRequest("vademecum", "handover", "/", (5e-3,), None, "surface", 1e-3)
+    order = PreparationRequest(
+        "vademecum", "handover", "/", ({"radius": 5e-3},), None, "surface", 1e-3
+    )
     what, budgets = model_spec(organ, order, None), DetailChooser()
     exact = budgets.detail(what, order)
     assert exact == Detail(organ.far.rank)
@@ -141,6 +143,11 @@ def test_a_refused_budget_gives_way_to_the_one_in_force_unless_a_newer_one_comes
 
 
 # --- In the cell -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def probe(lasting_probe: Any) -> Any:
+    return lasting_probe
 
 
 @pytest.fixture

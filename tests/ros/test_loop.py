@@ -23,6 +23,7 @@ from sensor_msgs.msg import PointCloud2
 
 from avatar_core.contact.effects import Friction, Viscoelasticity
 from avatar_core.contact.model import prepare
+from avatar_core.geometry.tip import Tip
 from tests.ros.through import Through
 
 pytestmark = pytest.mark.ros
@@ -31,7 +32,7 @@ RATE = 1000.0  # [Hz]
 N_BLEND = round(BLEND * RATE)
 SETTINGS = ContactSettings(
     tools=("tool",),
-    tip_radii=(5e-3,),
+    tips=(Tip(),),
     scene="",
     rate=RATE,
     cloud="surface",

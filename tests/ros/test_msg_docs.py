@@ -43,6 +43,11 @@ def markers(own_domain: dict[str, str]) -> Iterator[None]:
     assert process.finish() == 0
 
 
+@pytest.fixture(scope="module")
+def probe(lasting_probe: Any) -> Any:
+    return lasting_probe
+
+
 @pytest.fixture
 def running(cell: Any, probe: Any) -> Any:
     """A probe beside a cell that is up."""

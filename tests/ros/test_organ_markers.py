@@ -28,6 +28,11 @@ PARAMS = Path(__file__).resolve().parents[2] / "params"
 
 
 @pytest.fixture(scope="module")
+def probe(lasting_probe: Any) -> Any:
+    return lasting_probe
+
+
+@pytest.fixture(scope="module")
 def markers(own_domain: dict[str, str]) -> Iterator[Module]:
     process = Module("organ_markers", [], own_domain)
     yield process

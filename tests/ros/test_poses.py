@@ -33,6 +33,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
 from avatar_core.contact.model import prepare
+from avatar_core.geometry.tip import Tip
 from avatar_ros.msg import ContactState
 from tests.ros.through import Through
 
@@ -83,7 +84,7 @@ class Bench:
     def __init__(self, organ: Any, context: Any, timeout: float, n_tools: int = 1) -> None:
         names = tuple(f"tool{i}" for i in range(n_tools))
         base: dict[str, Any] = dict.fromkeys(ContactSettings.__dataclass_fields__)
-        base |= {"tools": names, "tip_radii": (5e-3,) * n_tools, "scene": "", "rate": 1000.0}
+        base |= {"tools": names, "tips": (Tip(),) * n_tools, "scene": "", "rate": 1000.0}
         base |= {
             "safety": Safety(leap=math.inf),
             "cloud": "off",
@@ -101,7 +102,7 @@ class Bench:
         )
         self.loop = ContactLoop(self.settings, self.tools, outlets, context)
         self.loop.guards = [Through() for _ in names]
-        model = prepare(organ, (5e-3,) * n_tools, cloud="off", halves=True)
+        model = prepare(organ, (Tip("sphere", 5e-3),) * n_tools, cloud="off", halves=True)
         self.loop.active = ActiveModel("a", model, self.settings)
         self.loop._used = self.loop.active  # at once, not faded in
 
@@ -263,6 +264,7 @@ def test_a_clock_that_goes_back_is_only_told(bench: Any, touch: Any) -> None:
     assert summary.missed == 0
 
 
+@pytest.mark.long  # the step of two tools is compiled
 def test_the_age_is_that_of_the_pose_that_was_answered(bench: Any, touch: Any) -> None:
     """A first tool without a pose was 54 years old."""
     cell = bench(n_tools=2)

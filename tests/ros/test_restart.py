@@ -34,7 +34,7 @@ from tests.ros.test_cell import _force, _stamp
 pytestmark = pytest.mark.ros
 
 CHOSEN = {"material.young_modulus": 0.25e6, "safety.max_force": 4.0}
-SCENE = "{name: blunt, tools: [{name: tool, tip_radius: 4e-3}]}"
+SCENE = "{name: blunt, tools: [{name: tool, tip: {shape: sphere, radius: 4e-3}}]}"
 HOW = {"kill -9": signal.SIGKILL, "SIGINT": signal.SIGINT}
 
 

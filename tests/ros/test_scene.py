@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from avatar_core.errors import AvatarError
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_core.scene.yaml_lines import MAX_BYTES
 from avatar_ros.msg import ContactState
@@ -42,7 +44,7 @@ YOUNG = 0.17e6  # [Pa] of the organ
 BARE = "name: bare"
 FRICTION = "effects: {friction: {static: 1.0, kinetic: 1.0}}"
 RELAXING = "effects: {viscoelasticity: {g: [0.5], tau: [0.2]}}"
-ORDER = PreparationRequest("", "", "", (5e-3,), None, "surface", 1e-3)
+ORDER = PreparationRequest("", "", "", (asdict(Tip()),), None, "surface", 1e-3)
 
 
 class Palpation:
@@ -140,8 +142,8 @@ def test_a_shipped_scene_loads_or_says_why_not(
     expected = [] if refusal else [effect.name for effect in read_scene(path).effects]
     assert answer.effects == expected
     if not refusal:  # press it by 2 mm with the scene's tip
-        radius = read_scene(path).tools[0].tip_radius
-        pressed = palpation.go((radius - ORDER.tip_radii[0]) * palpation.normal)
+        offset = read_scene(path).tools[0].tip.offset
+        pressed = palpation.go((offset - Tip().offset) * palpation.normal)
         assert pressed @ palpation.normal > 0.1
 
 

@@ -32,7 +32,9 @@ from tests.ros.test_cell import Hand
 
 pytestmark = pytest.mark.ros
 
-REQUEST = PreparationRequest("vademecum", "handover", "/", (5e-3,), None, "surface", 1e-3)
+REQUEST = PreparationRequest(
+    "vademecum", "handover", "/", ({"radius": 5e-3},), None, "surface", 1e-3
+)
 
 
 @pytest.fixture(scope="module")

@@ -57,6 +57,7 @@ def run_cell(
 ) -> CellReport:
     """Measure a cell with real-time priority and without, ``seconds`` each.
 
+    tip_radius : of the sphere that palpates [m]
     changes : of the material [Hz]
 
     Raises
@@ -218,7 +219,7 @@ def cell(
     environment = isolated_environment()
     files = ["-p", f"library_dir:={vademecum.parent}", "-p", f"vademecum:={vademecum.name}"]
     loader = Module("vademecum_loader", ["--ros-args", *files], environment)
-    numbers = ["-p", f"tip_radius:={float(tip_radius)}", "-p", f"realtime.priority:={priority}"]
+    numbers = ["-p", f"tip.radius:={float(tip_radius)}", "-p", f"realtime.priority:={priority}"]
     contact = Module("contact", ["--ros-args", *numbers], environment)
     try:
         yield environment, {"vademecum_loader": loader, "contact": contact}

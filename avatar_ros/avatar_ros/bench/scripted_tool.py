@@ -72,7 +72,7 @@ class RoundTrips:
 def palpation(
     vademecum: Vademecum, tip_radius: float, seconds: float, rate: float, depth: float = 0.005
 ) -> np.ndarray:
-    """Centres of the tip, shape (seconds * rate, 3) [m]: touches of four seconds, over and over.
+    """Centres of a sphere, shape (seconds * rate, 3) [m]: touches of four seconds, over and over.
 
     Along the surface normal to the organ, two sinusoidal pushes of ``depth`` [m], a slide of
     40 mm there and back at 3 mm depth, and away. Odd touches slide at right angles to even ones.
@@ -232,7 +232,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("vademecum", type=Path, help="file with the organ's surface")
     parser.add_argument("--tool", default="tool", help="name of the tool")
     parser.add_argument("--frame", default="organ", help="frame of its poses")
-    parser.add_argument("--tip-radius", type=float, default=0.005, help="[m]")
+    parser.add_argument("--tip-radius", type=float, default=0.005, help="of a sphere [m]")
     parser.add_argument("--seconds", type=float, default=60.0, help="duration [s]")
     parser.add_argument("--rate", type=float, default=1000.0, help="poses per second [Hz]")
     parser.add_argument("--priority", type=int, default=0, help="SCHED_FIFO priority; 0: none")

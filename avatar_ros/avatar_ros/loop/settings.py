@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from array import array
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
-from avatar_core.contact.layout import TIP_RADIUS_RANGE
+from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Shape, Tip
 from avatar_core.vademecum.accuracy import Budget, Cloud, Quantity
 from avatar_ros.framework.parameters import AUTOSTART, FRAME_ID, Parameter, ParameterError
 from avatar_ros.framework.saved_state import STATE_DIR
@@ -29,17 +31,31 @@ THRESHOLDS = (
     *_threshold("missed", 0.01, 0.05, "fraction of periods longer than 1.5 nominal ones"),
 )
 
+# Each holds one value, or an array of one for each tool.
+TIP = (
+    Parameter(
+        "tip.shape",
+        "sphere",
+        f"shape of the tools' tips: {', '.join(get_args(Shape))}",
+        any_type=True,
+    ),
+    Parameter(
+        "tip.radius", 0.005, "radius of the sphere, the punch or the cone's base [m]", any_type=True
+    ),
+    Parameter(
+        "tip.half_angle",
+        0.0,
+        "angle between a cone's axis and its side [degrees]; 0: none",
+        any_type=True,
+    ),
+    Parameter("tip.rounding", 0.0, "radius of a rounded cone's apex [m]; 0: none", any_type=True),
+)
+
 CONTACT = (
     AUTOSTART,
     FRAME_ID,
     Parameter("tools", ["tool"], "names of the tools; the topics of each are below NAME/"),
-    Parameter(
-        "tip_radius",
-        0.005,
-        f"radius of the spherical tool tips [m], {TIP_RADIUS_RANGE[0]:g} to "
-        f"{TIP_RADIUS_RANGE[1]:g}; one number, or one for each tool",
-        any_type=True,
-    ),
+    *TIP,
     Parameter(
         "scene",
         "",
@@ -130,7 +146,7 @@ MATERIAL = {
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """Parameters of the contact node; rates [Hz], times [s], radii [m].
+    """Parameters of the contact node; rates [Hz], times [s].
 
     scene : YAML, checked; empty for the natural effects of the vademecum
     material : values chosen, by name of the coordinate; the others are those of the vademecum
@@ -138,7 +154,7 @@ class ContactSettings:
     """
 
     tools: tuple[str, ...]
-    tip_radii: tuple[float, ...]
+    tips: tuple[Tip, ...]
     scene: str
     rate: float
     cloud: Cloud
@@ -152,6 +168,36 @@ class ContactSettings:
     cpu: int
     lock_memory: bool
     safety: Safety = field(default_factory=Safety)
+
+
+def chosen_tips(value: dict[str, Any], n_tools: int) -> tuple[Tip, ...]:
+    """The tips that the parameters tip.* describe, one for each tool.
+
+    Raises
+    ------
+    ParameterError : naming the parameter and what it takes
+    """
+    columns = [_of_each_tool(p.name, value[p.name], n_tools) for p in TIP]
+    return tuple(_tip(*row) for row in zip(*columns, strict=True))
+
+
+def _of_each_tool(name: str, value: Any, n_tools: int) -> list[Any]:
+    values = list(value) if isinstance(value, list | array) else [value]
+    if len(values) == 1:
+        values *= n_tools
+    if len(values) != n_tools:
+        raise ParameterError(
+            f"parameter {name}: there are {len(values)} values; give one, or one for each of "
+            f"{n_tools} tools"
+        )
+    return values
+
+
+def _tip(shape: Any, radius: Any, half_angle: Any, rounding: Any) -> Tip:
+    try:
+        return Tip(shape, radius, half_angle or None, rounding or None)
+    except SceneError as error:
+        raise ParameterError(f"parameters tip.*: {error}") from error
 
 
 def chosen_material(value: dict[str, Any]) -> dict[str, float]:

@@ -113,7 +113,7 @@ class ContactNode(ManagedNode):
             topic=self.resolve_topic_name("vademecum"),
             node_name=f"_{self.get_name()}_handover",
             namespace=self.get_namespace(),
-            tip_radii=settings.tip_radii,
+            tips=tuple(asdict(tip) for tip in settings.tips),
             modes=settings.modes,
             cloud=settings.cloud,
             period=period,

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, get_args
+from typing import get_args
 
 from rclpy.node import Node
 
-from avatar_core.contact.layout import TIP_RADIUS_RANGE
 from avatar_core.errors import SceneError
 from avatar_core.scene.file import parse_scene, read_scene, write_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.vademecum.accuracy import Cloud
 from avatar_ros.framework.parameters import ParameterError, frame, values
 from avatar_ros.loop.safety import chosen_safety
-from avatar_ros.loop.settings import CONTACT, ContactSettings, chosen_budget, chosen_material
+from avatar_ros.loop.settings import (
+    CONTACT,
+    ContactSettings,
+    chosen_budget,
+    chosen_material,
+    chosen_tips,
+)
 from avatar_ros.prepare import scenes
 
 CLOUDS = get_args(Cloud)
@@ -45,7 +50,7 @@ def read_contact(node: Node, saved_scene: str = "") -> ContactSettings:
         raise ParameterError(f"parameter cloud: give one of {', '.join(CLOUDS)}")
     settings = ContactSettings(
         tools=tools,
-        tip_radii=_tip_radii(value["tip_radius"], len(tools)),
+        tips=chosen_tips(value, len(tools)),
         scene="",
         rate=value["rate"],
         cloud=value["cloud"],
@@ -77,25 +82,9 @@ def _with_scene(settings: ContactSettings, read: Callable[[], Scene]) -> Contact
         raise ParameterError(f"parameter scene: {error}") from error
     return replace(
         settings,
-        tip_radii=tuple(tool.tip_radius for tool in scene.tools),
+        tips=tuple(tool.tip for tool in scene.tools),
         scene=write_scene(scene),
         cloud=scene.cloud,
         cloud_divisor=scene.cloud_divisor,
         modes=scene.modes,
     )
-
-
-def _tip_radii(value: Any, n_tools: int) -> tuple[float, ...]:
-    numbers = [value] if isinstance(value, int | float) else value
-    low, high = TIP_RADIUS_RANGE
-    try:
-        radii = [float(number) for number in numbers]
-    except (TypeError, ValueError):
-        radii = []
-    if len(radii) == 1:
-        radii *= n_tools
-    if len(radii) != n_tools or not all(low <= radius <= high for radius in radii):
-        raise ParameterError(
-            f"parameter tip_radius: give one number or {n_tools}, from {low:g} to {high:g} m"
-        )
-    return tuple(radii)

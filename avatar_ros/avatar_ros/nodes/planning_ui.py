@@ -19,6 +19,7 @@ except ImportError as error:
     raise SystemExit("planning_ui: viser is missing; pip install 'avatar[ui]'") from error
 
 from avatar_core.errors import AvatarError
+from avatar_core.geometry.tip import Tip
 from avatar_core.geometry.tumour import read_tumour
 from avatar_core.scene.file import read_scene, shipped_scenes
 from avatar_core.scene.model import Scene
@@ -27,7 +28,7 @@ from avatar_ros.framework import qos
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import AUTOSTART, Parameter, ParameterError, values
 from avatar_ros.framework.reader import Reader
-from avatar_ros.loop.settings import MATERIAL
+from avatar_ros.loop.settings import MATERIAL, TIP, chosen_tips
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
 from avatar_ros.prepare.scenes import scene_file
 from avatar_ros.ui.display import RATE, NewestCloud
@@ -38,13 +39,14 @@ from avatar_ros.ui.recorder import Recorder, scene_in_force
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.texts import frame_text, scene_texts, warnings
 from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess
-from avatar_ros.ui.view import OrganView
+from avatar_ros.ui.view import CLEARANCE, OrganView
 
 FRAME = "organ"
 _PLOT_FRAMES = 6  # between two points of the plots
 _POLL_FRAMES = 30  # between two checks of library and nodes
 _SILENCE = 1.0  # after which the contact node counts as not answering [s]
-_OF_CONTACT = ("tip_radius", "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
+_TIP = tuple(parameter.name for parameter in TIP)
+_OF_CONTACT = (*_TIP, "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
 
 PLANNING_UI = (
     AUTOSTART,
@@ -171,9 +173,9 @@ class PlanningNode(ManagedNode):
             return
         self._stop_recording("the organ changed")
         self._material = {}
-        radius = self._radius()
-        self._state.live["target"][0] = organ.above(4.0 * radius)
-        self._view.show(organ, tumour, radius)
+        tip = self._tip()
+        self._state.live["target"][0] = organ.above(tip.offset + CLEARANCE)
+        self._view.show(organ, tumour, tip)
         self._panels.show_organ(organ)
         self._organ = organ
         self._listen_to_clouds()
@@ -184,12 +186,13 @@ class PlanningNode(ManagedNode):
         now = time.monotonic() - self._began
         self._panels.show_loop(now, window.step_p99, window.missed / max(window.window, 1e-3))
 
-    def _radius(self) -> float:
-        """Radius of the tool's tip [m]."""
+    def _tip(self) -> Tip:
+        """The tip of the first tool."""
         if self._scene:
-            return read_scene(shipped_scenes()[self._scene]).tools[0].tip_radius
-        given = self._contact.get("tip_radius", 0.005)
-        return float(given if isinstance(given, float) else given[0])
+            return read_scene(shipped_scenes()[self._scene]).tools[0].tip
+        if "tools" not in self._contact:  # the contact node was not asked yet
+            return Tip()
+        return chosen_tips(self._contact, len(self._contact["tools"]))[0]
 
     def _show(self) -> None:
         """Update the page; called for every frame."""
@@ -200,13 +203,13 @@ class PlanningNode(ManagedNode):
         if organ is None or self._cloud is None:
             return
         taken = self._cloud.take()
+        tip, force = live["tip"].copy(), live["force"] if self._answers() else np.zeros(3)
         largest = 0.0
         if taken is not None:
-            largest = self._view.move(taken[1])
+            largest = self._view.move(taken[1], tip, force)
             if self._recorder.is_on:
                 self._recorder.note_cloud(taken[1][:, 3:])
-        force = live["force"] if self._answers() else np.zeros(3)
-        self._view.place_tool(live["tip"].copy(), force)
+        self._view.place_tool(tip, force)
         if self._frame % _PLOT_FRAMES == 0:
             size = float(np.linalg.norm(force))
             error = float(live["error"]) if np.isfinite(live["error"]) else 0.0
@@ -243,7 +246,7 @@ class PlanningNode(ManagedNode):
     def _on_contact_started(self, values: dict[str, Any]) -> None:
         """The contact node runs, for the first time or again."""
         self._contact, self._is_to_restore = values, True
-        self._view.resize_tool(self._radius())
+        self._view.change_tip(self._tip())
         self._panels.show_material(self._in_force())
 
     def _note_material(self, values: dict[str, Any]) -> None:
@@ -299,7 +302,7 @@ class PlanningNode(ManagedNode):
         def note(switched: bool) -> None:
             if switched:
                 self._scene = name
-                self._view.resize_tool(self._radius())
+                self._view.change_tip(self._tip())
 
         self._requests.load_scene(name, self._say, then=note)
 
@@ -350,7 +353,7 @@ class PlanningNode(ManagedNode):
             chosen,
             organ.vademecum,
             self._in_force(),
-            self._radius(),
+            self._tip(),
             contact["cloud"],
             contact["cloud_divisor"],
         )

@@ -81,7 +81,7 @@ class DetailChooser:
         row = self._row(spec, detail)
         if row is None or detail in self._rows:
             return None
-        paths = slides(spec.vademecum, spec.tip_radii)
+        paths = slides(spec.vademecum, spec.tips)
         row = replace(row, points=tuple(timed_points(model, row.points, paths, check)))
         self._rows[detail] = row.plain()
         return self._rows[detail]
@@ -95,6 +95,6 @@ class DetailChooser:
 
     def _keep_for(self, spec: ModelSpec) -> None:
         """Forget the curves of another vademecum or scene."""
-        key = (spec.vademecum.id, spec.tip_radii, spec.cloud, spec.effect_names)
+        key = (spec.vademecum.id, spec.tips, spec.cloud, spec.effect_names)
         if key != self._key:
             self._key, self._timed, self._rows = key, None, {}

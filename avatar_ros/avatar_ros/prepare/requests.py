@@ -16,7 +16,8 @@ class PreparationRequest:
     """What the worker prepares, and where it gets the vademecum.
 
     topic, node_name, namespace : of the worker's node
-    tip_radii : one per tool [m]; a scene with as many tools replaces them
+    tips : fields of an avatar_core.geometry.tip.Tip for each tool; a scene with as many tools
+        replaces them
     modes, cloud : of a model without a scene
     period : of a step [s]
     material : values by name of the coordinate; they override those of the scene
@@ -28,7 +29,7 @@ class PreparationRequest:
     topic: str
     node_name: str
     namespace: str
-    tip_radii: tuple[float, ...]
+    tips: tuple[dict[str, Any], ...]
     modes: int | None
     cloud: Cloud
     period: float

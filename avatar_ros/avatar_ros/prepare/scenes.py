@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import shipped_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.yaml_lines import MAX_BYTES
@@ -56,10 +57,10 @@ def model_spec(vademecum: Vademecum, request: PreparationRequest, scene: Scene |
     from avatar_core.scene.prepare import default_spec, scene_spec
 
     if scene is not None:
-        require_tools(scene, len(request.tip_radii))
+        require_tools(scene, len(request.tips))
         return scene_spec(vademecum, scene, request.material)
-    radii = tuple(request.tip_radii)
-    return default_spec(vademecum, radii, request.modes, request.cloud, request.material)
+    tips = tuple(Tip(**tip) for tip in request.tips)
+    return default_spec(vademecum, tips, request.modes, request.cloud, request.material)
 
 
 def require_tools(scene: Scene, n_tools: int) -> None:

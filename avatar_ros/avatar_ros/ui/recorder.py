@@ -10,6 +10,7 @@ import numpy as np
 
 from avatar_core.contact.effects import Tumour
 from avatar_core.contact.effects.selection import default_effects
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
@@ -22,18 +23,18 @@ def scene_in_force(
     chosen: Scene | None,
     vademecum: Vademecum,
     material: dict[str, float],
-    tip_radius: float,
+    tip: Tip,
     cloud: Cloud = "surface",
     cloud_divisor: int = 1,
 ) -> Scene:
     """The scene of one tool that reproduces what runs now, including its material.
 
-    chosen : None for the natural effects of the vademecum, with tip_radius and cloud as given
+    chosen : None for the natural effects of the vademecum, with tip and cloud as given
     material : values by coordinate, which override those of the scene
     """
     scene = chosen or Scene(
         name="natural effects",
-        tools=(Tool(tip_radius=tip_radius),),
+        tools=(Tool(tip=tip),),
         cloud=cloud,
         cloud_divisor=cloud_divisor,
         effects=default_effects(vademecum, 1),

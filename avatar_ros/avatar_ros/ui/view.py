@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 import viser
 
+from avatar_core.contact.fine_surface import FineSurface, fine_surface
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
 from avatar_ros.ui.colours import table, top_for
 from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.tip_body import tip_body, turn_to
 
 N_BANDS = 10  # of the colour scale; a mesh has a single colour
 CLAMP = (90, 90, 90)
@@ -19,6 +22,8 @@ TOOL = (0, 114, 178)
 ARROW = (213, 94, 0)
 FORCE_SCALE = 0.004  # length of the arrow per force [m/N]
 MAX_ARROW = 0.06  # [m]
+LEAST_FORCE = 1e-3  # that is shown [N]
+CLEARANCE = 0.015  # of a new organ's tool over the surface [m]
 _NO_FACE = np.zeros((1, 3), np.uint32)  # of a band without faces; a mesh must not be empty
 _VIEW = 0.5  # part of the view along the normal; the rest is from the side
 _DISTANCE = 1.8  # of the camera, in lengths of the organ
@@ -41,6 +46,14 @@ def camera_of(organ: Organ) -> tuple[np.ndarray, np.ndarray, float]:
     return organ.centre + _DISTANCE * organ.size * view, organ.centre, float(np.radians(50.0))
 
 
+def _draw(mesh: Any, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Change a mesh in an order in which no face ever names a vertex that is not there."""
+    if len(vertices) >= len(mesh.vertices):
+        mesh.vertices, mesh.faces = vertices, faces
+    else:
+        mesh.faces, mesh.vertices = faces, vertices
+
+
 class OrganView:
     """Draws into a viser server; everything in metres, in the organ's frame.
 
@@ -53,13 +66,14 @@ class OrganView:
         self._organ: Organ | None = None
         self._bands: list[Any] = []
         self._tool: Any = None
+        self._tip: Tip | None = None
         self._arrow: Any = None
         self.top = top_for(0.0)
         server.scene.set_up_direction("+z")
         server.scene.world_axes.visible = False
         server.scene.add_light_ambient("/light", intensity=1.2)  # the first colours are dark
 
-    def show(self, organ: Organ, tumour: SurfaceMesh | None, tip_radius: float) -> None:
+    def show(self, organ: Organ, tumour: SurfaceMesh | None, tip: Tip) -> None:
         """Show another organ, at rest."""
         scene, first = self._server.scene, self._organ is None
         self._organ, self.top = organ, top_for(0.0)
@@ -86,16 +100,7 @@ class OrganView:
             )
         else:
             scene.remove_by_name("/tumour")
-        self._add_tool(tip_radius, organ.above(2.0 * tip_radius))
-        self._aim(organ)
-        if not first:
-            for client in self._server.get_clients().values():
-                client.camera.look_at = tuple(organ.centre)
-
-    def _add_tool(self, radius: float, position: np.ndarray) -> None:
-        scene = self._server.scene
-        self._tool = scene.add_icosphere("/tool", radius, TOOL, position=tuple(position))
-        self._tool.on_drag("left")(self._dragged)
+        self._add_tool(tip, organ.above(tip.offset + CLEARANCE))
         self._arrow = scene.add_arrows(
             "/force",
             np.zeros((1, 2, 3)),
@@ -105,6 +110,23 @@ class OrganView:
             head_length=0.008,
             visible=False,
         )
+        self._aim(organ)
+        if not first:
+            for client in self._server.get_clients().values():
+                client.camera.look_at = tuple(organ.centre)
+
+    def _add_tool(self, tip: Tip, position: np.ndarray) -> None:
+        self._tip = tip
+        vertices, faces = tip_body(tip)
+        self._tool = self._server.scene.add_mesh_simple(
+            "/tool", vertices, faces, color=TOOL, wxyz=self._upright(position), position=position
+        )
+        self._tool.on_drag("left")(self._dragged)
+
+    def _upright(self, position: np.ndarray) -> np.ndarray:
+        """Turns the shaft along the surface's normal, for which the force is computed."""
+        assert self._organ is not None
+        return turn_to(self._organ.outward(position))
 
     def _aim(self, organ: Organ) -> None:
         camera = self._server.initial_camera
@@ -115,28 +137,35 @@ class OrganView:
         way = np.array(event.end_position) - np.array(event.start_position)
         self._on_drag(np.array(self._tool.position) + way)
 
-    def resize_tool(self, radius: float) -> None:
-        """Change the radius of the tip [m]."""
+    def change_tip(self, tip: Tip) -> None:
+        """Show another tip in the same place."""
         if self._tool is not None:
-            self._tool.radius = radius
+            self._add_tool(tip, np.array(self._tool.position))
 
-    def move(self, points: np.ndarray) -> float:
-        """Move the surface as in a cloud, (n, 6) [m]; returns the largest displacement [m]."""
+    def move(self, points: np.ndarray, tip: np.ndarray, force: np.ndarray) -> float:
+        """Move the surface as in a cloud, (n, 6) [m]; returns the largest displacement [m].
+
+        Under a tip [m] that feels a force [N], smaller triangles show its dent.
+        """
         organ = self._organ
         if organ is None or len(points) != len(organ.vertices):
             return 0.0
-        size = np.linalg.norm(points[:, 3:], axis=1)
+        if self._tip is not None and np.linalg.norm(force) > LEAST_FORCE:
+            shown = fine_surface(organ.vademecum, points, self._tip, tip)
+        else:
+            shown = FineSurface(points[:, :3], points[:, 3:], organ.faces)
+        size = np.linalg.norm(shown.displacements, axis=1)
         largest = float(size.max())
         self.top = top_for(largest, self.top)
-        of_face = size[organ.faces].mean(axis=1)
+        of_face = size[shown.faces].mean(axis=1)
         band = np.minimum((of_face * (N_BANDS / self.top)).astype(int), N_BANDS - 1)
+        positions = np.ascontiguousarray(shown.positions, np.float32)
         with self._server.atomic():
             for i, mesh in enumerate(self._bands):
-                faces = organ.faces[band == i]
+                faces = shown.faces[band == i]
                 if len(faces) == 0 and len(mesh.faces) == 1:
                     continue  # still empty
-                mesh.vertices = np.ascontiguousarray(points[:, :3])
-                mesh.faces = faces.astype(np.uint32) if len(faces) else _NO_FACE
+                _draw(mesh, positions, faces.astype(np.uint32) if len(faces) else _NO_FACE)
         return largest
 
     def place_tool(self, tip: np.ndarray, force: np.ndarray) -> None:
@@ -145,9 +174,10 @@ class OrganView:
             return
         with self._server.atomic():
             self._tool.position = tuple(tip)
+            self._tool.wxyz = self._upright(tip)
             size = float(np.linalg.norm(force))
-            if size > 1e-3:
+            if size > LEAST_FORCE:
                 length = min(FORCE_SCALE * size, MAX_ARROW)
                 self._arrow.points = np.stack([tip, tip + force * (length / size)])[None]
-            if self._arrow.visible != (size > 1e-3):
-                self._arrow.visible = size > 1e-3
+            if self._arrow.visible != (size > LEAST_FORCE):
+                self._arrow.visible = size > LEAST_FORCE

@@ -1,0 +1,66 @@
+"""The elastic problem of a patient: an own mesh, clamped and loaded where the template is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avatar_core.atlas.base import PatientBase
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_normals
+from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.correspondence import carry_regions, registered_positions
+from avatar_core.shapes.registration import Registration
+
+
+@dataclass(frozen=True, eq=False)
+class PatientProblem:
+    """A patient's own mesh, with clamp and load positions transferred from the template.
+
+    surface : of the patient; registration : of the template to it
+    mesh, regions, loads, elasticity : the patient's
+    """
+
+    surface: SurfaceMesh
+    registration: Registration
+    mesh: TetMesh
+    regions: Regions
+    loads: LoadSurface
+    elasticity: Elasticity
+
+    @property
+    def outline(self) -> SurfaceMesh | None:
+        """What tools touch: the surface, or None for the boundary of a registered template, which
+        lies beside it."""
+        return None if self.mesh is self.registration.mesh else self.surface
+
+
+def patient_problem(
+    surface: SurfaceMesh, base: PatientBase, registration: Registration, mesh: TetMesh
+) -> PatientProblem:
+    """Transfer clamp, accessible region and patch radius of the base to a patient's mesh.
+
+    Raises
+    ------
+    RegistrationError, MeshError
+        If the mesh lies elsewhere, or is too coarse for the regions or the patch.
+    """
+    regions = carry_regions(registration, mesh)
+    loads = load_surface(mesh, regions, base.loads.patch_radius)
+    elasticity = Elasticity(mesh, base.material, regions.clamped)
+    return PatientProblem(surface, registration, mesh, regions, loads, elasticity)
+
+
+def member_problem(
+    surface: SurfaceMesh, base: PatientBase, member: int, registration: Registration
+) -> PatientProblem:
+    """An anatomy of the base on the registered template, on which its response was computed."""
+    template = base.template
+    mesh = TetMesh(np.asarray(base.vertices[member], float), template.mesh.tets)
+    own = replace(registration, mesh=mesh)
+    loads = replace(base.loads, centers=registered_positions(own, base.loads))
+    loads = replace(loads, normals=patch_normals(mesh, loads.centers, loads.patch_radius))
+    elasticity = Elasticity(mesh, base.material, template.regions.clamped)
+    return PatientProblem(surface, own, mesh, template.regions, loads, elasticity)
