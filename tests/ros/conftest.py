@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import tempfile
 import time
-import zlib
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,14 +17,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.slowness import Deadline
+from tests.slowness import Deadline, slowness
 from tests.stored import stored
 
+_DOMAINS = range(1, 102)  # of DDS, those that work on every platform
 TIP_RADIUS = 0.005  # [m]
 # Of a contact node: a test may be kept from sending poses for longer than a driver.
 PATIENT = ["--ros-args", "-p", "pose_timeout:=0.5"]
 START_TIMEOUT = 120.0  # of a process, its compilation included, on a busy machine [s]
 DISCOVERY = 0.3  # of a client by its service [s]
+JOINING = 5.0  # after which a node that joined is taken to have missed something [s]
 ASK_AGAIN = 2.0  # after which an answer is taken for lost [s]
 TOUCH_DEPTH = 0.004  # [m]
 
@@ -115,25 +119,59 @@ class Probe:
         return client
 
 
+@contextmanager
+def newcomer(knows: Callable[[Any], bool]) -> Iterator[Probe]:
+    """A probe whose node discovered what it has to know; if none does, the last that joined.
+
+    One that joins may miss for good what another node said of itself: then one more joins.
+    """
+    passed = Deadline(START_TIMEOUT)
+    while True:
+        with closing(Probe()) as probe:
+            patience = JOINING * slowness()
+            probe.until(lambda probe=probe: knows(probe.node), patience, fail=False)
+            if knows(probe.node) or passed:
+                probe.spin(DISCOVERY)  # what is there beyond that, a test should see, too
+                yield probe
+                return
+
+
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     """Run alone without ROS, these tests are skipped by the file, which pytest takes for none."""
     if exitstatus == pytest.ExitCode.NO_TESTS_COLLECTED and find_spec("rclpy") is None:
         session.exitstatus = pytest.ExitCode.OK
 
 
-@pytest.fixture(scope="session", autouse=True)
-def own_domain(worker_id: str, testrun_uid: str) -> dict[str, str]:
-    """No other cell on this machine or network hears these tests, nor they it."""
-    from avatar_ros.bench import cell
-    from avatar_ros.bench.cell import isolated_environment
+@contextmanager
+def free_domain() -> Iterator[int]:
+    """A DDS domain that no other worker or run of these tests on this machine has meanwhile."""
+    first = os.getpid() % len(_DOMAINS)
+    for number in (*_DOMAINS[first:], *_DOMAINS[:first]):
+        with ExitStack() as held:
+            try:
+                path = Path(tempfile.gettempdir(), f"avatar-tests-domain-{number}.lock")
+                lock = held.enter_context(path.open("w"))
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except (BlockingIOError, PermissionError):  # another user's, the latter
+                continue
+            yield number
+            return
+    raise AssertionError("no DDS domain is free")
 
-    environment = isolated_environment()
-    if worker_id != "master":  # next to one another, whatever the first
-        first = zlib.crc32(testrun_uid.encode())
-        number = first + int(worker_id.removeprefix("gw"))
-        environment["ROS_DOMAIN_ID"] = str(1 + number % len(cell._DOMAINS))
-    os.environ.update(environment)
-    return environment
+
+@pytest.fixture(scope="session", autouse=True)
+def own_domain() -> Iterator[dict[str, str]]:
+    """No other cell on this machine or network hears these tests, nor they it.
+
+    A cell that is measured here takes this domain, too, and none at random.
+    """
+    from avatar_ros.bench import cell
+
+    with free_domain() as number, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cell, "_DOMAINS", range(number, number + 1))
+        environment = cell.isolated_environment()
+        os.environ.update(environment)
+        yield environment
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,7 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from avatar_ros.msg import ContactState
+from tests.ros.conftest import newcomer
 from tests.ros.pages import (
     PAGES,
     entry,
@@ -48,6 +49,18 @@ def probe(lasting_probe: Any) -> Any:
     return lasting_probe
 
 
+def documented(node: str) -> set[tuple[str, str, str]]:
+    """Name, type and direction of what a node has by the index."""
+    return {(topic(row), row["type"], row["direction"]) for row in index() if row["node"] == node}
+
+
+@pytest.fixture(scope="module")
+def graph(markers: None, cell: Any) -> Iterator[Any]:
+    """A node that discovered of the others all that the pages say."""
+    with newcomer(lambda graph: all(offered(graph, n) >= documented(n) for n in NODES)) as probe:
+        yield probe.node
+
+
 @pytest.fixture
 def running(cell: Any, probe: Any) -> Any:
     """A probe beside a cell that is up."""
@@ -70,34 +83,22 @@ def test_every_page_is_in_the_index() -> None:
 
 
 @pytest.mark.parametrize("node", NODES)
-def test_topics_and_services_are_those_of_the_pages(running: Any, node: str) -> None:
-    documented = {
-        (topic(row), row["type"], row["direction"]) for row in index() if row["node"] == node
-    }
+def test_topics_and_services_are_those_of_the_pages(graph: Any, node: str) -> None:
     # What one node sends any other may hear: it has its page.
     heard = {(topic(row), row["type"], "in") for row in index() if row["direction"] == "out"}
-    graph = running.node
-    # Discovery takes its time: what is missing may still come, what is too much does not go.
-    running.until(lambda: offered(graph, node) >= documented, 20.0, fail=False)
-    assert offered(graph, node) - heard == documented
+    assert offered(graph, node) - heard == documented(node)
 
 
 @pytest.mark.parametrize(
     "row", [row for row in index() if row["kind"] == "topic"], ids=lambda row: row["interface"]
 )
-def test_quality_of_service_is_that_of_the_page(running: Any, row: dict[str, str]) -> None:
-    graph = running.node
+def test_quality_of_service_is_that_of_the_page(graph: Any, row: dict[str, str]) -> None:
     look = (
         graph.get_subscriptions_info_by_topic
         if row["direction"] == "in"
         else graph.get_publishers_info_by_topic
     )
-
-    def ends() -> list[Any]:
-        return [end for end in look(topic(row)) if end.node_name == row["node"]]
-
-    running.until(lambda: bool(ends()), 20.0)
-    (end,) = ends()
+    (end,) = (end for end in look(topic(row)) if end.node_name == row["node"])
     said = entry(row["page"], "QoS")
     reliable = end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
     latched = end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL

@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,10 +34,10 @@ from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.action import BuildPatient
 from avatar_ros.msg import ContactState
 from avatar_ros.srv import InterpolatePatient, LoadVademecum
-from tests.ros.conftest import DISCOVERY, START_TIMEOUT, Probe
+from tests.ros.conftest import newcomer
 from tests.ros.pages import index, offered, parameter_rows, yaml_parameters
 from tests.ros.refusals import refusal
-from tests.slowness import Deadline, end_of, within
+from tests.slowness import end_of, within
 
 pytestmark = pytest.mark.ros
 
@@ -184,17 +183,18 @@ def test_services_and_actions_are_those_of_the_pages(node: Module) -> None:
     rows = [row for row in index() if row["node"] == NODE]
     named = {row["interface"]: row["type"] for row in rows if row["kind"] == "service"}
     documented = {f"/{name}": kind for name, kind in named.items()}
-    passed, found, actions = Deadline(START_TIMEOUT), {}, []
-    while found != documented:  # a newcomer may miss what a node said of itself: ask another one
-        assert not passed, f"offered: {found}"
-        with closing(Probe()) as newcomer:
-            newcomer.until(lambda: bool(offered(newcomer.node, NODE)), 5.0, fail=False)
-            newcomer.spin(DISCOVERY)
-            if seen := offered(newcomer.node, NODE):
-                found = {name: kind for name, kind, _ in seen if "_action" not in name}
-                actions = get_action_server_names_and_types_by_node(newcomer.node, NODE, "/")
-    (action,) = (row for row in rows if row["kind"] == "action")
-    assert actions == [(f"/{action['interface']}", [action["type"]])]
+    actions = [(f"/{row['interface']}", [row["type"]]) for row in rows if row["kind"] == "action"]
+    assert documented and len(actions) == 1
+
+    def seen(graph: Any) -> tuple[dict[str, str], list[Any]]:
+        """An action is told by its topics, which may be discovered after the services."""
+        found = {name: kind for name, kind, _ in offered(graph, NODE) if "_action" not in name}
+        if not found:  # nor the node itself
+            return {}, []
+        return found, get_action_server_names_and_types_by_node(graph, NODE, "/")
+
+    with newcomer(lambda graph: seen(graph) == (documented, actions)) as one:
+        assert seen(one.node) == (documented, actions)
 
 
 def test_parameters_are_those_of_page_and_yaml_file(node: Module, probe: Any) -> None:
