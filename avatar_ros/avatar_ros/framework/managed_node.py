@@ -19,10 +19,12 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from avatar_core.errors import AvatarError
 from avatar_ros.framework import discovery
+from avatar_ros.framework.ending import end_within
 from avatar_ros.framework.parameters import Parameter, ParameterError, declare
 from avatar_ros.framework.ports import Ports
 
 _SIGNAL_LATENCY = 0.1  # longest until a signal is noticed [s]
+_END = 1.0  # from the last answer to the end of the process [s]
 _LAST_ANSWERS = 1.0  # for requests that are pending when the node ends [s]
 
 
@@ -145,19 +147,23 @@ def run(make_node: Callable[[], ManagedNode], keeps_time: bool = False) -> int:
     The signal handlers of rclpy are not used: they shut the middleware down while the loop still
     has a last message to send.
     """
-    stop = StopSignal()
+    stop, code = StopSignal(), 1
+    node: ManagedNode | None = None
     try:
         discovery.stay_local()
         middleware = get_rmw_implementation_identifier()
         with discovery.udp_alone(middleware) if keeps_time else nullcontext():
             rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
             node = make_node()
-        return _live(node, stop)
+        code = _live(node, stop)
     except (ParameterError, AvatarError) as error:
         print(error, file=sys.stderr)
-        return 1
     finally:
+        end_within(_END, code)
+        if node is not None:
+            node.destroy_node()
         rclpy.try_shutdown()
+    return code
 
 
 def _live(node: ManagedNode, stop: StopSignal) -> int:
@@ -177,4 +183,3 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
         while node.has_pending_answers and time.monotonic() < end:
             executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
         executor.shutdown(timeout_sec=_LAST_ANSWERS)  # else it waits forever for open requests
-        node.destroy_node()
