@@ -45,11 +45,13 @@ def nodes_of_a_page(
     running = {
         name: Module(name, ["--ros-args", *words], domain) for name, words in arguments.items()
     }
-    yield running
-    for process in running.values():
-        process.send_signal(signal.SIGINT)
-    # `finish` is impatient where a browser shares the cores with all of them
-    codes = {name: process.wait(60.0) for name, process in running.items()}
+    try:
+        yield running
+    finally:  # a page that did not open leaves no nodes to other tests
+        for process in running.values():
+            process.send_signal(signal.SIGINT)
+        # `finish` is impatient where a browser shares the cores with all of them
+        codes = {name: process.wait(60.0) for name, process in running.items()}
     assert codes == dict.fromkeys(running, 0)
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import mmap
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,6 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.bench.cell import CellError, run_cell
-from avatar_ros.bench.footprint import Footprint, Growth
 
 pytestmark = pytest.mark.ros
 
@@ -66,28 +63,3 @@ def test_the_cell_keeps_time_while_the_material_changes(library: Path) -> None:
     # the next is asked for when the last is in use: a busy machine makes fewer of the twelve
     assert run.material_changes >= 3
     assert run.on_time_fraction > run.floor_on_time_fraction - 0.05
-
-
-@pytest.mark.long
-@pytest.mark.timing
-def test_nothing_grows_in_a_minute(library: Path) -> None:
-    """The times of a soak are measured by `avatar bench cell --seconds 600` on a quiet machine."""
-    report = run_cell(library / "liver.h5", 60.0, real_time=False)
-    run = report.ordinary
-    assert run is not None
-    print(f"\n{report.table()}")
-    named = {growth.process for growth in run.growths}
-    assert named >= {"vademecum_loader", "contact", "contact's helper 1", "scripted_tool"}
-    assert [growth.complaint for growth in run.growths if growth.complaint] == []
-
-
-def test_what_grows_is_complained_of(tmp_path: Path) -> None:
-    begin = Footprint.of(os.getpid())
-    taken = mmap.mmap(-1, 8_000_000)
-    taken.write(bytes(len(taken)))
-    with (tmp_path / "file").open("w"):
-        end = Footprint.of(os.getpid())
-    growth = Growth("test", begin, end)
-    assert growth.memory_mb == pytest.approx(8.0, abs=0.5)
-    assert growth.complaint.endswith("MB and 1 files more")
-    assert Growth("test", end, begin).complaint == ""

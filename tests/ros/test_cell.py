@@ -20,6 +20,7 @@ from shape_msgs.msg import Mesh
 
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumInfo
 from avatar_ros.srv import LoadVademecum
+from tests.ros.conftest import START_TIMEOUT
 
 pytestmark = pytest.mark.ros
 
@@ -198,9 +199,16 @@ def test_a_pose_that_stops_coming_is_stale(
 
 
 def test_the_loop_keeps_its_rate_without_poses(cell: Any, probe: Any) -> None:
-    probe.next(LoopStatistics, "statistics", qos.STATISTICS)
-    on_time = np.mean(wake_up_periods(1.0) < 1.5e-3)  # of a loop that only sleeps, meanwhile
-    statistics = probe.next(LoopStatistics, "statistics", qos.STATISTICS)
+    windows: list[LoopStatistics] = []  # of 1 s
+    listener = probe.node.create_subscription(
+        LoopStatistics, "statistics", windows.append, qos.STATISTICS
+    )
+    probe.until(lambda: bool(windows), START_TIMEOUT)
+    windows.clear()
+    on_time = np.mean(wake_up_periods(1.2) < 1.5e-3)  # of a loop that only sleeps, meanwhile
+    probe.until(lambda: bool(windows), START_TIMEOUT)
+    probe.node.destroy_subscription(listener)
+    statistics = windows[-1]
     # The design rate is 1000 Hz; the bound only tells a working loop from a broken one, since
     # these tests share their cores with whatever else runs. `avatar bench cell` measures it.
     assert 700.0 * on_time < statistics.rate < 1100.0

@@ -25,8 +25,9 @@ from rcl_interfaces.srv import SetParameters
 
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
-from tests.ros.conftest import Probe
+from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.fault_cell import MOST, FaultCell, Harm, Silence
+from tests.slowness import Deadline
 
 pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
 
@@ -125,7 +126,9 @@ def test_the_contact_node_is_killed(tool: FaultCell) -> None:
         cell.end("contact")
         cell.ear.statuses.clear()
         cell.start("contact")
+        passed = Deadline(START_TIMEOUT)
         while not (cell.ear.statuses and cell.ear.statuses[-1][2]):
+            assert not passed, "the contact node did not come back"
             time.sleep(0.01)
         assert identity in ("", cell.ear.statuses[-1][2])
 

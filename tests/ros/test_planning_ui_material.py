@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from tests.ros.browser import (
     until,
 )
 from tests.ros.conftest import PATIENT, Probe
+from tests.stored import stored
 
 pytestmark = [
     pytest.mark.ros,
@@ -49,23 +51,33 @@ BALL = 0.018  # radius of the tumour [m]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A library with a coarse phantom over Poisson's ratio and the contrast of a tumour."""
+    folder = tmp_path_factory.mktemp("tumour")
+    for name, content in _library().items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+@stored
+def _library() -> dict[str, bytes]:
     import pyvista
 
-    folder = tmp_path_factory.mktemp("tumour")
     liver = phantom_liver(12e-3)
     center = liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0])
     ball = pyvista.Sphere(radius=BALL, center=center, theta_resolution=20, phi_resolution=20)
     faces = ball.faces.reshape(-1, 4)[:, 1:]
-    meshio.write_points_cells(folder / "tumour.stl", 1e3 * ball.points, {"triangle": faces})
-    options = OrganOptions(
-        n_vertices=600,
-        rule=BuildRule(max_modes=20, most_oversampling=1.2),
-        coordinates=(Coordinate("poisson", 0.40, 0.49, 2), Coordinate("contrast", 0.5, 20.0, 3)),
-        tumour=read_tumour(folder / "tumour.stl"),
-        n_certified=4,
-    )
-    save_vademecum(build(liver, options), folder / "liver.h5")
-    return folder
+    with TemporaryDirectory() as name:
+        tumour, organ = Path(name, "tumour.stl"), Path(name, "liver.h5")
+        meshio.write_points_cells(tumour, 1e3 * ball.points, {"triangle": faces})
+        contrast = Coordinate("contrast", 0.5, 20.0, 3)
+        options = OrganOptions(
+            n_vertices=600,
+            rule=BuildRule(max_modes=20, most_oversampling=1.2),
+            coordinates=(Coordinate("poisson", 0.40, 0.49, 2), contrast),
+            tumour=read_tumour(tumour),
+            n_certified=4,
+        )
+        save_vademecum(build(liver, options), organ)
+        return {file.name: file.read_bytes() for file in (tumour, organ)}
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,7 @@ from avatar_ros.framework.discovery import (
 )
 from lifecycle_msgs.srv import GetState
 
+from tests.ros.conftest import START_TIMEOUT
 from tests.slowness import end_of
 
 pytestmark = pytest.mark.ros
@@ -208,9 +209,10 @@ def test_another_machine_reaches_a_node_only_if_told(
         time.sleep(2.0)
         peer_environment = _plain(own_domain) | {RANGE: "SUBNET"}
         peer_environment["ROS_STATIC_PEERS"] = machines.address
-        script = textwrap.dedent(HEARD.format(seconds=LISTENING))
+        seconds = LISTENING if heard == "nothing" else START_TIMEOUT  # it ends when it hears
+        script = textwrap.dedent(HEARD.format(seconds=seconds))
         peer = machines.start(1, [sys.executable, "-c", script], peer_environment)
-        assert peer.communicate(timeout=60.0)[0].strip() == heard
+        assert peer.communicate(timeout=2 * START_TIMEOUT)[0].strip() == heard
         assert node.poll() is None
     finally:
         node.terminate()

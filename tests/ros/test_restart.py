@@ -30,6 +30,7 @@ from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.fault_cell import FaultCell
 from tests.ros.test_cell import _force, _stamp
+from tests.slowness import Deadline
 
 pytestmark = pytest.mark.ros
 
@@ -53,8 +54,9 @@ class State:
         assert scene.success, scene.message
         soft = np.linalg.norm(self.force(info.id))
         self.set(CHOSEN)
+        passed = Deadline(START_TIMEOUT)
         while np.linalg.norm(self.force(info.id)) < 1.1 * soft:  # in use some tenths of a second on
-            pass
+            assert not passed
         return str(info.id)
 
     def set(self, values: dict[str, float]) -> None:
@@ -162,9 +164,9 @@ def test_what_is_started_again_goes_on_as_before(
 
 def wait_until_kept(file: Path, name: str) -> None:
     """A budget is granted, and kept, once the model before is out of use, 0.1 s after it shows."""
-    deadline = time.monotonic() + START_TIMEOUT
+    passed = Deadline(START_TIMEOUT)
     while name not in json.loads(file.read_text())["changed"]:
-        assert time.monotonic() < deadline, f"{name} is not kept in {file}"
+        assert not passed, f"{name} is not kept in {file}"
         time.sleep(0.05)
 
 

@@ -80,7 +80,7 @@ class Palpation:
         """Stay; the last force."""
         self.felt.clear()
         self.probe.spin(seconds)
-        assert self.felt
+        self.probe.until(lambda: bool(self.felt), 10.0)
         return self.felt[-1]
 
     def settle(self, size: float) -> None:

@@ -110,9 +110,12 @@ def hand(
     files = ["-p", f"library_dir:={twins}", "-p", "vademecum:=one.h5"]
     loader = Module("vademecum_loader", ["--ros-args", *files], own_domain)
     contact = Module("contact", PATIENT, own_domain)
-    probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
-    yield Hand(probe, touch[0])
-    assert [contact.finish(), loader.finish()] == [0, 0]
+    try:
+        probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
+        yield Hand(probe, touch[0])
+    finally:
+        codes = [contact.finish(), loader.finish()]
+    assert codes == [0, 0]
 
 
 @pytest.mark.parametrize("n_swaps", [2, pytest.param(6, marks=pytest.mark.long)])

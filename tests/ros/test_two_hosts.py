@@ -26,6 +26,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState
+from tests.slowness import Deadline
 
 pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
 
@@ -141,8 +142,8 @@ class Ear:
 
     def until(self, wanted: Callable[[dict[str, Any]], bool], timeout: float) -> dict[str, Any]:
         assert self._process.stdout is not None
-        end = time.monotonic() + timeout
-        while time.monotonic() < end:
+        passed = Deadline(timeout)
+        while not passed:
             line = json.loads(self._process.stdout.readline())
             self.lines.append(line)
             if wanted(line):
