@@ -27,13 +27,14 @@ from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.fault_cell import MOST, FaultCell, Harm, Silence
-from tests.slowness import Deadline
+from tests.slowness import Deadline, end_of
 
 pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
 
 STOPPED = 2.0  # [s]
 RECOVERY = 1.0  # [s]
-JOINING = 30  # processes
+JOINING = 30  # processes, two at a time
+SWAPS = 150
 JOIN = """
 import time, rclpy
 rclpy.init()
@@ -168,9 +169,10 @@ def test_processes_join(tool: FaultCell, own_domain: dict[str, str]) -> None:
     """Any ROS process of the same machine, with the middleware's own settings."""
 
     def join(cell: FaultCell) -> None:
-        for _ in range(JOINING):
-            joined = subprocess.Popen([sys.executable, "-c", JOIN], cwd="/", env=own_domain)
-            assert joined.wait(30.0) == 0
+        command = [sys.executable, "-c", JOIN]
+        for _ in range(JOINING // 2):
+            pair = [subprocess.Popen(command, cwd="/", env=own_domain) for _ in range(2)]
+            assert [end_of(one, 30.0) for one in pair] == [0, 0]
 
     harm = tool.suffer(f"{JOINING} processes join", join)
     accept(harm)
@@ -200,12 +202,12 @@ def test_vademecums_are_swapped_all_the_time(tool: FaultCell, lasting_probe: Pro
     def swap(cell: FaultCell) -> None:
         client = lasting_probe.client(LoadVademecum, "load_vademecum")
         begin = time.monotonic()
-        for k in range(300):
+        for k in range(SWAPS):
             name = ("twin.h5", "liver.h5")[k % 2]
             client.call_async(LoadVademecum.Request(name=name))
             lasting_probe.until(lambda k=k: time.monotonic() > begin + 0.1 * (k + 1), 10.0)
 
-    harm = tool.suffer("a swap every 100 ms for 30 s", swap)
+    harm = tool.suffer(f"{SWAPS} swaps, one every 100 ms", swap)
     accept(harm)
 
 
