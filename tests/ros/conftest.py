@@ -217,12 +217,13 @@ def _organ() -> Any:
 
 @pytest.fixture(scope="session")
 def library(organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Good and bad files, and a way out."""
+    """Good and bad files, the same organ by another name, and a way out."""
     from avatar_core.vademecum.storage import save_vademecum
 
     folder = tmp_path_factory.mktemp("library")
     outside = tmp_path_factory.mktemp("outside")
     save_vademecum(organ, folder / "liver.h5")
+    save_vademecum(replace(organ, name="twin"), folder / "twin.h5")
     content = (folder / "liver.h5").read_bytes()
     (outside / "liver.h5").write_bytes(content)
     (folder / "link.h5").symlink_to(outside / "liver.h5")

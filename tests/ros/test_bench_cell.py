@@ -21,6 +21,7 @@ def test_a_missing_vademecum_is_named(tmp_path: Path) -> None:
         run_cell(tmp_path / "missing.h5", 1.0)
 
 
+@pytest.mark.long  # five processes for one line
 def test_a_broken_vademecum_ends_the_measurement(library: Path) -> None:
     with pytest.raises(CellError, match="build"):
         run_cell(library / "short.h5", 1.0, real_time=False)

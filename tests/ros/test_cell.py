@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -249,3 +250,31 @@ def test_a_good_file_is_loaded(cell: Any, probe: Any, organ: Any, library: Path)
     assert answer.info.n_modes == expected.n_modes
     assert answer.info.contact_worst == expected.contact_worst
     assert answer.info.header.frame_id == "organ"
+
+
+@pytest.mark.parametrize("n_swaps", [2, pytest.param(6, marks=pytest.mark.long)])
+def test_another_vademecum_is_felt_soon_and_timed_later(
+    cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndarray], n_swaps: int
+) -> None:
+    _wait_for_model(cell, probe)
+    hand = Hand(probe, touch[0])
+    seconds = []
+    for k in range(n_swaps):
+        request = LoadVademecum.Request(name=("twin.h5", "liver.h5")[k % 2])
+        wanted = probe.call(LoadVademecum, "load_vademecum", request).info.id
+        asked = time.monotonic()
+        probe.next(
+            ContactState,
+            "contact_state",
+            qos.state(1),
+            lambda s, wanted=wanted: s.vademecum_id == wanted and s.contacts,
+            60.0,
+            hand,
+        )
+        seconds.append(time.monotonic() - asked)
+        timed = lambda window: math.isfinite(window.promised_step_p99)  # noqa: E731
+        probe.next(LoopStatistics, "statistics", qos.STATISTICS, timed, 60.0, hand)
+    print(
+        f"\nfrom the answer of load_vademecum to the first force of the new one: median "
+        f"{np.median(seconds):.2f} s, worst {max(seconds):.2f} s of {n_swaps}"
+    )

@@ -23,7 +23,6 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
-from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.fault_cell import MOST, FaultCell, Harm, Silence
@@ -46,15 +45,8 @@ SILENT_AFTER = 30e-3  # a pose is stale, and the force gone: 20 ms and 10 ms [s]
 
 @pytest.fixture(scope="module")
 def cell(
-    own_domain: dict[str, str],
-    organ: Any,
-    library: Path,
-    folder: Path,
-    touch: tuple[np.ndarray, np.ndarray],
+    own_domain: dict[str, str], library: Path, folder: Path, touch: tuple[np.ndarray, np.ndarray]
 ) -> Iterator[FaultCell]:
-    from dataclasses import replace
-
-    save_vademecum(replace(organ, name="twin"), library / "twin.h5")
     cell = FaultCell(library, folder, touch, own_domain)
     yield cell
     cell.close()

@@ -12,11 +12,12 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
+from avatar_ros.framework.conversions import vademecum_file
 from geometry_msgs.msg import WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
-from avatar_ros.msg import ContactState
+from avatar_ros.msg import ContactState, VademecumFile
 from tests.ros.refusals import refusal
 from tests.slowness import end_of
 
@@ -42,7 +43,9 @@ def _is_silent(probe: Any, kind: type, topic: str, seconds: float = 0.5) -> bool
     return not heard
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
+)
 def test_a_signal_ends_a_node_cleanly(own_domain: dict[str, str], probe: Any, number: int) -> None:
     processes = {node: Module(node, [], own_domain) for node in NODES}
     try:
@@ -57,7 +60,9 @@ def test_a_signal_ends_a_node_cleanly(own_domain: dict[str, str], probe: Any, nu
             process.kill()
 
 
-def test_without_vademecum_the_wrench_is_zero(own_domain: dict[str, str], probe: Any) -> None:
+def test_without_vademecum_the_wrench_is_zero_and_a_broken_one_changes_nothing(
+    own_domain: dict[str, str], probe: Any
+) -> None:
     process = Module("contact", [], own_domain)
     try:
         state = probe.next(ContactState, "contact_state", qos.state(1))
@@ -67,6 +72,11 @@ def test_without_vademecum_the_wrench_is_zero(own_domain: dict[str, str], probe:
         assert wrench == WrenchStamped(header=wrench.header)
         assert wrench.header.frame_id == "organ"
         assert (wrench.header.stamp.sec, wrench.header.stamp.nanosec) == (0, 0)
+        publisher = probe.node.create_publisher(VademecumFile, "vademecum", qos.LATCHED)
+        publisher.publish(vademecum_file("0" * 64, "forged", b"x" * 1000))
+        probe.until(lambda: "'forged' refused" in process.said(), 30.0)
+        state = probe.next(ContactState, "contact_state", qos.state(1))
+        assert state.status == ContactState.STATUS_NO_MODEL
     finally:
         assert process.finish() == 0
 
@@ -147,22 +157,3 @@ def test_a_wrong_parameter_ends_the_node(
     process = Module(node, ["--ros-args", *options], own_domain)
     assert end_of(process, 60.0) == 1
     assert reason in process.last_line()
-
-
-def test_a_broken_vademecum_from_elsewhere_is_refused(
-    own_domain: dict[str, str], probe: Any
-) -> None:
-    from avatar_ros.framework.conversions import vademecum_file
-
-    from avatar_ros.msg import VademecumFile
-
-    process = Module("contact", [], own_domain)
-    try:
-        probe.next(ContactState, "contact_state", qos.state(1))
-        publisher = probe.node.create_publisher(VademecumFile, "vademecum", qos.LATCHED)
-        publisher.publish(vademecum_file("0" * 64, "forged", b"x" * 1000))
-        probe.until(lambda: "'forged' refused" in process.said(), 30.0)
-        state = probe.next(ContactState, "contact_state", qos.state(1))
-        assert state.status == ContactState.STATUS_NO_MODEL
-    finally:
-        assert process.finish() == 0

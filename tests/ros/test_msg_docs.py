@@ -36,12 +36,12 @@ NODES = ("vademecum_loader", "contact", "organ_markers")
 OVERRIDABLE = NODES[:2]  # whose quality of service parameters may change
 
 
-@pytest.fixture(scope="module", autouse=True)
-def markers(own_domain: dict[str, str]) -> Iterator[None]:
-    """The node for RViz and Foxglove, beside the cell."""
-    process = Module("organ_markers", [], own_domain)
-    yield
-    assert process.finish() == 0
+@pytest.fixture(scope="module")
+def cell(own_domain: dict[str, str]) -> Iterator[list[Module]]:
+    """The nodes with nothing but their defaults."""
+    processes = [Module(node, [], own_domain) for node in NODES]
+    yield processes
+    assert [process.finish() for process in processes] == [0] * len(NODES)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def documented(node: str) -> set[tuple[str, str, str]]:
 
 
 @pytest.fixture(scope="module")
-def graph(markers: None, cell: Any) -> Iterator[Any]:
+def graph(cell: Any) -> Iterator[Any]:
     """A node that discovered of the others all that the pages say."""
     with newcomer(lambda graph: all(offered(graph, n) >= documented(n) for n in NODES)) as probe:
         yield probe.node
@@ -64,7 +64,7 @@ def graph(markers: None, cell: Any) -> Iterator[Any]:
 @pytest.fixture
 def running(cell: Any, probe: Any) -> Any:
     """A probe beside a cell that is up."""
-    probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
+    probe.next(ContactState, "contact_state", qos.state(1))
     return probe
 
 
@@ -136,7 +136,6 @@ def test_the_yaml_file_holds_every_parameter_at_its_default(running: Any) -> Non
     request = GetParameters.Request(names=list(values))
     answer = running.ask(GetParameters, "/contact/get_parameters", request)
     running_with = [parameter_value_to_python(value) for value in answer.values]
-    values["pose_timeout"] = 0.5  # of the cell in these tests
     assert dict(zip(values, running_with, strict=True)) == values
     listed = running.ask(ListParameters, "/contact/list_parameters", ListParameters.Request())
     declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}

@@ -87,69 +87,6 @@ def test_what_would_harm_is_refused_in_one_line(
     assert f"parameter {value.split(':=')[0].rsplit('.', 1)[0]}" in said
 
 
-def test_an_override_is_what_others_see(own_domain: dict[str, str], probe: Any) -> None:
-    values = (f"{WRENCHES}.reliability:=best_effort", f"{WRENCHES}.deadline:=50000000")
-    with running("contact", own_domain, *values):
-        topic = "/tool/spatial/servo_cf"
-        probe.until(lambda: bool(probe.node.get_publishers_info_by_topic(topic)), 60.0)
-        (end,) = probe.node.get_publishers_info_by_topic(topic)
-        assert end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-        assert end.qos_profile.deadline == Duration(nanoseconds=50_000_000)
-        probe.next(WrenchStamped, topic, qos.NEWEST)
-
-
-def test_a_driver_learns_by_its_deadline_that_the_wrenches_ended(
-    own_domain: dict[str, str], probe: Any
-) -> None:
-    missed: list[Any] = []
-    heard: list[Any] = []
-    asked = QoSProfile(
-        depth=1, reliability=ReliabilityPolicy.RELIABLE, deadline=Duration(seconds=0.2)
-    )
-    probe.node.create_subscription(
-        WrenchStamped,
-        "tool/spatial/servo_cf",
-        heard.append,
-        asked,
-        event_callbacks=SubscriptionEventCallbacks(deadline=missed.append),
-    )
-    with running("contact", own_domain) as process:
-        probe.until(lambda: len(heard) > 100, 60.0)  # it matches: as short a one is offered
-        process.send_signal(signal.SIGSTOP)
-        missed.clear()
-        try:
-            probe.until(lambda: bool(missed), 5.0)
-        finally:
-            process.send_signal(signal.SIGCONT)
-
-
-def test_a_driver_that_does_not_match_is_named(own_domain: dict[str, str], probe: Any) -> None:
-    """Shut out by a deadline that it does not offer, only since that was asked for."""
-    topic = "tool/measured_cp"
-    with running("contact", own_domain, f"{POSES}.deadline:=20000000") as process:
-        assert diagnosis(probe, lambda status: True).level == DiagnosticStatus.OK
-        publisher = probe.node.create_publisher(PoseStamped, topic, qos.NEWEST)
-        said = diagnosis(probe, lambda status: status.level == DiagnosticStatus.WARN)
-        assert "/tool/measured_cp: not matched with probe" in said.message
-        assert "deadline" in said.message.lower()
-        assert "/tool/measured_cp: probe is not heard here" in process.said()
-        assert f"{POSES}.*" in process.said()
-        assert process.said().count("is not heard here") == 1
-        probe.node.destroy_publisher(publisher)
-        diagnosis(probe, lambda status: status.level == DiagnosticStatus.OK)
-
-
-def test_a_viewer_that_does_not_match_is_named(own_domain: dict[str, str], probe: Any) -> None:
-    from sensor_msgs.msg import PointCloud2
-
-    with running("contact", own_domain) as process:
-        probe.next(ContactState, "contact_state", qos.state(1))
-        probe.node.create_subscription(PointCloud2, "deformation", lambda _: None, RELIABLE)
-        said = diagnosis(probe, lambda status: status.level == DiagnosticStatus.WARN)
-        assert "/deformation: not matched with probe" in said.message
-        assert "qos_overrides./deformation.publisher.reliability" in process.said()
-
-
 LISTEN = """
 import rclpy
 from geometry_msgs.msg import WrenchStamped
@@ -198,3 +135,85 @@ def test_reliable_subscribers_that_stand_still_do_not_hold_up_the_loop(
     # tells a loop that goes on from one that waits for them, a tenth of a second each time
     assert asleep.rate > 0.5 * awake.rate
     assert asleep.compute_p99 < 0.05 * slowness()
+
+
+# --- One contact node for the tests of its defaults, then one for those of its overrides ---------
+# Each is there until it is another's turn: what starts its own comes before.
+
+
+@pytest.fixture(scope="module")
+def contact(request: pytest.FixtureRequest, own_domain: dict[str, str]) -> Iterator[Module]:
+    with running("contact", own_domain, *request.param) as process:
+        yield process
+
+
+DEFAULTS: tuple[str, ...] = ()
+OVERRIDES = (
+    f"{WRENCHES}.reliability:=best_effort",
+    f"{WRENCHES}.deadline:=50000000",
+    f"{POSES}.deadline:=20000000",
+)
+by_default = pytest.mark.parametrize("contact", [DEFAULTS], indirect=True, ids=["defaults"])
+overridden = pytest.mark.parametrize("contact", [OVERRIDES], indirect=True, ids=["overrides"])
+
+
+@overridden
+def test_an_override_is_what_others_see(contact: Module, probe: Any) -> None:
+    topic = "/tool/spatial/servo_cf"
+    probe.until(lambda: bool(probe.node.get_publishers_info_by_topic(topic)), 60.0)
+    (end,) = probe.node.get_publishers_info_by_topic(topic)
+    assert end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    assert end.qos_profile.deadline == Duration(nanoseconds=50_000_000)
+    probe.next(WrenchStamped, topic, qos.NEWEST)
+
+
+@by_default
+def test_a_driver_learns_by_its_deadline_that_the_wrenches_ended(
+    contact: Module, probe: Any
+) -> None:
+    missed: list[Any] = []
+    heard: list[Any] = []
+    asked = QoSProfile(
+        depth=1, reliability=ReliabilityPolicy.RELIABLE, deadline=Duration(seconds=0.2)
+    )
+    probe.node.create_subscription(
+        WrenchStamped,
+        "tool/spatial/servo_cf",
+        heard.append,
+        asked,
+        event_callbacks=SubscriptionEventCallbacks(deadline=missed.append),
+    )
+    probe.until(lambda: len(heard) > 100, 60.0)  # it matches: as short a one is offered
+    contact.send_signal(signal.SIGSTOP)
+    missed.clear()
+    try:
+        probe.until(lambda: bool(missed), 5.0)
+    finally:
+        contact.send_signal(signal.SIGCONT)
+
+
+@overridden
+def test_a_driver_that_does_not_match_is_named(contact: Module, probe: Any) -> None:
+    """Shut out by a deadline that it does not offer, only since that was asked for."""
+    topic = "tool/measured_cp"
+    assert diagnosis(probe, lambda status: True).level == DiagnosticStatus.OK
+    publisher = probe.node.create_publisher(PoseStamped, topic, qos.NEWEST)
+    said = diagnosis(probe, lambda status: status.level == DiagnosticStatus.WARN)
+    assert "/tool/measured_cp: not matched with probe" in said.message
+    assert "deadline" in said.message.lower()
+    assert "/tool/measured_cp: probe is not heard here" in contact.said()
+    assert f"{POSES}.*" in contact.said()
+    assert contact.said().count("is not heard here") == 1
+    probe.node.destroy_publisher(publisher)
+    diagnosis(probe, lambda status: status.level == DiagnosticStatus.OK)
+
+
+@by_default
+def test_a_viewer_that_does_not_match_is_named(contact: Module, probe: Any) -> None:
+    from sensor_msgs.msg import PointCloud2
+
+    probe.next(ContactState, "contact_state", qos.state(1))
+    probe.node.create_subscription(PointCloud2, "deformation", lambda _: None, RELIABLE)
+    said = diagnosis(probe, lambda status: status.level == DiagnosticStatus.WARN)
+    assert "/deformation: not matched with probe" in said.message
+    assert "qos_overrides./deformation.publisher.reliability" in contact.said()

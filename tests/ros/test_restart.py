@@ -6,7 +6,6 @@ import json
 import signal
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import parameter_value_to_python
 
-from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumInfo
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.ros.conftest import START_TIMEOUT, Probe
@@ -112,13 +110,11 @@ def state_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def cell(
     own_domain: dict[str, str],
-    organ: Any,
     library: Path,
     folder: Path,
     touch: tuple[np.ndarray, np.ndarray],
     state_dir: Path,
 ) -> Iterator[FaultCell]:
-    save_vademecum(replace(organ, name="twin"), library / "twin.h5")
     patient = ("pose_timeout:=0.5",)
     cell = FaultCell(library, folder, touch, own_domain, state_dir, 0.0, patient)
     cell.start("tool", 200.0)
