@@ -44,7 +44,8 @@ from tests.ros.pages import parameter_rows
 
 pytestmark = [
     pytest.mark.ros,
-    pytest.mark.long,  # a browser that draws without a graphics card takes both cores
+    pytest.mark.long,
+    pytest.mark.timing,  # a browser that draws without a graphics card takes both cores
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
 ]
 

@@ -41,6 +41,7 @@ from tests.stored import stored
 pytestmark = [
     pytest.mark.ros,
     pytest.mark.long,  # an organ with coordinates is solved first
+    pytest.mark.timing,  # a browser that draws without a graphics card takes both cores
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
 ]
 
