@@ -28,8 +28,8 @@ from avatar_core.contact.effects.selection import (
     selected_arrays,
 )
 from avatar_core.contact.effects.several_tools import SeveralTools
-from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, RIDGE, tip_law_arrays
-from avatar_core.contact.effects.tip_profile import BETA, KAPPA, STIFFNESS, TAKEN
+from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, tip_law_arrays
+from avatar_core.contact.effects.tip_profile import ANISOTROPY, KAPPA, STIFFNESS, TAKEN, TAU
 from avatar_core.contact.kernels import ModelArrays
 from avatar_core.contact.locate import MAX_DEPTH
 from avatar_core.contact.tip_response import TipResponse, make_tip_response, sampled_at_tip
@@ -169,16 +169,17 @@ def lay_out(
 
 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
-    """kappa, beta, E* and c on the grid of the tip field, shape (4, nx, ny, nz) float32.
+    """kappa, tau, D, E* and c on the grid of the tip field, shape (5, nx, ny, nz) float32.
 
     Over a tumour of contrast q that stores the fraction f of the energy under a tip, E* is that of
     the organ over 1 - f + f / q.
     """
     stiffness = vademecum.material.plane_strain_modulus
     radius = vademecum.surface.patch_radius
-    field, local = vademecum.tip_field, np.zeros((4, *self_compliance.shape), np.float32)
+    field, local = vademecum.tip_field, np.zeros((5, *self_compliance.shape), np.float32)
     if field.curvature is not None:  # as in files since schema 2.3
-        local[KAPPA], local[BETA] = field.curvature, RIDGE * field.ridge
+        local[KAPPA], local[TAU] = field.curvature, field.growth
+        local[ANISOTROPY] = field.anisotropy
     local[STIFFNESS] = stiffness
     if field.tumour is not None and vademecum.contrast is not None:
         local[STIFFNESS] /= 1.0 - field.tumour + field.tumour / vademecum.contrast

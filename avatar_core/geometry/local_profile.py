@@ -1,15 +1,22 @@
 """How a surface falls away around a point: what decides where a blunt tip first touches.
 
 At radius r around a point of the surface, with n its outward normal, the height of the tangent
-plane over the surface, averaged over the circle, is about
+plane over the surface is h(r, theta). Its mean over the circle is about
 
-    h(r) = beta r + kappa r^2 / 2,
+    h(r) = kappa r^2 / 2 + tau r^3 / 6,
 
-kappa the mean curvature [1/m], positive where convex, and beta >= 0 the part of ridges and
-vertices: (2 / pi) tan(a) on a ridge whose two sides fall off at the angle a.
+kappa the mean curvature [1/m], positive where convex, and tau its change with the radius [1/m^2]:
+negative on a ridge, which is sharp at its crest and flat beside it. From the variance of h over the
+circle comes
+
+    D = 8 Var h / r^4,
+
+the square of half the difference of the principal curvatures where the surface has them.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import igl
 import numpy as np
@@ -19,38 +26,41 @@ from avatar_core.geometry.skin import Soup
 RADII = 1e-3 * np.array([1.5, 3.0, 4.5, 6.0])  # of the circles [m]
 DIRECTIONS = 7  # odd: on a ridge, as good as twice as many
 STEEPEST = 0.5  # squared cosine of a side's angle, 45 degrees: no tip follows a steeper one
+OUTER = slice(2, 4)  # circles of which the variance counts
+MIDDLE = float(RADII[OUTER].mean())  # their mean radius [m]
 
 
-def local_profile(
-    surface: Soup, points: np.ndarray, normals: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """kappa and beta around points of a surface, by least squares of h(r) / r up to 6 mm.
+class LocalProfile(NamedTuple):
+    """The shape of a surface around n points, each of shape (n,).
 
-    Where that gives beta < 0, a valley or a flat place beside an edge, beta is zero and kappa
-    fits alone.
+    curvature : kappa [1/m]
+    growth : tau [1/m^2]
+    anisotropy : D [1/m^2]
+    """
+
+    curvature: np.ndarray
+    growth: np.ndarray
+    anisotropy: np.ndarray
+
+
+def local_profile(surface: Soup, points: np.ndarray, normals: np.ndarray) -> LocalProfile:
+    """kappa and tau around points of a surface, by least squares of h(r) / r up to 6 mm, and D.
 
     Parameters
     ----------
     surface : vertices (m, 3) [m] and triangles (k, 3)
     points : ndarray, shape (n, 3), on the surface [m]
     normals : ndarray, shape (n, 3), unit vectors, outward
-
-    Returns
-    -------
-    kappa : ndarray, shape (n,) [1/m]
-    beta : ndarray, shape (n,), >= 0
     """
-    slope = _heights(surface, points, normals) / RADII
-    middle, mean = RADII.mean(), slope.mean(axis=1)
-    offset = RADII - middle
-    curvature = slope @ offset / (offset @ offset)
-    ridge = mean - curvature * middle
-    alone = slope @ RADII / (RADII @ RADII)
-    return 2.0 * np.where(ridge > 0.0, curvature, alone), np.maximum(ridge, 0.0)
+    height = _heights(surface, points, normals)
+    terms = np.stack([RADII / 2.0, RADII**2 / 6.0], axis=1)
+    curvature, growth = np.linalg.pinv(terms) @ (height.mean(axis=2) / RADII).T
+    spread = 8.0 * height.var(axis=2) / RADII**4
+    return LocalProfile(curvature, growth, spread[:, OUTER].mean(axis=1))
 
 
 def _heights(surface: Soup, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Mean height of the tangent plane over the surface on each circle, (n, radii) [m].
+    """Heights of the tangent plane over the surface on the circles, (n, radii, directions) [m].
 
     A point of the circle at q, whose closest point of the surface is c, at the angle a from n, is
     |q - c| / cos(a) above it: exact over a plane side, to fourth order over a ball.
@@ -58,14 +68,14 @@ def _heights(surface: Soup, points: np.ndarray, normals: np.ndarray) -> np.ndarr
     first, second = tangents(normals)
     angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     around = np.cos(angle)[:, None, None] * first + np.sin(angle)[:, None, None] * second
-    out = np.empty((len(points), len(RADII)))
+    out = np.empty((len(points), len(RADII), DIRECTIONS))
     for k, radius in enumerate(RADII):
         q = (points + radius * around).reshape(-1, 3)
         square, _, closest = igl.point_mesh_squared_distance(q, *surface)
         rise = ((q - closest).reshape(around.shape) * normals).sum(axis=2)
         square = np.maximum(square.reshape(rise.shape), 1e-30)
         height = rise / np.maximum(rise**2 / square, STEEPEST)
-        out[:, k] = np.clip(height, -radius, radius).mean(axis=0)
+        out[:, k] = np.clip(height, -radius, radius).T
     return out
 
 

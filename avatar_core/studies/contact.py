@@ -141,7 +141,7 @@ def _row(name: str, contact: SiteContact) -> dict[str, Value]:
         "liver": name,
         "place": site.kind,
         "kappa_per_m": site.kappa,
-        "beta": site.beta,
+        "anisotropy_per_m2": site.anisotropy,
         "radius_m": contact.radius,
         "depth_m": contact.depth,
         "true_n": contact.truth,

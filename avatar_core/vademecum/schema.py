@@ -55,7 +55,9 @@ _PARAMETRIC_BODY: Shapes = {
     "parametric/body/mass": "f: basis basis",
     "parametric/body/weight": "f: basis 3",
 }
-_PROFILE: Shapes = {"tip_field/curvature": "f: nx ny nz", "tip_field/ridge": "f: nx ny nz"}
+_PROFILE: Shapes = {
+    f"tip_field/{name}": "f: nx ny nz" for name in ("curvature", "growth", "anisotropy")
+}
 _TUMOUR: Shapes = {"tip_field/tumour": "f: nx ny nz"}
 _LARGE: Shapes = {
     "large/space": "f: 3*vertices large",

@@ -15,7 +15,8 @@ Datasets:
     near/start, near/target, near/block [m/N]
     contact_near/start, contact_near/target, contact_near/block [m/N]
     tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
-    tip_field/curvature [1/m], tip_field/ridge, from schema 2.3; tip_field/tumour over a tumour
+    tip_field/curvature [1/m], growth [1/m2], anisotropy [1/m2], from schema 2.3; tip_field/tumour
+    over a tumour
 
 A vademecum with coordinates of the material (from schema 2.0) has
 the JSON attributes ``coordinates``, ``contrast``, and

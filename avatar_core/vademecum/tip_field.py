@@ -13,10 +13,11 @@ square of 0.02 to 0.04 mm, and 0.26 mm at worst, where a ball of 3 mm can follow
 it from either side and overlap it by less than 0.1 mm. Elsewhere it rounds edges over about two
 spacings, by up to 0.6 mm.
 
-kappa(p) and beta(p) say how the outline falls away around the closest point, across grad phi; see
-:mod:`avatar_core.geometry.local_profile`. Over a tumour, f(p) is the part of the energy under a tip
-that it stores; see :mod:`avatar_core.geometry.tumour`. All are sampled where a tip may need them,
-within ``MARGIN`` of the outline and near the accessible faces; elsewhere their mean stands in.
+kappa(p), tau(p) and D(p) say how the outline falls away around the closest point, across grad phi;
+see :mod:`avatar_core.geometry.local_profile`. Over a tumour, f(p) is the part of the energy under
+a tip that it stores; see :mod:`avatar_core.geometry.tumour`. All are sampled where a tip may need
+them, within ``MARGIN`` of the outline and near the accessible faces; elsewhere their mean stands
+in.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from scipy.ndimage import (
     zoom,
 )
 
-from avatar_core.geometry.local_profile import local_profile
+from avatar_core.geometry.local_profile import LocalProfile, local_profile
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.skin import Skin, Soup
 from avatar_core.geometry.surface import SurfaceMesh
@@ -50,28 +51,28 @@ ROUND = 1.01  # depth over distance, up to which a side is round
 STEEPEST = 2.5  # depth over distance, at most: thin lobes
 MOST_STEPS = 12  # of the way, each by the distance that is left
 SMOOTHING = 0.5  # standard deviation of G, in spacings
-PROFILE_SMOOTHING = 1.0  # the same, for kappa and beta
-SHARED = (2e-3, 0.25)  # closest points [m] and components of normals that share a profile
+SHARED = (1e-3, 0.1)  # closest points [m] and components of normals that share a profile
 FADING = 0.5  # distance beyond the accessible surface over which access fades, in patch radii
 
+TUMOUR_SMOOTHING = 1.0  # standard deviation of the kernel for f, in spacings
 TUMOUR_CONTACT = 4e-3  # radius of the contact for which f is sampled [m],
 TUMOUR_REACH = 2.0  # and patch radii within which energy counts: they fit resolved contacts of
 # spheres of 1.5 to 10 mm, 2 and 5 mm above a tumour, with the least error in the mean
 
-# distance [m], access, curvature [1/m], ridge, tumour (nx, ny, nz) float32: phi, chi, kappa, beta,
-# f, the last three None in files before schema 2.3, the last without a tumour; origin (3,) [m];
-# spacing (1,) [m]
+# distance [m], access, curvature [1/m], growth [1/m^2], anisotropy [1/m^2], tumour, each
+# (nx, ny, nz) float32: phi, chi, kappa, tau, D, f, the last four None in files before schema 2.3,
+# the last without a tumour; origin (3,) [m]; spacing (1,) [m]
 TipField = namedtuple(
     "TipField",
-    ["distance", "access", "origin", "spacing", "curvature", "ridge", "tumour"],
-    defaults=(None, None, None),
+    ["distance", "access", "origin", "spacing", "curvature", "growth", "anisotropy", "tumour"],
+    defaults=(None,) * 4,
 )
 
 
 def make_tip_field(
     mesh: TetMesh, regions: Regions, patch_radius: float, outline: SurfaceMesh | None = None
 ) -> TipField:
-    """Sample phi, chi, kappa and beta around the accessible surface.
+    """Sample phi, chi and the local profile around the accessible surface.
 
     Inside the organ, the distance is taken to the outline within the fading distance of the
     accessible faces, so that a push into a thin lobe does not come out at its back.
@@ -104,11 +105,9 @@ def make_tip_field(
         spline_filter(smoothed(values, SMOOTHING), order=2)
         for values in (distance, _deepened(distance))
     )
-    curvature, ridge = _profile(skin.boundary, near, plain, access, origin)
-    distance, access, curvature, ridge = (
-        values.astype(np.float32) for values in (distance, access, curvature, ridge)
-    )
-    return TipField(distance, access, origin, np.array([SPACING]), curvature, ridge)
+    profile = _profile(skin.boundary, near, plain, access, origin)
+    distance, access = distance.astype(np.float32), access.astype(np.float32)
+    return TipField(distance, access, origin, np.array([SPACING]), *profile)
 
 
 def with_tumour(field: TipField, tumour: SurfaceMesh, patch_radius: float) -> TipField:
@@ -121,7 +120,7 @@ def with_tumour(field: TipField, tumour: SurfaceMesh, patch_radius: float) -> Ti
     fraction[known] = strained_fraction(
         tumour, points[first], normals[first], TUMOUR_CONTACT, TUMOUR_REACH * patch_radius
     )[group]
-    fraction = np.clip(smoothed(fraction, PROFILE_SMOOTHING, known), 0.0, 1.0)
+    fraction = np.clip(smoothed(fraction, TUMOUR_SMOOTHING, known), 0.0, 1.0)
     return field._replace(tumour=fraction.astype(np.float32))
 
 
@@ -173,8 +172,8 @@ def _deepened(distance: np.ndarray) -> np.ndarray:
 
 def _profile(
     outline: Soup, near: Soup, distance: np.ndarray, access: np.ndarray, origin: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """kappa and beta of the outline on the grid, around the closest points.
+) -> LocalProfile:
+    """kappa, tau and D of the outline on the grid, around the closest points.
 
     Points with nearly the same closest point and direction share their profile: there are
     several along each normal.
@@ -182,11 +181,15 @@ def _profile(
     known, normals = _around(distance, access)
     closest = _closest(near, origin + SPACING * np.argwhere(known))[2]
     first, group = _shared(closest, normals)
-    kappa, beta = np.zeros((2, *distance.shape))
     some = local_profile(outline, closest[first], normals[first])
-    kappa[known], beta[known] = (values[group] for values in some)
-    kappa, beta = (smoothed(values, PROFILE_SMOOTHING, known) for values in (kappa, beta))
-    return kappa, np.maximum(beta, 0.0)
+
+    def on_grid(values: np.ndarray) -> np.ndarray:
+        grid = np.zeros(distance.shape)
+        grid[known] = values[group]
+        return smoothed(grid, SMOOTHING, known).astype(np.float32)
+
+    profile = LocalProfile(*(on_grid(values) for values in some))
+    return profile._replace(anisotropy=np.maximum(profile.anisotropy, 0.0))
 
 
 def _around(distance: np.ndarray, access: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -116,7 +116,7 @@ def _organ(
         rest=np.pad(points, ((0, 0), (0, 3))).astype(single),
         tip_offset=np.array([tip.offset]),
     )
-    local = np.zeros((4, *shape), single)
+    local = np.zeros((5, *shape), single)
     local[STIFFNESS], local[TAKEN] = E_STAR, PATCH / (E_STAR * PATCH_RADIUS)
     law, large = tip_law_arrays((tip,), MATERIAL, local), None
     if neo_hookean is not None:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from avatar_core.cli import picture
-from avatar_core.contact.effects.tip_law import BENT_ERROR, LAW_ERROR
-from avatar_core.contact.effects.tip_profile import KAPPA
+from avatar_core.contact.effects.tip_law import ANISOTROPY_ERROR, LAW_ERROR
+from avatar_core.contact.effects.tip_profile import ANISOTROPY
 from avatar_core.contact.model import estimate_error, prepare, step
 from avatar_core.errors import ContactError, CoordinateError, MeshError, StorageError
 from avatar_core.fem.elasticity import Elasticity, Material
@@ -90,7 +90,7 @@ def certified(vademecum: Vademecum, found: ContactSites) -> Vademecum:
 
 
 def pressed(vademecum: Vademecum) -> tuple[float, float, float]:
-    """Force on a sphere 2 mm deep, the error that is said, and |kappa| there."""
+    """Force on a sphere 2 mm deep, the error that is said, and sqrt(D) there."""
     tip = Tip("sphere", 5e-3)
     model = prepare(vademecum, (tip,), cloud="off", effects=())
     centre = np.array([0.05, 0.1, 0.05])
@@ -98,14 +98,19 @@ def pressed(vademecum: Vademecum) -> tuple[float, float, float]:
         step(model, (centre + (tip.offset - depth) * UP)[None])
     estimate_error(model)
     force = float(np.linalg.norm(model.out.force[0]))
-    return force, float(model.out.force_error[0]), abs(model.effects.tip_law.value[0, KAPPA])
+    return (
+        force,
+        float(model.out.force_error[0]),
+        float(np.sqrt(model.effects.tip_law.value[0, ANISOTROPY])),
+    )
 
 
 def test_the_factor_scales_the_laws_part_of_the_error_that_is_said(box: Vademecum) -> None:
-    force, once, kappa = pressed(box)
+    force, once, bent = pressed(box)
     same, thrice, _ = pressed(certified(box, replace(FOUND, factor=3.0)))
     assert force == same > 0.0
-    assert thrice - once == pytest.approx(2.0 * force * (LAW_ERROR + BENT_ERROR * kappa))
+    law = force * (LAW_ERROR + ANISOTROPY_ERROR * bent)
+    assert thrice - once == pytest.approx(2.0 * law, rel=1e-5)
 
 
 def test_an_organ_without_contact_sites_says_the_same_error_as_with_the_factor_one(

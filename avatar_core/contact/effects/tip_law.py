@@ -7,16 +7,21 @@ the tip dents is put in its place. With F the normal force and d the depth of th
     d = delta(F) + F [gamma - c],      c = 0.7665 / (E* R_p),      E* = E / (1 - nu^2),
 
 gamma the organ's compliance for the patch and c at most gamma. A tip on a surface that falls off
-around it as beta r + kappa r^2 / 2 (a mean over all directions) touches within a radius a where
-(Popov & Hess, Method of Dimensionality Reduction, 2015, Sec. 3.2; g in ``geometry.tip``)
+around it as kappa r^2 / 2 + tau r^3 / 6 (a mean over all directions) touches within a radius a
+where (Popov & Hess, Method of Dimensionality Reduction, 2015, Sec. 3.2; g in ``geometry.tip``)
 
-    delta = g(a) + pi/2 beta a + kappa a^2,      F = 2 E* int_0^a x delta'(x) dx.
+    delta = g(a) + kappa a^2 + pi/8 tau a^3,      F = 2 E* int_0^a x delta'(x) dx.
 
 That is Sneddon's solution for every body of revolution on a half-space, and Hertz's for small a.
+On a ridge or a saddle a sphere touches over an ellipse, and Hertz's force is that of the geometric
+mean of both relative curvatures b +- sqrt(D), b = 1 / R + kappa + tau r / 3, to the second order in
+their ratio (Johnson, Contact Mechanics, 1985, Sec. 4.2). kappa is therefore lowered by
+b - sqrt(b^2 - D), r being the radius where :mod:`avatar_core.geometry.local_profile` finds D.
+
 The dent stores the energy E* Phi, Phi = int_0^a (delta(a) - delta(x))^2 dx, and the force on the
 tip is the derivative of all energy: at constant F, with M_n = int_0^a x^n / n delta'(x) dx,
 
-    dF_tip = 2 E* M_3 grad kappa + pi E* M_2 grad beta - Phi grad E* - F^2 / 2 grad c.
+    dF_tip = 2 E* M_3 grad kappa + pi/4 E* M_4 grad tau - Phi grad E* - F^2 / 2 grad c.
 
 Where the scene chooses large deformation, a sphere in a neo-Hookean organ sinks by eta deeper than
 delta, which may be negative (:mod:`avatar_core.contact.effects.large_dent`),
@@ -24,7 +29,7 @@ delta, which may be negative (:mod:`avatar_core.contact.effects.large_dent`),
     eta(F) = R e(w),      w = (3 F / (4 E* R^2))^(2/3),      Psi = int_0^(F / E*) L d eta(L),
 
 w being Hertz's depth over R, e fitted to our own finite elements. It depends on the force alone,
-whatever kappa and beta are, and adds its Psi to Phi: the force stays the derivative of one energy.
+whatever kappa and tau are, and adds its Psi to Phi: the force stays the derivative of one energy.
 
 c is the Hankel transform 48 J_3(x) / x^3 of the patch's profile (1 - r^2 / R_p^2)^2, squared and
 integrated over x, over pi E* R_p, less what the organ's elements are too wide to show of it. In
@@ -44,46 +49,48 @@ from avatar_core.common.splines import cell_at, in_cell
 from avatar_core.contact.effects.large_deformation import evaluate_added_depth
 from avatar_core.contact.effects.large_dent import LEAST, evaluate_large_dent, large_dent_of
 from avatar_core.contact.effects.tip_profile import (
-    BETA,
+    ANISOTROPY,
     INTERVALS,
     KAPPA,
+    LEAST_SLOPE,
     STIFFNESS,
     TAKEN,
+    TAU,
     least_kappa,
     profile_of,
 )
 from avatar_core.errors import ContactError
 from avatar_core.fem.elasticity import Material
+from avatar_core.geometry.local_profile import MIDDLE
 from avatar_core.geometry.tip import Tip
 
 PATCH = 0.7665  # c E* R_p on a half-space,
 # and on the elements of a liver: at 38 places of five livers the same patch sank 0.03 to 0.12 of
 # 1 / (E* R_p) deeper on elements that resolve it. 0.67 to 0.75 fit resolved contacts alike.
 PATCH_ON_MESH = 0.72
-# Part of beta that counts: a tip on a ridge touches along it, and is carried better than its mean
-# over all directions says. 0.2 to 0.5 fit resolved contacts alike.
-RIDGE = 0.35
-# Of the force, on plane places, per kappa and per beta: with the patch's error they cover 91 % of
-# 403 contacts resolved on five livers, drawn ones and ridges and hollows at the share of two to
-# one, and are 3.6 times the true error in the median. Wide tips on ridges err most.
-LAW_ERROR, BENT_ERROR, RIDGE_ERROR = 0.025, 1e-3, 3.0  # [-], [m], [-]
+# Of the force, and per sqrt(D): with the patch's error they cover 92 % of 405 contacts resolved on
+# four livers, drawn ones, and half as many on ridges and in hollows, and are 3.0 times the
+# true error in the median. Tips on ridges err most.
+LAW_ERROR, ANISOTROPY_ERROR = 0.002, 9e-4  # [-], [m]
 TUMOUR_ERROR = 0.25  # of the force, per relative change of E* by a tumour underneath
 LEAST_CONTACT = 0.02  # contact radius over the tip's, where the tangent of a light touch is taken
 MOST_TAKEN = 0.9  # part of a dent's least compliance, 1 / (2 E* radius), that may be taken off
+MOST_ANISOTROPY = 0.75  # D over b^2, at most: one curvature is then 14 times the other
 MAX_STEPS = 60  # of Newton's method, with bisection where it leaves its bracket
 TOLERANCE = 1e-13  # [m] of depth, or relative of the force
 
 TipLawArrays = namedtuple(
     "TipLawArrays",
     [
-        "profile",  # (T, INTERVALS + 1, 8) a, da/ds, g, dg/ds, M_1, M_2, M_3, Phi over s in [0, 1]
+        "profile",  # (T, INTERVALS + 1, 8) a, da/ds, g, dg/ds, M_1, M_3, M_4, Phi over s in [0, 1]
         "radius",  # (T,) of the tip [m]
+        "bluntness",  # (T,) curvature of a sphere, 0 for a tip that is none [1/m]
         "least_kappa",  # (T,) below which a concave surface is not followed [1/m]
         "mindlin",  # (1,) tangential over normal compliance of a dent, (2 - nu) / (2 (1 - nu))
         "error_factor",  # (1,) of the organ, on the law's error; 1 where it was not calibrated
         "modulus",  # (1,) E* without a tumour [Pa]
         "large_dent",  # (T, 6) of :func:`large_dent_of`
-        "local",  # (4, nx, ny, nz) kappa [1/m], beta [-], E* [Pa], c [m/N] on the tip's grid
+        "local",  # (5, nx, ny, nz) kappa [1/m], tau [1/m^2], D [1/m^2], E* [Pa], c [m/N] on a grid
     ],
 )
 TipLawState = namedtuple(
@@ -91,14 +98,15 @@ TipLawState = namedtuple(
     [
         "profile",
         "radius",
+        "bluntness",
         "least_kappa",
         "mindlin",
         "error_factor",
         "modulus",
         "large_dent",
         "local",
-        "value",  # (T, 4) kappa, beta, E*, c at the tip
-        "gradient",  # (T, 4, 3)
+        "value",  # (T, 5) kappa, tau, D, E*, c at the tip
+        "gradient",  # (T, 5, 3)
         "place",  # (T,) s of the contact; above 1 the tip has sunk in to its full radius
         "elastic",  # (T,) F, or the force on an elastic organ that is dented alike [N]
         "past",  # (n, T) of viscoelasticity [N]
@@ -118,7 +126,7 @@ def tip_law_arrays(
     """Tables of the tips; None where all are patches.
 
     material : of the organ
-    local : ndarray float32, shape (4, nx, ny, nz), kappa, beta, E* and c
+    local : ndarray float32, shape (5, nx, ny, nz), kappa, tau, D, E* and c
     error_factor : :attr:`avatar_core.vademecum.certificate.ContactSites.factor`
     neo_hookean : whether the dents of spheres are those of large strain
 
@@ -135,6 +143,7 @@ def tip_law_arrays(
     return TipLawArrays(
         np.stack([profile_of(tip) for tip in tips]),
         np.array([tip.radius for tip in tips]),
+        np.array([1.0 / tip.radius if tip.shape == "sphere" else 0.0 for tip in tips]),
         np.array([least_kappa(tip) for tip in tips]),
         np.array([(2.0 - nu) / (2.0 * (1.0 - nu))]),
         np.array([error_factor]),
@@ -150,14 +159,15 @@ def tip_law_state(arrays: TipLawArrays, n_terms: int) -> TipLawState:
     return TipLawState(
         profile=arrays.profile,
         radius=arrays.radius,
+        bluntness=arrays.bluntness,
         least_kappa=arrays.least_kappa,
         mindlin=arrays.mindlin,
         error_factor=arrays.error_factor,
         modulus=arrays.modulus,
         large_dent=arrays.large_dent,
         local=arrays.local,
-        value=np.ones((n, 4)),
-        gradient=np.zeros((n, 4, 3)),
+        value=np.ones((n, 5)),
+        gradient=np.zeros((n, 5, 3)),
         place=np.zeros(n),
         elastic=np.zeros(n),
         past=np.zeros((n_terms, n)),
@@ -168,18 +178,50 @@ def tip_law_state(arrays: TipLawArrays, n_terms: int) -> TipLawState:
 
 @inlined
 def sample_surface(model, law, t, tip):  # type: ignore[no-untyped-def]
-    """kappa, beta, E* and c at a tip, with their gradients."""
+    """kappa, tau, D, E* and c at a tip, with their gradients."""
     if law is None:
         return
     cell = cell_at(model.origin, model.spacing[0], tip)
-    for k in range(4):
+    for k in range(5):
         law.value[t, k] = in_cell(law.local[k], cell, law.gradient[t, k])
-    if law.value[t, KAPPA] < law.least_kappa[t]:
-        law.value[t, KAPPA] = law.least_kappa[t]
-        law.gradient[t, KAPPA] = 0.0
-    if law.value[t, BETA] < 0.0:
-        law.value[t, BETA] = 0.0
-        law.gradient[t, BETA] = 0.0
+    if law.bluntness[t] > 0.0:
+        _lower_kappa(law, t)
+    _limit(law, t)
+
+
+@fast
+def _limit(law, t):  # type: ignore[no-untyped-def]
+    """kappa and tau as far down as the tip can follow, so that delta grows with the contact."""
+    value, gradient = law.value[t], law.gradient[t]
+    if value[KAPPA] < law.least_kappa[t]:
+        value[KAPPA] = law.least_kappa[t]
+        gradient[KAPPA] = 0.0
+    steepest = -16.0 / (3.0 * np.pi * law.radius[t])
+    least = steepest * (value[KAPPA] - law.least_kappa[t])
+    if value[TAU] < least:
+        value[TAU] = least
+        for d in range(3):
+            gradient[TAU, d] = steepest * gradient[KAPPA, d]
+
+
+@fast
+def _lower_kappa(law, t):  # type: ignore[no-untyped-def]
+    """By what the contact's ellipse takes of the mean curvature: b - sqrt(b^2 - D)."""
+    value, gradient = law.value[t], law.gradient[t]
+    b = law.bluntness[t] + value[KAPPA] + MIDDLE / 3.0 * value[TAU]
+    least = LEAST_SLOPE * law.bluntness[t]
+    whole = 1.0 if b > least else 0.0  # of grad b
+    b = max(b, least)
+    most = MOST_ANISOTROPY * b * b
+    limited = value[ANISOTROPY] > most
+    root = np.sqrt(b * b - min(value[ANISOTROPY], most))
+    value[KAPPA] += root - b
+    for d in range(3):
+        slope = whole * (gradient[KAPPA, d] + MIDDLE / 3.0 * gradient[TAU, d])
+        if limited:
+            gradient[KAPPA, d] += (root / b - 1.0) * slope
+        else:
+            gradient[KAPPA, d] += (b / root - 1.0) * slope - 0.5 / root * gradient[ANISOTROPY, d]
 
 
 @fast
@@ -212,13 +254,13 @@ def dent(law, t):  # type: ignore[no-untyped-def]
     a = _hermite(w, p[0], q[0], p[1], q[1])
     g = _hermite(w, p[2], q[2], p[3], q[3])
     first = _hermite(w, p[4], q[4], p[0] * p[3], q[0] * q[3])
-    kappa, ridge = law.value[t, KAPPA], 0.5 * np.pi * law.value[t, BETA]
-    delta = g + (ridge + kappa * a) * a + wall
-    load = 2.0 * (first + (0.5 * ridge + kappa * a / 1.5) * a * a + a * wall)
+    kappa, cubic = law.value[t, KAPPA], np.pi / 8.0 * law.value[t, TAU]
+    delta = g + (kappa + cubic * a) * a * a + wall
+    load = 2.0 * (first + (kappa / 1.5 + 0.75 * cubic * a) * a * a * a + a * wall)
     if law.place[t] > 1.0:
         return delta, law.radius[t], load, a
     slope = (1.0 - u) * p[3] + u * q[3]
-    slope += (ridge + 2.0 * kappa * a) * ((1.0 - u) * p[1] + u * q[1])
+    slope += (2.0 * kappa + 3.0 * cubic * a) * a * ((1.0 - u) * p[1] + u * q[1])
     return delta, slope, load, a
 
 
@@ -336,14 +378,14 @@ def add_tip_force(state, law, large_deformation, out, t):  # type: ignore[no-unt
     e = law.elastic[t]
     if e <= 0.0:
         return
-    second, third, stored = _moments(law, t)
+    third, fourth, stored = _moments(law, t)
     stiffness, gradient = law.value[t, STIFFNESS], law.gradient[t]
     if large_deformation is not None:
         stored += evaluate_large_dent(law, t, e / stiffness)[2]
     relaxed = state.force[t] / e
     for d in range(3):
         change = 2.0 * stiffness * third * gradient[KAPPA, d] - stored * gradient[STIFFNESS, d]
-        change += np.pi * stiffness * second * gradient[BETA, d]
+        change += 0.25 * np.pi * stiffness * fourth * gradient[TAU, d]
         out.force[t, d] += (change - 0.5 * e * e * gradient[TAKEN, d]) * relaxed
 
 
@@ -351,28 +393,27 @@ def add_tip_force(state, law, large_deformation, out, t):  # type: ignore[no-unt
 def law_error(law, t):  # type: ignore[no-untyped-def]
     """Relative error of the force by the law alone, larger on bent surfaces and over tumours."""
     more = TUMOUR_ERROR * abs(law.value[t, STIFFNESS] / law.modulus[0] - 1.0)
-    more += BENT_ERROR * abs(law.value[t, KAPPA]) + RIDGE_ERROR * law.value[t, BETA]
+    more += ANISOTROPY_ERROR * np.sqrt(law.value[t, ANISOTROPY])
     return law.error_factor[0] * (LAW_ERROR + more)
 
 
 @fast
 def _moments(law, t):  # type: ignore[no-untyped-def]
-    """M_2 [m^3], M_3 [m^4] and Phi [m^3] at ``place``."""
+    """M_3 [m^4], M_4 [m^5] and Phi [m^3] at ``place``."""
     w, p, q, _, wall = _at_place(law, t)
     a = _hermite(w, p[0], q[0], p[1], q[1])
     m1 = _hermite(w, p[4], q[4], p[0] * p[3], q[0] * q[3])
-    m2 = _hermite(w, p[5], q[5], 0.5 * p[0] ** 2 * p[3], 0.5 * q[0] ** 2 * q[3])
-    m3 = _hermite(w, p[6], q[6], p[0] ** 3 * p[3] / 3.0, q[0] ** 3 * q[3] / 3.0)
+    m3 = _hermite(w, p[5], q[5], p[0] ** 3 * p[3] / 3.0, q[0] ** 3 * q[3] / 3.0)
+    m4 = _hermite(w, p[6], q[6], 0.25 * p[0] ** 4 * p[3], 0.25 * q[0] ** 4 * q[3])
     phi = _hermite(w, p[7], q[7], 2.0 * p[4] * p[3], 2.0 * q[4] * q[3])
-    b, k = 0.5 * np.pi * law.value[t, BETA], law.value[t, KAPPA]
-    # of the ridge and the curvature: b x + k x^2 beside g
-    extra = (b + k * a) * a
-    phi += 2.0 * (b * m2 + 2.0 * k * m3) + 2.0 * (m1 * extra - 2.0 * b * m2 - 3.0 * k * m3)
-    phi += a**3 * (b * b / 3.0 + 5.0 / 6.0 * b * k * a + 8.0 / 15.0 * k * k * a * a)
-    load = 2.0 * (m1 + (0.5 * b + k * a / 1.5) * a * a)
-    m2 += a**3 * (b / 6.0 + 0.25 * k * a)
-    m3 += a**4 * (b / 12.0 + 2.0 / 15.0 * k * a)
-    return m2 + 0.5 * a * a * wall, m3 + a**3 * wall / 3.0, phi + (load + a * wall) * wall
+    # beside g, of the surface: k x^2 + c x^3
+    k, c = law.value[t, KAPPA], np.pi / 8.0 * law.value[t, TAU]
+    phi += 2.0 * (k * (a * a * m1 - m3) + c * (a**3 * m1 - m4))
+    phi += a**5 * (8.0 / 15.0 * k * k + (7.0 / 6.0 * k + 9.0 / 14.0 * c * a) * c * a)
+    load = 2.0 * (m1 + (k / 1.5 + 0.75 * c * a) * a**3)
+    m3 += a**5 * (2.0 / 15.0 * k + c * a / 6.0)
+    m4 += a**6 * (k / 12.0 + 3.0 / 28.0 * c * a)
+    return m3 + a**3 * wall / 3.0, m4 + 0.25 * a**4 * wall, phi + (load + a * wall) * wall
 
 
 @inlined

@@ -13,7 +13,7 @@ from numpy.polynomial.legendre import leggauss
 from avatar_core.geometry.tip import Tip
 
 INTERVALS = 256  # of the table
-KAPPA, BETA, STIFFNESS, TAKEN = range(4)  # what the law of a tip reads where the tip is
+KAPPA, TAU, ANISOTROPY, STIFFNESS, TAKEN = range(5)  # what the law of a tip reads where it is
 LAST = 3.0  # atanh of the last contact radius over that of a sphere
 LEAST_SLOPE = 0.2  # part of g' that a concave surface leaves
 
@@ -35,7 +35,7 @@ def profile_of(tip: Tip) -> np.ndarray:
     (a, a_slope), (x, x_slope) = _contact_radius(tip, s), _contact_radius(tip, inner)
     width = x_slope * weight / (2.0 * INTERVALS)
     rise = tip.depth_slope(x) * width
-    moments = [_running(x**n / n * rise) for n in (1, 2, 3)]
+    moments = [_running(x**n / n * rise) for n in (1, 3, 4)]
     g = tip.depth(a)
     first, second = (_running(tip.depth(x) ** n * width) for n in (1, 2))
     stored = g**2 * a - 2.0 * g * first + second
@@ -48,6 +48,6 @@ def _running(parts: np.ndarray) -> np.ndarray:
 
 
 def least_kappa(tip: Tip) -> float:
-    """The kappa at which delta' is ``LEAST_SLOPE`` of g' where it is least."""
+    """The kappa at which delta' is ``LEAST_SLOPE`` of g' where it is least, without tau."""
     a = tip.radius * np.linspace(0.0, 1.0, INTERVALS + 1)[1:-1]
     return float(-(1.0 - LEAST_SLOPE) * (tip.depth_slope(a) / (2.0 * a)).min())

@@ -48,14 +48,14 @@ class Site:
 
     kind : "drawn", "ridge" or "hollow"
     point, normal : ndarray, shape (3,) [m], normal pointing out
-    kappa, beta : local shape [1/m], [-]; see :mod:`avatar_core.geometry.local_profile`
+    kappa, anisotropy : local shape [1/m], [1/m^2]; see :mod:`avatar_core.geometry.local_profile`
     """
 
     kind: str
     point: np.ndarray
     normal: np.ndarray
     kappa: float
-    beta: float
+    anisotropy: float
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def draw_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) ->
     rest = sites[n - 2 :]
     if len(rest) < 2:
         return sites
-    ridge = max(rest, key=lambda site: site.beta)
+    ridge = max(rest, key=lambda site: site.kappa)
     hollow = min(rest, key=lambda site: site.kappa)
     return [*sites[: n - 2], replace(ridge, kind="ridge"), replace(hollow, kind="hollow")]
 
@@ -208,9 +208,9 @@ def _site(vademecum: Vademecum, point: np.ndarray) -> Site:
     def at(values: np.ndarray) -> float:
         return float(evaluate(values, field.origin, field.spacing[0], point, slope, np.nan))
 
-    kappa, beta = at(field.curvature), at(field.ridge)
+    kappa, anisotropy = at(field.curvature), at(field.anisotropy)
     at(field.distance)
-    return Site("drawn", point, slope / np.linalg.norm(slope), kappa, beta)
+    return Site("drawn", point, slope / np.linalg.norm(slope), kappa, anisotropy)
 
 
 def _access(vademecum: Vademecum, site: Site) -> float:
