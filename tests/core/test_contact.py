@@ -151,7 +151,7 @@ def test_closed_paths_do_no_work(
 
 @pytest.mark.long
 def test_closed_paths_on_real_livers_do_no_work(real_vademecum: Vademecum) -> None:
-    worst = closed_path_work(real_vademecum, prepare(real_vademecum, (SPHERE,)), 300, seed=1)
+    worst = closed_path_work(real_vademecum, prepare(real_vademecum, (SPHERE,)), 150, seed=1)
     print(f"{real_vademecum.name}: work at most {worst:.2%} of the peak stored energy")
     assert worst < 0.01
 
