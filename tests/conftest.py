@@ -12,17 +12,19 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
+from avatar_core.atlas import patient
 from avatar_core.contact import layout
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry import mesh
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.offline import linear, parametric
 from avatar_core.offline.large_deformation import hyperelastic_problem, with_large_deformation
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
 
-from . import examples, kept_meshes
+from . import examples, kept_fields, kept_meshes
 from .alone import Turns
 from .kept_responses import kept
 from .recorded_meshes import recorded
@@ -46,6 +48,15 @@ def same_meshes() -> Iterator[None]:
     """The same meshes of the built-in liver in every run, and of others in one of the same code."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mesh, "_fill", recorded(kept_meshes.kept))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def same_fields() -> Iterator[None]:
+    """The contact geometry of one organ is sampled once, whatever is built around it."""
+    with pytest.MonkeyPatch.context() as patch:
+        for builder in (linear, parametric, patient):
+            patch.setattr(builder, "make_tip_field", kept_fields.kept)
         yield
 
 

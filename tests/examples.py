@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 FEW, ALL = "few", "all"
 _PART = 8  # of the examples, one in so many in the quick suite
@@ -24,8 +24,13 @@ def choose(config: pytest.Config) -> None:
 
 
 def examples(n: int, least: int = 1, **more: Any) -> settings:
-    """Settings for ``n`` examples, of which the quick suite draws the first few."""
+    """Settings for ``n`` examples, of which the quick suite draws the first few.
+
+    least : the fewest that it draws; with 0, those that are written out are enough for it
+    """
     few = settings.get_current_profile_name() == FEW
+    if few and not least:
+        return settings(phases=[Phase.explicit], **more)
     return settings(max_examples=min(n, max(least, n // _PART)) if few else n, **more)
 
 

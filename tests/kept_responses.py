@@ -6,15 +6,13 @@ takes a second, and tests make hundreds of models of few organs; each model gets
 
 from __future__ import annotations
 
-import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
-import numpy as np
-
 from avatar_core.contact.tip_response import TipResponse
+
+from .content import digest
 
 KEPT = 24  # of some megabytes each
 
@@ -24,7 +22,7 @@ def kept(make: Callable[..., TipResponse]) -> Callable[..., TipResponse]:
     known: OrderedDict[bytes, TipResponse] = OrderedDict()
 
     def found(*arguments: Any) -> TipResponse:
-        key = _key(arguments)
+        key = digest(*arguments)
         if key not in known:
             known[key] = make(*arguments)
             if len(known) > KEPT:
@@ -33,24 +31,3 @@ def kept(make: Callable[..., TipResponse]) -> Callable[..., TipResponse]:
         return TipResponse(*(array.copy() for array in known[key]))
 
     return found
-
-
-def _key(arguments: tuple[Any, ...]) -> bytes:
-    total = hashlib.blake2b()
-
-    def take(value: Any) -> None:
-        if isinstance(value, np.ndarray):
-            total.update(f"{value.dtype} {value.shape} {value.flags.c_contiguous}".encode())
-            total.update(np.ascontiguousarray(value))
-        elif value is None or isinstance(value, (int, float)):
-            total.update(repr(value).encode())
-        elif isinstance(value, tuple):
-            for one in value:
-                take(one)
-        else:
-            for field in fields(value):
-                take(getattr(value, field.name))
-
-    for argument in arguments:
-        take(argument)
-    return total.digest()

@@ -32,11 +32,19 @@ _LATE_ROOMS = ("studies", "cli")  # nothing that is stored comes from them
 
 def stored(compute: Callable[P, T]) -> Callable[P, T]:
     """Decorator: keep what a function gives; its arguments tell themselves by ``repr``, files
-    by their content."""
+    by their content. It is the same object for all tests of a worker."""
+    return functools.cache(on_disk(compute))
+
+
+def on_disk(compute: Callable[P, T], rooms: tuple[str, ...] | None = None) -> Callable[P, T]:
+    """The same, each time as another object.
+
+    rooms : of the core, which the result may follow from; by default all but the last
+    """
 
     @functools.wraps(compute)
     def found(*arguments: P.args, **named: P.kwargs) -> T:
-        key = hashlib.sha256(_of_all().encode())
+        key = hashlib.sha256(_of_all(rooms).encode())
         key.update(Path(inspect.getfile(compute)).read_bytes() + compute.__name__.encode())
         for value in (*arguments, *sorted(named.items())):
             text = repr(value)
@@ -53,21 +61,26 @@ def stored(compute: Callable[P, T]) -> Callable[P, T]:
             os.utime(file)
         return pickle.loads(file.read_bytes())
 
-    return functools.cache(found)
+    return found
 
 
 @functools.cache
-def _of_all() -> str:
-    """Hash of what every result may follow from."""
+def _of_all(rooms: tuple[str, ...] | None) -> str:
+    """Hash of what every result may follow from, where it is made in some rooms of the core."""
     found = hashlib.sha256(sys.version.encode())
     found.update(repr(sorted((d.name, d.version) for d in distributions())).encode())
     core = Path(avatar_core.__file__).parent
-    files = [f for f in core.rglob("*.py") if f.relative_to(core).parts[0] not in _LATE_ROOMS]
+    late = _LATE_ROOMS if rooms is None else _rooms(core) - {*rooms}
+    files = [f for f in core.rglob("*.py") if f.relative_to(core).parts[0] not in late]
     for file in sorted(files, key=lambda f: f.relative_to(core).as_posix()):
         found.update(file.read_bytes())
     for file in (HERE / "recorded_meshes.py", HERE / "data" / "phantom_meshes.npz"):
         found.update(file.read_bytes())
     return found.hexdigest()
+
+
+def _rooms(core: Path) -> set[str]:
+    return {path.name for path in core.iterdir() if path.is_dir()}
 
 
 @contextmanager

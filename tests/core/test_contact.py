@@ -141,14 +141,17 @@ def energy_slope(model: ContactModel, tip: np.ndarray, h: float = 1e-5) -> np.nd
     return (np.array(energy[:3]) - np.array(energy[3:])) / (2.0 * h)
 
 
-def test_closed_paths_do_no_work(phantom_vademecum: Vademecum, model: ContactModel) -> None:
-    worst = closed_path_work(phantom_vademecum, model, 100, seed=0)
+@pytest.mark.parametrize("n_paths", [30, pytest.param(100, marks=pytest.mark.long)])
+def test_closed_paths_do_no_work(
+    phantom_vademecum: Vademecum, model: ContactModel, n_paths: int
+) -> None:
+    worst = closed_path_work(phantom_vademecum, model, n_paths, seed=0)
     assert worst < 0.01
 
 
 @pytest.mark.long
 def test_closed_paths_on_real_livers_do_no_work(real_vademecum: Vademecum) -> None:
-    worst = closed_path_work(real_vademecum, prepare(real_vademecum, (SPHERE,)), 300, seed=1)
+    worst = closed_path_work(real_vademecum, prepare(real_vademecum, (SPHERE,)), 150, seed=1)
     print(f"{real_vademecum.name}: work at most {worst:.2%} of the peak stored energy")
     assert worst < 0.01
 

@@ -14,6 +14,7 @@ from avatar_core.errors import RegistrationError
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.shapes.correspondence import (
     carry_regions,
@@ -33,6 +34,7 @@ from avatar_core.shapes.registration import (
     register,
 )
 from avatar_core.shapes.springs import sample_target
+from tests.stored import stored
 
 # Eq. 17 of the paper: volume gain 21 %, distortion up to 10 %
 WARP = np.array([[1.15, 0.08, -0.06], [0.0, 0.92, 0.10], [0.0, 0.0, 1.14]])
@@ -40,13 +42,24 @@ SHIFT = np.array([0.03, -0.02, 0.05])
 
 
 @pytest.fixture(scope="module")
-def template(phantom_mesh: TetMesh) -> Template:
-    return Template("phantom", phantom_mesh, regions_by_rule(phantom_mesh))
+def template() -> Template:
+    return _template()
+
+
+def _template() -> Template:
+    mesh = tetrahedralize(phantom_liver(), 700)
+    return Template("phantom", mesh, regions_by_rule(mesh))
 
 
 @pytest.fixture(scope="module")
-def warped(template: Template, phantom: SurfaceMesh) -> Registration:
-    return register(template, replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT))
+def warped() -> Registration:
+    return _warped()
+
+
+@stored
+def _warped() -> Registration:
+    phantom = phantom_liver()
+    return register(_template(), replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT))
 
 
 @pytest.fixture(scope="module")

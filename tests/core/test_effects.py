@@ -16,7 +16,7 @@ from avatar_core.contact.effects import (
     Viscoelasticity,
 )
 from avatar_core.contact.layout import Layout, lay_out
-from avatar_core.contact.model import prepare, step
+from avatar_core.contact.model import _effects, prepare, step
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
 from avatar_core.vademecum.model import Vademecum
@@ -29,15 +29,18 @@ from tests.core.effect_cases import CHOICES, PATCH, SPHERE, TIP, forces, push_an
 def test_an_effect_is_absent_from_the_step_when_off(
     phantom_vademecum: Vademecum, name: str
 ) -> None:
-    """No argument of the compiled step, no array in the model: only None."""
-    without = prepare(phantom_vademecum, (PATCH,), cloud="off", effects=())
-    with_it = prepare(phantom_vademecum, (PATCH,), cloud="off", effects=(CHOICES[name],))
-    assert getattr(without.effects, name) is None
-    assert getattr(with_it.effects, name) is not None
-    assert all(value is None for value in without.effects)
-    assert not [key for key in without.layout.flat() if "." in key]
-    assert [key for key in with_it.layout.flat() if key.startswith(f"{name}.")]
-    assert all(getattr(with_it.effects, other) is None for other in CHOICES if other != name)
+    """No argument of the compiled step, no array in the model: only None.
+
+    The arguments decide what is compiled; nothing has to be for that.
+    """
+    without = lay_out(phantom_vademecum, (PATCH,), effects=())
+    with_it = lay_out(phantom_vademecum, (PATCH,), effects=(CHOICES[name],))
+    given, more = _effects(without), _effects(with_it)
+    assert all(value is None for value in given)
+    assert getattr(more, name) is not None
+    assert not [key for key in without.flat() if "." in key]
+    assert [key for key in with_it.flat() if key.startswith(f"{name}.")]
+    assert all(getattr(more, other) is None for other in CHOICES if other != name)
 
 
 def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -> None:

@@ -88,8 +88,9 @@ def test_a_member_gets_its_own_vademecum_bit_for_bit(
     atlas: Atlas, file: Path, livers: list[Path]
 ) -> None:
     member = patient_vademecum(read_surface(livers[2]), base_of(atlas), "interpolated", QUICK)
+    uncertified = replace(QUICK, n_certified=0)
     again = patient_vademecum(
-        read_surface(livers[2]), base_of(load_atlas(file)), "interpolated", QUICK
+        read_surface(livers[2]), base_of(load_atlas(file)), "interpolated", uncertified
     )
     assert member.neighbours[0] == "liver2" and member.weights[0] == 1.0
     assert member.weights[1:].any() == np.False_
@@ -137,7 +138,14 @@ def test_another_kind_of_organ_is_refused(atlas: Atlas) -> None:
         patient_vademecum(rod, base_of(atlas), "interpolated", QUICK)
 
 
-@pytest.mark.parametrize("stage", ["registration", "mesh", "response", "certify"])
+@pytest.mark.parametrize(
+    "stage",
+    [
+        *(pytest.param(early, marks=pytest.mark.long) for early in ("registration", "mesh")),
+        "response",
+        "certify",
+    ],
+)
 def test_a_build_can_be_stopped_in_every_stage(
     atlas: Atlas, livers: list[Path], stage: str
 ) -> None:

@@ -122,7 +122,7 @@ def test_samples(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_pgd(tmp_path: Path) -> None:
-    found = pgd.study(phantom_liver(12e-3), pgd.PGDSettings(600, 24, 5))
+    found = pgd.study(phantom_liver(12e-3), pgd.PGDSettings(300, 24, 5))
     summary = checked_files(found, tmp_path)
     # no modes are better than the best; the default is exact near the patch
     assert summary["svd_l2_mean_11_modes"] < summary["l2_mean_11_modes"]

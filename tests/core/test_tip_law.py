@@ -154,7 +154,9 @@ def force_is_the_slope(straight: Vademecum, tip: Tip, effects: tuple[Effect, ...
         np.testing.assert_allclose(force, -slope, atol=1e-4 * np.linalg.norm(force))
 
 
-@pytest.mark.parametrize("effects", [(), (LargeDeformationEffect(),)])
+@pytest.mark.parametrize(
+    "effects", [(), pytest.param((LargeDeformationEffect(),), marks=pytest.mark.long)]
+)
 def test_tips_that_share_an_organ_conserve_energy(
     bent: Vademecum, effects: tuple[Effect, ...]
 ) -> None:

@@ -41,7 +41,7 @@ H = 4e-3  # spacing of the grids, if nothing else is said [m]
 WHOLE = ball()
 UP = np.array([0.0, 0.0, RADIUS])
 # figures are only added to
-few = examples(5, suppress_health_check=[HealthCheck.function_scoped_fixture])
+few = examples(5, least=0, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def direction(turn: float, height: float) -> np.ndarray:
@@ -151,15 +151,15 @@ def test_an_inside_out_surface_keeps_its_inside(figure, tmp_path, phantom):
     turned = inside_out(phantom)
     surface = read_surface(written(tmp_path, turned))
     assert any("inside out" in notice for notice in surface.notices)
-    right = distance_grid(phantom, H, 2 * H)
+    right = distance_grid(phantom, 1.5 * H, 3 * H)
     # without the door, too
-    for name, spoilt in {"turned": turned, "read": surface}.items():
-        grid = distance_grid(spoilt, H, 2 * H)
+    for name, spoilt in {"read": surface, "turned": turned}.items():
+        grid = distance_grid(spoilt, 1.5 * H, 3 * H)
         clear = np.abs(right.values) > 1e-9
         assert np.allclose(grid.values, right.values, rtol=0, atol=1e-9), name
         assert np.array_equal(grid.values[clear] < 0, right.values[clear] < 0), name
         assert signed_volume(isosurface(grid)) > 0, name
-    figure(f"volume {distance_grid(turned, H, 2 * H).volume / phantom.volume - 1:+.2%}")
+    figure(f"volume {grid.volume / phantom.volume - 1:+.2%}")
 
 
 def test_an_inside_out_surface_with_a_hole(figure, tmp_path):
@@ -188,7 +188,7 @@ def test_a_second_skin_just_inside_changes_nothing(figure, tmp_path_factory, gap
     assert np.allclose(grid.values, alone.values, rtol=0, atol=1e-9)
     error = grid.volume / ball_volume() - 1
     assert abs(error) < 2.5e-3
-    points = grid.points[np.abs(grid.values.ravel()) < 2 * H][::7]
+    points = grid.points[np.abs(grid.values.ravel()) < 2 * H][::21]
     assert np.mean(np.abs(gradient_length(points, surface) - 1) < 1e-3) > 0.99
     if gap == 2e-3:
         assert surface.volume == pytest.approx(ball_volume(), rel=4e-3)
@@ -198,9 +198,10 @@ def test_a_second_skin_just_inside_changes_nothing(figure, tmp_path_factory, gap
 def test_a_hole_through_both_skins(figure):
     """The winding number is 2 inside and 1 in the hole, which would count as inside."""
     one = with_hole(WHOLE, UP, 0.04)
+    alone = distance_grid(one, H, 2 * H)
     for gap in (0.0, 2e-5):
         both = joined(one, SurfaceMesh((1 - gap / RADIUS) * one.vertices, one.faces))
-        grid, alone = (distance_grid(s, H, 2 * H) for s in (both, one))
+        grid = distance_grid(both, H, 2 * H)
         assert np.allclose(grid.values, alone.values, rtol=0, atol=2 * gap + 1e-9)
         assert steepest(grid) < 1 + 1e-9
     figure(f"volume {grid.volume / ball_volume() - 1:+.2%}")

@@ -205,10 +205,11 @@ FOUR = ("Amos-007", "LiTS-27", "LiTS-52", "LiTS-74")  # two closed, two with sli
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("names", [pytest.param(FOUR, id="four"), pytest.param((), id="all")])
-def test_level_sets_of_real_livers(figure, livers_dir, names):
-    paths = [path for path in sorted(livers_dir.glob("*.obj")) if path.stem in names or not names]
-    assert len(paths) == (len(names) or 64)
+def test_level_sets_of_real_livers(figure, livers_dir):
+    """Of every fourth, and of the four."""
+    paths = sorted(livers_dir.glob("*.obj"))
+    paths = [path for i, path in enumerate(paths) if i % 4 == 0 or path.stem in FOUR]
+    assert len(paths) >= 16 and {path.stem for path in paths} >= {*FOUR}
     found = {path.stem: liver_level_set(path) for path in paths}
     for name, (error, share, slope) in found.items():
         assert abs(error) < 2.5e-3, name

@@ -8,24 +8,33 @@ import pytest
 
 from avatar_core.atlas import growth as atlas_build
 from avatar_core.atlas.anatomy import Anatomy
-from avatar_core.atlas.growth import build_anatomy, new_atlas
+from avatar_core.atlas.growth import AtlasOptions, build_anatomy, new_atlas
 from avatar_core.atlas.model import Atlas
-from avatar_core.geometry.mesh import TetMesh, regions_by_rule
+from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import RegistrationRule, Template
 from tests.core.atlas.rough import OPTIONS, N
+from tests.stored import stored
 
 
 @pytest.fixture(scope="session")
 def template(phantom_mesh: TetMesh) -> Template:
-    return Template("phantom", phantom_mesh, regions_by_rule(phantom_mesh))
+    return _template(phantom_mesh)
+
+
+def _template(mesh: TetMesh) -> Template:
+    return Template("phantom", mesh, regions_by_rule(mesh))
 
 
 @pytest.fixture(scope="session")
 def livers() -> list[SurfaceMesh]:
+    return _livers(N)
+
+
+def _livers(n: int) -> list[SurfaceMesh]:
     coarse = phantom_liver(12e-3)
-    maps = population(N, seed=3)
+    maps = population(n, seed=3)
     return [replace(f.moved(coarse), name=f"liver{i}") for i, f in enumerate(maps)]
 
 
@@ -35,8 +44,14 @@ def empty(template: Template) -> Atlas:
 
 
 @pytest.fixture(scope="session")
-def members(empty: Atlas, livers: list[SurfaceMesh]) -> list[Anatomy]:
-    return [build_anatomy(empty, liver) for liver in livers]
+def members() -> list[Anatomy]:
+    return _members(OPTIONS, N)
+
+
+@stored
+def _members(options: AtlasOptions, n: int) -> list[Anatomy]:
+    empty = new_atlas(_template(tetrahedralize(phantom_liver(), 700)), options)
+    return [build_anatomy(empty, liver) for liver in _livers(n)]
 
 
 @pytest.fixture(scope="session")

@@ -73,12 +73,21 @@ def test_create_add_and_show(
     assert code == 0 and "duplicate of liver0" in out and "3 anatomies (1 duplicates)" in out
 
 
+@pytest.mark.parametrize(
+    "more",
+    [
+        pytest.param(("--shapes-only",), id="shapes"),
+        pytest.param((), id="responses", marks=pytest.mark.long),
+    ],
+)
 def test_a_stopped_command_goes_on(
     run: Callable[..., tuple[int, str, str]],
     livers: list[SurfaceMesh],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    more: tuple[str, ...],
 ) -> None:
+    options = ("--spacing", 0.02, "--jobs", 1, *more)
     file = tmp_path / "a.h5"
     files = [write_obj(tmp_path / f"{liver.name}.obj", liver) for liver in livers[:2]]
     register = atlas_build.register
@@ -89,10 +98,10 @@ def test_a_stopped_command_goes_on(
         return register(template, surface, rule)
 
     monkeypatch.setattr(atlas_build, "register", stopped)
-    code, _, err = run("create", file, *files, "--spacing", 0.02, "--jobs", 1)
+    code, _, err = run("create", file, *files, *options)
     assert code == 130 and "run the same command again" in err and not file.exists()
     monkeypatch.setattr(atlas_build, "register", register)
-    code, out, _ = run("create", file, *files, "--spacing", 0.02, "--jobs", 1)
+    code, out, _ = run("create", file, *files, *options)
     assert code == 0 and "1 of them from an interrupted build" in out
 
 

@@ -98,6 +98,7 @@ def cluster() -> Iterator[Any]:
         yield running
 
 
+@pytest.mark.long  # its processes take longer to start than to work
 def test_a_cluster_builds_too_though_a_worker_is_killed(
     template: Template,
     livers: list[SurfaceMesh],

@@ -1,0 +1,33 @@
+"""The contact geometry around an organ, sampled once for all tests and runs of the same code.
+
+It follows from mesh, regions, patch and outline alone, and takes seconds whatever else is built.
+"""
+
+from __future__ import annotations
+
+from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.vademecum import tip_field
+from avatar_core.vademecum.tip_field import TipField
+
+from .content import ByContent
+from .stored import on_disk
+
+# Imports never run back: a field comes from no later room.
+_ROOMS = ("common", "geometry", "fem", "reduction", "shapes", "vademecum")
+
+_plain = tip_field.make_tip_field
+
+
+def _sampled(organ: ByContent) -> TipField:
+    return _plain(*organ.values)
+
+
+_found = on_disk(_sampled, _ROOMS)
+
+
+def kept(
+    mesh: TetMesh, regions: Regions, patch_radius: float, outline: SurfaceMesh | None = None
+) -> TipField:
+    """In the place of ``make_tip_field``; what it refuses is not kept."""
+    return _found(ByContent(mesh, regions, float(patch_radius), outline))
