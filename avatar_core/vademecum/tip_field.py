@@ -51,6 +51,7 @@ ROUND = 1.01  # depth over distance, up to which a side is round
 STEEPEST = 2.5  # depth over distance, at most: thin lobes
 MOST_STEPS = 12  # of the way, each by the distance that is left
 SMOOTHING = 0.5  # standard deviation of G, in spacings
+HALFWAY = 0.5  # of the way to the outline, where a tip reads the local profile
 SHARED = (1e-3, 0.1)  # closest points [m] and components of normals that share a profile
 FADING = 0.5  # distance beyond the accessible surface over which access fades, in patch radii
 
@@ -183,10 +184,14 @@ def _profile(
     first, group = _shared(closest, normals)
     some = local_profile(outline, closest[first], normals[first])
 
+    halfway = np.argwhere(known).T - HALFWAY / SPACING * (distance[known][:, None] * normals).T
+
     def on_grid(values: np.ndarray) -> np.ndarray:
         grid = np.zeros(distance.shape)
         grid[known] = values[group]
-        return smoothed(grid, SMOOTHING, known).astype(np.float32)
+        grid = smoothed(grid, SMOOTHING, known)
+        grid[known] = map_coordinates(grid, halfway, order=2, prefilter=False, mode="nearest")
+        return grid.astype(np.float32)
 
     profile = LocalProfile(*(on_grid(values) for values in some))
     return profile._replace(anisotropy=np.maximum(profile.anisotropy, 0.0))

@@ -93,9 +93,10 @@ def test_a_ball_has_the_curvature_of_its_surface_all_around() -> None:
     for height in (-10e-3, *OFFSETS):
         kappa, tau, anisotropy = profile(field, (RADIUS + height) * n)
         secant = kappa + MIDDLE / 3.0 * tau
-        # facets of 1.5 mm
-        np.testing.assert_allclose(secant, 1.0 / RADIUS, rtol=0.05)
-        np.testing.assert_allclose(np.sqrt(anisotropy), 0.0, atol=0.15 / RADIUS)
+        np.testing.assert_allclose(secant, 1.0 / RADIUS, rtol=0.05)  # facets of 1.5 mm
+        # only its square counts; facets at the rim of the accessible half leave the most
+        assert np.quantile(np.sqrt(anisotropy), 0.98) < 0.1 / RADIUS
+        assert np.sqrt(anisotropy).max() < 0.5 / RADIUS
 
 
 def test_a_ridge_is_felt_above_the_ridge_only() -> None:

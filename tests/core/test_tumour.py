@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from avatar_core.contact.effects.tip_profile import STIFFNESS
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.fem.elasticity import Elasticity, Inclusion
 from avatar_core.fem.patch_loads import load_surface
@@ -87,7 +88,7 @@ def test_a_tip_feels_the_tumour_under_it_and_not_aside() -> None:
     for aside, low, high in ((0.0, 1.5, CONTRAST), (28e-3, 0.99, 1.02)):
         step(law, (top("cube") + np.array([aside, 1e-3, 0.0]))[None])
         assert law.effects.tip_law is not None
-        modulus = law.effects.tip_law.value[0, 2] / law.effects.tip_law.modulus[0]
+        modulus = law.effects.tip_law.value[0, STIFFNESS] / law.effects.tip_law.modulus[0]
         assert low <= modulus <= high
 
 
