@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.optimize import brentq
+from scipy.special import ellipe, ellipk
 
 from avatar_core.contact.effects import (
     Effect,
@@ -16,7 +18,7 @@ from avatar_core.contact.effects import (
     Viscoelasticity,
 )
 from avatar_core.contact.effects.large_dent import evaluate_large_dent
-from avatar_core.contact.effects.tip_law import PATCH, STIFFNESS
+from avatar_core.contact.effects.tip_law import ANISOTROPY, KAPPA, PATCH, STIFFNESS, TAU
 from avatar_core.contact.model import ContactModel, Status, prepare, step, stored_energy
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
@@ -108,6 +110,72 @@ def test_large_strain_shares_the_depth_with_the_organ(
     assert force == pytest.approx(pressed_in(small, SPHERE, depth - added), rel=1e-6)
     assert abs(added) > 1e-3 * depth
     assert (added > 0.0) == (nu == 0.48)
+
+
+def bent_organ(tip: Tip, kappa: float, tau: float = 0.0, anisotropy: float = 0.0) -> ContactModel:
+    """A half-space whose surface falls away around every place in the same way."""
+    model = flat_organ(compliance=ALONE, tip=tip)
+    local = model.effects.tip_law.local
+    local[KAPPA], local[TAU], local[ANISOTROPY] = kappa, tau, anisotropy
+    return model
+
+
+@pytest.mark.parametrize(("kappa", "tau"), [(60.0, -4e3), (-40.0, 5e3), (20.0, 0.0)])
+@pytest.mark.parametrize("depth", [0.5e-3, 3e-3])
+def test_a_sphere_on_a_bent_surface_is_a_tip_of_another_profile(
+    kappa: float, tau: float, depth: float
+) -> None:
+    """Sneddon's integrals over f'(r) + kappa r + tau r^2 / 2."""
+    radius = SPHERE.radius
+
+    def integral(a: float, power: int) -> float:
+        def inner(angle: float) -> float:
+            r = a * np.sin(angle)
+            slope = r / np.sqrt(radius**2 - r**2) + kappa * r + 0.5 * tau * r**2
+            return float(r**power * slope)
+
+        return float(quad(inner, 0.0, 0.5 * np.pi)[0])
+
+    a = brentq(lambda a: a * integral(a, 0) - depth, 0.0, 0.999 * radius)
+    force = pressed(bent_organ(SPHERE, kappa, tau), SPHERE, depth)
+    assert force == pytest.approx(2.0 * E_STAR * integral(a, 2), rel=2e-3)
+
+
+@pytest.mark.parametrize("ratio", [2.0, 5.0, 10.0])
+def test_a_sphere_on_a_tube_touches_over_an_ellipse(ratio: float) -> None:
+    """Hertz's elliptic contact (Johnson, Contact Mechanics, 1985, eqs. 4.26 to 4.32).
+
+    ``ratio`` is that of the relative curvatures across and along the tube.
+    """
+    tip, depth = Tip("sphere", 10e-3), 0.1e-3
+    tube = (ratio - 1.0) / tip.radius  # its curvature
+
+    def curvatures(m: float) -> tuple[float, float]:
+        """A and B times E* / p0 and the longer half axis, over an ellipse with m = e^2."""
+        short, whole, second = np.sqrt(1.0 - m), ellipk(m), ellipe(m)
+        return short / m * (whole - second), short / m * (second / (1.0 - m) - whole)
+
+    def missed(m: float) -> float:
+        along, across = curvatures(m)
+        return float(across / along) - ratio
+
+    m = brentq(missed, 1e-4, 0.999)
+    # A = 1 / (2 R) = curvatures p0 / (E* a), depth = p0 / E* b K
+    pressure_over_a = 0.5 / tip.radius / curvatures(m)[0]  # p0 / (E* a)
+    a = np.sqrt(depth / (pressure_over_a * np.sqrt(1.0 - m) * ellipk(m)))
+    exact = 2.0 / 3.0 * np.pi * a**2 * np.sqrt(1.0 - m) * pressure_over_a * a * E_STAR
+    force = pressed(bent_organ(tip, 0.5 * tube, anisotropy=(0.5 * tube) ** 2), tip, depth)
+    assert force == pytest.approx(exact, rel=0.015)
+    round_one = pressed(bent_organ(tip, 0.5 * tube), tip, depth)
+    assert round_one < 0.98 * exact
+
+
+@pytest.mark.parametrize("tip", [SPHERE, Tip("flat", 3e-3), Tip("cone", 15e-3, 60.0)])
+@pytest.mark.parametrize(("kappa", "tau"), [(-500.0, 0.0), (100.0, -1e6), (-500.0, -1e6)])
+def test_no_hollow_makes_a_contact_shrink_as_it_deepens(tip: Tip, kappa: float, tau: float) -> None:
+    model = bent_organ(tip, kappa, tau)
+    force = [pressed_in(model, tip, depth) for depth in np.linspace(0.2e-3, 6e-3, 30)]
+    assert (np.diff(force) > 0.0).all()
 
 
 def test_another_tip_feels_small_strain() -> None:
