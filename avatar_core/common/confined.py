@@ -1,6 +1,6 @@
 """Calls in a separate process with limits of time and memory, for reading files of others.
 
-Some damaged files crash the libraries behind HDF5, VTK and NIfTI (a segmentation fault of HDF5
+Some damaged files crash the libraries behind HDF5 and NIfTI (a segmentation fault of HDF5
 2.0), hang them or make them allocate all memory, before any check of this project. In a process of
 their own they do no harm: if it dies, another is started.
 

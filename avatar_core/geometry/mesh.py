@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 
 from avatar_core.errors import MeshError
 from avatar_core.geometry.surface import SurfaceMesh, winding_number
+from avatar_core.geometry.tetwild import fill_box
 
 # Faces of a positively oriented tetrahedron, each with its normal pointing outwards.
 _TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -214,19 +215,14 @@ def first_edge(volume: float, n_vertices: int) -> float:
 
 
 def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
-    import pytetwild
-
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     with _scratch_folder(), _own_interrupt():
-        vertices, tets = pytetwild.tetrahedralize(
+        vertices, tets = fill_box(
             surface.vertices * 1e3,  # millimetres, for which fTetWild's thresholds are made
             surface.faces.astype(np.int32),
-            edge_length_fac=edge / diagonal,
-            epsilon=4e-3,  # a smaller envelope forbids coarse meshes
-            num_threads=1,
-            quiet=True,
-            disable_filtering=True,
-        )[:2]
+            edge=edge / diagonal,
+            envelope=4e-3,  # a smaller one forbids coarse meshes
+        )
     vertices = vertices * 1e-3
     volumes = TetMesh(vertices, tets).tet_volumes
     if np.median(volumes) < 0:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from avatar_core.common import files
 from avatar_core.errors import SurfaceError, one_line
+from avatar_core.geometry.vtk_files import read_polydata
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -97,35 +98,11 @@ def _by_meshio(reader: str) -> Callable[[Path], Soup]:
 
 
 def _read_vtk(path: Path) -> Soup:
-    """Legacy VTK: polygonal data by VTK itself, which meshio cannot read, the rest by meshio."""
-    header = path.read_bytes()[:1024].upper()
-    return _read_polydata(path) if b"POLYDATA" in header else _by_meshio("vtk")(path)
-
-
-def _read_polydata(path: Path) -> Soup:
-    try:
-        from vtkmodules.util.numpy_support import vtk_to_numpy
-        from vtkmodules.vtkCommonCore import vtkObject
-        from vtkmodules.vtkFiltersCore import vtkTriangleFilter
-        from vtkmodules.vtkIOLegacy import vtkPolyDataReader
-    except ImportError as error:
-        raise SurfaceError(
-            f"{path.name}: VTK polygonal data needs VTK; pip install vtk, or export it as PLY"
-        ) from error
-    reader = vtkPolyDataReader()
-    reader.SetFileName(str(path))
-    triangles = vtkTriangleFilter()
-    triangles.PassLinesOff()
-    triangles.PassVertsOff()
-    triangles.SetInputConnection(reader.GetOutputPort())
-    vtkObject.GlobalWarningDisplayOff()  # VTK reports in many lines on stderr; ours is one
-    triangles.Update()
-    vtkObject.GlobalWarningDisplayOn()
-    data = triangles.GetOutput()
-    if data.GetNumberOfPolys() == 0:
-        return np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    faces = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
-    return vtk_to_numpy(data.GetPoints().GetData()).astype(np.float64), faces.astype(np.int64)
+    """Legacy VTK: polygonal data by our own reader, which meshio cannot read, the rest by it."""
+    content = path.read_bytes()
+    if b"POLYDATA" in content[:1024].upper():
+        return read_polydata(content)
+    return _by_meshio("vtk")(path)
 
 
 def _read_label_map(path: Path, label: int | None) -> Soup:

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
+from importlib.machinery import EXTENSION_SUFFIXES, PathFinder
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from avatar_core.errors import MeshError
+from avatar_core.geometry import tetwild
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.vademecum.model import Vademecum
+from tests.hard.mesh_mutations import encode, pristine
 from tests.recorded_meshes import N_VERTICES
 
 
@@ -43,3 +51,74 @@ def test_the_built_in_liver_has_the_same_mesh_at_any_scale(spacing: float, n: in
     np.testing.assert_array_equal(again.tets, mesh.tets)
     np.testing.assert_allclose(again.vertices, 10.0 * mesh.vertices, rtol=0.0, atol=1e-9)
     assert mesh.volume == pytest.approx(liver.volume, rel=0.03)
+
+
+_IMPORTS = """
+import sys
+import avatar_core
+from avatar_core.geometry.mesh import tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
+mesh = tetrahedralize(phantom_liver(12e-3), 600)
+assert 400 < len(mesh.vertices) < 800
+avatar_core.read_surface(sys.argv[1])
+print(*{name.partition(".")[0] for name in sys.modules})
+"""
+
+
+def test_neither_pyvista_nor_vtk_is_imported(tmp_path: Path) -> None:
+    """They are 580 MB, and are not installed with the project."""
+    ball = tmp_path / "ball.vtk"
+    ball.write_bytes(encode(pristine(), "vtk-polydata"))
+    run = subprocess.run(
+        [sys.executable, "-c", _IMPORTS, str(ball)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert run.returncode == 0, run.stderr
+    imported = set(run.stdout.split())
+    assert "avatar_core" in imported
+    assert imported.isdisjoint({"pytetwild", "pyvista", "vtk", "vtkmodules"})
+
+
+@pytest.fixture
+def anew() -> Iterator[None]:
+    """The compiled module is looked for again, before and after."""
+    tetwild._compiled.cache_clear()
+    yield
+    tetwild._compiled.cache_clear()
+
+
+def _filled() -> None:
+    liver = phantom_liver(12e-3)
+    tetwild.fill_box(liver.vertices, liver.faces, edge=0.1, envelope=4e-3)
+
+
+@pytest.mark.usefixtures("anew")
+def test_a_wheel_that_is_missing_or_has_no_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    for finder in (tetwild, PathFinder):
+        with monkeypatch.context() as patch:
+            patch.setattr(finder, "find_spec", lambda *_: None)
+            with pytest.raises(MeshError, match=r"not installed; pip install 'pytetwild"):
+                _filled()
+
+
+@pytest.mark.usefixtures("anew")
+def test_a_wheel_for_another_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "pytetwild"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / f"PyfTetWildWrapper{EXTENSION_SUFFIXES[0]}").write_bytes(b"for another system")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(MeshError, match=r"does not fit this Python .*; pip install 'pytetwild"):
+        _filled()
+
+
+def test_a_wheel_with_another_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (
+        SimpleNamespace(),
+        SimpleNamespace(tetrahedralize_mesh=lambda vertices, faces: None),
+    ):
+        monkeypatch.setattr(tetwild, "_compiled", lambda module=module: module)
+        with pytest.raises(MeshError, match=r"another interface .*; pip install 'pytetwild"):
+            _filled()

@@ -25,6 +25,7 @@ from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.storage import save_vademecum
+from tests.hard.small_files import ball
 from tests.ros.browser import (
     CHROMIUM,
     force_of,
@@ -60,15 +61,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @stored
 def _library() -> dict[str, bytes]:
-    import pyvista
-
     liver = phantom_liver(12e-3)
     center = liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0])
-    ball = pyvista.Sphere(radius=BALL, center=center, theta_resolution=20, phi_resolution=20)
-    faces = ball.faces.reshape(-1, 4)[:, 1:]
+    points, faces = ball(360, BALL)
     with TemporaryDirectory() as name:
         tumour, organ = Path(name, "tumour.stl"), Path(name, "liver.h5")
-        meshio.write_points_cells(tumour, 1e3 * ball.points, {"triangle": faces})
+        meshio.write_points_cells(tumour, 1e3 * (center + points), {"triangle": faces})
         contrast = Coordinate("contrast", 0.5, 20.0, 3)
         options = OrganOptions(
             n_vertices=600,
