@@ -40,7 +40,7 @@ Json = Annotated[
 def bench_step(
     surface: Surface = "phantom",
     unit: Unit = "mm",
-    axes: Axes = "RAS",
+    axes: Axes = None,
     label: Label = None,
     small: Annotated[
         int, typer.Option(help="approximate number of vertices of the small mesh")
@@ -72,7 +72,7 @@ def bench_step(
 def bench_effects(
     surface: Surface = "phantom",
     unit: Unit = "mm",
-    axes: Axes = "RAS",
+    axes: Axes = None,
     label: Label = None,
     vertices: Vertices = 2850,
     modes: Annotated[int, typer.Option(help="number of far-field modes")] = 50,
@@ -147,7 +147,7 @@ def bench_cell(
         if file.suffix != ".h5":
             with BuildBar() as progress:
                 built = build(
-                    read_organ(surface, "mm", "RAS", None),
+                    read_organ(surface, "mm", None, None),
                     OrganOptions(n_vertices=vertices),
                     progress,
                 )

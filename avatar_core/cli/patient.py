@@ -59,7 +59,7 @@ def patient(
         typer.Option(help="name of a known organ that is not used; may be repeated"),
     ] = None,
     unit: Unit = "mm",
-    axes: Axes = "RAS",
+    axes: Axes = None,
     label: Label = None,
     vertices: Vertices = 2850,
     modes: Annotated[int, typer.Option(help="maximum number of far-field modes")] = 100,

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from avatar_core.cli import main as cli
+from avatar_core.cli.vademecum import _read_tumour, read_organ
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
@@ -113,6 +114,21 @@ def test_bad_option(
     source = phantom_file(tmp_path)
     small = [] if "--vertices" in options else ["--vertices", "800"]
     refused(monkeypatch, capsys, tmp_path, [source, *small, *options], remedy)
+
+
+@pytest.mark.parametrize(
+    ("states", "given", "read"),
+    [("", None, "LPS"), ("# SPACE=RAS\n", None, "RAS"), ("", "LPI", "LPI")],
+    ids=["the organ's", "its own", "those given"],
+)
+def test_axes_of_a_tumour(tmp_path: Path, states: str, given: str | None, read: str) -> None:
+    organ = phantom_file(tmp_path)
+    organ.write_text("# SPACE=LPS\n" + organ.read_text())
+    tumour = tmp_path / "tumour.obj"
+    tumour.write_text(states + organ.read_text().partition("\n")[2])
+    surface = read_organ(str(organ), "mm", None, None)
+    assert surface.axes_name == "LPS"
+    assert _read_tumour(tumour, "mm", given, surface).axes_name == read
 
 
 def test_missing_output_folder(
