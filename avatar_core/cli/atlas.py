@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from avatar_core.cli.output import require_output
 from avatar_core.errors import AvatarError
 
 if TYPE_CHECKING:
@@ -87,6 +88,7 @@ def create(
     from avatar_core.atlas.response import ResponseSolver
     from avatar_core.atlas.workers import Workers
 
+    require_output(file, [".h5"], surfaces)
     sources = _sources(surfaces, unit, axes, label)
     options = AtlasOptions(template_vertices, box, spacing)
     with _bar(len(sources)) as progress:

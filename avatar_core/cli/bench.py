@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from avatar_core.cli.output import require_output
 from avatar_core.cli.vademecum import (
     Axes,
     BuildBar,
@@ -54,6 +55,7 @@ def bench_step(
     from avatar_core.studies.bench.methods import load_average
     from avatar_core.studies.bench.step import run_step_bench
 
+    _require_json(output, surface)
     organ = read_organ(surface, unit, axes, label)
     with BuildBar() as progress:
         rows, summary = run_step_bench(organ, small, large, progress)
@@ -92,6 +94,7 @@ def bench_effects(
     from avatar_core.studies.bench.methods import load_average
 
     require(modes >= 36, f"--modes is {modes}; inertia and self_weight need at least 36")
+    _require_json(output, surface, fused)
     organ = read_organ(surface, unit, axes, label)
     with BuildBar(large=True) as progress:
         vademecum = build_for_effects(organ, vertices, modes, progress)
@@ -142,6 +145,7 @@ def bench_cell(
     from avatar_core.vademecum.storage import save_vademecum
 
     require_ros()
+    _require_json(output, surface)
     with tempfile.TemporaryDirectory(prefix="avatar_bench_") as folder:
         file = Path(surface)
         if file.suffix != ".h5":
@@ -154,6 +158,12 @@ def bench_cell(
             file = Path(folder) / "bench.h5"
             save_vademecum(built, file)
         run_cell(file, seconds, output, changes)
+
+
+def _require_json(output: Path | None, *inputs: str | Path | None) -> None:
+    """Raise StorageError, before minutes of work, if the table cannot be written."""
+    if output is not None:
+        require_output(output, [".json"], inputs)
 
 
 def require_ros() -> None:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from avatar_core.cli.output import require_output
 from avatar_core.cli.vademecum import require
 
 
@@ -29,10 +30,12 @@ def export(
 ) -> None:
     """Export an organ for ParaView: at rest, with its first modes and its displacement."""
     from avatar_core.contact.tool_path import middle_of_access
+    from avatar_core.scene.export import FORMATS
     from avatar_core.scene.export import export as exported
     from avatar_core.vademecum.storage import load_vademecum
 
     require(modes >= 0, f"--modes is {modes}; ask for 0 or more")
+    require_output(output, FORMATS, [file])
     newtons = _newtons(force)
     vademecum = load_vademecum(file)
     point = vademecum.surface.centers[middle_of_access(vademecum)] if at is None else at

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
+from avatar_core.cli.output import Overwrite, require_output
 from avatar_core.errors import AvatarError
 
 if TYPE_CHECKING:
@@ -127,6 +128,7 @@ def vademecum(
             "--mesh-error", help="also measure the discretisation error of the mesh (slow)"
         ),
     ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Build the certified vademecum of an organ. Exit code 3: written, but not converged."""
     from avatar_core.fem.elasticity import Material
@@ -134,7 +136,7 @@ def vademecum(
     from avatar_core.offline.pipeline import OrganOptions, build, orientation_warning
     from avatar_core.offline.rule import BuildRule
     from avatar_core.reduction.coordinates import Coordinate
-    from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+    from avatar_core.vademecum.storage import is_vademecum, load_vademecum, save_vademecum
 
     rule = BuildRule() if material == "linear" else LINEAR_RULE
     rule = replace(rule, max_modes=modes or rule.max_modes, tolerance=tolerance or rule.tolerance)
@@ -154,7 +156,8 @@ def vademecum(
     )
     require(0 < max_push <= 0.05, f"--max-push is {max_push} m; choose up to 0.05 (20e-3: 20 mm)")
     require(pushed >= 0, f"--pushed is {pushed}; ask for 0 or more sites")
-    require(output.parent.is_dir(), f"folder {output.parent} does not exist; create it first")
+    inputs = (None if surface == "phantom" else surface, tumour, groups)
+    require_output(output, [".h5"], inputs, is_vademecum, overwrite)
     coordinates = tuple(Coordinate.parse(text) for text in coordinate or ())
     organ = read_organ(surface, unit, axes, label)
     lesion = None if tumour is None else _read_tumour(tumour, unit, axes, organ)

@@ -131,13 +131,6 @@ def test_axes_of_a_tumour(tmp_path: Path, states: str, given: str | None, read: 
     assert _read_tumour(tumour, "mm", given, surface).axes_name == read
 
 
-def test_missing_output_folder(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert run(monkeypatch, "vademecum", "phantom", "-o", tmp_path / "no" / "v.h5") == 1
-    assert "create it first" in capsys.readouterr().err
-
-
 @pytest.mark.long
 def test_tolerance_out_of_reach_is_written_and_marked(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
