@@ -25,6 +25,7 @@ EXIT_STOPPED = 130
 atlas = typer.Typer(
     help="Build and inspect atlases: known organs from which patients are made.",
     no_args_is_help=True,
+    rich_markup_mode=None,  # which takes units, such as [m], for markup
 )
 
 File = Annotated[Path, typer.Argument(metavar="ATLAS.h5", help="file of the atlas")]

@@ -30,7 +30,11 @@ if TYPE_CHECKING:
     from avatar_core.studies.bench.effects import EffectRow
     from avatar_core.studies.bench.methods import StepRow
 
-bench = typer.Typer(help="Measure whether this machine holds 1 kHz.", no_args_is_help=True)
+bench = typer.Typer(
+    help="Measure whether this machine holds 1 kHz.",
+    no_args_is_help=True,
+    rich_markup_mode=None,  # which takes units, such as [m], for markup
+)
 
 Json = Annotated[
     Path | None, typer.Option("-o", "--output", help="also write the table to this file, as JSON")

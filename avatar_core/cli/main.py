@@ -26,6 +26,7 @@ app = typer.Typer(
     help="Computational patient avatars: compute the mechanical response of an organ once, and "
     "evaluate it at 1 kHz.",
     no_args_is_help=True,
+    rich_markup_mode=None,  # which takes units, such as [m], for markup
     pretty_exceptions_enable=False,
     add_completion=False,
 )

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
 from avatar_core.cli import main as cli
 from avatar_core.cli.vademecum import _read_tumour, read_organ
@@ -170,6 +174,31 @@ def test_help(
 ) -> None:
     assert run(monkeypatch, *command, "--help") == 0
     assert "Usage" in capsys.readouterr().out
+
+
+def commands(group: Any, *words: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command of a group, with the words that call it."""
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, *words, name)
+        else:
+            yield (*words, name), command
+
+
+def test_help_shows_every_unit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    n_metres = 0
+    for words, command in commands(typer.main.get_command(cli.app)):
+        assert run(monkeypatch, *words, "--help") == 0
+        shown = " ".join(capsys.readouterr().out.split())
+        for parameter in command.params:
+            units = re.findall(r"\[[^\]]+\]", parameter.help or "")
+            n_metres += units.count("[m]")
+            for unit in units:
+                described = str(parameter.help).partition(unit)[0].split()[-1]
+                assert f"{described} {unit}" in shown, (words, parameter.name)
+    assert n_metres >= 5  # of vademecum, atlas create and export
 
 
 def refused(
