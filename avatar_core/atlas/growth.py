@@ -44,7 +44,7 @@ class SurfaceFile:
 
     path: Path
     unit: str = "mm"
-    axes: Axes = "RAS"
+    axes: Axes | None = None
     label: int | None = None
 
     @property
@@ -92,7 +92,8 @@ class Growth:
     added : names of the new members
     skipped : surfaces that were not added
     resumed : number of new members that an interrupted build had finished
-    notices : new members that are duplicates or whose registration did not converge, one line each
+    notices : new members that are duplicates, whose registration did not converge, or whose
+        surface was changed on reading, one line each
     """
 
     atlas: Atlas
@@ -236,6 +237,11 @@ def _growth(atlas: Atlas, results: Sequence[Anatomy | Skipped], resumed: int) ->
         f"{one.name}: {not_converged(one.quality)}"
         for one in grown.anatomies[len(atlas) :]
         if not one.converged
+    )
+    notices += tuple(
+        f"{one.name}: {notice}"
+        for one in grown.anatomies[len(atlas) :]
+        for notice in one.surface.notices
     )
     skipped = tuple(one for one in results if isinstance(one, Skipped))
     return Growth(grown, added, skipped, resumed, notices)

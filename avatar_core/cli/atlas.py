@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from avatar_core.cli.output import require_output
 from avatar_core.errors import AvatarError
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ EXIT_STOPPED = 130
 atlas = typer.Typer(
     help="Build and inspect atlases: known organs from which patients are made.",
     no_args_is_help=True,
+    rich_markup_mode=None,  # which takes units, such as [m], for markup
 )
 
 File = Annotated[Path, typer.Argument(metavar="ATLAS.h5", help="file of the atlas")]
@@ -37,9 +39,10 @@ Surfaces = Annotated[
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the files: mm, cm or m")]
 Axes = Annotated[
-    str,
+    str | None,
     typer.Option(
-        help="coordinate axes of the files: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS"
+        help="coordinate axes of the files: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS; "
+        "default: as each header states (SPACE=LPS, as 3D Slicer writes), else RAS"
     ),
 ]
 Label = Annotated[int | None, typer.Option(help="value that marks the organ in label maps")]
@@ -61,7 +64,7 @@ def create(
     file: File,
     surfaces: Surfaces,
     unit: Unit = "mm",
-    axes: Axes = "RAS",
+    axes: Axes = None,
     label: Label = None,
     template_vertices: Annotated[
         int, typer.Option(help="approximate number of vertices of the template's mesh")
@@ -86,6 +89,7 @@ def create(
     from avatar_core.atlas.response import ResponseSolver
     from avatar_core.atlas.workers import Workers
 
+    require_output(file, [".h5"], surfaces)
     sources = _sources(surfaces, unit, axes, label)
     options = AtlasOptions(template_vertices, box, spacing)
     with _bar(len(sources)) as progress:
@@ -105,7 +109,7 @@ def add(
     file: File,
     surfaces: Surfaces,
     unit: Unit = "mm",
-    axes: Axes = "RAS",
+    axes: Axes = None,
     label: Label = None,
     shapes_only: ShapesOnly = False,
     jobs: Jobs = None,
@@ -224,7 +228,9 @@ def _report(file: Path, growth: Growth) -> None:
     )
 
 
-def _sources(surfaces: Sequence[str], unit: str, axes: str, label: int | None) -> list[Source]:
+def _sources(
+    surfaces: Sequence[str], unit: str, axes: str | None, label: int | None
+) -> list[Source]:
     """The surfaces named, those of a folder in the order of their names."""
     from avatar_core.atlas.growth import SurfaceFile
     from avatar_core.cli.vademecum import parsed_axes
@@ -232,10 +238,11 @@ def _sources(surfaces: Sequence[str], unit: str, axes: str, label: int | None) -
     from avatar_core.geometry.surface import METRES, axes_matrix
 
     parsed = parsed_axes(axes)
-    axes_matrix(parsed)  # an error in the options, not in each file
+    if parsed is not None:
+        axes_matrix(parsed)  # an error in the options, not in each file
     if unit not in METRES:
         raise AvatarError(f"--unit is '{unit}'; use one of {', '.join(METRES)}")
-    frozen = parsed if isinstance(parsed, str) else tuple(map(tuple, parsed))
+    frozen = parsed if parsed is None or isinstance(parsed, str) else tuple(map(tuple, parsed))
     sources: list[Source] = []
     for name in surfaces:
         if name == "phantom":

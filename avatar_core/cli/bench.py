@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from avatar_core.cli.output import require_output
 from avatar_core.cli.vademecum import (
     Axes,
     BuildBar,
@@ -29,7 +30,11 @@ if TYPE_CHECKING:
     from avatar_core.studies.bench.effects import EffectRow
     from avatar_core.studies.bench.methods import StepRow
 
-bench = typer.Typer(help="Measure whether this machine holds 1 kHz.", no_args_is_help=True)
+bench = typer.Typer(
+    help="Measure whether this machine holds 1 kHz.",
+    no_args_is_help=True,
+    rich_markup_mode=None,  # which takes units, such as [m], for markup
+)
 
 Json = Annotated[
     Path | None, typer.Option("-o", "--output", help="also write the table to this file, as JSON")
@@ -40,7 +45,7 @@ Json = Annotated[
 def bench_step(
     surface: Surface = "phantom",
     unit: Unit = "mm",
-    axes: Axes = "RAS",
+    axes: Axes = None,
     label: Label = None,
     small: Annotated[
         int, typer.Option(help="approximate number of vertices of the small mesh")
@@ -54,6 +59,7 @@ def bench_step(
     from avatar_core.studies.bench.methods import load_average
     from avatar_core.studies.bench.step import run_step_bench
 
+    _require_json(output, surface)
     organ = read_organ(surface, unit, axes, label)
     with BuildBar() as progress:
         rows, summary = run_step_bench(organ, small, large, progress)
@@ -72,7 +78,7 @@ def bench_step(
 def bench_effects(
     surface: Surface = "phantom",
     unit: Unit = "mm",
-    axes: Axes = "RAS",
+    axes: Axes = None,
     label: Label = None,
     vertices: Vertices = 2850,
     modes: Annotated[int, typer.Option(help="number of far-field modes")] = 50,
@@ -92,6 +98,7 @@ def bench_effects(
     from avatar_core.studies.bench.methods import load_average
 
     require(modes >= 36, f"--modes is {modes}; inertia and self_weight need at least 36")
+    _require_json(output, surface, fused)
     organ = read_organ(surface, unit, axes, label)
     with BuildBar(large=True) as progress:
         vademecum = build_for_effects(organ, vertices, modes, progress)
@@ -142,18 +149,25 @@ def bench_cell(
     from avatar_core.vademecum.storage import save_vademecum
 
     require_ros()
+    _require_json(output, surface)
     with tempfile.TemporaryDirectory(prefix="avatar_bench_") as folder:
         file = Path(surface)
         if file.suffix != ".h5":
             with BuildBar() as progress:
                 built = build(
-                    read_organ(surface, "mm", "RAS", None),
+                    read_organ(surface, "mm", None, None),
                     OrganOptions(n_vertices=vertices),
                     progress,
                 )
             file = Path(folder) / "bench.h5"
             save_vademecum(built, file)
         run_cell(file, seconds, output, changes)
+
+
+def _require_json(output: Path | None, *inputs: str | Path | None) -> None:
+    """Raise StorageError, before minutes of work, if the table cannot be written."""
+    if output is not None:
+        require_output(output, [".json"], inputs)
 
 
 def require_ros() -> None:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from avatar_core.cli.output import require_output
 from avatar_core.cli.vademecum import require
 
 
@@ -14,9 +15,10 @@ def export(
     file: Annotated[Path, typer.Argument(help="vademecum to export (.h5)")],
     output: Annotated[Path, typer.Option("-o", "--output", help="mesh to write (.vtu or .xdmf)")],
     at: Annotated[
-        tuple[float, float, float] | None,
+        str | None,
         typer.Option(
-            help="point of the load, x y z [m]; default: middle of the accessible surface"
+            help="point of the load [m], such as 0,0.07,0.005; default: middle of the accessible "
+            "surface"
         ),
     ] = None,
     force: Annotated[
@@ -29,13 +31,16 @@ def export(
 ) -> None:
     """Export an organ for ParaView: at rest, with its first modes and its displacement."""
     from avatar_core.contact.tool_path import middle_of_access
+    from avatar_core.scene.export import FORMATS
     from avatar_core.scene.export import export as exported
     from avatar_core.vademecum.storage import load_vademecum
 
     require(modes >= 0, f"--modes is {modes}; ask for 0 or more")
-    newtons = _newtons(force)
+    require_output(output, FORMATS, [file])
+    newtons = _numbers("--force", force, (1, 3), "one number or three, as 0,-1,0.5")
+    given = None if at is None else _numbers("--at", at, (3,), "three numbers, as 0,0.07,0.005")
     vademecum = load_vademecum(file)
-    point = vademecum.surface.centers[middle_of_access(vademecum)] if at is None else at
+    point = vademecum.surface.centers[middle_of_access(vademecum)] if given is None else given
     mesh = exported(vademecum, output, point, newtons, modes)
     moved = ((mesh.point_data["displacement"] ** 2).sum(axis=1) ** 0.5).max()
     x, y, z = vademecum.surface.nearest(point).point
@@ -47,11 +52,14 @@ def export(
     )
 
 
-def _newtons(text: str) -> list[float]:
-    """One number or three."""
+def _numbers(option: str, text: str, counts: tuple[int, ...], remedy: str) -> list[float]:
+    """The numbers of an option, separated by commas.
+
+    Raises AvatarError, with the remedy, unless there are as many as one of the counts.
+    """
     try:
         numbers = [float(number) for number in text.replace(",", " ").split()]
     except ValueError:
         numbers = []
-    require(len(numbers) in (1, 3), f"--force is '{text}'; give one number or three, as 0,-1,0.5")
+    require(len(numbers) in counts, f"{option} is '{text}'; give {remedy}")
     return numbers

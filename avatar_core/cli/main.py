@@ -12,6 +12,7 @@ from avatar_core.cli.atlas import atlas
 from avatar_core.cli.bench import bench, require_ros, run_cell
 from avatar_core.cli.cell import Host, Port, cell, require_ui, run_page
 from avatar_core.cli.export import export
+from avatar_core.cli.output import require_output
 from avatar_core.cli.patient import patient
 from avatar_core.cli.replay import replay
 from avatar_core.cli.scene import scene
@@ -25,6 +26,7 @@ app = typer.Typer(
     help="Computational patient avatars: compute the mechanical response of an organ once, and "
     "evaluate it at 1 kHz.",
     no_args_is_help=True,
+    rich_markup_mode=None,  # which takes units, such as [m], for markup
     pretty_exceptions_enable=False,
     add_completion=False,
 )
@@ -65,9 +67,9 @@ def _usage(error: Exception) -> int:
 
 @app.command()
 def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", help="file of the picture")] = Path(
-        "avatar_demo.png"
-    ),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="file of the picture (.png, .pdf, .svg)")
+    ] = Path("avatar_demo.png"),
     seconds: Annotated[float, typer.Option(help="duration of the palpation over ROS 2 [s]")] = 10.0,
     vertices: Vertices = 1200,
     ui: Annotated[
@@ -90,6 +92,8 @@ def demo(
     require_ros()
     if ui:
         require_ui()
+    else:
+        require_output(output, [".png", ".pdf", ".svg"], [])
     print("1. building the vademecum of the built-in liver")
     surface = phantom_liver()
     with BuildBar() as progress:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from avatar_core.cli.output import Overwrite, require_output
 from avatar_core.cli.vademecum import (
     EXIT_NOT_CONVERGED,
     Axes,
@@ -59,7 +60,7 @@ def patient(
         typer.Option(help="name of a known organ that is not used; may be repeated"),
     ] = None,
     unit: Unit = "mm",
-    axes: Axes = "RAS",
+    axes: Axes = None,
     label: Label = None,
     vertices: Vertices = 2850,
     modes: Annotated[int, typer.Option(help="maximum number of far-field modes")] = 100,
@@ -69,18 +70,20 @@ def patient(
             help="number of unseen loads for the certificate; default: 24, or 200 if solved"
         ),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Build a patient's vademecum from an atlas. Exit code 3: written, but not converged."""
     from avatar_core.atlas.base import base_of, numbers_of
     from avatar_core.atlas.patient import PatientOptions, patient_vademecum, require_fidelity
     from avatar_core.atlas.storage import load_atlas
-    from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+    from avatar_core.vademecum.storage import is_vademecum, load_vademecum, save_vademecum
 
     require_fidelity(fidelity)
     require(weighting in WEIGHTINGS, f"--weighting is {weighting}; choose {', '.join(WEIGHTINGS)}")
     require(modes >= 1, f"--modes is {modes}; ask for at least 1")
     require(neighbors is None or neighbors >= 1, f"--neighbors is {neighbors}; ask for at least 1")
-    require(output.parent.is_dir(), f"folder {output.parent} does not exist; create it first")
+    inputs = (None if surface == "phantom" else surface, atlas)
+    require_output(output, [".h5"], inputs, is_vademecum, overwrite)
     base = base_of(load_atlas(atlas))
     options = PatientOptions(
         n_vertices=vertices,

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 scene = typer.Typer(
     help="Inspect scenes: YAML files that name organ, tools, outputs and effects.",
     no_args_is_help=True,
+    rich_markup_mode=None,  # which takes units, such as [m], for markup
 )
 
 

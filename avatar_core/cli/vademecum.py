@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
+from avatar_core.cli.output import Overwrite, require_output
 from avatar_core.errors import AvatarError
 
 if TYPE_CHECKING:
@@ -31,9 +32,10 @@ Surface = Annotated[
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the file: mm, cm or m")]
 Axes = Annotated[
-    str,
+    str | None,
     typer.Option(
-        help="coordinate axes of the file: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS"
+        help="coordinate axes of the file: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS; "
+        "default: as its header states (SPACE=LPS, as 3D Slicer writes), else RAS"
     ),
 ]
 Label = Annotated[int | None, typer.Option(help="value that marks the organ in a label map")]
@@ -44,7 +46,7 @@ def vademecum(
     surface: Surface,
     output: Annotated[Path, typer.Option("-o", "--output", help="vademecum to write (.h5)")],
     unit: Unit = "mm",
-    axes: Axes = "RAS",
+    axes: Axes = None,
     label: Label = None,
     vertices: Vertices = 2850,
     young: Annotated[float, typer.Option(help="Young's modulus [Pa]")] = 0.17e6,
@@ -87,7 +89,10 @@ def vademecum(
         ),
     ] = None,
     tumour: Annotated[
-        Path | None, typer.Option(help="surface file of a tumour, in unit and axes of the organ")
+        Path | None,
+        typer.Option(
+            help="surface file of a tumour, in unit and axes of the organ unless it states its own"
+        ),
     ] = None,
     contrast: Annotated[
         float, typer.Option(help="Young's modulus inside the tumour over that outside [-]")
@@ -123,15 +128,15 @@ def vademecum(
             "--mesh-error", help="also measure the discretisation error of the mesh (slow)"
         ),
     ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Build the certified vademecum of an organ. Exit code 3: written, but not converged."""
     from avatar_core.fem.elasticity import Material
-    from avatar_core.geometry.tumour import read_tumour
     from avatar_core.offline.large_deformation import LINEAR_RULE, LargeRule
     from avatar_core.offline.pipeline import OrganOptions, build, orientation_warning
     from avatar_core.offline.rule import BuildRule
     from avatar_core.reduction.coordinates import Coordinate
-    from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+    from avatar_core.vademecum.storage import is_vademecum, load_vademecum, save_vademecum
 
     rule = BuildRule() if material == "linear" else LINEAR_RULE
     rule = replace(rule, max_modes=modes or rule.max_modes, tolerance=tolerance or rule.tolerance)
@@ -151,13 +156,16 @@ def vademecum(
     )
     require(0 < max_push <= 0.05, f"--max-push is {max_push} m; choose up to 0.05 (20e-3: 20 mm)")
     require(pushed >= 0, f"--pushed is {pushed}; ask for 0 or more sites")
-    require(output.parent.is_dir(), f"folder {output.parent} does not exist; create it first")
+    inputs = (None if surface == "phantom" else surface, tumour, groups)
+    require_output(output, [".h5"], inputs, is_vademecum, overwrite)
     coordinates = tuple(Coordinate.parse(text) for text in coordinate or ())
+    organ = read_organ(surface, unit, axes, label)
+    lesion = None if tumour is None else _read_tumour(tumour, unit, axes, organ)
     options = OrganOptions(
         n_vertices=vertices,
         material=Material(young, poisson),
         coordinates=coordinates,
-        tumour=None if tumour is None else read_tumour(tumour, unit, parsed_axes(axes)),
+        tumour=lesion,
         contrast=contrast,
         large=None if material == "linear" else material,  # type: ignore[arg-type]
         large_rule=LargeRule(max_push=max_push),
@@ -171,8 +179,7 @@ def vademecum(
         seed=seed,
         with_mesh_error=mesh_error,
     )
-    organ = read_organ(surface, unit, axes, label)
-    for notice in organ.notices:
+    for notice in (*organ.notices, *(lesion.notices if lesion else ())):
         print(f"notice: {notice}", file=sys.stderr)
     warning = orientation_warning(organ)
     if warning:
@@ -249,7 +256,7 @@ def _large_summary(v: Vademecum) -> dict[str, Any] | None:
     return {"material": v.large.material, "bytes": v.large.nbytes, "certificate": certificate}
 
 
-def read_organ(surface: str, unit: str, axes: str, label: int | None) -> SurfaceMesh:
+def read_organ(surface: str, unit: str, axes: str | None, label: int | None) -> SurfaceMesh:
     """A surface from a file, or the built-in liver."""
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.geometry.surface import read_surface
@@ -259,8 +266,20 @@ def read_organ(surface: str, unit: str, axes: str, label: int | None) -> Surface
     return read_surface(surface, unit, parsed_axes(axes), label)
 
 
-def parsed_axes(axes: str) -> Any:
-    """A name of axes, or 16 numbers as a 4x4 matrix."""
+def _read_tumour(file: Path, unit: str, axes: str | None, organ: SurfaceMesh) -> SurfaceMesh:
+    """A tumour in the axes given, in those that its file states, or in those of the organ."""
+    from avatar_core.geometry.surface_files import stated_axes
+    from avatar_core.geometry.tumour import read_tumour
+
+    if axes is not None:
+        return read_tumour(file, unit, parsed_axes(axes))
+    return read_tumour(file, unit, stated_axes(file) or organ.axes)
+
+
+def parsed_axes(axes: str | None) -> Any:
+    """A name of axes, 16 numbers as a 4x4 matrix, or None for those of the file."""
+    if axes is None:
+        return None
     numbers = axes.replace(",", " ").split()
     if len(numbers) != 16:
         return axes

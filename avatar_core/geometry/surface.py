@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.skin import Skin, components, directed_edges, skin_of, weld
-from avatar_core.geometry.surface_files import content_of, parse
+from avatar_core.geometry.surface_files import content_of, parse, stated_axes
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -50,7 +50,7 @@ class SurfaceMesh:
     name : what the surface is called, the stem of its file
     unit : unit of the file it came from (the vertices are in metres whatever it says)
     axes : ndarray, shape (4, 4), rigid map from the file's coordinates (in its unit) to RAS
-    notices : what was changed or dropped on reading, one line each
+    notices : what was changed, dropped or contradictory on reading, one line each
     source_sha256 : hash of the file's bytes, empty for a generated surface
 
     Raises SurfaceError if the arrays are empty, not finite or do not fit each other.
@@ -131,7 +131,7 @@ class SurfaceMesh:
 def read_surface(
     path: str | Path,
     unit: str = "mm",
-    axes: str | ArrayLike = "RAS",
+    axes: str | ArrayLike | None = None,
     label: int | None = None,
     *,
     check_size: bool = True,
@@ -141,7 +141,9 @@ def read_surface(
 
     unit : "m", "cm" or "mm", of the file's coordinates
     axes : where the file's +x, +y, +z point ("RAS", "LPS", "RIA", ...), or a rigid (4, 4) matrix
-        from the file's coordinates to RAS in the file's unit
+        from the file's coordinates to RAS in the file's unit; None: as the file's header states
+        (``SPACE=LPS``, as 3D Slicer writes it), RAS if it states none. Axes that are given hold
+        against the header, with a notice.
     label : which label of a label map; not needed if there is only one
     one_body : small stray bodies are dropped, others refused; False for tumours
 
@@ -150,7 +152,8 @@ def read_surface(
     """
     path = Path(path)
     scale = _metres_per(unit)
-    matrix = axes_matrix(axes)
+    stated = stated_axes(path)
+    matrix = axes_matrix((stated or "RAS") if axes is None else axes)
     content = content_of(path)
     vertices, faces = parse(path, label)
     _check_arrays(vertices, faces, path.name)
@@ -163,6 +166,7 @@ def read_surface(
         name=path.name.split(".")[0],
         unit=unit,
         axes=matrix,
+        notices=_contradictions(matrix, stated),
         source_sha256=hashlib.sha256(content).hexdigest(),
     )
     if one_body:
@@ -420,6 +424,16 @@ def axes_matrix(axes: str | ArrayLike) -> FloatArray:
     ):
         raise SurfaceError("axes: the matrix is not rigid; put a scale into --unit instead")
     return matrix
+
+
+def _contradictions(axes: FloatArray, stated: str | None) -> tuple[str, ...]:
+    """A notice if axes (4, 4) turn the file otherwise than those that its header states."""
+    if stated is None or np.allclose(axes[:3, :3], _named_axes(stated), atol=1e-4):
+        return ()
+    return (
+        f"axes {_axes_name(axes)}, as given, although the file's header states {stated} "
+        f"(SPACE={stated}); give --axes {stated}, or none, if the organ is turned",
+    )
 
 
 def _named_axes(name: str) -> FloatArray:

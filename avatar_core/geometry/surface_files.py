@@ -6,6 +6,7 @@ Nothing is checked here but that the file can be read; :mod:`avatar_core.geometr
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from itertools import pairwise
 from pathlib import Path
@@ -26,6 +27,7 @@ Soup = tuple[FloatArray, IntArray]
 MAX_FILE_BYTES = 4 << 30
 MAX_LABEL_BYTES = 2**30  # of a decompressed label map
 LABEL_SPACING = 2.0  # label maps finer than this are averaged to it [mm]
+HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for
 
 
 def content_of(path: Path) -> bytes:
@@ -37,6 +39,56 @@ def content_of(path: Path) -> bytes:
         raise SurfaceError(
             f"cannot read {path}: {error}; check the path and its permissions"
         ) from error
+
+
+def stated_axes(path: Path) -> str | None:
+    """The axes that a file's header states, "RAS" or "LPS"; None if it states none.
+
+    3D Slicer writes ``SPACE=LPS`` or ``SPACE=RAS`` into the header of STL, the comments of OBJ and
+    PLY, and the title of legacy VTK. No more than ``HEADER_BYTES`` are read.
+
+    Raises SurfaceError if there is no such ordinary file.
+    """
+    comments_of = _COMMENTS.get(path.suffix.lower())
+    if comments_of is None:
+        return None
+    try:
+        with files.opened(path, MAX_FILE_BYTES) as source:
+            head = source.read(HEADER_BYTES)
+    except (files.FileError, OSError) as error:
+        raise SurfaceError(
+            f"cannot read {path}: {error}; check the path and its permissions"
+        ) from error
+    found = re.search(rb"\bSPACE=(RAS|LPS)\b", comments_of(head), re.IGNORECASE)
+    return found[1].decode().upper() if found else None
+
+
+def _obj_comments(head: bytes) -> bytes:
+    return b"\n".join(line for line in head.splitlines() if line.lstrip().startswith(b"#"))
+
+
+def _ply_comments(head: bytes) -> bytes:
+    lines = head.partition(b"end_header")[0].splitlines()
+    return b"\n".join(line for line in lines if line.startswith(b"comment"))
+
+
+def _stl_comments(head: bytes) -> bytes:
+    """The line ``solid`` of a text file, the 80 bytes before the triangles of a binary one."""
+    is_text = head.startswith(b"solid") and b"\0" not in head
+    return head.partition(b"\n")[0] if is_text else head[:80]
+
+
+def _vtk_comments(head: bytes) -> bytes:
+    """The title, which is the second line."""
+    return b"".join(head.splitlines()[1:2])
+
+
+_COMMENTS: dict[str, Callable[[bytes], bytes]] = {
+    ".obj": _obj_comments,
+    ".ply": _ply_comments,
+    ".stl": _stl_comments,
+    ".vtk": _vtk_comments,
+}
 
 
 def parse(path: Path, label: int | None) -> Soup:

@@ -23,8 +23,8 @@ _POLAR, _AZIMUTHS, _DEPTHS = 4, 8, 8  # directions and distances of points under
 _CORE = 0.25  # part of the energy within the contact's own radius
 
 
-def read_tumour(path: str | Path, unit: str = "mm", axes: Any = "RAS") -> SurfaceMesh:
-    """Read the surface of one or more tumours, in the coordinates of the organ's file.
+def read_tumour(path: str | Path, unit: str = "mm", axes: Any = None) -> SurfaceMesh:
+    """Read the surface of one or more tumours, in the coordinates of its file.
 
     Raises SurfaceError as :func:`avatar_core.geometry.surface.read_surface`, but for size and
     bodies.

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
 from avatar_core.cli import main as cli
+from avatar_core.cli.vademecum import _read_tumour, read_organ
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
@@ -115,11 +120,19 @@ def test_bad_option(
     refused(monkeypatch, capsys, tmp_path, [source, *small, *options], remedy)
 
 
-def test_missing_output_folder(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert run(monkeypatch, "vademecum", "phantom", "-o", tmp_path / "no" / "v.h5") == 1
-    assert "create it first" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("states", "given", "read"),
+    [("", None, "LPS"), ("# SPACE=RAS\n", None, "RAS"), ("", "LPI", "LPI")],
+    ids=["the organ's", "its own", "those given"],
+)
+def test_axes_of_a_tumour(tmp_path: Path, states: str, given: str | None, read: str) -> None:
+    organ = phantom_file(tmp_path)
+    organ.write_text("# SPACE=LPS\n" + organ.read_text())
+    tumour = tmp_path / "tumour.obj"
+    tumour.write_text(states + organ.read_text().partition("\n")[2])
+    surface = read_organ(str(organ), "mm", None, None)
+    assert surface.axes_name == "LPS"
+    assert _read_tumour(tumour, "mm", given, surface).axes_name == read
 
 
 @pytest.mark.long
@@ -161,6 +174,31 @@ def test_help(
 ) -> None:
     assert run(monkeypatch, *command, "--help") == 0
     assert "Usage" in capsys.readouterr().out
+
+
+def commands(group: Any, *words: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command of a group, with the words that call it."""
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, *words, name)
+        else:
+            yield (*words, name), command
+
+
+def test_help_shows_every_unit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    n_metres = 0
+    for words, command in commands(typer.main.get_command(cli.app)):
+        assert run(monkeypatch, *words, "--help") == 0
+        shown = " ".join(capsys.readouterr().out.split())
+        for parameter in command.params:
+            units = re.findall(r"\[[^\]]+\]", parameter.help or "")
+            n_metres += units.count("[m]")
+            for unit in units:
+                described = str(parameter.help).partition(unit)[0].split()[-1]
+                assert f"{described} {unit}" in shown, (words, parameter.name)
+    assert n_metres >= 5  # of vademecum, atlas create and export
 
 
 def refused(

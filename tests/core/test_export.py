@@ -113,6 +113,9 @@ def test_a_load_that_makes_no_sense_is_refused(
         (["--force", "1,2"], "one number or three"),
         (["--force", "much"], "one number or three"),
         (["--force", "nan"], "finite numbers"),
+        (["--at", "0,1"], "three numbers"),
+        (["--at", "here"], "three numbers"),
+        (["--at", "-0.1,1,1"], "off the accessible surface"),
         (["--modes", "-1"], "0 or more"),
     ],
 )
@@ -128,6 +131,16 @@ def test_bad_options_are_one_line(
     (line,) = capsys.readouterr().err.splitlines()
     assert reason in line
     assert not list(tmp_path.iterdir())
+
+
+def test_point_and_force_are_written_alike(
+    monkeypatch: pytest.MonkeyPatch, straight: Vademecum, file: Path, tmp_path: Path
+) -> None:
+    place = straight.surface.centers[-1]
+    point, output = ",".join(map(repr, place.tolist())), tmp_path / "out.vtu"
+    assert run(monkeypatch, file, "-o", output, "--at", point, "--force", "0,0,-2") == 0
+    expected = straight.displacement_at(place, [0.0, 0.0, -2.0])
+    np.testing.assert_allclose(meshio.read(output).point_data["displacement"], expected, atol=1e-12)
 
 
 def test_another_suffix_is_refused(

@@ -10,10 +10,12 @@ import meshio
 import nibabel
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry import surface as door
 from avatar_core.geometry import surface_files
+from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh, ambiguous_fraction, axes_matrix, read_surface
 
 RADIUS = 60.0  # of the test ball [mm], an organ of 0.12 m
@@ -177,6 +179,103 @@ def test_mirrored_axes_keep_the_faces_outward(tmp_path):
 def test_axes_that_are_no_axes(axes):
     with pytest.raises(SurfaceError, match="axes"):
         axes_matrix(axes)
+
+
+# --- axes that a file states ------------------------------------------------------------------
+
+
+def lump() -> tuple[np.ndarray, np.ndarray]:
+    """A ball with a bump to the right, behind and above: no half-turn maps it onto itself [mm]."""
+    vertices, faces = ball(centre=(10, 20, 30))
+    towards = np.array([0.6, -0.64, 0.48])
+    bump = np.clip((vertices - [10, 20, 30]) @ towards / RADIUS, 0, 1)[:, None] ** 4
+    return vertices + 25 * bump * towards, faces
+
+
+def write_stating(path: Path, vertices, faces, words: str, binary: bool = False) -> Path:
+    """The surface with ``words`` where 3D Slicer puts its ``SPACE=LPS``."""
+    n, text = len(faces), path.suffix[1:]
+    points = [" ".join(map(repr, point)) for point in np.asarray(vertices, float).tolist()]
+    corners = [" ".join(map(str, face)) for face in np.asarray(faces).tolist()]
+    if text == "obj":
+        write_obj(path, vertices, faces)
+        path.write_text(f"# 3D Slicer output. {words}\n" + path.read_text())
+    elif text == "stl" and binary:
+        record = np.zeros(n, [("normal", "<f4", 3), ("at", "<f4", (3, 3)), ("_", "<u2")])
+        record["at"] = vertices[faces]
+        header = f"3D Slicer output. {words}".encode().ljust(80)
+        path.write_bytes(header + n.to_bytes(4, "little") + record.tobytes())
+    elif text == "stl":
+        facets = [
+            "facet normal 0 0 0\nouter loop\n"
+            + "".join(f"vertex {points[i]}\n" for i in face)
+            + "endloop\nendfacet"
+            for face in faces
+        ]
+        path.write_text("\n".join([f"solid 3D Slicer output. {words}", *facets, "endsolid\n"]))
+    elif text == "ply":
+        header = f"ply\nformat ascii 1.0\ncomment 3D Slicer output. {words}\nelement vertex "
+        header += f"{len(points)}\nproperty double x\nproperty double y\nproperty double z\n"
+        header += f"element face {n}\nproperty list uchar int vertex_indices\nend_header"
+        path.write_text("\n".join([header, *points, *(f"3 {c}" for c in corners), ""]))
+    else:
+        header = f"# vtk DataFile Version 3.0\n3D Slicer output. {words}\nASCII\n"
+        header += f"DATASET UNSTRUCTURED_GRID\nPOINTS {len(points)} double"
+        cells = [f"CELLS {n} {4 * n}", *(f"3 {c}" for c in corners)]
+        path.write_text("\n".join([header, *points, *cells, f"CELL_TYPES {n}", *["5"] * n, ""]))
+    return path
+
+
+STATING = [("obj", False), ("stl", False), ("stl", True), ("ply", False), ("vtk", False)]
+
+
+@pytest.mark.parametrize(("suffix", "binary"), STATING)
+def test_a_file_that_states_lps_is_read_so(tmp_path, suffix, binary):
+    vertices, faces = lump()
+    ras = read_surface(write_obj(tmp_path / "ras.obj", vertices, faces))
+    turned = vertices * [-1, -1, 1]
+    path = write_stating(tmp_path / f"lps.{suffix}", turned, faces, "SPACE=LPS", binary)
+    lps = read_surface(path)
+    near, _ = cKDTree(ras.vertices).query(lps.vertices)
+    assert near.max() < 1e-6
+    assert lps.axes_name == "LPS"
+    assert lps.notices == ()
+    clamped = [clamp_centre(surface) for surface in (ras, lps)]
+    assert np.allclose(*clamped, atol=5e-3)  # the meshes differ by their generator
+    assert clamped[1][1] < 0.02 < clamped[1][2]  # behind and above the ball's centre
+
+
+def clamp_centre(surface: SurfaceMesh) -> np.ndarray:
+    mesh = tetrahedralize(surface, 300)
+    clamped = regions_by_rule(mesh).clamped
+    return mesh.vertices[mesh.boundary_faces[clamped]].mean(axis=(0, 1))
+
+
+@pytest.mark.parametrize(("suffix", "binary"), STATING)
+@pytest.mark.parametrize("words", ["SPACE=RAS", "SPACE=LPSX", "AEROSPACE=LPS", ""])
+def test_a_file_that_states_ras_or_nothing_is_read_as_ras(tmp_path, suffix, binary, words):
+    path = write_stating(tmp_path / f"b.{suffix}", *ball(centre=(10, 20, 30)), words, binary)
+    surface = read_surface(path)
+    assert surface.vertices.mean(axis=0) == pytest.approx([0.01, 0.02, 0.03], abs=1e-5)
+    assert surface.axes_name == "RAS"
+
+
+def test_given_axes_hold_against_those_that_the_file_states(tmp_path):
+    path = write_stating(tmp_path / "b.obj", *ball(centre=(10, 20, 30)), "SPACE=LPS")
+    surface = read_surface(path, axes="RAS")
+    assert surface.vertices.mean(axis=0) == pytest.approx([0.01, 0.02, 0.03])
+    (notice,) = surface.notices
+    assert "axes RAS" in notice
+    assert "SPACE=LPS" in notice
+    assert read_surface(path, axes="LPS").notices == ()
+
+
+def test_axes_are_looked_for_in_the_head_of_a_file_only(tmp_path, monkeypatch):
+    path = write_obj(tmp_path / "b.obj", *ball(centre=(10, 20, 30)))
+    path.write_text(path.read_text() + "# SPACE=LPS\n")
+    monkeypatch.setattr(surface_files, "HEADER_BYTES", 1000)
+    assert surface_files.stated_axes(path) is None
+    assert read_surface(path).axes_name == "RAS"
 
 
 @pytest.mark.parametrize(

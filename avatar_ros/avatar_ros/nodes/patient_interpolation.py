@@ -67,7 +67,7 @@ def patient_request(request: Any, settings: InterpolationSettings) -> PatientReq
         vertices=vertices,
         faces=faces,
         unit=request.unit or "mm",
-        axes=request.axes or "RAS",
+        axes=request.axes or None,
         leave_out=tuple(request.leave_out),
         neighbors=request.neighbors,
         fidelity=fidelity,

@@ -43,7 +43,7 @@ class PatientRequest:
     """One patient; all paths are absolute.
 
     surface : file, or empty if there are vertices, shape (n, 3) [m], and faces, shape (m, 3)
-    unit, axes : of the file
+    unit, axes : of the file; axes None for those that it states, else RAS
     neighbors : 0 for all
     tolerance : 0 for the default
     output : file to write
@@ -53,7 +53,7 @@ class PatientRequest:
     vertices: np.ndarray | None
     faces: np.ndarray | None
     unit: str
-    axes: str
+    axes: str | None
     leave_out: tuple[str, ...]
     neighbors: int
     fidelity: str

@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 
 from avatar_core.atlas.anatomy import Anatomy, AtlasError, Response
-from avatar_core.atlas.growth import build_anatomy, create_atlas, extend_atlas, new_atlas
+from avatar_core.atlas.growth import (
+    SurfaceFile,
+    build_anatomy,
+    create_atlas,
+    extend_atlas,
+    new_atlas,
+)
 from avatar_core.atlas.model import Atlas, box_around
 from avatar_core.atlas.storage import load_atlas, save_atlas
 from avatar_core.errors import LLEError
 from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import Template
-from tests.core.atlas.rough import ALONE, OPTIONS, N, same
+from tests.core.atlas.rough import ALONE, OPTIONS, N, same, write_obj
 
 # --- growing ----------------------------------------------------------------------------------
 
@@ -164,6 +170,17 @@ def test_two_identical_livers(
     twins = load_atlas(file)
     assert twins.barycenter(members[1].distances, 5).neighbors.tolist() == [0]
     assert twins.lle(3).weight_matrix[1].tolist() == [1.0, 0.0]
+
+
+def test_what_a_file_states_against_the_axes_given_is_said(
+    template: Template, livers: list[SurfaceMesh], tmp_path: Path
+) -> None:
+    file = write_obj(tmp_path / "liver0.obj", livers[0])
+    file.write_text("# SPACE=LPS\n" + file.read_text())
+    source = SurfaceFile(file, axes="RAS")
+    growth = create_atlas(tmp_path / "a.h5", [source], OPTIONS, template=template, workers=ALONE)
+    (said,) = (line for line in growth.notices if "SPACE=LPS" in line)
+    assert said.startswith("liver0: axes RAS")
 
 
 def test_the_default_box_holds_a_large_liver_and_about_49000_points(template: Template) -> None:

@@ -1,0 +1,61 @@
+"""Where a command may write its result: refused before anything is computed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avatar_core.errors import StorageError
+
+Overwrite = Annotated[
+    bool,
+    typer.Option("--overwrite", help="replace a file that is there, even if it is no vademecum"),
+]
+
+
+def require_output(
+    output: Path,
+    suffixes: Iterable[str],
+    inputs: Iterable[str | Path | None],
+    replaces: Callable[[Path], bool] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Raise StorageError unless a result can be written without the loss of anything else.
+
+    Parameters
+    ----------
+    output : file to write
+    suffixes : in which its name may end
+    inputs : files that are read; never replaced, whatever the name or link that leads to them
+    replaces : whether a file that is there may be replaced; None: any file of that suffix
+    overwrite : replace any file but an input
+    """
+    suffixes = tuple(suffixes)
+    if output.suffix not in suffixes:
+        raise StorageError(f"{output} ends in '{output.suffix}'; choose {' or '.join(suffixes)}")
+    if os.path.isdir(output):
+        raise StorageError(f"{output} is a folder; give the name of a file")
+    if not os.path.isdir(output.parent):
+        raise StorageError(f"folder {output.parent} does not exist; create it first")
+    if not os.access(output.parent, os.W_OK | os.X_OK):
+        raise StorageError(f"folder {output.parent} cannot be written to; choose another")
+    for source in inputs:
+        if source is not None and _same_file(output, source):
+            raise StorageError(f"{output} is also read ({source}); give another name")
+    there = os.path.lexists(output)
+    if there and not overwrite and replaces is not None and not replaces(output):
+        raise StorageError(
+            f"{output} exists and is no vademecum; give another name, or --overwrite to replace it"
+        )
+
+
+def _same_file(one: str | Path, other: str | Path) -> bool:
+    """Whether both exist and are one file, through links too."""
+    try:
+        return os.path.samefile(one, other)
+    except (OSError, ValueError):
+        return False
