@@ -66,7 +66,7 @@ TUMOUR_REACH = 2.0  # and patch radii within which energy counts: they fit resol
 TipField = namedtuple(
     "TipField",
     ["distance", "access", "origin", "spacing", "curvature", "growth", "anisotropy", "tumour"],
-    defaults=(None,) * 4,
+    defaults=(None, None, None, None),
 )
 
 

@@ -131,10 +131,19 @@ def test_a_cluster_builds_too_though_a_worker_is_killed(
 
 
 @pytest.mark.long  # the scheduler tries it on four workers, each of which has to start again
-def test_a_task_that_kills_every_worker_costs_its_own_result_only(cluster: Any) -> None:
-    # after a second: tasks that share a worker with it when it dies are blamed alike
-    last = "__import__('time').sleep(1) or __import__('os')._exit(1)"
-    work = ["1 + 1", last, "2 + 2"]
+def test_a_task_that_kills_every_worker_costs_its_own_result_only(
+    cluster: Any, tmp_path: Path
+) -> None:
+    def noted(name: str, value: int) -> str:
+        return f"(__import__('pathlib').Path({str(tmp_path / name)!r}).touch(), {value})[1]"
+
+    # last, and well after them: tasks that share a worker with it when it dies are blamed alike
+    done = f"len(__import__('os').listdir({str(tmp_path)!r})) == 2"
+    pause = "__import__('time').sleep"
+    last = (
+        f"[{pause}(0.1) for _ in range(200) if not {done}], {pause}(2), __import__('os')._exit(1)"
+    )
+    work = [noted("first", 2), last, noted("last", 4)]
     results = dict(Workers(scheduler=cluster.scheduler_address).map(eval, work))
     assert results[0] == 2 and results[2] == 4
     assert type(results[1]).__name__ == "KilledWorker"
