@@ -141,7 +141,7 @@ def test_a_sphere_on_a_bent_surface_is_a_tip_of_another_profile(
     assert force == pytest.approx(2.0 * E_STAR * integral(a, 2), rel=2e-3)
 
 
-@pytest.mark.parametrize("ratio", [2.0, 5.0, 10.0])
+@pytest.mark.parametrize("ratio", [2.0, 4.0, 7.0])
 def test_a_sphere_on_a_tube_touches_over_an_ellipse(ratio: float) -> None:
     """Hertz's elliptic contact (Johnson, Contact Mechanics, 1985, eqs. 4.26 to 4.32).
 
