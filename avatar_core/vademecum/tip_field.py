@@ -177,7 +177,7 @@ def _profile(
     """kappa, tau and D of the outline on the grid, around the closest points.
 
     Points with nearly the same closest point and direction share their profile: there are
-    several along each normal.
+    several along each normal. Each grid point gets what is found ``HALFWAY`` to the outline.
     """
     known, normals = _around(distance, access)
     closest = _closest(near, origin + SPACING * np.argwhere(known))[2]

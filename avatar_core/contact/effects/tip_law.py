@@ -216,17 +216,18 @@ def _limit(law, t):  # type: ignore[no-untyped-def]
     value, gradient, least = law.value[t], law.gradient[t], law.least_kappa[t]
     room, part = _positive(value[KAPPA] - least, -0.25 * least)
     value[KAPPA] = least + room
-    unit = -3.0 / 16.0 * np.pi * law.radius[t]
-    flattening = unit * value[TAU]
-    ratio = flattening / room if flattening < 2.0 * room else 2.0
-    kept, slope = _capped(ratio, *FLATTENINGS)
-    if flattening > 0.0:
-        value[TAU] = room * kept / unit
     for d in range(3):
         gradient[KAPPA, d] *= part
-        if flattening > 0.0:
-            gradient[TAU, d] *= slope
-            gradient[TAU, d] += (kept - ratio * slope) / unit * gradient[KAPPA, d]
+    if value[TAU] >= 0.0:
+        return
+    unit = -3.0 / 16.0 * np.pi * law.radius[t]
+    flattening = unit * value[TAU]
+    ratio = flattening / room if flattening < 2.0 * room else 2.0  # room may be zero
+    kept, slope = _capped(ratio, *FLATTENINGS)
+    value[TAU] = room * kept / unit
+    for d in range(3):
+        gradient[TAU, d] *= slope
+        gradient[TAU, d] += (kept - ratio * slope) / unit * gradient[KAPPA, d]
 
 
 @fast
