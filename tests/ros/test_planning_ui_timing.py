@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +50,7 @@ pytestmark = [
 DEEP = -0.002  # of the tip's centre over the surface, while it presses [m]
 SWING = 10.0  # of the mouse [px]
 SECONDS = 10.0  # of a measurement
+NEIGHBOUR = "import numpy as np\nx = np.ones(1_000_000)\nwhile True: x *= 1.0"
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +102,21 @@ def figures(probe: Probe, meanwhile: Callable[[], None]) -> np.ndarray:
     return np.median(windows[1:-1], axis=0)
 
 
+@contextmanager
+def neighbour() -> Iterator[None]:
+    """A process that computes as a browser draws: one core, and the memory that all share.
+
+    A planner's browser draws on his own machine; what it takes from the loop on
+    this one is not what the page's node takes.
+    """
+    process = subprocess.Popen([sys.executable, "-c", NEIGHBOUR])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
 def test_the_loop_keeps_its_figures_while_the_page_is_dragged(
     page: Any, folder: Path, nodes: dict[str, Module], lasting_probe: Probe
 ) -> None:
@@ -111,7 +130,8 @@ def test_the_loop_keeps_its_figures_while_the_page_is_dragged(
     for _ in range(3):
         page.goto("about:blank")
         nodes["planning_ui"].send_signal(signal.SIGSTOP)
-        without = figures(lasting_probe, lambda: None)
+        with neighbour():
+            without = figures(lasting_probe, lambda: None)
         nodes["planning_ui"].send_signal(signal.SIGCONT)
         page.goto(address)
         news(page, "All nodes answer")
