@@ -9,6 +9,7 @@ from pathlib import Path
 # Before numpy: where tests run side by side, one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("RAYON_NUM_THREADS", "1")
 
 import pytest
 
@@ -27,7 +28,6 @@ from avatar_core.vademecum.model import Vademecum
 from . import examples, kept_fields, kept_meshes
 from .alone import Turns
 from .kept_responses import kept
-from .recorded_meshes import recorded
 from .stored import stored
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -45,9 +45,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session", autouse=True)
 def same_meshes() -> Iterator[None]:
-    """The same meshes of the built-in liver in every run, and of others in one of the same code."""
+    """A surface is filled once, whatever is built of it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mesh, "_fill", recorded(kept_meshes.kept))
+        patch.setattr(mesh, "_fill", kept_meshes.kept)
         yield
 
 

@@ -1,4 +1,4 @@
-"""Meshes of surfaces that are not recorded: filled once for all tests and runs of the same code."""
+"""Meshes are filled once for all tests, and for all runs of the same code."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 from .content import ByContent
 from .stored import stored
 
-_plain = mesh._fill
+plain = mesh._fill
 
 
 class _Solid(ByContent):
@@ -22,7 +22,7 @@ class _Solid(ByContent):
 
 @stored
 def _filled(solid: _Solid) -> TetMesh:
-    return _plain(solid.surface, solid.edge)
+    return plain(solid.surface, solid.edge)
 
 
 def kept(surface: SurfaceMesh, edge: float) -> TetMesh:

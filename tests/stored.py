@@ -1,7 +1,7 @@
 """What tests compute from the code under test, computed once for all workers and runs.
 
 A result is found by the content of everything that it may follow from: the core, the file of the
-function that computes it, its arguments, the recorded meshes, Python and all installed packages.
+function that computes it, its arguments, Python and all installed packages.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ import avatar_core
 
 P, T = ParamSpec("P"), TypeVar("T")
 
-HERE = Path(__file__).parent
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avatar" / "tests"
 UNUSED = 14 * 86400.0  # after which a result is removed [s]
 _LATE_ROOMS = ("studies", "cli")  # nothing that is stored comes from them
@@ -73,8 +72,6 @@ def _of_all(rooms: tuple[str, ...] | None) -> str:
     late = _LATE_ROOMS if rooms is None else _rooms(core) - {*rooms}
     files = [f for f in core.rglob("*.py") if f.relative_to(core).parts[0] not in late]
     for file in sorted(files, key=lambda f: f.relative_to(core).as_posix()):
-        found.update(file.read_bytes())
-    for file in (HERE / "recorded_meshes.py", HERE / "data" / "phantom_meshes.npz"):
         found.update(file.read_bytes())
     return found.hexdigest()
 

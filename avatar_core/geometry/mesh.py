@@ -6,12 +6,6 @@ clamp and the accessible surface, found by a geometric rule or read from a file 
 
 from __future__ import annotations
 
-import os
-import signal
-import tempfile
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -171,6 +165,8 @@ def make_mesh(vertices: np.ndarray, tets: np.ndarray) -> TetMesh:
 def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
     """Fill a surface with tetrahedra by fTetWild, to about the number of vertices asked for.
 
+    The same surface gives the same mesh, bit for bit.
+
     fTetWild accepts cracked, doubled and self-intersecting faces (Hu et al., "Fast Tetrahedral
     Meshing in the Wild", 2020). Of the box that it fills, the tetrahedra are kept whose centroids
     the winding number of the surface calls inside; its own filter loses a lobe of a folded liver
@@ -211,18 +207,17 @@ def first_edge(volume: float, n_vertices: int) -> float:
     c was fitted at some 3,000 vertices, where a third of them lie on the surface, and shifts a
     little with size: hence a second try.
     """
-    return float(0.0973 * (volume * 2850.0 / n_vertices) ** (1.0 / 3.0))
+    return float(0.0950 * (volume * 2850.0 / n_vertices) ** (1.0 / 3.0))
 
 
 def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    with _scratch_folder(), _own_interrupt():
-        vertices, tets = fill_box(
-            surface.vertices * 1e3,  # millimetres, for which fTetWild's thresholds are made
-            surface.faces.astype(np.int32),
-            edge=edge / diagonal,
-            envelope=4e-3,  # a smaller one forbids coarse meshes
-        )
+    vertices, tets = fill_box(
+        surface.vertices * 1e3,  # millimetres, for which fTetWild's thresholds are made
+        surface.faces.astype(np.int32),
+        edge=edge / diagonal,
+        envelope=4e-3,  # a smaller one forbids coarse meshes
+    )
     vertices = vertices * 1e-3
     volumes = TetMesh(vertices, tets).tet_volumes
     if np.median(volumes) < 0:
@@ -232,29 +227,6 @@ def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
     if len(solid) == 0:
         raise MeshError("no tetrahedra fit into the surface; check that it encloses a volume")
     return make_mesh(vertices, _largest_component(solid))
-
-
-@contextmanager
-def _scratch_folder() -> Iterator[None]:
-    """Work in a temporary folder: fTetWild leaves a file where it runs."""
-    before = Path.cwd()
-    with tempfile.TemporaryDirectory() as folder:
-        os.chdir(folder)
-        try:
-            yield
-        finally:
-            os.chdir(before)
-
-
-@contextmanager
-def _own_interrupt() -> Iterator[None]:
-    """Restore the handler of Ctrl-C, which the geometry library of fTetWild replaces."""
-    handler = signal.getsignal(signal.SIGINT)
-    try:
-        yield
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, handler)
 
 
 def _largest_component(tets: np.ndarray) -> np.ndarray:
