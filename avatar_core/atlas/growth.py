@@ -20,6 +20,7 @@ from avatar_core.atlas.checkpoint import Checkpoint, checkpoint_of
 from avatar_core.atlas.model import LARGEST_ORGAN, SPACING, Atlas, anatomy_of, box_around
 from avatar_core.atlas.storage import ATLAS_SCHEMA, load_atlas, save_atlas
 from avatar_core.atlas.workers import Workers
+from avatar_core.common.processes import repeatable
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
@@ -269,6 +270,7 @@ class AnatomyBuilder:
             return Skipped(source.name, _in_one_line(error))
 
 
+@repeatable
 def build_anatomy(
     atlas: Atlas, source: Source, solve_response: SolveResponse | None = None
 ) -> Anatomy:

@@ -27,6 +27,7 @@ from avatar_core.atlas.transfer import (
     combine,
     patient_weights,
 )
+from avatar_core.common.processes import repeatable
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import TetMesh, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
@@ -129,6 +130,7 @@ class Patient:
     seconds: StageSeconds
 
 
+@repeatable
 def patient_vademecum(
     surface: SurfaceMesh,
     atlas: Atlas | PatientBase,

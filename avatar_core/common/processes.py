@@ -1,13 +1,19 @@
-"""Modules of this project as processes of their own: where they start, with how many threads."""
+"""Threads of the numerical libraries, here and in modules that run as processes of their own."""
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ParamSpec, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA", "RAYON", "IGL")
 
@@ -15,6 +21,22 @@ _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA", "RAYON", "IGL")
 def thread_limits(n_threads: int = 1) -> dict[str, str]:
     """Environment variables that limit the threads of each numerical library."""
     return {f"{library}_NUM_THREADS": str(n_threads) for library in _LIBRARIES}
+
+
+def repeatable(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator: the same arguments give the same bits, with any number of threads allowed.
+
+    On two threads BLAS adds in another order than on one, and modes of almost equal energy come
+    out mixed otherwise: the same accuracy from other numbers. One thread costs less processor
+    time (22 s for 28 s, 700 vertices).
+    """
+
+    @functools.wraps(function)
+    def on_one_thread(*arguments: P.args, **named: P.kwargs) -> T:
+        with threadpool_limits(1, user_api="blas"):
+            return function(*arguments, **named)
+
+    return on_one_thread
 
 
 class ModuleProcess(subprocess.Popen[Any]):

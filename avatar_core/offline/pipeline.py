@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from avatar_core.common.processes import repeatable
 from avatar_core.errors import ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import load_surface
@@ -124,10 +125,13 @@ class OrganOptions:
             raise MeshError(f"cannot read node groups from {self.groups}: there is no such file")
 
 
+@repeatable
 def build(
     surface: SurfaceMesh, options: OrganOptions | None = None, progress: Progress = silent
 ) -> Vademecum:
     """Mesh, solve, separate and certify one organ.
+
+    The same surface and options give the same vademecum, bit for bit, but for what a clock says.
 
     Raises
     ------

@@ -36,10 +36,10 @@ and the same under parametric/body for that basis; one with large deformation th
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import math
+import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -48,7 +48,7 @@ import numpy as np
 
 from avatar_core.common.dataclass_json import of_plain, parsed, require_name
 from avatar_core.common.files import FileError, opened
-from avatar_core.common.hdf5 import format_of, replace_file, require_schema, verified
+from avatar_core.common.hdf5 import checksum, format_of, replace_file, require_schema, verified
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface
@@ -87,15 +87,19 @@ _JSON_LATER = ("coordinates", "contrast", "large", "accuracy")  # from schema 2.
 _STORED_AS = {"tip_force_mean": "felt_mean", "tip_force_worst": "felt_worst"}
 
 
-def save_vademecum(vademecum: Vademecum, path: str | Path) -> None:
+def save_vademecum(vademecum: Vademecum, path: str | Path) -> str:
     """Write a vademecum; the file appears complete or not at all.
+
+    Returns its id: the same for the same surface, options and versions, see `id_of`.
 
     Raises
     ------
     StorageError
         If the folder does not exist or the disk is full; nothing is left behind.
     """
-    replace_file(Path(path), _arrays(vademecum), _attributes(vademecum))
+    arrays, attributes = _arrays(vademecum), _attributes(vademecum)
+    replace_file(Path(path), arrays, attributes)
+    return id_of(arrays, attributes)
 
 
 def load_vademecum(path: str | Path) -> Vademecum:
@@ -142,21 +146,21 @@ def _read(source: BinaryIO, origin: str) -> Vademecum:
         vademecum = _assemble(arrays, attributes)
     except AvatarError as error:
         raise StorageError(f"{origin}: {error}") from error
-    return replace(vademecum, id=_digest(source), nbytes=source.tell())
+    nbytes = source.seek(0, os.SEEK_END)
+    return replace(vademecum, id=id_of(arrays, attributes), nbytes=nbytes)
 
 
-def file_id(path: str | Path) -> str:
-    """SHA-256 of the file, the id under which a vademecum is announced."""
-    with Path(path).open("rb") as file:
-        return _digest(file)
+def id_of(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
+    """SHA-256 of a file's content but for what a clock measured, 64 hexadecimal digits.
 
-
-def _digest(source: BinaryIO) -> str:
-    digest = hashlib.sha256()
-    source.seek(0)
-    while block := source.read(1 << 20):
-        digest.update(block)
-    return digest.hexdigest()
+    Left out are ``accuracy`` and the certificate's ``build_cpu_seconds``: two builds of one
+    organ differ in nothing else.
+    """
+    lasting = {key: value for key, value in attributes.items() if key != "accuracy"}
+    certificate = json.loads(lasting["certificate"])
+    if certificate is not None:
+        certificate.pop("build_cpu_seconds", None)
+    return checksum(arrays, lasting | {"certificate": json.dumps(certificate)})
 
 
 def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:

@@ -89,8 +89,8 @@ def build(
     report("save", 0.0, math.nan)
     with _uninterrupted():
         require_replaceable(Path(request.output), reader)
-        storage.save_vademecum(patient.vademecum, request.output)
-        built = _result_of(patient, surface, atlas, request)
+        identity = storage.save_vademecum(patient.vademecum, request.output)
+        built = _result_of(patient, identity, surface, atlas, request)
         connection.send(built)
     return built
 
@@ -138,11 +138,15 @@ def _options(request: PatientRequest, base: PatientBase, settings: BuildSettings
 
 
 def _result_of(
-    patient: Patient, surface: SurfaceMesh, atlas: LoadedAtlas, request: PatientRequest
+    patient: Patient,
+    identity: str,
+    surface: SurfaceMesh,
+    atlas: LoadedAtlas,
+    request: PatientRequest,
 ) -> Built:
     weights = np.asarray(patient.weights, dtype=float)
     return Built(
-        vademecum_id=storage.file_id(request.output),
+        vademecum_id=identity,
         file=os.path.basename(request.output),
         neighbours=list(patient.neighbours),
         weights=weights.tolist(),
