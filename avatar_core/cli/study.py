@@ -13,6 +13,7 @@ import typer
 from avatar_core.errors import StorageError
 
 STUDIES = {
+    "meshes": "avatar_core.studies.meshes",
     "grid": "avatar_core.studies.grid",
     "in-silico": "avatar_core.studies.in_silico",
     "samples": "avatar_core.studies.samples",

@@ -62,6 +62,7 @@ class CoordinatesSettings:
     """Vertices of the meshes and of those that the canonical forms are compared on; unseen loads.
 
     n_canonical : products at most; n_pushed : sites of large pushes; n_combined : of combinations
+    patch_radius : of the loads, by default the organ's own [m]
     """
 
     n_vertices: int = 2850
@@ -70,6 +71,7 @@ class CoordinatesSettings:
     n_canonical: int = 60
     n_pushed: int = 12
     n_combined: int = 4
+    patch_radius: float | None = None
 
 
 FULL = CoordinatesSettings()
@@ -97,13 +99,14 @@ def study(one: SurfaceMesh, other: SurfaceMesh, settings: CoordinatesSettings) -
     poisson = (Coordinate("poisson", 0.40, 0.49),)
     incompressible = (Coordinate("poisson", 0.40, 0.499),)
     rows: list[dict[str, Value]] = []
+    coarse = replace(settings, n_vertices=settings.n_vertices_canonical)
     with ProgressBar(8) as bar:
         for surface in (one, other) if one.name != other.name else (one,):
             progress = bar.begin(f"Poisson's ratio, {surface.name}")
-            organ = _organ(surface, settings.n_vertices)
+            organ = _organ(surface, settings)
             rows += _parametric(organ, "poisson", poisson, settings, progress)
         progress = bar.begin("towards incompressibility")
-        organ = _organ(one, settings.n_vertices, "Taylor-Hood")
+        organ = _organ(one, settings, "Taylor-Hood")
         rows += _parametric(organ, "incompressible", incompressible, settings, progress)
         rows += _tumour_rows(settings, bar.begin("tumour"))
         for name, coordinates, element in (
@@ -111,9 +114,9 @@ def study(one: SurfaceMesh, other: SurfaceMesh, settings: CoordinatesSettings) -
             ("incompressible", incompressible, "Taylor-Hood"),
         ):
             progress = bar.begin(f"canonical PGD, {name}")
-            small = _organ(one, settings.n_vertices_canonical, element)  # type: ignore[arg-type]
+            small = _organ(one, coarse, element)  # type: ignore[arg-type]
             rows += _canonical(small, name, coordinates, settings, progress)
-        large = _organ(one, settings.n_vertices)
+        large = _organ(one, settings)
         rows += _large(large, "neo-hookean", settings, bar.begin("neo-Hookean"))
         rows += _large(large, "st-venant-kirchhoff", settings, bar.begin("St Venant-Kirchhoff"))
     summary = _summary(rows)
@@ -130,11 +133,11 @@ def study(one: SurfaceMesh, other: SurfaceMesh, settings: CoordinatesSettings) -
 
 def _organ(
     surface: SurfaceMesh,
-    n_vertices: int,
+    settings: CoordinatesSettings,
     element: Element | None = None,
     tumour: Path | None = None,
 ) -> Organ:
-    mesh = tetrahedralize(surface, n_vertices)
+    mesh = tetrahedralize(surface, settings.n_vertices)
     regions = regions_by_rule(mesh)
     inclusion = None
     if tumour is not None:
@@ -143,7 +146,7 @@ def _organ(
         )
     material = Material()
     elasticity = Elasticity(mesh, material, regions.clamped, element, inclusion)
-    return Organ(surface, regions, load_surface(mesh, regions), elasticity)
+    return Organ(surface, regions, load_surface(mesh, regions, settings.patch_radius), elasticity)
 
 
 # --- coordinates of the material ----------------------------------------------------------------
@@ -191,7 +194,7 @@ def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[dict
     liver, tumour = TUMOUR_FOLDER / "liver.vtk", TUMOUR_FOLDER / "liver_tumours.vtk"
     if not liver.is_file():
         return []
-    organ = _organ(read_surface(liver, axes=TUMOUR_AXES), settings.n_vertices, tumour=tumour)
+    organ = _organ(read_surface(liver, axes=TUMOUR_AXES), settings, tumour=tumour)
     coordinates = (Coordinate("poisson", 0.40, 0.49), Coordinate("contrast", 0.5, 20.0))
     return _parametric(organ, "tumour", coordinates, settings, progress)
 

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from avatar_core.common.processes import repeatable
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.level_set import distance_grid, isosurface, signed_distance
 from avatar_core.geometry.mesh import Regions, TetMesh, regions_by_rule, tetrahedralize
@@ -30,7 +31,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.correspondence import closest_points, interpolation_matrix
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
 from avatar_core.studies.shapes import Livers, read_livers
-from avatar_core.studies.study import Study, Value, follow, mean_and_worst, one_blas_thread
+from avatar_core.studies.study import Study, Value, follow, mean_and_worst
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,20 +81,20 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(surfaces, QUICK if quick else FULL)
 
 
+@repeatable
 def study(folder: Path | None, settings: GridSettings) -> Study:
     """One row for each liver and spacing, and one with h = 0 for the second mesh."""
     livers = read_livers(folder, settings.n_livers, settings.phantoms)
     step = max(1, len(livers.surfaces) // max(settings.n_fine, settings.n_displaced, 1))
     rows: list[dict[str, Value]] = []
-    with one_blas_thread() as notices:
-        for i, surface in enumerate(follow(livers.surfaces, "livers")):
-            rank = i // step if i % step == 0 else len(livers.surfaces)
-            reference = reference_of(surface, settings) if rank < settings.n_displaced else None
-            if reference is not None and settings.remeshed:
-                rows.append(other_mesh_row(surface, reference, settings))
-            fine = rank < settings.n_fine
-            chosen = [h for h in settings.spacings if h > FINEST_REMESHED or fine]
-            rows += [grid_row(surface, h, reference, settings) for h in chosen]
+    for i, surface in enumerate(follow(livers.surfaces, "livers")):
+        rank = i // step if i % step == 0 else len(livers.surfaces)
+        reference = reference_of(surface, settings) if rank < settings.n_displaced else None
+        if reference is not None and settings.remeshed:
+            rows.append(other_mesh_row(surface, reference, settings))
+        fine = rank < settings.n_fine
+        chosen = [h for h in settings.spacings if h > FINEST_REMESHED or fine]
+        rows += [grid_row(surface, h, reference, settings) for h in chosen]
     return Study(
         name="grid",
         sentence=_sentence(summary := summarize(rows, settings), livers),
@@ -103,7 +104,6 @@ def study(folder: Path | None, settings: GridSettings) -> Study:
         draw=lambda figure: _draw(figure, rows),
         notices=(
             *livers.notices,
-            *notices,
             "displacement_error: the field kept at grid points and read back, one mesh; "
             "remeshed_error: finite elements on a mesh of the marching-cubes surface",
         ),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from avatar_core.common.processes import repeatable
 from avatar_core.fem.patch_loads import default_patch_radius, load_surface
 from avatar_core.geometry.level_set import GridBox, reinitialize
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
@@ -23,7 +24,7 @@ from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.shapes.lle import CLEAR_GAP, estimate_dimension, fit, locally_linear_embedding
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
 from avatar_core.studies.shapes import PAPER_GRID, as_grid, distance_vectors, paper_box
-from avatar_core.studies.study import Study, Value, follow, mean_and_worst, one_blas_thread
+from avatar_core.studies.study import Study, Value, follow, mean_and_worst
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,15 +79,15 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(QUICK if quick else FULL)
 
 
+@repeatable
 def study(settings: InSilicoSettings) -> Study:
     """Spectrum of all livers, then errors of those held out."""
-    with one_blas_thread() as notices:
-        livers = populate(settings)
-        spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < settings.n_base]
-        rows = held_out_rows(livers, settings)
-        base, embedding = locally_linear_embedding(livers.vectors, NEIGHBORS, 2)
-        eigenvalues = estimate_dimension(base).eigenvalues
-        flat = embedding.coordinates
+    livers = populate(settings)
+    spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < settings.n_base]
+    rows = held_out_rows(livers, settings)
+    base, embedding = locally_linear_embedding(livers.vectors, NEIGHBORS, 2)
+    eigenvalues = estimate_dimension(base).eigenvalues
+    flat = embedding.coordinates
     summary = {
         **mean_and_worst("volume_error", [row["volume_error"] for row in rows]),
         **mean_and_worst("displacement_nodewise", [row["nodewise"] for row in rows]),
@@ -105,7 +106,7 @@ def study(settings: InSilicoSettings) -> Study:
         rows=(*rows, *spectra),
         paper=PAPER,
         draw=lambda figure: _draw(figure, eigenvalues, flat, rows, settings),
-        notices=(*notices, *_spectrum_notices(spectra)),
+        notices=tuple(_spectrum_notices(spectra)),
     )
 
 

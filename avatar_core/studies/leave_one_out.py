@@ -19,6 +19,7 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
+from avatar_core.common.processes import repeatable
 from avatar_core.geometry.level_set import DistanceGrid, GridBox, dice, isosurface
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.shapes.barycenter import barycenter_weights, convex_weights
@@ -33,7 +34,7 @@ from avatar_core.studies.shapes import (
     paper_box,
     read_livers,
 )
-from avatar_core.studies.study import Study, Value, follow, one_blas_thread
+from avatar_core.studies.study import Study, Value, follow
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -109,16 +110,17 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(surfaces, QUICK if quick else FULL)
 
 
+@repeatable
 def study(folder: Path | None, settings: LeaveOneOutSettings) -> Study:
     """One row for each alignment and method."""
     livers = read_livers(folder, settings.n_livers, settings.phantoms)
     rows: list[dict[str, Value]] = []
-    with one_blas_thread() as notices:
-        for alignment in ALIGNMENTS:
-            base = placed(livers, alignment, settings)
-            notices = (*notices, *base.notices)
-            tried = follow(methods(base, settings), f"leave one out, {alignment}")
-            rows += [{"alignment": alignment, **judged(base, method)} for method in tried]
+    notices: tuple[str, ...] = ()
+    for alignment in ALIGNMENTS:
+        base = placed(livers, alignment, settings)
+        notices = (*notices, *base.notices)
+        tried = follow(methods(base, settings), f"leave one out, {alignment}")
+        rows += [{"alignment": alignment, **judged(base, method)} for method in tried]
     summary = summarize(rows)
     best = max(_of(rows, "LLE"), key=lambda row: row["dice"])  # type: ignore[arg-type,return-value]
     n, persons = len(livers.surfaces), len(np.unique(livers.subjects))

@@ -17,6 +17,7 @@ from avatar_core.atlas.base import base_of
 from avatar_core.atlas.growth import AtlasOptions, build_anatomy, default_template, new_atlas
 from avatar_core.atlas.patient import Fidelity, PatientOptions, patient_vademecum
 from avatar_core.atlas.response import ResponseSolver
+from avatar_core.common.processes import repeatable
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.geometry.level_set import distance_grid, isosurface
 from avatar_core.geometry.phantom import phantom_liver, population
@@ -27,7 +28,7 @@ from avatar_core.shapes.registration import RegistrationRule
 from avatar_core.studies.grid import GridSettings, grid_row, reference_of
 from avatar_core.studies.leave_one_out import LeaveOneOutSettings, judged, methods, placed
 from avatar_core.studies.shapes import read_livers
-from avatar_core.studies.study import Value, follow, one_blas_thread
+from avatar_core.studies.study import Value, follow
 
 FIDELITIES: tuple[Fidelity, ...] = get_args(Fidelity)
 _ROUGH = RegistrationRule(  # 1 s an anatomy
@@ -78,6 +79,7 @@ def grid_rows(surface: SurfaceMesh, spacings: tuple[float, ...]) -> list[dict[st
     return rows
 
 
+@repeatable
 def shape_rows(folder: Path | None, n_livers: int) -> list[dict[str, Value]]:
     """Each liver interpolated from the others: LLE with several numbers of neighbours, and rivals.
 
@@ -87,23 +89,22 @@ def shape_rows(folder: Path | None, n_livers: int) -> list[dict[str, Value]]:
         n_livers, (5, 10, 20, 0), (1e-3,), (), (5, 10, 20, 0), (29, 21, 25), 16
     )
     rows: list[dict[str, Value]] = []
-    with one_blas_thread():
-        livers = read_livers(folder, settings.n_livers, settings.phantoms)
-        base = placed(livers, "similarity", settings)
-        others = np.arange(1, len(base.vectors))
-        for method in follow(methods(base, settings), "shapes"):
-            if method.name in ("convex LLE", "inverse distance"):
-                continue
-            found = judged(base, method)
-            seconds = _cpu(lambda m=method: m.weights(0, others), 50)  # type: ignore[misc]
-            error = 1.0 - float(found["dice"])  # type: ignore[arg-type]
-            name = {"PCA": f"PCA, {method.k} components"}.get(method.name, method.name)
-            if method.name == "LLE":
-                name = f"LLE, k = {method.k}"
-            rows.append(
-                _row("shape", method.name, name, error, seconds)
-                | {"size": method.k, "sdf_max_mm": found["sdf_max_mm"]}
-            )
+    livers = read_livers(folder, settings.n_livers, settings.phantoms)
+    base = placed(livers, "similarity", settings)
+    others = np.arange(1, len(base.vectors))
+    for method in follow(methods(base, settings), "shapes"):
+        if method.name in ("convex LLE", "inverse distance"):
+            continue
+        found = judged(base, method)
+        seconds = _cpu(lambda m=method: m.weights(0, others), 50)  # type: ignore[misc]
+        error = 1.0 - float(found["dice"])  # type: ignore[arg-type]
+        name = {"PCA": f"PCA, {method.k} components"}.get(method.name, method.name)
+        if method.name == "LLE":
+            name = f"LLE, k = {method.k}"
+        rows.append(
+            _row("shape", method.name, name, error, seconds)
+            | {"size": method.k, "sdf_max_mm": found["sdf_max_mm"]}
+        )
     return rows
 
 

@@ -18,11 +18,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from avatar_core.common.processes import repeatable
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import barycenter
 from avatar_core.shapes.lle import LLE, locally_linear_embedding
 from avatar_core.studies.shapes import PAPER_GRID, distance_vectors, paper_box
-from avatar_core.studies.study import Study, Value, follow, mean_and_worst, one_blas_thread
+from avatar_core.studies.study import Study, Value, follow, mean_and_worst
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,6 +71,7 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     return study(QUICK if quick else FULL)
 
 
+@repeatable
 def study(settings: SamplesSettings) -> Study:
     """Errors for each size of the base, then times for the largest."""
     organ = phantom_liver(settings.phantom_spacing)
@@ -77,12 +79,12 @@ def study(settings: SamplesSettings) -> Study:
     moved = [shape.moved(organ) for shape in maps]
     vectors = distance_vectors(moved, paper_box(moved, settings.shape))
     base, targets = vectors[: settings.sizes[-1]], vectors[settings.sizes[-1] :]
-    with one_blas_thread() as notices:
-        rows = [error_row(base[:n], targets) for n in follow(settings.sizes, "errors")]
-        timing = time_lle(base, settings.repeats)
+    rows = [error_row(base[:n], targets) for n in follow(settings.sizes, "errors")]
+    timing = time_lle(base, settings.repeats)
     summary = _summary(rows, timing)
+    notices: tuple[str, ...] = ()
     if math.isnan(timing.sklearn_seconds):
-        notices = (*notices, "scikit-learn is not installed: no times beside ours")
+        notices = ("scikit-learn is not installed: no times beside ours",)
     return Study(
         name="samples",
         sentence=_sentence(summary, settings.sizes[-1]),

@@ -9,7 +9,6 @@ import platform
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -126,18 +125,6 @@ class ProgressBar:
             self._bar.set_description_str(f"{name}: {stage} {fraction:.0%}{known}")
 
         return progress
-
-
-@contextmanager
-def one_blas_thread() -> Iterator[tuple[str, ...]]:
-    """Limit linear algebra to one thread, for all methods alike; yields notices."""
-    try:
-        from threadpoolctl import threadpool_limits
-    except ImportError:
-        yield ("threadpoolctl is not installed: BLAS threads are as OMP_NUM_THREADS says",)
-        return
-    with threadpool_limits(limits=1):
-        yield ()
 
 
 def mean_and_worst(key: str, values: Iterable[float]) -> dict[str, float]:

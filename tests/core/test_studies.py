@@ -26,6 +26,7 @@ from avatar_core.studies import (
     in_silico,
     indentation,
     leave_one_out,
+    meshes,
     passivity,
     pgd,
     samples,
@@ -74,6 +75,18 @@ def write_phantoms(folder: Path, n: int) -> Path:
 
 
 # --- the four studies -------------------------------------------------------------------------
+
+
+def test_meshes(tmp_path: Path) -> None:
+    settings = meshes.MeshesSettings(n_built=0, n_again=1, n_vertices=300, n_points=2000)
+    found = meshes.study(write_phantoms(tmp_path, 3), settings)
+    summary = checked_files(found, tmp_path)
+    assert len(found.rows) == 3
+    assert summary["same_again"] == 1.0
+    assert summary["n_inverted"] == 0
+    assert summary["volume_error_worst"] < 0.02
+    assert 0.0 < summary["distance_rms_worst_mm"] < 2.0
+    assert summary["min_dihedral_deg"] > 5.0
 
 
 @pytest.mark.usefixtures("no_folder")
@@ -136,9 +149,11 @@ def test_pgd(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_coordinates(tmp_path: Path) -> None:
+def test_coordinates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the real tumours, whose two coordinates alone take minutes."""
+    monkeypatch.setattr(coordinates, "TUMOUR_FOLDER", tmp_path)
     organ = phantom_liver(12e-3)
-    settings = coordinates.CoordinatesSettings(600, 600, 12, 12, 2, 2)
+    settings = coordinates.CoordinatesSettings(400, 400, 8, 8, 2, 1, 30e-3)
     found = coordinates.study(organ, organ, settings)
     summary = checked_files(found, tmp_path)
     assert summary["poisson_mean"] < summary["poisson_canonical_small_mesh_mean"]

@@ -1,0 +1,188 @@
+"""Meshes of real organs: how near the surface they are, how well shaped, what they cost.
+
+For each surface, meshed as `avatar vademecum` does:
+
+- volume: of the mesh over that inside the surface, less one;
+- distance: of random points of the mesh's boundary from the surface, rms and worst, and worst of
+  the surface's vertices from the mesh;
+- least dihedral angle, and inverted elements;
+- processor time of mesh and regions, fTetWild's process included;
+- built again: whether a second mesh of the same surface is the same, bit for bit.
+
+And of the vademecums of some of them, built in full: their certificates, the mesh's own error by
+one refinement, and the processor time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import igl
+import numpy as np
+
+from avatar_core.geometry.level_set import signed_distance
+from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.offline.pipeline import OrganOptions, build, cpu_seconds
+from avatar_core.studies.shapes import read_livers
+from avatar_core.studies.study import Study, Value, follow
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class MeshesSettings:
+    """Numbers of livers, of those built in full, and of those meshed twice; sizes of the work.
+
+    n_vertices, n_certified : of `avatar vademecum`; n_points : on each boundary
+    """
+
+    n_livers: int | None = None
+    n_built: int = 5
+    n_again: int = 5
+    n_vertices: int = 2850
+    n_certified: int = 200
+    n_points: int = 20_000
+    phantoms: int = 3
+
+
+FULL = MeshesSettings()
+QUICK = MeshesSettings(n_livers=6, n_built=0, n_again=1)
+
+
+def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
+    """The study on a folder of surfaces; None for the default one."""
+    return study(surfaces, QUICK if quick else FULL)
+
+
+def study(folder: Path | None, settings: MeshesSettings) -> Study:
+    """One row for each surface."""
+    livers = read_livers(folder, settings.n_livers, settings.phantoms)
+    n = len(livers.surfaces)
+    built = set(np.linspace(0, n - 1, min(settings.n_built, n)).astype(int).tolist())
+    again = set(np.linspace(0, n - 1, min(settings.n_again, n)).astype(int).tolist())
+    rows: list[dict[str, Value]] = []
+    for i, surface in enumerate(follow(livers.surfaces, "livers")):
+        row, mesh = _meshed(surface, settings)
+        if i in again:
+            row["same_again"] = _same(mesh, tetrahedralize(surface, settings.n_vertices))
+        if i in built:
+            row |= _certified(surface, settings)
+        rows.append(row)
+    summary = _summary(rows)
+    return Study(
+        name="meshes",
+        sentence=_sentence(summary, n),
+        summary=summary,
+        rows=tuple(rows),
+        paper={},
+        draw=lambda figure: _draw(figure, rows),
+        notices=livers.notices,
+    )
+
+
+def _meshed(surface: SurfaceMesh, settings: MeshesSettings) -> tuple[dict[str, Value], TetMesh]:
+    start = cpu_seconds()
+    mesh = tetrahedralize(surface, settings.n_vertices)
+    regions_by_rule(mesh)
+    seconds = cpu_seconds() - start
+    off = np.abs(signed_distance(_points_on(mesh, settings.n_points), surface))
+    faces = mesh.boundary_faces.astype(np.int64)
+    missed, _, _ = igl.point_mesh_squared_distance(surface.vertices, mesh.vertices, faces)
+    shape = quality(mesh)
+    row: dict[str, Value] = {
+        "liver": surface.name,
+        "n_vertices": len(mesh.vertices),
+        "n_tets": len(mesh.tets),
+        "volume_error": float(mesh.volume / surface.volume - 1.0),
+        "distance_rms_mm": 1e3 * math.sqrt(float((off**2).mean())),
+        "distance_worst_mm": 1e3 * float(off.max()),
+        "missed_worst_mm": 1e3 * math.sqrt(float(missed.max())),
+        "min_dihedral_deg": shape.min_dihedral,
+        "n_inverted": int((mesh.tet_volumes <= 0.0).sum()),
+        "mesh_cpu_seconds": seconds,
+    }
+    return row, mesh
+
+
+def _points_on(mesh: TetMesh, n: int) -> np.ndarray:
+    """Random points of the boundary, uniform over its area, shape (n, 3) [m]."""
+    rng = np.random.default_rng(0)
+    share = mesh.face_areas / mesh.face_areas.sum()
+    face = mesh.boundary_faces[rng.choice(len(share), n, p=share)]
+    corner = rng.dirichlet((1.0, 1.0, 1.0), n)
+    return np.asarray(np.einsum("ij,ijk->ik", corner, mesh.vertices[face]))
+
+
+def _same(one: TetMesh, other: TetMesh) -> bool:
+    return np.array_equal(one.tets, other.tets) and np.array_equal(one.vertices, other.vertices)
+
+
+def _certified(surface: SurfaceMesh, settings: MeshesSettings) -> dict[str, Value]:
+    """Certificate of the vademecum, the mesh's own error and the processor time without it."""
+    options = OrganOptions(n_vertices=settings.n_vertices, n_certified=settings.n_certified)
+    start = cpu_seconds()
+    vademecum = build(surface, options)
+    seconds = cpu_seconds() - start
+    certificate = vademecum.certificate
+    assert certificate is not None
+    return {
+        "l2_mean": certificate.l2_mean,
+        "l2_worst": certificate.l2_worst,
+        "contact_mean": certificate.contact_mean,
+        "contact_worst": certificate.contact_worst,
+        "build_cpu_seconds": seconds,
+    }
+
+
+def _summary(rows: list[dict[str, Value]]) -> dict[str, float]:
+    def column(key: str) -> np.ndarray:
+        return np.array([row[key] for row in rows if key in row], dtype=float)
+
+    found = {
+        "n_vertices_least": column("n_vertices").min(),
+        "n_vertices_most": column("n_vertices").max(),
+        "volume_error_worst": np.abs(column("volume_error")).max(),
+        "distance_rms_median_mm": np.median(column("distance_rms_mm")),
+        "distance_rms_worst_mm": column("distance_rms_mm").max(),
+        "min_dihedral_deg": column("min_dihedral_deg").min(),
+        "n_inverted": column("n_inverted").sum(),
+        "mesh_cpu_seconds_median": np.median(column("mesh_cpu_seconds")),
+        "mesh_cpu_seconds_worst": column("mesh_cpu_seconds").max(),
+        "same_again": column("same_again").mean(),
+    }
+    for key in ("l2_mean", "l2_worst", "build_cpu_seconds"):
+        if len(values := column(key)):
+            found |= {f"{key}_median": np.median(values), f"{key}_worst": values.max()}
+    return {key: float(value) for key, value in found.items()}
+
+
+def _sentence(summary: dict[str, float], n: int) -> str:
+    again = "the same" if summary["same_again"] == 1.0 else "another"
+    return (
+        f"Meshes of {n} livers lie within {summary['distance_rms_worst_mm']:.2f} mm rms of the "
+        f"surface, hold its volume within {summary['volume_error_worst']:.1%}, have no dihedral "
+        f"angle below {summary['min_dihedral_deg']:.1f} degrees, take "
+        f"{summary['mesh_cpu_seconds_median']:.1f} s of processor time in the median, and meshed "
+        f"again a surface gives {again} mesh."
+    )
+
+
+def _draw(figure: Figure, rows: list[dict[str, Value]]) -> None:
+    panels = figure.subplots(1, 3)
+    for axes, key, label, line in zip(
+        panels,
+        ("distance_rms_mm", "min_dihedral_deg", "mesh_cpu_seconds"),
+        ("boundary to surface, rms [mm]", "least dihedral angle [deg]", "processor time [s]"),
+        (0.3, 5.0, 3.0),
+        strict=True,
+    ):
+        axes.plot([row["n_vertices"] for row in rows], [row[key] for row in rows], "o", ms=4)
+        axes.axhline(line, color="gray", ls=":", label=f"aim: {line:g}")
+        axes.set(xlabel="vertices of the mesh", ylabel=label, ylim=(0.0, None))
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
