@@ -24,7 +24,7 @@ from scipy.optimize import brentq
 
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.dent import FADE, REACH, patch_dent, quarter_turn
-from avatar_core.contact.effects.tip_law import PATCH
+from avatar_core.contact.effects.tip_law import PATCH_ON_MESH
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
@@ -105,7 +105,7 @@ def find_touch(vademecum: Vademecum, tip: Tip, pose: np.ndarray) -> Touch | None
     except AvatarError:  # off the accessible surface
         return None
     stiffness = vademecum.material.plane_strain_modulus
-    taken = min(PATCH / vademecum.surface.patch_radius, stiffness * compliance)
+    taken = min(PATCH_ON_MESH / vademecum.surface.patch_radius, stiffness * compliance)
     depth, rest = tip.offset - phi, stiffness * compliance - taken
     most = 1.0 + depth / tip.radius
 
