@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from avatar_core.cli.output import Overwrite, require_output
+from avatar_core.cli.timings import StageClock, Timings, require_timings, show_timings
 from avatar_core.cli.vademecum import (
     EXIT_NOT_CONVERGED,
     Axes,
@@ -70,6 +71,7 @@ def patient(
             help="number of unseen loads for the certificate; default: 24, or 200 if solved"
         ),
     ] = None,
+    timings: Timings = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Build a patient's vademecum from an atlas. Exit code 3: written, but not converged."""
@@ -84,7 +86,11 @@ def patient(
     require(neighbors is None or neighbors >= 1, f"--neighbors is {neighbors}; ask for at least 1")
     inputs = (None if surface == "phantom" else surface, atlas)
     require_output(output, [".h5"], inputs, is_vademecum, overwrite)
+    require_timings(timings)
+    clock = StageClock()
+    clock.begin("atlas")
     base = base_of(load_atlas(atlas))
+    clock.begin("surface")
     options = PatientOptions(
         n_vertices=vertices,
         weighting=weighting,  # type: ignore[arg-type]
@@ -98,10 +104,14 @@ def patient(
     for notice in organ.notices:
         print(f"notice: {notice}", file=sys.stderr)
     with _StageBar() as progress:
-        found = patient_vademecum(organ, base, fidelity, options, progress)  # type: ignore[arg-type]
+        report = clock.following(progress)
+        found = patient_vademecum(organ, base, fidelity, options, report)  # type: ignore[arg-type]
+    clock.begin("save")
     save_vademecum(found.vademecum, output)
+    clock.begin("show")
     show_text(load_vademecum(output))
     _show_origin(found)
+    show_timings(clock, timings)
     if fidelity != "interpolated" and not found.vademecum.convergence.converged:
         print(
             "avatar: not converged; the file is complete, and marked as not converged; choose "

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import typer
 
 from avatar_core.cli.output import Overwrite, require_output
+from avatar_core.cli.timings import StageClock, Timings, require_timings, show_timings
 from avatar_core.errors import AvatarError
 
 if TYPE_CHECKING:
@@ -128,6 +129,7 @@ def vademecum(
             "--mesh-error", help="also measure the discretisation error of the mesh (slow)"
         ),
     ] = False,
+    timings: Timings = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Build the certified vademecum of an organ. Exit code 3: written, but not converged."""
@@ -159,6 +161,9 @@ def vademecum(
     inputs = (None if surface == "phantom" else surface, tumour, groups)
     require_output(output, [".h5"], inputs, is_vademecum, overwrite)
     coordinates = tuple(Coordinate.parse(text) for text in coordinate or ())
+    require_timings(timings)
+    clock = StageClock()
+    clock.begin("surface")
     organ = read_organ(surface, unit, axes, label)
     lesion = None if tumour is None else _read_tumour(tumour, unit, axes, organ)
     options = OrganOptions(
@@ -185,11 +190,15 @@ def vademecum(
     if warning:
         print(f"warning: {warning}", file=sys.stderr)
     with BuildBar(material != "linear", contact_sites) as progress:
-        built = _timed(build(organ, options, progress), progress)
+        report = clock.following(progress)
+        built = _timed(build(organ, options, report), report)
     for notice in built.provenance.notices[len(organ.notices) :]:
         print(f"notice: {notice}", file=sys.stderr)
+    clock.begin("save")
     save_vademecum(built, output)
+    clock.begin("show")
     show_text(load_vademecum(output))
+    show_timings(clock, timings)
     if not built.convergence.converged:
         best = built.convergence.rank_errors[-1]
         print(

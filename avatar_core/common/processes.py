@@ -23,6 +23,11 @@ def thread_limits(n_threads: int = 1) -> dict[str, str]:
     return {f"{library}_NUM_THREADS": str(n_threads) for library in _LIBRARIES}
 
 
+def cpu_seconds() -> float:
+    """User + system time of this process so far, and of its children that have ended [s]."""
+    return sum(os.times()[:4])
+
+
 def repeatable(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator: the same arguments give the same bits, with any number of threads allowed.
 

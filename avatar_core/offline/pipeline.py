@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from avatar_core.common.processes import repeatable
+from avatar_core.common.processes import cpu_seconds, repeatable
 from avatar_core.errors import ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import load_surface
@@ -226,11 +225,6 @@ def _elasticity(mesh: TetMesh, regions: Regions, options: OrganOptions) -> Elast
 def orientation_warning(surface: SurfaceMesh) -> str | None:
     """A warning if the surface lies more than 45 degrees off the phantom, naming the option."""
     return orientation_offset(surface, phantom_liver()).warning
-
-
-def cpu_seconds() -> float:
-    """User + system time of this process and its children so far [s]."""
-    return sum(os.times()[:4])
 
 
 def _provenance(surface: SurfaceMesh, options: OrganOptions) -> Provenance:

@@ -23,10 +23,11 @@ from typing import TYPE_CHECKING
 import igl
 import numpy as np
 
+from avatar_core.common.processes import cpu_seconds
 from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.pipeline import OrganOptions, build, cpu_seconds
+from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.studies.shapes import read_livers
 from avatar_core.studies.study import Study, Value, follow
 

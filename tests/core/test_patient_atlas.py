@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -199,9 +200,13 @@ def test_the_command_writes_a_certified_vademecum(
 ) -> None:
     output = tmp_path / "patient.h5"
     arguments = ["--fidelity", fidelity, "--vertices", 350, "--certify", 6, "--tolerance", 0.2]
-    code, out, err = run(livers[N], "--atlas", file, "-o", output, *arguments)
+    times = tmp_path / "times.json"
+    code, out, err = run(livers[N], "--atlas", file, "-o", output, "--timings", times, *arguments)
     assert code == 0, err
     assert "liver" in out and "CPU time" in out
+    spent = {one["stage"]: one["cpu_seconds"] for one in json.loads(times.read_text())}
+    assert list(spent)[:5] == ["start", "atlas", "surface", "registration", "mesh"]
+    assert spent["mesh"] > 0.1  # of the mesher's own process
     certificate = load_vademecum(output).certificate
     assert certificate is not None and certificate.build_cpu_seconds > 0
     # an affine family, but 4 members and a rough registration for 'interpolated'
