@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
+import signal
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from types import ModuleType
@@ -23,6 +24,7 @@ import numpy as np
 _NAME = "PyfTetWildWrapper"
 _RANDOM = b"_ZNSt13random_device9_M_getvalEv"  # std::random_device::_M_getval()
 _SEED = 5489  # the default seed of std::mt19937
+_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 # ELF-64, little endian (System V gABI, chapters 4 and 5).
 _RELOCATIONS = 4  # SHT_RELA
@@ -39,6 +41,8 @@ _RELOCATION = np.dtype([("where", "<u8"), ("kind", "<u4"), ("symbol", "<u4"), ("
 def main() -> None:
     """Fill the box of the arrays in ``input.npz`` and write ``output.npz``, in this folder."""
     library = sys.argv[1]
+    if sys.platform.startswith("linux"):  # nobody waits for the mesh of a command that was killed
+        ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
     module = _loaded(library)
     function = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_void_p)(lambda _: _SEED)
     seeded = _replace_import(library, _RANDOM, function)

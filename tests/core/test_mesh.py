@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from importlib.machinery import EXTENSION_SUFFIXES, PathFinder
 from pathlib import Path
@@ -20,6 +23,7 @@ from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.vademecum.model import Vademecum
 from tests import kept_meshes
 from tests.hard.mesh_mutations import encode, pristine
+from tests.slowness import Deadline
 
 
 @pytest.mark.long
@@ -114,6 +118,35 @@ def test_a_wheel_for_another_system(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(MeshError, match=r"does not fit this Python .*; pip install 'pytetwild"):
         _filled()
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="no /proc")
+def test_a_command_that_is_killed_takes_the_process_with_it() -> None:
+    parent = subprocess.Popen(
+        [sys.executable, "-c", _IMPORTS.replace("12e-3), 600", "6e-3), 300000")],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
+    passed = Deadline(60.0)
+    while not (started := children.read_text().split()):
+        assert not passed
+        assert parent.poll() is None
+        time.sleep(0.01)
+    filling = Path(f"/proc/{started[0]}/stat")
+    passed = Deadline(20.0)
+    while b"fTetWild" not in filling.with_name("cmdline").read_bytes():
+        assert not passed
+    time.sleep(0.5)  # it asks to end with its parent once it has started
+    parent.kill()
+    parent.wait()
+    passed = Deadline(5.0)
+    try:
+        while filling.exists() and filling.read_text().rpartition(")")[2].split()[0] != "Z":
+            assert not passed
+            time.sleep(0.01)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(int(started[0]), signal.SIGKILL)
 
 
 @pytest.mark.parametrize(
