@@ -227,7 +227,9 @@ def errors_at(
     both = CondensedContact(fine, pushes, np.max(PAIR_DEPTHS), reach=2.0)
     truth = [both.solve((0, 1), depths).forces for depths in PAIR_DEPTHS]
     force = [pressed(model, PAIR, points, normals, depths) for depths in PAIR_DEPTHS]
-    return np.array(force) / truth - 1.0
+    off = np.array(force) - truth
+    # no error where neither has a force: the deeper tip takes the surface away from the other
+    return np.divide(off, truth, out=np.zeros_like(off), where=off != 0.0)
 
 
 @pytest.mark.long
