@@ -9,8 +9,7 @@ For each surface, meshed as `avatar vademecum` does:
 - processor time of mesh and regions, fTetWild's process included;
 - built again: whether a second mesh of the same surface is the same, bit for bit.
 
-And of the vademecums of some of them, built in full: their certificates, the mesh's own error by
-one refinement, and the processor time.
+And of the vademecums of some of them, built in full: their certificates and the processor time.
 """
 
 from __future__ import annotations
@@ -64,8 +63,10 @@ def study(folder: Path | None, settings: MeshesSettings) -> Study:
     """One row for each surface."""
     livers = read_livers(folder, settings.n_livers, settings.phantoms)
     n = len(livers.surfaces)
-    built = set(np.linspace(0, n - 1, min(settings.n_built, n)).astype(int).tolist())
-    again = set(np.linspace(0, n - 1, min(settings.n_again, n)).astype(int).tolist())
+    built, again = (
+        set(np.linspace(0, n - 1, min(chosen, n)).astype(int).tolist())
+        for chosen in (settings.n_built, settings.n_again)
+    )
     rows: list[dict[str, Value]] = []
     for i, surface in enumerate(follow(livers.surfaces, "livers")):
         row, mesh = _meshed(surface, settings)
@@ -87,6 +88,7 @@ def study(folder: Path | None, settings: MeshesSettings) -> Study:
 
 
 def _meshed(surface: SurfaceMesh, settings: MeshesSettings) -> tuple[dict[str, Value], TetMesh]:
+    """A row of the study, with units in its keys, and the mesh."""
     start = cpu_seconds()
     mesh = tetrahedralize(surface, settings.n_vertices)
     regions_by_rule(mesh)
@@ -124,7 +126,7 @@ def _same(one: TetMesh, other: TetMesh) -> bool:
 
 
 def _certified(surface: SurfaceMesh, settings: MeshesSettings) -> dict[str, Value]:
-    """Certificate of the vademecum, the mesh's own error and the processor time without it."""
+    """Errors of the vademecum's certificate, relative, and processor time of its build [s]."""
     options = OrganOptions(n_vertices=settings.n_vertices, n_certified=settings.n_certified)
     start = cpu_seconds()
     vademecum = build(surface, options)
