@@ -206,7 +206,6 @@ def test_the_command_writes_a_certified_vademecum(
     assert "liver" in out and "CPU time" in out
     spent = {one["stage"]: one["cpu_seconds"] for one in json.loads(times.read_text())}
     assert list(spent)[:5] == ["start", "atlas", "surface", "registration", "mesh"]
-    assert min(spent.values()) >= 0.0
     certificate = load_vademecum(output).certificate
     assert certificate is not None and certificate.build_cpu_seconds > 0
     # an affine family, but 4 members and a rough registration for 'interpolated'

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from avatar_core.atlas.patient import _timed
 from avatar_core.cli.timings import StageClock, require_timings, show_timings
 from avatar_core.errors import StorageError
 
@@ -35,6 +36,13 @@ def test_each_second_goes_to_the_stage_it_was_spent_in(
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 5
     assert lines[-1].split()[:2] == ["all", f"{sum(s.cpu_seconds for s in clock.stages):.2f}"]
+
+
+def test_stages_of_a_patient_count_their_processes() -> None:
+    clock: dict[str, float] = {}
+    with _timed(clock, "mesh"):
+        subprocess.run([sys.executable, "-S", "-c", BUSY], check=True)
+    assert clock["mesh"] > 0.35
 
 
 def test_reports_pass_through_and_set_the_stage() -> None:
