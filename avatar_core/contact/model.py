@@ -48,7 +48,7 @@ class Status(IntEnum):
 
 
 class Compiled(NamedTuple):
-    """The halves of a step or the whole, compiled for the types of one model.
+    """The halves of a step or the whole, and the error, compiled for the types of one model.
 
     Called without numba's look-up of argument types, which takes 4 us for so many arrays.
     """
@@ -56,6 +56,7 @@ class Compiled(NamedTuple):
     solve: Callable[..., int] | None
     deform: Callable[..., None] | None
     step: Callable[..., int] | None
+    error: Callable[..., None]
 
 
 @dataclass(frozen=True)
@@ -184,14 +185,14 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     """
     arrays, state, out, effects = layout.arrays, _state(layout), _out(layout), _effects(layout)
     far_away = np.full((len(arrays.tip_offset), 3), FAR_AWAY)
-    kernels.force_error(arrays, state, out, far_away, effects.tip_law)
+    error = _compiled(kernels.force_error, arrays, state, out, far_away, effects.tip_law)
     if halves:
         first = _compiled(kernels.contact_solve, arrays, state, out, far_away, effects)
         second = _compiled(kernels.contact_deform, arrays, state, out, effects)
-        compiled = Compiled(first, second, None)
+        compiled = Compiled(first, second, None, error)
     else:
         whole = _compiled(kernels.contact_step, arrays, state, out, far_away, effects)
-        compiled = Compiled(None, None, whole)
+        compiled = Compiled(None, None, whole, error)
     model = ContactModel(layout, state, effects, out, far_away, compiled)
     model.reset()
     return model
@@ -312,7 +313,7 @@ def estimate_error(model: ContactModel) -> None:
     vademecum was not measured. Real-time safe, as :func:`step`; separate, so that it can follow
     the sending of the forces.
     """
-    kernels.force_error(
+    model.compiled.error(
         model.layout.arrays, model.state, model.out, model.tips, model.effects.tip_law
     )
 
