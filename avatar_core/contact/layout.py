@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -103,7 +103,19 @@ def lay_out(
     detail : of the displacement; by default all modes at the surface
     """
     detail = detail or Detail(vademecum.far.rank)
-    _check(vademecum, tips, detail)
+    return next(lay_out_details(vademecum, tips, [detail], effects, period))
+
+
+def lay_out_details(
+    vademecum: Vademecum,
+    tips: Sequence[Tip],
+    details: Sequence[Detail],
+    effects: Sequence[Effect] | None = None,
+    period: float = PERIOD,
+) -> Iterator[Layout]:
+    """:func:`lay_out` for one detail after the other; they share what does not depend on it."""
+    for detail in details:
+        _check(vademecum, tips, detail)
     if effects is None:
         effects = default_effects(vademecum, len(tips))
     for effect in effects:
@@ -112,48 +124,16 @@ def lay_out(
         raise SceneError(
             f"{len(tips)} tools without several_tools; add it to the effects, or name one tool"
         )
-    modes = None if detail.modes == vademecum.far.rank else detail.modes
+    rank = vademecum.far.rank
     vademecum, mass = adapted_vademecum(vademecum, effects)
     surface, contact = vademecum.surface, vademecum.contact_near
     contact_start, contact_slot = hash_rows(contact)
     load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
+    padded, softness = _padded(load), float((load**2).sum(axis=(1, 2)).mean() / 3.0)
     field, offset = vademecum.tip_field, np.array([tip.offset for tip in tips])
     response = make_tip_response(surface, field, load, contact, MAX_DEPTH, max(offset))
     large = vademecum.large if find(effects, LargeDeformationEffect) is not None else None
-    shown = cloud_arrays(
-        vademecum,
-        modes,
-        detail.cloud,
-        detail.precision,
-        detail.near,
-        large.space if large else None,
-    )
-    points = vademecum.mesh.vertices[shown.points]
-    arrays = ModelArrays(
-        distance=field.distance,
-        access=field.access,
-        origin=field.origin,
-        spacing=field.spacing,
-        row=response.row,
-        carrier=response.carrier,
-        carrier_weight=response.carrier_weight,
-        self_compliance=response.self_compliance,
-        force_error=_force_error(vademecum.certificate, large, response.smoothing),
-        position=np.ascontiguousarray(surface.centers),
-        load=_padded(load),
-        contact_start=contact_start,
-        contact_slot=contact_slot,
-        contact_block=contact.block,
-        softness=np.array([float((load**2).sum(axis=(1, 2)).mean() / 3.0)]),
-        space=shown.space,
-        space_scale=shown.space_scale,
-        near_start=shown.near.start,
-        near_target=shown.near.target,
-        near_block=shown.near.block,
-        rest=np.pad(points, ((0, 0), (0, 3))).astype(np.float32),
-        tip_offset=offset,
-    )
-    nonlinear = _nonlinear_arrays(vademecum, large, response, shown.fade) if large else None
+    error = _force_error(vademecum.certificate, large, response.smoothing)
     reach = _reach(contact, surface.centers)
     law = tip_law_arrays(
         tips,
@@ -162,10 +142,45 @@ def lay_out(
         (vademecum.certificate or Certificate.unknown()).contact_sites.factor,
         large is not None and large.material == "neo-hookean",
     )
-    dent = dent_arrays(tips, points, surface.centers, surface.patch_radius) if law else None
-    return Layout(
-        arrays, selected_arrays(vademecum, effects, mass, nonlinear, reach, period, law, dent)
-    )
+    for detail in details:
+        shown = cloud_arrays(
+            vademecum,
+            None if detail.modes == rank else detail.modes,
+            detail.cloud,
+            detail.precision,
+            detail.near,
+            large.space if large else None,
+        )
+        points = vademecum.mesh.vertices[shown.points]
+        arrays = ModelArrays(
+            distance=field.distance,
+            access=field.access,
+            origin=field.origin,
+            spacing=field.spacing,
+            row=response.row,
+            carrier=response.carrier,
+            carrier_weight=response.carrier_weight,
+            self_compliance=response.self_compliance,
+            force_error=error,
+            position=np.ascontiguousarray(surface.centers),
+            load=padded,
+            contact_start=contact_start,
+            contact_slot=contact_slot,
+            contact_block=contact.block,
+            softness=np.array([softness]),
+            space=shown.space,
+            space_scale=shown.space_scale,
+            near_start=shown.near.start,
+            near_target=shown.near.target,
+            near_block=shown.near.block,
+            rest=np.pad(points, ((0, 0), (0, 3))).astype(np.float32),
+            tip_offset=offset,
+        )
+        nonlinear = _nonlinear_arrays(vademecum, large, response, shown.fade) if large else None
+        dent = dent_arrays(tips, points, surface.centers, surface.patch_radius) if law else None
+        yield Layout(
+            arrays, selected_arrays(vademecum, effects, mass, nonlinear, reach, period, law, dent)
+        )
 
 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from avatar_core.common.machine import processor
 from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.layout import PERIOD, lay_out
+from avatar_core.contact.layout import PERIOD, lay_out_details
 from avatar_core.contact.model import ContactModel, deform, make_model, solve, step
 from avatar_core.contact.tool_path import slide, starts_apart
 from avatar_core.geometry.tip import Tip
@@ -40,9 +40,11 @@ def timed(
     """
     paths = slides(vademecum, tips)
     pairs: list[tuple[ContactModel, CurvePoint]] = []
-    for group in _same_arrays(curve):
-        whole = replace(group[0].detail, modes=vademecum.far.rank)
-        model = make_model(lay_out(vademecum, tips, whole, effects, period), halves)
+    groups = _same_arrays(curve)
+    details = [replace(group[0].detail, modes=vademecum.far.rank) for group in groups]
+    layouts = lay_out_details(vademecum, tips, details, effects, period)
+    for group, layout in zip(groups, layouts, strict=True):
+        model = make_model(layout, halves)
         pairs += [(model, point) for point in group]
         progress(0.5 * len(pairs) / len(curve.points))
     points = _timed(pairs, paths, lambda fraction: progress(0.5 + 0.5 * fraction))
