@@ -240,7 +240,13 @@ def test_a_file_that_states_lps_is_read_so(tmp_path, suffix, binary):
     assert near.max() < 1e-6
     assert lps.axes_name == "LPS"
     assert lps.notices == ()
-    clamped = [clamp_centre(surface) for surface in (ras, lps)]
+
+
+def test_a_file_that_states_lps_is_clamped_behind_and_above(tmp_path):
+    vertices, faces = lump()
+    ras = read_surface(write_obj(tmp_path / "ras.obj", vertices, faces))
+    path = write_stating(tmp_path / "lps.obj", vertices * [-1, -1, 1], faces, "SPACE=LPS", False)
+    clamped = [clamp_centre(surface) for surface in (ras, read_surface(path))]
     assert np.allclose(*clamped, atol=5e-3)  # the meshes differ by their generator
     assert clamped[1][1] < 0.02 < clamped[1][2]  # behind and above the ball's centre
 
