@@ -113,7 +113,10 @@ def lay_out_details(
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
 ) -> Iterator[Layout]:
-    """:func:`lay_out` for one detail after the other; they share what does not depend on it."""
+    """:func:`lay_out` for one detail after the other; they share what does not depend on it.
+
+    Nothing is checked before the first is asked for.
+    """
     for detail in details:
         _check(vademecum, tips, detail)
     if effects is None:
