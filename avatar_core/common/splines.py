@@ -3,6 +3,9 @@
 f(p) = sum_ijk v_ijk B_i(x) B_j(y) B_k(z) over the 27 samples around p (de Boor, A Practical Guide
 to Splines). The sum smooths the samples a little; it is once continuously differentiable and its
 second derivatives are bounded. Several fields on one grid share the weights of a *cell*.
+
+A field that vanishes nearly everywhere is kept in *bricks* of ``BRICK``^3 samples where it does
+not: ``brick`` (nx, ny, nz) holds the number of each, -1 where the samples are zero.
 """
 
 from __future__ import annotations
@@ -10,6 +13,9 @@ from __future__ import annotations
 import numpy as np
 
 from avatar_core.common.jit import entry, fast, inlined
+
+BRICK = 8  # samples along each side: a power of two
+_SHIFT, _LAST = 3, 7
 
 
 @inlined
@@ -109,6 +115,59 @@ def second_derivatives(values, cell, spacing, hessian):  # type: ignore[no-untyp
 
 
 @fast
+def add_in_bricks(brick, values, cell, gradient):  # type: ignore[no-untyped-def]
+    """Value of a field in bricks; its gradient [1/m] is added to ``gradient``.
+
+    values : (n_bricks, BRICK, BRICK, BRICK); all samples of the cell lie in ``brick``
+    """
+    (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
+    value = 0.0
+    for i in range(3):
+        x = nx + i
+        for j in range(3):
+            y = ny + j
+            for k in range(3):
+                z = nz + k
+                b = brick[x >> _SHIFT, y >> _SHIFT, z >> _SHIFT]
+                if b < 0:
+                    continue
+                v = values[b, x & _LAST, y & _LAST, z & _LAST]
+                value += wx[i] * wy[j] * wz[k] * v
+                gradient[0] += dx[i] * wy[j] * wz[k] * v
+                gradient[1] += wx[i] * dy[j] * wz[k] * v
+                gradient[2] += wx[i] * wy[j] * dz[k] * v
+    return value
+
+
+@fast
+def add_second_derivatives(brick, values, cell, spacing, hessian):  # type: ignore[no-untyped-def]
+    """Second derivatives [1/m^2] of a field in bricks, added to (3, 3)."""
+    (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
+    end = 1.0 / (spacing * spacing)
+    curve = (end, -2.0 * end, end)
+    for i in range(3):
+        x = nx + i
+        for j in range(3):
+            y = ny + j
+            for k in range(3):
+                z = nz + k
+                b = brick[x >> _SHIFT, y >> _SHIFT, z >> _SHIFT]
+                if b < 0:
+                    continue
+                v = values[b, x & _LAST, y & _LAST, z & _LAST]
+                hessian[0, 0] += curve[i] * wy[j] * wz[k] * v
+                hessian[1, 1] += wx[i] * curve[j] * wz[k] * v
+                hessian[2, 2] += wx[i] * wy[j] * curve[k] * v
+                for a, c, slope in (
+                    (0, 1, dx[i] * dy[j] * wz[k] * v),
+                    (0, 2, dx[i] * wy[j] * dz[k] * v),
+                    (1, 2, wx[i] * dy[j] * dz[k] * v),
+                ):
+                    hessian[a, c] += slope
+                    hessian[c, a] += slope
+
+
+@fast
 def _line(values, i, j, k):  # type: ignore[no-untyped-def]
     return values[i, j, k], values[i, j, k + 1], values[i, j, k + 2]
 
@@ -120,3 +179,15 @@ def evaluate(values, origin, spacing, p, gradient, outside):  # type: ignore[no-
         gradient[0] = gradient[1] = gradient[2] = 0.0
         return outside
     return in_cell(values, cell_at(origin, spacing, p), gradient)
+
+
+@entry
+def evaluate_all(values, origin, spacing, points, out, gradients):  # type: ignore[no-untyped-def]
+    """Of a sampled field at points (n, 3): values into (n,), gradients into (n, 3).
+
+    Off the grid they are zero.
+    """
+    for i in range(len(points)):
+        out[i] = gradients[i, 0] = gradients[i, 1] = gradients[i, 2] = 0.0
+        if on_grid(values.shape, origin, spacing, points[i]):
+            out[i] = in_cell(values, cell_at(origin, spacing, points[i]), gradients[i])

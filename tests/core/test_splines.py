@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.common.splines import cell_at, evaluate, in_cell, on_grid, second_derivatives
+from avatar_core.common.splines import (
+    BRICK,
+    add_in_bricks,
+    add_second_derivatives,
+    cell_at,
+    evaluate,
+    in_cell,
+    on_grid,
+    second_derivatives,
+)
 
 ORIGIN, SPACING = np.array([0.01, -0.02, 0.03]), 3e-3
 
@@ -43,6 +52,24 @@ def test_derivatives_are_those_of_the_value() -> None:
             change = (slopes[0] - slopes[1]) / (2 * h)
             # the second derivative jumps at cell borders, which a difference may straddle
             np.testing.assert_allclose(change, hessian[d], atol=2e-2 * np.abs(hessian).max())
+
+
+def test_bricks_are_the_same_field() -> None:
+    """Of a field that vanishes in all bricks but two, next to each other."""
+    values = np.zeros((3 * BRICK, BRICK, 2 * BRICK))
+    values[BRICK:, :, :BRICK] = np.random.default_rng(2).standard_normal((2 * BRICK, BRICK, BRICK))
+    brick = np.array([[[-1, -1]], [[1, -1]], [[0, -1]]], np.int32)
+    cut = np.stack([values[2 * BRICK :, :, :BRICK], values[BRICK : 2 * BRICK, :, :BRICK]])
+    rng, shape = np.random.default_rng(3), np.array(values.shape)
+    for p in ORIGIN + SPACING * rng.uniform(1.0, shape - 2.0, (200, 3)):
+        cell, gradient, added = cell_at(ORIGIN, SPACING, p), np.zeros(3), np.ones(3)
+        value = in_cell(values, cell, gradient)
+        assert add_in_bricks(brick, cut, cell, added) == pytest.approx(value, abs=1e-12)
+        np.testing.assert_allclose(added - 1.0, gradient, rtol=1e-9, atol=1e-6)
+        hessian, more = np.zeros((3, 3)), np.ones((3, 3))
+        second_derivatives(values, cell, SPACING, hessian)
+        add_second_derivatives(brick, cut, cell, SPACING, more)
+        np.testing.assert_allclose(more - 1.0, hessian, rtol=1e-9, atol=1e-3)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 1.0])
