@@ -61,7 +61,7 @@ def same_fields() -> Iterator[None]:
     """The contact geometry of one organ is sampled once, whatever is built around it."""
     with pytest.MonkeyPatch.context() as patch:
         for builder in (linear, parametric, patient):
-            patch.setattr(builder, "make_tip_field", kept_fields.kept)
+            patch.setattr(builder, "make_felt_field", kept_fields.kept)
         yield
 
 

@@ -5,18 +5,18 @@ It follows from mesh, regions, patch and outline alone, and takes seconds whatev
 
 from __future__ import annotations
 
+from avatar_core.contact import ball_shift
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.vademecum import tip_field
 from avatar_core.vademecum.tip_field import TipField
 
 from .content import ByContent
 from .stored import on_disk
 
 # Imports never run back: a field comes from no later room.
-_ROOMS = ("common", "geometry", "fem", "reduction", "shapes", "vademecum")
+_ROOMS = ("common", "geometry", "fem", "reduction", "shapes", "vademecum", "contact")
 
-_plain = tip_field.make_tip_field
+_plain = ball_shift.make_felt_field
 
 
 def _sampled(organ: ByContent) -> TipField:
@@ -29,5 +29,5 @@ _found = on_disk(_sampled, _ROOMS)
 def kept(
     mesh: TetMesh, regions: Regions, patch_radius: float, outline: SurfaceMesh | None = None
 ) -> TipField:
-    """In the place of ``make_tip_field``; what it refuses is not kept."""
+    """In the place of ``make_felt_field``; what it refuses is not kept."""
     return _found(ByContent(mesh, regions, float(patch_radius), outline))

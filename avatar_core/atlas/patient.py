@@ -27,6 +27,7 @@ from avatar_core.atlas.transfer import (
     patient_weights,
 )
 from avatar_core.common.processes import cpu_seconds, repeatable
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import TetMesh, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
@@ -47,7 +48,6 @@ from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import load_map
 from avatar_core.shapes.registration import Registration, register
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
-from avatar_core.vademecum.tip_field import make_tip_field
 
 Fidelity = Literal["interpolated", "reduced", "solved"]
 Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
@@ -356,7 +356,7 @@ def _assembled(
         contact_near=residual_compliance_blocks(
             response.residual_compliance, support, loads, rule.contact_support * radius
         ),
-        tip_field=make_tip_field(problem.mesh, problem.regions, radius, problem.outline),
+        tip_field=make_felt_field(problem.mesh, problem.regions, radius, problem.outline),
         convergence=convergence,
         provenance=_provenance(problem),
     )

@@ -3,7 +3,9 @@
 Each tool tip (a sphere of centre p and radius r; of other tips, p lies r above the lowest point)
 presses at the surface point below it, along the normal n = grad phi / |grad phi|. Its force deforms
 the organ as that of a patch would, but for the dent right under the tip, which
-:mod:`avatar_core.contact.effects.tip_law` adds. Forces lambda of patches solve the Signorini
+:mod:`avatar_core.contact.effects.tip_law` adds. A sphere's distance is shifted by what the surface
+around it does to its contact (:mod:`avatar_core.contact.ball_shift`): phi is phi + psi from here
+on. Forces lambda of patches solve the Signorini
 conditions
 
     gap_t = phi(p_t) - r_t,   gap_t + sum_t' C_tt' lambda_t' >= 0,   lambda >= 0,  complementary,
@@ -91,6 +93,9 @@ ModelArrays = namedtuple(
         "access",
         "origin",
         "spacing",
+        "brick",
+        "shift",
+        "shift_spacing",
         "row",
         "carrier",
         "carrier_weight",
@@ -120,9 +125,9 @@ State = namedtuple(
         "seen",  # (T, 3) last valid position of the tip in contact [m]
         "force",  # (T,) lambda
         "active",  # (T,) the tip is closer than its radius to a surface that it may touch
-        "gap",  # (T,) phi - r
-        "slope",  # (T, 3) grad phi
-        "steepness",  # (T,) |grad phi|
+        "gap",  # (T,) phi + psi - r
+        "slope",  # (T, 3) grad (phi + psi)
+        "steepness",  # (T,) its length
         "normal",  # (T, 3) n
         "access",  # (T,) chi
         "access_slope",  # (T, 3)
@@ -201,7 +206,7 @@ def force_error(model, state, out, tips, tip_law):  # type: ignore[no-untyped-de
             relative = value_in_cell(model.force_error, cell)
             if tip_law is not None:
                 part = state.self_compliance[t] * state.force[t] / max(-state.gap[t], 1e-6)
-                relative = law_error(tip_law, t) + min(part, 1.0) * relative
+                relative = law_error(tip_law, state.steepness[t], t) + min(part, 1.0) * relative
             out.force_error[t] = size * relative
 
 

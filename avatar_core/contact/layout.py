@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from avatar_core.contact import kernels
+from avatar_core.contact.ball_shift import shift_of
 from avatar_core.contact.cloud import cloud_arrays
 from avatar_core.contact.dent import dent_arrays
 from avatar_core.contact.effects.base import Effect
@@ -42,6 +43,7 @@ from avatar_core.vademecum.certificate import Certificate
 if TYPE_CHECKING:
     from avatar_core.vademecum.large_deformation import LargeDeformation
     from avatar_core.vademecum.model import Vademecum
+    from avatar_core.vademecum.tip_field import TipField
 
 LANES = 32  # float32 numbers that a vectorised loop processes at once
 PERIOD = 1e-3  # of the steps [s]
@@ -52,7 +54,8 @@ class Layout:
     """The constant arrays of a step: of the organ and its tools, and of the chosen effects.
 
     arrays : ModelArrays
-        distance, access, origin, spacing: the tip field; row, carrier, carrier_weight,
+        distance, access, origin, spacing: the tip field; brick, shift (n_tools, n_bricks, BRICK,
+        BRICK, BRICK), shift_spacing: psi of each tip; row, carrier, carrier_weight,
         self_compliance: the tip response on its grid; force_error, relative, on the same grid;
         position (n_positions, 3) [m]; load (n_positions, 3, rank and zeros) and the contact_*
         blocks with their hash tables: compliance [m/N]; softness (1,), added where access fades
@@ -138,6 +141,7 @@ def lay_out_details(
     large = vademecum.large if find(effects, LargeDeformationEffect) is not None else None
     error = _force_error(vademecum.certificate, large, response.smoothing)
     reach = _reach(contact, surface.centers)
+    brick, shift, shift_spacing = _shifts(field, tips)
     law = tip_law_arrays(
         tips,
         vademecum.material,
@@ -160,6 +164,9 @@ def lay_out_details(
             access=field.access,
             origin=field.origin,
             spacing=field.spacing,
+            brick=brick,
+            shift=shift,
+            shift_spacing=shift_spacing,
             row=response.row,
             carrier=response.carrier,
             carrier_weight=response.carrier_weight,
@@ -184,6 +191,17 @@ def lay_out_details(
         yield Layout(
             arrays, selected_arrays(vademecum, effects, mass, nonlinear, reach, period, law, dent)
         )
+
+
+def _shifts(field: TipField, tips: Sequence[Tip]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """psi of all tips: bricks, (n_tools, n_bricks, BRICK, BRICK, BRICK) and the spacing (1,)."""
+    found = [shift_of(field, tip) for tip in tips]
+    brick, values, spacing = max(found, key=lambda one: one[1].size)
+    shift = np.zeros((len(tips), *values.shape), np.float32)
+    for own, (_, value, _) in zip(shift, found, strict=True):
+        if value.size:
+            own[:] = value
+    return brick, shift, np.array([spacing])
 
 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from avatar_core.common.jit import inlined
-from avatar_core.common.splines import cell_at, in_cell, on_grid
+from avatar_core.common.splines import add_in_bricks, cell_at, in_cell, on_grid
 from avatar_core.contact.tip_response import gather
 
 OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
@@ -40,6 +40,8 @@ def locate(model, state, t, tip, superposition):  # type: ignore[no-untyped-def]
     cell = cell_at(model.origin, model.spacing[0], tip)
     phi = in_cell(model.distance, cell, state.slope[t])
     state.gap[t] = phi - model.tip_offset[t]
+    fine = cell_at(model.origin, model.shift_spacing[0], tip)
+    state.gap[t] += add_in_bricks(model.brick, model.shift[t], fine, state.slope[t])
     if state.gap[t] >= 0.0:
         return OK
     access = in_cell(model.access, cell, state.access_slope[t])
@@ -77,7 +79,7 @@ def _is_continuous(state, t, tip):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_normal(state, t, p, phi):  # type: ignore[no-untyped-def]
-    """n = g / |g| with g = grad phi, and s = p - phi n."""
+    """n = g / |g| with g = grad (phi + psi), and s = p - phi n."""
     g = state.slope[t]
     state.steepness[t] = max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
     for d in range(3):

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 
 from avatar_core.contact import kernels, locate
+from avatar_core.contact.ball_shift import no_shift
 from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.selection import NO_EFFECTS, Selection, allocate
@@ -322,12 +323,16 @@ def warm_up(n_tools: int = 1) -> None:
     """Compile the halves of a step or read them from the cache. Not real-time safe."""
     single, double = np.float32, np.float64
     n, rank, points = 1, 1, 1
+    brick, shift, extent = no_shift(8.0)
     blocks = (np.zeros(n + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, 3, 3), single))
     arrays = ModelArrays(
         distance=np.full((8, 8, 8), 1.0, single),
         access=np.zeros((8, 8, 8), single),
         origin=np.zeros(3, double),
         spacing=np.ones(1, double),
+        brick=brick,
+        shift=np.stack([shift] * n_tools),
+        shift_spacing=np.array([extent]),
         row=np.full((8, 8, 8), -1, np.int32),
         carrier=np.zeros((0, 6), np.int32),
         carrier_weight=np.zeros((0, 6), single),

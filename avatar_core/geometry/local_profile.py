@@ -52,30 +52,44 @@ def local_profile(surface: Soup, points: np.ndarray, normals: np.ndarray) -> Loc
     points : ndarray, shape (n, 3), on the surface [m]
     normals : ndarray, shape (n, 3), unit vectors, outward
     """
-    height = _heights(surface, points, normals)
+    angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    height = heights_around(surface, points, normals, RADII, angle, STEEPEST)
+    height = np.clip(height, -RADII[:, None], RADII[:, None])
     terms = np.stack([RADII / 2.0, RADII**2 / 6.0], axis=1)
     curvature, growth = np.linalg.pinv(terms) @ (height.mean(axis=2) / RADII).T
     spread = 8.0 * height.var(axis=2) / RADII**4
     return LocalProfile(curvature, growth, spread[:, OUTER].mean(axis=1))
 
 
-def _heights(surface: Soup, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Heights of the tangent plane over the surface on the circles, (n, radii, directions) [m].
+def heights_around(
+    surface: Soup,
+    points: np.ndarray,
+    normals: np.ndarray,
+    radii: np.ndarray,
+    angles: np.ndarray,
+    steepest: float,
+) -> np.ndarray:
+    """Heights of the planes across the normals over the surface, shape (n, radii, angles) [m].
 
     A point of the circle at q, whose closest point of the surface is c, at the angle a from n, is
     |q - c| / cos(a) above it: exact over a plane side, to fourth order over a ball.
+
+    Parameters
+    ----------
+    surface, points, normals : as of :func:`local_profile`, points beside the surface as well
+    radii : ndarray, shape (m,) or (m, n), of the circles [m]
+    angles : ndarray, directions on the circles
+    steepest : squared cosine of the side that counts as the steepest
     """
     first, second = tangents(normals)
-    angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    around = np.cos(angle)[:, None, None] * first + np.sin(angle)[:, None, None] * second
-    out = np.empty((len(points), len(RADII), DIRECTIONS))
-    for k, radius in enumerate(RADII):
-        q = (points + radius * around).reshape(-1, 3)
+    around = np.cos(angles)[:, None, None] * first + np.sin(angles)[:, None, None] * second
+    out = np.empty((len(points), len(radii), len(angles)))
+    for k, radius in enumerate(radii):
+        q = (points + np.reshape(radius, (-1, 1)) * around).reshape(-1, 3)
         square, _, closest = igl.point_mesh_squared_distance(q, *surface)
         rise = ((q - closest).reshape(around.shape) * normals).sum(axis=2)
         square = np.maximum(square.reshape(rise.shape), 1e-30)
-        height = rise / np.maximum(rise**2 / square, STEEPEST)
-        out[:, k] = np.clip(height, -radius, radius).T
+        out[:, k] = (rise / np.maximum(rise**2 / square, steepest)).T
     return out
 
 

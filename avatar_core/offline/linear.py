@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.sparse as sp
 
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
@@ -38,7 +39,6 @@ from avatar_core.vademecum.modal_mass import (
     body_response,
 )
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
-from avatar_core.vademecum.tip_field import make_tip_field
 
 _MAX_OUTLIERS = 0.01  # part of the load positions whose fields may be stored in full
 _WORST_OVER_MEAN = 8 / 3  # the worst load may be this much worse than the mean asked for
@@ -96,7 +96,7 @@ def build_vademecum(
         far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
         near=displacement_near(far, response, surface, rule, outliers),
         contact_near=contact_near(far, response, surface, rule),
-        tip_field=make_tip_field(elasticity.mesh, regions, surface.patch_radius, outline),
+        tip_field=make_felt_field(elasticity.mesh, regions, surface.patch_radius, outline),
         body=body,
         convergence=Convergence(converged, rule.tolerance, solution.history, errors),
         provenance=provenance,

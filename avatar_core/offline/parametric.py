@@ -21,6 +21,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
@@ -43,7 +44,7 @@ from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.modal_mass import LEAST_MODES, BodyResponse, body_response
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.parametric import ParametricResponse, galerkin_field
-from avatar_core.vademecum.tip_field import TipField, make_tip_field
+from avatar_core.vademecum.tip_field import TipField
 
 _BASIS_OVER_RANK = 4.0  # functions of the basis over the modes used at given values
 _DRAWN = 6  # random values that a certificate is made at
@@ -110,7 +111,7 @@ def build_parametric_vademecum(
         rule = rule.with_wider_near_field()
         snapshots = [_with_near_field(snapshot, surface, rule) for snapshot in snapshots]
         error = _rank_error(_errors(snapshots, reduced), rule)
-    field = make_tip_field(elasticity.mesh, regions, surface.patch_radius, outline)
+    field = make_felt_field(elasticity.mesh, regions, surface.patch_radius, outline)
     whole = _assemble(
         name, elasticity, regions, surface, tuple(coordinates), rule, snapshots, reduced, field
     )

@@ -1,6 +1,6 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 2.3), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 2.4), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
 ``provenance``, ``convergence``, ``certificate`` (from schema 2.3 with ``contact_sites``), and from
@@ -17,6 +17,8 @@ Datasets:
     tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
     tip_field/curvature [1/m], growth [1/m2], anisotropy [1/m2], from schema 2.3; tip_field/tumour
     over a tumour
+    tip_field/shift/brick (bx, by, bz), value (n_radii, n_bricks, 8, 8, 8) [m], spacing [m], radius
+    (n_radii,) [m], from schema 2.4
 
 A vademecum with coordinates of the material (from schema 2.0) has
 the JSON attributes ``coordinates``, ``contrast``, and
@@ -72,11 +74,12 @@ from avatar_core.vademecum.schema import (
     PARAMETRIC_BODY_KEYS,
     PARAMETRIC_KEYS,
     PROFILE_KEYS,
+    SHIFT_KEYS,
     TUMOUR_KEYS,
     require_sound,
     shapes_of,
 )
-from avatar_core.vademecum.tip_field import TipField
+from avatar_core.vademecum.tip_field import BallShift, TipField
 
 FORMAT = "avatar vademecum"
 MAX_FILE_BYTES = 4 << 30
@@ -179,6 +182,7 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
     held += BODY_KEYS[:1] * bool(v.body)
     held += PROFILE_KEYS[:1] * (v.tip_field.curvature is not None)
     held += TUMOUR_KEYS[:1] * (v.tip_field.tumour is not None)
+    held += SHIFT_KEYS[:1] * (v.tip_field.shift is not None)
     held += PARAMETRIC_BODY_KEYS[:1] * bool(v.parametric and v.parametric.body)
     for key in shapes_of(held):
         value: Any = v
@@ -234,7 +238,7 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         far=SeparatedField(arrays["far/space"], arrays["far/load"]),
         near=blocks("near"),
         contact_near=blocks("contact_near"),
-        tip_field=TipField(*(arrays.get(f"tip_field/{name}") for name in TipField._fields)),
+        tip_field=_tip_field(arrays),
         convergence=of_plain(Convergence, plain["convergence"], "convergence"),
         provenance=of_plain(Provenance, plain["provenance"], "provenance"),
         certificate=_certificate(plain["certificate"], plain["accuracy"]),
@@ -243,6 +247,13 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         large=_large(arrays, plain["large"]),
         body=_body(arrays, BODY_KEYS),
     )
+
+
+def _tip_field(arrays: dict[str, np.ndarray]) -> TipField:
+    field = TipField(*(arrays.get(f"tip_field/{name}") for name in TipField._fields))
+    if SHIFT_KEYS[0] not in arrays:
+        return field
+    return field._replace(shift=BallShift(*(arrays[key] for key in SHIFT_KEYS)))
 
 
 def _body(arrays: dict[str, np.ndarray], keys: tuple[str, ...]) -> BodyResponse | None:

@@ -62,12 +62,28 @@ TUMOUR_REACH = 2.0  # and patch radii within which energy counts: they fit resol
 
 # distance [m], access, curvature [1/m], growth [1/m^2], anisotropy [1/m^2], tumour, each
 # (nx, ny, nz) float32: phi, chi, kappa, tau, D, f, the last four None in files before schema 2.3,
-# the last without a tumour; origin (3,) [m]; spacing (1,) [m]
+# the last without a tumour; origin (3,) [m]; spacing (1,) [m]; shift, a BallShift, None in files
+# before schema 2.4
 TipField = namedtuple(
     "TipField",
-    ["distance", "access", "origin", "spacing", "curvature", "growth", "anisotropy", "tumour"],
-    defaults=(None, None, None, None),
+    [
+        "distance",
+        "access",
+        "origin",
+        "spacing",
+        "curvature",
+        "growth",
+        "anisotropy",
+        "tumour",
+        "shift",
+    ],
+    defaults=(None, None, None, None, None),
 )
+
+# psi of :mod:`avatar_core.contact.ball_shift` in bricks (:mod:`avatar_core.common.splines`) from
+# the same origin: brick (bx, by, bz) int32; value (n_radii, n_bricks, BRICK, BRICK, BRICK) float32
+# [m]; spacing (1,) [m]; radius (n_radii,) of the balls, rising [m]
+BallShift = namedtuple("BallShift", ["brick", "value", "spacing", "radius"])
 
 
 def make_tip_field(

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from avatar_core.contact.ball_shift import no_shift
 from avatar_core.contact.cloud_kernels import BLOCK
 from avatar_core.contact.dent import dent_arrays
 from avatar_core.contact.effects.base import Effect
@@ -92,11 +93,15 @@ def _organ(
     )
     start, slot = hash_rows(blocks)
     gamma = float((load[0, 2] ** 2).sum()) + float(single(near))
+    brick, shift, extent = no_shift(spacing * max(shape))
     arrays = ModelArrays(
         distance=phi(*np.meshgrid(*grid, indexing="ij")).astype(single),
         access=np.ones(shape, single),
         origin=origin,
         spacing=np.array([spacing]),
+        brick=brick,
+        shift=shift[None],
+        shift_spacing=np.array([extent]),
         row=np.zeros(shape, np.int32),
         carrier=np.zeros((1, 3), np.int32),
         carrier_weight=np.array([[1.0, 0.0, 0.0]], single),

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,8 +68,36 @@ def test_file_gives_back_the_same_vademecum(phantom_vademecum: Vademecum, tmp_pa
         a, b = getattr(v, name), getattr(phantom_vademecum, name)
         for field in a.__dataclass_fields__:
             np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+    for a, b in zip(v.tip_field.shift, phantom_vademecum.tip_field.shift, strict=True):
+        np.testing.assert_array_equal(a, b)
     assert v.nbytes == (tmp_path / "a.h5").stat().st_size
     assert len(v.id) == 64
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("brick", lambda brick: brick + 1, "points outside"),
+        ("brick", lambda brick: brick[1:], "does not cover"),
+        ("brick", lambda brick: np.pad(brick, 3, constant_values=-1), "does not cover"),
+        ("spacing", lambda spacing: spacing / 10.0, "spacing' is"),
+        ("radius", lambda radius: radius[::-1].copy(), "does not rise"),
+    ],
+)
+def test_a_shift_of_balls_that_does_not_fit_is_refused(
+    phantom_vademecum: Vademecum,
+    tmp_path: Path,
+    name: str,
+    change: Callable[[np.ndarray], np.ndarray],
+    message: str,
+) -> None:
+    field = phantom_vademecum.tip_field
+    shift = field.shift._replace(**{name: change(getattr(field.shift, name))})
+    save_vademecum(
+        replace(phantom_vademecum, tip_field=field._replace(shift=shift)), tmp_path / "a.h5"
+    )
+    with pytest.raises(StorageError, match=message):
+        load_vademecum(tmp_path / "a.h5")
 
 
 def test_files_keep_their_names_for_the_force_on_a_tip(

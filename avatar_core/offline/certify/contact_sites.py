@@ -289,7 +289,7 @@ def _at_site(
                     force,
                     float(models[i].out.force_error[0]),
                     float(
-                        law_error(models[i].effects.tip_law, 0)
+                        law_error(models[i].effects.tip_law, models[i].state.steepness[0], 0)
                         * np.linalg.norm(models[i].out.force[0])
                     ),
                     pressed(patches[i], site, tip, depth),
