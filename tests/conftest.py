@@ -15,7 +15,7 @@ os.environ.setdefault("RAYON_NUM_THREADS", "1")
 import pytest
 
 from avatar_core.atlas import patient
-from avatar_core.contact import layout
+from avatar_core.contact import ball_shift, layout
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry import mesh
 from avatar_core.geometry.phantom import phantom_liver
@@ -61,7 +61,9 @@ def same_fields() -> Iterator[None]:
     """The contact geometry of one organ is sampled once, whatever is built around it."""
     with pytest.MonkeyPatch.context() as patch:
         for builder in (linear, parametric, patient):
-            patch.setattr(builder, "make_felt_field", kept_fields.kept)
+            patch.setattr(builder, "make_felt_field", kept_fields.felt)
+        patch.setattr(ball_shift, "make_tip_field", kept_fields.smooth)
+        patch.setattr(patient, "make_tip_field", kept_fields.smooth)
         yield
 
 

@@ -8,26 +8,38 @@ from __future__ import annotations
 from avatar_core.contact import ball_shift
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.vademecum import tip_field
 from avatar_core.vademecum.tip_field import TipField
 
 from .content import ByContent
 from .stored import on_disk
 
 # Imports never run back: a field comes from no later room.
-_ROOMS = ("common", "geometry", "fem", "reduction", "shapes", "vademecum", "contact")
+_ROOMS = ("common", "geometry", "fem", "reduction", "shapes", "vademecum")
 
-_plain = ball_shift.make_felt_field
-
-
-def _sampled(organ: ByContent) -> TipField:
-    return _plain(*organ.values)
+_smooth, _felt = tip_field.make_tip_field, ball_shift.make_felt_field
 
 
-_found = on_disk(_sampled, _ROOMS)
+def _of_tips(organ: ByContent) -> TipField:
+    return _smooth(*organ.values)
 
 
-def kept(
+def _of_balls(organ: ByContent) -> TipField:
+    return _felt(*organ.values)
+
+
+_found, _found_for_balls = on_disk(_of_tips, _ROOMS), on_disk(_of_balls, (*_ROOMS, "contact"))
+
+
+def smooth(
     mesh: TetMesh, regions: Regions, patch_radius: float, outline: SurfaceMesh | None = None
 ) -> TipField:
-    """In the place of ``make_felt_field``; what it refuses is not kept."""
+    """In the place of ``make_tip_field``; what it refuses is not kept."""
     return _found(ByContent(mesh, regions, float(patch_radius), outline))
+
+
+def felt(
+    mesh: TetMesh, regions: Regions, patch_radius: float, outline: SurfaceMesh | None = None
+) -> TipField:
+    """In the place of ``make_felt_field``, likewise."""
+    return _found_for_balls(ByContent(mesh, regions, float(patch_radius), outline))

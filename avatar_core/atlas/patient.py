@@ -29,7 +29,7 @@ from avatar_core.atlas.transfer import (
 from avatar_core.common.processes import cpu_seconds, repeatable
 from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
-from avatar_core.geometry.mesh import TetMesh, tetrahedralize
+from avatar_core.geometry.mesh import Regions, TetMesh, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import certify
 from avatar_core.offline.linear import build_vademecum, with_rank
@@ -48,6 +48,7 @@ from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import load_map
 from avatar_core.shapes.registration import Registration, register
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
+from avatar_core.vademecum.tip_field import TipField, make_tip_field
 
 Fidelity = Literal["interpolated", "reduced", "solved"]
 Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
@@ -230,12 +231,14 @@ def interpolated(
 
     ``lle-grid`` combines at common positions, as in the paper, the others nodewise on the template.
     The near field is that of the modes alone. The contact compliance includes the residual
-    compliance that the base holds for each patch.
+    compliance that the base holds for each patch. Balls feel the smooth surface: what facets and
+    folds change is less than the error of the response.
     """
     response = interpolated_response(problem, base, weights, options)
     support = RESIDUAL_SUPPORT * problem.loads.patch_radius
     convergence = Convergence(converged=False, tolerance=float("nan"))
-    return _assembled(problem, response, support, convergence, options)
+    field_ = make_tip_field(*_surroundings(problem))
+    return _assembled(problem, response, support, convergence, options, field_)
 
 
 def interpolated_response(
@@ -297,7 +300,8 @@ def vademecum_of_reduced(
         options.tolerance,
         rank_errors=tuple(RankError(e.rank, e.mean, e.worst) for e in found.history),
     )
-    return _assembled(problem, found.response, found.support, convergence, options)
+    field_ = make_felt_field(*_surroundings(problem))
+    return _assembled(problem, found.response, found.support, convergence, options, field_)
 
 
 def solved(
@@ -333,12 +337,18 @@ def certified(
     )
 
 
+def _surroundings(problem: PatientProblem) -> tuple[TetMesh, Regions, float, SurfaceMesh | None]:
+    """What a tip field is made of."""
+    return problem.mesh, problem.regions, problem.loads.patch_radius, problem.outline
+
+
 def _assembled(
     problem: PatientProblem,
     response: CompactResponse,
     support: float,
     convergence: Convergence,
     options: PatientOptions,
+    tip_field: TipField,
 ) -> Vademecum:
     """The vademecum of a compact response: leading modes as far field, the rest as near field."""
     rule, loads = options.build, problem.loads
@@ -356,7 +366,7 @@ def _assembled(
         contact_near=residual_compliance_blocks(
             response.residual_compliance, support, loads, rule.contact_support * radius
         ),
-        tip_field=make_felt_field(problem.mesh, problem.regions, radius, problem.outline),
+        tip_field=tip_field,
         convergence=convergence,
         provenance=_provenance(problem),
     )

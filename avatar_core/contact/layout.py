@@ -29,7 +29,7 @@ from avatar_core.contact.effects.selection import (
     selected_arrays,
 )
 from avatar_core.contact.effects.several_tools import SeveralTools
-from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, tip_law_arrays
+from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, UNSHIFTED, tip_law_arrays
 from avatar_core.contact.effects.tip_profile import ANISOTROPY, KAPPA, STIFFNESS, TAKEN, TAU
 from avatar_core.contact.kernels import ModelArrays
 from avatar_core.contact.locate import MAX_DEPTH
@@ -146,7 +146,7 @@ def lay_out_details(
         tips,
         vademecum.material,
         _local(vademecum, response.self_compliance),
-        (vademecum.certificate or Certificate.unknown()).contact_sites.factor,
+        _error_factors(vademecum, tips),
         large is not None and large.material == "neo-hookean",
     )
     for detail in details:
@@ -233,6 +233,13 @@ def _nonlinear_arrays(
     near = large.near[:, kept] * fade[kept, None].astype(large.near.dtype)
     # C order whether or not blocks were left out: one memory layout, one compilation
     return LargeDeformationArrays(grid, large.load, np.ascontiguousarray(near))
+
+
+def _error_factors(vademecum: Vademecum, tips: Sequence[Tip]) -> np.ndarray:
+    """On the law's error of each tip: the organ's own, and what it is worth without a shift."""
+    organ = (vademecum.certificate or Certificate.unknown()).contact_sites.factor
+    shifted = [vademecum.tip_field.shift is not None and tip.shape == "sphere" for tip in tips]
+    return organ * np.where(shifted, 1.0, UNSHIFTED)
 
 
 def _force_error(

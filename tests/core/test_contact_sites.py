@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from avatar_core.cli import picture
-from avatar_core.contact.effects.tip_law import LAW_ERROR
+from avatar_core.contact.effects.tip_law import LAW_ERROR, UNSHIFTED
 from avatar_core.contact.model import estimate_error, prepare, step
 from avatar_core.errors import ContactError, CoordinateError, MeshError, StorageError
 from avatar_core.fem.elasticity import Elasticity, Material
@@ -106,6 +106,14 @@ def test_the_factor_scales_the_laws_part_of_the_error_that_is_said(box: Vademecu
     assert force == same > 0.0
     law = force * (LAW_ERROR + steeper)
     assert thrice - once == pytest.approx(2.0 * law, rel=1e-5)
+
+
+def test_an_older_file_says_more_error(box: Vademecum) -> None:
+    """It does not know the surface around a ball."""
+    force, said, steeper = pressed(box)
+    older = replace(box, tip_field=box.tip_field._replace(shift=None))
+    law = force * (LAW_ERROR + steeper)
+    assert pressed(older)[1] - said == pytest.approx((UNSHIFTED - 1.0) * law, rel=1e-3)
 
 
 def test_an_organ_without_contact_sites_says_the_same_error_as_with_the_factor_one(
