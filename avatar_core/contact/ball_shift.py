@@ -17,6 +17,8 @@ nearest.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.ndimage import map_coordinates, maximum_filter, spline_filter
 
@@ -68,28 +70,37 @@ def with_ball_shift(field: TipField, surface: Soup) -> TipField:
     return field._replace(shift=BallShift(brick, cut, np.array([SPACING]), np.array(RADII)))
 
 
-def shift_of(field: TipField, tip: Tip) -> tuple[np.ndarray, np.ndarray, float]:
-    """psi of a tip: ``brick``, its samples (n_bricks, BRICK, BRICK, BRICK) and their spacing [m].
+def shifts_of(field: TipField, tips: Sequence[Tip]) -> BallShift:
+    """psi of each tip, in the place of each radius; zero for tips that are no balls."""
+    radius, balls = np.array([tip.radius for tip in tips]), [tip.shape == "sphere" for tip in tips]
+    if field.shift is None or not any(balls):
+        return no_shift(float(field.spacing[0]) * max(field.distance.shape), radius)
+    found = {r: _of_radius(field, field.shift, r) for r in radius[balls]}
+    brick = _used(np.stack(list(found.values())))
+    value = np.zeros((len(tips), int(brick.max()) + 1, BRICK, BRICK, BRICK), np.float32)
+    for own, r, is_ball in zip(value, radius, balls, strict=True):
+        if is_ball:
+            own[:] = _in_bricks(found[r], brick)
+    return BallShift(brick, value, field.shift.spacing, radius)
 
-    Zero for tips that are no balls, and where the field has none.
-    """
-    shift = field.shift
-    if shift is None or tip.shape != "sphere":
-        return no_shift(float(field.spacing[0]) * max(field.distance.shape))
-    place = np.interp(np.log(tip.radius), np.log(shift.radius), np.arange(len(shift.radius)))
+
+def no_shift(extent: float, radius: np.ndarray) -> BallShift:
+    """Zero for tips up to an extent [m]: one brick that is none."""
+    value = np.zeros((len(radius), 0, BRICK, BRICK, BRICK), np.float32)
+    return BallShift(np.full((1, 1, 1), -1, np.int32), value, np.array([extent]), radius)
+
+
+def _of_radius(field: TipField, shift: BallShift, radius: float) -> np.ndarray:
+    """Coefficients of psi of a ball at all points of the grid."""
+    place = np.interp(np.log(radius), np.log(shift.radius), np.arange(len(shift.radius)))
     low, part = int(place), float(place) - int(place)
-    if shift.radius[low] == tip.radius:
-        return shift.brick, shift.value[low], float(shift.spacing[0])
+    if shift.radius[low] == radius:
+        return _dense(shift.value[low], shift.brick)
     grid = _Grid(field, np.array(shift.brick.shape), float(shift.spacing[0]))
-    mixed = (1.0 - part) * grid.moved(shift, low, tip.radius)
+    mixed = (1.0 - part) * grid.moved(shift, low, radius)
     if part > 0.0:
-        mixed += part * grid.moved(shift, low + 1, tip.radius)
-    return shift.brick, _in_bricks(mixed, shift.brick), float(shift.spacing[0])
-
-
-def no_shift(extent: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """As :func:`shift_of`, zero up to an extent [m]: one brick that is none."""
-    return np.full((1, 1, 1), -1, np.int32), np.zeros((0,) + (BRICK,) * 3, np.float32), extent
+        mixed += part * grid.moved(shift, low + 1, radius)
+    return mixed
 
 
 class _Grid:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from avatar_core.contact import kernels
-from avatar_core.contact.ball_shift import shift_of
+from avatar_core.contact.ball_shift import shifts_of
 from avatar_core.contact.cloud import cloud_arrays
 from avatar_core.contact.dent import dent_arrays
 from avatar_core.contact.effects.base import Effect
@@ -43,7 +43,6 @@ from avatar_core.vademecum.certificate import Certificate
 if TYPE_CHECKING:
     from avatar_core.vademecum.large_deformation import LargeDeformation
     from avatar_core.vademecum.model import Vademecum
-    from avatar_core.vademecum.tip_field import TipField
 
 LANES = 32  # float32 numbers that a vectorised loop processes at once
 PERIOD = 1e-3  # of the steps [s]
@@ -141,7 +140,7 @@ def lay_out_details(
     large = vademecum.large if find(effects, LargeDeformationEffect) is not None else None
     error = _force_error(vademecum.certificate, large, response.smoothing)
     reach = _reach(contact, surface.centers)
-    brick, shift, shift_spacing = _shifts(field, tips)
+    shift = shifts_of(field, tips)
     law = tip_law_arrays(
         tips,
         vademecum.material,
@@ -164,9 +163,9 @@ def lay_out_details(
             access=field.access,
             origin=field.origin,
             spacing=field.spacing,
-            brick=brick,
-            shift=shift,
-            shift_spacing=shift_spacing,
+            brick=shift.brick,
+            shift=shift.value,
+            shift_spacing=shift.spacing,
             row=response.row,
             carrier=response.carrier,
             carrier_weight=response.carrier_weight,
@@ -191,17 +190,6 @@ def lay_out_details(
         yield Layout(
             arrays, selected_arrays(vademecum, effects, mass, nonlinear, reach, period, law, dent)
         )
-
-
-def _shifts(field: TipField, tips: Sequence[Tip]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """psi of all tips: bricks, (n_tools, n_bricks, BRICK, BRICK, BRICK) and the spacing (1,)."""
-    found = [shift_of(field, tip) for tip in tips]
-    brick, values, spacing = max(found, key=lambda one: one[1].size)
-    shift = np.zeros((len(tips), *values.shape), np.float32)
-    for own, (_, value, _) in zip(shift, found, strict=True):
-        if value.size:
-            own[:] = value
-    return brick, shift, np.array([spacing])
 
 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:

@@ -93,15 +93,15 @@ def _organ(
     )
     start, slot = hash_rows(blocks)
     gamma = float((load[0, 2] ** 2).sum()) + float(single(near))
-    brick, shift, extent = no_shift(spacing * max(shape))
+    shift = no_shift(spacing * max(shape), np.zeros(1))
     arrays = ModelArrays(
         distance=phi(*np.meshgrid(*grid, indexing="ij")).astype(single),
         access=np.ones(shape, single),
         origin=origin,
         spacing=np.array([spacing]),
-        brick=brick,
-        shift=shift[None],
-        shift_spacing=np.array([extent]),
+        brick=shift.brick,
+        shift=shift.value,
+        shift_spacing=shift.spacing,
         row=np.zeros(shape, np.int32),
         carrier=np.zeros((1, 3), np.int32),
         carrier_weight=np.array([[1.0, 0.0, 0.0]], single),

@@ -13,7 +13,7 @@ from avatar_core.contact.ball_shift import (
     RETREAT,
     SPACING,
     make_felt_field,
-    shift_of,
+    shifts_of,
     with_ball_shift,
 )
 from avatar_core.contact.ball_shift import _dense as dense
@@ -46,9 +46,9 @@ def roof() -> TipField:
 
 
 def psi(field: TipField, radius: float, at: np.ndarray) -> np.ndarray:
-    brick, values, spacing = shift_of(field, Tip("sphere", radius))
-    out = np.empty(len(at))
-    evaluate_all(dense(values, brick), field.origin, spacing, at, out, np.empty_like(at))
+    shift = shifts_of(field, [Tip("sphere", radius)])
+    values, out = dense(shift.value[0], shift.brick), np.empty(len(at))
+    evaluate_all(values, field.origin, shift.spacing[0], at, out, np.empty_like(at))
     return out
 
 
@@ -120,7 +120,7 @@ def test_a_ball_between_two_radii_feels_what_lies_between() -> None:
     np.testing.assert_allclose(between, psi(own, radius, at), rtol=0.1, atol=3e-5)
 
 
-@pytest.mark.parametrize(("radius", "nearest"), [(1e-3, RADII[0]), (15e-3, RADII[-1])])
+@pytest.mark.parametrize(("radius", "nearest"), [(1e-3, RADII[0]), (20e-3, RADII[-1])])
 def test_a_ball_beyond_the_radii_feels_as_the_nearest_one_does(
     radius: float, nearest: float
 ) -> None:
@@ -132,8 +132,11 @@ def test_a_ball_beyond_the_radii_feels_as_the_nearest_one_does(
 
 
 def test_only_balls_are_shifted() -> None:
-    assert shift_of(roof(), Tip("flat", 3e-3))[1].size == 0
-    assert shift_of(roof()._replace(shift=None), Tip("sphere", 3e-3))[1].size == 0
-    brick, values, spacing = shift_of(roof(), Tip("sphere", 3e-3))
-    assert spacing == SPACING
-    assert len(values) == brick.max() + 1 > 0
+    tips = [Tip("flat", 3e-3), Tip("sphere", 3e-3), Tip("sphere", 17e-3), Tip("sphere", 3e-3)]
+    shift = shifts_of(roof(), tips)
+    assert shift.spacing == SPACING
+    assert not shift.value[0].any()
+    assert abs(shift.value[1:]).max(axis=(1, 2, 3, 4)).min() > 5e-5
+    np.testing.assert_array_equal(shift.value[1], shift.value[3])
+    assert shifts_of(roof(), tips[:1]).value.size == 0
+    assert shifts_of(roof()._replace(shift=None), tips).value.size == 0
