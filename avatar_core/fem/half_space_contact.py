@@ -53,7 +53,7 @@ def loads_on_heights(
     """
     rise = window[:, None] * ring_radii()
     gap = radius - np.sqrt(radius**2 - rise**2) - depth[:, None]
-    gap = (gap[:, :, None] + height).reshape(len(depth), -1) / window[:, None]
+    gap = (gap[:, :, None] + height).reshape(len(depth), RINGS * SECTORS) / window[:, None]
     step, weight, largest = _problem()
     load = np.empty(len(depth))
     _solve((gap * (weight / largest)).astype(np.float32), step, weight, load)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from avatar_core.cli import main as cli
+from avatar_core.common.splines import evaluate
 from avatar_core.contact.effects import Respiration
 from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import middle_of_access, push_and_slide
@@ -256,10 +257,11 @@ def test_tools_push_and_slide_without_a_jump(phantom_vademecum: Vademecum) -> No
     assert path.shape == (600, 3)
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 0.5e-3
     model = prepare(phantom_vademecum, (Tip("sphere", radius),), cloud="off", effects=())
-    gaps = []
+    field, gaps = phantom_vademecum.tip_field, []
     for tip in path:
         assert step(model, tip[None]) == 0
-        gaps.append(model.state.gap[0])
+        place = (field.origin, field.spacing[0], tip, np.zeros(3), np.nan)
+        gaps.append(evaluate(field.distance, *place) - radius)
     assert gaps[0] > 0
     assert min(gaps[:200]) == pytest.approx(-PUSH, abs=1e-3)
     np.testing.assert_allclose(gaps[400:], -DEPTH, atol=1e-6)

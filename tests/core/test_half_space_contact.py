@@ -68,6 +68,10 @@ def test_the_tilt_of_a_plane_turns_the_force() -> None:
     assert tilted == pytest.approx(load(radius, left), rel=0.04)
 
 
+def test_no_balls_no_loads() -> None:
+    assert loads_on_heights(5e-3, np.empty(0), np.empty(0), np.empty((0, 8, 8))).shape == (0,)
+
+
 def test_no_overlap_no_load() -> None:
     assert load(5e-3, 1e-3, 3e3, 3e3) > 0.0
     window, height = np.array([1e-3]), np.full((1, len(ring_radii()), len(sector_angles())), 2e-3)
