@@ -123,15 +123,9 @@ def add_in_bricks(brick, values, cell, gradient):  # type: ignore[no-untyped-def
     (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
     value = 0.0
     for i in range(3):
-        x = nx + i
         for j in range(3):
-            y = ny + j
             for k in range(3):
-                z = nz + k
-                b = brick[x >> _SHIFT, y >> _SHIFT, z >> _SHIFT]
-                if b < 0:
-                    continue
-                v = values[b, x & _LAST, y & _LAST, z & _LAST]
+                v = _in_brick(brick, values, nx + i, ny + j, nz + k)
                 value += wx[i] * wy[j] * wz[k] * v
                 gradient[0] += dx[i] * wy[j] * wz[k] * v
                 gradient[1] += wx[i] * dy[j] * wz[k] * v
@@ -146,15 +140,9 @@ def add_second_derivatives(brick, values, cell, spacing, hessian):  # type: igno
     end = 1.0 / (spacing * spacing)
     curve = (end, -2.0 * end, end)
     for i in range(3):
-        x = nx + i
         for j in range(3):
-            y = ny + j
             for k in range(3):
-                z = nz + k
-                b = brick[x >> _SHIFT, y >> _SHIFT, z >> _SHIFT]
-                if b < 0:
-                    continue
-                v = values[b, x & _LAST, y & _LAST, z & _LAST]
+                v = _in_brick(brick, values, nx + i, ny + j, nz + k)
                 hessian[0, 0] += curve[i] * wy[j] * wz[k] * v
                 hessian[1, 1] += wx[i] * curve[j] * wz[k] * v
                 hessian[2, 2] += wx[i] * wy[j] * curve[k] * v
@@ -165,6 +153,13 @@ def add_second_derivatives(brick, values, cell, spacing, hessian):  # type: igno
                 ):
                     hessian[a, c] += slope
                     hessian[c, a] += slope
+
+
+@fast
+def _in_brick(brick, values, i, j, k):  # type: ignore[no-untyped-def]
+    """A sample of a field in bricks."""
+    b = brick[i >> _SHIFT, j >> _SHIFT, k >> _SHIFT]
+    return values[b, i & _LAST, j & _LAST, k & _LAST] if b >= 0 else 0.0
 
 
 @fast

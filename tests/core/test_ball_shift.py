@@ -17,6 +17,7 @@ from avatar_core.contact.ball_shift import (
     with_ball_shift,
 )
 from avatar_core.contact.ball_shift import _dense as dense
+from avatar_core.contact.ball_shift import _of_radius as of_radius
 from avatar_core.contact.effects.tip_law import depths_under_loads, tip_law_arrays, tip_law_state
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.half_space_contact import loads_on_heights, ring_radii, sector_angles
@@ -107,6 +108,8 @@ def test_nothing_is_felt_before_the_ball_touches() -> None:
         phi = np.empty(2)
         evaluate_all(field.distance, field.origin, field.spacing[0], at, phi, np.empty_like(at))
         assert (phi + psi(field, radius, at) > radius).all()
+        touching, pressed = psi(field, radius, over_the_ridge(radius, np.array([0.0, 1e-3])))
+        assert abs(touching) < 0.15 * abs(pressed)
 
 
 def test_a_ball_between_two_radii_feels_what_lies_between() -> None:
@@ -129,6 +132,9 @@ def test_a_ball_beyond_the_radii_feels_as_the_nearest_one_does(
     found = psi(roof(), radius, over_the_ridge(radius, depths))
     np.testing.assert_allclose(found, as_nearest, rtol=0.1, atol=3e-5)
     assert abs(as_nearest).max() > 5e-5
+    shift = shifts_of(roof(), [Tip("sphere", radius)])
+    whole = of_radius(roof(), roof().shift, radius)
+    np.testing.assert_allclose(dense(shift.value[0], shift.brick), whole, atol=1.1e-6)
 
 
 def test_only_balls_are_shifted() -> None:
