@@ -15,7 +15,7 @@ import pickle
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import ParamSpec, TypeVar
@@ -89,5 +89,6 @@ def _locked(path: Path) -> Iterator[None]:
 
 def _drop_unused() -> None:
     for file in CACHE.iterdir():
-        if file.stat().st_mtime < time.time() - UNUSED:
-            file.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # another worker has just finished its part
+            if file.stat().st_mtime < time.time() - UNUSED:
+                file.unlink()
