@@ -37,10 +37,10 @@ from avatar_core.common.jit import entry, fast, inlined
 from avatar_core.common.splines import cell_at, value_in_cell
 from avatar_core.contact.cloud_kernels import deform
 from avatar_core.contact.effects.friction import (
+    add_torque,
     force_squared,
     gather_friction,
     solve_friction,
-    write_torque,
 )
 from avatar_core.contact.effects.inertia import advance_inertia, predict_inertia
 from avatar_core.contact.effects.large_deformation import add_nonlinear_force, sample_coefficients
@@ -254,7 +254,7 @@ def _locate_tips(  # type: ignore[no-untyped-def]
     """Gap and compliance of each tip on its own; returns the worst status."""
     status = OK
     for t in range(tips.shape[0]):
-        out.status[t] = locate(model, state, t, tips[t], superposition)
+        out.status[t] = locate(model, state, t, tips[t], superposition, tip_law)
         status = max(status, out.status[t])
         if not state.active[t]:
             state.force[t] = 0.0
@@ -415,7 +415,7 @@ def write_forces(model, state, out, tips, effects):  # type: ignore[no-untyped-d
         if add_nonlinear_force(state, e.large_deformation, out, t) and out.status[t] == OK:
             out.status[t] = EXTRAPOLATED
         add_tip_force(state, e.tip_law, e.large_deformation, out, t)
-        write_torque(model, state, e.friction, out, t)
+        add_torque(model, state, e.friction, out, t)
         out.contact_tool[n] = t
         fade = model.softness[0] * (1.0 / state.access[t] - 1.0)
         out.contact_penetration[n] = fade * state.force[t]

@@ -29,6 +29,7 @@ from avatar_core.contact.effects.selection import (
     selected_arrays,
 )
 from avatar_core.contact.effects.several_tools import SeveralTools
+from avatar_core.contact.effects.tilt import Tilt, tilt_arrays
 from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, UNSHIFTED, tip_law_arrays
 from avatar_core.contact.effects.tip_profile import ANISOTROPY, KAPPA, STIFFNESS, TAKEN, TAU
 from avatar_core.contact.kernels import ModelArrays
@@ -129,6 +130,9 @@ def lay_out_details(
         raise SceneError(
             f"{len(tips)} tools without several_tools; add it to the effects, or name one tool"
         )
+    leaning = find(effects, Tilt)
+    if leaning is not None:
+        leaning.require_flat(tips)
     rank = vademecum.far.rank
     vademecum, mass = adapted_vademecum(vademecum, effects)
     surface, contact = vademecum.surface, vademecum.contact_near
@@ -141,6 +145,7 @@ def lay_out_details(
     error = _force_error(vademecum.certificate, large, response.smoothing)
     reach = _reach(contact, surface.centers)
     shift = shifts_of(field, tips)
+    tilt = tilt_arrays(leaning, tips, field) if leaning is not None else None
     law = tip_law_arrays(
         tips,
         vademecum.material,
@@ -188,7 +193,8 @@ def lay_out_details(
         nonlinear = _nonlinear_arrays(vademecum, large, response, shown.fade) if large else None
         dent = dent_arrays(tips, points, surface.centers, surface.patch_radius) if law else None
         yield Layout(
-            arrays, selected_arrays(vademecum, effects, mass, nonlinear, reach, period, law, dent)
+            arrays,
+            selected_arrays(vademecum, effects, mass, nonlinear, reach, period, law, dent, tilt),
         )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from avatar_core.common.jit import inlined
 from avatar_core.common.splines import add_in_bricks, cell_at, in_cell, on_grid
+from avatar_core.contact.effects.tip_law import edge_below
 from avatar_core.contact.tip_response import gather
 
 OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
@@ -27,7 +28,7 @@ FULL_ACCESS = 0.99  # below, the force fades
 
 
 @inlined
-def locate(model, state, t, tip, superposition):  # type: ignore[no-untyped-def]
+def locate(model, state, t, tip, superposition, tip_law):  # type: ignore[no-untyped-def]
     """Gap, normal, access, compliance, surface point and load positions of a tip in contact."""
     before, continuous = state.passage[t], _is_continuous(state, t, tip)
     state.active[t] = False
@@ -42,6 +43,7 @@ def locate(model, state, t, tip, superposition):  # type: ignore[no-untyped-def]
     state.gap[t] = phi - model.tip_offset[t]
     fine = cell_at(model.origin, model.shift_spacing[0], tip)
     state.gap[t] += add_in_bricks(model.brick, model.shift[t], fine, state.slope[t])
+    state.gap[t] -= edge_below(tip_law, t, cell)
     if state.gap[t] >= 0.0:
         return OK
     access = in_cell(model.access, cell, state.access_slope[t])

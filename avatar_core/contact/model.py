@@ -68,8 +68,8 @@ class ContactModel:
     state : State, forces kept for the next period, and scratch
     effects : Selection, state and scratch of the chosen effects, None for the others
     out : Out
-        force, torque (n_tools, 3) [N, N m], of the organ on each tool about its tip (a
-        frictionless sphere has no torque about its centre); status (n_tools,), of each;
+        force, torque (n_tools, 3) [N, N m], of the organ on each tool about its pose: of
+        friction, and of a punch that leans; status (n_tools,), of each;
         cloud (n_points, 6) float32, deformed position and displacement [m];
         force_error (n_tools,), that one contact in ten exceeds [N], by :func:`estimate_error`;
         n_contacts (1,), then contact_tool, contact_position, contact_normal (organ to tool),
@@ -99,6 +99,23 @@ class ContactModel:
     def nbytes(self) -> int:
         """Memory of the constant arrays [bytes]."""
         return self.layout.nbytes
+
+    @property
+    def axes(self) -> np.ndarray | None:
+        """Unit vectors from tip to shaft, shape (n_tools, 3), to be set before a step.
+
+        None without tilt; zero, as at first, for a tool along the surface's normal.
+        """
+        return None if self._tilt is None else np.asarray(self._tilt.axis)
+
+    @property
+    def shaft(self) -> np.ndarray | None:
+        """The same in the frame of the tools' poses, shape (3,); None without tilt."""
+        return None if self._tilt is None else np.asarray(self._tilt.shaft)
+
+    @property
+    def _tilt(self) -> Any:
+        return None if self.effects.tip_law is None else self.effects.tip_law.tilt
 
     @property
     def n_modes(self) -> int:
@@ -138,10 +155,17 @@ class ContactModel:
         self.state.force[:] = 0.0
         fresh = _effects(self.layout)
         for mine, new in zip(self.effects, fresh, strict=True):
-            pairs: Any = zip(mine or (), new or (), strict=True)
-            for array, clean in pairs:
-                if array is not clean:  # constants are the same in both
-                    array[...] = clean
+            _restore(mine, new)
+
+
+def _restore(arrays: Any, clean: Any) -> None:
+    """Set arrays, or tuples of them, to those of the same kind that nothing has touched."""
+    if isinstance(arrays, np.ndarray):
+        if arrays is not clean:  # constants are the same in both
+            arrays[...] = clean
+        return
+    for one, other in zip(arrays or (), clean or (), strict=True):
+        _restore(one, other)
 
 
 def prepare(

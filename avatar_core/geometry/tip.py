@@ -25,7 +25,8 @@ ANGLES = (10.0, 85.0)  # of a cone [degrees]
 
 @dataclass(frozen=True)
 class Tip:
-    """The part of a tool that touches; its axis is taken along the surface's normal.
+    """The part of a tool that touches; its axis is taken along the surface's normal, but for a
+    flat punch with :class:`avatar_core.contact.effects.Tilt`.
 
     A pose is that of the centre of a sphere, of the sphere that rounds a cone, of the face of a
     flat punch, or of the apex of a cone. A "patch" is no tool: it is the load that a vademecum

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, get_args
 
 from avatar_core.common.quantities import check_line, check_numbers, quantity
-from avatar_core.contact.effects import Effect
+from avatar_core.contact.effects import Effect, Tilt
 from avatar_core.contact.kernels import MAX_TOOLS
 from avatar_core.errors import CoordinateError, SceneError
 from avatar_core.geometry.tip import Tip
@@ -113,6 +113,8 @@ class Scene:
             raise SceneError(
                 f"tools: {n_tools} tools without several_tools: add it to effects, or name one tool"
             )
+        if self.effect("tilt") is not None:
+            Tilt.require_flat([tool.tip for tool in self.tools])
 
     def effect(self, name: str) -> Effect | None:
         """The effect of a name, if the scene has it."""

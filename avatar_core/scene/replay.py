@@ -7,7 +7,7 @@ the breath. A period is *known* if this state follows from the recording:
 - without effects, or with friction, large deformation, self-weight and several tools, the state is
   reset whenever no tip touches: known from the first such period on, and again after lost periods;
 - with viscoelasticity or inertia, only in a recording from rest, up to the first lost period;
-- with respiration never, since the phase of the breath is not recorded.
+- with respiration or tilt never: phase of the breath and direction of the tool are not recorded.
 
 Forces in known periods are identical to the last bit on the machine that recorded them. They are
 compared before the force guard, whose state (limits, ramps, engagement) is not recorded.
@@ -29,7 +29,7 @@ from avatar_core.scene.recording import Periods, Recording
 from avatar_core.vademecum.model import Vademecum
 
 _REMEMBER_FOR_EVER = ("viscoelasticity", "inertia")
-_RECORDED_NOWHERE = "respiration"
+_RECORDED_NOWHERE = {"respiration": "phase of the breath", "tilt": "direction of the tool's axis"}
 _MAY_BE_INSIDE = (int(Status.OUT_OF_RANGE), int(Status.INVALID_POSE))
 
 
@@ -101,7 +101,7 @@ def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray
     """Whether the state of the model in each period follows from the recording, shape (n,)."""
     names = {effect.name for effect in scene.effects}
     known = np.zeros(len(periods), bool)
-    if _RECORDED_NOWHERE in names:
+    if names & set(_RECORDED_NOWHERE):
         return known
     forgets = not names & set(_REMEMBER_FOR_EVER)
     inside = periods.force.any(axis=2) | np.isin(periods.status, _MAY_BE_INSIDE)
@@ -116,8 +116,9 @@ def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray
 def why_not(recording: Recording) -> str:
     """Why no period of a recording is known, and the remedy."""
     names = {effect.name for effect in parse_scene(recording.scene, "scene").effects}
-    if _RECORDED_NOWHERE in names:
-        return "the phase of the breath is not recorded; record without respiration"
+    for name, what in _RECORDED_NOWHERE.items():
+        if name in names:
+            return f"the {what} is not recorded; record without {name}"
     if names & set(_REMEMBER_FOR_EVER):
         return "the state of the organ at the start is not recorded; start with the tool off it"
     return "the tool was never off the organ; start with the tool off it"

@@ -16,7 +16,8 @@ from avatar_core.contact.cloud_kernels import BLOCK
 from avatar_core.contact.dent import dent_arrays
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.large_deformation import LargeDeformationArrays
-from avatar_core.contact.effects.selection import selected_arrays
+from avatar_core.contact.effects.selection import find, selected_arrays
+from avatar_core.contact.effects.tilt import Tilt, tilt_arrays
 from avatar_core.contact.effects.tip_law import PATCH, tip_law_arrays
 from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
 from avatar_core.contact.kernels import ModelArrays
@@ -25,6 +26,7 @@ from avatar_core.contact.model import ContactModel, make_model
 from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.near_field import LocalBlocks, hash_rows
+from avatar_core.vademecum.tip_field import TipField
 
 FAR, NEAR = 3e-4, 1e-4  # [m/N]
 COMPLIANCE = FAR + NEAR
@@ -131,7 +133,10 @@ def _organ(
             np.zeros((3, *shape), single), np.zeros((2, 1, 0), single), np.zeros((2, 0, 3), single)
         )
     dent = dent_arrays((tip,), points, arrays.position, PATCH_RADIUS) if law else None
-    constants = selected_arrays(None, effects, None, large, 0.1, period, law, dent)  # type: ignore[arg-type]
+    field = TipField(arrays.distance, arrays.access, origin, arrays.spacing)
+    leaning = find(effects, Tilt)
+    tilt = tilt_arrays(leaning, (tip,), field) if leaning else None
+    constants = selected_arrays(None, effects, None, large, 0.1, period, law, dent, tilt)  # type: ignore[arg-type]
     return make_model(Layout(arrays, constants))
 
 

@@ -70,7 +70,7 @@ def test_an_effect_changes_the_result_when_on(phantom_vademecum: Vademecum, name
 
 
 def test_the_list_of_effects_is_complete() -> None:
-    assert set(CHOICES) | {"large_deformation", "tumour"} == set(EFFECTS)
+    assert set(CHOICES) | {"large_deformation", "tumour", "tilt"} == set(EFFECTS)
 
 
 def test_a_layout_survives_being_flat(phantom_vademecum: Vademecum) -> None:

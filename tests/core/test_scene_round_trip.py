@@ -17,6 +17,7 @@ from avatar_core.contact.effects import (
     Friction,
     SelfWeight,
     SeveralTools,
+    Tilt,
     Viscoelasticity,
 )
 from avatar_core.errors import SceneError
@@ -47,7 +48,9 @@ def test_the_shipped_scenes_are_those_and_show_every_effect() -> None:
         "tumour": {"tumour"},
         "hanging": {"self_weight"},
         "release": {"inertia"},
-        "everything": set(EFFECTS) - {"tumour"},  # which excludes large deformation
+        "leaning_punch": {"tilt"},
+        # without what excludes large deformation, and what needs another tip
+        "everything": set(EFFECTS) - {"tumour", "tilt"},
     }
     assert set().union(*names.values()) == set(EFFECTS)
     assert scenes["palpation"] == Scene(text=scenes["palpation"].text)
@@ -115,13 +118,16 @@ def scenes(draw: st.DrawFn) -> Scene:
             kinds.remove(EFFECTS[draw(st.sampled_from([one, other]))])
     if len(names) > 1 and SeveralTools not in kinds:
         kinds.append(SeveralTools)
+    tips = [draw(TIPS) for _ in names]
+    if Tilt in kinds:
+        tips[0] = Tip("flat", draw(RADII))
     return Scene(
         name=draw(LINES.filter(bool)),
         text=draw(LINES),
         vademecum=draw(LINES),
         young_modulus=draw(st.none() | st.floats(1.0, 1e8)),
         poisson_ratio=draw(st.none() | st.floats(0.0, 0.4999)),
-        tools=tuple(Tool(name, draw(TIPS)) for name in names),
+        tools=tuple(Tool(name, tip) for name, tip in zip(names, tips, strict=True)),
         cloud=draw(st.sampled_from(["surface", "volume", "off"])),
         cloud_divisor=draw(st.integers(1, 1000)),
         modes=draw(st.none() | st.integers(1, 100_000)),

@@ -14,6 +14,7 @@ from avatar_core.contact.effects.large_deformation import LargeDeformationEffect
 from avatar_core.contact.effects.respiration import Respiration
 from avatar_core.contact.effects.self_weight import SelfWeight
 from avatar_core.contact.effects.several_tools import SeveralTools
+from avatar_core.contact.effects.tilt import Tilt
 from avatar_core.contact.effects.tumour import Tumour
 from avatar_core.contact.effects.viscoelasticity import Viscoelasticity
 
@@ -28,6 +29,7 @@ EFFECTS: dict[str, type[Effect]] = {
         Respiration,
         Tumour,
         SeveralTools,
+        Tilt,
     )
 }
 
@@ -40,6 +42,7 @@ __all__ = [
     "Respiration",
     "SelfWeight",
     "SeveralTools",
+    "Tilt",
     "Tumour",
     "Viscoelasticity",
 ]

@@ -437,11 +437,11 @@ def force_squared(friction, t):  # type: ignore[no-untyped-def]
 
 
 @fast
-def write_torque(model, state, friction, out, t):  # type: ignore[no-untyped-def]
+def add_torque(model, state, friction, out, t):  # type: ignore[no-untyped-def]
     """Moment about the tip's centre of the force at its contact point, -r n x F."""
     if friction is None:
         return
     n, r, f = state.normal[t], model.tip_offset[t], out.force[t]
-    out.torque[t, 0] = -r * (n[1] * f[2] - n[2] * f[1])
-    out.torque[t, 1] = -r * (n[2] * f[0] - n[0] * f[2])
-    out.torque[t, 2] = -r * (n[0] * f[1] - n[1] * f[0])
+    out.torque[t, 0] -= r * (n[1] * f[2] - n[2] * f[1])
+    out.torque[t, 1] -= r * (n[2] * f[0] - n[0] * f[2])
+    out.torque[t, 2] -= r * (n[0] * f[1] - n[1] * f[0])

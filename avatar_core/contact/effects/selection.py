@@ -48,6 +48,7 @@ from avatar_core.contact.effects.several_tools import (
     SeveralToolsArrays,
     several_tools_state,
 )
+from avatar_core.contact.effects.tilt import TiltArrays, tilt_state
 from avatar_core.contact.effects.tip_law import TipLawArrays, tip_law_state
 from avatar_core.contact.effects.tumour import Tumour, at_contrast
 from avatar_core.contact.effects.viscoelasticity import (
@@ -78,12 +79,14 @@ class Constants(NamedTuple):
     respiration: Any = None
     tip_law: Any = None
     dent: Any = None
+    tilt: Any = None
 
 
 class Selection(NamedTuple):
     """The step's arguments after ``tips``.
 
-    superposition : present with any effect but large deformation and respiration
+    superposition : present with any effect but large deformation, respiration and tilt
+    tip_law : with the tilt of the tips
     """
 
     superposition: Any
@@ -108,6 +111,7 @@ ARRAYS: dict[str, Any] = {
     "respiration": RespirationArrays,
     "tip_law": TipLawArrays,
     "dent": DentArrays,
+    "tilt": TiltArrays,
 }
 NO_EFFECTS = Constants()
 
@@ -156,6 +160,7 @@ def selected_arrays(
     period: float,
     tip_law: TipLawArrays | None = None,
     dent: DentArrays | None = None,
+    tilt: TiltArrays | None = None,
 ) -> Constants:
     """Constant arrays of the chosen effects; those of large deformation and tips come in complete.
 
@@ -176,13 +181,14 @@ def selected_arrays(
         respiration_arrays(respiration, period) if respiration else None,
         tip_law,
         dent,
+        tilt,
     )
 
 
 def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int) -> Selection:
     """State and scratch around the constant arrays: the organ at rest, no tool near it."""
     several_tools, large_deformation, friction, viscoelasticity, inertia, weight = constants[:6]
-    respiration, tip_law, dent = constants[6:]
+    respiration, tip_law, dent, tilt = constants[6:]
     n_terms = len(viscoelasticity.decay) if viscoelasticity else 0
     if weight is not None:
         weight = SelfWeightArrays(np.pad(weight.amplitude, (0, n_modes - len(weight.amplitude))))
@@ -196,6 +202,6 @@ def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int)
         inertia_state(inertia, n_modes, weight) if inertia else None,
         weight,
         respiration_state(respiration) if respiration else None,
-        tip_law_state(tip_law, n_terms) if tip_law else None,
+        tip_law_state(tip_law, n_terms, tilt_state(tilt) if tilt else None) if tip_law else None,
         dent_state(dent) if dent else None,
     )

@@ -49,6 +49,7 @@ from avatar_core.common.jit import entry, fast, inlined
 from avatar_core.common.splines import cell_at, in_cell
 from avatar_core.contact.effects.large_deformation import evaluate_added_depth
 from avatar_core.contact.effects.large_dent import LEAST, evaluate_large_dent, large_dent_of
+from avatar_core.contact.effects.tilt import TiltState, add_righting, evaluate_tilt, sample_tilt
 from avatar_core.contact.effects.tip_profile import (
     ANISOTROPY,
     INTERVALS,
@@ -116,6 +117,7 @@ TipLawState = namedtuple(
         "past",  # (n, T) of viscoelasticity [N]
         "last",  # (T,) ``elastic`` at the end of the last period [N]
         "held",  # (T,) load that keeps it constant [N]
+        "tilt",  # TiltState, None for tips that stand upright
     ],
 )
 
@@ -157,7 +159,7 @@ def tip_law_arrays(
     )
 
 
-def tip_law_state(arrays: TipLawArrays, n_terms: int) -> TipLawState:
+def tip_law_state(arrays: TipLawArrays, n_terms: int, tilt: TiltState | None = None) -> TipLawState:
     """Without any contact; ``n_terms`` of viscoelasticity."""
     n = len(arrays.radius)
     return TipLawState(
@@ -177,7 +179,14 @@ def tip_law_state(arrays: TipLawArrays, n_terms: int) -> TipLawState:
         past=np.zeros((n_terms, n)),
         last=np.zeros(n),
         held=np.zeros(n),
+        tilt=tilt,
     )
+
+
+@inlined
+def edge_below(law, t, cell):  # type: ignore[no-untyped-def]
+    """How deep the lowest point of a tip that leans is below the one that its pose says [m]."""
+    return 0.0 if law is None else sample_tilt(law.tilt, t, cell)
 
 
 @inlined
@@ -304,8 +313,9 @@ def _find_place(state, law, large_deformation, t, of_depth, of_load, target):  #
     for _ in range(MAX_STEPS):
         law.place[t] = s
         delta, slope, load, a = dent(law, t)
-        value = of_depth * delta + of_load * load - target
-        rise = slope * (of_depth + 2.0 * a * of_load)
+        leaning, bent, _ = evaluate_tilt(law.tilt, t, load)
+        value = of_depth * (delta + leaning) + of_load * load - target
+        rise = slope * (of_depth * (1.0 + 2.0 * a * bent) + 2.0 * a * of_load)
         if large_deformation is not None and of_depth > 0.0:
             state.force[t] = law.value[t, STIFFNESS] * load
             evaluate_added_depth(state, large_deformation, t)
@@ -367,6 +377,9 @@ def evaluate_tip(state, superposition, law, large_deformation, t):  # type: igno
         deeper, slope, _ = evaluate_large_dent(law, t, load)
         delta += deeper
         tangent += slope / law.value[t, STIFFNESS]
+    leaning, slope, _ = evaluate_tilt(law.tilt, t, load)
+    delta += leaning
+    tangent += slope / law.value[t, STIFFNESS]
     return delta - taken * law.elastic[t], gain * tangent
 
 
@@ -410,11 +423,13 @@ def add_tip_force(state, law, large_deformation, out, t):  # type: ignore[no-unt
     stiffness, gradient = law.value[t, STIFFNESS], law.gradient[t]
     if large_deformation is not None:
         stored += evaluate_large_dent(law, t, e / stiffness)[2]
+    stored += evaluate_tilt(law.tilt, t, e / stiffness)[2]
     relaxed = state.force[t] / e
     for d in range(3):
         change = 2.0 * stiffness * third * gradient[KAPPA, d] - stored * gradient[STIFFNESS, d]
         change += 0.25 * np.pi * stiffness * fourth * gradient[TAU, d]
         out.force[t, d] += (change - 0.5 * e * e * gradient[TAKEN, d]) * relaxed
+    add_righting(law.tilt, out, t, stiffness, e, relaxed)
 
 
 @inlined
@@ -490,5 +505,6 @@ def dent_energy(law: TipLawState, t: int) -> float:
     """E* (Phi + Psi) - c F^2 / 2 of a tip at rest [J]."""
     _, _, stored = _moments(law, t)
     stiffness, taken = law.value[t, STIFFNESS], law.value[t, TAKEN]
-    stored += evaluate_large_dent(law, t, law.elastic[t] / stiffness)[2]
+    load = law.elastic[t] / stiffness
+    stored += evaluate_large_dent(law, t, load)[2] + evaluate_tilt(law.tilt, t, load)[2]
     return float(stiffness * stored - 0.5 * taken * law.elastic[t] ** 2)

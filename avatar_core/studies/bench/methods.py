@@ -177,10 +177,10 @@ def one_pass(
     return times[kept] * 1e6, contacts[kept]
 
 
-def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000) -> np.ndarray:
-    """Slides that start far apart, shape (n, n_tools, 3)."""
+def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000, tip: Tip = SPHERE) -> np.ndarray:
+    """Slides of a tip that start far apart, shape (n, n_tools, 3)."""
     starts = starts_apart(vademecum, n_tools)
-    paths = [slide(vademecum, RADIUS, DEPTH, n * 1e-4, position=start) for start in starts]
+    paths = [slide(vademecum, tip.offset, DEPTH, n * 1e-4, position=start) for start in starts]
     return np.ascontiguousarray(np.stack(paths, axis=1))
 
 
@@ -199,7 +199,7 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
     """:func:`avatar_core.contact.kernels.contact_step` with stored columns instead of modes."""
     e = effects
     for t in range(tips.shape[0]):
-        locate(model, state, t, tips[t], e.superposition)
+        locate(model, state, t, tips[t], e.superposition, e.tip_law)
         state.mode[t] = np.float32(0.0)
         if not state.active[t]:
             state.force[t] = 0.0

@@ -139,6 +139,16 @@ def rotation_between(
     )
 
 
+def rotated(
+    vector: tuple[float, float, float], orientation: tuple[float, float, float, float]
+) -> tuple[float, float, float]:
+    """A vector in the frame that an orientation is given in. Real-time safe."""
+    x, y, z = vector
+    i, j, k, w = orientation
+    a, b, c = 2.0 * (j * z - k * y), 2.0 * (k * x - i * z), 2.0 * (i * y - j * x)
+    return (x + w * a + j * c - k * b, y + w * b + k * a - i * c, z + w * c + i * b - j * a)
+
+
 def stamp_nanoseconds(stamp: bytes) -> int:
     """Time of a stamp since the epoch of its clock [ns]. Real-time safe."""
     seconds, nanoseconds = struct.unpack("=iI", stamp)

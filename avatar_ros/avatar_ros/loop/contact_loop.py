@@ -239,6 +239,9 @@ class ContactLoop:
         """Forces at the tips of the moment. Real-time safe."""
         if model.effects.friction is not None:
             model.effects.friction.spin[:] = self._rotations
+        if model.axes is not None:
+            for tool, axis in zip(self._tools, model.axes, strict=True):
+                tool.point(model.shaft, axis)
         contact.solve(model, self._tips)
 
     def _next_due(self, start: int, fresh: bool) -> int:

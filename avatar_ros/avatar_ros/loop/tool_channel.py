@@ -10,7 +10,13 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from avatar_ros.framework import qos
 from avatar_ros.framework.ports import PolledSubscriptions, Ports
-from avatar_ros.framework.templates import NO_STAMP, PoseReader, WrenchTemplate, rotation_between
+from avatar_ros.framework.templates import (
+    NO_STAMP,
+    PoseReader,
+    WrenchTemplate,
+    rotated,
+    rotation_between,
+)
 from avatar_ros.loop.safety import Safety
 from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.msg import ContactState
@@ -90,6 +96,19 @@ class ToolChannel:
             return False
         self._place(tip, turn)
         return True
+
+    def point(self, shaft: np.ndarray, axis: np.ndarray) -> None:
+        """Turn a direction in the frame of the last pose into the organ's frame. Real-time safe.
+
+        axis : receives it; zero without a valid pose
+        """
+        if self._orientation is None:
+            axis[:] = 0.0
+            return
+        axis[:] = rotated((shaft[0], shaft[1], shaft[2]), self._orientation)
+        if self._is_turned:
+            np.dot(self._rotation, axis, out=self._turned)
+            axis[:] = self._turned
 
     def answer(self) -> None:
         """Send ``wrench``, given in the organ's frame, in the tool's frame. Real-time safe."""
