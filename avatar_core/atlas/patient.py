@@ -77,7 +77,7 @@ class PatientOptions:
     n_vertices: int = 2850
     weighting: Weighting = "kriging"
     n_neighbors: int | None = None
-    tolerance: float = 0.03
+    tolerance: float = 0.02
     max_modes: int = 100
     n_certified: int | None = None
     leave_out: tuple[int, ...] = ()

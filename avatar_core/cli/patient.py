@@ -43,7 +43,7 @@ def patient(
     tolerance: Annotated[
         float,
         typer.Option(help="target of 'reduced' for the mean relative error of displacement [-]"),
-    ] = 0.03,
+    ] = 0.02,
     weighting: Annotated[
         str,
         typer.Option(

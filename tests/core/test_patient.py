@@ -191,6 +191,7 @@ def test_estimate_brackets_the_error_and_the_tolerance_is_met(case: Case) -> Non
     estimate = patient.estimates[-1]
     assert patient.vademecum.convergence.converged
     assert 0.5 < estimate.mean / error.mean() < 2.0
+    assert 0.5 < estimate.worst / error.max() < 2.0
     assert error.mean() < 0.05
     assert patient.estimates[-1].rank >= patient.estimates[0].rank
     assert patient.solutions < 3 * n
