@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import igl
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
@@ -23,6 +24,7 @@ _TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 _LOST_VOLUME = 0.03  # of the organ, that a mesh may lack; 64 livers at 2,850 vertices: below 0.8 %
 
+_IN_FACE = (np.ones((3, 3)) + 3.0 * np.eye(3)) / 6.0  # of three points, exact for parabolas
 POSTERIOR_SUPERIOR = np.array([0.0, -1.0, 1.0]) / np.sqrt(2.0)
 ANTERIOR = np.array([0.0, 1.0, 0.0])
 
@@ -165,7 +167,7 @@ def make_mesh(vertices: np.ndarray, tets: np.ndarray) -> TetMesh:
 def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
     """Fill a surface with tetrahedra by fTetWild, to about the number of vertices asked for.
 
-    The same surface gives the same mesh, bit for bit.
+    The same surface gives the same mesh, bit for bit, and the mesh holds its volume.
 
     fTetWild accepts cracked, doubled and self-intersecting faces (Hu et al., "Fast Tetrahedral
     Meshing in the Wild", 2020). Of the box that it fills, the tetrahedra are kept whose centroids
@@ -198,7 +200,21 @@ def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
             f"the mesh holds {1.0 - lost:.0%} of the volume of the surface; close its gaps and "
             "remove faces inside the organ, or ask for more vertices"
         )
-    return mesh
+    return _filled_out(mesh, surface)
+
+
+def _filled_out(mesh: TetMesh, surface: SurfaceMesh) -> TetMesh:
+    """The mesh with its boundary moved along its normals by the mean gap to the surface.
+
+    Facets between points of a round surface cut corners: of a liver they lack half a per cent.
+    """
+    faces, area = mesh.boundary_faces, mesh.face_areas
+    points = np.einsum("qk,fkd->fqd", _IN_FACE, mesh.vertices[faces]).reshape(-1, 3)
+    closest = igl.point_mesh_squared_distance(points, *surface.skin.boundary)[2]
+    gap = (closest - points).reshape(len(faces), -1, 3).mean(axis=1)
+    outward = (gap * mesh.face_area_normals).sum() / area.sum()
+    moved = TetMesh(mesh.vertices + outward * mesh.vertex_normals, mesh.tets)
+    return moved if (moved.tet_volumes > 0.0).all() else mesh
 
 
 def first_edge(volume: float, n_vertices: int) -> float:
