@@ -86,7 +86,7 @@ def force_curve(
     depth = np.linspace(0.0, max(RESOLVED), 51)
     force, error = np.empty_like(depth), np.empty_like(depth)
     for k, at in enumerate(depth):
-        force[k] = pressed(model, site, TIP, at)
+        force[k] = np.linalg.norm(pressed(model, site, TIP, at))
         error[k] = model.out.force_error[0]
     hertz = hertz_force(vademecum.material, TIP.radius, depth)
     return ForceCurve(depth, force, error, hertz, _resolved(vademecum, surface, site, progress))
@@ -156,7 +156,7 @@ def _draw_curve(figure, curve: ForceCurve) -> None:  # type: ignore[no-untyped-d
     axes.set_xlim(left=0.0)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("depth of the tip [mm]")
-    axes.set_ylabel("normal force [N]")
+    axes.set_ylabel("force [N]")
     axes.set_title(_sentence(curve))
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", fontsize=9)

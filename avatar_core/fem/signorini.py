@@ -12,6 +12,9 @@ and the condition holds in the mean over each of its hats. With K^-1 condensed t
 on the hats that a tip can reach, what is left is a small linear complementarity problem for each
 depth: C p - b >= 0, p >= 0, p.(C p - b) = 0.
 
+A frictionless ball takes no moment about its centre, but along an n of which its contact lies to
+the side these tractions have one. :func:`through_centre` gives the n along which they have none.
+
 The error falls with the elements; :func:`avatar_core.geometry.refinement.refine` makes them small.
 """
 
@@ -60,6 +63,8 @@ class Touch:
     depth : d [m]
     force : of the organ on the tip along the axis [N]
     radius : of the disc with the area of the contact [m]
+    lean : ndarray, shape (3,), across the axis, the tangent of the angle between the axis and the
+        way from the centre of pressure to that of the ball; zero for other tips
     vertices : ndarray of int, shape (n,), of the mesh under pressure
     pressures : ndarray, shape (n,), p at them [Pa]
     """
@@ -67,6 +72,7 @@ class Touch:
     depth: float
     force: float
     radius: float
+    lean: np.ndarray
     vertices: np.ndarray
     pressures: np.ndarray
 
@@ -96,13 +102,16 @@ class _Zone:
 
     vertices : (m,); loads : sparse (3 n_nodes, m), nodal forces of unit pressures along -n [m2];
     areas : (m,), integral of each hat [m2]; heights : (m,), that of (z - f) times it [m3];
-    outermost : (m,) bool, those beyond which the tip goes on
+    aside : (m, 3), mean place across the axis [m]; below : (m,), how far below the ball's centre it
+    touches there, 0 for other tips [m]; outermost : (m,) bool, those beyond which the tip goes on
     """
 
     vertices: np.ndarray
     loads: sp.csc_matrix
     areas: np.ndarray
     heights: np.ndarray
+    aside: np.ndarray
+    below: np.ndarray
     outermost: np.ndarray
 
 
@@ -227,6 +236,18 @@ def resolved_contact(
     return contact, condensed.displacements([contact])[0]
 
 
+def through_centre(push: Push, touch: Touch) -> Push:
+    """The push of the same ball in the same place, its axis turned by what ``touch`` leans.
+
+    Its force then acts along the way from the centre of pressure to the ball's; a few turns find
+    the axis about which nothing leans. Other tips are left as they are.
+    """
+    axis = push.axis - touch.lean
+    axis /= np.linalg.norm(axis)
+    to_centre = push.tip.offset - touch.depth
+    return Push(push.tip, push.point + to_centre * (push.axis - axis), axis)
+
+
 def half_space_radius(tip: Tip, depth: float) -> float:
     """Radius a of the contact with a half-space at a depth [m]; the tip's own at most."""
     if tip.shape == "flat":
@@ -290,14 +311,17 @@ def _balanced(compliance: np.ndarray, needed: np.ndarray, active: np.ndarray) ->
 
 def _touch(zone: _Zone, depth: float, pressure: np.ndarray) -> Touch:
     active = pressure > 0
+    load = zone.areas * pressure
+    below = float(load @ zone.below)
     if (active & zone.outermost).any():
         raise ContactError(
             "the contact is larger than the surface prepared for it; raise its reach"
         )
     return Touch(
         depth=float(depth),
-        force=float(zone.areas @ pressure),
+        force=float(load.sum()),
         radius=float(np.sqrt(zone.areas[active].sum() / np.pi)),
+        lean=(load @ zone.aside) / below if below > 0.0 else np.zeros(3),
         vertices=zone.vertices[active],
         pressures=pressure[active],
     )
@@ -331,12 +355,21 @@ def _zone(elasticity: Elasticity, push: Push, deepest: float, reach: float) -> _
     at_border = np.zeros(n, bool)
     at_border[corners[(kept & ~chosen)[corners].any(axis=1)]] = True
     vertices = np.flatnonzero(chosen)
+    across = points - z[..., None] * push.axis
+    aside = np.stack([over_hats(area * x) for x in np.moveaxis(across, -1, 0)], axis=1)
+    aside = aside[vertices] / areas[vertices, None]
+    below = np.zeros(len(vertices))
+    if push.tip.shape == "sphere":
+        rim = np.minimum(np.linalg.norm(aside, axis=1), push.tip.radius)
+        below = push.tip.radius - push.tip.height(rim)
     loads = _hat_loads(elasticity, faces, area, barycentric)[:, vertices]
     return _Zone(
         vertices,
         sp.kron(loads, -push.axis[:, None], format="csc"),
         areas[vertices],
         heights[vertices],
+        aside,
+        below,
         at_border[vertices],
     )
 

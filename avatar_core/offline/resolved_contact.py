@@ -2,18 +2,29 @@
 
 The organ's own mesh is refined around the place for the smallest and the largest contact at once,
 fitted there to the surface, factorized once, and condensed to what all tips together can reach.
+
+Balls are pressed in along the normal of the place, and stay where they are while the axis of their
+tractions is turned until it leads through the centre of pressure and that of the ball: without
+friction they take no moment. Beside a fold, that changed the force by up to a tenth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
-from avatar_core.errors import MeshError
+from avatar_core.errors import ContactError, MeshError
 from avatar_core.fem.elasticity import Elasticity, Inclusion, Material
-from avatar_core.fem.signorini import CondensedContact, Contact, Push, half_space_radius
+from avatar_core.fem.signorini import (
+    CondensedContact,
+    Contact,
+    Push,
+    half_space_radius,
+    through_centre,
+)
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.refinement import Grading, onto_surface, refine
 from avatar_core.geometry.surface import SurfaceMesh
@@ -22,6 +33,9 @@ from avatar_core.geometry.tumour import volume_fraction_inside
 
 SPHERES = tuple(Tip("sphere", radius) for radius in (1.5e-3, 3e-3, 5e-3, 10e-3))
 DEPTHS = (1e-3, 2e-3, 5e-3)
+LEANING = np.tan(np.radians(2.0))  # off the axis, beyond which it is turned,
+_TURNS = 3  # at most; what is left of 20 degrees after each is 2 and 0.3
+_REACHES = (1.6, 2.8)  # of a contact that is pressed through its middle: the first that suffices
 _FITTED = (2.0, 1.5, 1.2)  # radii of the mesh fitted to the surface, over the largest contact's
 
 
@@ -47,17 +61,19 @@ class ResolvedPlace:
     """What tips feel at one place.
 
     elasticity : the organ, refined there
-    condensed : CondensedContact, of the tips one by one
+    condensed : CondensedContact, of the tips one by one along the normal
     contacts : contacts[i][k] of tip i at depth k
+    axes : ndarray, shape (n_tips, n_depths, 3), along which their forces act, out of the organ
     """
 
     elasticity: Elasticity
     condensed: CondensedContact
     contacts: tuple[tuple[Contact, ...], ...]
+    axes: np.ndarray
 
     @property
     def forces(self) -> np.ndarray:
-        """Along the normal, shape (n_tips, n_depths) [N]."""
+        """Along the axes, shape (n_tips, n_depths) [N]."""
         return np.array([[contact.forces[0] for contact in row] for row in self.contacts])
 
 
@@ -83,7 +99,8 @@ def contacts_at(
     regions : Regions, of the mesh
     material : Material
     place : ndarray, shape (3,), on the surface (or the facets), where depths are zero [m]
-    normal : ndarray, shape (3,), pointing out; the direction in which tips are pushed in, reversed
+    normal : ndarray, shape (3,), pointing out; the direction in which tips are pushed in, reversed,
+        and along which all but balls press
     tips : sequence of Tip
     depths : of a tip's lowest point below the place [m]
     resolution : Resolution
@@ -103,10 +120,34 @@ def contacts_at(
     )
     pushes = [Push(tip, np.asarray(place, float), normal) for tip in tips]
     condensed = CondensedContact(elasticity, pushes, max(depths), resolution.reach, progress)
-    contacts = tuple(
-        tuple(condensed.solve([i], [depth]) for depth in depths) for i in range(len(pushes))
+    found = [
+        [_without_moment(elasticity, push, condensed.solve([i], [depth])) for depth in depths]
+        for i, push in enumerate(pushes)
+    ]
+    return ResolvedPlace(
+        elasticity,
+        condensed,
+        tuple(tuple(contact for contact, _ in row) for row in found),
+        np.array([[push.axis for _, push in row] for row in found]),
     )
-    return ResolvedPlace(elasticity, condensed, contacts)
+
+
+def _without_moment(elasticity: Elasticity, push: Push, contact: Contact) -> tuple[Contact, Push]:
+    """The contact of a ball whose force goes through its centre, and its push."""
+    for _ in range(_TURNS):
+        (touch,) = contact.touches
+        if np.linalg.norm(touch.lean) < LEANING:
+            break
+        push = through_centre(push, touch)
+        contact = _alone(elasticity, push, touch.depth)
+    return contact, push
+
+
+def _alone(elasticity: Elasticity, push: Push, depth: float) -> Contact:
+    for reach in _REACHES[:-1]:
+        with suppress(ContactError):
+            return CondensedContact(elasticity, [push], depth, reach).solve([0], [depth])
+    return CondensedContact(elasticity, [push], depth, _REACHES[-1]).solve([0], [depth])
 
 
 def refined_organ(

@@ -117,7 +117,7 @@ def sneddon(tip: Tip, material: Material, depth: float) -> float:
 
 
 def summary_of(contacts: Sequence[SiteContact]) -> dict[str, float]:
-    """Key figures; errors are relative, of the force along the normal."""
+    """Key figures; errors are relative, of the force along that of the resolved contact."""
     found = summarized(contacts)
     patch = np.array([abs(contact.patch / contact.truth - 1.0) for contact in contacts])
     hertz = np.array([abs(contact.hertz / contact.truth - 1.0) for contact in contacts])
@@ -128,6 +128,8 @@ def summary_of(contacts: Sequence[SiteContact]) -> dict[str, float]:
         "force_worst": found.worst,
         "far_field_l2": float(max(contact.far_l2 for contact in contacts)),
         "far_field_l2_mean": float(np.mean([contact.far_l2 for contact in contacts])),
+        "far_field_l2_median": float(np.median([contact.far_l2 for contact in contacts])),
+        "direction_mean_deg": float(np.degrees(np.mean([contact.angle for contact in contacts]))),
         "coverage": found.coverage,
         "median_overestimate": found.overestimate,
         "patch_mean": float(patch.mean()),
@@ -146,6 +148,7 @@ def _row(name: str, contact: SiteContact) -> dict[str, Value]:
         "depth_m": contact.depth,
         "true_n": contact.truth,
         "force_n": contact.force,
+        "angle_rad": contact.angle,
         "said_error_n": contact.estimate,
         "patch_n": contact.patch,
         "hertz_n": contact.hertz,

@@ -51,7 +51,7 @@ Compared = Callable[..., Iterator[list[SiteContact]]]
 
 def contact(force: float, patch: float, law: float, site: Site = SITE) -> SiteContact:
     """A contact whose resolved force is 2 N; the patch's and the law's part of its error [N]."""
-    return SiteContact(site, 3e-3, 1e-3, 2.0, force, patch + law, law, 6.0, 1.0, 0.05)
+    return SiteContact(site, 3e-3, 1e-3, 2.0, force, 0.0, patch + law, law, 6.0, 1.0, 0.05)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
 
 def contact(force: float, estimate: float) -> SiteContact:
     """A contact whose resolved force is 2 N."""
-    return SiteContact(SITE, 3e-3, 1e-3, 2.0, force, estimate, 0.5 * estimate, 6.0, 1.0, 0.05)
+    return SiteContact(SITE, 3e-3, 1e-3, 2.0, force, 0.0, estimate, 0.5 * estimate, 6.0, 1.0, 0.05)
 
 
 def test_key_figures_are_those_of_the_contacts() -> None:

@@ -13,6 +13,7 @@ from avatar_core.fem.signorini import (
     complementary,
     half_space_radius,
     resolved_contact,
+    through_centre,
 )
 from avatar_core.geometry.refinement import Grading, refine
 from avatar_core.geometry.tip import Tip
@@ -74,6 +75,38 @@ def test_the_surface_gives_way_and_pushes_back(pressed: CondensedContact) -> Non
     r = np.linalg.norm((mesh.vertices[touch.vertices] - TOP)[:, [0, 2]], axis=1)
     inside = touch.vertices[r < 1.5e-3]
     np.testing.assert_allclose(-u[inside, 1], 2e-3 - SPHERE.height(r[r < 1.5e-3]), atol=0.03 * 2e-3)
+
+
+def test_a_ball_pushed_askew_finds_the_axis_without_moment() -> None:
+    """In a half-space that is its normal, and the force Sneddon's, whatever axis it began with."""
+    depth, angle = 1e-3, np.radians(12.0)
+    axis = np.array([np.sin(angle), np.cos(angle), 0.0])
+    to_centre = SPHERE.radius - depth
+    askew = Push(SPHERE, TOP + to_centre * (UP - axis), axis)
+    cube = _cube(0.4e-3, 0.25, 0.7)
+    touch = CondensedContact(cube, [askew], depth, reach=2.5).solve([0], [depth]).touches[0]
+    np.testing.assert_allclose(touch.lean, np.tan(angle) * across(axis), atol=0.03)
+    for _ in range(2):
+        askew = through_centre(askew, touch)
+        touch = CondensedContact(cube, [askew], depth).solve([0], [depth]).touches[0]
+    assert askew.axis @ UP > np.cos(np.radians(0.5))
+    np.testing.assert_allclose(
+        askew.point + to_centre * askew.axis, TOP + to_centre * UP, atol=1e-9
+    )
+    assert touch.force == pytest.approx(_sphere_force(SPHERE.radius, depth), rel=0.02)
+
+
+def across(axis: np.ndarray) -> np.ndarray:
+    """The direction across an axis in which ``UP`` leans away from it."""
+    side = (axis @ UP) * axis - UP
+    return np.asarray(side / np.linalg.norm(side))
+
+
+def test_a_punch_keeps_its_axis(pressed: CondensedContact) -> None:
+    for k in (1, 2):
+        touch = pressed.solve([k], [1e-3]).touches[0]
+        assert not touch.lean.any()
+        np.testing.assert_array_equal(through_centre(pressed.pushes[k], touch).axis, UP)
 
 
 def test_no_force_before_the_tip_touches(pressed: CondensedContact) -> None:

@@ -60,10 +60,10 @@ class Site:
 
 @dataclass(frozen=True)
 class SiteContact:
-    """One contact: a sphere of a radius at a depth at a site; forces along the normal [N].
+    """One contact: a sphere of a radius at a depth at a site; forces along that of the truth [N].
 
-    truth : of the resolved contact; force : of the step; estimate : its error as it is said, of
-    which law_estimate is the law's part
+    truth : of the resolved contact; force : of the step; angle : between the two [rad]
+    estimate : error of the force as it is said, of which law_estimate is the law's part
     patch : of the vademecum's own patch; hertz : of a sphere on a flat half-space (Hertz 1882)
     far_l2 : relative L2 error of the displacement more than 15 mm away
     """
@@ -73,6 +73,7 @@ class SiteContact:
     depth: float
     truth: float
     force: float
+    angle: float
     estimate: float
     law_estimate: float
     patch: float
@@ -278,7 +279,7 @@ def _at_site(
             continue
         moved = truth.condensed.displacements(truth.contacts[i])[:, : len(vertices)]
         for k, depth in enumerate(depths):
-            force = pressed(models[i], site, tip, depth)
+            force, axis = pressed(models[i], site, tip, depth), truth.axes[i, k]
             shown = models[i].out.cloud[:, 3:].astype(float).ravel()
             out.append(
                 SiteContact(
@@ -286,13 +287,14 @@ def _at_site(
                     tip.radius,
                     depth,
                     float(truth.forces[i, k]),
-                    force,
+                    float(force @ axis),
+                    _angle(force, axis),
                     float(models[i].out.force_error[0]),
                     float(
                         law_error(models[i].effects.tip_law, models[i].state.steepness[0], 0)
                         * np.linalg.norm(models[i].out.force[0])
                     ),
-                    pressed(patches[i], site, tip, depth),
+                    float(pressed(patches[i], site, tip, depth) @ axis),
                     float(hertz_force(vademecum.material, tip.radius, depth)),
                     float(relative_l2(shown[kept], moved[k].ravel()[kept], mass[kept])),
                 )
@@ -306,12 +308,18 @@ def hertz_force(material: Material, radius: float, depth: np.ndarray | float) ->
     return np.asarray(4.0 / 3.0 * stiffness * np.sqrt(radius * np.asarray(depth) ** 3))
 
 
-def pressed(model: ContactModel, site: Site, tip: Tip, depth: float) -> float:
-    """The step's force along the normal at a depth, after an approach from outside [N]."""
+def _angle(force: np.ndarray, axis: np.ndarray) -> float:
+    """Between a force and a unit vector [rad]; NaN without a force."""
+    size = np.linalg.norm(force)
+    return float(np.arccos(np.clip(force @ axis / size, -1.0, 1.0))) if size > 0.0 else np.nan
+
+
+def pressed(model: ContactModel, site: Site, tip: Tip, depth: float) -> np.ndarray:
+    """The step's force at a depth below a site, after an approach along its normal, (3,) [N]."""
     model.reset()
     for at in (*np.arange(-0.5e-3, depth, 1e-3), depth):
         status = step(model, (site.point + (tip.offset - at) * site.normal)[None])
     if status not in (Status.OK, Status.EXTRAPOLATED):
-        return float("nan")
+        return np.full(3, np.nan)
     estimate_error(model)
-    return float(model.out.force[0] @ site.normal)
+    return model.out.force[0].copy()
