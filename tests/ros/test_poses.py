@@ -41,6 +41,7 @@ pytestmark = pytest.mark.ros
 
 OK, INVALID = int(ContactState.STATUS_OK), int(ContactState.STATUS_INVALID_POSE)
 STALE, BARRED = int(ContactState.STATUS_STALE_POSE), int(ContactState.STATUS_OUT_OF_RANGE)
+SLOW, LOST = int(ContactState.STATUS_SLOW_POSES), int(ContactState.STATUS_LOST_TOOL)
 UNKNOWN_FRAME = int(ContactState.STATUS_UNKNOWN_FRAME)
 SECOND = 1_000_000_000
 TIP = np.array([0.0, 0.6, 0.0, 0.8])  # a unit quaternion
@@ -299,15 +300,60 @@ def test_5_khz_and_10_hz(bench: Any, touch: Any) -> None:
     assert np.ptp(np.linalg.norm(np.array(fine)[:, 1:], axis=1)) > 0.1
 
 
-def test_10_hz_below_the_timeout_is_stale_in_between(bench: Any, touch: Any) -> None:
+@pytest.mark.parametrize("hertz", [1, 5, 20, 33, 45])
+def test_a_stream_below_the_timeout_is_slow_all_along(bench: Any, touch: Any, hertz: int) -> None:
     cell = bench(timeout=0.02)
     tip = cell.press(touch, 0.0)
-    for _ in range(3):
-        found = [cell.step(pose(tip) if k == 0 else None) for k in range(100)]
+    period = round(1000 / hertz)
+    for n in range(5):
+        found = [cell.step(pose(tip) if k == 0 else None) for k in range(period)]
         statuses = np.array([status for status, _ in found])
-        assert (statuses[:20] == OK).all() and (statuses[22:] == STALE).all()
-        assert found[0][1].any()
-        assert not np.array([force for _, force in found])[statuses == STALE].any()
+        if n >= 2:
+            assert (statuses == SLOW).all()
+            assert not np.array([force for _, force in found]).any()
+    for k in range(5):  # at 1 kHz again
+        status, force = cell.step(pose(tip))
+        assert (status == OK) == (k >= 2)
+    assert force.any()
+
+
+@pytest.mark.parametrize("hertz", [100, 1000])
+def test_one_gap_in_a_stream_makes_it_not_slow(bench: Any, touch: Any, hertz: int) -> None:
+    cell = bench(timeout=0.02)
+    tip = cell.press(touch, 0.0)
+    period = 1000 // hertz
+    found = [
+        cell.step(pose(tip) if k % period == 0 and not 40 < k < 140 else None)[0]
+        for k in range(300)
+    ]
+    assert found[45:60] == [OK] * 15 and found[62:140] == [STALE] * 78
+    assert found[140:] == [OK] * 160
+
+
+@pytest.mark.parametrize("hertz", [1, 5, 20, 33, 100, 1000])
+@pytest.mark.parametrize("fault", ["frame", "stamp", "NaN", "quaternion"])
+def test_what_came_last_says_why_there_is_no_force(
+    bench: Any, touch: Any, hertz: int, fault: str
+) -> None:
+    """Between two refused poses as well, however slowly they come; and after the first."""
+    cell = bench(timeout=0.02)
+    spoilt, expected = {
+        "frame": (pose(touch[0], frame="world"), UNKNOWN_FRAME),
+        "stamp": (pose(touch[0], stamp=0), INVALID),
+        "NaN": (pose(np.full(3, np.nan)), INVALID),
+        "quaternion": (pose(touch[0], quaternion=np.zeros(4)), INVALID),
+    }[fault]
+    cell.tools[0].publishers = 0  # as counted before this one joined
+    period = 1000 // hertz
+    found = [cell.step(spoilt if k % period == 0 else None) for k in range(2500)]
+    assert {status for status, _ in found} == {expected}
+    assert not np.array([force for _, force in found]).any()
+    for _ in range(2600):
+        status = cell.step(None)[0]
+    assert status == STALE
+    cell.step(spoilt)
+    cell.tools[0].publishers = 0
+    assert cell.step(None)[0] == LOST
 
 
 @pytest.mark.parametrize(("depth", "expected"), [(0.0, OK), (10e-3, BARRED)])

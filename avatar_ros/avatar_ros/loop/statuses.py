@@ -9,8 +9,12 @@ EXPLANATIONS: dict[int, tuple[str, str]] = {
     ContactState.STATUS_NO_MODEL: ("no vademecum is loaded", "load one"),
     ContactState.STATUS_NO_POSE: ("no pose of the tool has arrived yet", "start its driver"),
     ContactState.STATUS_STALE_POSE: (
-        "the tool's poses stopped or come too late",
-        "check its driver, the network and the load of the machine, or raise pose_timeout",
+        "the tool's poses stopped",
+        "check its driver, the network and the load of the machine",
+    ),
+    ContactState.STATUS_SLOW_POSES: (
+        "the tool's poses come more slowly than pose_timeout allows",
+        "send them faster, or set pose_timeout to twice the time between them",
     ),
     ContactState.STATUS_INVALID_POSE: (
         "a pose of the tool is not finite, has stamp 0, or is not a rotation",

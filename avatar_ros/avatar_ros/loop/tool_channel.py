@@ -28,10 +28,16 @@ INVALID_POSE = int(ContactState.STATUS_INVALID_POSE)
 LEAP = int(ContactState.STATUS_LEAP)
 SEVERAL_PUBLISHERS = int(ContactState.STATUS_SEVERAL_PUBLISHERS)
 LOST_TOOL = int(ContactState.STATUS_LOST_TOOL)
+SLOW_POSES = int(ContactState.STATUS_SLOW_POSES)
+UNKNOWN_FRAME = int(ContactState.STATUS_UNKNOWN_FRAME)
 
 FAR_AWAY = 1e3  # position of a tool without a pose, for the step [m]
 _UNKNOWN = float("nan")  # position of a tool whose last pose was invalid: it may not have moved
 _LEAP_INTERVAL = 2e-3  # between two poses, to which ``leap`` refers [s]
+_SLOW = 0.75  # of the timeout: poses that lie farther apart are slow
+# a stream that was refused is so until the next message, or until none came for this long [ns]
+_SILENCE = 2_500_000_000
+_OF_A_STREAM = (INVALID_POSE, UNKNOWN_FRAME, SEVERAL_PUBLISHERS, SLOW_POSES)
 _ALTERNATION = 500_000_000  # within which messages of several publishers alternate [ns]
 _NO_NUMBER = 2**64 - 1  # of middleware that does not count messages
 _N_STATUS = 32
@@ -66,7 +72,9 @@ class ToolChannel:
         self._origin = np.array(safety.transform[:3])
         self._turned = np.zeros(3)
         self._last = np.full(3, FAR_AWAY)  # valid position, in the tool's frame [m]
-        self._received = 0  # [ns]
+        self._received = 0  # the last valid pose [ns]
+        self._heard = 0  # the last message, valid or not [ns]
+        self._intervals = (0, 0, 0)  # between the last valid poses [ns]
         self._number = -1  # of the last message, as its publisher counts
         self._last_decrease = -_ALTERNATION  # when the numbers last decreased [ns]
         self._several_until = 0  # [ns]
@@ -90,7 +98,8 @@ class ToolChannel:
             self.status = status
         if status != OK:
             self._orientation = None
-            tip[:] = _UNKNOWN if status == INVALID_POSE else FAR_AWAY
+            held = status == INVALID_POSE and now - self._received <= timeout
+            tip[:] = _UNKNOWN if held else FAR_AWAY
             return False
         if taken is None:
             return False
@@ -121,9 +130,9 @@ class ToolChannel:
     def _judge(self, taken: Any, now: int, timeout: int, leap: float) -> int:
         """The status after a message, or after none came. Real-time safe."""
         if taken is None:
-            if self.status == NO_POSE or now - self._received <= timeout:
-                return self.status
-            return STALE_POSE if self.publishers else LOST_TOOL
+            return self._in_silence(now, timeout)
+        self._heard = now
+        self.publishers = max(self.publishers, 1)  # counted anew only once in a while
         status = self._reader.read(taken[0])
         if self._comes_from_several(taken[1], now):
             status = SEVERAL_PUBLISHERS
@@ -132,12 +141,24 @@ class ToolChannel:
         interval = max((now - self._received) * 1e-9, _LEAP_INTERVAL)
         leapt = math.dist(self._reader.position, self._last) * _LEAP_INTERVAL > leap * interval
         late = now - self._received > timeout
+        self._intervals = (*self._intervals[1:], now - self._received)
         self._last[:] = self._reader.position
         self._received = now
         self.stamp = self._reader.stamp
+        if sorted(self._intervals)[1] > _SLOW * timeout:  # of a stream, not of one pose
+            return SLOW_POSES
         if late:  # with a good pose before, only if the loop itself was held up
             return STALE_POSE if self.status == OK else OK
         return LEAP if leapt and self.status in (OK, LEAP, INVALID_POSE) else OK
+
+    def _in_silence(self, now: int, timeout: int) -> int:
+        """The status of a period without a message. Real-time safe."""
+        if self.status == NO_POSE or now - self._received <= timeout:
+            return self.status
+        if not self.publishers:
+            return LOST_TOOL
+        refused = self.status in _OF_A_STREAM and now - self._heard <= _SILENCE
+        return self.status if refused else STALE_POSE
 
     def _comes_from_several(self, info: Any, now: int) -> bool:
         """Whether message numbers decreased twice lately; once is a restart. Real-time safe."""
