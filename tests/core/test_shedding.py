@@ -17,6 +17,13 @@ def test_missed_periods_shed_a_level_each_and_never_the_last() -> None:
     assert shedder.is_shedding
 
 
+def test_rest_takes_all_back_at_once() -> None:
+    shedder = Shedder(LEVELS)
+    for _ in range(3):
+        shedder.update(*BUSY)
+    assert shedder.rest() == 80 and not shedder.is_shedding
+
+
 def test_calm_takes_all_back_one_by_one() -> None:
     shedder = Shedder(LEVELS)
     for _ in range(3):

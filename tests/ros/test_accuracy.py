@@ -14,7 +14,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.framework import qos
 from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
-from avatar_ros.nodes.contact_reports import log_shown_modes
+from avatar_ros.nodes.contact_reports import ShownModesLog
 from avatar_ros.prepare.budget_requests import BudgetRequests
 from avatar_ros.prepare.detail_chooser import DetailChooser
 from avatar_ros.prepare.requests import Change, PreparationRequest
@@ -54,11 +54,44 @@ def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> 
     assert not report.shedding and model.n_shown == model.n_modes
 
 
-def test_the_log_names_modes_left_out_and_taken_back(probe: Probe) -> None:
-    """At two severities, which rclpy does not let one line of code have."""
-    node = SimpleNamespace(get_logger=probe.node.get_logger)
-    for shedding in (True, False, True):
-        log_shown_modes(node, ShownModesReport("modes", shedding, changed=True))
+def test_nobody_looks_and_no_mode_is_left_out(organ: Any) -> None:
+    model = prepare(organ, halves=True)
+    accuracy = ShownModes(model, organ.certificate.curve.of("surface"), float("inf"))
+    accuracy.update(window(50, 30e-6), watched=True)
+    assert model.n_shown < model.n_modes
+    for _ in range(3):
+        report = accuracy.update(window(50, 30e-6), watched=False)
+        assert not report.shedding and model.n_shown == model.n_modes
+    assert accuracy.update(window(50, 30e-6), watched=True).shedding
+
+
+def test_the_log_names_modes_left_out_once_a_minute(probe: Probe) -> None:
+    """And taken back, at another severity, which rclpy does not let one line of code have."""
+    now, said = [0.0], []
+    logger = probe.node.get_logger()
+
+    class Heard:
+        def warning(self, text: str) -> None:
+            said.append((now[0], text))
+            logger.warning(text)
+
+        def info(self, text: str) -> None:
+            said.append((now[0], text))
+            logger.info(text)
+
+    log = ShownModesLog(SimpleNamespace(get_logger=Heard), lambda: now[0])
+    for second in range(130):
+        now[0] = float(second)
+        left_out = second % 4 < 2
+        log.note(ShownModesReport("left out" if left_out else "all", left_out, second % 2 == 0))
+    assert said == [
+        (0, "left out"),
+        (2, "all"),
+        (60, "left out"),
+        (62, "all"),
+        (120, "left out"),
+        (122, "all"),
+    ]
 
 
 def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> None:

@@ -65,6 +65,11 @@ class Shedder:
                 self._patience, self._restored = PATIENCE, False  # the machine can serve it
         return self.modes
 
+    def rest(self) -> int:
+        """All modes again, after a window in which nobody looked."""
+        self._level, self._calm, self._restored = len(self._levels) - 1, 0, False
+        return self.modes
+
     def _shed(self) -> None:
         if self._restored:
             self._patience = min(2 * self._patience, _LONGEST)

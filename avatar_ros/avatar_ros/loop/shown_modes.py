@@ -69,23 +69,26 @@ class ShownModes:
         """Leave out modes by another deadline from now on [s]."""
         self._shedder.deadline = deadline
 
-    def update(self, statistics: LoopStatistics) -> ShownModesReport:
+    def update(self, statistics: LoopStatistics, watched: bool = True) -> ShownModesReport:
         """Complete a window's statistics with its modes, and choose those of the next window.
 
         The loop reads the new number at its next step.
+
+        watched : a tool touches the organ, or somebody receives what is shown; else all modes are
         """
         before = self._model.n_shown
         self._describe(statistics, before)
         missed = statistics.missed / max(statistics.periods, 1)
-        modes = self._shedder.update(missed, statistics.step_p99)
+        shedder = self._shedder
+        modes = shedder.update(missed, statistics.step_p99) if watched else shedder.rest()
         self._model.show(modes)
         text = f"{modes} of {self._model.n_modes} modes shown"
-        if self._shedder.is_shedding:
+        if shedder.is_shedding:
             text += (
                 f": {missed:.1%} of the periods missed, 99 % of steps within "
                 f"{statistics.step_p99 * 1e6:.0f} us; the force keeps all modes"
             )
-        return ShownModesReport(text, self._shedder.is_shedding, modes != before)
+        return ShownModesReport(text, shedder.is_shedding, modes != before)
 
     def _describe(self, statistics: LoopStatistics, shown: int) -> None:
         measured = [n for n in self._points if n <= shown]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
@@ -17,6 +17,8 @@ from avatar_ros.loop.shown_modes import ShownModesReport
 from avatar_ros.loop.statistics import TimingRecord, statistics
 from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.msg import LoopStatistics
+
+_MINUTE = 60.0  # [s]
 
 
 class ContactReports:
@@ -37,6 +39,7 @@ class ContactReports:
         self._publishers, self._ports = publishers, ports
         self._faults = diagnostics.FaultCounter(tools)
         self._logged: dict[str, str] = {}  # last fault, by tool
+        self._shown_modes_log = ShownModesLog(node)
 
     def publish(self) -> None:
         """Publish statistics and diagnostics of the window that ends now."""
@@ -45,10 +48,16 @@ class ContactReports:
         window = statistics(record, end, loop.settings.rate)
         window.header.stamp = self._node.get_clock().now().to_msg()
         shown_modes = loop.active.shown_modes
-        report = shown_modes.update(window) if shown_modes is not None else None
+        report = shown_modes.update(window, self._is_watched()) if shown_modes is not None else None
         self._publishers.statistics.publish(window)
         self._publish_diagnostics(window, report)
         gc.collect()  # the loop's process does it nowhere else
+
+    def _is_watched(self) -> bool:
+        """Whether a tool touches the organ, or somebody receives the cloud."""
+        model = self._loop.active.model
+        touched = model is not None and model.out.n_contacts[0] > 0
+        return touched or self._publishers.deformation.get_subscription_count() > 0
 
     def _publish_diagnostics(self, window: LoopStatistics, report: ShownModesReport | None) -> None:
         node, loop, active = self._node, self._loop, self._loop.active
@@ -61,7 +70,7 @@ class ContactReports:
             diagnostics.qos_status(name, self._ports.mismatches()),
         ]
         if report is not None:
-            log_shown_modes(node, report)
+            self._shown_modes_log.note(report)
             statuses.append(diagnostics.accuracy_status(name, report.text, report.shedding, window))
         for i, faults in enumerate(self._faults.window()):
             tool_name = loop.settings.tools[i]
@@ -90,11 +99,19 @@ class ContactReports:
             tool.publishers = tool.subscription.get_publisher_count()
 
 
-def log_shown_modes(node: Node, report: ShownModesReport) -> None:
-    """Log that modes are left out or shown again."""
-    if not report.changed:
-        return
-    if report.shedding:
-        node.get_logger().warning(report.text)
-    else:  # on a line of its own: rclpy allows only one severity for each line of code
-        node.get_logger().info(report.text)
+class ShownModesLog:
+    """Logs that modes are left out, once a minute at most, and that all of them are back."""
+
+    def __init__(self, node: Node, clock: Callable[[], float] = time.monotonic) -> None:
+        self._node, self._clock = node, clock
+        self._warned = -_MINUTE  # when
+        self._left_out = False  # as the log has it
+
+    def note(self, report: ShownModesReport) -> None:
+        """Log the report of a window if it is news."""
+        if report.shedding and report.changed and self._clock() - self._warned >= _MINUTE:
+            self._warned, self._left_out = self._clock(), True
+            self._node.get_logger().warning(report.text)
+        elif self._left_out and not report.shedding:
+            self._left_out = False  # on a line of its own: rclpy takes one severity a line of code
+            self._node.get_logger().info(report.text)
