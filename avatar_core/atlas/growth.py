@@ -46,7 +46,7 @@ class SurfaceFile:
     path: Path
     unit: str = "mm"
     axes: Axes | None = None
-    label: int | None = None
+    label: int | str | None = None
 
     @property
     def name(self) -> str:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from avatar_core.atlas.growth import Growth, Source
     from avatar_core.atlas.model import Atlas
 
-SUFFIXES = (".obj", ".stl", ".ply", ".vtk", ".off", ".nii", ".nii.gz")
+SUFFIXES = (".obj", ".stl", ".ply", ".vtk", ".off", ".nii", ".nii.gz", ".nrrd")
 
 EXIT_STOPPED = 130
 
@@ -33,8 +33,8 @@ Surfaces = Annotated[
     list[str],
     typer.Argument(
         metavar="SURFACE...",
-        help="surface files (OBJ, STL, PLY, VTK, OFF), label maps (.nii, .nii.gz), folders of "
-        "these, or 'phantom', the built-in liver",
+        help="surface files (OBJ, STL, PLY, VTK, OFF), label maps (.nii, .nii.gz, .nrrd), folders "
+        "of these, or 'phantom', the built-in liver",
     ),
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the files: mm, cm or m")]
@@ -45,7 +45,7 @@ Axes = Annotated[
         "default: as each header states (SPACE=LPS, as 3D Slicer writes), else RAS"
     ),
 ]
-Label = Annotated[int | None, typer.Option(help="value that marks the organ in label maps")]
+Label = Annotated[str | None, typer.Option(help="number or name of the organ in label maps")]
 Jobs = Annotated[
     int | None, typer.Option(help="number of processes on this machine; default: one per CPU")
 ]
@@ -229,7 +229,7 @@ def _report(file: Path, growth: Growth) -> None:
 
 
 def _sources(
-    surfaces: Sequence[str], unit: str, axes: str | None, label: int | None
+    surfaces: Sequence[str], unit: str, axes: str | None, label: str | None
 ) -> list[Source]:
     """The surfaces named, those of a folder in the order of their names."""
     from avatar_core.atlas.growth import SurfaceFile

@@ -27,8 +27,8 @@ EXIT_NOT_CONVERGED = 3
 Surface = Annotated[
     str,
     typer.Argument(
-        help="surface file (OBJ, STL, PLY, VTK, OFF) or label map (.nii, .nii.gz); 'phantom': the "
-        "built-in liver"
+        help="surface file (OBJ, STL, PLY, VTK, OFF) or label map (.nii, .nii.gz, .nrrd); "
+        "'phantom': the built-in liver"
     ),
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the file: mm, cm or m")]
@@ -39,7 +39,9 @@ Axes = Annotated[
         "default: as its header states (SPACE=LPS, as 3D Slicer writes), else RAS"
     ),
 ]
-Label = Annotated[int | None, typer.Option(help="value that marks the organ in a label map")]
+Label = Annotated[
+    str | None, typer.Option(help="number or name (.seg.nrrd) of the organ in a label map")
+]
 Vertices = Annotated[int, typer.Option(help="approximate number of mesh vertices")]
 
 
@@ -92,8 +94,12 @@ def vademecum(
     tumour: Annotated[
         Path | None,
         typer.Option(
-            help="surface file of a tumour, in unit and axes of the organ unless it states its own"
+            help="surface file of a tumour, in unit and axes of the organ unless it states its "
+            "own, or a label map, such as that of the organ"
         ),
+    ] = None,
+    tumour_label: Annotated[
+        str | None, typer.Option(help="number or name of the tumour in its label map")
     ] = None,
     contrast: Annotated[
         float, typer.Option(help="Young's modulus inside the tumour over that outside [-]")
@@ -165,7 +171,7 @@ def vademecum(
     clock = StageClock()
     clock.begin("surface")
     organ = read_organ(surface, unit, axes, label)
-    lesion = None if tumour is None else _read_tumour(tumour, unit, axes, organ)
+    lesion = None if tumour is None else _read_tumour(tumour, unit, axes, tumour_label, organ)
     options = OrganOptions(
         n_vertices=vertices,
         material=Material(young, poisson),
@@ -265,7 +271,7 @@ def _large_summary(v: Vademecum) -> dict[str, Any] | None:
     return {"material": v.large.material, "bytes": v.large.nbytes, "certificate": certificate}
 
 
-def read_organ(surface: str, unit: str, axes: str | None, label: int | None) -> SurfaceMesh:
+def read_organ(surface: str, unit: str, axes: str | None, label: str | None) -> SurfaceMesh:
     """A surface from a file, or the built-in liver."""
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.geometry.surface import read_surface
@@ -275,14 +281,16 @@ def read_organ(surface: str, unit: str, axes: str | None, label: int | None) -> 
     return read_surface(surface, unit, parsed_axes(axes), label)
 
 
-def _read_tumour(file: Path, unit: str, axes: str | None, organ: SurfaceMesh) -> SurfaceMesh:
+def _read_tumour(
+    file: Path, unit: str, axes: str | None, label: str | None, organ: SurfaceMesh
+) -> SurfaceMesh:
     """A tumour in the axes given, in those that its file states, or in those of the organ."""
     from avatar_core.geometry.surface_files import stated_axes
     from avatar_core.geometry.tumour import read_tumour
 
     if axes is not None:
-        return read_tumour(file, unit, parsed_axes(axes))
-    return read_tumour(file, unit, stated_axes(file) or organ.axes)
+        return read_tumour(file, unit, parsed_axes(axes), label)
+    return read_tumour(file, unit, stated_axes(file) or organ.axes, label)
 
 
 def parsed_axes(axes: str | None) -> Any:

@@ -14,8 +14,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
+from avatar_core.geometry.label_maps import march
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.geometry.surface_files import march
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avatar_core.errors import SurfaceError
+from avatar_core.geometry.label_maps import march
 from avatar_core.geometry.level_set import grid_points
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.geometry.surface_files import march
 
 FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]

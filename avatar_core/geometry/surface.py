@@ -132,19 +132,19 @@ def read_surface(
     path: str | Path,
     unit: str = "mm",
     axes: str | ArrayLike | None = None,
-    label: int | None = None,
+    label: int | str | None = None,
     *,
     check_size: bool = True,
     one_body: bool = True,
 ) -> SurfaceMesh:
-    """Read OBJ, STL, PLY, VTK, OFF or a NIfTI label map as one closed organ surface.
+    """Read OBJ, STL, PLY, VTK, OFF or a label map (NIfTI, NRRD) as one closed organ surface.
 
     unit : "m", "cm" or "mm", of the file's coordinates
     axes : where the file's +x, +y, +z point ("RAS", "LPS", "RIA", ...), or a rigid (4, 4) matrix
         from the file's coordinates to RAS in the file's unit; None: as the file's header states
         (``SPACE=LPS``, as 3D Slicer writes it), RAS if it states none. Axes that are given hold
         against the header, with a notice.
-    label : which label of a label map; not needed if there is only one
+    label : number, or name in a ``.seg.nrrd``, of one in a label map; not needed for the only one
     one_body : small stray bodies are dropped, others refused; False for tumours
 
     Raises SurfaceError naming cause and remedy: file missing or unreadable, no triangles, points

@@ -1,6 +1,7 @@
 """Surface file formats: each reader returns vertices and triangles, unconnected and unchecked.
 
-OBJ, STL, PLY, VTK and OFF give triangles in the file's coordinates; NIfTI label maps are meshed.
+OBJ, STL, PLY, VTK and OFF give triangles in the file's coordinates; of label maps
+(:mod:`avatar_core.geometry.label_maps`) the surface of one label is made.
 Nothing is checked here but that the file can be read; :mod:`avatar_core.geometry.surface` decides.
 """
 
@@ -10,14 +11,13 @@ import re
 from collections.abc import Callable, Iterable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from avatar_core.common import files
 from avatar_core.errors import SurfaceError, one_line
+from avatar_core.geometry.label_maps import is_label_map, surface_of_label
 from avatar_core.geometry.vtk_files import read_polydata
 
 FloatArray = NDArray[np.float64]
@@ -25,8 +25,6 @@ IntArray = NDArray[np.int64]
 Soup = tuple[FloatArray, IntArray]
 
 MAX_FILE_BYTES = 4 << 30
-MAX_LABEL_BYTES = 2**30  # of a decompressed label map
-LABEL_SPACING = 2.0  # label maps finer than this are averaged to it [mm]
 HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for
 
 
@@ -45,10 +43,13 @@ def stated_axes(path: Path) -> str | None:
     """The axes that a file's header states, "RAS" or "LPS"; None if it states none.
 
     3D Slicer writes ``SPACE=LPS`` or ``SPACE=RAS`` into the header of STL, the comments of OBJ and
-    PLY, and the title of legacy VTK. No more than ``HEADER_BYTES`` are read.
+    PLY, and the title of legacy VTK. No more than ``HEADER_BYTES`` are read. Label maps say where
+    their voxels lie, and are read in RAS.
 
     Raises SurfaceError if there is no such ordinary file.
     """
+    if is_label_map(path):
+        return "RAS"
     comments_of = _COMMENTS.get(path.suffix.lower())
     if comments_of is None:
         return None
@@ -91,16 +92,18 @@ _COMMENTS: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-def parse(path: Path, label: int | None) -> Soup:
+def parse(path: Path, label: int | str | None) -> Soup:
     """Vertices (n, 3) in the file's unit and axes, and triangles (m, 3)."""
     kind = ".nii" if path.name.lower().endswith(".nii.gz") else path.suffix.lower()
-    if kind not in _READERS:
-        raise SurfaceError(f"{path.name}: format not supported; use {', '.join(_READERS)} (.gz)")
+    if kind not in _READERS and not is_label_map(path):
+        raise SurfaceError(
+            f"{path.name}: format not supported; use {', '.join(_READERS)}, .nii (.gz) or .nrrd"
+        )
     try:
-        return _read_label_map(path, label) if kind == ".nii" else _READERS[kind](path)
+        return surface_of_label(path, label) if is_label_map(path) else _READERS[kind](path)
     except SurfaceError:
         raise
-    except Exception as error:  # parsers of five formats, each with errors of its own
+    except Exception as error:  # parsers of seven formats, each with errors of its own
         raise SurfaceError(
             f"{path.name}: not a readable {kind[1:].upper()} file ({one_line(error, 80)}); "
             "export it again"
@@ -157,92 +160,10 @@ def _read_vtk(path: Path) -> Soup:
     return _by_meshio("vtk")(path)
 
 
-def _read_label_map(path: Path, label: int | None) -> Soup:
-    """Surface of one label of a NIfTI volume, in its world coordinates (RAS by definition)."""
-    import nibabel
-
-    image: Any = nibabel.load(path)
-    _require_loadable(path, image)
-    values = np.squeeze(np.asanyarray(image.dataobj))
-    if values.ndim != 3:
-        raise SurfaceError(f"{path.name}: {values.ndim} dimensions; give a 3D label map")
-    inside = values == _chosen_label(path, values, label)
-    return _surface_of_mask(inside, np.asarray(image.affine, dtype=np.float64))
-
-
-def _require_loadable(path: Path, image: Any) -> None:
-    """Bound the decompressed size before anything is loaded."""
-    scaled = (image.dataobj.slope, image.dataobj.inter) != (1.0, 0.0)
-    item = 8 if scaled else image.get_data_dtype().itemsize
-    n_bytes = item * int(np.prod(image.shape, dtype=np.int64))
-    if n_bytes > MAX_LABEL_BYTES:
-        raise SurfaceError(
-            f"{path.name}: label map of {n_bytes / 1e9:.1f} GB; crop it to the organ "
-            f"(limit {MAX_LABEL_BYTES / 1e9:.1f} GB)"
-        )
-
-
-def _chosen_label(path: Path, values: NDArray[Any], label: int | None) -> float:
-    present = np.unique(values)
-    present = present[present != 0]
-    if len(present) > 100:
-        raise SurfaceError(f"{path.name}: an image, not a label map; give the segmentation")
-    if label is None and len(present) == 1:
-        return float(present[0])
-    if label is None or label not in present:
-        names = ", ".join(f"{value:g}" for value in present) or "none"
-        raise SurfaceError(f"{path.name}: labels present: {names}; choose one with --label")
-    return float(label)
-
-
-def _surface_of_mask(inside: NDArray[np.bool_], affine: FloatArray) -> Soup:
-    """Marching cubes on a mask averaged to 2 mm and blurred by half its coarsest voxel."""
-    from scipy.ndimage import gaussian_filter
-
-    corner, mask = _crop(inside)
-    size = np.linalg.norm(affine[:3, :3], axis=0)
-    factor = np.maximum(np.floor(LABEL_SPACING / size + 1e-6), 1).astype(int)
-    averaged = np.pad(_block_mean(mask, factor), 3)
-    filled = gaussian_filter(averaged, 0.5 * (size * factor).max() / (size * factor))
-    index, faces = march(0.5 - filled)
-    voxel = corner + (index - 3) * factor + (factor - 1) / 2
-    vertices = voxel @ affine[:3, :3].T + affine[:3, 3]
-    return vertices, faces if np.linalg.det(affine[:3, :3]) > 0 else faces[:, ::-1]
-
-
-def _crop(mask: NDArray[np.bool_]) -> tuple[IntArray, NDArray[np.bool_]]:
-    """First corner of the bounding box of the mask, and the mask inside it."""
-    spans = []
-    for axis in range(3):
-        used = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
-        spans.append(slice(used[0], used[-1] + 1))
-    return np.array([s.start for s in spans]), mask[tuple(spans)]
-
-
-def _block_mean(mask: NDArray[np.bool_], factor: IntArray) -> FloatArray:
-    """Mean over blocks of factor voxels, the mask padded with outside to whole blocks."""
-    padded = np.pad(mask, [(0, int(-n % f)) for n, f in zip(mask.shape, factor, strict=True)])
-    blocks = [int(k) for n, f in zip(padded.shape, factor, strict=True) for k in (n // f, f)]
-    return padded.reshape(blocks).mean(axis=(1, 3, 5))
-
-
-def march(values: FloatArray) -> Soup:
-    """Zero surface of a grid, negative inside, by marching cubes in index coordinates.
-
-    values : ndarray, shape (nx, ny, nz). Returns vertices (n, 3) and outward faces (m, 3).
-    """
-    shape = values.shape
-    k, j, i = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in shape[::-1]), indexing="ij")
-    grid = np.column_stack([i.ravel(), j.ravel(), k.ravel()])
-    vertices, faces, _ = igl.marching_cubes(values.ravel(order="F"), grid, *shape, 0.0)
-    return vertices, faces
-
-
 _READERS: dict[str, Callable[..., Soup]] = {
     ".obj": _read_obj,
     ".stl": _by_meshio("stl"),
     ".ply": _by_meshio("ply"),
     ".off": _by_meshio("off"),
     ".vtk": _read_vtk,
-    ".nii": _read_label_map,
 }

@@ -23,13 +23,15 @@ _POLAR, _AZIMUTHS, _DEPTHS = 4, 8, 8  # directions and distances of points under
 _CORE = 0.25  # part of the energy within the contact's own radius
 
 
-def read_tumour(path: str | Path, unit: str = "mm", axes: Any = None) -> SurfaceMesh:
+def read_tumour(
+    path: str | Path, unit: str = "mm", axes: Any = None, label: int | str | None = None
+) -> SurfaceMesh:
     """Read the surface of one or more tumours, in the coordinates of its file.
 
     Raises SurfaceError as :func:`avatar_core.geometry.surface.read_surface`, but for size and
     bodies.
     """
-    return read_surface(path, unit, axes, check_size=False, one_body=False)
+    return read_surface(path, unit, axes, label, check_size=False, one_body=False)
 
 
 def volume_fraction_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import nrrd
 import numpy as np
 import pytest
 import typer
@@ -132,7 +133,25 @@ def test_axes_of_a_tumour(tmp_path: Path, states: str, given: str | None, read: 
     tumour.write_text(states + organ.read_text().partition("\n")[2])
     surface = read_organ(str(organ), "mm", None, None)
     assert surface.axes_name == "LPS"
-    assert _read_tumour(tumour, "mm", given, surface).axes_name == read
+    assert _read_tumour(tumour, "mm", given, None, surface).axes_name == read
+
+
+def test_a_tumour_in_a_label_map_lies_where_its_voxels_do(tmp_path: Path) -> None:
+    """And has not the axes of the organ's file."""
+    organ = phantom_file(tmp_path)
+    organ.write_text("# SPACE=LPS\n" + organ.read_text())
+    surface = read_organ(str(organ), "mm", None, None)
+    values = np.zeros((12, 12, 12), np.uint8)
+    values[3:9, 3:9, 3:9], values[0, 0, 0] = 4, 1
+    fields = {
+        "space": "LPS",
+        "space directions": 3.0 * np.eye(3),
+        "space origin": [20.0, 30.0, 40.0],
+    }
+    nrrd.write(str(tmp_path / "found.nrrd"), values, fields)
+    tumour = _read_tumour(tmp_path / "found.nrrd", "mm", None, "4", surface)
+    centre = 1e-3 * (np.array([20.0, 30.0, 40.0]) + 3.0 * 5.5) * [-1, -1, 1]
+    np.testing.assert_allclose(tumour.vertices.mean(axis=0), centre, atol=1e-4)
 
 
 @pytest.mark.long

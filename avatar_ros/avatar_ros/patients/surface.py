@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+from avatar_core.geometry.label_maps import MAX_LABEL_BYTES
 from avatar_core.geometry.surface import (
     SurfaceMesh,
     keep_organ,
@@ -12,7 +13,6 @@ from avatar_core.geometry.surface import (
     require_closed,
     require_plausible_size,
 )
-from avatar_core.geometry.surface_files import MAX_LABEL_BYTES
 from avatar_ros.framework.reader import Reader
 from avatar_ros.patients.protocol import PatientRequest
 
@@ -26,7 +26,7 @@ def read_confined(request: PatientRequest, reader: Reader) -> SurfaceMesh:
         return reader.read(
             "mesh", request.vertices.nbytes + request.faces.nbytes, surface_of, request
         )
-    packed = request.surface.endswith((".gz", ".nii"))  # may unpack to MAX_LABEL_BYTES
+    packed = request.surface.endswith((".gz", ".nii", ".nrrd"))  # may unpack to MAX_LABEL_BYTES
     n_bytes = MAX_LABEL_BYTES if packed else os.path.getsize(request.surface)
     return reader.read(os.path.basename(request.surface), n_bytes, surface_of, request)
 
