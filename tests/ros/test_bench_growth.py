@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import mmap
-import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -29,12 +29,32 @@ def test_nothing_grows_in_a_minute(library: Path) -> None:
     assert [growth.complaint for growth in run.growths if growth.complaint] == []
 
 
+_GROWING = """
+import mmap, sys
+print(flush=True), sys.stdin.readline()
+taken = mmap.mmap(-1, 8_000_000)
+taken.write(bytes(len(taken)))
+held = open(sys.argv[1], "w")
+print(flush=True), sys.stdin.readline()
+"""
+
+
 def test_what_grows_is_complained_of(tmp_path: Path) -> None:
-    begin = Footprint.of(os.getpid())
-    taken = mmap.mmap(-1, 8_000_000)
-    taken.write(bytes(len(taken)))
-    with (tmp_path / "file").open("w"):
-        end = Footprint.of(os.getpid())
+    """Of a process that does nothing else, as this one, with threads of other tests, may."""
+    with subprocess.Popen(
+        [sys.executable, "-S", "-c", _GROWING, str(tmp_path / "file")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdin is not None and process.stdout is not None
+        process.stdout.readline()
+        begin = Footprint.of(process.pid)
+        process.stdin.write("\n")
+        process.stdin.flush()
+        process.stdout.readline()
+        end = Footprint.of(process.pid)
+        process.stdin.close()
     growth = Growth("test", begin, end)
     assert growth.memory_mb == pytest.approx(8.0, abs=0.5)
     assert growth.complaint.endswith("MB and 1 files more")
