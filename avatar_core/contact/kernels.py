@@ -56,9 +56,9 @@ from avatar_core.contact.effects.tip_law import (
     advance_tips,
     law_error,
     predict_tips,
-    sample_surface,
     solve_tip,
 )
+from avatar_core.contact.effects.tip_surface import sample_surface
 from avatar_core.contact.effects.viscoelasticity import (
     advance_history,
     predict_history,

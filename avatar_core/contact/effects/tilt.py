@@ -131,6 +131,14 @@ def sample_tilt(tilt, t, cell):  # type: ignore[no-untyped-def]
 
 
 @fast
+def _righting(ratio):  # type: ignore[no-untyped-def]
+    """w'(t), the torque over F a."""
+    if ratio <= 1.0:
+        return ratio / 3.0
+    return 1.0 - 2.0 / 3.0 * (1.0 + 0.75 * (ratio - 1.0)) ** (-2.0 / 3.0)
+
+
+@fast
 def evaluate_tilt(tilt, t, load):  # type: ignore[no-untyped-def]
     """What leaning adds to the depth of the lowest point [m], to its derivative by the load F / E*
     [1/m], and to the stored energy over E* [m^3]."""
@@ -142,9 +150,10 @@ def evaluate_tilt(tilt, t, load):  # type: ignore[no-untyped-def]
     ratio = 4.0 * a * edge / load
     if ratio <= 1.0:
         return edge, 0.0, 2.0 / 3.0 * a * edge * edge
+    first = _righting(ratio)
     root = (1.0 + 0.75 * (ratio - 1.0)) ** (1.0 / 3.0)
     w = ratio - 5.0 / 6.0 - 8.0 / 3.0 * (root - 1.0)
-    first, second = 1.0 - 2.0 / (3.0 * root * root), 1.0 / (3.0 * root**5)
+    second = 1.0 / (3.0 * root**5)
     scale = 0.25 / a
     depth = edge - scale * load * (2.0 * w - ratio * first)
     slope = -scale * (2.0 * (w - ratio * first) + ratio * ratio * second)
@@ -163,10 +172,7 @@ def add_righting(tilt, out, t, stiffness, elastic, relaxed):  # type: ignore[no-
     if sine == 0.0 or elastic <= 0.0 or tilt.cosine[t] <= 0.0:
         return
     ratio = 4.0 * stiffness * a * a * sine / elastic
-    part = ratio / 3.0
-    if ratio > 1.0:
-        part = 1.0 - 2.0 / 3.0 * (1.0 + 0.75 * (ratio - 1.0)) ** (-2.0 / 3.0)
-    factor = relaxed * elastic * a * part * tilt.cosine[t] / sine
+    factor = relaxed * elastic * a * _righting(ratio) * tilt.cosine[t] / sine
     for d in range(3):
         out.force[t, d] += factor * tilt.rise[t, d]
         out.torque[t, d] += factor * tilt.across[t, d]

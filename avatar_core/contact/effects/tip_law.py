@@ -46,7 +46,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from avatar_core.common.jit import entry, fast, inlined
-from avatar_core.common.splines import cell_at, in_cell
 from avatar_core.contact.effects.large_deformation import evaluate_added_depth
 from avatar_core.contact.effects.large_dent import LEAST, evaluate_large_dent, large_dent_of
 from avatar_core.contact.effects.tilt import TiltState, add_righting, evaluate_tilt, sample_tilt
@@ -54,16 +53,15 @@ from avatar_core.contact.effects.tip_profile import (
     ANISOTROPY,
     INTERVALS,
     KAPPA,
-    LEAST_SLOPE,
     STIFFNESS,
     TAKEN,
     TAU,
     least_kappa,
     profile_of,
 )
+from avatar_core.contact.effects.tip_surface import felt_shape
 from avatar_core.errors import ContactError
 from avatar_core.fem.elasticity import Material
-from avatar_core.geometry.local_profile import MIDDLE
 from avatar_core.geometry.tip import Tip
 
 PATCH = 0.7665  # c E* R_p on a half-space,
@@ -78,9 +76,6 @@ UNSHIFTED = 2.5
 TUMOUR_ERROR = 0.25  # of the force, per relative change of E* by a tumour underneath
 LEAST_CONTACT = 0.02  # contact radius over the tip's, where the tangent of a light touch is taken
 MOST_TAKEN = 0.9  # part of a dent's least compliance, 1 / (2 E* radius), that may be taken off
-# Limits set in between these, so that the force does not jump:
-ANISOTROPIES = (0.6, 0.9)  # D over b^2; at the limit one curvature is 14 times the other
-FLATTENINGS = (0.5, 1.5)  # of -tau, over the most that a tip with its radius can follow
 MAX_STEPS = 60  # of Newton's method, with bisection where it leaves its bracket
 TOLERANCE = 1e-13  # [m] of depth, or relative of the force
 
@@ -187,78 +182,6 @@ def tip_law_state(arrays: TipLawArrays, n_terms: int, tilt: TiltState | None = N
 def edge_below(law, t, cell):  # type: ignore[no-untyped-def]
     """How deep the lowest point of a tip that leans is below the one that its pose says [m]."""
     return 0.0 if law is None else sample_tilt(law.tilt, t, cell)
-
-
-@inlined
-def sample_surface(model, law, t, tip):  # type: ignore[no-untyped-def]
-    """kappa, tau, D, E* and c at a tip, with their gradients."""
-    if law is None:
-        return
-    cell = cell_at(model.origin, model.spacing[0], tip)
-    for k in range(5):
-        law.value[t, k] = in_cell(law.local[k], cell, law.gradient[t, k])
-    if law.bluntness[t] > 0.0:
-        _lower_kappa(law, t)
-    _limit(law, t)
-
-
-@fast
-def _lower_kappa(law, t):  # type: ignore[no-untyped-def]
-    """By what the contact's ellipse takes of the mean curvature: b - b (1 - D / b^2)^(2/3)."""
-    value, gradient = law.value[t], law.gradient[t]
-    least = LEAST_SLOPE * law.bluntness[t]
-    b = law.bluntness[t] + value[KAPPA] + MIDDLE / 3.0 * value[TAU]
-    above, whole = _positive(b - least, least)
-    b = least + above
-    ratio, part = _capped(value[ANISOTROPY] / (b * b), *ANISOTROPIES)
-    root = (1.0 - ratio) ** (1.0 / 3.0)
-    by_anisotropy = -2.0 / 3.0 * part / (root * b)
-    by_b = root * root - 1.0 - 2.0 * by_anisotropy * value[ANISOTROPY] / b
-    value[KAPPA] += b * (root * root - 1.0)
-    for d in range(3):
-        slope = whole * (gradient[KAPPA, d] + MIDDLE / 3.0 * gradient[TAU, d])
-        gradient[KAPPA, d] += by_b * slope + by_anisotropy * gradient[ANISOTROPY, d]
-
-
-@fast
-def _limit(law, t):  # type: ignore[no-untyped-def]
-    """kappa and tau as far down as the tip can follow, so that delta grows with the contact."""
-    value, gradient, least = law.value[t], law.gradient[t], law.least_kappa[t]
-    room, part = _positive(value[KAPPA] - least, -0.25 * least)
-    value[KAPPA] = least + room
-    for d in range(3):
-        gradient[KAPPA, d] *= part
-    if value[TAU] >= 0.0:
-        return
-    unit = -3.0 / 16.0 * np.pi * law.radius[t]
-    flattening = unit * value[TAU]
-    ratio = flattening / room if flattening < 2.0 * room else 2.0  # room may be zero
-    kept, slope = _capped(ratio, *FLATTENINGS)
-    value[TAU] = room * kept / unit
-    for d in range(3):
-        gradient[TAU, d] *= slope
-        gradient[TAU, d] += (kept - ratio * slope) / unit * gradient[KAPPA, d]
-
-
-@fast
-def _positive(z, width):  # type: ignore[no-untyped-def]
-    """z, but no less than 0, and its slope, which changes over ``width`` to both sides."""
-    if z >= width:
-        return z, 1.0
-    if z <= -width:
-        return 0.0, 0.0
-    return (z + width) ** 2 / (4.0 * width), (z + width) / (2.0 * width)
-
-
-@fast
-def _capped(z, low, high):  # type: ignore[no-untyped-def]
-    """z, but no more than the middle of ``low`` and ``high``, between which its slope falls."""
-    if z <= low:
-        return z, 1.0
-    if z >= high:
-        return 0.5 * (low + high), 0.0
-    beyond = (z - low) / (high - low)
-    return z - 0.5 * beyond * (z - low), 1.0 - beyond
 
 
 @fast
@@ -467,9 +390,7 @@ def depths_under_loads(law, curvature, growth, anisotropy, load, depth):  # type
     for i in range(len(load)):
         law.value[0, KAPPA], law.value[0, TAU] = curvature[i], growth[i]
         law.value[0, ANISOTROPY] = anisotropy[i]
-        if law.bluntness[0] > 0.0:
-            _lower_kappa(law, 0)
-        _limit(law, 0)
+        felt_shape(law, 0)
         law.place[0] = 0.0
         _find_place(None, law, None, 0, 0.0, 1.0, load[i])
         depth[i] = dent(law, 0)[0]

@@ -16,7 +16,7 @@ from avatar_core.common.jit import compiled
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud_kernels import write_cloud
 from avatar_core.contact.dent import add_dents
-from avatar_core.contact.effects.tip_law import sample_surface
+from avatar_core.contact.effects.tip_surface import sample_surface
 from avatar_core.contact.locate import locate
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.contact.tip_compliance import assemble_own, near_along_normal
