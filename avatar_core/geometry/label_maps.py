@@ -37,13 +37,13 @@ _NRRD_TYPES = {
     "f4": ("float",),
     "f8": ("double",),
 }
-_TO_RAS = {  # of the spaces that NRRD names, the signs of their axes
+_TO_RAS = {  # of the spaces that NRRD names, in full and in short, the signs of their axes
     "right-anterior-superior": (1, 1, 1),
     "left-anterior-superior": (-1, 1, 1),
     "left-posterior-superior": (-1, -1, 1),
-}
-_SHORT = {"ras": "right-anterior-superior", "las": "left-anterior-superior"} | {
-    "lps": "left-posterior-superior"
+    "ras": (1, 1, 1),
+    "las": (-1, 1, 1),
+    "lps": (-1, -1, 1),
 }
 
 
@@ -125,7 +125,6 @@ def _read_nrrd(path: Path) -> LabelMap:
     directions = np.atleast_2d(directions)
     axes = np.asarray(np.isfinite(directions).all(axis=-1))
     space = str(header.get("space", "")).lower()
-    space = _SHORT.get(space, space)
     if axes.sum() != 3 or directions.shape[-1] != 3 or space not in _TO_RAS:
         raise SurfaceError(
             f"{path.name}: does not say where its three axes point; save it as a segmentation "

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from avatar_core.errors import SurfaceError
+from avatar_core.geometry.label_maps import is_label_map
 from avatar_core.geometry.skin import Skin, components, directed_edges, skin_of, weld
 from avatar_core.geometry.surface_files import content_of, parse, stated_axes
 
@@ -166,7 +167,7 @@ def read_surface(
         name=path.name.split(".")[0],
         unit=unit,
         axes=matrix,
-        notices=_contradictions(matrix, stated),
+        notices=_contradictions(matrix, stated, path),
         source_sha256=hashlib.sha256(content).hexdigest(),
     )
     if one_body:
@@ -426,13 +427,16 @@ def axes_matrix(axes: str | ArrayLike) -> FloatArray:
     return matrix
 
 
-def _contradictions(axes: FloatArray, stated: str | None) -> tuple[str, ...]:
-    """A notice if axes (4, 4) turn the file otherwise than those that its header states."""
+def _contradictions(axes: FloatArray, stated: str | None, path: Path) -> tuple[str, ...]:
+    """A notice if axes (4, 4) turn the file otherwise than it states."""
     if stated is None or np.allclose(axes[:3, :3], _named_axes(stated), atol=1e-4):
         return ()
+    where = f"the file's header states {stated} (SPACE={stated})"
+    if is_label_map(path):
+        where = f"a label map says where its voxels lie, and is read in {stated}"
     return (
-        f"axes {_axes_name(axes)}, as given, although the file's header states {stated} "
-        f"(SPACE={stated}); give --axes {stated}, or none, if the organ is turned",
+        f"axes {_axes_name(axes)}, as given, although {where}; give --axes {stated}, or none, if "
+        "the organ is turned",
     )
 
 

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import igl
 import meshio
-import nibabel
-import nrrd
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry import label_maps, surface_files
 from avatar_core.geometry import surface as door
+from avatar_core.geometry import surface_files
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh, ambiguous_fraction, axes_matrix, read_surface
-from avatar_core.geometry.tumour import read_tumour
 
 RADIUS = 60.0  # of the test ball [mm], an organ of 0.12 m
 
@@ -101,162 +96,6 @@ def test_legacy_vtk_polydata(tumour_dir):
     liver = read_surface(tumour_dir / "liver.vtk")
     assert 1e-3 < liver.volume < 3e-3
     assert read_surface(tumour_dir / "liver_tumours.vtk").volume < 2e-4
-
-
-def label_map(path: Path, affine: np.ndarray, labels: tuple[int, ...] = (1,)) -> Path:
-    """An ellipsoid of 40, 50, 60 mm about (10, -20, 30) mm in world coordinates."""
-    shape = tuple(np.ceil(160 / np.linalg.norm(affine[:3, :3], axis=0)).astype(int))
-    voxels = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-    world = voxels @ affine[:3, :3].T + affine[:3, 3]
-    inside = np.linalg.norm((world - [10, -20, 30]) / [40, 50, 60], axis=-1) < 1
-    values = np.zeros(shape, dtype=np.uint8)
-    values[inside] = labels[0]
-    for label in labels[1:]:
-        values[-label:, 0, 0] = label
-    nibabel.save(nibabel.Nifti1Image(values, affine), path)
-    return path
-
-
-@pytest.mark.parametrize("mirror", [1.0, -1.0])
-@pytest.mark.parametrize("size", [(2.0, 2.0, 2.0), (0.8, 0.8, 5.0)])
-def test_label_map_honours_its_affine(tmp_path, mirror, size):
-    affine = np.diag([mirror * size[0], size[1], size[2], 1.0])
-    affine[:3, 3] = [10 - mirror * 80, -100, -50]
-    surface = read_surface(label_map(tmp_path / "organ.nii.gz", affine))
-    low, high = surface.bounding_box
-    # half a coarsest voxel
-    assert np.allclose(low, [-0.03, -0.07, -0.03], atol=size[2] * 0.5e-3)
-    assert np.allclose(high, [0.05, 0.03, 0.09], atol=size[2] * 0.5e-3)
-    assert surface.volume == pytest.approx(4 / 3 * np.pi * 0.04 * 0.05 * 0.06, rel=0.02)
-    assert surface.notices == ()
-
-
-def test_label_map_asks_which_label(tmp_path):
-    affine = np.diag([2.0, 2.0, 2.0, 1.0])
-    affine[:3, 3] = [-70, -100, -50]
-    path = label_map(tmp_path / "organs.nii", affine, labels=(3, 7))
-    refused(path, "3, 7", "--label")
-    refused(path, "3, 7", "--label", label=5)
-    assert read_surface(path, label=3).volume == pytest.approx(5.03e-4, rel=0.02)
-
-
-def segmentation(path: Path, names: dict[str, int], layers: int = 1, **header: Any) -> Path:
-    """A file as 3D Slicer writes it: a liver about (10, -20, 30) mm in RAS, and a lesion."""
-    size = np.array([2.0, 2.5, 3.0])
-    turn = Rotation.from_euler("zx", [20.0, -35.0], degrees=True).as_matrix()
-    shape = np.ceil(170 / size).astype(int)
-    affine = np.eye(4)
-    affine[:3, :3] = turn * size
-    affine[:3, 3] = [10, -20, 30] - affine[:3, :3] @ (shape / 2)
-    voxels = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-    world = voxels @ affine[:3, :3].T + affine[:3, 3]
-    values = np.zeros((layers, *shape), np.uint8)
-    liver = np.linalg.norm((world - [10, -20, 30]) / [40, 50, 60], axis=-1) < 1
-    lesion = np.linalg.norm(world - [20, -10, 30], axis=-1) < 15
-    values[0][liver], values[layers - 1][lesion] = 1, 2
-    lps = np.diag([-1.0, -1.0, 1.0])
-    directions = [*(lps @ affine[:3, :3]).T]
-    fields: dict[str, Any] = {
-        "space": "left-posterior-superior",
-        "space directions": np.array(
-            [np.full(3, np.nan), *directions] if layers > 1 else directions
-        ),
-        "space origin": lps @ affine[:3, 3],
-        "kinds": ["list"] * (layers > 1) + ["domain"] * 3,
-        "encoding": "gzip",
-    }
-    for k, (name, value) in enumerate(names.items()):
-        layer = min(layers - 1, k)
-        fields |= {
-            f"Segment{k}_Name": name,
-            f"Segment{k}_LabelValue": str(value),
-            f"Segment{k}_Layer": str(layer),
-        }
-    nrrd.write(str(path), values if layers > 1 else values[0], fields | header)
-    return path
-
-
-@pytest.mark.parametrize("layers", [1, 2])
-@pytest.mark.parametrize("encoding", ["gzip", "raw"])
-def test_a_segmentation_of_slicer_is_read_by_its_names(tmp_path, layers, encoding):
-    path = segmentation(
-        tmp_path / "a.seg.nrrd", {"Liver": 1, "lesion 1": 2}, layers, encoding=encoding
-    )
-    refused(path, "Liver (1), lesion 1 (2)", "--label")
-    refused(path, "Liver (1)", label="spleen")
-    liver = read_surface(path, label="liver")
-    whole = 4 / 3 * np.pi * 0.04 * 0.05 * 0.06
-    cut_out = 0.0 if layers > 1 else 4 / 3 * np.pi * 0.015**3  # one layer holds one label a voxel
-    assert liver.volume == pytest.approx(whole - cut_out, rel=0.01)
-    low, high = liver.bounding_box
-    np.testing.assert_allclose(low, [-0.03, -0.07, -0.03], atol=1.5e-3)
-    np.testing.assert_allclose(high, [0.05, 0.03, 0.09], atol=1.5e-3)
-    tumour = read_tumour(path, label="lesion 1")
-    np.testing.assert_allclose(tumour.vertices.mean(axis=0), [0.02, -0.01, 0.03], atol=1e-3)
-    assert read_surface(path, label=1).volume == liver.volume
-    assert liver.notices == ()
-
-
-def test_a_label_map_in_nrrd_equals_that_in_nifti(tmp_path):
-    affine = np.diag([2.0, -2.0, 3.0, 1.0])
-    affine[:3, 3] = [-70, 60, -50]
-    nifti = label_map(tmp_path / "organ.nii", affine)
-    values = np.asarray(nibabel.load(nifti).dataobj)
-    fields = {"space": "RAS", "space directions": affine[:3, :3].T, "space origin": affine[:3, 3]}
-    nrrd.write(str(tmp_path / "organ.nrrd"), values, fields)
-    one, other = read_surface(nifti), read_surface(tmp_path / "organ.nrrd")
-    np.testing.assert_allclose(other.vertices, one.vertices, atol=1e-12)
-    np.testing.assert_array_equal(other.faces, one.faces)
-    refused(tmp_path / "organ.nrrd", "labels present: 1, without names", label="liver")
-
-
-def test_a_segmentation_that_cannot_be_read_says_why(tmp_path, monkeypatch):
-    values = np.ones((4, 4, 4), np.uint8)
-    nrrd.write(str(tmp_path / "nowhere.nrrd"), values, {"spacings": [1, 1, 1]})
-    refused(tmp_path / "nowhere.nrrd", "where its three axes point")
-    nrrd.write(str(tmp_path / "packed.nrrd"), values, {"encoding": "bzip2"})
-    refused(tmp_path / "packed.nrrd", "encoding bzip2")
-    nrrd.write(str(tmp_path / "parts.nhdr"), values)
-    (tmp_path / "parts.nhdr").rename(tmp_path / "parts.nrrd")
-    refused(tmp_path / "parts.nrrd", "in another file")
-    whole = segmentation(tmp_path / "whole.seg.nrrd", {"liver": 1, "lesion": 2, "vein": 3})
-    refused(whole, "the segment vein is empty", label="vein")
-    cut = tmp_path / "cut.seg.nrrd"
-    cut.write_bytes(whole.read_bytes()[:-400])
-    refused(cut, "bytes of voxels", label="liver")
-    monkeypatch.setattr(label_maps, "MAX_LABEL_BYTES", 1000)
-    refused(whole, "crop it", label="liver")
-
-
-def test_voxels_of_no_organ_are_refused(tmp_path):
-    affine = np.diag([2.0, 2.0, 1e15, 1.0])  # the blur over them would take hours
-    nibabel.save(nibabel.Nifti1Image(np.ones((4, 4, 4), np.uint8), affine), tmp_path / "a.nii")
-    refused(tmp_path / "a.nii", "voxels of 2 x 2 x 1e+15 mm")
-
-
-def test_a_damaged_segmentation_is_refused_or_read(tmp_path):
-    """Bytes of the header, changed or cut: never another error, nor more memory than allowed."""
-    whole = segmentation(tmp_path / "whole.seg.nrrd", {"liver": 1, "lesion": 2}, 2).read_bytes()
-    head, path = whole.index(b"\n\n") + 2, tmp_path / "damaged.seg.nrrd"
-    rng, outcomes = np.random.default_rng(0), set()
-    for _ in range(200):
-        content = bytearray(whole)
-        for at in rng.integers(0, head, rng.integers(1, 4)):
-            content[at : at + rng.integers(0, 3)] = bytes([rng.integers(32, 127)])
-        path.write_bytes(content)
-        try:
-            vertices, _ = surface_files.parse(path, "liver")
-            outcomes.add("read" if len(vertices) else "empty")
-        except SurfaceError as error:
-            assert "\n" not in str(error)
-            outcomes.add("refused")
-    assert outcomes == {"read", "refused"}
-
-
-def test_label_map_is_bounded_before_it_is_loaded(tmp_path, monkeypatch):
-    path = label_map(tmp_path / "organ.nii.gz", np.diag([4.0, 4.0, 4.0, 1.0]))
-    monkeypatch.setattr(label_maps, "MAX_LABEL_BYTES", 1000)
-    refused(path, "crop it")
 
 
 # --- unit and axes ----------------------------------------------------------------------------
