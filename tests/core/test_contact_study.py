@@ -11,19 +11,24 @@ from avatar_core.studies.contact import reference_error, summary_of
 SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
 
 
-def contact(force: float, estimate: float) -> SiteContact:
+def contact(force: float, estimate: float, angle: float = 0.0) -> SiteContact:
     """A contact whose resolved force is 2 N."""
-    return SiteContact(SITE, 3e-3, 1e-3, 2.0, force, 0.0, estimate, 0.5 * estimate, 6.0, 1.0, 0.05)
+    return SiteContact(
+        SITE, 3e-3, 1e-3, 2.0, force, angle, estimate, 0.5 * estimate, 6.0, 1.0, 0.05
+    )
 
 
 def test_key_figures_are_those_of_the_contacts() -> None:
-    found = summary_of([contact(2.1, 0.2), contact(1.8, 0.1), contact(2.0, 0.1), contact(2.0, 0.0)])
+    found = summary_of(
+        [contact(2.1, 0.2), contact(1.8, 0.1), contact(2.0, 0.1), contact(2.0, 0.0, 0.2)]
+    )
     assert found["force_mean"] == pytest.approx((0.05 + 0.1) / 4)
     assert found["force_worst"] == pytest.approx(0.1)
     assert found["coverage"] == 0.75  # 1.8 N is 0.2 N off and says 0.1 N
     assert found["patch_mean"] == pytest.approx(2.0)
     assert found["hertz_mean"] == pytest.approx(0.5)
-    assert found["far_field_l2"] == 0.05
+    assert found["far_field_l2"] == found["far_field_l2_median"] == 0.05
+    assert found["direction_mean_deg"] == pytest.approx(np.degrees(0.05))
 
 
 @pytest.mark.long

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +24,9 @@ from avatar_core.reduction.galerkin import (
     GalerkinBasis,
     ReductionRule,
     compact_response,
+    estimate_errors,
     reduce,
+    relative_residual,
     residual_compliance_blocks,
     solve_probes,
 )
@@ -195,6 +199,31 @@ def test_estimate_brackets_the_error_and_the_tolerance_is_met(case: Case) -> Non
     assert error.mean() < 0.05
     assert patient.estimates[-1].rank >= patient.estimates[0].rank
     assert patient.solutions < 3 * n
+
+
+def test_a_large_compliance_does_not_hide_a_residual() -> None:
+    """Of a lobe that gives way a hundred times as far, with three times the residual of others."""
+    residual = np.array([1.0, 1.0, 1.0, 3.0])
+    basis: Any = SimpleNamespace(
+        compliance_trace=lambda: np.array([1.0, 1.0, 1.0, 100.0]), load_norm=np.ones(4)
+    )
+    blocks = (residual**2 / 3.0)[:, None, None] * np.eye(3)
+    relative = relative_residual(basis, blocks)
+    np.testing.assert_allclose(relative[:3], 1.0 / 0.825)  # over the mean of 1, 1, 1 and 0.3
+    assert relative[3] == pytest.approx(3.0 / 1.5)
+
+
+def test_the_worst_that_is_said_is_no_less_than_a_probe() -> None:
+    """Of three loads with the same residual, one is four times as wrong as the others."""
+    basis: Any = SimpleNamespace(
+        compliance_trace=lambda: np.ones(3), load_norm=np.ones(3), rank=1, solutions=1
+    )
+    probes: Any = SimpleNamespace(
+        positions=np.arange(3), errors=lambda _: np.array([0.01, 0.01, 0.04])
+    )
+    found = estimate_errors(basis, probes, np.broadcast_to(np.eye(3), (3, 3, 3)))
+    assert found.mean == pytest.approx(0.02)
+    assert found.worst == pytest.approx(0.04)
 
 
 def test_a_tolerance_out_of_reach_stops_at_the_share_and_says_so(case: Case) -> None:

@@ -170,6 +170,7 @@ def test_the_study_measures_each_fidelity_against_all_solutions(
     assert row.reduced < min(row.interpolated)
     assert row.reduced_solutions < row.solved_solutions
     assert row.clamp_rule > 0.0
+    assert row.cpu_seconds_from_file > row.total_cpu_seconds > row.reduced_cpu_seconds
     assert found.summary["interpolated_kriging_mean"] == row.interpolated[2]
     assert all(np.isfinite(value) for value in found.summary.values())
 

@@ -17,6 +17,7 @@ from avatar_core.fem.signorini import (
 )
 from avatar_core.geometry.refinement import Grading, refine
 from avatar_core.geometry.tip import Tip
+from avatar_core.offline.resolved_contact import contacts_at
 from tests.core.conftest import box_mesh, box_regions
 
 SIDE = 0.2  # of the cube that stands for a half-space [m]
@@ -94,6 +95,19 @@ def test_a_ball_pushed_askew_finds_the_axis_without_moment() -> None:
         askew.point + to_centre * askew.axis, TOP + to_centre * UP, atol=1e-9
     )
     assert touch.force == pytest.approx(_sphere_force(SPHERE.radius, depth), rel=0.02)
+
+
+def test_contacts_at_a_place_turn_the_axis_of_balls_alone() -> None:
+    """The centre of the ball stays; a punch presses along the axis that it was given."""
+    angle, depth = np.radians(12.0), 1e-3
+    axis = np.array([np.sin(angle), np.cos(angle), 0.0])
+    mesh = box_mesh(4, (SIDE, SIDE, SIDE))
+    tips = (SPHERE, PUNCH)
+    found = contacts_at(None, mesh, box_regions(mesh), MATERIAL, TOP, axis, tips, (depth,))
+    assert found.axes[0, 0] @ UP > np.cos(np.radians(2.0))
+    np.testing.assert_array_equal(found.axes[1, 0], axis)
+    deeper = SPHERE.radius - (SPHERE.radius - depth) * np.cos(angle)
+    assert found.forces[0, 0] == pytest.approx(_sphere_force(SPHERE.radius, deeper), rel=0.02)
 
 
 def across(axis: np.ndarray) -> np.ndarray:
