@@ -291,7 +291,7 @@ def _require_box(box: GridBox) -> None:
 
 
 def _require_rule(rule: RegistrationRule) -> None:
-    loops = (rule.n_stages, rule.sweeps)
+    loops = (rule.n_stages, rule.sweeps, 1 + rule.last_sweeps)
     finite = all(math.isfinite(value) and value >= 0 for value in asdict(rule).values())
     if not finite or not all(1 <= n <= MOST_STEPS for n in loops) or rule.n_samples > MAX_POINTS:
         raise StorageError("'about.rule' would register nothing; build the atlas again")

@@ -14,9 +14,10 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from avatar_core.common.jit import compiled
+
 FloatArray = NDArray[np.float64]
 
-_PAIRS = ((0, 1), (0, 2), (1, 2))
 _LEAST_CURVATURE = 1e-3  # replaces that of concave modes; a stretch has 4
 
 
@@ -45,9 +46,25 @@ class Distortion:
         """Sparsity of the Hessian, and position of each element entry in it."""
         n = 3 * self.n_vertices
         key = np.repeat(self._dofs, 12, axis=1).ravel() * n + np.tile(self._dofs, (1, 12)).ravel()
-        entry, self._place = np.unique(key, return_inverse=True)
-        self._columns = entry % n
-        self._starts = np.searchsorted(entry // n, np.arange(n + 1))
+        self._entries, self._place = np.unique(key, return_inverse=True)
+        self._columns = self._entries % n
+        self._starts = np.searchsorted(self._entries // n, np.arange(n + 1))
+
+    @property
+    def n_entries(self) -> int:
+        """Of the Hessian that are stored."""
+        return len(self._entries)
+
+    def matrix(self, values: FloatArray) -> sp.csr_matrix:
+        """Sparse matrix of the Hessian's pattern, symmetric, (3 n_vertices, 3 n_vertices)."""
+        n = 3 * self.n_vertices
+        return sp.csr_matrix((values, self._columns, self._starts), shape=(n, n))
+
+    def add(self, hessian: sp.csr_matrix, other: sp.csr_matrix) -> None:
+        """Add a matrix that couples vertices of the same tetrahedron, and keep the pattern."""
+        n = 3 * self.n_vertices
+        rows = np.repeat(np.arange(n), np.diff(other.indptr))
+        hessian.data[np.searchsorted(self._entries, rows * n + other.indices)] += other.data
 
     def deformation_gradient(self, positions: FloatArray) -> FloatArray:
         """F of each tetrahedron, shape (n_tets, 3, 3)."""
@@ -59,11 +76,7 @@ class Distortion:
 
     def energy(self, positions: FloatArray) -> float:
         """W(x), infinite if a tetrahedron is flat or inverted."""
-        F = self.deformation_gradient(positions)
-        if not np.linalg.det(F).min() > 0:
-            return float("inf")
-        squares = (F**2).sum(axis=(1, 2)) + (np.linalg.inv(F) ** 2).sum(axis=(1, 2))
-        return float(0.5 * (self._weight @ (squares - 6.0)))
+        return float(_energy(self.deformation_gradient(positions), self._weight))
 
     def derivatives(self, positions: FloatArray) -> tuple[FloatArray, sp.csr_matrix]:
         """Gradient (3 n_vertices,) and positive definite Hessian (3 n_vertices, 3 n_vertices).
@@ -78,29 +91,74 @@ class Distortion:
         stress = (left * (s - s**-3)[:, None, :]) @ right * self._weight[:, None, None]
         nodal = self._gradients @ np.swapaxes(stress, 1, 2)
         n = 3 * self.n_vertices
-        gradient = np.zeros(n)
-        np.add.at(gradient, self._dofs.ravel(), nodal.ravel())
-        modes, curvature = _eigenmodes(left, s, right)
-        # change of each mode's amplitude with the twelve coordinates of the tetrahedron
-        change = np.einsum("tmab,tkb->tmka", modes, self._gradients).reshape(len(s), 9, 12)
-        scaled = change * (curvature * self._weight[:, None])[:, :, None]
-        blocks = np.swapaxes(change, 1, 2) @ scaled
-        values = np.bincount(self._place, weights=blocks.ravel(), minlength=len(self._columns))
-        return gradient, sp.csr_matrix((values, self._columns, self._starts), shape=(n, n))
+        gradient = np.bincount(self._dofs.ravel(), nodal.ravel(), n).astype(float)
+        # v_i . g_k, with which mode u_i (x) v_j changes by u_i where corner k moves
+        along = right @ np.swapaxes(self._gradients, 1, 2)
+        values = np.zeros(self.n_entries)
+        place = self._place.reshape(len(s), 12, 12)
+        _add_hessians(left, s, along, self._weight, place, values)
+        return gradient, self.matrix(values)
 
 
-def _eigenmodes(
-    left: FloatArray, s: FloatArray, right: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Nine orthonormal modes of F and the curvature of the energy in each, (n, 9, 3, 3), (n, 9)."""
-    outer: FloatArray = np.einsum("tai,tjb->tijab", left, right)
-    modes = [outer[:, i, i] for i in range(3)]
-    curvature: list[FloatArray] = [1.0 + 3.0 * s[:, i] ** -4 for i in range(3)]
-    for i, j in _PAIRS:
-        a, b = s[:, i], s[:, j]
-        cube = (a * b) ** 3
-        modes.append((outer[:, i, j] + outer[:, j, i]) / np.sqrt(2.0))
-        curvature.append(1.0 + (a * a + a * b + b * b) / cube)
-        modes.append((outer[:, i, j] - outer[:, j, i]) / np.sqrt(2.0))
-        curvature.append(np.maximum(1.0 - (a * a - a * b + b * b) / cube, _LEAST_CURVATURE))
-    return np.stack(modes, axis=1), np.column_stack(curvature)
+@compiled()
+def _energy(deformation, weight):  # type: ignore[no-untyped-def]
+    """sum_t w_t (|F|^2 + |F^-1|^2 - 6) / 2; F^-1 is the transpose of the cofactors over det F."""
+    total = 0.0
+    for t in range(len(weight)):
+        f = deformation[t]
+        squares, cofactors, determinant = 0.0, 0.0, 0.0
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            for a in range(3):
+                b, c = (a + 1) % 3, (a + 2) % 3
+                cofactor = f[j, b] * f[k, c] - f[j, c] * f[k, b]
+                squares += f[i, a] ** 2
+                cofactors += cofactor**2
+                if i == 0:
+                    determinant += f[0, a] * cofactor
+        if not determinant > 0.0:
+            return np.inf
+        total += weight[t] * (squares + cofactors / determinant**2 - 6.0)
+    return 0.5 * total
+
+
+@compiled()
+def _add_hessians(left, s, along, weight, place, values):  # type: ignore[no-untyped-def]
+    """Add the Hessian of each tetrahedron, 12 x 12, to the matrix at ``place``.
+
+    left, s, along : u_i in the columns, s_i, and v_i . g_k, of each tetrahedron
+    """
+    change, block = np.empty(12), np.empty((12, 12))
+    for t in range(len(s)):
+        block[:] = 0.0
+        for i in range(3):
+            j = (i + 1) % 3
+            a, b = s[t, i], s[t, j]
+            cube = (a * b) ** 3
+            u, v, p, q = left[t, :, i], left[t, :, j], along[t, i], along[t, j]
+            _set_change(u, p, u, p, 0.0, change)
+            _add_outer(change, weight[t] * (1.0 + 3.0 * a**-4), block)
+            _set_change(u, q, v, p, 1.0, change)
+            shear = 1.0 + (a * a + a * b + b * b) / cube
+            _add_outer(change, 0.5 * weight[t] * shear, block)
+            _set_change(u, q, v, p, -1.0, change)
+            twist = max(1.0 - (a * a - a * b + b * b) / cube, _LEAST_CURVATURE)
+            _add_outer(change, 0.5 * weight[t] * twist, block)
+        for row in range(12):
+            for column in range(12):
+                values[place[t, row, column]] += block[row, column]
+
+
+@compiled()
+def _set_change(u, q, v, p, sign, change):  # type: ignore[no-untyped-def]
+    """u_a q_k + sign v_a p_k, of component a of corner k."""
+    for k in range(4):
+        for a in range(3):
+            change[3 * k + a] = u[a] * q[k] + sign * v[a] * p[k]
+
+
+@compiled()
+def _add_outer(change, factor, block):  # type: ignore[no-untyped-def]
+    for row in range(12):
+        for column in range(12):
+            block[row, column] += factor * change[row] * change[column]

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import rslab
-import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -52,6 +52,7 @@ class RegistrationRule:
     first_stiffness, last_stiffness : of the distortion against the distances, both made
         dimensionless with the cube root of the target's volume
     n_stages, sweeps : the stiffness falls by equal factors in ``n_stages`` of ``sweeps`` steps
+    last_sweeps : of steps that follow in the last stage, until the tolerance is met
     tolerance : mean node-to-surface distance at which the registration has converged [m]
     largest_mean, largest_reverse_mean : mean distance beyond which a registration has failed, from
         the template's vertices to the target and from the target to the template's faces [m]
@@ -69,7 +70,8 @@ class RegistrationRule:
     first_stiffness: float = 1.0
     last_stiffness: float = 2e-4
     n_stages: int = 14
-    sweeps: int = 2
+    sweeps: int = 1
+    last_sweeps: int = 4
     tolerance: float = 0.2e-3
     largest_mean: float = 0.5e-3
     largest_reverse_mean: float = 2.5e-3
@@ -83,8 +85,10 @@ class RegistrationRule:
 
     @property
     def stiffnesses(self) -> FloatArray:
-        """Stiffness of each stage, descending."""
-        return np.geomspace(self.first_stiffness, self.last_stiffness, self.n_stages)
+        """Stiffness of each step, descending."""
+        stages = np.geomspace(self.first_stiffness, self.last_stiffness, self.n_stages)
+        last = np.full(self.last_sweeps, self.last_stiffness)
+        return np.concatenate([np.repeat(stages, self.sweeps), last])
 
 
 @dataclass(frozen=True)
@@ -195,9 +199,8 @@ def register(
     fit = _Fit(Distortion(aligned, template.mesh.tets), template.mesh, target, rule)
     positions, history = aligned, []
     for stiffness in rule.stiffnesses:
-        for _ in range(rule.sweeps):
-            positions, step = fit.step(positions, float(stiffness))
-            history.append(step)
+        positions, step = fit.step(positions, float(stiffness))
+        history.append(step)
         if history[-1].mean_distance <= rule.tolerance:
             break
     reached = measure(fit.distortion, template.mesh, positions, target)
@@ -252,12 +255,19 @@ class _Fit:
 
         slope, curvature = self.distortion.derivatives(x)
         gradient = stiffness * slope + A.T @ (A @ x.ravel() - b)
-        hessian = stiffness * curvature + A.T @ A
-        direction = -rslab.ldlt(sp.csc_matrix(hessian)).solve(gradient)
+        hessian = stiffness * curvature
+        self.distortion.add(hessian, (A.T @ A).tocsr())
+        direction = -self._analysis.factor(hessian).solve(gradient)
         x, value, length = line_search(objective, x, direction, float(gradient @ direction))
         distance, _ = self.target.closest(x[self.mesh.surface_vertices])
         jacobian = float(self.distortion.jacobians(x).min())
         return x, RegistrationStep(stiffness, value, length, float(distance.mean()), jacobian)
+
+    @cached_property
+    def _analysis(self) -> rslab.LdltSymbolic:
+        """Of the pattern that all Hessians share."""
+        pattern = self.distortion.matrix(np.ones(self.distortion.n_entries))
+        return rslab.analyze(pattern, path="ldlt", threads=1)
 
     def _tangential(self, stiffness: float) -> float:
         """Falls from the rule's value in the first stage to 0 in the last, in the logarithm."""

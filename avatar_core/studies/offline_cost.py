@@ -32,7 +32,7 @@ from avatar_core.studies.study import Value, follow
 
 FIDELITIES: tuple[Fidelity, ...] = get_args(Fidelity)
 _ROUGH = RegistrationRule(  # 1 s an anatomy
-    n_stages=5, sweeps=1, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
+    n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
 )
 
 

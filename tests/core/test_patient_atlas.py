@@ -31,7 +31,7 @@ from tests.stored import stored
 
 # rough and coarse, 1 s an anatomy; the atlas's own tests use the same rule
 ROUGH = RegistrationRule(
-    n_stages=5, sweeps=1, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
+    n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
 )
 QUICK = PatientOptions(n_vertices=350, n_certified=6, tolerance=0.1)
 N = 4

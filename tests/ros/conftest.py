@@ -264,7 +264,7 @@ def _patients() -> dict[str, bytes]:
     from avatar_core.shapes.registration import RegistrationRule, Template
 
     rough = RegistrationRule(
-        n_stages=5, sweeps=1, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
+        n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
     )
     mesh = tetrahedralize(phantom_liver(12e-3), 300)
     with TemporaryDirectory() as name:

@@ -15,7 +15,7 @@ from avatar_core.shapes.registration import RegistrationRule
 
 # a rough registration, 0.3 s instead of 6 s: what an atlas does with it is the same
 ROUGH = RegistrationRule(
-    n_stages=5, sweeps=1, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
+    n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
 )
 OPTIONS = AtlasOptions(spacing=0.02, rule=ROUGH)
 ALONE = Workers(jobs=1)
