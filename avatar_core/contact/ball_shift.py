@@ -28,6 +28,7 @@ from avatar_core.fem.elasticity import Material
 from avatar_core.fem.half_space_contact import loads_on_heights, ring_radii, sector_angles
 from avatar_core.geometry.local_profile import heights_around
 from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.geometry.offsets import OffsetGrid
 from avatar_core.geometry.skin import Soup
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
@@ -64,7 +65,8 @@ def with_ball_shift(field: TipField, surface: Soup) -> TipField:
     extent = (np.array(field.distance.shape) - 1) * float(field.spacing[0])
     n_bricks = ((extent / SPACING).astype(int) + 2) // BRICK + 1
     grid = _Grid(field, n_bricks, SPACING)
-    shift = np.stack([grid.splines(*grid.pressed(surface, radius), radius) for radius in RADII])
+    offsets = OffsetGrid(surface)
+    shift = np.stack([grid.splines(*grid.pressed(offsets, radius), radius) for radius in RADII])
     brick = _used(shift)
     cut = np.stack([_in_bricks(values, brick) for values in shift])
     return field._replace(shift=BallShift(brick, cut, np.array([SPACING]), np.array(RADII)))
@@ -118,7 +120,7 @@ class _Grid:
         self.distance = _refined(field.distance, step, self.shape)
         self.open = _refined(maximum_filter(field.access, size=3), step, self.shape) > 0.0
 
-    def pressed(self, surface: Soup, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    def pressed(self, offsets: OffsetGrid, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Points (n, 3) of the grid where a ball presses on the surface, and psi there (n,)."""
         first, last = PRESSED
         points, depth, normal = self._within(radius, first - _BEYOND, last + _BEYOND)
@@ -127,7 +129,7 @@ class _Grid:
         window, exact = _on_a_plane(radius, dent)
         feet = at - (radius - depth)[:, None] * normal
         circles = CIRCLES[:, None] * window
-        height = heights_around(surface, feet, normal, circles, sector_angles(), STEEPEST)
+        height = heights_around(offsets, feet, normal, circles, sector_angles(), STEEPEST)
         height = np.einsum("rc,nct->nrt", _between_circles(), height)
         load = exact * loads_on_heights(radius, dent, window, height)
         return points, np.clip(dent - self._depth_of_law(radius, at, load), -MOST, MOST)

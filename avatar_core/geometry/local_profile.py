@@ -16,11 +16,13 @@ the square of half the difference of the principal curvatures where the surface 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
-import igl
 import numpy as np
 
+from avatar_core.geometry.offsets import exact_offsets
 from avatar_core.geometry.skin import Soup
 
 RADII = 1e-3 * np.array([1.5, 3.0, 4.5, 6.0])  # of the circles [m]
@@ -53,7 +55,8 @@ def local_profile(surface: Soup, points: np.ndarray, normals: np.ndarray) -> Loc
     normals : ndarray, shape (n, 3), unit vectors, outward
     """
     angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    height = heights_around(surface, points, normals, RADII, angle, STEEPEST)
+    offsets = partial(exact_offsets, surface)
+    height = heights_around(offsets, points, normals, RADII, angle, STEEPEST)
     height = np.clip(height, -RADII[:, None], RADII[:, None])
     terms = np.stack([RADII / 2.0, RADII**2 / 6.0], axis=1)
     curvature, growth = np.linalg.pinv(terms) @ (height.mean(axis=2) / RADII).T
@@ -62,7 +65,7 @@ def local_profile(surface: Soup, points: np.ndarray, normals: np.ndarray) -> Loc
 
 
 def heights_around(
-    surface: Soup,
+    offsets: Callable[[np.ndarray], np.ndarray],
     points: np.ndarray,
     normals: np.ndarray,
     radii: np.ndarray,
@@ -76,7 +79,8 @@ def heights_around(
 
     Parameters
     ----------
-    surface, points, normals : as of :func:`local_profile`, points beside the surface as well
+    offsets : q - c of points q (k, 3), exact or :class:`avatar_core.geometry.offsets.OffsetGrid`
+    points, normals : as of :func:`local_profile`, points beside the surface as well
     radii : ndarray, shape (m,) or (m, n), of the circles [m]
     angles : ndarray, directions on the circles
     steepest : squared cosine of the side that counts as the steepest
@@ -86,9 +90,9 @@ def heights_around(
     out = np.empty((len(points), len(radii), len(angles)))
     for k, radius in enumerate(radii):
         q = (points + np.reshape(radius, (-1, 1)) * around).reshape(-1, 3)
-        square, _, closest = igl.point_mesh_squared_distance(q, *surface)
-        rise = ((q - closest).reshape(around.shape) * normals).sum(axis=2)
-        square = np.maximum(square.reshape(rise.shape), 1e-30)
+        offset = offsets(q).reshape(around.shape)
+        rise = (offset * normals).sum(axis=2)
+        square = np.maximum((offset**2).sum(axis=2), 1e-30)
         out[:, k] = (rise / np.maximum(rise**2 / square, steepest)).T
     return out
 
