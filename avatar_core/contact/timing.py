@@ -22,7 +22,7 @@ from avatar_core.vademecum.accuracy import AccuracyCurve, CurvePoint, Detail
 from avatar_core.vademecum.model import Vademecum
 
 _TIP, _DEPTH = Tip("sphere", 10e-3), 5e-3  # [m] of the slide that is timed
-_STEPS, _WARM, _ROUNDS = 300, 50, 7
+_STEPS, _WARM, _ROUNDS = 200, 50, 5
 
 
 def timed(

@@ -58,7 +58,7 @@ class AxisymmetricBody:
         self.free = np.flatnonzero(~np.stack([held | (r < 1e-9), held], axis=1).ravel())
         self._entries = self._lower_triangle()
         pattern = self._assembled(np.ones((len(self.nodes) + len(self.top), 18, 18)))
-        self._analysis = rslab.analyze(pattern, path="ldlt")
+        self._analysis = rslab.analyze(pattern, path="ldlt", threads=1)
 
     @property
     def n_nodes(self) -> int:

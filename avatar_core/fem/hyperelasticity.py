@@ -133,7 +133,7 @@ class Hyperelasticity:
         indices, indptr, _ = self._pattern
         n = len(self.free)
         pattern = sp.csc_matrix((np.ones(len(indices)), indices, indptr), shape=(n, n))
-        return rslab.analyze(pattern, path="ldlt")
+        return rslab.analyze(pattern, path="ldlt", threads=1)
 
     @cached_property
     def _pattern(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -203,7 +203,7 @@ def _harmonic(mesh: TetMesh) -> Callable[[np.ndarray], np.ndarray]:
     """Extends vectors at boundary vertices to all vertices, shape (n_vertices, 3)."""
     matrix = _laplace.assemble(Basis(_skfem_mesh(mesh), ElementTetP1(), intorder=1)).tocsr()
     inside = np.setdiff1d(np.arange(len(mesh.vertices)), mesh.surface_vertices)
-    factor = rslab.ldlt(sp.csc_matrix(matrix[inside][:, inside]))
+    factor = rslab.ldlt(sp.csc_matrix(matrix[inside][:, inside]), threads=1)
 
     def extended(shift: np.ndarray) -> np.ndarray:
         out = shift.copy()

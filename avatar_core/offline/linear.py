@@ -186,7 +186,7 @@ def find_modes(
         return weights.copy()
 
     solution = solve_pgd(
-        LoadProblem(elasticity, loads.tocsr(), base, response.energy),
+        LoadProblem(elasticity, loads.tocsr(), base, response.energy, response.single),
         PGDRule(limit, tolerance=1e-6),
         lambda rank: progress("modes", rank / limit, current),
         follow_error,

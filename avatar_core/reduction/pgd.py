@@ -147,12 +147,15 @@ class LoadProblem:
     loads : sparse, shape (3 n_nodes, n_loads)
     weights : ndarray, shape (n_loads,), positive
     energy : ndarray, shape (n_loads,), f(s) . K^-1 f(s) [J], the patch compliance
+    single : solve in single precision; modes are K-orthonormal, and Y = F^T X, in double all the
+        same
     """
 
     elasticity: Elasticity
     loads: sp.csr_matrix
     weights: np.ndarray
     energy: np.ndarray
+    single: bool = False
 
 
 def solve_pgd(
@@ -245,7 +248,7 @@ def _sweep(expansion: _Expansion, load: np.ndarray) -> tuple[np.ndarray, np.ndar
     problem = expansion.problem
     weighted = problem.weights[:, None] * load
     weighted /= np.linalg.norm(weighted, axis=0) + 1e-300
-    space = problem.elasticity.solve(problem.loads @ weighted)
+    space = problem.elasticity.solve(problem.loads @ weighted, problem.single).astype(float)
     space -= expansion.space @ (expansion.load.T @ weighted)
     work = problem.loads.T @ space
     value, vector = np.linalg.eigh((work.T @ weighted + weighted.T @ work) / 2.0)

@@ -17,6 +17,7 @@ import pytest
 from avatar_core.errors import StorageError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.offline.certify.linear import certify
+from avatar_core.offline.exact_response import SINGLE_ERROR
 from avatar_core.offline.linear import with_rank
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
@@ -44,7 +45,8 @@ def test_certificate_sees_a_damaged_vademecum(phantom_vademecum: Vademecum) -> N
 
 
 def test_near_field_makes_the_loaded_positions_exact(phantom_vademecum: Vademecum) -> None:
-    """Within the plateau around a load position, the displacement is the full solution."""
+    """Within the plateau around a load position, the displacement is the full solution, but for
+    the single precision that the build may solve it in; without near field it errs by 10 %."""
     from avatar_core.fem.patch_loads import patch_loads
 
     v = phantom_vademecum
@@ -55,7 +57,7 @@ def test_near_field_makes_the_loaded_positions_exact(phantom_vademecum: Vademecu
         near = np.linalg.norm(v.mesh.vertices - v.surface.centers[j], axis=1)
         near = np.repeat(near < 1.8 * v.surface.patch_radius, 3)
         estimate = v.displacement(np.array([j]), np.ones(1))
-        assert np.abs(estimate - exact)[near].max() < 1e-5 * np.abs(exact).max()
+        assert np.abs(estimate - exact)[near].max() < SINGLE_ERROR * np.abs(exact).max()
 
 
 def test_file_gives_back_the_same_vademecum(phantom_vademecum: Vademecum, tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, get_args
 
 import numpy as np
@@ -81,19 +82,14 @@ class DisplayErrors:
                     wanted - arrays.near.combined(positions, weights, len(points))
                     for arrays in fields
                 ]
-                rows += [
-                    l2_norm(left - part, mass) / size
-                    for left in outside
-                    for part in self._partial_sums(space, load)
-                ]
+                sums = self._partial_sums(space, load)
+                rows += [l2_norm(left - part, mass) / size for left in outside for part in sums]
         return np.array(rows)
 
-    def _partial_sums(self, space: np.ndarray, load: np.ndarray) -> Iterator[np.ndarray]:
+    def _partial_sums(self, space: np.ndarray, load: np.ndarray) -> list[np.ndarray]:
         """The far field with the modes of each level."""
-        total = np.zeros((len(space), 3))
-        for before, level in zip((0, *self._levels), self._levels, strict=False):
-            total = total + space[:, before:level] @ load[before:level]
-            yield total
+        pieces = pairwise((0, *self._levels))
+        return list(accumulate(space[:, a:b] @ load[a:b] for a, b in pieces))
 
 
 def curve_of(vademecum: Vademecum, shown: np.ndarray, force: np.ndarray) -> AccuracyCurve:
