@@ -9,7 +9,8 @@ For each surface, meshed as `avatar vademecum` does:
 - processor time of mesh and regions, fTetWild's process included;
 - built again: whether a second mesh of the same surface is the same, bit for bit.
 
-And of the vademecums of some of them, built in full: their certificates and the processor time.
+And of their vademecums, built in full: certificates and processor time, and for some of them the
+error of the mesh itself, by one refinement.
 """
 
 from __future__ import annotations
@@ -36,13 +37,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MeshesSettings:
-    """Numbers of livers, of those built in full, and of those meshed twice; sizes of the work.
+    """Numbers of livers, of those built in full, of those whose mesh error is measured, and of
+    those meshed twice, None for all; sizes of the work.
 
     n_vertices, n_certified : of `avatar vademecum`; n_points : on each boundary
     """
 
     n_livers: int | None = None
-    n_built: int = 5
+    n_built: int | None = None
+    n_refined: int = 5
     n_again: int = 5
     n_vertices: int = 2850
     n_certified: int = 200
@@ -51,7 +54,7 @@ class MeshesSettings:
 
 
 FULL = MeshesSettings()
-QUICK = MeshesSettings(n_livers=6, n_built=0, n_again=1)
+QUICK = MeshesSettings(n_livers=6, n_built=0, n_refined=0, n_again=1)
 
 
 def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
@@ -63,9 +66,9 @@ def study(folder: Path | None, settings: MeshesSettings) -> Study:
     """One row for each surface."""
     livers = read_livers(folder, settings.n_livers, settings.phantoms)
     n = len(livers.surfaces)
-    built, again = (
-        set(np.linspace(0, n - 1, min(chosen, n)).astype(int).tolist())
-        for chosen in (settings.n_built, settings.n_again)
+    built, refined, again = (
+        set(np.linspace(0, n - 1, n if chosen is None else min(chosen, n)).astype(int).tolist())
+        for chosen in (settings.n_built, settings.n_refined, settings.n_again)
     )
     rows: list[dict[str, Value]] = []
     for i, surface in enumerate(follow(livers.surfaces, "livers")):
@@ -73,7 +76,7 @@ def study(folder: Path | None, settings: MeshesSettings) -> Study:
         if i in again:
             row["same_again"] = _same(mesh, tetrahedralize(surface, settings.n_vertices))
         if i in built:
-            row |= _certified(surface, settings)
+            row |= _certified(surface, settings, i in refined)
         rows.append(row)
     summary = _summary(rows)
     return Study(
@@ -125,21 +128,29 @@ def _same(one: TetMesh, other: TetMesh) -> bool:
     return np.array_equal(one.tets, other.tets) and np.array_equal(one.vertices, other.vertices)
 
 
-def _certified(surface: SurfaceMesh, settings: MeshesSettings) -> dict[str, Value]:
-    """Errors of the vademecum's certificate, relative, and processor time of its build [s]."""
-    options = OrganOptions(n_vertices=settings.n_vertices, n_certified=settings.n_certified)
+def _certified(surface: SurfaceMesh, settings: MeshesSettings, refined: bool) -> dict[str, Value]:
+    """Errors of the vademecum's certificate, relative, and processor time of its build [s].
+
+    refined : measure the error of the mesh as well; the time then includes it and is left out
+    """
+    options = OrganOptions(
+        n_vertices=settings.n_vertices, n_certified=settings.n_certified, with_mesh_error=refined
+    )
     start = cpu_seconds()
     vademecum = build(surface, options)
     seconds = cpu_seconds() - start
     certificate = vademecum.certificate
     assert certificate is not None
-    return {
+    row: dict[str, Value] = {
+        "modes": certificate.modes,
         "l2_mean": certificate.l2_mean,
         "l2_worst": certificate.l2_worst,
         "contact_mean": certificate.contact_mean,
         "contact_worst": certificate.contact_worst,
-        "build_cpu_seconds": seconds,
     }
+    if refined:
+        return row | {"mesh_l2": certificate.mesh_l2, "mesh_contact": certificate.mesh_contact}
+    return row | {"build_cpu_seconds": seconds}
 
 
 def _summary(rows: list[dict[str, Value]]) -> dict[str, float]:
@@ -158,7 +169,8 @@ def _summary(rows: list[dict[str, Value]]) -> dict[str, float]:
         "mesh_cpu_seconds_worst": column("mesh_cpu_seconds").max(),
         "same_again": column("same_again").mean(),
     }
-    for key in ("l2_mean", "l2_worst", "build_cpu_seconds"):
+    certified = ("l2_mean", "l2_worst", "contact_mean", "contact_worst")
+    for key in (*certified, "mesh_l2", "mesh_contact", "build_cpu_seconds"):
         if len(values := column(key)):
             found |= {f"{key}_median": np.median(values), f"{key}_worst": values.max()}
     return {key: float(value) for key, value in found.items()}
