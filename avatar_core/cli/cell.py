@@ -20,7 +20,7 @@ from avatar_core.errors import AvatarError
 _AGAIN = 1.0  # after which a cell that has not ended is interrupted again [s]
 
 Host = Annotated[
-    str, typer.Option(help="network address to serve the page on; 0.0.0.0: all, without a password")
+    str, typer.Option(help="network address to serve the page on; 0.0.0.0: all, without TLS")
 ]
 Port = Annotated[int, typer.Option(help="port of the page; if it is taken, the next free one")]
 

@@ -104,7 +104,7 @@ def demo(
         v = load_vademecum(file)
         show_text(v)
         if ui:
-            print(f"2. running the cell; open its page at http://{host}:{port} (Ctrl-C ends both)")
+            print("2. running the cell; open the address of its page below (Ctrl-C ends both)")
             run_page(file, host, port)
             return
         print(f"2. running loader, contact and tool as ROS 2 processes for {seconds:g} s")

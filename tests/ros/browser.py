@@ -18,6 +18,7 @@ from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.view import camera_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+TOKEN = "a-token-for-tests"  # of the page
 WINDOW = (1280, 800)  # [px]
 SLOW = 300_000  # of what starts, compiles or builds, on a busy machine [ms]
 # Software rendering: there is no graphics card where this runs.
@@ -62,12 +63,13 @@ def opened(port: int, shots: Path) -> Iterator[Any]:
 
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
-        page = browser.new_page(viewport={"width": WINDOW[0], "height": WINDOW[1]})
+        context = browser.new_context(viewport={"width": WINDOW[0], "height": WINDOW[1]})
+        page = context.new_page()
         foreign: list[str] = []
         page.on("request", lambda asked: foreign.append(asked.url))
         for _ in range(60):
             try:
-                page.goto(f"http://127.0.0.1:{port}")
+                page.goto(f"http://127.0.0.1:{port}/?token={TOKEN}")
                 break
             except Error:  # not there yet
                 page.wait_for_timeout(1000)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import re
 import signal
 from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
 pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 
+import viser
 from avatar_ros.bench.cell import Module
 from avatar_ros.ui.organ import Organ
 from rcl_interfaces.srv import ListParameters
@@ -26,6 +30,7 @@ from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.ros.browser import (
     CHROMIUM,
     SLOW,
+    TOKEN,
     WINDOW,
     choose,
     drag,
@@ -82,7 +87,7 @@ def nodes(
             *library,
             *("-p", f"atlas:={folder / 'atlas.h5'}", "-p", "vertices:=350"),
         ],
-        "planning_ui": [*library, "-p", f"port:={port}"],
+        "planning_ui": [*library, "-p", f"port:={port}", "-p", f"token:={TOKEN}"],
     }
     with nodes_of_a_page(arguments, own_domain) as running:
         yield running
@@ -117,6 +122,27 @@ def test_a_drag_is_felt_and_the_surface_gives_way(page: Any, shown: Organ, shots
     until(page, lambda: force_of(page) == 0.0, "the organ left")
 
 
+def test_a_page_of_another_site_in_the_same_browser_is_refused(page: Any, port: int) -> None:
+    """On another port of this machine, to which the browser sends this page's cookie as well."""
+    handler = partial(SimpleHTTPRequestHandler, directory="/dev/null")
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as site:
+        Thread(target=site.serve_forever, daemon=True).start()
+        other = page.context.new_page()
+        other.goto(f"http://127.0.0.1:{site.server_address[1]}")
+        answer = other.evaluate(
+            """([port, version]) => new Promise(done => {
+                const socket = new WebSocket(`ws://127.0.0.1:${port}`, [version]);
+                socket.onopen = () => done("open");
+                socket.onerror = () => done("refused");
+            })""",
+            [port, f"viser-v{viser.__version__}"],
+        )
+        other.close()
+        site.shutdown()
+    assert answer == "refused"
+    assert "All nodes answer" in page.inner_text("body")
+
+
 def test_keys_move_the_tool(page: Any) -> None:
     page.mouse.click(60, 700)  # nothing is there, but the page listens
     for _ in range(60):
@@ -137,7 +163,7 @@ def test_a_recording_replays(page: Any, shown: Organ, folder: Path) -> None:
     for _ in range(45):
         page.get_by_text("press 1 mm", exact=True).click()
         page.wait_for_timeout(60)
-        if force_of(page) > 1.0:
+        if force_of(page) > 3.0:
             break
     page.wait_for_timeout(1000)
     press(page, "Lift off the organ")

@@ -28,6 +28,7 @@ from avatar_core.vademecum.storage import save_vademecum
 from tests.hard.small_files import ball
 from tests.ros.browser import (
     CHROMIUM,
+    TOKEN,
     force_of,
     free_port,
     nodes_of_a_page,
@@ -90,7 +91,15 @@ def page(folder: Path, own_domain: dict[str, str], shots: Path) -> Iterator[Any]
     arguments = {
         "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
         "contact": [*PATIENT[1:], "-p", f"material.young_modulus:={CHOSEN_BY_ANOTHER}"],
-        "planning_ui": [*library, "-p", f"port:={port}", "-p", "tumour:=tumour.stl"],
+        "planning_ui": [
+            *library,
+            "-p",
+            f"port:={port}",
+            "-p",
+            f"token:={TOKEN}",
+            "-p",
+            "tumour:=tumour.stl",
+        ],
     }
     with nodes_of_a_page(arguments, own_domain), opened(port, shots) as page:
         yield page

@@ -27,6 +27,7 @@ from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from avatar_ros.msg import LoopStatistics
 from tests.ros.browser import (
     CHROMIUM,
+    TOKEN,
     drag,
     draw_in_idle_time,
     force_of,
@@ -71,7 +72,7 @@ def nodes(folder: Path, own_domain: dict[str, str], port: int) -> Iterator[dict[
     arguments = {
         "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
         "contact": PATIENT[1:],
-        "planning_ui": [*library, "-p", f"port:={port}"],
+        "planning_ui": [*library, "-p", f"port:={port}", "-p", f"token:={TOKEN}"],
     }
     with nodes_of_a_page(arguments, own_domain) as running:
         yield running

@@ -32,6 +32,7 @@ from avatar_ros.loop.settings import MATERIAL, TIP, chosen_tips
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
 from avatar_ros.prepare.scenes import scene_file
 from avatar_ros.ui.display import RATE, NewestCloud
+from avatar_ros.ui.guard import Guard, guarded
 from avatar_ros.ui.library import Library
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.panels import Actions, Panels
@@ -50,10 +51,11 @@ _OF_CONTACT = (*_TIP, "rate", "tools", "frame_id", "scene", "cloud", "cloud_divi
 
 PLANNING_UI = (
     AUTOSTART,
-    Parameter("host", "127.0.0.1", "address to listen on; 0.0.0.0: all; there is no password"),
+    Parameter("host", "127.0.0.1", "address to listen on; 0.0.0.0: all"),
     Parameter(
         "port", 8080, "port to listen on; the next free one if it is in use", range=(1, 65535)
     ),
+    Parameter("token", "", "at the end of the page's address; empty: a new one at each start"),
     Parameter("library_dir", ".", "directory of the loader's files; recordings are written there"),
     Parameter("tool", "tool", "name of the tool to move, one of those of contact"),
     Parameter(
@@ -93,7 +95,9 @@ class PlanningNode(ManagedNode):
         self._library = Library(folder.resolve())
         self._tumour = value["tumour"]
         self._tool = value["tool"]
-        server = viser.ViserServer(value["host"], value["port"], verbose=False)
+        guard = Guard(value["host"], value["token"])
+        with guarded(guard):
+            server = viser.ViserServer(value["host"], value["port"], verbose=False)
         self._server = server
         self._requests = Requests(self)
         self._view = OrganView(server, self._drag)
@@ -120,7 +124,7 @@ class PlanningNode(ManagedNode):
                 LoopStatistics, "statistics", self._take_statistics, qos.STATISTICS
             ),
         ]
-        self.get_logger().info(f"planning page at http://{value['host']}:{server.get_port()}")
+        self.get_logger().info(f"planning page at {guard.address(server.get_port())}")
 
     def activate(self) -> None:
         self._timer = self.create_timer(1.0 / RATE, self._show)
