@@ -61,8 +61,9 @@ def cell(
 ) -> None:
     """Run the loader, the contact node and, with an atlas, the patient node, until Ctrl-C.
 
-    Options override the parameter file. When one node ends, all end. Equivalent to `ros2 launch
-    avatar_ros planning_cell.launch.py`.
+    Options override the parameter file. A node that dies is started again; one that refuses to
+    start, or is told to end, ends all. Otherwise as `ros2 launch avatar_ros
+    planning_cell.launch.py`.
     """
     require_ros()
     page = {"host": host, "port": str(port)} if ui else {}

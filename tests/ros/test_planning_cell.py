@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.framework import qos
-from avatar_ros.nodes.cell import node_arguments
+from avatar_ros.nodes.cell import node_arguments, wait_after
 
 from avatar_ros.msg import ContactState
 from tests.ros.conftest import START_TIMEOUT
@@ -66,7 +67,47 @@ def test_one_file_of_parameters_starts_a_cell_that_a_signal_ends(
         print(f"ended in {time.monotonic() - begin:.1f} s")
 
 
-def test_a_node_that_ends_ends_the_cell_and_is_named(
+def child(process: subprocess.Popen[str], node: str) -> int | None:
+    """Number of the cell's process of a node."""
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    for number in map(int, children):
+        if f"avatar_ros.nodes.{node}".encode() in Path(f"/proc/{number}/cmdline").read_bytes():
+            return number
+    return None
+
+
+def test_a_node_that_dies_is_started_again_and_named(
+    own_domain: dict[str, str], library: Path, probe: Any
+) -> None:
+    def model() -> None:
+        """Wait for a step of the contact node with the model."""
+        probe.next(
+            ContactState, "contact_state", qos.state(1), lambda s: s.vademecum_id, START_TIMEOUT
+        )
+
+    arguments = ["--library-dir", str(library), "--vademecum", "liver.h5"]
+    with started(arguments, own_domain) as process:
+        model()
+        killed = child(process, "contact")
+        assert killed is not None
+        os.kill(killed, signal.SIGKILL)
+        while Path(f"/proc/{killed}").exists():  # until the cell has noticed
+            time.sleep(0.01)
+        model()
+        assert child(process, "contact") not in (None, killed)
+        process.send_signal(signal.SIGINT)
+        assert end_of(process, 15.0) == 0
+        assert process.stderr is not None
+        said = process.stderr.read()
+    assert "contact died of SIGKILL; starting it again" in said
+    assert "vademecum_loader" not in said.replace("[vademecum_loader]", "")
+
+
+def test_a_node_that_dies_again_and_again_is_given_time() -> None:
+    assert [wait_after(deaths) for deaths in range(1, 9)] == [0, 1, 2, 4, 8, 16, 30, 30]
+
+
+def test_a_node_that_refuses_to_start_ends_the_cell_and_is_named(
     own_domain: dict[str, str], tmp_path: Path
 ) -> None:
     file = tmp_path / "bad.yaml"

@@ -1,5 +1,8 @@
 """A planning cell without the launch package: its nodes as processes that end together.
 
+A node that dies is started again, at once and then after ever longer waits. One that refuses to
+start, or was told to end, ends the cell.
+
 Run as ``avatar cell``.
 """
 
@@ -18,6 +21,9 @@ from avatar_ros.framework.managed_node import StopSignal
 
 _POLL = 0.1  # [s]
 _STOP_TIMEOUT = 5.0  # for a node to end by itself [s]
+_STARTED = 10.0  # after which an error is none of the start, such as a wrong parameter [s]
+_WELL = 60.0  # after which earlier deaths are forgotten [s]
+_LONGEST_WAIT = 30.0  # before a node is started again [s]
 
 # Parameters that override those of the file, by node.
 OVERRIDES = {
@@ -43,33 +49,69 @@ def node_arguments(params: Path | None, given: dict[str, str]) -> dict[str, list
     return found
 
 
-def run(arguments: dict[str, list[str]]) -> int:
-    """Keep the nodes running until one ends or a signal comes; returns the exit code."""
-    stop = StopSignal()
-    processes = {
-        name: ModuleProcess(
-            f"avatar_ros.nodes.{name}",
-            *words,
+class KeptNode:
+    """A node as a process, which is started again when it dies."""
+
+    def __init__(self, name: str, words: list[str]) -> None:
+        self.name, self._words = name, words
+        self._deaths, self._again = 0, 0.0
+        self._start()
+
+    def _start(self) -> None:
+        self._began, self._is_dead = time.monotonic(), False
+        self.process = ModuleProcess(
+            f"avatar_ros.nodes.{self.name}",
+            *self._words,
             preexec_fn=partial(realtime.die_with_parent, signal.SIGINT),
         )
-        for name, words in arguments.items()
-    }
-    ended: dict[str, int] = {}
-    while not stop and not ended:
+
+    def tend(self) -> bool:
+        """Start the node again if it died, and say so; False if the cell cannot go on."""
+        code, now = self.process.poll(), time.monotonic()
+        if code is None:
+            return True
+        if self._is_dead:
+            if now >= self._again:
+                self._start()
+            return True
+        lived = now - self._began
+        if code == 0 or (code > 0 and lived < _STARTED):
+            _say(f"{self.name} ended with code {code}; ending the cell")
+            return False
+        self._deaths = 1 if lived > _WELL else self._deaths + 1
+        wait = wait_after(self._deaths)
+        self._is_dead, self._again = True, now + wait
+        how = f"died of {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+        _say(f"{self.name} {how}; starting it again" + (f" in {wait:g} s" if wait else ""))
+        return True
+
+
+def wait_after(deaths: int) -> float:
+    """Time before a node is started again that died so often in a row [s]."""
+    return 0.0 if deaths < 2 else min(2.0 ** (deaths - 2), _LONGEST_WAIT)
+
+
+def run(arguments: dict[str, list[str]]) -> int:
+    """Keep the nodes running until one cannot, or a signal comes; returns the exit code."""
+    stop = StopSignal()
+    nodes = [KeptNode(name, words) for name, words in arguments.items()]
+    goes_on = True
+    while goes_on and not stop:
         time.sleep(_POLL)
-        polled = {name: process.poll() for name, process in processes.items()}
-        ended = {name: code for name, code in polled.items() if code is not None}
-    for name, code in ended.items():
-        print(f"avatar: {name} ended with code {code}; ending the cell", file=sys.stderr)
+        goes_on = all([node.tend() for node in nodes])
     codes = []
-    for name, process in processes.items():
-        code = process.finish(_STOP_TIMEOUT, signal.SIGINT)
-        codes.append(code)
-        if code == -signal.SIGKILL and name not in ended:
-            print(
-                f"avatar: {name} did not end in {_STOP_TIMEOUT:g} s and was killed", file=sys.stderr
-            )
-    return 0 if not ended and not any(codes) else 1
+    for node in nodes:
+        ended = node.process.poll() is not None
+        code = node.process.finish(_STOP_TIMEOUT, signal.SIGINT)
+        if not ended:
+            codes.append(code)
+        if code == -signal.SIGKILL and not ended:
+            _say(f"{node.name} did not end in {_STOP_TIMEOUT:g} s and was killed")
+    return 0 if goes_on and not any(codes) else 1
+
+
+def _say(text: str) -> None:
+    print(f"avatar: {text}", file=sys.stderr, flush=True)
 
 
 def main() -> int:
