@@ -33,7 +33,6 @@ from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.reduction.compact_response import CompactResponse, positive_part
 from avatar_core.reduction.near_field import LocalBlocks, near_pairs, wendland
 
-_BATCH = 200  # load positions whose residuals are formed at once
 _DEPENDENT = 1e-10  # part of the largest energy below which a direction is rounding
 WORST_OVER_MEAN = 1.75  # estimated, of the mean asked for; the true one is up to 1.8 times that
 
@@ -90,11 +89,11 @@ class GalerkinBasis:
         self.load = np.zeros((loads.shape[1], 0))
         self.solutions = 0
         self._loaded = np.flatnonzero(np.diff(loads.indptr))
-        self._loads_there = loads[self._loaded].tocsc()
         root = np.sqrt(elasticity.stiffness.diagonal()[self._loaded])
-        self._inverse_root = (1.0 / root).astype(np.float32)
-        scaled = sp.diags(1.0 / root) @ loads[self._loaded]
-        self.load_norm = np.sqrt(np.asarray(scaled.power(2).sum(axis=0)).reshape(-1, 3).sum(axis=1))
+        self._inverse_root = 1.0 / root
+        self._scaled = (sp.diags(self._inverse_root) @ loads[self._loaded]).tocsc()
+        self._own = _products_of_triples(self._scaled)
+        self.load_norm = np.sqrt(np.trace(self._own, axis1=1, axis2=2))
 
     @property
     def rank(self) -> int:
@@ -127,19 +126,18 @@ class GalerkinBasis:
     def residual_blocks(self) -> NDArray[np.float64]:
         """r(s) . D^-1 r(s) of each position, by directions, shape (n_positions, 3, 3) [m/N].
 
-        Only the loaded nodes count: elsewhere no load acts.
+        Only the loaded nodes count: elsewhere no load acts. With F' = D^-1/2 f(s), K' = D^-1/2 K X
+        there, they are F'^T F' - F'^T K' Y^T - Y K'^T F' + Y K'^T K' Y^T.
         """
-        n = self.loads.shape[1] // 3
-        force = (self.force[self._loaded] * self._inverse_root[:, None]).astype(np.float32)
-        load = self.load.astype(np.float32)
-        out = np.empty((n, 3, 3))
-        for first in range(0, n, _BATCH):
-            columns = slice(3 * first, 3 * min(first + _BATCH, n))
-            acting = self._loads_there[:, columns].toarray().astype(np.float32)
-            left = acting * self._inverse_root[:, None] - force @ load[columns].T
-            left = left.T.reshape(-1, 3, len(force))
-            out[first : first + _BATCH] = left @ left.transpose(0, 2, 1)
-        return out
+        force = self.force[self._loaded] * self._inverse_root[:, None]
+        mixed = self._scaled.T @ force
+        load, change = (
+            part.reshape(-1, 3, self.rank)
+            for part in (self.load, self.load @ (force.T @ force) - mixed)
+        )
+        cross = mixed.reshape(-1, 3, self.rank) @ load.transpose(0, 2, 1)
+        blocks = self._own - cross + load @ change.transpose(0, 2, 1)
+        return positive_part(blocks)  # of what is left of loads in the space, rounding
 
     def compliance_trace(self) -> FloatArray:
         """Trace of the Galerkin compliance Y Y^T of each patch, shape (n_positions,) [m/N]."""
@@ -343,6 +341,13 @@ def residual_compliance_blocks(
     fade = wendland(pairs.distance, support)[:, None, None]
     block = fade * (root[pairs.target] @ root[position])
     return LocalBlocks(pairs.start, pairs.target, block.astype(np.float32))
+
+
+def _products_of_triples(columns: sp.csc_matrix) -> NDArray[np.float64]:
+    """Products of each three columns with each other, shape (n, 3, 3)."""
+    part = [columns[:, k::3] for k in range(3)]
+    product = [[part[a].multiply(part[b]).sum(axis=0) for b in range(3)] for a in range(3)]
+    return np.asarray(product, float).reshape(3, 3, -1).transpose(2, 0, 1)
 
 
 def triples(positions: NDArray[np.int64]) -> NDArray[np.int64]:
