@@ -23,7 +23,7 @@ from numpy.polynomial.legendre import leggauss
 from avatar_core.common.jit import compiled
 
 RINGS, SECTORS = 8, 8
-ITERATIONS = 16  # 0.2 % from the solution at most
+ITERATIONS = 25
 _PARTS, _ORDER = 4, 6  # of a sector that is close, in both directions, and of its quadrature
 _RAYS = 720  # from the middle of a sector over itself
 _HALVINGS = 50  # to where such a ray leaves the sector
