@@ -49,10 +49,11 @@ def exact_response(
     loads: sp.csr_matrix,
     rule: BuildRule,
     progress: Progress,
+    single: bool = False,
 ) -> ExactResponse:
     """Solve for every load position and keep what the vademecum needs.
 
-    The solutions are of single precision where it does, in half the time.
+    single : solve in single precision where that does, in half the time
     """
     radius, n = surface.patch_radius, surface.n_positions
     vertices = elasticity.mesh.vertices
@@ -69,7 +70,7 @@ def exact_response(
     mass = elasticity.mesh.lumped_mass
     by_column, average = loads.tocsc(), loads.T.tocsr()
     tried = min(n, _TRIED)
-    single = elasticity.single_error(by_column[:, : 3 * tried]) < SINGLE_ERROR
+    single = single and elasticity.single_error(by_column[:, : 3 * tried]) < SINGLE_ERROR
     for first in range(0, n, _BATCH):
         batch = range(first, min(first + _BATCH, n))
         solution = elasticity.solve(by_column[:, 3 * batch.start : 3 * batch.stop], single)

@@ -64,7 +64,7 @@ def build_vademecum(
     ``convergence.converged`` is False.
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
-    response = exact_response(elasticity, surface, loads, rule, progress)
+    response = exact_response(elasticity, surface, loads, rule, progress, single=True)
     residual = FarFieldResidual(elasticity, surface, response, rule)
     rule, with_body = _with_room_for_body(rule)
     solution, weights = find_modes(elasticity, loads, response, residual, rule, progress)

@@ -136,8 +136,8 @@ class GalerkinBasis:
             for part in (self.load, self.load @ (force.T @ force) - mixed)
         )
         cross = mixed.reshape(-1, 3, self.rank) @ load.transpose(0, 2, 1)
-        blocks = self._own - cross + load @ change.transpose(0, 2, 1)
-        return positive_part(blocks)  # of what is left of loads in the space, rounding
+        blocks = positive_part(self._own - cross + load @ change.transpose(0, 2, 1))
+        return np.asarray(blocks, float)  # of loads in the space, rounding would be left
 
     def compliance_trace(self) -> FloatArray:
         """Trace of the Galerkin compliance Y Y^T of each patch, shape (n_positions,) [m/N]."""
