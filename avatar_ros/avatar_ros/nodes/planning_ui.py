@@ -208,17 +208,18 @@ class PlanningNode(ManagedNode):
             return
         taken = self._cloud.take()
         tip, force = live["tip"].copy(), live["force"] if self._answers() else np.zeros(3)
+        fraction = float(live["sent_fraction"])
         largest = 0.0
         if taken is not None:
             largest = self._view.move(taken[1], tip, force)
             if self._recorder.is_on:
                 self._recorder.note_cloud(taken[1][:, 3:])
-        self._view.place_tool(tip, force)
+        self._view.place_tool(tip, fraction * force)
         if self._frame % _PLOT_FRAMES == 0:
             size = float(np.linalg.norm(force))
             error = float(live["error"]) if np.isfinite(live["error"]) else 0.0
             n_kept = self._recorder.n_periods if self._recorder.is_on else None
-            self._panels.readout.content = frame_text(size, error, largest, n_kept)
+            self._panels.readout.content = frame_text(size, error, fraction, largest, n_kept)
             self._panels.show_scale(self._view.top)
             self._panels.show_force(time.monotonic() - self._began, size, error)
 

@@ -9,6 +9,7 @@ from avatar_ros.loop.statuses import EXPLANATIONS, explanation
 from avatar_ros.msg import ContactState
 from avatar_ros.ui.requests import START
 
+_SHOWN_FORCE = 0.01  # smallest difference that is written [N]
 NO_ORGAN = "no organ yet: choose a vademecum under Organ"
 
 
@@ -30,11 +31,23 @@ def warnings(missing: Sequence[str], has_organ: bool, status: int | None) -> str
     return "\n\n".join(f"⚠ {line[0].upper()}{line[1:]}." for line in lines)
 
 
-def frame_text(force: float, error: float, largest: float, n_kept: int | None) -> str:
-    """Force and its error [N], largest displacement [m], recorded periods or None, as Markdown."""
+def frame_text(
+    force: float, error: float, fraction: float, largest: float, n_kept: int | None
+) -> str:
+    """What a frame shows, as Markdown.
+
+    Parameters
+    ----------
+    force, error : of the organ [N]
+    fraction : of the force that the device gets; less while it is limited or faded in or out
+    largest : displacement [m]
+    n_kept : recorded periods, or None
+    """
     recorded = "" if n_kept is None else f"; recording, {n_kept} periods"
+    less = force * (1.0 - fraction) >= _SHOWN_FORCE
+    device = f", **limited: the device gets {force * fraction:.2f} N**" if less else ""
     return (
-        f"Force **{force:.2f} N** ± {error:.2f} N, largest displacement "
+        f"Force **{force:.2f} N** ± {error:.2f} N{device}, largest displacement "
         f"**{1e3 * largest:.1f} mm**{recorded}"
     )
 

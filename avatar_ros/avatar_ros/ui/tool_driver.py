@@ -101,7 +101,7 @@ class ToolDriver:
         force = np.zeros(3)
         for contact in state.contacts:
             force += (contact.force.x, contact.force.y, contact.force.z)
-        live["force"][0] = force * state.force_share
+        live["force"][0] = force
         live["error"][0], live["sent_fraction"][0] = state.force_error, state.force_share
         live["status"][0], live["touches"][0] = state.status, len(state.contacts)
         live["heard"][0] = time.monotonic_ns()

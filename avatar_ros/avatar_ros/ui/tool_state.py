@@ -25,9 +25,9 @@ LIVE = np.dtype(
         ("target", np.float64, 3),  # from the node: centre of the tip [m]
         ("recording", np.int64),
         ("tip", np.float64, 3),  # from the driver: as sent last [m]
-        ("force", np.float64, 3),  # as sent by the contact node [N]
+        ("force", np.float64, 3),  # of the organ [N]
         ("error", np.float64),  # [N]
-        ("sent_fraction", np.float64),
+        ("sent_fraction", np.float64),  # of the force, that the device gets
         ("status", np.int64),  # of avatar_ros/msg/ContactState
         ("touches", np.int64),
         ("heard", np.int64),  # when the last state came, monotonic clock [ns]
