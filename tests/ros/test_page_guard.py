@@ -85,7 +85,9 @@ def test_another_site_is_refused_even_where_the_browser_sends_the_cookie(port, o
     assert asked(port, "/", Cookie=cookie_of(port), Origin=origin).status == 403
 
 
-@pytest.mark.parametrize("host", ["example.org", "example.org:8080", "127.0.0.1.example.org", "["])
+@pytest.mark.parametrize(
+    "host", ["example.org", "example.org:8080", "127.0.0.1.example.org", "[", "127.0.0.1:x"]
+)
 def test_a_name_that_points_here_is_refused(port, host):
     """A site may let its name point to 127.0.0.1; to the browser, the page is then the site's."""
     cookie = cookie_of(port)

@@ -65,9 +65,10 @@ class Guard:
 
     def _is_ours(self, host: str) -> bool:
         try:
-            name = urlsplit(f"//{host}").hostname or ""
+            place = urlsplit(f"//{host}")
+            name, _ = place.hostname or "", place.port
             return name in self._names or bool(ip_address(name))
-        except ValueError:  # neither a name that is known nor an address
+        except ValueError:  # neither a name that is known nor an address, or no port
             return False
 
 
