@@ -174,6 +174,30 @@ def test_basis_that_holds_the_solution_is_exact(case: Case) -> None:
     assert error < 1e-9 * np.abs(case.exact[:, 30:36]).max()  # rounding of two solves
 
 
+def test_residuals_are_those_of_the_vectors_themselves(case: Case) -> None:
+    """r = f - K X Y^T at the loaded nodes, in the norm of D; nothing is left of loads in X.
+
+    At a clamped node, of K X, without the reaction of the clamp.
+    """
+    elasticity, loads = case.problem.elasticity, case.loads
+    basis = GalerkinBasis(elasticity, loads)
+    basis.enrich(loads[:, 30:36].toarray())
+    basis.enrich(loads[:, 60:66].toarray())
+    reaction = elasticity.apply(basis.space) - basis.force
+    held_dofs = 3 * elasticity.clamped_nodes[:, None] + np.arange(3)
+    reaction[held_dofs.ravel()] = 0.0
+    assert np.abs(reaction).max() < 1e-9 * np.abs(basis.force).max()
+    left = loads.toarray() - basis.force @ basis.load.T
+    loaded = np.diff(loads.indptr) > 0
+    scaled = left[loaded] / np.sqrt(elasticity.stiffness.diagonal()[loaded, None])
+    scaled = scaled.T.reshape(-1, 3, int(loaded.sum()))
+    blocks = basis.residual_blocks()
+    size = np.trace(blocks, axis1=1, axis2=2).max()
+    assert blocks == pytest.approx(scaled @ scaled.transpose(0, 2, 1), abs=1e-9 * size)
+    held = np.trace(blocks[[10, 11, 20, 21]], axis1=1, axis2=2)
+    assert (held >= 0.0).all() and held.max() < 1e-9 * size
+
+
 def test_error_falls_with_neighbours_functions_and_with_enrichment(case: Case) -> None:
     functions = np.linalg.qr(np.random.default_rng(0).standard_normal((case.loads.shape[1], 60)))[0]
     vertices = case.problem.elasticity.at_vertices

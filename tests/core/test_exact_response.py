@@ -1,0 +1,49 @@
+"""The full solutions of a build: single precision where it does, double where it does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.patch_loads import load_surface, patch_loads
+from avatar_core.offline import exact_response as module
+from avatar_core.offline.exact_response import SINGLE_ERROR, ExactResponse, exact_response
+from avatar_core.offline.rule import BuildRule, silent
+from tests.core.conftest import box_mesh, box_regions
+
+DOUBLE = 1e-6  # columns are kept in float32
+
+
+def found(elasticity: Elasticity, single: bool) -> tuple[ExactResponse, float]:
+    """The response of a box, and the largest error of its columns, relative to the largest."""
+    surface = load_surface(elasticity.mesh, box_regions(elasticity.mesh), 0.03)
+    loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
+    response = exact_response(elasticity, surface, loads, BuildRule(), silent, single)
+    exact = elasticity.at_vertices(elasticity.solve(loads))
+    return response, float(np.abs(response.columns - exact).max() / np.abs(exact).max())
+
+
+@pytest.fixture
+def elasticity(box_elasticity: Elasticity) -> Elasticity:
+    mesh = box_mesh(4)
+    return Elasticity(mesh, box_elasticity.material, box_regions(mesh).clamped)
+
+
+def test_single_precision_is_taken_only_where_it_is_allowed(elasticity: Elasticity) -> None:
+    response, error = found(elasticity, single=True)
+    assert response.single and DOUBLE < error < SINGLE_ERROR
+    response, error = found(elasticity, single=False)
+    assert not response.single and error < DOUBLE
+
+
+def test_loads_that_single_precision_does_not_solve_are_solved_in_double(
+    elasticity: Elasticity, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error that is tried exceeds what is tolerated."""
+    error = elasticity.single_error(
+        patch_loads(elasticity, elasticity.mesh.vertices[[-1]], 0.03).tocsc()
+    )
+    monkeypatch.setattr(module, "SINGLE_ERROR", 1e-3 * error)
+    response, error = found(elasticity, single=True)
+    assert not response.single and error < DOUBLE
