@@ -32,7 +32,8 @@ from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions, TetMesh, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import certify
-from avatar_core.offline.linear import build_vademecum, with_rank
+from avatar_core.offline.exact_response import remainder
+from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.reduction.galerkin import (
@@ -42,7 +43,8 @@ from avatar_core.reduction.galerkin import (
     reduce,
     residual_compliance_blocks,
 )
-from avatar_core.reduction.near_field import LocalBlocks, near_pairs
+from avatar_core.reduction.near_field import LocalBlocks, taper
+from avatar_core.reduction.regional import RegionalField, regions_of, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import load_map
@@ -69,7 +71,7 @@ class PatientOptions:
     n_vertices : approximate number, of the patient's own mesh
     weighting, n_neighbors : see `patient_weights`
     tolerance : target of ``reduced`` for the mean relative L2 error of displacement
-    max_modes : far-field modes of the vademecum; the rest becomes near field
+    max_modes : modes of the vademecum at a place; see :class:`BuildRule`
     n_certified : unseen loads of the certificate; None for 24, or 200 with ``solved``; 0 for none
     leave_out : numbers of anatomies that get no weight, such as other scans of the patient
     """
@@ -230,9 +232,9 @@ def interpolated(
     """Eq. 18: no equation of the patient is solved.
 
     ``lle-grid`` combines at common positions, as in the paper, the others nodewise on the template.
-    The near field is that of the modes alone. The contact compliance includes the residual
-    compliance that the base holds for each patch. Balls feel the smooth surface: what facets and
-    folds change is less than the error of the response.
+    The contact compliance includes the residual compliance that the base holds for each patch.
+    Balls feel the smooth surface: what facets and folds change is less than the error of the
+    response.
     """
     response = interpolated_response(problem, base, weights, options)
     support = RESIDUAL_SUPPORT * problem.loads.patch_radius
@@ -294,7 +296,7 @@ def reduced_response(
 def vademecum_of_reduced(
     problem: PatientProblem, found: ReducedResponse, options: PatientOptions
 ) -> Vademecum:
-    """What contact needs around a response: sorted modes, near field, distance and access."""
+    """What contact needs around a response: sorted modes, regions, distance and access."""
     convergence = Convergence(
         found.converged,
         options.tolerance,
@@ -350,27 +352,55 @@ def _assembled(
     options: PatientOptions,
     tip_field: TipField,
 ) -> Vademecum:
-    """The vademecum of a compact response: leading modes as far field, the rest as near field."""
-    rule, loads = options.build, problem.loads
-    radius = loads.patch_radius
-    far = _sorted_by_norm(response, problem.mesh)
-    whole = Vademecum(
+    """The vademecum of a compact response: leading modes as global ones, the rest by regions."""
+    rule, loads = replace(options.build, max_modes=options.max_modes), problem.loads
+    modes = _sorted_by_norm(response, problem.mesh)
+    n_global, rank = min(rule.n_global, modes.rank), min(rule.contact_modes, modes.rank)
+    reach = rule.contact_support * loads.patch_radius
+    residual = residual_compliance_blocks(response.residual_compliance, support, loads, reach)
+    return Vademecum(
         name=problem.surface.name,
         mesh=problem.mesh,
         regions=problem.regions,
         material=problem.elasticity.material,
         element=problem.elasticity.element,
         surface=loads,
-        far=far,
-        near=_no_blocks(loads, problem.mesh, rule.near_outer * radius),
-        contact_near=residual_compliance_blocks(
-            response.residual_compliance, support, loads, rule.contact_support * radius
-        ),
+        far=modes.truncate(n_global),
+        regional=_regional(modes, n_global, problem, rule),
+        trailing=modes.load[:, n_global:rank],
+        contact_near=_with_gram_of(modes.load[:, rank:], residual, loads, reach),
         tip_field=tip_field,
         convergence=convergence,
         provenance=_provenance(problem),
     )
-    return with_rank(whole, options.max_modes, rule)
+
+
+def _regional(
+    modes: SeparatedField, n_global: int, problem: PatientProblem, rule: BuildRule
+) -> RegionalField:
+    """The modes beyond the global ones, separated by regions of the load surface."""
+    loads, mass = problem.loads, problem.mesh.lumped_mass
+    root = np.asarray(np.linalg.qr(np.sqrt(mass)[:, None] * modes.space, mode="r"))
+    size = np.linalg.norm(modes.load @ root.T, axis=1).reshape(-1, 3)
+    space, load = modes.space[:, n_global:], modes.load[:, n_global:].reshape(len(size), 3, -1)
+    n_regions = rule.n_regions(loads.area, loads.patch_radius, loads.n_positions)
+    return separate_regions(
+        regions_of(loads.centers, n_regions),
+        lambda positions: np.tensordot(space, load[positions], ([1], [2])),
+        np.maximum(size, 1e-300),
+        mass,
+        rule.regional,
+    )[0]
+
+
+def _with_gram_of(
+    load: np.ndarray, near: LocalBlocks, surface: LoadSurface, reach: float
+) -> LocalBlocks:
+    """Blocks and the tapered compliance of modes that are left out, Y Y^T."""
+    distance = np.linalg.norm(surface.centers[near.position] - surface.centers[near.target], axis=1)
+    zero = replace(near, block=np.zeros_like(near.block))
+    left = remainder(zero, load, taper(distance / reach))
+    return replace(near, block=near.block - left.block)
 
 
 def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
@@ -379,11 +409,6 @@ def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
     size = np.maximum((field_.load**2).sum(axis=1), 1e-300)
     sorted_ = field_.sorted_by_norm(mesh.lumped_mass, 1.0 / size)
     return SeparatedField(sorted_.space.astype(np.float32), sorted_.load.astype(np.float32))
-
-
-def _no_blocks(loads: LoadSurface, mesh: TetMesh, reach: float) -> LocalBlocks:
-    pairs = near_pairs(loads.centers, mesh.vertices, reach)
-    return LocalBlocks(pairs.start, pairs.target, np.zeros((len(pairs.target), 3, 3), np.float32))
 
 
 def _provenance(problem: PatientProblem) -> Provenance:

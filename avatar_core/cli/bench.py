@@ -81,7 +81,7 @@ def bench_effects(
     axes: Axes = None,
     label: Label = None,
     vertices: Vertices = 2850,
-    modes: Annotated[int, typer.Option(help="number of far-field modes")] = 50,
+    modes: Annotated[int, typer.Option(help="modes at a place at most")] = 100,
     fused: Annotated[
         Path | None,
         typer.Option(

@@ -27,7 +27,7 @@ def export(
             help="load [N]: one number, inward along the normal, or a vector such as 0,-1,0.5"
         ),
     ] = "1",
-    modes: Annotated[int, typer.Option(help="number of far-field modes to write")] = 10,
+    modes: Annotated[int, typer.Option(help="number of global modes to write")] = 10,
 ) -> None:
     """Export an organ for ParaView: at rest, with its first modes and its displacement."""
     from avatar_core.contact.tool_path import middle_of_access

@@ -64,7 +64,7 @@ def patient(
     axes: Axes = None,
     label: Label = None,
     vertices: Vertices = 2850,
-    modes: Annotated[int, typer.Option(help="maximum number of far-field modes")] = 100,
+    modes: Annotated[int, typer.Option(help="maximum number of modes at a place")] = 100,
     certify: Annotated[
         int | None,
         typer.Option(

@@ -63,9 +63,7 @@ def vademecum(
     ] = None,
     modes: Annotated[
         int | None,
-        typer.Option(
-            help="maximum number of far-field modes; default: 100, or 200 with large deformation"
-        ),
+        typer.Option(help="modes that show the displacement at a place, at most; default: 100"),
     ] = None,
     tolerance: Annotated[
         float | None,
@@ -140,13 +138,13 @@ def vademecum(
 ) -> None:
     """Build the certified vademecum of an organ. Exit code 3: written, but not converged."""
     from avatar_core.fem.elasticity import Material
-    from avatar_core.offline.large_deformation import LINEAR_RULE, LargeRule
+    from avatar_core.offline.large_deformation import LargeRule
     from avatar_core.offline.pipeline import OrganOptions, build, orientation_warning
     from avatar_core.offline.rule import BuildRule
     from avatar_core.reduction.coordinates import Coordinate
     from avatar_core.vademecum.storage import is_vademecum, load_vademecum, save_vademecum
 
-    rule = BuildRule() if material == "linear" else LINEAR_RULE
+    rule = BuildRule()
     rule = replace(rule, max_modes=modes or rule.max_modes, tolerance=tolerance or rule.tolerance)
     require(modes is None or modes >= 1, f"--modes is {modes}; ask for at least 1")
     require(
@@ -324,7 +322,7 @@ def show_text(v: Vademecum) -> None:
     )
     print(
         f"  {info.n_load_positions} load positions, patch radius {info.patch_radius * 1e3:.1f} mm, "
-        f"{info.n_modes} modes, {info.bytes / 1e6:.1f} MB"
+        f"{info.n_modes} modes at a place, {info.n_regions} regions, {info.bytes / 1e6:.1f} MB"
     )
     if v.contrast is not None:
         print(f"  tumour: Young's modulus {v.contrast:g} times that of the organ")
@@ -401,9 +399,9 @@ def _show_large(v: Vademecum) -> None:
         return
     reach = v.large.reach * 1e3
     print(
-        f"  large deformation, {v.large.material}: {v.large.space.shape[1]} modes, linear depth up "
-        f"to {reach.max():.0f} mm (half of the positions {sorted(reach)[len(reach) // 2]:.0f}, the "
-        f"least {reach.min():.0f})"
+        f"  large deformation, {v.large.material}: {v.large.terms.rank} modes at a place, linear "
+        f"depth up to {reach.max():.0f} mm (half of the positions "
+        f"{sorted(reach)[len(reach) // 2]:.0f}, the least {reach.min():.0f})"
     )
     c = v.large.certificate
     if c is None:
@@ -443,7 +441,7 @@ def finite(value: Any) -> Any:
 class BuildBar:
     """A progress bar over the stages of a build, ``contact_sites`` among them or none."""
 
-    _LINEAR: ClassVar = {"mesh": 0.1, "solve": 0.35, "modes": 0.3, "certify": 0.15, "time": 0.1}
+    _LINEAR: ClassVar = {"mesh": 0.1, "solve": 0.45, "modes": 0.2, "certify": 0.15, "time": 0.1}
     _PER_SITE: ClassVar = 0.4  # of a place, over all else
     _LARGE: ClassVar = {
         "mesh": 0.02,

@@ -28,6 +28,11 @@ Attributes = dict[str, str]
 UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, ArithmeticError)
 
 
+MAX_EXPANSION = 8  # of compressed arrays over the file, so that a small file cannot fill the memory
+_PACKED_FROM = 1 << 16  # bytes of an array from which it is compressed, without loss
+_PACKING = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+
+
 def replace_file(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> None:
     """Write arrays and attributes with their checksum, replacing a file atomically.
 
@@ -61,11 +66,14 @@ def replace_file(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str
 def encoded(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> memoryview:
     """The HDF5 file in memory: on a full disk, HDF5 itself would crash."""
     content = io.BytesIO()
-    with h5py.File(content, "w") as file:
+    # the latest layout keeps an array of one chunk without an index, in which damage would hide
+    with h5py.File(content, "w", libver="latest") as file:
         for key, value in attributes.items():
             file.attrs[key] = value
         for key, array in arrays.items():
-            file.create_dataset(key, data=array)
+            large = array.nbytes > _PACKED_FROM
+            how = {**_PACKING, "chunks": array.shape} if large else {}
+            file.create_dataset(key, data=array, **how)
         file.attrs["checksum"] = checksum(arrays, attributes)
     return content.getbuffer()
 
@@ -156,7 +164,7 @@ def _arrays(
             raise ValueError(f"'{key}' is missing or only a link")
         _require_plain(key, datasets[key])
         claimed += datasets[key].nbytes
-        if claimed > size:
+        if claimed > MAX_EXPANSION * size:
             raise ValueError(f"'{key}' claims more data than the file holds")
     return {key: _array(key, datasets[key]) for key in keys}
 
@@ -165,7 +173,7 @@ def _require_plain(key: str, dataset: h5py.Dataset) -> None:
     if dataset.is_virtual or dataset.external:
         raise ValueError(f"'{key}' points outside the file")
     dtype = dataset.dtype
-    plain = np.can_cast(dtype, np.int64) or (dtype.kind == "f" and dtype.itemsize in (4, 8))
+    plain = np.can_cast(dtype, np.int64) or (dtype.kind == "f" and dtype.itemsize in (2, 4, 8))
     if not (plain and dtype.isnative):
         raise ValueError(f"'{key}' is no array of plain numbers")
 

@@ -1,17 +1,16 @@
 """The displacement modes of a cloud of points, laid out for the compiled step.
 
 Their number and precision concern the display alone: the force comes from the contact compliance,
-which keeps all modes in single precision.
+which keeps all its modes in single precision.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from avatar_core.reduction.near_field import LocalBlocks, plateau
+from avatar_core.reduction.regional import RegionalField
 from avatar_core.vademecum.accuracy import Cloud, Precision
 
 if TYPE_CHECKING:
@@ -20,46 +19,49 @@ if TYPE_CHECKING:
 BLOCK = 256  # displacements that are summed together, within the first-level cache
 
 _LARGEST = {"int16": 32767, "int8": 127}
-_FADE = 0.5  # of its radius, where a shortened near field begins to fade
 
 
 class CloudArrays(NamedTuple):
     """The arrays of the same names in :class:`avatar_core.contact.layout.Layout`, and their source.
 
     points : vertices of the mesh that are shown
-    fade : factor of each block of the vademecum's near field; zero where it is left out
+    large_start : as ``region_start``, of the modes of large deformation, which come last
     """
 
     space: np.ndarray
     space_scale: np.ndarray
-    near: LocalBlocks
+    region_start: np.ndarray
+    regional_load: np.ndarray
     points: np.ndarray
-    fade: np.ndarray
+    large_start: np.ndarray
 
 
 def cloud_arrays(
     vademecum: Vademecum,
-    modes: int | None,
+    modes: int,
     cloud: Cloud,
     precision: Precision,
-    near: float,
-    nonlinear: np.ndarray | None = None,
+    large: RegionalField | None = None,
 ) -> CloudArrays:
-    """Far and near field at the points of a cloud.
+    """Global modes, those of all regions, and those of large deformation at the points of a cloud.
 
-    Parameters
-    ----------
-    modes : of the far field; None for all
-    near : radius of the near field over the vademecum's own, 0 to 1
-    nonlinear : ndarray, shape (3 n_vertices, n), modes of large deformation
+    modes : at a place, global ones first, then those of its region
     """
     points = shown_vertices(vademecum, cloud)
-    n_vertices = len(vademecum.mesh.vertices)
-    space = vademecum.far.space.reshape(n_vertices, 3, -1)[points, :, :modes]
-    if nonlinear is not None:
-        space = np.concatenate([space, nonlinear.reshape(n_vertices, 3, -1)[points]], axis=2)
-    blocks, fade = _near_at(vademecum.near, _fade(vademecum, near), points, n_vertices)
-    return CloudArrays(*in_blocks(space, precision), blocks, points, fade)
+    far = vademecum.far.space[:, :modes]
+    regional = vademecum.regional.truncated(modes - vademecum.far.rank)
+    parts = [far, regional.space] + ([large.space] if large else [])
+    space = np.concatenate([_at(part, points) for part in parts], axis=2)
+    start = far.shape[1] + regional.start
+    large_start = start[-1] + (large.start if large else np.zeros_like(start))
+    load = np.ascontiguousarray(regional.load)
+    return CloudArrays(*in_blocks(space, precision), start, load, points, large_start)
+
+
+def _at(space: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Modes (3 n_vertices, n) at some vertices, shape (n_points, 3, n) float32."""
+    by_vertex = space.reshape(len(space) // 3, 3, space.shape[1])
+    return by_vertex[points].astype(np.float32)
 
 
 def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
@@ -92,39 +94,3 @@ def out_of_blocks(blocks: np.ndarray, scale: np.ndarray, n_points: int) -> np.nd
     rank = len(scale)
     flat = blocks.transpose(0, 2, 1).reshape(-1, rank)[: 3 * n_points]
     return np.asarray(flat * scale, np.float32)
-
-
-def _fade(vademecum: Vademecum, fraction: float) -> np.ndarray:
-    """Factor of every block of a near field that is cut to a fraction of its radius."""
-    near = vademecum.near
-    distance = _reach(vademecum)
-    if fraction >= 1.0 or len(distance) == 0:
-        return np.ones(len(distance))
-    if fraction <= 0.0:
-        return np.zeros(len(distance))
-    filled = np.flatnonzero(np.diff(near.start))
-    farthest = np.maximum.reduceat(distance, near.start[filled])
-    radius = fraction * float(np.median(farthest))  # median: some positions reach across the organ
-    return plateau(distance, _FADE * radius, radius)
-
-
-def _reach(vademecum: Vademecum) -> np.ndarray:
-    """Distance of every block's vertex from its load position [m]."""
-    centers, vertices = vademecum.surface.centers, vademecum.mesh.vertices
-    near = vademecum.near
-    return np.asarray(np.linalg.norm(centers[near.position] - vertices[near.target], axis=1))
-
-
-def _near_at(
-    near: LocalBlocks, fade: np.ndarray, points: np.ndarray, n_vertices: int
-) -> tuple[LocalBlocks, np.ndarray]:
-    """The faded near field at some vertices, renumbered in their order, and the blocks' factors.
-
-    The factors (n_blocks,) are zero where a block is left out.
-    """
-    number = np.full(n_vertices, -1, np.int32)
-    number[points] = np.arange(len(points), dtype=np.int32)
-    fade = np.where(number[near.target] >= 0, fade, 0.0)
-    kept = near.kept(fade > 0.0)
-    block = kept.block * fade[fade > 0.0][:, None, None].astype(kept.block.dtype)
-    return replace(kept, target=number[kept.target], block=block), fade

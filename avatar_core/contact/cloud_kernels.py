@@ -1,10 +1,13 @@
-"""The compiled part of the contact step that deforms the cloud: far field by modes, near by blocks.
+"""The compiled part of the contact step that deforms the cloud: global modes, and those of regions.
 
-    u(x) = - sum_t lambda_t a_t [ sum_k X_k(x) Y_k . f_t  +  sum_j w_j N_j(x) n_t ]
+    u(x) = - sum_t lambda_t a_t [ sum_k X_k(x) Y_k . f_t  +  sum_j w_j sum_k Z_k(x) W_k(s_j) n_t ]
 
-with f_t = w(p_t) n_t as in :mod:`avatar_core.contact.kernels`, N_j the exact near field of load
+with f_t = w(p_t) n_t as in :mod:`avatar_core.contact.kernels`, Z_k the modes of the region of load
 position j, and for large deformation the terms of :mod:`avatar_core.vademecum.large_deformation`.
 That is an organ under patches; near a tip, :mod:`avatar_core.contact.dent` shows the tip's dent.
+
+A step reads the modes of the regions that are *touched*: those of the load positions that carry a
+tip or hold a history of loads.
 """
 
 from __future__ import annotations
@@ -14,15 +17,12 @@ import numpy as np
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.dent import add_dents
-from avatar_core.contact.effects.large_deformation import (
-    add_nonlinear_amplitudes,
-    add_nonlinear_near,
-    powers_of_depth,
-)
+from avatar_core.contact.effects.large_deformation import add_nonlinear_load, powers_of_depth
 from avatar_core.contact.effects.respiration import shift_cloud
 from avatar_core.contact.effects.viscoelasticity import least_shown
 
-LEAST_WEIGHT = 0.02  # of a load position, below which its near field is left out
+LEAST_WEIGHT = 0.04  # of the load positions of a region, below which its modes are left out
+MAX_PAST = 4  # regions whose history of loads is shown
 
 
 @fast
@@ -41,17 +41,18 @@ def deform(model, state, out, effects):  # type: ignore[no-untyped-def]
 def _displace(  # type: ignore[no-untyped-def]
     model, state, out, superposition, large_deformation, friction, viscoelasticity
 ):
-    """Far and near field into ``state.field``."""
+    """The displacement of all points into ``state.field``."""
     if superposition is None and out.n_contacts[0] == 0:
         state.field[:] = np.float32(0.0)
         return
-    _amplitudes(state, superposition, large_deformation)
-    _far_field(model, state, large_deformation)
+    _global_amplitudes(model, state, superposition)
+    _release_regions(state)
+    if viscoelasticity is not None:
+        _load_past(model, state, large_deformation, viscoelasticity)
     for t in range(state.passage.shape[0]):
         if state.force[t] > 0.0:
-            _near_field(model, state, large_deformation, friction, viscoelasticity, t)
-    if viscoelasticity is not None:
-        _near_history(model, state, viscoelasticity)
+            _load_regions(model, state, large_deformation, friction, viscoelasticity, t)
+    _sum_modes(model, state, large_deformation)
 
 
 @fast
@@ -65,71 +66,66 @@ def write_cloud(rest, field, cloud):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _amplitudes(state, superposition, large_deformation):  # type: ignore[no-untyped-def]
-    """Far amplitudes - sum_t lambda_t a_t Y^T f_t, then those of large deformation."""
-    amplitude = state.amplitude
-    n_modes = amplitude.shape[0]
-    amplitude[:] = np.float32(0.0)
-    if large_deformation is not None:
-        n_modes -= large_deformation.load.shape[2]
+def _global_amplitudes(model, state, superposition):  # type: ignore[no-untyped-def]
+    """- sum_t lambda_t a_t Y^T f_t, or what the effects superpose."""
+    amplitude, n_modes = state.amplitude, model.region_start[0]
+    for k in range(n_modes):
+        amplitude[k] = np.float32(0.0 if superposition is None else superposition.total[k])
     if superposition is not None:
-        for k in range(n_modes):
-            amplitude[k] = np.float32(superposition.total[k])
+        return
     for t in range(state.passage.shape[0]):
-        if state.force[t] <= 0.0:
-            continue
-        if superposition is None:
+        if state.force[t] > 0.0:
             force = np.float32(state.force[t] * state.scale[t])
             for k in range(n_modes):
                 amplitude[k] -= force * state.mode[t, k]
-        if large_deformation is not None:
-            add_nonlinear_amplitudes(state, large_deformation, t, amplitude)
 
 
 @fast
-def _far_field(model, state, large_deformation):  # type: ignore[no-untyped-def]
-    """sum_k X_k a_k over the modes that are shown, then those of large deformation."""
-    amplitude, scale = state.amplitude, model.space_scale
-    shown = min(state.shown[0], scale.shape[0])
-    for b in range(model.space.shape[0]):
-        u = state.field[b * BLOCK : (b + 1) * BLOCK]
-        x = model.space[b]
-        for i in range(BLOCK):
-            u[i] = np.float32(0.0)
-        for k in range(0, shown - 3, 4):
-            a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
-            a2, a3 = amplitude[k + 2] * scale[k + 2], amplitude[k + 3] * scale[k + 3]
-            for i in range(BLOCK):
-                u[i] += x[k, i] * a0 + x[k + 1, i] * a1 + x[k + 2, i] * a2 + x[k + 3, i] * a3
-        for k in range(shown - shown % 4, shown):
-            a = amplitude[k] * scale[k]
-            for i in range(BLOCK):
-                u[i] += x[k, i] * a
-        if large_deformation is not None:
-            _add_modes(amplitude, scale, x, u, scale.shape[0] - large_deformation.load.shape[2])
+def _release_regions(state):  # type: ignore[no-untyped-def]
+    for i in range(state.n_touched[0]):
+        state.is_touched[state.touched[i]] = False
+    state.n_touched[0] = 0
+
+
+@inlined
+def _touch(model, state, large_deformation, r):  # type: ignore[no-untyped-def]
+    """Clear the amplitudes of a region that was not touched before."""
+    if state.is_touched[r]:
+        return
+    state.is_touched[r] = True
+    state.touched[state.n_touched[0]] = r
+    state.n_touched[0] += 1
+    state.amplitude[model.region_start[r] : model.region_start[r + 1]] = np.float32(0.0)
+    if large_deformation is not None:
+        start = large_deformation.start
+        state.amplitude[start[r] : start[r + 1]] = np.float32(0.0)
 
 
 @fast
-def _add_modes(amplitude, scale, x, u, first):  # type: ignore[no-untyped-def]
-    """The same sum from mode ``first``. Calling it in the loop above costs the bare step 6 %."""
-    end = scale.shape[0]
-    for k in range(first, end - 3, 4):
-        a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
-        a2, a3 = amplitude[k + 2] * scale[k + 2], amplitude[k + 3] * scale[k + 3]
-        for i in range(BLOCK):
-            u[i] += x[k, i] * a0 + x[k + 1, i] * a1 + x[k + 2, i] * a2 + x[k + 3, i] * a3
-    for k in range(end - (end - first) % 4, end):
-        a = amplitude[k] * scale[k]
-        for i in range(BLOCK):
-            u[i] += x[k, i] * a
+def _add_load(model, state, j, x, y, z):  # type: ignore[no-untyped-def]
+    """Amplitudes of a region by a force at one of its load positions."""
+    first, end = model.region_start[model.region[j]], model.region_start[model.region[j] + 1]
+    amplitude, load = state.amplitude[first:end], model.regional_load[j]
+    f0, f1, f2 = np.float32(x), np.float32(y), np.float32(z)
+    for k in range(amplitude.shape[0]):
+        amplitude[k] += load[0, k] * f0 + load[1, k] * f1 + load[2, k] * f2
 
 
 @fast
-def _near_field(model, state, large_deformation, friction, viscoelasticity, t):  # type: ignore[no-untyped-def]
-    """The exact near field around the load positions that carry the force of a tip."""
-    kept = 0.0
+def _load_regions(model, state, large_deformation, friction, viscoelasticity, t):  # type: ignore[no-untyped-def]
+    """The force of a tip on the regions of the load positions that carry it.
+
+    A region fades out before the tip leaves it, so that few are read; the others take its part.
+    """
+    region_weight, kept = state.region_weight, 0.0
     for i in range(state.n_nodes[t]):
-        kept += _soft_threshold(state.weight[t, i, 0])
+        region_weight[model.region[state.nodes[t, i]]] = 0.0
+    for i in range(state.n_nodes[t]):
+        region_weight[model.region[state.nodes[t, i]]] += state.weight[t, i, 0]
+    for i in range(state.n_nodes[t]):
+        whole = region_weight[model.region[state.nodes[t, i]]]
+        if whole != 0.0:
+            kept += state.weight[t, i, 0] * _soft_threshold(whole) / whole
     n, scale = state.normal[t], state.scale[t] / kept
     f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
     if friction is not None:
@@ -138,42 +134,105 @@ def _near_field(model, state, large_deformation, friction, viscoelasticity, t): 
     if large_deformation is not None:
         second, third = powers_of_depth(state, large_deformation, t)
     for i in range(state.n_nodes[t]):
-        w = _soft_threshold(state.weight[t, i, 0])
+        j = state.nodes[t, i]
+        whole = region_weight[model.region[j]]
+        if whole == 0.0:
+            continue
+        w = state.weight[t, i, 0] * _soft_threshold(whole) / whole
         if w != 0.0:
-            j, part = state.nodes[t, i], w * scale
+            _touch(model, state, large_deformation, model.region[j])
             if viscoelasticity is None:
-                _add_row(model, state, j, part * f0, part * f1, part * f2)
+                part = w * scale
+                _add_load(model, state, j, part * f0, part * f1, part * f2)
             if large_deformation is not None:
-                add_nonlinear_near(model, state, large_deformation, j, w / kept, second, third)
-
-
-@fast
-def _near_history(model, state, viscoelasticity):  # type: ignore[no-untyped-def]
-    """The near field of the load history; its weakest loads fade out."""
-    least = least_shown(viscoelasticity)
-    for m in range(viscoelasticity.count[0]):
-        e = viscoelasticity.near_elastic[m]
-        size = np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
-        if size > least:
-            part = (size - least) / size
-            _add_row(
-                model, state, viscoelasticity.position[m], part * e[0], part * e[1], part * e[2]
-            )
+                r = model.region[j]
+                add_nonlinear_load(state, large_deformation, r, j, w / kept, second, third)
 
 
 @inlined
 def _soft_threshold(w):  # type: ignore[no-untyped-def]
-    """Soft thresholding, so that the near field of a load position vanishes continuously."""
+    """Soft thresholding, so that the modes of a region vanish continuously."""
     if w > 0.0:
         return max(w - LEAST_WEIGHT, 0.0)
     return min(w + LEAST_WEIGHT, 0.0)
 
 
 @fast
-def _add_row(model, state, j, x, y, z):  # type: ignore[no-untyped-def]
-    u, f0, f1, f2 = state.field, np.float32(x), np.float32(y), np.float32(z)
-    for e in range(model.near_start[j], model.near_start[j + 1]):
-        v = 3 * model.near_target[e]
-        block = model.near_block[e]
-        for d in range(3):
-            u[v + d] += block[d, 0] * f0 + block[d, 1] * f1 + block[d, 2] * f2
+def _load_past(model, state, large_deformation, viscoelasticity):  # type: ignore[no-untyped-def]
+    """The load history on its regions; the weakest loads fade out, and so do weak regions."""
+    least = least_shown(viscoelasticity)
+    for m in range(viscoelasticity.count[0]):
+        e, j = viscoelasticity.near_elastic[m], viscoelasticity.position[m]
+        size = np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
+        if size > least:
+            part = (size - least) / size
+            _touch(model, state, large_deformation, model.region[j])
+            _add_load(model, state, j, part * e[0], part * e[1], part * e[2])
+    if state.n_touched[0] > MAX_PAST:
+        _fade_regions(model, state)
+
+
+@fast
+def _fade_regions(model, state):  # type: ignore[no-untyped-def]
+    """Keep the ``MAX_PAST`` regions that move most, less what the next one moves."""
+    norm, n = state.region_weight, state.n_touched[0]
+    for i in range(n):
+        r = state.touched[i]
+        norm[r] = 0.0
+        for k in range(model.region_start[r], model.region_start[r + 1]):
+            norm[r] += np.float64(state.amplitude[k] * model.space_scale[k]) ** 2
+        norm[r] = np.sqrt(norm[r])
+    bound = np.inf  # in the end the norm of the region after the last that is kept
+    for _ in range(MAX_PAST + 1):
+        largest = 0.0
+        for i in range(n):
+            if norm[state.touched[i]] < bound:
+                largest = max(largest, norm[state.touched[i]])
+        bound = largest
+    kept = 0
+    for i in range(n):
+        r = state.touched[i]
+        if norm[r] > bound:
+            factor = np.float32((norm[r] - bound) / norm[r])
+            for k in range(model.region_start[r], model.region_start[r + 1]):
+                state.amplitude[k] *= factor
+            state.touched[kept] = r
+            kept += 1
+        else:
+            state.is_touched[r] = False
+    state.n_touched[0] = kept
+
+
+@fast
+def _sum_modes(model, state, large_deformation):  # type: ignore[no-untyped-def]
+    """sum_k X_k a_k over the global modes that are shown, then over those of touched regions."""
+    amplitude, scale, start = state.amplitude, model.space_scale, model.region_start
+    n_global = min(state.shown[0], start[0])
+    n_regional = max(state.shown[0] - start[0], 0)
+    for b in range(model.space.shape[0]):
+        u, x = state.field[b * BLOCK : (b + 1) * BLOCK], model.space[b]
+        for i in range(BLOCK):
+            u[i] = np.float32(0.0)
+        _add_modes(amplitude, scale, x, u, 0, n_global)
+        for q in range(state.n_touched[0]):
+            r = state.touched[q]
+            end = min(start[r] + n_regional, start[r + 1])
+            _add_modes(amplitude, scale, x, u, start[r], end)
+            if large_deformation is not None:
+                nonlinear = large_deformation.start
+                _add_modes(amplitude, scale, x, u, nonlinear[r], nonlinear[r + 1])
+
+
+@fast
+def _add_modes(amplitude, scale, x, u, first, end):  # type: ignore[no-untyped-def]
+    """The same sum over some modes, four at a time."""
+    whole = end - (end - first) % 4
+    for k in range(first, whole, 4):
+        a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
+        a2, a3 = amplitude[k + 2] * scale[k + 2], amplitude[k + 3] * scale[k + 3]
+        for i in range(BLOCK):
+            u[i] += x[k, i] * a0 + x[k + 1, i] * a1 + x[k + 2, i] * a2 + x[k + 3, i] * a3
+    for k in range(whole, end):
+        a = amplitude[k] * scale[k]
+        for i in range(BLOCK):
+            u[i] += x[k, i] * a

@@ -109,9 +109,9 @@ ModelArrays = namedtuple(
         "softness",
         "space",
         "space_scale",
-        "near_start",
-        "near_target",
-        "near_block",
+        "region",
+        "region_start",
+        "regional_load",
         "rest",
         "tip_offset",
     ],
@@ -143,8 +143,12 @@ State = namedtuple(
         "gram",  # (T, T) f_t . C f_t'
         "scale",  # (T,) a_t
         "compliance",  # (T, T)
-        "shown",  # (1,) number of far-field modes in the cloud
-        "amplitude",  # (rank,) of the far-field modes, those of large deformation last
+        "shown",  # (1,) number of modes in the cloud at a place, global ones first
+        "amplitude",  # (n_modes,) of the modes of the cloud
+        "touched",  # (n_regions,) the regions whose modes move the cloud,
+        "n_touched",  # (1,) their number,
+        "is_touched",  # (n_regions,) and whether a region is one
+        "region_weight",  # (n_regions,) scratch
         "field",  # (n_blocks BLOCK,) displacement of the cloud, three components a point
     ],
 )

@@ -60,9 +60,11 @@ class Layout:
         position (n_positions, 3) [m]; load (n_positions, 3, rank and zeros) and the contact_*
         blocks with their hash tables: compliance [m/N]; softness (1,), added where access fades
         [m/N];
-        space (n_blocks, rank, BLOCK) int16, displacement modes of the cloud in units of
-        space_scale (rank,), and the near_* blocks [m/N]; rest (n_points, 6), the cloud without
-        displacement [m]; tip_offset (n_tools,), of a pose above the lowest point of the tip [m]
+        space (n_blocks, n_modes, BLOCK) int16, displacement modes of the cloud in units of
+        space_scale (n_modes,): global ones, then those of each region from region_start
+        (n_regions + 1,) on, then those of large deformation; region (n_positions,) and
+        regional_load (n_positions, 3, most); rest (n_points, 6), the cloud without displacement
+        [m]; tip_offset (n_tools,), of a pose above the lowest point of the tip [m]
     effects : Constants, None for each effect that was not chosen
     """
 
@@ -105,7 +107,7 @@ def lay_out(
 
     detail : of the displacement; by default all modes at the surface
     """
-    detail = detail or Detail(vademecum.far.rank)
+    detail = detail or Detail(vademecum.n_modes)
     return next(lay_out_details(vademecum, tips, [detail], effects, period))
 
 
@@ -133,11 +135,10 @@ def lay_out_details(
     leaning = find(effects, Tilt)
     if leaning is not None:
         leaning.require_flat(tips)
-    rank = vademecum.far.rank
     vademecum, mass = adapted_vademecum(vademecum, effects)
     surface, contact = vademecum.surface, vademecum.contact_near
     contact_start, contact_slot = hash_rows(contact)
-    load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
+    load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
     padded, softness = _padded(load), float((load**2).sum(axis=(1, 2)).mean() / 3.0)
     field, offset = vademecum.tip_field, np.array([tip.offset for tip in tips])
     response = make_tip_response(surface, field, load, contact, MAX_DEPTH, max(offset))
@@ -155,12 +156,7 @@ def lay_out_details(
     )
     for detail in details:
         shown = cloud_arrays(
-            vademecum,
-            None if detail.modes == rank else detail.modes,
-            detail.cloud,
-            detail.precision,
-            detail.near,
-            large.space if large else None,
+            vademecum, detail.modes, detail.cloud, detail.precision, large.terms if large else None
         )
         points = vademecum.mesh.vertices[shown.points]
         arrays = ModelArrays(
@@ -184,13 +180,15 @@ def lay_out_details(
             softness=np.array([softness]),
             space=shown.space,
             space_scale=shown.space_scale,
-            near_start=shown.near.start,
-            near_target=shown.near.target,
-            near_block=shown.near.block,
+            region=vademecum.regional.region,
+            region_start=shown.region_start,
+            regional_load=shown.regional_load,
             rest=np.pad(points, ((0, 0), (0, 3))).astype(np.float32),
             tip_offset=offset,
         )
-        nonlinear = _nonlinear_arrays(vademecum, large, response, shown.fade) if large else None
+        nonlinear = (
+            _nonlinear_arrays(vademecum, large, response, shown.large_start) if large else None
+        )
         dent = dent_arrays(tips, points, surface.centers, surface.patch_radius) if law else None
         yield Layout(
             arrays,
@@ -218,15 +216,12 @@ def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
 
 
 def _nonlinear_arrays(
-    vademecum: Vademecum, large: LargeDeformation, response: TipResponse, fade: np.ndarray
+    vademecum: Vademecum, large: LargeDeformation, response: TipResponse, start: np.ndarray
 ) -> LargeDeformationArrays:
-    """Coefficients of large deformation on the grid, and its modes at the cloud."""
+    """Coefficients of large deformation on the grid, and its loads in the modes of the cloud."""
     values = np.vstack([large.depth, large.reach])
     grid = sampled_at_tip(vademecum.surface, vademecum.tip_field, response, values)
-    kept = fade > 0.0
-    near = large.near[:, kept] * fade[kept, None].astype(large.near.dtype)
-    # C order whether or not blocks were left out: one memory layout, one compilation
-    return LargeDeformationArrays(grid, large.load, np.ascontiguousarray(near))
+    return LargeDeformationArrays(grid, np.ascontiguousarray(large.terms.load), start)
 
 
 def _error_factors(vademecum: Vademecum, tips: Sequence[Tip]) -> np.ndarray:
@@ -260,14 +255,10 @@ def _padded(load: np.ndarray) -> np.ndarray:
 def _check(vademecum: Vademecum, tips: Sequence[Tip], detail: Detail) -> None:
     if not 1 <= len(tips) <= kernels.MAX_TOOLS:
         raise ContactError(f"{len(tips)} tools; give 1 to {kernels.MAX_TOOLS} tips")
-    modes, rank = detail.modes, vademecum.far.rank
-    if not 1 <= modes <= rank:
-        raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {rank}")
+    modes, most = detail.modes, vademecum.n_modes
+    if not 1 <= modes <= most:
+        raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {most}")
     for name, known in (("cloud", get_args(Cloud)), ("precision", get_args(Precision))):
         value = getattr(detail, name)
         if value not in known:
             raise ContactError(f"{name} '{value}' is unknown; choose {', '.join(known)}")
-    if not 0.0 <= detail.near <= 1.0:
-        raise ContactError(
-            f"near is {detail.near:g}; give a fraction of the near field's radius, 0 to 1"
-        )

@@ -119,19 +119,23 @@ class ContactModel:
 
     @property
     def n_modes(self) -> int:
-        """Modes of the far field that the cloud can show."""
-        return _n_far(self.layout)
+        """Modes that the cloud can show at a place."""
+        return _n_modes(self.layout)
+
+    @property
+    def n_global(self) -> int:
+        """Those of them that all places share."""
+        return int(self.arrays.region_start[0])
 
     @property
     def n_shown(self) -> int:
-        """Modes of the far field that the cloud shows."""
+        """Modes that the cloud shows at a place: global ones first, then those of its region."""
         return int(self.state.shown[0])
 
     def show(self, modes: int) -> None:
         """Show the displacement with fewer modes, or with all again, from the next step on.
 
-        Real-time safe. The force does not change: the contact compliance keeps all modes and the
-        near field.
+        Real-time safe. The force does not change: the contact compliance keeps all modes.
         """
         self.state.shown[0] = min(max(modes, 0), self.n_modes)
 
@@ -177,7 +181,6 @@ def prepare(
     period: float = PERIOD,
     halves: bool = False,
     precision: Precision = "int16",
-    near: float = 1.0,
 ) -> ContactModel:
     """Lay out a vademecum for the step, and compile the step for the effects. Not real-time safe.
 
@@ -185,21 +188,20 @@ def prepare(
     ----------
     vademecum : Vademecum
     tips : the tip of each tool
-    modes : far-field modes of the *displacement*; None for all. Fewer modes leave the force
-        exact, since the contact compliance keeps all of them.
+    modes : of the *displacement* at a place, global ones first, then those of its region; None for
+        all. Fewer modes leave the force exact, since the contact compliance keeps all of its own.
     cloud : "surface" or "volume" vertices, or "off"
     effects : to simulate; by default those that the vademecum and the tools require
     period : of the steps [s], for effects that depend on time
     halves : compile :func:`solve` and :func:`deform` instead of :func:`step`
     precision : of the displacement's modes
-    near : radius of the displacement's near field over the vademecum's own, 0 to 1
 
     Raises
     ------
     ContactError, SceneError
         For modes or clouds out of range; for effects that the vademecum cannot serve.
     """
-    detail = Detail(vademecum.far.rank if modes is None else modes, cloud, precision, near)
+    detail = Detail(vademecum.n_modes if modes is None else modes, cloud, precision)
     return make_model(lay_out(vademecum, tips, detail, effects, period), halves)
 
 
@@ -227,6 +229,7 @@ def _state(layout: Layout) -> State:
     """Without any contact."""
     arrays, single = layout.arrays, np.float32
     n_tools, n_modes = len(arrays.tip_offset), arrays.load.shape[2]
+    n_regions = len(arrays.region_start) - 1
     return State(
         passage=np.zeros(n_tools, np.int64),
         seen=np.zeros((n_tools, 3)),
@@ -250,8 +253,12 @@ def _state(layout: Layout) -> State:
         gram=np.ones((n_tools, n_tools)),
         scale=np.ones(n_tools),
         compliance=np.zeros((n_tools, n_tools)),
-        shown=np.array([_n_far(layout)], np.int64),
+        shown=np.array([_n_modes(layout)], np.int64),
         amplitude=np.zeros(len(arrays.space_scale), single),
+        touched=np.zeros(n_regions, np.int64),
+        n_touched=np.zeros(1, np.int64),
+        is_touched=np.zeros(n_regions, np.bool_),
+        region_weight=np.zeros(n_regions),
         field=np.zeros(arrays.space.shape[0] * BLOCK, single),
     )
 
@@ -274,10 +281,9 @@ def _out(layout: Layout) -> Out:
     )
 
 
-def _n_far(layout: Layout) -> int:
-    """Modes of the far field that the cloud can show."""
-    nonlinear, n_modes = layout.effects.large_deformation, len(layout.arrays.space_scale)
-    return n_modes if nonlinear is None else n_modes - nonlinear.load.shape[2]
+def _n_modes(layout: Layout) -> int:
+    """Modes that the cloud can show at a place."""
+    return int(layout.arrays.region_start[0]) + layout.arrays.regional_load.shape[2]
 
 
 def _effects(layout: Layout) -> Selection:
@@ -348,7 +354,6 @@ def warm_up(n_tools: int = 1) -> None:
     single, double = np.float32, np.float64
     n, rank, points = 1, 1, 1
     shift = no_shift(8.0, np.zeros(n_tools))
-    blocks = (np.zeros(n + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, 3, 3), single))
     arrays = ModelArrays(
         distance=np.full((8, 8, 8), 1.0, single),
         access=np.zeros((8, 8, 8), single),
@@ -370,9 +375,9 @@ def warm_up(n_tools: int = 1) -> None:
         softness=np.ones(1, double),
         space=np.zeros((1, rank, BLOCK), np.int16),
         space_scale=np.zeros(rank, single),
-        near_start=blocks[0],
-        near_target=blocks[1],
-        near_block=blocks[2],
+        region=np.zeros(n, np.int32),
+        region_start=np.full(2, rank, np.int64),
+        regional_load=np.zeros((n, 3, 0), single),
         rest=np.zeros((points, 6), single),
         tip_offset=np.full(n_tools, 5e-3, double),
     )

@@ -41,7 +41,7 @@ def timed(
     paths = slides(vademecum, tips)
     pairs: list[tuple[ContactModel, CurvePoint]] = []
     groups = _same_arrays(curve)
-    details = [replace(group[0].detail, modes=vademecum.far.rank) for group in groups]
+    details = [replace(group[0].detail, modes=vademecum.n_modes) for group in groups]
     layouts = lay_out_details(vademecum, tips, details, effects, period)
     for group, layout in zip(groups, layouts, strict=True):
         model = make_model(layout, halves)

@@ -83,6 +83,12 @@ class LoadSurface:
         return self.centers[self.corners].mean(axis=1)
 
     @property
+    def area(self) -> float:
+        """Area of the accessible faces [m^2]."""
+        a, b, c = (self.centers[self.corners[:, i]] for i in range(3))
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
+
+    @property
     def face_normals(self) -> np.ndarray:
         """Unit outward normals of the accessible faces, shape (n_triangles, 3)."""
         a, b, c = (self.centers[self.corners[:, i]] for i in range(3))

@@ -1,4 +1,4 @@
-"""The full solutions of a build: each is computed once, and reduced to what the vademecum needs."""
+"""The full solutions of a build, each computed once."""
 
 from __future__ import annotations
 
@@ -10,174 +10,117 @@ import scipy.sparse as sp
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface
-from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress
-from avatar_core.reduction.near_field import LocalBlocks, Pairs, near_pairs, plateau, wendland
+from avatar_core.offline.rule import NO_ERROR, Progress
+from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 from avatar_core.reduction.separated import SeparatedField
 
 _BATCH = 40  # load positions solved at once
 _TRIED = 2  # load positions on which single precision is tried,
-SINGLE_ERROR = 1e-3  # and the relative error up to which it does: modes leave thirty times it
+SINGLE_ERROR = 1e-3  # and the relative error up to which it does: modes leave six times it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ExactResponse:
-    """What is kept of the full solutions, each computed once and dropped.
+    """The response to every load, in single precision.
 
-    vertex, contact : LocalBlocks, exact displacement at near vertices and near positions
-    vertex_pairs, contact_pairs : Pairs, their distances
+    columns : ndarray, shape (3 n_vertices, n_loads), displacement at the vertices [m/N]
+    compliance : ndarray, shape (n_loads, n_loads), of patch under patch, symmetric [m/N]
     norm : ndarray, shape (n_loads,), mass-weighted L2 norm of each column [m^(5/2)/N]
-    energy : ndarray, shape (n_loads,), patch compliance of each load [m/N]
-    samples : ndarray of int, positions whose columns are kept; ``columns`` (3 n_vertices, 3 n)
-        float32
-    single : whether single precision does for the solutions
     """
 
-    vertex: LocalBlocks
-    contact: LocalBlocks
-    vertex_pairs: Pairs
-    contact_pairs: Pairs
-    norm: np.ndarray
-    energy: np.ndarray
-    samples: np.ndarray
     columns: np.ndarray
-    single: bool
+    compliance: np.ndarray
+    norm: np.ndarray
+
+    @property
+    def energy(self) -> np.ndarray:
+        """Patch compliance of each load, shape (n_loads,) [m/N]."""
+        return np.diagonal(self.compliance).astype(float)
+
+    def remainder(self, far: SeparatedField, positions: np.ndarray) -> np.ndarray:
+        """What a field leaves of some positions' columns, shape (3 n_vertices, n, 3)."""
+        loads = (3 * positions[:, None] + np.arange(3)).ravel()
+        smooth = far.space.astype(np.float32) @ far.load[loads].T.astype(np.float32)
+        return (self.columns[:, loads] - smooth).reshape(len(smooth), -1, 3)
 
 
 def exact_response(
     elasticity: Elasticity,
     surface: LoadSurface,
     loads: sp.csr_matrix,
-    rule: BuildRule,
     progress: Progress,
     single: bool = False,
 ) -> ExactResponse:
-    """Solve for every load position and keep what the vademecum needs.
+    """Solve for every load position.
 
     single : solve in single precision where that does, in half the time
     """
-    radius, n = surface.patch_radius, surface.n_positions
-    vertices = elasticity.mesh.vertices
-    widest = rule.near_growth * rule.near_outer * radius
-    vertex_pairs = near_pairs(surface.centers, vertices, widest)
-    contact_pairs = near_pairs(surface.centers, surface.centers, rule.contact_support * radius)
-    vertex = np.empty((len(vertex_pairs.target), 3, 3), np.float32)
-    contact = np.empty((len(contact_pairs.target), 3, 3))
-    norm, energy = np.empty((n, 3)), np.empty((n, 3))
-    sampled = np.random.default_rng(1).permutation(n)
-    sampled = np.sort(sampled[: max(1, rule.max_sample_bytes // (36 * len(vertices)))])
-    columns = np.empty((3 * len(vertices), len(sampled), 3), np.float32)
-    place = {int(j): k for k, j in enumerate(sampled)}
-    mass = elasticity.mesh.lumped_mass
+    n, n_rows = surface.n_positions, 3 * len(elasticity.mesh.vertices)
+    columns = np.empty((n_rows, 3 * n), np.float32, order="F")
+    compliance = np.empty((3 * n, 3 * n), np.float32, order="F")
     by_column, average = loads.tocsc(), loads.T.tocsr()
     tried = min(n, _TRIED)
     single = single and elasticity.single_error(by_column[:, : 3 * tried]) < SINGLE_ERROR
-    for first in range(0, n, _BATCH):
-        batch = range(first, min(first + _BATCH, n))
-        solution = elasticity.solve(by_column[:, 3 * batch.start : 3 * batch.stop], single)
-        displacement = elasticity.at_vertices(solution)
-        at_vertex = displacement.reshape(len(vertices), 3, -1, 3)
-        at_position = (average @ solution).reshape(n, 3, -1, 3)
-        norm[batch] = l2_norm(displacement, mass).reshape(-1, 3)
-        for k, j in enumerate(batch):
-            row = slice(vertex_pairs.start[j], vertex_pairs.start[j + 1])
-            vertex[row] = at_vertex[vertex_pairs.target[row], :, k]
-            row = slice(contact_pairs.start[j], contact_pairs.start[j + 1])
-            contact[row] = at_position[contact_pairs.target[row], :, k]
-            energy[j] = np.diagonal(at_position[j, :, k])
-            if j in place:
-                columns[:, place[j]] = at_vertex[:, :, k].reshape(-1, 3)
-        progress("solve", batch.stop / n, NO_ERROR)
-    return ExactResponse(
-        LocalBlocks(vertex_pairs.start, vertex_pairs.target, vertex),
-        LocalBlocks(contact_pairs.start, contact_pairs.target, contact),
-        vertex_pairs,
-        contact_pairs,
-        norm.ravel(),
-        energy.ravel(),
-        sampled,
-        columns.reshape(3 * len(vertices), -1),
-        single,
-    )
+    for first in range(0, 3 * n, 3 * _BATCH):
+        batch = slice(first, min(first + 3 * _BATCH, 3 * n))
+        solution = elasticity.solve(by_column[:, batch], single)
+        columns[:, batch] = elasticity.at_vertices(solution)
+        compliance[:, batch] = average @ solution
+        progress("solve", batch.stop / (3 * n), NO_ERROR)
+    _symmetrize(compliance)
+    mass = elasticity.mesh.lumped_mass.astype(np.float32)
+    batches = range(0, 3 * n, 3 * _BATCH)
+    norm = np.concatenate([l2_norm(columns[:, k : k + 3 * _BATCH], mass) for k in batches])
+    return ExactResponse(columns, compliance, norm)
 
 
-class FarFieldResidual:
-    """Error that the modes found so far leave in the sampled columns, outside the near field."""
-
-    def __init__(
-        self, elasticity: Elasticity, surface: LoadSurface, response: ExactResponse, rule: BuildRule
-    ) -> None:
-        distance = np.linalg.norm(
-            elasticity.mesh.vertices[:, None] - surface.centers[response.samples][None], axis=2
-        )
-        inner, outer = (r * surface.patch_radius for r in (rule.near_inner, rule.near_outer))
-        keep = 1.0 - plateau(distance, inner, outer)
-        weight = elasticity.mesh.vertex_volumes[:, None] * keep**2
-        self.loads = (3 * response.samples[:, None] + np.arange(3)).ravel()
-        self._weight = np.repeat(weight, 3, axis=0).astype(np.float32)
-        self._norm = response.norm[self.loads]
-        self._columns = response.columns
-        self._left: np.ndarray | None = None
-
-    def reset(self) -> None:
-        """Discard all modes and free their memory."""
-        self._left = None
-
-    def subtract(self, space: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Subtract modes; returns the relative L2 error of each sampled load, shape (n,)."""
-        if self._left is None:
-            self._left = self._columns.copy()
-        self._left -= space.astype(np.float32) @ load[self.loads].astype(np.float32).T
-        left = self._left.reshape(len(self._weight), -1, 3)
-        squared = np.einsum("vs,vsc,vsc->sc", self._weight, left, left, optimize=False)
-        return np.sqrt(squared).ravel() / self._norm
+def _symmetrize(matrix: np.ndarray) -> None:
+    """(C + C^T) / 2 in place, by strips: rounding is all it removes (Maxwell-Betti)."""
+    for k in range(0, len(matrix), 3 * _BATCH):
+        strip = slice(k, k + 3 * _BATCH)
+        mean = 0.5 * (matrix[k:, strip] + matrix[strip, k:].T)
+        matrix[k:, strip], matrix[strip, k:] = mean, mean.T
 
 
-def displacement_near(
-    far: SeparatedField,
-    response: ExactResponse,
-    surface: LoadSurface,
-    rule: BuildRule,
-    outliers: np.ndarray,
-) -> LocalBlocks:
-    """(u - far) at the vertices around each position, faded out; stored in full at outliers."""
-    radius = surface.patch_radius
-    fade = plateau(
-        response.vertex_pairs.distance, rule.near_inner * radius, rule.near_outer * radius
-    )
-    blocks = remainder(response.vertex, far.space, far.load, fade)
-    blocks = blocks.kept(response.vertex_pairs.distance < rule.near_outer * radius)
-    rows = {}
-    for j in outliers:
-        k = 3 * int(np.searchsorted(response.samples, j))
-        left = response.columns[:, k : k + 3] - far.space @ far.load[3 * j : 3 * j + 3].T
-        rows[int(j)] = left.reshape(-1, 3, 3).astype(np.float32)
-    return blocks.with_whole_rows(rows)
+def contact_blocks(response: ExactResponse, surface: LoadSurface, support: float) -> LocalBlocks:
+    """The compliance between load positions up to a distance [m] apart."""
+    pairs = near_pairs(surface.centers, surface.centers, support)
+    exact = response.compliance.reshape(surface.n_positions, 3, surface.n_positions, 3)
+    blocks = np.empty((len(pairs.target), 3, 3), np.float32)
+    for j in range(surface.n_positions):
+        row = slice(pairs.start[j], pairs.start[j + 1])
+        blocks[row] = exact[pairs.target[row], :, j]
+    return LocalBlocks(pairs.start, pairs.target, blocks)
 
 
 def contact_near(
-    far: SeparatedField, response: ExactResponse, surface: LoadSurface, rule: BuildRule
+    exact: LocalBlocks, load: np.ndarray, surface: LoadSurface, support: float
 ) -> LocalBlocks:
-    """(C - Y Y^T), tapered by Wendland's function and exactly symmetric."""
-    support = rule.contact_support * surface.patch_radius
-    taper = wendland(response.contact_pairs.distance, support)
-    blocks = remainder(response.contact, far.load, far.load, taper)
-    return replace(blocks, block=_symmetrized(blocks))
+    """(C - Y Y^T), tapered up to a distance and exactly symmetric.
+
+    exact : of :func:`contact_blocks`
+    load : ndarray, shape (n_loads, rank), Y
+    support : [m]
+    """
+    distance = np.linalg.norm(
+        surface.centers[exact.position] - surface.centers[exact.target], axis=1
+    )
+    return _symmetrized(remainder(exact, load, taper(distance / support)))
 
 
-def remainder(
-    exact: LocalBlocks, target: np.ndarray, load: np.ndarray, fade: np.ndarray
-) -> LocalBlocks:
-    rank = target.shape[1]
-    target, load = target.reshape(-1, 3, rank), load.reshape(-1, 3, rank)
+def remainder(exact: LocalBlocks, load: np.ndarray, fade: np.ndarray) -> LocalBlocks:
+    """(C - Y Y^T) of blocks of a compliance, times a factor of each block."""
+    load = load.reshape(len(load) // 3, 3, load.shape[1])
     block = np.empty(exact.block.shape, np.float32)
     for j in range(len(exact.start) - 1):
         row = slice(exact.start[j], exact.start[j + 1])
-        smooth = (target[exact.target[row]].reshape(-1, rank) @ load[j].T).reshape(-1, 3, 3)
+        smooth = np.tensordot(load[exact.target[row]], load[j], ([2], [1]))
         block[row] = fade[row, None, None] * (exact.block[row] - smooth)
-    return LocalBlocks(exact.start, exact.target, block)
+    return replace(exact, block=block)
 
 
-def _symmetrized(blocks: LocalBlocks) -> np.ndarray:
+def _symmetrized(blocks: LocalBlocks) -> LocalBlocks:
     """(B + B^T) / 2 block by block: rounding is all it removes (Maxwell-Betti)."""
     order = np.lexsort((blocks.position, blocks.target))  # the transpose, in the same pattern
-    return 0.5 * (blocks.block + blocks.block[order].transpose(0, 2, 1))
+    mean = 0.5 * (blocks.block + blocks.block[order].transpose(0, 2, 1))
+    return replace(blocks, block=mean)

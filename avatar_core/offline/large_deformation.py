@@ -22,11 +22,10 @@ import scipy.sparse as sp
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.fem.hyperelasticity import Hyperelasticity
-from avatar_core.fem.norms import require_orthonormal
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
-from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
+from avatar_core.offline.rule import NO_ERROR, Progress, silent
 from avatar_core.reduction.asymptotic_series import path_series
-from avatar_core.reduction.near_field import plateau
+from avatar_core.reduction.regional import RegionalRule, separate_regions
 from avatar_core.vademecum.large_deformation import (
     POWERS,
     LargeDeformation,
@@ -37,14 +36,10 @@ from avatar_core.vademecum.model import Vademecum
 
 _BATCH = 16  # paths followed at once, 40 MB each at paper size
 _ORDER = 5
+_WORST_OVER_MEAN = 5.0  # of what the modes of a region may leave
 # x^4 and x^5 in x^2 and x^3 on [0, 1], and the largest error relative to x
 _ECONOMISED = np.array([[-0.43078, 1.39231], [-0.68586, 1.61050]])
 _LEFT = np.array([0.0385, 0.0754])
-
-
-# The linear response that large pushes start from. Finer than a vademecum that is only linear: at
-# 15 mm many sites bend by 5 % only, which 3 % of error in the linear part would hide.
-LINEAR_RULE = BuildRule(tolerance=0.012, max_modes=300)
 
 
 @dataclass(frozen=True)
@@ -55,15 +50,16 @@ class LargeRule:
     tolerance : of displacement (relative L2) and depth at the reach
     least_det : smallest det F at the reach, so that no element is inside out
     least_stiffness : smallest d(force)/d(depth), over that at rest
-    max_modes : space functions at most; ``mode_tolerance``, mean relative L2 of what they leave
+    max_modes : of a region at most; ``mode_tolerance``, mean relative L2 of what they leave of the
+        displacement at the reach
     """
 
     max_push: float = 20e-3
     tolerance: float = 0.05
     least_det: float = 0.0
     least_stiffness: float = 0.2
-    max_modes: int = 50
-    mode_tolerance: float = 0.01
+    max_modes: int = 40
+    mode_tolerance: float = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +82,6 @@ def with_large_deformation(
     problem: Hyperelasticity,
     material: LargeMaterial,
     rule: LargeRule | None = None,
-    build: BuildRule | None = None,
     progress: Progress = silent,
 ) -> Vademecum:
     """A linear vademecum with the load's magnitude as a coordinate.
@@ -97,21 +92,22 @@ def with_large_deformation(
 
     Where ``max_modes`` do not meet ``mode_tolerance``, a notice in the provenance says so.
     """
-    rule, build = rule or LargeRule(), build or BuildRule()
+    rule = rule or LargeRule()
     paths = _follow(problem, vademecum.surface, rule, progress)
-    mass = vademecum.mesh.lumped_mass
-    space, remainder = _principal(paths, mass, rule)
-    load = paths.fields @ (mass[:, None] * space)
-    near = _near(vademecum, paths, space, load, build)
-    single = np.float32
-    large = LargeDeformation(
-        material, space.astype(single), load.astype(single), near, paths.depth, paths.reach
+    terms, errors = separate_regions(
+        vademecum.regional.region,
+        lambda positions: paths.fields[:, positions].transpose(2, 1, 0),
+        paths.size[:, None] / paths.reach[:, None] ** np.array(POWERS),
+        vademecum.mesh.lumped_mass,
+        RegionalRule(rule.mode_tolerance, _WORST_OVER_MEAN * rule.mode_tolerance, rule.max_modes),
     )
+    large = LargeDeformation(material, terms, paths.depth, paths.reach)
     provenance = vademecum.provenance
-    if remainder > rule.mode_tolerance:
+    left = float(errors[-1].mean())
+    if left > rule.mode_tolerance:
         notice = (
-            f"the {space.shape[1]} modes of large deformation leave {remainder:.1%} of the "
-            f"displacement, more than the {rule.mode_tolerance:.1%} asked for"
+            f"the {terms.rank} modes of large deformation leave {left:.1%} of the displacement, "
+            f"more than the {rule.mode_tolerance:.1%} asked for"
         )
         provenance = replace(provenance, notices=(*provenance.notices, notice))
     return replace(vademecum, large=large, provenance=provenance)
@@ -191,59 +187,6 @@ def _linear_depth(beta: FloatArray, rule: LargeRule) -> float:
     holds = (slope < 1.0 / rule.least_stiffness) & (slope > rule.least_stiffness)
     holds &= depth <= rule.max_push
     return float(a[max(1, int(np.argmin(holds)) - 1)]) if not holds.all() else float(a[-1])
-
-
-def _principal(paths: _Paths, mass: FloatArray, rule: LargeRule) -> tuple[FloatArray, float]:
-    """Principal components of the terms at the reach, and what they leave of these.
-
-    By a randomised range finder (Halko, Martinsson & Tropp, SIAM Review 53, 2011).
-
-    Returns
-    -------
-    space : ndarray, shape (3 n_vertices, n), mass-orthonormal
-    remainder : mean relative L2 error
-    """
-    scale = paths.reach ** np.array(POWERS)[:, None] / paths.size
-    root = np.sqrt(mass).astype(np.float32)
-    columns = (scale.astype(np.float32)[..., None] * paths.fields).reshape(-1, len(mass)) * root
-    n = min(rule.max_modes + 20, *columns.shape)
-    mixed = columns.T @ np.random.default_rng(0).standard_normal((len(columns), n)).astype(
-        np.float32
-    )
-    for _ in range(2):
-        basis = np.linalg.qr(mixed)[0]
-        mixed = columns.T @ (columns @ basis)
-    basis = np.linalg.qr(mixed)[0]
-    inner = columns @ basis
-    value, vector = np.linalg.eigh(inner.T @ inner)
-    rotated = inner @ vector[:, ::-1]
-    whole = (columns**2).sum(axis=1)
-    left = np.sqrt(np.maximum(whole[:, None] - np.cumsum(rotated**2, axis=1), 0.0)).mean(axis=0)
-    enough = left <= rule.mode_tolerance
-    rank = int(np.argmax(enough)) + 1 if enough.any() else len(value)
-    rank = min(rank, rule.max_modes)
-    space = np.asarray((basis @ vector[:, ::-1][:, :rank]) / root[:, None], float)
-    require_orthonormal(space, mass[:, None] * space, "modes", tolerance=1e-5)  # single precision
-    return space, float(left[rank - 1])
-
-
-def _near(
-    vademecum: Vademecum, paths: _Paths, space: FloatArray, load: FloatArray, build: BuildRule
-) -> FloatArray:
-    """(V_k - X' load_k) at the near vertices of each position, faded out; (2, n_blocks, 3)."""
-    near, surface = vademecum.near, vademecum.surface
-    radius = surface.patch_radius
-    out = np.empty((len(POWERS), len(near.target), 3), np.float32)
-    functions = space.reshape(-1, 3, space.shape[1])
-    for j in range(surface.n_positions):
-        row = slice(near.start[j], near.start[j + 1])
-        at = near.target[row]
-        distance = np.linalg.norm(vademecum.mesh.vertices[at] - surface.centers[j], axis=1)
-        fade = plateau(distance, build.near_inner * radius, build.near_outer * radius)
-        for k in range(len(POWERS)):
-            far = functions[at] @ load[k, j]
-            out[k, row] = fade[:, None] * (paths.fields[k, j].reshape(-1, 3)[at] - far)
-    return out
 
 
 def hyperelastic_problem(vademecum: Vademecum, material: LargeMaterial) -> Hyperelasticity:

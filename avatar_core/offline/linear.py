@@ -1,15 +1,17 @@
 """The offline stage: from an organ's mesh to its vademecum.
 
-1. every patch is solved once; what lies near it, its energy and its norm are kept;
-2. PGD finds the modes, and an orthogonal mixing sorts them by displacement norm;
-3. the rank is the smallest that meets the tolerance on the build's own loads; where none does,
-   the near field grows, and the fields of a few outliers are stored in full;
-4. the near field becomes the exact remainder, tapered.
+1. every patch is solved once;
+2. PGD finds the modes that all loads share, and body functions join them; an orthogonal mixing
+   sorts them by displacement norm. The first are the global modes of the displacement; the contact
+   compliance uses all of them;
+3. what the global modes leave is separated region by region of the load surface, in as many modes
+   as the tolerance asks for;
+4. what the modes leave of the contact compliance is kept near each load, tapered.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -21,28 +23,36 @@ from avatar_core.geometry.mesh import Regions
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.exact_response import (
     ExactResponse,
-    FarFieldResidual,
+    contact_blocks,
     contact_near,
-    displacement_near,
     exact_response,
-    remainder,
 )
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
-from avatar_core.reduction.near_field import LocalBlocks, plateau, wendland
-from avatar_core.reduction.pgd import LoadProblem, PGDRule, PGDSolution, solve_pgd
+from avatar_core.reduction.pgd import EnrichmentReport, PGDRule, SolvedLoads, solve_pgd
+from avatar_core.reduction.regional import RegionalField, regions_of, separate_regions
 from avatar_core.reduction.separated import SeparatedField
-from avatar_core.vademecum.modal_mass import (
-    LEAST_MODES,
-    N_BODY,
-    BodyResponse,
-    body_functions,
-    body_response,
-)
+from avatar_core.vademecum.modal_mass import LEAST_MODES, N_BODY, body_functions, body_response
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 
-_MAX_OUTLIERS = 0.01  # part of the load positions whose fields may be stored in full
-_WORST_OVER_MEAN = 8 / 3  # the worst load may be this much worse than the mean asked for
-_ENOUGH = 1.25  # factor below the tolerance that the found modes must reach, as not all are kept
+_ENERGY_TOLERANCE = 3e-3  # at which PGD stops: beyond, single precision has no more to say
+_DEPENDENT = 1e-6  # part of a mode's energy below which it depends on the body's functions
+_FEW = 3000  # loads whose compliance is multiplied in double precision
+_BLOCK = 40  # pairs sought at once: products of a large matrix with few columns are slow
+_RANK_STEP = 5  # between the numbers of modes whose errors are reported
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """K-orthonormal modes of all loads, sorted by displacement norm.
+
+    space : ndarray, shape (3 n_nodes, rank), X
+    load : ndarray, shape (n_loads, rank), Y = F^T X
+    history : of the enrichments
+    """
+
+    space: np.ndarray
+    load: np.ndarray
+    history: tuple[EnrichmentReport, ...]
 
 
 def build_vademecum(
@@ -64,28 +74,20 @@ def build_vademecum(
     ``convergence.converged`` is False.
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
-    response = exact_response(elasticity, surface, loads, rule, progress, single=True)
-    residual = FarFieldResidual(elasticity, surface, response, rule)
-    rule, with_body = _with_room_for_body(rule)
-    solution, weights = find_modes(elasticity, loads, response, residual, rule, progress)
-    modes = SeparatedField(elasticity.at_vertices(solution.space), solution.load)
-    mixing = modes.mixing_by_norm(elasticity.mesh.lumped_mass, weights)
-    modes = SeparatedField(modes.space @ mixing, modes.load @ mixing)
-    errors = _rank_errors(modes, residual, rule)
-    rank, converged = _choose_rank(errors, rule)
-    if not converged and rule.near_growth > 1.0:
-        rule = rule.with_wider_near_field()
-        residual = FarFieldResidual(elasticity, surface, response, rule)
-        errors = _rank_errors(modes, residual, rule)
-        rank, converged = _choose_rank(errors, rule)
-    far, body = modes.truncate(rank), None
+    response = exact_response(elasticity, surface, loads, progress, single=True)
+    with_body = rule.max_modes >= LEAST_MODES
+    n_body = N_BODY if with_body else 0
+    modes = find_modes(elasticity, loads, response, rule.contact_modes - n_body, progress)
+    n_global = min(rule.n_global - n_body, modes.load.shape[1])
+    space, load = modes.space[:, :n_global], modes.load[:, :n_global]
+    trailing, body = modes.load[:, n_global:], None
     if with_body:
-        far, body = _with_body(elasticity, loads, solution.space @ mixing[:, :rank], far.load)
-    outliers = np.empty(0, np.int64)
-    if not converged:
-        outliers, final = _outliers(far, residual, rule)
-        errors = (*errors, final)
-        converged = is_met(final.mean, final.worst, rule)
+        space, load, trailing = _with_body(elasticity, loads, modes, n_global)
+        body = body_response(elasticity, space)
+    far = SeparatedField(elasticity.at_vertices(space), load)
+    regional, errors = regional_field(far, response, surface, elasticity, rule, progress)
+    last = errors[-1]
+    support = rule.contact_support * surface.patch_radius
     return Vademecum(
         name=name,
         mesh=elasticity.mesh,
@@ -93,65 +95,21 @@ def build_vademecum(
         material=elasticity.material,
         element=elasticity.element,
         surface=surface,
-        far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
-        near=displacement_near(far, response, surface, rule, outliers),
-        contact_near=contact_near(far, response, surface, rule),
+        far=SeparatedField(far.space.astype(np.float32), load.astype(np.float32)),
+        regional=regional,
+        trailing=trailing.astype(np.float32),
+        contact_near=contact_near(
+            contact_blocks(response, surface, support),
+            np.hstack([load, trailing]),
+            surface,
+            support,
+        ),
         tip_field=make_felt_field(elasticity.mesh, regions, surface.patch_radius, outline),
         body=body,
-        convergence=Convergence(converged, rule.tolerance, solution.history, errors),
+        convergence=Convergence(
+            rule.is_met(last.mean, last.worst), rule.tolerance, modes.history, errors
+        ),
         provenance=provenance,
-    )
-
-
-def _with_room_for_body(rule: BuildRule) -> tuple[BuildRule, bool]:
-    """The rule without the modes reserved for body functions, if it has enough modes."""
-    if rule.max_modes < LEAST_MODES:
-        return rule, False
-    return replace(rule, max_modes=rule.max_modes - N_BODY), True
-
-
-def _with_body(
-    elasticity: Elasticity, loads: sp.csr_matrix, space: np.ndarray, load: np.ndarray
-) -> tuple[SeparatedField, BodyResponse]:
-    """The far field with the body's functions beside its modes (3 n_nodes, rank)."""
-    own = body_functions(elasticity, space)
-    space, load = np.hstack([space, own]), np.hstack([load, loads.T @ own])
-    body = body_response(elasticity, space)
-    return SeparatedField(elasticity.at_vertices(space), load), body
-
-
-def with_rank(vademecum: Vademecum, rank: int, rule: BuildRule) -> Vademecum:
-    """The vademecum that a build with fewer modes would have given.
-
-    The near fields absorb the near part of the dropped modes, so that the response at the load
-    positions stays exact.
-    """
-    surface, far = vademecum.surface, vademecum.far
-    if rank >= far.rank:
-        return vademecum
-    dropped = SeparatedField(far.space[:, rank:], far.load[:, rank:])
-    radius = surface.patch_radius
-    inner, outer = rule.near_inner * radius, rule.near_outer * radius
-
-    def grown(
-        near: LocalBlocks, factor: np.ndarray, points: np.ndarray, contact: bool
-    ) -> LocalBlocks:
-        distance = np.linalg.norm(surface.centers[near.position] - points[near.target], axis=1)
-        fade = (
-            wendland(distance, rule.contact_support * radius)
-            if contact
-            else plateau(distance, inner, outer)
-        )
-        zero = replace(near, block=np.zeros_like(near.block))
-        tail = remainder(zero, -factor, dropped.load, fade)
-        return replace(near, block=near.block + tail.block)
-
-    return replace(
-        vademecum,
-        far=far.truncate(rank),
-        body=None,
-        near=grown(vademecum.near, dropped.space, vademecum.mesh.vertices, False),
-        contact_near=grown(vademecum.contact_near, dropped.load, surface.centers, True),
     )
 
 
@@ -159,78 +117,82 @@ def find_modes(
     elasticity: Elasticity,
     loads: sp.csr_matrix,
     response: ExactResponse,
-    residual: FarFieldResidual,
-    rule: BuildRule,
+    n_modes: int,
     progress: Progress,
-) -> tuple[PGDSolution, np.ndarray]:
-    """PGD in the energy norm, and the weights of the loads that it ended with.
+) -> Modes:
+    """PGD in the energy norm of loads that are solved.
 
-    Every column is divided by its own L2 norm, so that the relative error of a load at a stiff
-    place counts as much as that at a soft one; weights grow with the remaining error.
+    Every load is divided by its own L2 norm, so that the relative error of a load at a stiff place
+    counts as much as that at a soft one. PGD of many loads works in single precision; its modes
+    are then solved and made orthonormal in double.
     """
-    base = 1.0 / response.norm**2
-    weights = base.copy()
-
-    least = int(np.ceil(rule.oversampling * rule.max_modes))
-    limit = int(np.ceil(max(rule.oversampling, rule.most_oversampling) * rule.max_modes))
-    found, current = 0, NO_ERROR
-
-    def follow_error(space: np.ndarray, load: np.ndarray) -> np.ndarray | None:
-        nonlocal found, current
-        found += load.shape[1]
-        error = residual.subtract(elasticity.at_vertices(space), load)
-        current = float(error.mean())
-        if found >= least and is_met(_ENOUGH * error.mean(), _ENOUGH * error.max(), rule):
-            return None
-        weights[residual.loads] = base[residual.loads] * (error / error.mean()) ** 2
-        return weights.copy()
-
-    solution = solve_pgd(
-        LoadProblem(elasticity, loads.tocsr(), base, response.energy, response.single),
-        PGDRule(limit, tolerance=1e-6),
-        lambda rank: progress("modes", rank / limit, current),
-        follow_error,
+    weights = 1.0 / response.norm**2
+    compliance = response.compliance
+    if len(compliance) <= _FEW:
+        compliance = compliance.astype(float)
+    found = solve_pgd(
+        SolvedLoads(compliance, weights, response.energy),
+        PGDRule(n_modes, _ENERGY_TOLERANCE, _BLOCK),
+        lambda rank: progress("modes", rank / n_modes, NO_ERROR),
     )
-    return solution, weights
+    space = elasticity.solve(loads @ found.space)
+    energy = space.T @ (loads @ found.space)
+    root = np.linalg.inv(np.linalg.cholesky((energy + energy.T) / 2.0)).T
+    space = space @ root
+    load = np.asarray(loads.T @ space)
+    modes = SeparatedField(elasticity.at_vertices(space), load)
+    mixing = modes.mixing_by_norm(elasticity.mesh.lumped_mass, weights)
+    return Modes(space @ mixing, load @ mixing, found.history)
 
 
-def _rank_errors(
-    modes: SeparatedField, residual: FarFieldResidual, rule: BuildRule
-) -> tuple[RankError, ...]:
-    """Error on the kept loads against the number of modes, near field included."""
-    residual.reset()
-    errors = []
-    last = min(rule.max_modes, modes.rank)
-    ranks = sorted({*range(5, last, 5), last})
-    for before, rank in zip([0, *ranks[:-1]], ranks, strict=True):
-        error = residual.subtract(modes.space[:, before:rank], modes.load[:, before:rank])
-        errors.append(RankError(rank, float(error.mean()), float(error.max())))
-    return tuple(errors)
+def _with_body(
+    elasticity: Elasticity, loads: sp.csr_matrix, modes: Modes, n_global: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The first modes and after them the body's functions, which hold all of its sag.
 
-
-def _choose_rank(errors: tuple[RankError, ...], rule: BuildRule) -> tuple[int, bool]:
-    for error in errors:
-        if is_met(error.mean, error.worst, rule):
-            return error.rank, True
-    return errors[-1].rank, False
-
-
-def _outliers(
-    far: SeparatedField, residual: FarFieldResidual, rule: BuildRule
-) -> tuple[np.ndarray, RankError]:
-    """Sampled positions above the limit of the worst load, and the error once they are stored.
-
-    They lie beside the clamp, where displacements are small and unlike those of other loads.
+    Returns
+    -------
+    space (3 n_nodes, n), load (n_loads, n)
+    trailing : ndarray, load functions of the other modes, orthogonal in energy to these
     """
-    residual.reset()
-    error = residual.subtract(far.space, far.load)
-    limit = _WORST_OVER_MEAN * rule.tolerance
-    positions = np.unique(residual.loads[error > limit] // 3)
-    positions = positions[: int(_MAX_OUTLIERS * len(error) / 3)]
-    error[np.isin(residual.loads // 3, positions)] = 0.0
-    return positions, RankError(far.rank, float(error.mean()), float(error.max()))
+    first, others = modes.space[:, :n_global], modes.space[:, n_global:]
+    own = body_functions(elasticity, first)
+    own_load = np.asarray(loads.T @ own)
+    shared = elasticity.apply(own).T @ others
+    value, vector = np.linalg.eigh(np.eye(others.shape[1]) - shared.T @ shared)
+    new = value > _DEPENDENT
+    trailing = modes.load[:, n_global:] - own_load @ shared
+    trailing = (trailing @ (vector[:, new] / np.sqrt(value[new])))[:, ::-1]
+    load = np.hstack([modes.load[:, :n_global], own_load])
+    return np.hstack([first, own]), load, trailing
 
 
-def is_met(mean: float, worst: float, rule: BuildRule) -> bool:
-    """Whether errors over the build's own loads are as small as asked for."""
-    return mean <= rule.tolerance and worst <= _WORST_OVER_MEAN * rule.tolerance
+def regional_field(
+    far: SeparatedField,
+    response: ExactResponse,
+    surface: LoadSurface,
+    elasticity: Elasticity,
+    rule: BuildRule,
+    progress: Progress = silent,
+) -> tuple[RegionalField, tuple[RankError, ...]]:
+    """What the global modes leave, by regions, and the error for numbers of modes at a place."""
+    n = surface.n_positions
+    region = regions_of(surface.centers, rule.n_regions(surface.area, surface.patch_radius, n))
+    regional, errors = separate_regions(
+        region,
+        lambda positions: response.remainder(far, positions),
+        response.norm.reshape(n, 3),
+        elasticity.mesh.lumped_mass,
+        rule.regional,
+        lambda fraction: progress("regions", fraction, NO_ERROR),
+    )
+    return regional, rank_errors(far.rank, errors[: regional.rank + 1])
+
+
+def rank_errors(n_global: int, errors: np.ndarray) -> tuple[RankError, ...]:
+    """Mean and worst of errors (n_modes + 1, ...) by number of modes at a place."""
+    last = len(errors) - 1
+    return tuple(
+        RankError(n_global + k, float(errors[k].mean()), float(errors[k].max()))
+        for k in sorted({*range(0, last, _RANK_STEP), last})
+    )

@@ -3,8 +3,10 @@
 1. at every node of the coordinates all patches are solved, as for an ordinary vademecum, and PGD
    finds the modes there;
 2. the modes of all nodes are compressed into one space basis (proper orthogonal decomposition
-   over nodes and loads), with weights of the loads that grow with their error;
-3. the stiffness is projected term by term, and its error near the patch is kept at every node.
+   over nodes and loads), the functions of the body among its first;
+3. the stiffness is projected term by term; what the first functions leave of the displacement is
+   separated by regions, for all nodes together, and what the basis leaves of the contact compliance
+   is kept near the patch at every node.
 
 The space basis serves every value in the range by a small Galerkin system. A canonical separated
 form in all coordinates (:mod:`avatar_core.reduction.pgd_parametric`) needs several times as many
@@ -16,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -29,50 +32,60 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import certificate_of, measured
 from avatar_core.offline.exact_response import (
     ExactResponse,
-    FarFieldResidual,
+    contact_blocks,
     contact_near,
-    displacement_near,
     exact_response,
 )
-from avatar_core.offline.linear import find_modes, is_met
+from avatar_core.offline.linear import Modes, find_modes, rank_errors
 from avatar_core.offline.rule import BuildRule, Progress, silent
 from avatar_core.reduction.coordinates import Coordinate, node_values, problem_at
-from avatar_core.reduction.pgd import EnrichmentReport
+from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.reduction.regional import RegionalField, regions_of, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.certificate import Certificate
-from avatar_core.vademecum.modal_mass import LEAST_MODES, BodyResponse, body_response
+from avatar_core.vademecum.modal_mass import (
+    LEAST_MODES,
+    N_BODY,
+    BodyResponse,
+    body_response,
+    completed,
+)
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
-from avatar_core.vademecum.parametric import ParametricResponse, galerkin_field
-from avatar_core.vademecum.tip_field import TipField
+from avatar_core.vademecum.parametric import (
+    ParametricResponse,
+    galerkin_field,
+    regional_load_of_basis,
+)
 
-_BASIS_OVER_RANK = 4.0  # functions of the basis over the modes used at given values
 _DRAWN = 6  # random values that a certificate is made at
-_ROUNDS = 3  # of weighting loads by the error that the basis leaves
 
 
 @dataclass(frozen=True, eq=False)
 class _Snapshot:
     """The full solutions at one node, and the modes that PGD found there.
 
+    response : without its compliance, of which ``contact`` is what lies near
     space : (3 n_nodes, n) float32; load : (n_loads, n)
     """
 
     elasticity: Elasticity
     response: ExactResponse
-    residual: FarFieldResidual
-    space: np.ndarray
-    load: np.ndarray
-    history: tuple[EnrichmentReport, ...]
+    contact: LocalBlocks
+    modes: Modes
 
 
 @dataclass(frozen=True, eq=False)
-class _Reduced:
-    """A space basis, the projected terms of the stiffness, and the far field at every node."""
+class _Basis:
+    """A space basis and the terms of the stiffness in it.
 
-    basis: SeparatedField
+    n_global : functions of the global modes, those of the body last among them
+    body : of all functions, or None
+    """
+
+    field: SeparatedField
     operators: np.ndarray
-    fields: tuple[SeparatedField, ...]
+    n_global: int
     body: BodyResponse | None
 
 
@@ -99,30 +112,30 @@ def build_parametric_vademecum(
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     nodes = node_values(coordinates)
-    rule_per_node = replace(rule, max_sample_bytes=rule.max_sample_bytes // len(nodes))
     snapshots = [
-        _solved(
-            problem_at(elasticity, values), loads, surface, rule_per_node, _part(progress, k, nodes)
-        )
+        _solved(problem_at(elasticity, values), loads, surface, rule, _part(progress, k, nodes))
         for k, values in enumerate(nodes)
     ]
-    reduced, error = _reduce(snapshots, loads, rule)
-    if not is_met(error.mean, error.worst, rule) and rule.near_growth > 1.0:
-        rule = rule.with_wider_near_field()
-        snapshots = [_with_near_field(snapshot, surface, rule) for snapshot in snapshots]
-        error = _rank_error(_errors(snapshots, reduced), rule)
-    field = make_felt_field(elasticity.mesh, regions, surface.patch_radius, outline)
-    whole = _assemble(
-        name, elasticity, regions, surface, tuple(coordinates), rule, snapshots, reduced, field
-    )
-    history = tuple(report for snapshot in snapshots for report in snapshot.history)
-    converged = is_met(error.mean, error.worst, rule)
-    whole = replace(
-        whole,
+    basis = _project(snapshots, _principal(snapshots, rule), loads, rule)
+    whole, errors = _assemble(name, elasticity, surface, tuple(coordinates), rule, snapshots, basis)
+    last = errors[-1]
+    vademecum = Vademecum(
+        name=name,
+        mesh=elasticity.mesh,
+        regions=regions,
+        surface=surface,
+        element=elasticity.element,
+        tip_field=make_felt_field(elasticity.mesh, regions, surface.patch_radius, outline),
         provenance=provenance,
-        convergence=Convergence(converged, rule.tolerance, history, (error,)),
+        convergence=Convergence(
+            rule.is_met(last.mean, last.worst),
+            rule.tolerance,
+            tuple(report for snapshot in snapshots for report in snapshot.modes.history),
+            errors,
+        ),
+        **whole,
     )
-    return at_values(whole, _inside(coordinates, elasticity))
+    return at_values(vademecum, _inside(coordinates, elasticity))
 
 
 def _part(progress: Progress, k: int, nodes: Sequence[object]) -> Progress:
@@ -146,93 +159,67 @@ def _solved(
     def second(stage: str, fraction: float, error: float) -> None:
         progress("solve", half + half * fraction, error)
 
-    response = exact_response(elasticity, surface, loads, rule, first)
-    residual = FarFieldResidual(elasticity, surface, response, rule)
-    solution, _ = find_modes(elasticity, loads, response, residual, rule, second)
-    residual.reset()
-    space = solution.space.astype(np.float32)
+    response = exact_response(elasticity, surface, loads, first)
+    modes = find_modes(elasticity, loads, response, rule.contact_modes, second)
+    contact = contact_blocks(response, surface, rule.contact_support * surface.patch_radius)
     elasticity = elasticity.at(elasticity.material)  # drops the factorization, 0.5 GB
-    return _Snapshot(elasticity, response, residual, space, solution.load, solution.history)
+    return _Snapshot(
+        elasticity,
+        replace(response, compliance=np.empty((0, 0), np.float32)),
+        contact,
+        replace(modes, space=modes.space.astype(np.float32)),
+    )
 
 
-def _reduce(
-    snapshots: Sequence[_Snapshot], loads: sp.csr_matrix, rule: BuildRule
-) -> tuple[_Reduced, RankError]:
-    """The best basis for all nodes, after a few rounds of weighting loads by their error."""
-    weights = [1.0 / snapshot.response.norm**2 for snapshot in snapshots]
-    best: tuple[_Reduced, RankError] | None = None
-    for _ in range(_ROUNDS):
-        reduced = _project(snapshots, _principal(snapshots, weights, rule), loads, rule)
-        errors = _errors(snapshots, reduced)
-        error = _rank_error(errors, rule)
-        if best is None or error.worst < best[1].worst:
-            best = reduced, error
-        for snapshot, weight, left in zip(snapshots, weights, errors, strict=True):
-            weight[snapshot.residual.loads] *= (left / error.mean) ** 2
-    assert best is not None
-    return best
-
-
-def _errors(snapshots: Sequence[_Snapshot], reduced: _Reduced) -> list[np.ndarray]:
-    """Relative L2 error of the kept loads at every node, near field included."""
-    out = []
-    for snapshot, field in zip(snapshots, reduced.fields, strict=True):
-        out.append(snapshot.residual.subtract(field.space, field.load))
-        snapshot.residual.reset()
-    return out
-
-
-def _rank_error(errors: Sequence[np.ndarray], rule: BuildRule) -> RankError:
-    everything = np.concatenate(errors)
-    return RankError(rule.max_modes, float(everything.mean()), float(everything.max()))
-
-
-def _with_near_field(snapshot: _Snapshot, surface: LoadSurface, rule: BuildRule) -> _Snapshot:
-    """A snapshot whose errors are measured outside the near field of ``rule``."""
-    residual = FarFieldResidual(snapshot.elasticity, surface, snapshot.response, rule)
-    return replace(snapshot, residual=residual)
-
-
-def _principal(
-    snapshots: Sequence[_Snapshot], weights: Sequence[np.ndarray], rule: BuildRule
-) -> np.ndarray:
+def _principal(snapshots: Sequence[_Snapshot], rule: BuildRule) -> np.ndarray:
     """Principal space functions over all nodes and loads, shape (3 n_nodes, n).
 
     With X the modes of all nodes side by side, X^T M X = A^T A, and Y block-diagonal with
     Y^T W Y = B^T B, these are X B^T R for the leading R in A B^T = P S R^T.
     """
     mesh = snapshots[0].elasticity.mesh
-    space = np.hstack([snapshot.space for snapshot in snapshots])
+    space = np.hstack([snapshot.modes.space for snapshot in snapshots])
     mass = mesh.lumped_mass
     a = np.linalg.qr(np.sqrt(mass)[:, None] * space[: len(mass)].astype(float), mode="r")
     roots = [
-        np.linalg.qr(np.sqrt(weight)[:, None] * snapshot.load, mode="r")
-        for snapshot, weight in zip(snapshots, weights, strict=True)
+        np.linalg.qr(snapshot.modes.load / snapshot.response.norm[:, None], mode="r")
+        for snapshot in snapshots
     ]
     b = np.asarray(scipy.linalg.block_diag(*roots))
     _, _, right = np.linalg.svd(a @ b.T, full_matrices=False)
-    n = min(int(_BASIS_OVER_RANK * rule.max_modes), len(right))
+    n = min(rule.contact_modes, len(right))
     return space @ np.linalg.qr(b.T @ right[:n].T)[0].astype(np.float32)
 
 
 def _project(
     snapshots: Sequence[_Snapshot], space: np.ndarray, loads: sp.csr_matrix, rule: BuildRule
-) -> _Reduced:
-    """Galerkin projection of every term of the stiffness, and the far field at the nodes."""
+) -> _Basis:
+    """Galerkin projection of every term of the stiffness."""
     middle = snapshots[len(snapshots) // 2].elasticity
     space = space.astype(float)
     operators = _projected_terms(middle, space)
     stiffness = np.tensordot(middle.factors, operators, axes=1)
     inverse = np.linalg.inv(np.linalg.cholesky(stiffness)).T  # single precision can hold these
     space, operators = space @ inverse, inverse.T @ operators @ inverse
-    basis = SeparatedField(middle.at_vertices(space), loads.T @ space)
-    mass = middle.mesh.lumped_mass
-    body = body_response(middle, space) if rule.max_modes >= LEAST_MODES else None
-    fields = tuple(
-        galerkin_field(basis, operators, s.elasticity.factors, mass, rule.max_modes, body)[0]
-        for s in snapshots
-    )
-    return _Reduced(basis, operators, fields, body)
+    n_global, body = min(rule.n_global, space.shape[1]), None
+    if rule.max_modes >= LEAST_MODES:
+        body = body_response(middle, space)
+        order, n_global = _body_among_first(body, n_global)
+        space, operators, body = space @ order, order.T @ operators @ order, body.mixed(order)
+    field = SeparatedField(middle.at_vertices(space), loads.T @ space)
+    return _Basis(field, operators, n_global, body)
+
+
+def _body_among_first(body: BodyResponse, n_global: int) -> tuple[np.ndarray, int]:
+    """A rotation of a basis by which the functions of the body complete its first, (n, n).
+
+    Returns the number of the first too, as some functions of the body may depend on others.
+    """
+    identity = np.eye(len(body.mass))
+    first = completed(body, identity[:, : n_global - N_BODY])
+    rotation, triangle = np.linalg.qr(np.hstack([first, identity[:, n_global - N_BODY :]]))
+    signs = np.where(np.diagonal(triangle) < 0.0, -1.0, 1.0)
+    return rotation * signs[: rotation.shape[1]], first.shape[1]
 
 
 def _projected_terms(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
@@ -244,48 +231,82 @@ def _projected_terms(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
 def _assemble(
     name: str,
     elasticity: Elasticity,
-    regions: Regions,
     surface: LoadSurface,
     coordinates: tuple[Coordinate, ...],
     rule: BuildRule,
     snapshots: Sequence[_Snapshot],
-    reduced: _Reduced,
-    tip_field: TipField,
-) -> Vademecum:
-    """Near fields at all nodes; the vademecum's own fields are those of the first."""
-    none = np.empty(0, np.int64)
-    pairs = list(zip(snapshots, reduced.fields, strict=True))
-    near = [displacement_near(far, s.response, surface, rule, none) for s, far in pairs]
-    contact = [contact_near(far, s.response, surface, rule) for s, far in pairs]
-    basis = SeparatedField(
-        reduced.basis.space.astype(np.float32), reduced.basis.load.astype(np.float32)
+    basis: _Basis,
+) -> tuple[dict[str, Any], tuple[RankError, ...]]:
+    """The fields of a vademecum at the first node and the data of its coordinates; its errors."""
+    single = SeparatedField(
+        basis.field.space.astype(np.float32), basis.field.load.astype(np.float32)
     )
-    first = snapshots[0].elasticity
-    return Vademecum(
-        name=name,
-        mesh=elasticity.mesh,
-        regions=regions,
-        material=first.material,
-        element=elasticity.element,
-        surface=surface,
-        far=reduced.fields[0],
-        near=near[0],
-        contact_near=contact[0],
-        tip_field=tip_field,
-        convergence=Convergence(False, rule.tolerance),
-        provenance=Provenance(name, ""),
-        parametric=ParametricResponse(
-            coordinates=coordinates,
-            basis=basis,
-            operators=reduced.operators,
-            near=np.stack([blocks.block for blocks in near]),
+    parametric = ParametricResponse(
+        coordinates=coordinates,
+        basis=single,
+        operators=basis.operators,
+        projection=np.empty(0, np.float32),
+        regional_load=np.empty(0, np.float32),
+        contact_near=np.empty(0, np.float32),
+        n_global=basis.n_global,
+        rank=basis.field.rank,
+        young_modulus=elasticity.material.young_modulus,
+        body=basis.body,
+    )
+    fields = [galerkin_field(parametric, s.elasticity.factors) for s in snapshots]
+    regional, load, errors = _regional(snapshots, [far for far, _, _ in fields], surface, rule)
+    mass = elasticity.mesh.lumped_mass
+    projection = regional.coefficients(single.space, mass).astype(np.float32)
+    parametric = replace(parametric, projection=projection)
+    left = load.copy()
+    for k, (snapshot, (_, trailing, _)) in enumerate(zip(snapshots, fields, strict=True)):
+        factors = snapshot.elasticity.factors
+        left[k] -= regional_load_of_basis(parametric, factors, trailing, regional)
+    support = rule.contact_support * surface.patch_radius
+    contact = [
+        contact_near(s.contact, np.hstack([far.load, trailing]), surface, support)
+        for s, (far, trailing, _) in zip(snapshots, fields, strict=True)
+    ]
+    first, (far, trailing, body) = snapshots[0].elasticity, fields[0]
+    return {
+        "material": first.material,
+        "far": far,
+        "trailing": trailing,
+        "body": body,
+        "regional": replace(regional, load=load[0]),
+        "contact_near": contact[0],
+        "parametric": replace(
+            parametric,
+            regional_load=left,
             contact_near=np.stack([blocks.block for blocks in contact]),
-            rank=rule.max_modes,
-            young_modulus=elasticity.material.young_modulus,
-            body=reduced.body,
         ),
-        contrast=first.inclusion.contrast if first.inclusion else None,
+        "contrast": first.inclusion.contrast if first.inclusion else None,
+    }, errors
+
+
+def _regional(
+    snapshots: Sequence[_Snapshot],
+    fields: Sequence[SeparatedField],
+    surface: LoadSurface,
+    rule: BuildRule,
+) -> tuple[RegionalField, np.ndarray, tuple[RankError, ...]]:
+    """What the global modes leave at all nodes, and its loads (n_nodes, n_positions, 3, most)."""
+    n, n_nodes = surface.n_positions, len(snapshots)
+
+    def columns(positions: np.ndarray) -> np.ndarray:
+        pairs = zip(snapshots, fields, strict=True)
+        return np.concatenate([s.response.remainder(f, positions) for s, f in pairs], axis=2)
+
+    regional, errors = separate_regions(
+        regions_of(surface.centers, rule.n_regions(surface.area, surface.patch_radius, n)),
+        columns,
+        np.hstack([s.response.norm.reshape(n, 3) for s in snapshots]),
+        snapshots[0].elasticity.mesh.lumped_mass,
+        rule.regional,
     )
+    load = regional.load.reshape(n, n_nodes, 3, -1).transpose(1, 0, 2, 3)
+    found = rank_errors(fields[0].rank, errors[: regional.rank + 1])
+    return regional, np.ascontiguousarray(load), found
 
 
 def _inside(coordinates: Sequence[Coordinate], elasticity: Elasticity) -> dict[str, float]:

@@ -182,7 +182,7 @@ def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress)
     assert options.large is not None
     problem = hyperelastic_problem(vademecum, options.large)
     vademecum = with_large_deformation(
-        vademecum, problem, options.large, options.large_rule, options.rule, progress
+        vademecum, problem, options.large, options.large_rule, progress
     )
     if options.n_pushed == 0:
         return vademecum

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+
+from avatar_core.reduction.regional import RegionalRule
 
 Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
 NO_ERROR = float("nan")
+
+_GLOBAL_PART = 0.4  # of the modes that a place may have
+_REGION_POSITIONS = 30  # load positions of a region at least, in the mean
 
 
 def silent(stage: str, fraction: float, error: float) -> None:
@@ -18,32 +23,40 @@ class BuildRule:
     """Tolerance and sizes of a build.
 
     tolerance : mean relative L2 error over the build's own loads; the worst load may have
-        8/3 times it
-    max_modes : far-field modes at most
-    oversampling : PGD finds this many times ``max_modes``, of which the best are kept; if these
-        miss the tolerance, up to ``most_oversampling`` times
-    near_inner, near_outer : the displacement near field is exact within, absent beyond, in
-        patch radii
-    near_growth : both grow by this factor where ``max_modes`` do not meet the tolerance
+        ``worst_over_mean`` times it
+    max_modes : modes that show the displacement at a place at most: global ones, and those of the
+        place's region
+    global_modes : that all regions share, at most; and at most four in ten of ``max_modes``
+    contact_modes : of the contact compliance at most, the global ones among them
+    region_area : of the load surface for each region, in squared patch radii; a region has 30
+        load positions at least, in the mean
     contact_support : reach of the contact near field, in patch radii
-    max_sample_bytes : memory for the columns kept in full, all if they fit, to measure errors on
     """
 
-    tolerance: float = 0.045
+    tolerance: float = 0.006
+    worst_over_mean: float = 4.0
     max_modes: int = 100
-    oversampling: float = 1.2
-    most_oversampling: float = 2.2
-    near_inner: float = 1.8
-    near_outer: float = 3.3
-    near_growth: float = 1.4
-    contact_support: float = 4.0
-    max_sample_bytes: int = 400_000_000
+    global_modes: int = 16
+    contact_modes: int = 240
+    region_area: float = 4.5
+    contact_support: float = 5.0
 
-    def with_wider_near_field(self) -> BuildRule:
-        """The rule with its near field grown, once."""
-        return replace(
-            self,
-            near_inner=self.near_growth * self.near_inner,
-            near_outer=self.near_growth * self.near_outer,
-            near_growth=1.0,
-        )
+    @property
+    def n_global(self) -> int:
+        """Global modes."""
+        return max(1, min(self.global_modes, round(_GLOBAL_PART * self.max_modes)))
+
+    @property
+    def regional(self) -> RegionalRule:
+        """How many modes a region gets beside the global ones."""
+        most = self.max_modes - self.n_global
+        return RegionalRule(self.tolerance, self.worst_over_mean * self.tolerance, most)
+
+    def n_regions(self, area: float, radius: float, n_positions: int) -> int:
+        """Regions of a load surface of some area [m^2] and patch radius [m]."""
+        wanted = round(area / (self.region_area * radius**2))
+        return max(1, min(wanted, n_positions // _REGION_POSITIONS))
+
+    def is_met(self, mean: float, worst: float) -> bool:
+        """Whether errors over the build's own loads are as small as asked for."""
+        return mean <= self.tolerance and worst <= self.worst_over_mean * self.tolerance

@@ -31,7 +31,7 @@ from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm, require_orthonormal
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.reduction.compact_response import CompactResponse, positive_part
-from avatar_core.reduction.near_field import LocalBlocks, near_pairs, wendland
+from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 
 _DEPENDENT = 1e-10  # part of the largest energy below which a direction is rounding
 WORST_OVER_MEAN = 1.75  # estimated, of the mean asked for; the true worst was up to 2.4 times that
@@ -313,7 +313,7 @@ def residual_compliance(
     full = np.einsum("iab,kbc->iakc", root, root[probes.positions], optimize=True)
 
     def misfit_nearby(support: float) -> float:
-        model = wendland(distance, support * radius)[:, None, :, None] * full
+        model = taper(distance / (support * radius))[:, None, :, None] * full
         off = ((model - exact) ** 2).sum(axis=(1, 3))
         return float(off[distance < 2.0 * radius].sum())
 
@@ -327,7 +327,7 @@ def residual_compliance_blocks(
 
         dC(s, s') = phi(|s - s'| / support) M(s)^(1/2) M(s')^(1/2)
 
-    with Wendland's phi: the entry-wise product of a positive definite kernel and a Gram matrix
+    with the taper phi: the entry-wise product of a positive definite kernel and a Gram matrix
     (Schur). Blocks beyond the support, up to ``reach``, are kept as zeros.
 
     Parameters
@@ -338,7 +338,7 @@ def residual_compliance_blocks(
     pairs = near_pairs(surface.centers, surface.centers, reach)
     root = _root(compliance)
     position = np.repeat(np.arange(len(compliance)), np.diff(pairs.start))
-    fade = wendland(pairs.distance, support)[:, None, None]
+    fade = taper(pairs.distance / support)[:, None, None]
     block = fade * (root[pairs.target] @ root[position])
     return LocalBlocks(pairs.start, pairs.target, block.astype(np.float32))
 

@@ -1,9 +1,8 @@
-"""The exact part of the response close to a load, and the tapers that let it fade out.
+"""The exact part of the contact compliance close to a load, and the taper that lets it fade out.
 
-A truncated separated field is smooth and too stiff under the tool. Its error near the patch is
-stored exactly: 3 x 3 blocks for the pairs of (load position, target) closer than a radius,
-faded out so that no jump remains. Targets are mesh vertices (displacement field) or load
-positions (contact compliance).
+The Gram matrix of a truncated basis is too stiff under the tool. Its error near the patch is stored
+exactly: 3 x 3 blocks for the pairs of load positions closer than a radius, faded out so that no
+jump remains.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ class LocalBlocks:
     """Sparse 3 x 3 blocks by load position (compressed rows).
 
     start : ndarray of int64, shape (n_positions + 1,)
-    target : ndarray of int32, shape (n_blocks,), ascending within a row
+    target : ndarray of int32, shape (n_blocks,), load positions, ascending within a row
     block : ndarray, shape (n_blocks, 3, 3), displacement component by load direction [m/N]
     """
 
@@ -39,27 +38,10 @@ class LocalBlocks:
         """Row of every block, shape (n_blocks,)."""
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
 
-    def kept(self, mask: np.ndarray) -> LocalBlocks:
-        """The blocks for which a mask holds, shape (n_blocks,)."""
-        count = np.bincount(self.position[mask], minlength=len(self.start) - 1)
-        start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-        return LocalBlocks(
-            start, np.ascontiguousarray(self.target[mask]), np.ascontiguousarray(self.block[mask])
-        )
-
-    def with_whole_rows(self, rows: dict[int, np.ndarray]) -> LocalBlocks:
-        """The same with some rows replaced by blocks for all targets, each (n_targets, 3, 3)."""
-        if not rows:
-            return self
-        targets, blocks = [], []
-        for j in range(len(self.start) - 1):
-            row = slice(self.start[j], self.start[j + 1])
-            whole = rows.get(j)
-            targets.append(self.target[row] if whole is None else np.arange(len(whole)))
-            blocks.append(self.block[row] if whole is None else whole)
-        start = np.concatenate([[0], np.cumsum([len(t) for t in targets])]).astype(np.int64)
-        target = np.concatenate(targets).astype(np.int32)
-        return LocalBlocks(start, target, np.concatenate(blocks).astype(self.block.dtype))
+    @property
+    def is_upper(self) -> np.ndarray:
+        """Whether a block's target is its position or after it, shape (n_blocks,)."""
+        return np.asarray(self.target >= self.position)
 
     def combined(self, positions: np.ndarray, weights: np.ndarray, n_targets: int) -> np.ndarray:
         """Weighted sum of some rows, dense, shape (3 n_targets, 3)."""
@@ -68,6 +50,44 @@ class LocalBlocks:
             row = slice(self.start[j], self.start[j + 1])
             out[self.target[row]] += weight * self.block[row]
         return out.reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """From the upper half of symmetric blocks to all of them.
+
+    start, target : of all blocks
+    source : ndarray, shape (n_blocks,), the block of the upper half that each is, or the transpose
+        of; turned : ndarray of bool, shape (n_blocks,), whether it is the transpose
+    """
+
+    start: np.ndarray
+    target: np.ndarray
+    source: np.ndarray
+    turned: np.ndarray
+
+    @classmethod
+    def of(cls, start: np.ndarray, target: np.ndarray) -> Mirror:
+        """Of the compressed rows of the upper half."""
+        n_rows = len(start) - 1
+        position = np.repeat(np.arange(n_rows), np.diff(start))
+        below = np.flatnonzero(target > position)
+        row = np.concatenate([position, target[below]])
+        column = np.concatenate([target, position[below]])
+        order = np.lexsort((column, row))
+        count = np.bincount(row, minlength=n_rows)
+        return cls(
+            np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
+            column[order].astype(np.int32),
+            np.concatenate([np.arange(len(target)), below])[order],
+            order >= len(target),
+        )
+
+    def whole(self, block: np.ndarray) -> np.ndarray:
+        """All blocks, of those of the upper half (..., n_upper, 3, 3)."""
+        out = block[..., self.source, :, :]
+        out[..., self.turned, :, :] = out[..., self.turned, :, :].swapaxes(-1, -2)
+        return np.ascontiguousarray(out)
 
 
 @dataclass(frozen=True)
@@ -89,21 +109,19 @@ def near_pairs(positions: np.ndarray, targets: np.ndarray, radius: float) -> Pai
     return Pairs(start, target, distance)
 
 
-def plateau(distance: np.ndarray, inner: float, outer: float) -> np.ndarray:
-    """One up to ``inner``, zero from ``outer``, once continuously differentiable between."""
-    t = np.clip((distance - inner) / (outer - inner), 0.0, 1.0)
-    return 1.0 - t * t * (3.0 - 2.0 * t)
-
-
-def wendland(distance: np.ndarray, support: float) -> np.ndarray:
-    """Wendland's function (1 - r)^4 (4 r + 1), positive definite in space (Wendland 1995).
+def taper(distance: np.ndarray) -> np.ndarray:
+    """One at distance 0, zero from 1, and positive definite in space.
 
     The entry-wise product of two positive semi-definite matrices is positive semi-definite
     (Schur), so tapering a residual compliance with it keeps every contact problem well posed;
-    in geostatistics this is covariance tapering (Furrer, Genton & Nychka 2006).
+    in geostatistics this is covariance tapering (Furrer, Genton & Nychka 2006). Of all such
+    functions this one falls off least at first (Gneiting, J. Multivariate Analysis 83, 2002):
+
+        (1 - r) sin(2 pi r) / (2 pi r) + (1 - cos(2 pi r)) / (2 pi^2 r)
     """
-    r = np.minimum(distance / support, 1.0)
-    return (1.0 - r) ** 4 * (4.0 * r + 1.0)
+    r = np.minimum(distance, 1.0)
+    # sinc x = sin(pi x) / (pi x); 1 - cos(2 pi r) = 2 sin^2(pi r)
+    return np.asarray((1.0 - r) * np.sinc(2.0 * r) + r * np.sinc(r) ** 2)
 
 
 _HASH = 2654435761  # Knuth's multiplicative hashing, The Art of Computer Programming 3, Sec. 6.4

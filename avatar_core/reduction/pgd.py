@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -77,7 +78,7 @@ class PGDRule:
 class PGDSolution:
     """K-orthonormal space functions, their load functions, and the history that led there.
 
-    space : ndarray, shape (3 n_nodes, rank)
+    space : ndarray, shape (3 n_nodes, rank), or as the problem writes it
     load : ndarray, shape (n_loads, rank)
     """
 
@@ -94,9 +95,9 @@ class PGDSolution:
 class _Expansion:
     """The growing K-orthonormal expansion and the energy that it leaves to each load."""
 
-    def __init__(self, problem: LoadProblem, capacity: int) -> None:
+    def __init__(self, problem: PGDProblem, capacity: int) -> None:
         self.problem = problem
-        n_dofs, n_loads = problem.loads.shape
+        n_dofs, n_loads = problem.shape
         self._space = np.zeros((n_dofs, capacity), order="F")
         self._load = np.zeros((n_loads, capacity), order="F")
         self.rank = 0
@@ -123,30 +124,60 @@ class _Expansion:
         Raises ConvergenceError if the modes do not come out orthonormal.
         """
         for _ in range(2):  # once more for rounding
-            dual = self.problem.elasticity.apply(space)
+            dual = self.problem.apply(space)
             space = space - self.space @ (self.space.T @ dual)
-        dual = self.problem.elasticity.apply(space)
+        dual = self.problem.apply(space)
         value, vector = np.linalg.eigh(space.T @ dual)
         new = value > 1e-18 * value.max()
         scale = vector[:, new] / np.sqrt(value[new])
         space, dual = space @ scale, dual @ scale
-        load = self.problem.loads.T @ space
+        load = self.problem.observe(space)
         columns = slice(self.rank, self.rank + space.shape[1])
         self._space[:, columns], self._load[:, columns] = space, load
-        require_orthonormal(self._space[:, : columns.stop], dual, "PGD modes")
+        modes = self._space[:, : columns.stop]
+        require_orthonormal(modes, dual, "PGD modes", self.problem.rounding)
         self.energy -= (load**2).sum(axis=1)
         self.rank += space.shape[1]
         return int(space.shape[1])
 
 
+class PGDProblem(Protocol):
+    """K u(s) = f(s) for all loads s, as alternating directions need it.
+
+    shape : numbers of entries of a space function, and of loads
+    weights : ndarray, shape (n_loads,), positive, of each load in the norm over s
+    energy : ndarray, shape (n_loads,), f(s) . K^-1 f(s) [J], the patch compliance
+    rounding : by which orthonormal functions may be off
+    """
+
+    @property
+    def weights(self) -> np.ndarray: ...
+
+    @property
+    def energy(self) -> np.ndarray: ...
+
+    @property
+    def shape(self) -> tuple[int, int]: ...
+
+    @property
+    def rounding(self) -> float: ...
+
+    def solve(self, amounts: np.ndarray) -> np.ndarray:
+        """Space functions K^-1 sum_s f(s) a(s) of amounts a, shape (n_loads, n)."""
+
+    def observe(self, space: np.ndarray) -> np.ndarray:
+        """X . f(s) of space functions, shape (n_loads, n)."""
+
+    def apply(self, space: np.ndarray) -> np.ndarray:
+        """Dual functions, whose product with others is that in energy."""
+
+
 @dataclass(frozen=True)
 class LoadProblem:
-    """K u(s) = f(s) for all loads s, with the weight of each load in the norm over s.
+    """A problem whose loads are solved on the way; see :class:`PGDProblem`.
 
     elasticity : Elasticity, solves with and applies K
     loads : sparse, shape (3 n_nodes, n_loads)
-    weights : ndarray, shape (n_loads,), positive
-    energy : ndarray, shape (n_loads,), f(s) . K^-1 f(s) [J], the patch compliance
     single : solve in single precision; modes are K-orthonormal, and Y = F^T X, in double all the
         same
     """
@@ -157,9 +188,59 @@ class LoadProblem:
     energy: np.ndarray
     single: bool = False
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.loads.shape
+
+    @property
+    def rounding(self) -> float:
+        return 1e-6
+
+    def solve(self, amounts: np.ndarray) -> np.ndarray:
+        return self.elasticity.solve(self.loads @ amounts, self.single).astype(float)
+
+    def observe(self, space: np.ndarray) -> np.ndarray:
+        return np.asarray(self.loads.T @ space)
+
+    def apply(self, space: np.ndarray) -> np.ndarray:
+        return self.elasticity.apply(space)
+
+
+@dataclass(frozen=True)
+class SolvedLoads:
+    """A problem whose loads have all been solved: a sweep costs a product, not a solution.
+
+    A space function is written as the amounts c of the loads' solutions that it consists of,
+    X = K^-1 F c. Its products with the loads are C c, with C = F^T K^-1 F; in energy,
+    X . K X' = c . C c'.
+
+    compliance : ndarray, shape (n_loads, n_loads), C, symmetric; in single precision, modes are
+        orthonormal to 1e-2 only, and those of little energy are not found
+    """
+
+    compliance: np.ndarray
+    weights: np.ndarray
+    energy: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.compliance.shape[0], self.compliance.shape[1]
+
+    @property
+    def rounding(self) -> float:
+        return 1e-6 if self.compliance.dtype == np.float64 else 1e-2
+
+    def solve(self, amounts: np.ndarray) -> np.ndarray:
+        return amounts
+
+    def observe(self, space: np.ndarray) -> np.ndarray:
+        return np.asarray(self.compliance @ space.astype(self.compliance.dtype), float)
+
+    apply = observe
+
 
 def solve_pgd(
-    problem: LoadProblem,
+    problem: PGDProblem,
     rule: PGDRule,
     progress: Callable[[int], None] = lambda rank: None,
     reweigh: Callable[[np.ndarray, np.ndarray], np.ndarray | None] | None = None,
@@ -168,7 +249,7 @@ def solve_pgd(
 
     Parameters
     ----------
-    problem : LoadProblem
+    problem : LoadProblem or SolvedLoads
     rule : PGDRule
     progress : called with the rank after every enrichment
     reweigh : called with the new space and load functions; returns the weights of the loads for
@@ -194,7 +275,7 @@ def solve_pgd(
             weights = reweigh(expansion.space[:, new], expansion.load[:, new])
             if weights is None:
                 break
-            expansion.problem = replace(expansion.problem, weights=weights)
+            expansion.problem = replace(expansion.problem, weights=weights)  # type: ignore[type-var]
         if report.status is EnrichmentStatus.EXHAUSTED:
             break
     return PGDSolution(expansion.space.copy(), expansion.load.copy(), tuple(history))
@@ -248,9 +329,9 @@ def _sweep(expansion: _Expansion, load: np.ndarray) -> tuple[np.ndarray, np.ndar
     problem = expansion.problem
     weighted = problem.weights[:, None] * load
     weighted /= np.linalg.norm(weighted, axis=0) + 1e-300
-    space = problem.elasticity.solve(problem.loads @ weighted, problem.single).astype(float)
-    space -= expansion.space @ (expansion.load.T @ weighted)
-    work = problem.loads.T @ space
+    space = problem.solve(weighted)
+    space = space - expansion.space @ (expansion.load.T @ weighted)
+    work = problem.observe(space)
     value, vector = np.linalg.eigh((work.T @ weighted + weighted.T @ work) / 2.0)
     new = value > 1e-14 * value.max()
     scale = vector[:, new] / np.sqrt(value[new])

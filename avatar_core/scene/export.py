@@ -33,7 +33,7 @@ def export(
     path : .vtu or .xdmf
     point : array_like, shape (3,) [m]; None for the middle of the accessible surface
     force : float, along the inward normal, or array_like, shape (3,) [N]
-    n_modes : of the far field, at most
+    n_modes : global ones, at most
 
     Returns
     -------

@@ -82,7 +82,7 @@ class Scene:
     tools: tuple[Tool, ...] = (Tool(),)
     cloud: Cloud = "surface"
     cloud_divisor: int = quantity("-", 1, 1000, "the cloud is sent every so many steps", 1)
-    modes: int | None = quantity("-", 1, 100_000, "of the far field, for the cloud", None)
+    modes: int | None = quantity("-", 1, 100_000, "of the cloud at a place", None)
     effects: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:

@@ -38,8 +38,8 @@ class ModelSpec:
 
     @property
     def finest(self) -> Detail:
-        """All modes, with the whole near field."""
-        return Detail(self.modes or self.vademecum.far.rank, self.cloud)
+        """All modes, or as many as were asked for."""
+        return Detail(self.modes or self.vademecum.n_modes, self.cloud)
 
     @property
     def effect_names(self) -> tuple[str, ...]:

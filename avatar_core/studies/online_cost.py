@@ -2,8 +2,8 @@
 
 Errors are the 95 % quantile over fresh loads; times are whole steps on this machine.
 
-    vademecum      far field by PGD, exact near field, as a step shows it
-    SVD optimum    the best basis for 150 solved loads, judged on others; no near field
+    vademecum      global modes and those of the place's region, as a step shows it
+    SVD optimum    the best basis for 150 solved loads, judged on others; one for all places
     dense table    exact columns at the load positions, interpolated between them
     direct solve   back-substitution with the stored factor; its error is zero by definition
 """
@@ -112,7 +112,6 @@ def _row(method: str, point: CurvePoint, front: bool = False) -> dict[str, Value
         "cloud": detail.cloud,
         "modes": detail.modes,
         "precision": detail.precision,
-        "near": detail.near,
         "error": point.l2,
         "force_error": point.force,
         "p50_us": 1e6 * point.p50,
@@ -191,7 +190,7 @@ def _table_errors(
 def _optimum_rows(
     curve: AccuracyCurve, snapshots: np.ndarray, truth: np.ndarray, mass: np.ndarray
 ) -> list[dict[str, Value]]:
-    """The best n modes for the snapshots, on other loads; as fast as ours without near field."""
+    """The best n modes for the snapshots, on other loads; as fast as ours of one region."""
 
     def scaled_of(field: np.ndarray) -> np.ndarray:
         return np.asarray(np.sqrt(mass)[:, None] * field / l2_norm(field, mass))
@@ -199,7 +198,7 @@ def _optimum_rows(
     basis = np.linalg.svd(scaled_of(snapshots), full_matrices=False)[0]
     scaled = scaled_of(truth)
     rows = []
-    for point in curve.like(Detail(1, "volume", "int16", 0.0)).points:
+    for point in curve.like(Detail(1, "volume", "int16")).points:
         best = basis[:, : point.detail.modes]
         left = np.linalg.norm(scaled - best @ (best.T @ scaled), axis=0)
         fast = CurvePoint(

@@ -7,7 +7,8 @@ f . u of the load. The methods:
 
     paper     greedy enrichment, one pair at a time, in the energy norm; the vector (Hadamard) form
     SVD       the best that any n modes can do, relative errors counted
-    default   blocks of pairs in a norm that follows the error, rotated, exact near the patch
+    default   two levels: modes of all loads, by blocks of pairs in the norm of relative errors, and
+              those of four regions for what is left; modes are counted at a place
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 
-from avatar_core.common.arrays import FloatArray
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.rule import BuildRule
-from avatar_core.reduction.near_field import plateau
 from avatar_core.reduction.pgd import LoadProblem, PGDRule, solve_pgd
 from avatar_core.reduction.pgd_hadamard import solve_hadamard
+from avatar_core.reduction.regional import RegionalRule, regions_of, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.studies.shapes import read_liver
 from avatar_core.studies.study import Study, Value, follow
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 PAPER: dict[str, Value] = {"error_11_modes": "< 0.1"}
 ENOUGH = 0.10
+_REGIONS = 4  # of so few loads
 
 
 @dataclass(frozen=True)
@@ -59,14 +61,14 @@ class Case:
     """The loads, their exact answers and what counts.
 
     exact : ndarray, shape (3 n_vertices, n_loads) [m/N]; work : (n_loads,), f . u
-    near : ndarray, shape (3 n_vertices, n_loads), part of the answer that the near field stores
+    region : ndarray, shape (n_loads,), of each load
     """
 
     elasticity: Elasticity
     loads: sp.csr_matrix
     exact: FloatArray
     work: FloatArray
-    near: FloatArray
+    region: IntArray
 
     @property
     def mass(self) -> FloatArray:
@@ -133,15 +135,12 @@ def make_case(elasticity: Elasticity, positions: LoadSurface, nodes: FloatArray,
         spread_ = sp.kron(at, sp.identity(3), format="csr")
     loads = (spread_ @ sp.kron(sp.identity(len(nodes)), direction[:, None])).tocsr()
     solution = elasticity.solve(loads)
-    rule, radius = BuildRule(), positions.patch_radius
-    distance = np.linalg.norm(elasticity.mesh.vertices[:, None] - centers[None], axis=2)
-    near = plateau(distance, rule.near_inner * radius, rule.near_outer * radius)
     return Case(
         elasticity,
         loads,
         elasticity.at_vertices(solution),
         np.asarray(loads.multiply(solution).sum(axis=0)).ravel(),
-        np.repeat(near, 3, axis=0),
+        regions_of(centers, _REGIONS),
     )
 
 
@@ -166,22 +165,17 @@ def _rows(case: Case, kind: str, settings: PGDSettings) -> list[dict[str, Value]
         )
 
     greedy = _pgd(case, PGDRule(max(ranks), 1e-12, block=1), relative=False)
-    default, sorted_field = _default(case, max(ranks))
+    shared = _shared(case, max(ranks))
     root = np.sqrt(case.mass)[:, None]
     scaled = root * case.exact / case.size
     left_vectors = np.linalg.svd(scaled, full_matrices=False)[0]
     for rank in follow(ranks, f"{kind} loads"):
-        for method, load in (("PGD, paper's norm", greedy), ("default", default)):
-            some = SeparatedField(load.space[:, :rank], load.load[:, :rank])
-            if some.rank < rank:
-                continue
+        some = greedy.truncate(rank)
+        if some.rank == rank:
             contact = np.abs(1.0 - (some.load**2).sum(axis=1) / case.work)
-            if method == "default":
-                some = sorted_field.truncate(rank)
-                left = (1.0 - case.near) * (case.exact - some.evaluate())
-                add(method, rank, left, np.zeros(n))  # exact at the loads of the build
-            else:
-                add(method, rank, case.exact - _at(case, some), contact)
+            add("PGD, paper's norm", rank, case.exact - _at(case, some), contact)
+        left = _two_levels_leave(case, shared, rank)
+        add("default", rank, left, np.zeros(n))  # contact is exact at the loads of the build
         basis = left_vectors[:, :rank]
         best = basis @ (basis.T @ (scaled * case.size)) / root
         add("SVD optimum", rank, case.exact - best, np.full(n, np.nan))
@@ -211,22 +205,26 @@ def _pgd(case: Case, rule: PGDRule, relative: bool) -> SeparatedField:
     return SeparatedField(found.space, found.load)
 
 
-def _default(case: Case, n_modes: int) -> tuple[SeparatedField, SeparatedField]:
-    """The build's own way: weights follow the error left outside the near field; a rotation."""
-    base = 1.0 / case.size**2
-    weights, left = base.copy(), case.exact.copy()
-
-    def follow_error(space: FloatArray, load: FloatArray) -> FloatArray:
-        nonlocal left
-        left = left - case.elasticity.at_vertices(space) @ load.T
-        error = l2_norm((1.0 - case.near) * left, case.mass) / case.size
-        weights[:] = base * (error / error.mean()) ** 2
-        return weights.copy()
-
-    problem = LoadProblem(case.elasticity, case.loads, base, case.work)
-    found = solve_pgd(problem, PGDRule(n_modes, 1e-12), reweigh=follow_error)
+def _shared(case: Case, n_modes: int) -> SeparatedField:
+    """The modes of all loads as a build finds them, at the vertices, by displacement norm."""
+    found = _pgd(case, PGDRule(n_modes, 1e-12), relative=True)
     modes = SeparatedField(case.elasticity.at_vertices(found.space), found.load)
-    return SeparatedField(found.space, found.load), modes.sorted_by_norm(case.mass, weights)
+    return modes.sorted_by_norm(case.mass, 1.0 / case.size**2)
+
+
+def _two_levels_leave(case: Case, shared: SeparatedField, rank: int) -> FloatArray:
+    """What so many modes at a place leave of the displacement, in a build's parts."""
+    rule = BuildRule(tolerance=1e-12, max_modes=rank)
+    left = case.exact - shared.truncate(rule.n_global).evaluate()
+    most = RegionalRule(0.0, 0.0, rank - rule.n_global)
+    regional, _ = separate_regions(
+        case.region, lambda at: left[:, at, None], case.size[:, None], case.mass, most
+    )
+    for r in range(regional.n_regions):
+        at = case.region == r
+        modes = regional.modes(r)
+        left[:, at] -= modes @ regional.load[at, 0, : modes.shape[1]].T
+    return left
 
 
 def _summary(rows: list[dict[str, Value]]) -> dict[str, float]:

@@ -27,20 +27,17 @@ _CONFIDENCE = 0.95  # that it does, over draws of the loads that were measured
 class Detail:
     """How finely a step shows the displacement.
 
-    modes : of the far field
+    modes : at a place, global ones first, then those of its region
     cloud : vertices that are shown
     precision : in which the modes are stored
-    near : radius of the near field over the vademecum's own
     """
 
     modes: int
     cloud: Cloud = "surface"
     precision: Precision = "int16"
-    near: float = 1.0
 
     def __str__(self) -> str:
-        near = "" if self.near == 1.0 else f", near field to {self.near:g} of its radius"
-        return f"{self.modes} modes in {self.precision}, cloud {self.cloud}{near}"
+        return f"{self.modes} modes in {self.precision}, cloud {self.cloud}"
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class CurvePoint:
     l2, force : relative error that 95 % of unseen loads stay below, of the displacement of the
         cloud and of the normal force; l2 is NaN where nothing is shown
     p50, p99 : time that a step takes of the processor [s]; NaN before it was timed
-    nbytes : of what the step reads to show the displacement
+    nbytes : of all that is held to show the displacement; a step reads a part
     """
 
     detail: Detail

@@ -11,7 +11,7 @@ from avatar_core.fem.elasticity import Material, factors_at
 from avatar_core.reduction.coordinates import node_weights, require_known
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.model import Vademecum
-from avatar_core.vademecum.parametric import combined, galerkin_field
+from avatar_core.vademecum.parametric import combined, galerkin_field, regional_load_of_basis
 
 
 def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
@@ -42,19 +42,21 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     material = replace(material, poisson_ratio=point.get("poisson", material.poisson_ratio))
     contrast = point.get("contrast", vademecum.contrast)
     reference = replace(material, young_modulus=parametric.young_modulus)
-    mass = vademecum.mesh.lumped_mass
     factors = factors_at(reference, contrast)
-    far, body = galerkin_field(
-        parametric.basis, parametric.operators, factors, mass, parametric.rank, parametric.body
-    )
+    far, trailing, body = galerkin_field(parametric, factors)
+    regional_load = regional_load_of_basis(parametric, factors, trailing, vademecum.regional)
+    regional_load += combined(parametric.regional_load, weights)
     at_reference = replace(
         vademecum,
         material=reference,
         contrast=contrast,
         far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
+        trailing=trailing.astype(np.float32),
         body=body,
-        near=combined(vademecum.near, parametric.near, weights),
-        contact_near=combined(vademecum.contact_near, parametric.contact_near, weights),
+        regional=replace(vademecum.regional, load=regional_load),
+        contact_near=replace(
+            vademecum.contact_near, block=combined(parametric.contact_near, weights)
+        ),
     )
     return _with_young_modulus(at_reference, material)
 
@@ -65,12 +67,13 @@ def _with_young_modulus(vademecum: Vademecum, material: Material) -> Vademecum:
     if softer == 1.0:
         return replace(vademecum, material=material)
     root = np.float32(np.sqrt(softer))
-    far, near, contact = vademecum.far, vademecum.near, vademecum.contact_near
+    far, contact = vademecum.far, vademecum.contact_near
     return replace(
         vademecum,
         material=material,
         far=SeparatedField(root * far.space, root * far.load),
         body=vademecum.body.mixed(root * np.eye(far.rank)) if vademecum.body else None,
-        near=replace(near, block=np.float32(softer) * near.block),
+        regional=vademecum.regional.scaled(softer),
+        trailing=root * vademecum.trailing,
         contact_near=replace(contact, block=np.float32(softer) * contact.block),
     )

@@ -7,10 +7,9 @@ patch, gamma = n . C(s, s) n, the organ moves by
     d(s, a)    = a + sum_k beta_k(s) a^k,
 
 u_1 the linear vademecum, d the depth that is really reached. V_k and beta_k are the terms of the
-asymptotic-numerical series (:mod:`avatar_core.reduction.asymptotic_series`), separated like the
-linear response: low rank far away, exact near the patch. They hold up to a_max(s); beyond, both
-continue tangentially. As stress is proportional to Young's modulus, V_k and beta_k do not depend on
-it.
+asymptotic-numerical series (:mod:`avatar_core.reduction.asymptotic_series`), separated region by
+region of the load surface. They hold up to a_max(s); beyond, both continue tangentially. As stress
+is proportional to Young's modulus, V_k and beta_k do not depend on it.
 
 Only the response of a patch to its own normal force is nonlinear; coupling between patches and
 forces along the surface stay linear. :mod:`avatar_core.offline.certify.combinations` measures the
@@ -32,7 +31,7 @@ from avatar_core.fem.hyperelastic_materials import (
     NeoHookean,
     StVenantKirchhoff,
 )
-from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.reduction.regional import RegionalField
 
 POWERS = (2, 3)
 
@@ -86,18 +85,14 @@ class LargeDeformation:
     """The terms of second and third order; k counts them.
 
     material : of the large strains; its small ones are those of the vademecum
-    space : ndarray, shape (3 n_vertices, n), X'
-    load : ndarray, shape (2, n_positions, n): far part of V_k is X' load[k]^T [m^(1-k)]
-    near : ndarray, shape (2, n_blocks, 3), the rest of V_k in the pattern of ``vademecum.near``
+    terms : RegionalField, V_2 and V_3 as its two loads at a position [m^(1-k)]
     depth : ndarray, shape (2, n_positions), beta_k [m^(1-k)]
     reach : ndarray, shape (n_positions,), a_max [m]
     certificate : LargeCertificate or None
     """
 
     material: LargeMaterial
-    space: FloatArray
-    load: FloatArray
-    near: FloatArray
+    terms: RegionalField
     depth: FloatArray
     reach: FloatArray
     certificate: LargeCertificate | None = None
@@ -105,28 +100,19 @@ class LargeDeformation:
     @property
     def nbytes(self) -> int:
         """Memory held [bytes]."""
-        arrays = (self.space, self.load, self.near, self.depth, self.reach)
-        return int(sum(array.nbytes for array in arrays))
+        return self.terms.nbytes + self.depth.nbytes + self.reach.nbytes
 
-    def added_to(
-        self, linear: Push, positions: np.ndarray, weights: FloatArray, pattern: LocalBlocks
-    ) -> Push:
+    def added_to(self, linear: Push, positions: np.ndarray, weights: FloatArray) -> Push:
         """A linear push with the terms of second and third order at the same point.
 
         Parameters
         ----------
         positions, weights : ndarray, shape (n,), of the point
-        pattern : near field of the vademecum
         """
         reach = float(self.reach[positions].min())
-        terms = powers(linear.depth, reach)
-        load = np.einsum("k,i,kin->n", terms, weights, self.load[:, positions])
-        displacement = linear.displacement + self.space @ load
-        for position, weight in zip(positions, weights, strict=True):
-            row = slice(pattern.start[position], pattern.start[position + 1])
-            near = np.tensordot(terms, self.near[:, row], axes=1)
-            displacement.reshape(-1, 3)[pattern.target[row]] += weight * near
-        depth = linear.depth + float(terms @ (self.depth[:, positions] @ weights))
+        power = powers(linear.depth, reach)
+        displacement = linear.displacement + self.terms.combined(positions, weights) @ power
+        depth = linear.depth + float(power @ (self.depth[:, positions] @ weights))
         return Push(displacement, depth, linear.depth <= reach)
 
 

@@ -1,9 +1,9 @@
 """The computational vademecum: an organ's precomputed response to a load anywhere on its surface.
 
-u(x, s) = far field (separated, low rank) + near field (exact, sparse). The contact compliance
-C(s, s'), the patch-averaged displacement at s per patch force at s', is the Galerkin one of the
-same modes, Y Y^T, plus the exact remainder tapered to the neighbourhood: symmetric positive
-definite by construction, exact at the load positions themselves.
+u(x, s) = global modes, which all loads share + the modes of the region that s lies in. The contact
+compliance C(s, s'), the patch-averaged displacement at s per patch force at s', is the Galerkin one
+of the global modes and further ones, Y Y^T, plus the exact remainder tapered to the neighbourhood:
+symmetric positive definite by construction, exact at the load positions themselves.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.reduction.pgd import EnrichmentReport
+from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.large_deformation import LargeCertificate, LargeDeformation, Push
@@ -49,7 +50,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class RankError:
-    """Relative L2 error over the build's own loads with the first ``rank`` modes."""
+    """Relative L2 error over the build's own loads with ``rank`` modes at a place."""
 
     rank: int
     mean: float
@@ -63,7 +64,7 @@ class Convergence:
     converged : the tolerance was met within the mode limit
     tolerance : asked for, mean relative L2 error over the build's own loads
     enrichments : one report each
-    rank_errors : error against number of modes, near field included
+    rank_errors : error against number of modes at a place
     """
 
     converged: bool
@@ -85,6 +86,7 @@ class VademecumInfo:
     n_surface_vertices: int
     n_load_positions: int
     n_modes: int
+    n_regions: int
     bytes: int
     young_modulus: float
     poisson_ratio: float
@@ -100,16 +102,18 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "2.4"
+SCHEMA_VERSION = "3.0"
 
 
 @dataclass(frozen=True)
 class Vademecum:
     """An organ's precomputed mechanical response.
 
-    far : SeparatedField, space (3 n_vertices, rank) [m], load (3 n_positions, rank); the load
-        factor is also the far part Y Y^T of the contact compliance [m/N]
-    near : LocalBlocks, exact remainder at mesh vertices [m/N]
+    far : SeparatedField, the global modes: space (3 n_vertices, rank) [m], load (3 n_positions,
+        rank)
+    regional : RegionalField, what they leave, by regions [m/N]
+    trailing : ndarray, shape (3 n_positions, n), load functions of further modes, of which the
+        contact compliance alone makes use
     contact_near : LocalBlocks, tapered remainder of the contact compliance at load positions,
         symmetric [m/N]
     tip_field : TipField, smooth distance, shape and access that a tool tip feels
@@ -127,7 +131,8 @@ class Vademecum:
     element: Element
     surface: LoadSurface
     far: SeparatedField
-    near: LocalBlocks
+    regional: RegionalField
+    trailing: np.ndarray
     contact_near: LocalBlocks
     tip_field: TipField
     convergence: Convergence
@@ -140,21 +145,27 @@ class Vademecum:
     id: str = field(default="", compare=False)
     nbytes: int = field(default=0, compare=False)
 
-    def displacement(
-        self, positions: np.ndarray, weights: np.ndarray, rank: int | None = None
-    ) -> np.ndarray:
+    @property
+    def n_modes(self) -> int:
+        """Modes that show the displacement at a place: global ones, and those of its region."""
+        return self.far.rank + self.regional.rank
+
+    @property
+    def contact_load(self) -> np.ndarray:
+        """Y of the contact compliance Y Y^T + remainder, shape (3 n_positions, n)."""
+        return np.hstack([self.far.load, self.trailing])
+
+    def displacement(self, positions: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Displacement of all vertices under unit forces in x, y, z, shape (3 n_vertices, 3).
 
         Parameters
         ----------
         positions, weights : ndarray, shape (n,), a point of the surface as interpolated by
             :meth:`avatar_core.fem.patch_loads.LoadSurface.weights`
-        rank : int or None, modes to use; the near field belongs to all of them
         """
-        far = self.far if rank is None else self.far.truncate(rank)
+        far = self.far
         load = np.einsum("i,idk->dk", weights, far.load.reshape(-1, 3, far.rank)[positions])
-        near = self.near.combined(positions, weights, len(self.mesh.vertices))
-        return far.space @ load.T + near
+        return far.space @ load.T + self.regional.combined(positions, weights)
 
     def compliance(
         self,
@@ -166,11 +177,20 @@ class Vademecum:
         """Contact compliance between two surface points (the same by default), (3, 3) [m/N]."""
         if other_positions is None or other_weights is None:
             other_positions, other_weights = positions, weights
-        load = self.far.load.reshape(-1, 3, self.far.rank)
-        left = np.einsum("i,idk->dk", weights, load[positions])
-        right = np.einsum("i,idk->dk", other_weights, load[other_positions])
-        near = self.contact_near.combined(other_positions, other_weights, len(load))
+        left = self._contact_load_at(positions, weights)
+        right = self._contact_load_at(other_positions, other_weights)
+        n_positions = self.surface.n_positions
+        near = self.contact_near.combined(other_positions, other_weights, n_positions)
         return left @ right.T + np.einsum("i,iab->ab", weights, near.reshape(-1, 3, 3)[positions])
+
+    def _contact_load_at(self, positions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Y at a point of the surface, shape (3, n)."""
+        n = self.surface.n_positions
+        parts = (
+            np.einsum("i,idk->dk", weights, load.reshape(n, 3, load.shape[1])[positions])
+            for load in (self.far.load, self.trailing)
+        )
+        return np.hstack(list(parts))
 
     def push(self, positions: np.ndarray, weights: np.ndarray, force: float) -> Push:
         """The organ under a force along the inward normal of a point of the surface.
@@ -187,7 +207,7 @@ class Vademecum:
         linear = Push(moved, depth, within=True)
         if self.large is None:
             return linear
-        return self.large.added_to(linear, positions, weights, self.near)
+        return self.large.added_to(linear, positions, weights)
 
     def push_to(
         self, positions: np.ndarray, weights: np.ndarray, depth: float
@@ -287,7 +307,8 @@ class Vademecum:
             n_vertices=len(self.mesh.vertices),
             n_surface_vertices=len(self.mesh.surface_vertices),
             n_load_positions=self.surface.n_positions,
-            n_modes=self.far.rank,
+            n_modes=self.n_modes,
+            n_regions=self.regional.n_regions,
             bytes=self.nbytes,
             young_modulus=self.material.young_modulus,
             poisson_ratio=self.material.poisson_ratio,

@@ -7,22 +7,23 @@ Offline, one space basis V serves the whole range. Online, values p give the Gal
 which is K(p)-orthonormal as any far field of this project is, so that what remains of the contact
 compliance, C(p) - Y Y^T, is positive semi-definite. It is kept at the nodes of the range
 (:mod:`avatar_core.reduction.coordinates`) and combined with weights that are not negative: positive
-semi-definite again. The modes are sorted by their displacement norm at p, and the first of them are
-used. The result is an ordinary Vademecum, so that a step costs what it costs
-without coordinates.
+semi-definite again. The global modes are those of the first functions of the basis; what they leave
+is written in regional modes that serve the whole range: what the other functions hold of it
+follows from the Galerkin response, the small rest is combined from the nodes. The result is an
+ordinary Vademecum, so that a step costs what it costs without coordinates.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from avatar_core.reduction.coordinates import Coordinate
-from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
-from avatar_core.vademecum.modal_mass import N_BODY, BodyResponse, completed
+from avatar_core.vademecum.modal_mass import BodyResponse
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +31,16 @@ class ParametricResponse:
     """The data of a vademecum's coordinates, beside its own fields.
 
     coordinates : at least one
-    basis : SeparatedField, V at the vertices (3 n_vertices, n) and V^T f (3 n_positions, n)
+    basis : SeparatedField, V at the vertices (3 n_vertices, n) and V^T f (3 n_positions, n), the
+        functions of the body after those of the global modes
     operators : ndarray, shape (n_terms, n, n), A_q of :attr:`Elasticity.factors`
-    near, contact_near : ndarray, shape (n_nodes, n_blocks, 3, 3), blocks at the nodes in the
-        pattern of the vademecum's own near fields
-    rank : modes of a vademecum at given values
+    projection : ndarray, shape (n_regional, n), the functions of the basis in the regional modes
+    regional_load : ndarray, shape (n_nodes, n_positions, 3, most), what the basis leaves at the
+        nodes, in the regional modes
+    contact_near : ndarray, shape (n_nodes, n_blocks, 3, 3), blocks at the nodes in the pattern of
+        the vademecum's own near field
+    n_global : global modes of a vademecum at given values; rank : of its contact compliance, these
+        among them
     young_modulus : that the blocks are computed for [Pa]
     body : BodyResponse of the basis, or None
     """
@@ -42,48 +48,67 @@ class ParametricResponse:
     coordinates: tuple[Coordinate, ...]
     basis: SeparatedField
     operators: np.ndarray
-    near: np.ndarray
+    projection: np.ndarray
+    regional_load: np.ndarray
     contact_near: np.ndarray
+    n_global: int
     rank: int
     young_modulus: float
     body: BodyResponse | None = None
 
 
 def galerkin_field(
-    basis: SeparatedField,
-    operators: np.ndarray,
-    factors: np.ndarray,
-    mass: np.ndarray,
-    rank: int,
-    body: BodyResponse | None,
-) -> tuple[SeparatedField, BodyResponse | None]:
-    """The K(p)-orthonormal response in a space: modes by displacement norm, then body functions.
+    parametric: ParametricResponse, factors: np.ndarray
+) -> tuple[SeparatedField, np.ndarray, BodyResponse | None]:
+    """The K(p)-orthonormal response in the space of the basis.
+
+    L is triangular: the global modes at p span the first functions of the basis whatever p is, so
+    that what they leave is a smooth function of p.
 
     Parameters
     ----------
-    basis : V and V^T f
-    operators, factors : A_q and theta_q(p)
-    mass : ndarray, shape (3 n_vertices,), lumped
-    rank : modes in all
-    body : of the basis; None for modes of surface loads alone
+    parametric : ParametricResponse
+    factors : theta_q(p)
+
+    Returns
+    -------
+    far : the global modes, those of the body last
+    trailing : ndarray, load functions of further modes up to the rank
+    body : of the global modes; None for modes of surface loads alone
     """
-    stiffness = np.tensordot(factors, operators, axes=1)
+    basis, body, n = parametric.basis, parametric.body, parametric.n_global
+    stiffness = np.tensordot(factors, parametric.operators, axes=1)
     root = np.linalg.cholesky((stiffness + stiffness.T) / 2.0)
-    load = scipy.linalg.solve_triangular(root, basis.load.T, lower=True).T
-    space = scipy.linalg.solve_triangular(root, basis.space.T, lower=True).T
-    modes = SeparatedField(space, load)
-    kept = modes.mixing_by_norm(mass)
-    if body is None:
-        kept = kept[:, :rank]
-    else:
-        inverse = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True).T
-        body = body.mixed(inverse)
-        kept = completed(body, kept[:, : rank - N_BODY])
-        body = body.mixed(kept)
-    return SeparatedField(space @ kept, load @ kept), body
+    load = scipy.linalg.solve_triangular(root, basis.load.T, lower=True)[: parametric.rank].T
+    first = root[:n, :n]
+    space = scipy.linalg.solve_triangular(first, basis.space[:, :n].T, lower=True).T
+    if body is not None:
+        inverse = scipy.linalg.solve_triangular(first, np.eye(n), lower=True).T
+        body = BodyResponse(body.mass[:n, :n], body.weight[:n]).mixed(inverse)
+    return SeparatedField(space, load[:, :n]), load[:, n:], body
 
 
-def combined(near: LocalBlocks, at_nodes: np.ndarray, weights: np.ndarray) -> LocalBlocks:
-    """Blocks between the nodes."""
+def regional_load_of_basis(
+    parametric: ParametricResponse, factors: np.ndarray, trailing: np.ndarray, field: RegionalField
+) -> np.ndarray:
+    """The response beyond the global modes in the regional modes, (n_positions, 3, most).
+
+    trailing : of :func:`galerkin_field`
+    field : of which the regions and modes are taken
+    """
+    n, rank = parametric.n_global, parametric.rank
+    stiffness = np.tensordot(factors, parametric.operators, axes=1)[:rank, :rank]
+    root = np.linalg.cholesky((stiffness + stiffness.T) / 2.0)
+    modes = scipy.linalg.solve_triangular(root, parametric.projection[:, :rank].T, lower=True).T
+    load = trailing.reshape(len(field.region), 3, rank - n).astype(np.float32)
+    out = np.zeros((len(field.region), 3, field.rank), np.float32)
+    for r in range(field.n_regions):
+        at, own = field.region == r, modes[field.start[r] : field.start[r + 1], n:]
+        out[at, :, : len(own)] = load[at] @ own.T.astype(np.float32)
+    return out
+
+
+def combined(at_nodes: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Values between the nodes, of values at them (n_nodes, ...)."""
     used = np.flatnonzero(weights)
-    return replace(near, block=np.tensordot(weights[used].astype(np.float32), at_nodes[used], 1))
+    return np.asarray(np.tensordot(weights[used].astype(np.float32), at_nodes[used], 1))

@@ -32,9 +32,11 @@ _LINEAR: Shapes = {
     "surface/patch_radius": "f:",
     "far/space": "f: 3*vertices rank",
     "far/load": "f: 3*positions rank",
-    "near/start": "i: rows",
-    "near/target": "i: blocks",
-    "near/block": "f: blocks 3 3",
+    "trailing": "f: 3*positions trailing",
+    "regional/region": "i: positions",
+    "regional/start": "i: starts",
+    "regional/space": "h: 3*vertices regional",
+    "regional/load": "f: positions 3 most",
     "contact_near/start": "i: rows",
     "contact_near/target": "i: contact_blocks",
     "contact_near/block": "f: contact_blocks 3 3",
@@ -47,9 +49,11 @@ _PARAMETRIC: Shapes = {
     "parametric/basis/space": "f: 3*vertices basis",
     "parametric/basis/load": "f: 3*positions basis",
     "parametric/operators": "f: terms basis basis",
+    "parametric/n_global": "i:",
     "parametric/rank": "i:",
     "parametric/young_modulus": "f:",
-    "parametric/near": "f: nodes blocks 3 3",
+    "parametric/projection": "f: regional basis",
+    "parametric/regional_load": "f: nodes positions 3 most",
     "parametric/contact_near": "f: nodes contact_blocks 3 3",
 }
 _BODY: Shapes = {"body/mass": "f: rank rank", "body/weight": "f: rank 3"}
@@ -68,9 +72,10 @@ _SHIFT: Shapes = {
     "tip_field/shift/radius": "f: balls",
 }
 _LARGE: Shapes = {
-    "large/space": "f: 3*vertices large",
-    "large/load": "f: 2 positions large",
-    "large/near": "f: 2 blocks 3",
+    "large/terms/region": "i: positions",
+    "large/terms/start": "i: starts",
+    "large/terms/space": "h: 3*vertices large",
+    "large/terms/load": "f: positions 2 large_most",
     "large/depth": "f: 2 positions",
     "large/reach": "f: positions",
 }
@@ -108,13 +113,21 @@ def require_sound(arrays: Arrays) -> None:
         raise StorageError("the organ has no elements, load positions or modes; build it again")
     _require_mesh(arrays, sizes)
     _require_surface(arrays, sizes)
-    _require_rows(arrays, "near", sizes["positions"], sizes["vertices"])
+    _require_regions(arrays, "regional", sizes["regional"], sizes["most"])
     _require_rows(arrays, "contact_near", sizes["positions"], sizes["positions"])
     _require_tip_field(arrays)
     if "basis" in sizes:
         _require_range("parametric/rank", float(arrays["parametric/rank"]), (1, sizes["basis"]))
-    if "large/reach" in arrays and arrays["large/reach"].min() < 0.0:
-        raise StorageError("'large/reach' is negative; build the file again")
+        rank, n_global = arrays["parametric/rank"], arrays["parametric/n_global"]
+        _require_range("parametric/n_global", float(n_global), (1, float(rank)))
+    if "large/reach" in arrays:
+        _require_regions(arrays, "large/terms", sizes["large"], sizes["large_most"])
+        if not np.array_equal(arrays["large/terms/region"], arrays["regional/region"]):
+            raise StorageError(
+                "'large/terms/region' differs from 'regional/region'; build the file again"
+            )
+        if arrays["large/reach"].min() < 0.0:
+            raise StorageError("'large/reach' is negative; build the file again")
 
 
 def _require_mesh(arrays: Arrays, sizes: Mapping[str, int]) -> None:
@@ -141,14 +154,28 @@ def _require_surface(arrays: Arrays, sizes: Mapping[str, int]) -> None:
         )
 
 
+def _require_regions(arrays: Arrays, name: str, n_modes: int, most: int) -> None:
+    """Regions that exist, of modes in order, none with more than its loads have numbers for."""
+    start = arrays[f"{name}/start"].astype(np.int64)
+    if len(start) < 2:
+        raise StorageError(f"'{name}/start' names no region; build the file again")
+    require_indices(f"{name}/region", arrays[f"{name}/region"], len(start) - 1)
+    require_indices(f"{name}/start", start, n_modes + 1)
+    ranks = np.diff(start)
+    if not (start[0] == 0 and start[-1] == n_modes and ranks.min() >= 0 and ranks.max() <= most):
+        raise StorageError(f"'{name}/start' does not fit its modes; build the file again")
+
+
 def _require_rows(arrays: Arrays, name: str, n_rows: int, n_targets: int) -> None:
-    """Compressed rows: ascending, from the first block to the last."""
+    """Compressed rows of an upper half: ascending, from the first block to the last."""
     start, target = arrays[f"{name}/start"], arrays[f"{name}/target"]
     require_indices(f"{name}/target", target, n_targets)
     require_indices(f"{name}/start", start, len(target) + 1)
     rises = len(start) == n_rows + 1 and bool((start[1:] >= start[:-1]).all())
     if not rises or start[0] != 0 or start[-1] != len(target):
         raise StorageError(f"'{name}/start' does not fit its blocks; build the file again")
+    if (target < np.repeat(np.arange(n_rows), np.diff(start))).any():
+        raise StorageError(f"'{name}/target' lies before its position; build the file again")
 
 
 def _require_tip_field(arrays: Arrays) -> None:

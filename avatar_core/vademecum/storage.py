@@ -1,38 +1,37 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 2.4), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 3.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
-``provenance``, ``convergence``, ``certificate`` (from schema 2.3 with ``contact_sites``), and from
-schema 2.2 ``accuracy``, its curve.
-Datasets:
+``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve. Datasets:
 
     mesh/vertices (n_v, 3) [m]          mesh/tets (n_t, 4)
     regions/clamped, regions/accessible over the boundary faces
     surface/centers, surface/normals (n_s, 3) [m]   surface/corners (n_f, 3)
     surface/vertices                     surface/patch_radius [m]
     far/space (3 n_v, k) [m]             far/load (3 n_s, k)
-    near/start, near/target, near/block [m/N]
-    contact_near/start, contact_near/target, contact_near/block [m/N]
+    trailing (3 n_s, m), of the contact compliance
+    regional/region (n_s,), start (n_regions + 1,), space (3 n_v, n_modes), load (n_s, 3, most)
+    contact_near/start, target, block [m/N]: of the symmetric blocks those whose target is their
+    position or after it
     tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
-    tip_field/curvature [1/m], growth [1/m2], anisotropy [1/m2], from schema 2.3; tip_field/tumour
-    over a tumour
+    tip_field/curvature [1/m], growth [1/m2], anisotropy [1/m2]; tip_field/tumour over a tumour
     tip_field/shift/brick (bx, by, bz), value (n_radii, n_bricks, 8, 8, 8) [m], spacing [m], radius
-    (n_radii,) [m], from schema 2.4
+    (n_radii,) [m]
 
-A vademecum with coordinates of the material (from schema 2.0) has
-the JSON attributes ``coordinates``, ``contrast``, and
+A vademecum with coordinates of the material has the JSON attributes ``coordinates``,
+``contrast``, and
 
     parametric/basis/space (3 n_v, n)    parametric/basis/load (3 n_s, n)
-    parametric/operators (n_terms, n, n) parametric/rank, parametric/young_modulus [Pa]
-    parametric/near, parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N]
+    parametric/operators (n_terms, n, n) parametric/n_global, rank, young_modulus [Pa]
+    parametric/projection (n_modes, n)   parametric/regional_load (n_nodes, n_s, 3, most)
+    parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N], as of contact_near
 
-one with the organ's mass (from schema 2.1) body/mass (rank, rank) and body/weight (rank, 3),
+one with the organ's mass body/mass (rank, rank) and body/weight (rank, 3),
 and the same under parametric/body for that basis; one with large deformation the JSON attribute
 ``large`` (material, certificate) and, for k = 2, 3,
 
-    large/space (3 n_v, n)               large/load (2, n_s, n) [m^(1-k)]
-    large/near (2, n_blocks, 3) [m^(1-k)], in the pattern of near/
+    large/terms/region, start, space, load (n_s, 2, most) [m^(1-k)], as of regional
     large/depth (2, n_s) [m^(1-k)]       large/reach (n_s,) [m]
 """
 
@@ -56,7 +55,8 @@ from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.reduction.coordinates import Coordinate
-from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.reduction.near_field import LocalBlocks, Mirror
+from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.accuracy import AccuracyCurve, Cloud, Precision
 from avatar_core.vademecum.certificate import Certificate
@@ -85,7 +85,7 @@ FORMAT = "avatar vademecum"
 MAX_FILE_BYTES = 4 << 30
 
 _JSON = ("material", "provenance", "convergence", "certificate")
-_JSON_LATER = ("coordinates", "contrast", "large", "accuracy")  # from schema 2.0, the last 2.2
+_JSON_LATER = ("coordinates", "contrast", "large", "accuracy")
 # What files call fields of the certificate.
 _STORED_AS = {"tip_force_mean": "felt_mean", "tip_force_worst": "felt_worst"}
 
@@ -189,7 +189,21 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
         for attribute in key.split("/"):
             value = getattr(value, attribute)
         arrays[key] = np.asarray(value)
-    return arrays
+    return arrays | _upper_half(v)
+
+
+def _upper_half(v: Vademecum) -> dict[str, np.ndarray]:
+    """The contact near field, as it is symmetric."""
+    near, upper = v.contact_near, v.contact_near.is_upper
+    count = np.bincount(near.position[upper], minlength=len(near.start) - 1)
+    out = {
+        "contact_near/start": np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
+        "contact_near/target": near.target[upper],
+        "contact_near/block": near.block[upper],
+    }
+    if v.parametric is not None:
+        out["parametric/contact_near"] = v.parametric.contact_near[:, upper]
+    return out
 
 
 def _attributes(v: Vademecum) -> dict[str, str]:
@@ -217,10 +231,8 @@ def _attributes(v: Vademecum) -> dict[str, str]:
 def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vademecum:
     """The vademecum of arrays and attributes from elsewhere; all are checked first."""
     require_sound(arrays)
+    mirror = Mirror.of(arrays["contact_near/start"], arrays["contact_near/target"])
     plain = {key: parsed(attributes.get(key, "null"), key) for key in (*_JSON, *_JSON_LATER)}
-
-    def blocks(name: str) -> LocalBlocks:
-        return LocalBlocks(*(arrays[f"{name}/{k}"] for k in ("start", "target", "block")))
 
     return Vademecum(
         name=require_name(attributes["name"], "name"),
@@ -236,17 +248,24 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
             float(arrays["surface/patch_radius"]),
         ),
         far=SeparatedField(arrays["far/space"], arrays["far/load"]),
-        near=blocks("near"),
-        contact_near=blocks("contact_near"),
+        regional=_regional(arrays, "regional"),
+        trailing=arrays["trailing"],
+        contact_near=LocalBlocks(
+            mirror.start, mirror.target, mirror.whole(arrays["contact_near/block"])
+        ),
         tip_field=_tip_field(arrays),
         convergence=of_plain(Convergence, plain["convergence"], "convergence"),
         provenance=of_plain(Provenance, plain["provenance"], "provenance"),
         certificate=_certificate(plain["certificate"], plain["accuracy"]),
-        parametric=_parametric(arrays, plain["coordinates"]),
+        parametric=_parametric(arrays, plain["coordinates"], mirror),
         contrast=_contrast(plain["contrast"]),
         large=_large(arrays, plain["large"]),
         body=_body(arrays, BODY_KEYS),
     )
+
+
+def _regional(arrays: dict[str, np.ndarray], name: str) -> RegionalField:
+    return RegionalField(*(arrays[f"{name}/{key}"] for key in ("region", "start", "space", "load")))
 
 
 def _tip_field(arrays: dict[str, np.ndarray]) -> TipField:
@@ -294,7 +313,6 @@ class _Curve:
     modes: tuple[int, ...]
     cloud: tuple[Cloud, ...]
     precision: tuple[Precision, ...]
-    near: tuple[float, ...]
     l2: tuple[float, ...]
     force: tuple[float, ...]
     nbytes: tuple[int, ...]
@@ -323,24 +341,31 @@ def _large(arrays: dict[str, np.ndarray], stored: Any) -> LargeDeformation | Non
     if LARGE_KEYS[0] not in arrays:
         return None
     said = of_plain(_Large, stored, "large")
-    space, load, near, depth, reach = (arrays[key] for key in LARGE_KEYS)
-    return LargeDeformation(said.material, space, load, near, depth, reach, said.certificate)
+    terms = _regional(arrays, "large/terms")
+    depth, reach = arrays["large/depth"], arrays["large/reach"]
+    return LargeDeformation(said.material, terms, depth, reach, said.certificate)
 
 
-def _parametric(arrays: dict[str, np.ndarray], stored: Any) -> ParametricResponse | None:
+def _parametric(
+    arrays: dict[str, np.ndarray], stored: Any, mirror: Mirror
+) -> ParametricResponse | None:
     if PARAMETRIC_KEYS[0] not in arrays:
         return None
     part = {key.removeprefix("parametric/"): arrays[key] for key in PARAMETRIC_KEYS}
     coordinates = of_plain(tuple[Coordinate, ...], stored, "coordinates")
     n_nodes = math.prod(coordinate.n_nodes for coordinate in coordinates)
-    if not coordinates or n_nodes != len(part["near"]):
-        raise StorageError("'coordinates' do not fit 'parametric/near'; build the file again")
+    if not coordinates or n_nodes != len(part["contact_near"]):
+        raise StorageError(
+            "'coordinates' do not fit 'parametric/contact_near'; build the file again"
+        )
     return ParametricResponse(
         coordinates=coordinates,
         basis=SeparatedField(part["basis/space"], part["basis/load"]),
         operators=part["operators"],
-        near=part["near"],
-        contact_near=part["contact_near"],
+        projection=part["projection"],
+        regional_load=part["regional_load"],
+        contact_near=mirror.whole(part["contact_near"]),
+        n_global=int(part["n_global"]),
         rank=int(part["rank"]),
         young_modulus=Material(float(part["young_modulus"])).young_modulus,
         body=_body(arrays, PARAMETRIC_BODY_KEYS),

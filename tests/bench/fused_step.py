@@ -12,7 +12,7 @@ from numba import njit
 
 OK, INVALID_POSE, OUT_OF_RANGE = 0, 4, 7
 OUTSIDE, ENTERED, BARRED = range(3)
-BLOCK, LEAST_WEIGHT = 256, 0.02
+BLOCK, LEAST_WEIGHT = 256, 0.04
 HASH = 2654435761
 
 
@@ -200,49 +200,65 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
         out.contact_position[0, 0] = x - r * n0
         out.contact_position[0, 1] = y - r * n1
         out.contact_position[0, 2] = z - r * n2
-        # --- far field -------------------------------------------------------------------------
-        amplitude, scales = state.amplitude, model.space_scale
-        n_modes = scales.shape[0]
+        # --- regions of the load positions -----------------------------------------------------
+        amplitude, scales, start = state.amplitude, model.space_scale, model.region_start
+        region_weight, n_global, n_touched, kept = state.region_weight, start[0], 0, 0.0
         drive = np.float32(force * a)
-        for k in range(n_modes):
+        for k in range(n_global):
             amplitude[k] = -drive * mode[k]
+        for i in range(count):
+            region_weight[model.region[nodes[i]]] = 0.0
+        for i in range(count):
+            region_weight[model.region[nodes[i]]] += weight[i, 0]
+        for i in range(count):
+            whole = region_weight[model.region[nodes[i]]]
+            part = max(whole - LEAST_WEIGHT, 0.0) if whole > 0.0 else min(whole + LEAST_WEIGHT, 0.0)
+            if whole != 0.0:
+                kept += weight[i, 0] * part / whole
+        for i in range(count):
+            j = nodes[i]
+            r = model.region[j]
+            whole = region_weight[r]
+            part = max(whole - LEAST_WEIGHT, 0.0) if whole > 0.0 else min(whole + LEAST_WEIGHT, 0.0)
+            if whole == 0.0 or weight[i, 0] * part == 0.0:
+                continue
+            if not state.is_touched[r]:
+                state.is_touched[r] = True
+                state.touched[n_touched] = r
+                n_touched += 1
+                amplitude[start[r] : start[r + 1]] = np.float32(0.0)
+            part = -weight[i, 0] * part / whole * force * a / kept
+            w0, w1, w2 = np.float32(part * n0), np.float32(part * n1), np.float32(part * n2)
+            load, first = model.regional_load[j], start[r]
+            for k in range(start[r + 1] - first):
+                amplitude[first + k] += load[0, k] * w0 + load[1, k] * w1 + load[2, k] * w2
+        for i in range(n_touched):
+            state.is_touched[state.touched[i]] = False
+        # --- modes -----------------------------------------------------------------------------
         for block in range(model.space.shape[0]):
             u = field[block * BLOCK : (block + 1) * BLOCK]
             shapes = model.space[block]
             for i in range(BLOCK):
                 u[i] = np.float32(0.0)
-            for k in range(0, n_modes - 3, 4):
-                a0, a1 = amplitude[k] * scales[k], amplitude[k + 1] * scales[k + 1]
-                a2, a3 = amplitude[k + 2] * scales[k + 2], amplitude[k + 3] * scales[k + 3]
-                for i in range(BLOCK):
-                    u[i] += (
-                        shapes[k, i] * a0
-                        + shapes[k + 1, i] * a1
-                        + shapes[k + 2, i] * a2
-                        + shapes[k + 3, i] * a3
-                    )
-            for k in range(n_modes - n_modes % 4, n_modes):
-                a0 = amplitude[k] * scales[k]
-                for i in range(BLOCK):
-                    u[i] += shapes[k, i] * a0
-        # --- near field ------------------------------------------------------------------------
-        kept = 0.0
-        for i in range(count):
-            w = weight[i, 0]
-            kept += max(w - LEAST_WEIGHT, 0.0) if w > 0.0 else min(w + LEAST_WEIGHT, 0.0)
-        for i in range(count):
-            w = weight[i, 0]
-            w = max(w - LEAST_WEIGHT, 0.0) if w > 0.0 else min(w + LEAST_WEIGHT, 0.0)
-            if w == 0.0:
-                continue
-            part = -w * force * a / kept
-            w0, w1, w2 = np.float32(part * n0), np.float32(part * n1), np.float32(part * n2)
-            j = nodes[i]
-            for e in range(model.near_start[j], model.near_start[j + 1]):
-                v = 3 * model.near_target[e]
-                b = model.near_block[e]
-                for d in range(3):
-                    field[v + d] += b[d, 0] * w0 + b[d, 1] * w1 + b[d, 2] * w2
+            for q in range(n_touched + 1):
+                first, end = 0, n_global
+                if q > 0:
+                    first, end = start[state.touched[q - 1]], start[state.touched[q - 1] + 1]
+                whole_fours = end - (end - first) % 4
+                for k in range(first, whole_fours, 4):
+                    a0, a1 = amplitude[k] * scales[k], amplitude[k + 1] * scales[k + 1]
+                    a2, a3 = amplitude[k + 2] * scales[k + 2], amplitude[k + 3] * scales[k + 3]
+                    for i in range(BLOCK):
+                        u[i] += (
+                            shapes[k, i] * a0
+                            + shapes[k + 1, i] * a1
+                            + shapes[k + 2, i] * a2
+                            + shapes[k + 3, i] * a3
+                        )
+                for k in range(whole_fours, end):
+                    a0 = amplitude[k] * scales[k]
+                    for i in range(BLOCK):
+                        u[i] += shapes[k, i] * a0
     # --- cloud ---------------------------------------------------------------------------------
     n_points = out.cloud.shape[0]
     rest, cloud = model.rest.reshape(6 * n_points), out.cloud.reshape(6 * n_points)

@@ -58,7 +58,7 @@ def organ(body: Body) -> Vademecum:
         Elasticity(mesh, MATERIAL, regions.clamped),
         regions,
         load_surface(mesh, regions, PATCH_RADIUS),
-        BuildRule(tolerance=0.5, max_modes=20),
+        BuildRule(),
         Provenance(body, ""),
     )
 

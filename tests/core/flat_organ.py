@@ -117,9 +117,9 @@ def _organ(
         softness=np.ones(1),
         space=np.zeros((-(-3 * len(points) // BLOCK), LANES, BLOCK), np.int16),
         space_scale=np.zeros(LANES, single),
-        near_start=np.zeros(2, np.int64),
-        near_target=np.zeros(0, np.int32),
-        near_block=np.zeros((0, 3, 3), single),
+        region=np.zeros(1, np.int32),
+        region_start=np.full(2, LANES, np.int64),
+        regional_load=np.zeros((1, 3, 0), single),
         rest=np.pad(points, ((0, 0), (0, 3))).astype(single),
         tip_offset=np.array([tip.offset]),
     )
@@ -130,7 +130,7 @@ def _organ(
         soft = replace(MATERIAL, poisson_ratio=neo_hookean)
         law = tip_law_arrays((tip,), soft, local, neo_hookean=True)
         large = LargeDeformationArrays(
-            np.zeros((3, *shape), single), np.zeros((2, 1, 0), single), np.zeros((2, 0, 3), single)
+            np.zeros((3, *shape), single), np.zeros((1, 2, 0), single), np.full(2, LANES, np.int64)
         )
     dent = dent_arrays((tip,), points, arrays.position, PATCH_RADIUS) if law else None
     field = TipField(arrays.distance, arrays.access, origin, arrays.spacing)

@@ -187,17 +187,14 @@ def test_unseen_values_agree_with_full_finite_elements(
 
 
 @pytest.mark.long
-def test_the_near_field_grows_where_the_modes_do_not_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_few_modes_are_said_not_to_converge(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loads, "MIDPOINTS_FROM", 1.0)  # fewer load positions
-    rule = BuildRule(max_modes=5, most_oversampling=1.2)
+    rule = BuildRule(max_modes=5)
     options = OrganOptions(
         n_vertices=400, rule=rule, coordinates=(Coordinate("poisson", 0.45, 0.48),), n_certified=8
     )
     found = build(phantom_liver(12e-3), options)
-    at, centers = found.mesh.vertices[found.near.target], found.surface.centers
-    reach = np.linalg.norm(at - centers[found.near.position], axis=1).max()
-    wide = rule.near_growth * rule.near_outer * found.surface.patch_radius
-    assert 0.95 * wide < reach < wide
+    assert found.n_modes == 5
     assert not found.convergence.converged
 
 

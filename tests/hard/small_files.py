@@ -20,8 +20,9 @@ from avatar_core.geometry.level_set import GridBox
 from avatar_core.geometry.mesh import MeshQuality, Regions, TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.coordinates import Coordinate
-from avatar_core.reduction.near_field import LocalBlocks
+from avatar_core.reduction.near_field import LocalBlocks, Mirror
 from avatar_core.reduction.pgd import EnrichmentReport, EnrichmentStatus
+from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.shapes.registration import RegistrationQuality, SimilarityTransform, Template
 from avatar_core.vademecum.certificate import Certificate
@@ -55,7 +56,7 @@ def small_vademecum(parametric: bool = False, large: bool = False) -> Vademecum:
     vertices = np.vstack([points, np.zeros(3)])
     mesh = TetMesh(vertices, np.column_stack([np.full(len(faces), n), faces]))
     clamped = np.arange(len(faces)) == 0
-    near, contact_near = _blocks(rng, n, n_vertices), _blocks(rng, n, n)
+    region = np.arange(n, dtype=np.int32) % 2
     vademecum = Vademecum(
         name="ball",
         mesh=mesh,
@@ -66,8 +67,9 @@ def small_vademecum(parametric: bool = False, large: bool = False) -> Vademecum:
             points, points / RADIUS, faces[1:], np.arange(n, dtype=np.int64), 0.012
         ),
         far=_field(rng, 3 * n_vertices, 3 * n, RANK),
-        near=near,
-        contact_near=contact_near,
+        regional=_regional(rng, n_vertices, region, 3),
+        trailing=1e-3 * rng.normal(size=(3 * n, 2)).astype(np.float32),
+        contact_near=_blocks(n),
         tip_field=_tip_field(),
         convergence=Convergence(
             True,
@@ -130,12 +132,24 @@ def _field(rng: np.random.Generator, n_dofs: int, n_loads: int, rank: int) -> Se
     )
 
 
-def _blocks(rng: np.random.Generator, n_positions: int, n_targets: int) -> LocalBlocks:
-    """Two blocks for each position, the first of them its own."""
-    own = np.arange(n_positions)
-    target = np.sort(np.column_stack([own, (own + 1) % n_targets]), axis=1).ravel()
-    block = np.tile(1e-4 * np.eye(3, dtype=np.float32), (len(target), 1, 1))
-    return LocalBlocks(np.arange(0, len(target) + 1, 2), target.astype(np.int32), block)
+def _blocks(n_positions: int) -> LocalBlocks:
+    """Blocks between each position and itself, and the next one; symmetric."""
+    start = np.append(np.arange(0, 2 * n_positions, 2), 2 * n_positions - 1)
+    target = np.repeat(np.arange(n_positions), 2)[:-1]
+    target[1::2] += 1
+    mirror = Mirror.of(start, target)
+    block = np.tile(1e-4 * np.eye(3, dtype=np.float32), (len(mirror.target), 1, 1))
+    return LocalBlocks(mirror.start, mirror.target, block)
+
+
+def _regional(
+    rng: np.random.Generator, n_vertices: int, region: np.ndarray, n_loads: int
+) -> RegionalField:
+    """Two regions, of two modes and of one."""
+    load = 1e-4 * rng.normal(size=(len(region), n_loads, 2)).astype(np.float32)
+    load[region == 1, :, 1] = 0.0
+    space = rng.uniform(-1.0, 1.0, size=(3 * n_vertices, 3)).astype(np.float16)
+    return RegionalField(region, np.array([0, 2, 3]), space, load)
 
 
 def _body(rng: np.random.Generator, rank: int) -> BodyResponse:
@@ -165,9 +179,11 @@ def _parametric(rng: np.random.Generator, vademecum: Vademecum) -> ParametricRes
         (coordinate,),
         _field(rng, 3 * len(vademecum.mesh.vertices), 3 * n, rank),
         np.tile(np.eye(rank), (2, 1, 1)),
-        np.tile(vademecum.near.block, (nodes, 1, 1, 1)),
+        1e-2 * rng.normal(size=(vademecum.regional.space.shape[1], rank)).astype(np.float32),
+        np.tile(vademecum.regional.load, (nodes, 1, 1, 1)),
         np.tile(vademecum.contact_near.block, (nodes, 1, 1, 1)),
         RANK,
+        rank,
         vademecum.material.young_modulus,
         _body(rng, rank),
     )
@@ -175,12 +191,10 @@ def _parametric(rng: np.random.Generator, vademecum: Vademecum) -> ParametricRes
 
 def _large(rng: np.random.Generator, vademecum: Vademecum) -> LargeDeformation:
     n, powers = len(vademecum.surface.centers), len(POWERS)
-    field = _field(rng, 3 * len(vademecum.mesh.vertices), powers * n, 2)
+    n_vertices = len(vademecum.mesh.vertices)
     return LargeDeformation(
         "neo-hookean",
-        field.space,
-        field.load.reshape(powers, n, 2),
-        1e-2 * rng.normal(size=(powers, len(vademecum.near.target), 3)).astype(np.float32),
+        _regional(rng, n_vertices, vademecum.regional.region, powers),
         np.zeros((powers, n)),
         np.full(n, 0.01),
         LargeCertificate(0.02, 0.05, 0.01, 0.04, 0.1, 0.1, 3, 9, 0, 0.01, 0.01, 0.01),

@@ -299,8 +299,9 @@ def test_organ_with_mass_swings_out(figure: Figure) -> None:
     step(model, AWAY[None])
     assert not model.out.force.any()
     inertia, energy = model.effects.inertia, []
+    moving = slice(len(inertia.mass))  # the other modes of contact follow at once
     for _ in range(n):
-        energy.append(0.5 * (inertia.mass * inertia.velocity**2 + inertia.modes**2))
+        energy.append(0.5 * (inertia.mass * inertia.velocity**2 + inertia.modes[moving] ** 2))
         step(model, AWAY[None])
     modes = np.array(energy)
     total = modes.sum(axis=1)
@@ -308,8 +309,6 @@ def test_organ_with_mass_swings_out(figure: Figure) -> None:
     assert total[0] > 1e-3
     rates = []
     for k in np.argsort(-modes[0])[:5]:
-        if inertia.mass[k] == 0.0:
-            continue
         omega = 1.0 / np.sqrt(inertia.mass[k])
         # energy swings about its mean decay by zeta: over whole half periods it does not
         half = round(np.pi / omega / PERIOD)

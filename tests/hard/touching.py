@@ -72,7 +72,7 @@ def stiffened(model: ContactModel, factor: float, several: bool) -> ContactModel
     part = single(1.0 / factor)
     scaled = {
         name: getattr(arrays, name) * part
-        for name in ("self_compliance", "contact_block", "near_block")
+        for name in ("self_compliance", "contact_block", "regional_load")
     }
     root = single(np.sqrt(1.0 / factor))
     scaled |= {name: getattr(arrays, name) * root for name in ("load", "space_scale")}

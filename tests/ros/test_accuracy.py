@@ -114,7 +114,7 @@ def test_a_budget_chooses_what_keeps_it(organ: Any) -> None:
     )
     what, budgets = model_spec(organ, order, None), DetailChooser()
     exact = budgets.detail(what, order)
-    assert exact == Detail(organ.far.rank)
+    assert exact == Detail(organ.n_modes)
     errors = {p.detail: p.l2 for p in organ.certificate.curve.points}
     loose = replace(order, budget={"tolerance": 3.0 * errors[exact], "deadline": 1.0})
     coarse = budgets.detail(what, loose)
@@ -223,7 +223,7 @@ def test_a_tolerance_shows_fewer_modes_and_leaves_the_force(
     probe: Any, hand: Hand, organ: Any
 ) -> None:
     """However noisy the machine, the fastest of all details is none with all modes."""
-    rank = organ.far.rank
+    rank = organ.n_modes
     before = statistics(probe, hand, lambda s: s.modes == rank and s.step_p99 > 0.0)
     assert before.modes_shown == rank or before.missed > 0
     _, force = felt(probe, hand)

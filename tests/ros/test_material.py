@@ -43,7 +43,7 @@ def soft_organ() -> Any:
 def _soft_organ() -> Any:
     options = OrganOptions(
         n_vertices=800,
-        rule=BuildRule(max_modes=20, most_oversampling=1.2),
+        rule=BuildRule(max_modes=20),
         coordinates=(Coordinate("poisson", 0.30, 0.49, 2),),
         n_certified=8,
     )

@@ -71,7 +71,7 @@ def _library() -> dict[str, bytes]:
         contrast = Coordinate("contrast", 0.5, 20.0, 3)
         options = OrganOptions(
             n_vertices=600,
-            rule=BuildRule(max_modes=20, most_oversampling=1.2),
+            rule=BuildRule(max_modes=20),
             coordinates=(Coordinate("poisson", 0.40, 0.49, 2), contrast),
             tumour=read_tumour(tumour),
             n_certified=4,

@@ -172,13 +172,13 @@ def test_a_budget_that_was_granted_is_in_force_again(
 ) -> None:
     seen, identity = state
     seen.set({"accuracy.tolerance": 1.0})
-    seen.shows_fewer_modes(organ.far.rank)
+    seen.shows_fewer_modes(organ.n_modes)
     wait_until_kept(state_dir / "contact.json", "accuracy.tolerance")
     before = seen.force(identity)
     cell.end("contact")
     cell.start("contact")
     seen.force(identity)
-    seen.shows_fewer_modes(organ.far.rank)
+    seen.shows_fewer_modes(organ.n_modes)
     np.testing.assert_allclose(seen.force(identity), before, rtol=1e-6, atol=1e-9)
 
 

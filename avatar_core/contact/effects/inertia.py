@@ -11,7 +11,8 @@ integrated by the midpoint rule,
 
 which conserves energy up to d v_mid^2 dt (Simo & Tarnow, ZAMP 43:757, 1992). The loads f of a
 period satisfy the contact conditions at its end: on a tip at rest their work is -lambda gap <= 0,
-so contact never adds energy. The near field has no mass.
+so contact never adds energy. The modes of the contact compliance beside the global ones have no
+mass, nor has its near field: they follow at once.
 """
 
 from __future__ import annotations
@@ -50,11 +51,11 @@ InertiaArrays = namedtuple("InertiaArrays", ["mass", "damping", "period"])
 InertiaState = namedtuple(
     "InertiaState",
     [
-        "mass",  # (k,) m_k [s^2]
-        "damping",  # (k,) d_k [s]
+        "mass",  # (n,) m_k [s^2] of the modes that have mass, the first
+        "damping",  # (n,) d_k [s]
         "period",  # (1,) dt [s]
         "modes",  # (k,) q
-        "velocity",  # (k,) q'
+        "velocity",  # (n,) q'
     ],
 )
 
@@ -80,16 +81,14 @@ def inertia_state(
 ) -> InertiaState:
     """State of an organ at rest, deformed by its weight if that is simulated."""
     still = np.zeros(n_modes) if self_weight is None else self_weight.amplitude.copy()
-    padding = n_modes - len(arrays.mass)
-    mass, drag = np.pad(arrays.mass, (0, padding)), np.pad(arrays.damping, (0, padding))
-    return InertiaState(mass, drag, arrays.period, still, np.zeros(n_modes))
+    return InertiaState(*arrays, still, np.zeros(len(arrays.mass)))
 
 
 @fast
 def predict_inertia(superposition, inertia, viscoelasticity, self_weight):  # type: ignore[no-untyped-def]
     """Modes at the end of the period without any load, and their gain by a unit load."""
     dt = inertia.period[0]
-    for k in range(superposition.free.shape[0]):
+    for k in range(inertia.mass.shape[0]):
         m, q, v = inertia.mass[k], inertia.modes[k], inertia.velocity[k]
         stiff, before, after = 1.0, q, q  # dR/dq, R now, R at the end for constant q
         if viscoelasticity is not None:
@@ -105,6 +104,10 @@ def predict_inertia(superposition, inertia, viscoelasticity, self_weight):  # ty
         middle = (2.0 * m * v / dt - 0.5 * (before + after)) / whole
         superposition.free[k] = q + dt * middle
         superposition.gain[k] = dt / whole
+    if viscoelasticity is not None:
+        for k in range(inertia.mass.shape[0], superposition.free.shape[0]):
+            superposition.free[k] = -viscoelasticity.gain[0] * viscoelasticity.held[k]
+            superposition.gain[k] = viscoelasticity.gain[0]
 
 
 @fast
@@ -115,8 +118,9 @@ def advance_inertia(superposition, inertia):  # type: ignore[no-untyped-def]
     dt = inertia.period[0]
     for k in range(superposition.total.shape[0]):
         new = superposition.total[k]
-        speed = 2.0 * (new - inertia.modes[k]) / dt - inertia.velocity[k]
-        inertia.velocity[k] = speed if abs(speed) > 1e-30 else 0.0
+        if k < inertia.mass.shape[0]:
+            speed = 2.0 * (new - inertia.modes[k]) / dt - inertia.velocity[k]
+            inertia.velocity[k] = speed if abs(speed) > 1e-30 else 0.0
         inertia.modes[k] = new if abs(new) > 1e-30 else 0.0
 
 

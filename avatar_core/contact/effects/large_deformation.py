@@ -44,8 +44,8 @@ LargeDeformationArrays = namedtuple(
     "LargeDeformationArrays",
     [
         "grid",  # (3, nx, ny, nz) beta_2, beta_3 and the reach where a tip is
-        "load",  # (2, n_positions, n) far part of V_2 and V_3
-        "near",  # (2, n_blocks, 3) their near part at the cloud
+        "load",  # (n_positions, 2, n) of V_2 and V_3 in the modes of a position's region
+        "start",  # (n_regions + 1,) of the region's modes among those of the cloud
     ],
 )
 LargeDeformationState = namedtuple(
@@ -53,7 +53,7 @@ LargeDeformationState = namedtuple(
     [
         "grid",
         "load",
-        "near",
+        "start",
         "coefficient",  # (T, 3) beta_2, beta_3 and the reach
         "coefficient_gradient",  # (T, 3, 3) their gradients
         "added_depth",  # (T, 4) k h, k dh/da, the integral of k h, k d2h/da2 at the reach
@@ -146,25 +146,9 @@ def powers_of_depth(state, large_deformation, t):  # type: ignore[no-untyped-def
 
 
 @fast
-def add_nonlinear_amplitudes(state, large_deformation, t, amplitude):  # type: ignore[no-untyped-def]
-    """Amplitudes of the nonlinear modes, the last of the cloud, for one tip."""
-    n_nonlinear = large_deformation.load.shape[2]
-    nonlinear = amplitude[amplitude.shape[0] - n_nonlinear :]
-    second, third = powers_of_depth(state, large_deformation, t)
-    for i in range(state.n_nodes[t]):
-        w, j = state.weight[t, i, 0], state.nodes[t, i]
-        w2, w3 = np.float32(w * second), np.float32(w * third)
-        y2, y3 = large_deformation.load[0, j], large_deformation.load[1, j]
-        for k in range(n_nonlinear):
-            nonlinear[k] += w2 * y2[k] + w3 * y3[k]
-
-
-@fast
-def add_nonlinear_near(model, state, large_deformation, j, w, second, third):  # type: ignore[no-untyped-def]
-    """Nonlinear near field around one load position."""
-    u = state.field
-    w2, w3 = np.float32(w * second), np.float32(w * third)
-    for e in range(model.near_start[j], model.near_start[j + 1]):
-        v = 3 * model.near_target[e]
-        for d in range(3):
-            u[v + d] += w2 * large_deformation.near[0, e, d] + w3 * large_deformation.near[1, e, d]
+def add_nonlinear_load(state, large_deformation, r, j, w, second, third):  # type: ignore[no-untyped-def]
+    """Amplitudes of the nonlinear modes of a region by a part w of a tip at a load position."""
+    amplitude = state.amplitude[large_deformation.start[r] : large_deformation.start[r + 1]]
+    w2, w3, load = np.float32(w * second), np.float32(w * third), large_deformation.load[j]
+    for k in range(amplitude.shape[0]):
+        amplitude[k] += w2 * load[0, k] + w3 * load[1, k]

@@ -37,12 +37,7 @@ from avatar_core.contact.effects.respiration import (
     respiration_arrays,
     respiration_state,
 )
-from avatar_core.contact.effects.self_weight import (
-    SelfWeight,
-    SelfWeightArrays,
-    body_first,
-    self_weight_arrays,
-)
+from avatar_core.contact.effects.self_weight import SelfWeight, SelfWeightArrays, self_weight_arrays
 from avatar_core.contact.effects.several_tools import (
     SeveralTools,
     SeveralToolsArrays,
@@ -138,16 +133,11 @@ def default_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
 def adapted_vademecum(
     vademecum: Vademecum, effects: Sequence[Effect]
 ) -> tuple[Vademecum, np.ndarray | None]:
-    """The vademecum in the modes that the effects need, and with inertia the mass of each mode.
-
-    The modes of the moving body come first, since a cloud may show only the first.
-    """
+    """The vademecum in the modes that the effects need, and with inertia the mass of each mode."""
     vademecum = at_contrast(vademecum, find(effects, Tumour))
     inertia = find(effects, Inertia)
     if inertia is not None:
         return vibration_modes(vademecum, inertia.density)
-    if find(effects, SelfWeight) is not None and vademecum.body is not None:
-        return body_first(vademecum), None
     return vademecum, None
 
 

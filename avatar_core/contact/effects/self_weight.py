@@ -7,15 +7,13 @@ the amplitudes X^T M 1 rho g, M the mass matrix of unit density. Viscoelastic ti
 from __future__ import annotations
 
 from collections import namedtuple
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from avatar_core.common.quantities import quantity
 from avatar_core.contact.effects.base import Effect, direction, require_body
-from avatar_core.reduction.separated import SeparatedField
-from avatar_core.vademecum.modal_mass import N_BODY, BodyResponse
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
@@ -40,16 +38,6 @@ class SelfWeight(Effect):
 
     def require(self, vademecum: Vademecum) -> None:
         require_body(vademecum, self.name)
-
-
-def body_first(vademecum: Vademecum) -> Vademecum:
-    """The vademecum with the modes of body forces, which are its last, before the others."""
-    far, body = vademecum.far, vademecum.body
-    assert body is not None  # by `require`
-    order = np.roll(np.arange(far.rank), N_BODY)
-    turned = BodyResponse(body.mass[np.ix_(order, order)], body.weight[order])
-    far = SeparatedField(far.space[:, order], far.load[:, order])
-    return replace(vademecum, far=far, body=turned)
 
 
 SelfWeightArrays = namedtuple("SelfWeightArrays", ["amplitude"])  # (k,) of the modes, under gravity

@@ -66,8 +66,9 @@ from avatar_core.geometry.tip import Tip
 
 PATCH = 0.7665  # c E* R_p on a half-space,
 # and on the elements of a liver: at 38 places of five livers the same patch sank 0.03 to 0.12 of
-# 1 / (E* R_p) deeper on elements that resolve it. 0.67 to 0.75 fit resolved contacts alike.
-PATCH_ON_MESH = 0.72
+# 1 / (E* R_p) deeper on elements that resolve it, and between load positions it is 0.5 % too stiff.
+# 0.67 to 0.75 fit resolved contacts alike.
+PATCH_ON_MESH = 0.723
 # Of the force, beside what the gap's slope is off one: with the patch's error they cover 92 % of
 # 297 contacts resolved on LiTS-4, -60 and -70, and are 2.9 times the true error in the median.
 LAW_ERROR = 0.006

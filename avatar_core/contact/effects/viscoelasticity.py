@@ -12,8 +12,9 @@ and exactly, for e linear in time over a period (Simo & Hughes, Computational In
 
 Within a period the organ therefore has the compliance C / A, A = g_inf + sum_i r_i, and its history
 acts as the load -(sum_i exp(-dt / tau_i) h_i - e sum_i r_i) / A: tissue that was touched recovers
-slowly. For the far field, e and h_i are stored as modal loads; for the near field, as loads on the
-positions that were touched, at most ``MAX_HISTORY``, of which the weakest are dropped first.
+slowly. For the modes of contact, e and h_i are stored as modal loads; for the near field and the
+modes of regions, as loads on the positions that were touched, at most ``MAX_HISTORY``, of which the
+weakest are dropped first.
 """
 
 from __future__ import annotations

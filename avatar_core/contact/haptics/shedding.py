@@ -3,8 +3,7 @@
 A window of steps is *overloaded* if too many periods were missed or steps took longer than the
 deadline, *calm* if almost none were and there is a margin. One overloaded window sheds a level, a
 number of calm ones in a row restores one; if the machine is then overloaded again, that number
-doubles. The lowest level is never shed, and every level has the near field: under a tip the organ
-looks right, and the force does not depend on what is shown.
+doubles. The lowest level is never shed; the force does not depend on what is shown.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ def _tip_force(
     """Error of the force on tips anywhere, and relative change by smoothing, each (n,)."""
     contacts = draw_contacts(vademecum, n, seed)
     surface, field = vademecum.surface, vademecum.tip_field
-    load = vademecum.far.load.reshape(surface.n_positions, 3, -1)
+    load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
     response = make_tip_response(surface, field, load, vademecum.contact_near, 0.0, HEIGHTS[1])
     slope = np.zeros(3)
     compliance, smoothing = (
@@ -148,7 +148,7 @@ def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: in
         vertex_contact_worst=float(all_of("vertex_contact").max()),
         n_loads=len(contact),
         seed=seed,
-        modes=vademecum.far.rank,
+        modes=vademecum.n_modes,
         force_error=calibrated(all_of("smoothing"), tip_force),
         curve=curve_of(vademecum, all_of("shown"), tip_force),
     )

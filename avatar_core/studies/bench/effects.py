@@ -85,10 +85,8 @@ class EffectRow:
 def build_for_effects(
     surface: SurfaceMesh, n_vertices: int, modes: int, progress: Progress
 ) -> Vademecum:
-    """A vademecum of exactly so many modes that serves all effects (minutes)."""
-    rule = BuildRule(
-        tolerance=1e-9, max_modes=modes, oversampling=1.2, most_oversampling=1.2, near_growth=1.0
-    )
+    """A vademecum of so many modes at most that serves all effects (minutes)."""
+    rule = BuildRule(max_modes=modes)
     mesh = tetrahedralize(surface, n_vertices)
     regions = regions_by_rule(mesh)
     elasticity = Elasticity(mesh, Material(), regions.clamped)
@@ -98,7 +96,7 @@ def build_for_effects(
         surface.name, elasticity, regions, loads, rule, provenance, progress, surface
     )
     problem = hyperelastic_problem(linear, "neo-hookean")
-    return with_large_deformation(linear, problem, "neo-hookean", LargeRule(), rule, progress)
+    return with_large_deformation(linear, problem, "neo-hookean", LargeRule(), progress)
 
 
 def run_effects_bench(
@@ -112,7 +110,7 @@ def run_effects_bench(
     """
     rows = effect_rows(vademecum, (*CASES, ("everything", 2, EVERYTHING)), progress)
     summary = {
-        "worst_single_ratio": max(row.ratio for row in rows[1:-1]),
+        "worst_single_ratio": float(np.nanmax([row.ratio for row in rows[1:-1]])),
         "everything_p99_us": rows[-1].p99_us,
     }
     if fused is not None:
@@ -148,6 +146,9 @@ def _row(
     own, ratio, contacts = [], [], []
     for _ in range(ROUNDS):
         micro, touching = _slide(model, path)
+        if len(micro) == 0:  # a punch leans too far off a surface that lies askew
+            nan = float("nan")
+            return EffectRow(name, model.n_tools, 0.0, nan, nan, nan, model.nbytes)
         contacts.append(touching.mean())
         own.append((np.median(micro), np.quantile(micro, 0.99)))
         ratio.append(own[-1][0] / np.median(_slide(bare, bare_path)[0]))

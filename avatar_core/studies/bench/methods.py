@@ -24,7 +24,6 @@ from avatar_core.contact.tool_path import slide, starts_apart
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.tip import Tip
-from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.vademecum.model import Vademecum
 
 RADIUS, DEPTH = 10e-3, 5e-3  # [m] of the benchmark's tip, and how deep it slides
@@ -55,20 +54,25 @@ class StepRow:
     bytes: int
 
 
-def time_steps(vademecum: Vademecum, n_tools: int) -> StepRow:
-    """Slide ``n_tools`` spheres of 10 mm, 5 mm deep, with the field at all vertices."""
-    model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume")
-    rank = vademecum.far.rank
-    return _timed("vademecum", vademecum, model, rank, n_tools, lambda tips: step(model, tips))
+def time_steps(vademecum: Vademecum, n_tools: int, modes: int | None = None) -> StepRow:
+    """Slide ``n_tools`` spheres of 10 mm, 5 mm deep, with the field at all vertices.
+
+    modes : that are shown at a place; None for all
+    """
+    model = prepare(vademecum, (SPHERE,) * n_tools, modes, cloud="volume")
+    shown = model.n_modes
+    return _timed("vademecum", vademecum, model, shown, n_tools, lambda tips: step(model, tips))
 
 
-def time_tip_over_patch(vademecum: Vademecum, clock: Clock = time.process_time) -> float:
+def time_tip_over_patch(
+    vademecum: Vademecum, modes: int, clock: Clock = time.process_time
+) -> float:
     """Median step with a sphere over that with the patch alone, whose response is all linear.
 
     Both slide in turn; the median over the pairs of slides.
     """
     tips = tool_paths(vademecum, 1)
-    models = [prepare(vademecum, (tip,), cloud="volume") for tip in (SPHERE, PATCH)]
+    models = [prepare(vademecum, (tip,), modes, cloud="volume") for tip in (SPHERE, PATCH)]
 
     def p50(model: ContactModel) -> float:
         return float(np.median(one_pass(model, tips, lambda at: step(model, at), clock)[0]))
@@ -86,9 +90,8 @@ def time_dense_table(
         nan = float("nan")
         return StepRow("dense table", n_v, 0, n_tools, nan, 0, nan, nan, size)
     model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume")
-    load = vademecum.far.load.reshape(n_s, 3, -1)
-    columns = _dense(vademecum.far.space, load, vademecum.near, n_v).reshape(n_s, 3, 3 * n_v)
-    compliance = _dense(vademecum.far.load, load, vademecum.contact_near, n_s)
+    columns = _columns(vademecum)
+    compliance = _compliance(vademecum)
 
     effects = model.effects._replace(large_deformation=None)
 
@@ -184,10 +187,22 @@ def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000, tip: Tip = SPH
     return np.ascontiguousarray(np.stack(paths, axis=1))
 
 
-def _dense(space: np.ndarray, load: np.ndarray, near: LocalBlocks, n_targets: int) -> np.ndarray:
-    """All columns, shape (n_positions, 3, n_targets, 3): direction, target, component."""
-    n, _, rank = load.shape
-    dense = (load.reshape(-1, rank) @ space.T).reshape(n, 3, n_targets, 3)
+def _columns(vademecum: Vademecum) -> np.ndarray:
+    """Displacement under every load, shape (n_positions, 3, 3 n_vertices)."""
+    far, regional = vademecum.far, vademecum.regional
+    n = vademecum.surface.n_positions
+    out = (far.load @ far.space.T).reshape(n, 3, -1).astype(np.float32)
+    for r in range(regional.n_regions):
+        at, modes = regional.region == r, regional.modes(r)
+        out[at] += regional.load[at, :, : modes.shape[1]] @ modes.T
+    return np.ascontiguousarray(out)
+
+
+def _compliance(vademecum: Vademecum) -> np.ndarray:
+    """Between all load positions, shape (n, 3, n, 3): position, direction, position, component."""
+    load, near = vademecum.contact_load, vademecum.contact_near
+    n = vademecum.surface.n_positions
+    dense = (load @ load.T).reshape(n, 3, n, 3)
     for j in range(n):
         row = slice(near.start[j], near.start[j + 1])
         dense[j][:, near.target[row]] += near.block[row].transpose(2, 0, 1)

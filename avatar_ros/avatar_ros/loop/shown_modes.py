@@ -43,9 +43,10 @@ class ShownModes:
         if curve is not None:
             self._points = {p.detail.modes: p for p in curve.points}
         levels = list(self._points) or list(mode_levels(model.n_modes))
-        self._shedder = Shedder(
-            [*(n for n in levels if n < model.n_modes), model.n_modes], deadline
-        )
+        # no fewer than global ones and some of the region: under a tip the organ looks right
+        least = min(model.n_global, model.n_modes - 1)
+        fewer = (n for n in levels if least < n < model.n_modes)
+        self._shedder = Shedder([*fewer, model.n_modes], deadline)
 
     @property
     def promise(self) -> str:

@@ -26,7 +26,7 @@ PATIENT_INTERPOLATION = (
     Parameter(
         "vertices", 2850, "approximate number of vertices of a patient's mesh", range=(100, 50_000)
     ),
-    Parameter("modes", 100, "largest number of far-field modes", range=(1, 1000)),
+    Parameter("modes", 100, "largest number of modes at a place", range=(1, 1000)),
     Parameter(
         "weighting", "kriging", "weights of the neighbours: kriging, lle-template or lle-grid"
     ),

@@ -1,0 +1,170 @@
+"""Fields separated region by region: least errors, told errors, one field across borders."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from avatar_core.contact.cloud_kernels import MAX_PAST, _fade_regions
+from avatar_core.contact.effects import Viscoelasticity
+from avatar_core.contact.model import prepare, step
+from avatar_core.contact.tool_path import slide
+from avatar_core.geometry.tip import Tip
+from avatar_core.reduction.regional import RegionalField, RegionalRule, regions_of, separate_regions
+from avatar_core.vademecum.model import Vademecum
+
+N_VERTICES, N_POSITIONS, N_LOADS = 40, 24, 3
+HALF = 5e-4  # of half precision, in which modes are kept
+
+
+@pytest.fixture
+def columns() -> np.ndarray:
+    """Smooth fields of positions on a line: neighbours look alike, shape (3 n_v, n, 3)."""
+    x = np.linspace(0.0, 1.0, 3 * N_VERTICES)[:, None, None]
+    s = np.linspace(0.0, 1.0, N_POSITIONS)[None, :, None]
+    direction = np.array([1.0, 0.3, -0.7])
+    return np.asarray(np.exp(-30.0 * (x - s) ** 2) * direction + 0.1 * np.sin(9 * x * direction))
+
+
+MASS = np.linspace(0.5, 2.0, 3 * N_VERTICES)
+REGION = np.repeat([0, 1, 2], N_POSITIONS // 3).astype(np.int32)
+
+
+def separated(columns: np.ndarray, rule: RegionalRule) -> tuple[RegionalField, np.ndarray]:
+    size = np.sqrt(np.einsum("x,xij->ij", MASS, columns**2))
+    return separate_regions(REGION, lambda at: columns[:, at], size, MASS, rule)
+
+
+def true_errors(field: RegionalField, columns: np.ndarray) -> np.ndarray:
+    size = np.sqrt(np.einsum("x,xij->ij", MASS, columns**2))
+    left = np.stack(
+        [columns[:, j] - field.combined(np.array([j]), np.ones(1)) for j in range(N_POSITIONS)], 1
+    )
+    return np.asarray(np.sqrt(np.einsum("x,xij->ij", MASS, left**2)) / size)
+
+
+def test_errors_that_are_told_are_those_that_are_left(columns: np.ndarray) -> None:
+    for most in (2, 4, 7):
+        field, errors = separated(columns, RegionalRule(0.0, 0.0, most))
+        assert field.rank == most and (np.diff(field.start) == most).all()
+        np.testing.assert_allclose(errors[most], true_errors(field, columns), atol=2 * HALF)
+
+
+def test_the_tolerance_is_met_with_as_few_modes_as_do(columns: np.ndarray) -> None:
+    rule = RegionalRule(tolerance=0.02, worst=0.06, most=20)
+    field, errors = separated(columns, rule)
+    found = true_errors(field, columns)
+    for region, rank in enumerate(np.diff(field.start)):
+        here = region == REGION
+        assert found[here].mean() < rule.tolerance + HALF
+        assert found[here].max() < rule.worst + HALF
+        fewer = errors[rank - 1, here]
+        assert fewer.mean() > rule.tolerance or fewer.max() > rule.worst
+    assert field.rank < 20
+
+
+def test_no_basis_of_as_many_modes_leaves_less(columns: np.ndarray) -> None:
+    """In the sense of the mean square of relative errors, against random and smooth bases."""
+    _, errors = separated(columns, RegionalRule(0.0, 0.0, 3))
+    here = REGION == 1
+    size = np.sqrt(np.einsum("x,xij->ij", MASS, columns**2))
+    scaled = (np.sqrt(MASS)[:, None, None] * columns / size)[:, here].reshape(len(MASS), -1)
+    least = (errors[3, here] ** 2).sum()
+    rng = np.random.default_rng(0)
+    for basis in (rng.standard_normal((len(MASS), 3)), scaled[:, ::8][:, :3]):
+        q = np.linalg.qr(basis)[0]
+        assert ((scaled - q @ (q.T @ scaled)) ** 2).sum() > least
+
+
+def test_truncated_and_scaled_fields_are_those_of_fewer_modes_and_other_loads(
+    columns: np.ndarray,
+) -> None:
+    field, errors = separated(columns, RegionalRule(0.0, 0.0, 6))
+    np.testing.assert_allclose(true_errors(field.truncated(2), columns), errors[2], atol=2 * HALF)
+    assert field.truncated(9) is field
+    assert field.truncated(0).space.shape[1] == 0
+    at, weights = np.array([3, 20]), np.array([0.25, 0.75])
+    np.testing.assert_allclose(
+        field.scaled(3.0).combined(at, weights), 3.0 * field.combined(at, weights), rtol=1e-4
+    )
+
+
+def test_regions_are_compact_and_the_same_every_time() -> None:
+    centers = np.random.default_rng(3).uniform(size=(300, 3))
+    region = regions_of(centers, 12)
+    np.testing.assert_array_equal(region, regions_of(centers, 12))
+    assert set(region) == set(range(region.max() + 1)) and region.max() >= 9
+    within = np.mean([centers[region == r].var(axis=0).sum() for r in range(region.max() + 1)])
+    assert within < 0.3 * centers.var(axis=0).sum()
+    assert set(regions_of(centers[:2], 12)) == {0, 1}
+
+
+def test_no_field_has_no_modes_and_no_displacement() -> None:
+    none = RegionalField.none(N_VERTICES, N_POSITIONS)
+    assert none.rank == 0 and none.n_regions == 1
+    assert not none.combined(np.array([0, 5]), np.ones(2)).any()
+
+
+def test_displacement_and_force_cross_borders_of_regions_without_a_jump(
+    phantom_vademecum: Vademecum,
+) -> None:
+    """A tenth of a millimetre moves the cloud as little at a border as within a region."""
+    v, tip = phantom_vademecum, Tip("sphere", 8e-3)
+    model = prepare(v, (tip,), cloud="volume", precision="float32")
+    path = slide(v, tip.offset, 4e-3, 0.12)
+    quarters = np.arange(0.0, len(path) - 1.0, 0.25)
+    fine = np.column_stack([np.interp(quarters, np.arange(len(path)), x) for x in path.T])
+    moved, force, regions = [], [], []
+    for at in fine:
+        step(model, at[None].copy())
+        moved.append(model.out.cloud[:, 3:].astype(float).copy())
+        force.append(model.out.force[0].copy())
+        regions.append(frozenset(model.state.touched[: model.state.n_touched[0]].tolist()))
+    change = np.array([np.abs(b - a).max() for a, b in pairwise(moved)])
+    turns = np.array([a != b for a, b in pairwise(regions)])
+    assert turns.sum() >= 4  # the way leads through several regions
+    assert np.isfinite(change).all() and change.max() > 0.0
+    usual = np.quantile(change[~turns], 0.99)
+    assert change[turns].max() < 2.0 * usual
+    pull = np.linalg.norm(np.diff(force, axis=0), axis=1)
+    assert pull[turns].max() < 2.0 * np.quantile(pull[~turns], 0.99)
+
+
+def test_a_history_in_many_regions_is_shown_without_a_jump(phantom_vademecum: Vademecum) -> None:
+    """Of soft tissue that was stroked across many regions, those that moved most stay shown."""
+    v, tip = phantom_vademecum, Tip("sphere", 8e-3)
+    slow = Viscoelasticity((0.95,), (2.0,))
+    model = prepare(v, (tip,), cloud="volume", precision="float32", effects=(slow,))
+    path = slide(v, tip.offset, 4e-3, 0.25)
+    shown, change, turns, before = [], [], [], None
+    for at in path:
+        step(model, at[None].copy())
+        cloud = model.out.cloud[:, 3:].astype(float).copy()
+        shown.append(frozenset(model.state.touched[: model.state.n_touched[0]].tolist()))
+        if before is not None:
+            change.append(np.abs(cloud - before).max())
+            turns.append(shown[-1] != shown[-2])
+        before = cloud
+    seen = frozenset().union(*shown)
+    assert len(seen) > MAX_PAST + 2  # more were stroked than are shown
+    assert max(len(regions) for regions in shown) <= MAX_PAST + 4
+    assert np.max(change, where=turns, initial=0.0) < 2.0 * np.quantile(change, 0.99)
+
+
+def test_regions_fade_before_they_are_left_out(phantom_vademecum: Vademecum) -> None:
+    """Of seven, four stay, each less what the fifth moves: whichever it is, nothing jumps."""
+    model = prepare(phantom_vademecum, cloud="volume", precision="float32")
+    state, start = model.state, model.arrays.region_start
+    moved = np.arange(7.0, 0.0, -1.0)
+    state.n_touched[0], state.touched[:7] = 7, np.arange(7)
+    state.is_touched[:7] = True
+    state.amplitude[:] = 0.0
+    state.amplitude[start[:7]] = moved / model.arrays.space_scale[start[:7]]
+    _fade_regions(model.arrays, state)
+    assert state.n_touched[0] == MAX_PAST
+    assert state.touched[:MAX_PAST].tolist() == [0, 1, 2, 3]
+    assert state.is_touched[:7].tolist() == [True] * 4 + [False] * 3
+    kept = state.amplitude[start[:4]] * model.arrays.space_scale[start[:4]]
+    np.testing.assert_allclose(kept, moved[:4] - moved[4], rtol=1e-5)
