@@ -33,8 +33,13 @@ _PACKED_FROM = 1 << 16  # bytes of an array from which it is compressed, without
 _PACKING = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
-def replace_file(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> None:
+def replace_file(
+    path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, str], packed: bool = False
+) -> None:
     """Write arrays and attributes with their checksum, replacing a file atomically.
+
+    packed : compress large arrays, without loss; not for arrays that are almost constant, as what
+        a file claims may exceed its size ``MAX_EXPANSION`` times only
 
     Raises
     ------
@@ -43,7 +48,7 @@ def replace_file(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str
     """
     if not path.parent.is_dir():
         raise StorageError(f"folder {path.parent} does not exist; create it first")
-    content = encoded(arrays, attributes)
+    content = encoded(arrays, attributes, packed)
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
         try:
@@ -63,7 +68,9 @@ def replace_file(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str
         ) from error
 
 
-def encoded(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> memoryview:
+def encoded(
+    arrays: dict[str, np.ndarray], attributes: dict[str, str], packed: bool = False
+) -> memoryview:
     """The HDF5 file in memory: on a full disk, HDF5 itself would crash."""
     content = io.BytesIO()
     # the latest layout keeps an array of one chunk without an index, in which damage would hide
@@ -71,7 +78,7 @@ def encoded(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> memory
         for key, value in attributes.items():
             file.attrs[key] = value
         for key, array in arrays.items():
-            large = array.nbytes > _PACKED_FROM
+            large = packed and array.nbytes > _PACKED_FROM
             how = {**_PACKING, "chunks": array.shape} if large else {}
             file.create_dataset(key, data=array, **how)
         file.attrs["checksum"] = checksum(arrays, attributes)

@@ -101,7 +101,7 @@ def save_vademecum(vademecum: Vademecum, path: str | Path) -> str:
         If the folder does not exist or the disk is full; nothing is left behind.
     """
     arrays, attributes = _arrays(vademecum), _attributes(vademecum)
-    replace_file(Path(path), arrays, attributes)
+    replace_file(Path(path), arrays, attributes, packed=True)
     return id_of(arrays, attributes)
 
 

@@ -175,6 +175,13 @@ def test_a_scene_of_an_earlier_version_is_refused(organ: Vademecum) -> None:
         replay(old, organ)
 
 
+def test_an_organ_that_hardly_moves_is_recorded(organ: Vademecum, tmp_path: Path) -> None:
+    """Two minutes of zeros take their space, so that the size that is claimed is the file's."""
+    still = Clouds(np.arange(900), np.zeros((900, 300, 3), np.float32))
+    save_recording(replace(recorded(organ, ()), clouds=still), tmp_path / "still.h5")
+    assert load_recording(tmp_path / "still.h5").clouds.displacement.shape == (900, 300, 3)
+
+
 def test_a_spoilt_file_is_refused(organ: Vademecum, tmp_path: Path) -> None:
     file = tmp_path / "push.h5"
     save_recording(recorded(organ, ()), file)
