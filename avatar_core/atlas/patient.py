@@ -44,7 +44,7 @@ from avatar_core.reduction.galerkin import (
     residual_compliance_blocks,
 )
 from avatar_core.reduction.near_field import LocalBlocks, taper
-from avatar_core.reduction.regional import RegionalField, regions_of, separate_regions
+from avatar_core.reduction.regional import RegionalField, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import load_map
@@ -379,13 +379,12 @@ def _regional(
     modes: SeparatedField, n_global: int, problem: PatientProblem, rule: BuildRule
 ) -> RegionalField:
     """The modes beyond the global ones, separated by regions of the load surface."""
-    loads, mass = problem.loads, problem.mesh.lumped_mass
+    mass = problem.mesh.lumped_mass
     root = np.asarray(np.linalg.qr(np.sqrt(mass)[:, None] * modes.space, mode="r"))
     size = np.linalg.norm(modes.load @ root.T, axis=1).reshape(-1, 3)
     space, load = modes.space[:, n_global:], modes.load[:, n_global:].reshape(len(size), 3, -1)
-    n_regions = rule.n_regions(loads.area, loads.patch_radius, loads.n_positions)
     return separate_regions(
-        regions_of(loads.centers, n_regions),
+        rule.regions(problem.loads),
         lambda positions: np.tensordot(space, load[positions], ([1], [2])),
         np.maximum(size, 1e-300),
         mass,
@@ -397,7 +396,7 @@ def _with_gram_of(
     load: np.ndarray, near: LocalBlocks, surface: LoadSurface, reach: float
 ) -> LocalBlocks:
     """Blocks and the tapered compliance of modes that are left out, Y Y^T."""
-    distance = np.linalg.norm(surface.centers[near.position] - surface.centers[near.target], axis=1)
+    distance = near.distances(surface.centers)
     zero = replace(near, block=np.zeros_like(near.block))
     left = remainder(zero, load, taper(distance / reach))
     return replace(near, block=near.block - left.block)

@@ -123,9 +123,7 @@ def _load_regions(model, state, large_deformation, friction, viscoelasticity, t)
     for i in range(state.n_nodes[t]):
         region_weight[model.region[state.nodes[t, i]]] += state.weight[t, i, 0]
     for i in range(state.n_nodes[t]):
-        whole = region_weight[model.region[state.nodes[t, i]]]
-        if whole != 0.0:
-            kept += state.weight[t, i, 0] * _soft_threshold(whole) / whole
+        kept += _kept_weight(model, state, t, i)
     n, scale = state.normal[t], state.scale[t] / kept
     f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
     if friction is not None:
@@ -134,19 +132,22 @@ def _load_regions(model, state, large_deformation, friction, viscoelasticity, t)
     if large_deformation is not None:
         second, third = powers_of_depth(state, large_deformation, t)
     for i in range(state.n_nodes[t]):
-        j = state.nodes[t, i]
-        whole = region_weight[model.region[j]]
-        if whole == 0.0:
-            continue
-        w = state.weight[t, i, 0] * _soft_threshold(whole) / whole
+        j, w = state.nodes[t, i], _kept_weight(model, state, t, i)
         if w != 0.0:
-            _touch(model, state, large_deformation, model.region[j])
+            r = model.region[j]
+            _touch(model, state, large_deformation, r)
             if viscoelasticity is None:
                 part = w * scale
                 _add_load(model, state, j, part * f0, part * f1, part * f2)
             if large_deformation is not None:
-                r = model.region[j]
                 add_nonlinear_load(state, large_deformation, r, j, w / kept, second, third)
+
+
+@inlined
+def _kept_weight(model, state, t, i):  # type: ignore[no-untyped-def]
+    """Weight of a load position, less what its region as a whole has faded."""
+    whole = state.region_weight[model.region[state.nodes[t, i]]]
+    return state.weight[t, i, 0] * _soft_threshold(whole) / whole if whole != 0.0 else 0.0
 
 
 @inlined

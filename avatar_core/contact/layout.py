@@ -243,8 +243,7 @@ def _force_error(
 
 def _reach(near: LocalBlocks, centers: np.ndarray) -> float:
     """Longest distance between the two positions of a block [m]."""
-    distance = np.linalg.norm(centers[near.position] - centers[near.target], axis=1)
-    return float(distance.max(initial=0.0)) * (1.0 + 1e-9)
+    return float(near.distances(centers).max(initial=0.0)) * (1.0 + 1e-9)
 
 
 def _padded(load: np.ndarray) -> np.ndarray:

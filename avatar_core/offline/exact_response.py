@@ -102,9 +102,7 @@ def contact_near(
     load : ndarray, shape (n_loads, rank), Y
     support : [m]
     """
-    distance = np.linalg.norm(
-        surface.centers[exact.position] - surface.centers[exact.target], axis=1
-    )
+    distance = exact.distances(surface.centers)
     return _symmetrized(remainder(exact, load, taper(distance / support)))
 
 

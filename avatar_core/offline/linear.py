@@ -29,7 +29,7 @@ from avatar_core.offline.exact_response import (
 )
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.reduction.pgd import EnrichmentReport, PGDRule, SolvedLoads, solve_pgd
-from avatar_core.reduction.regional import RegionalField, regions_of, separate_regions
+from avatar_core.reduction.regional import RegionalField, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.modal_mass import LEAST_MODES, N_BODY, body_functions, body_response
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
@@ -176,12 +176,10 @@ def regional_field(
     progress: Progress = silent,
 ) -> tuple[RegionalField, tuple[RankError, ...]]:
     """What the global modes leave, by regions, and the error for numbers of modes at a place."""
-    n = surface.n_positions
-    region = regions_of(surface.centers, rule.n_regions(surface.area, surface.patch_radius, n))
     regional, errors = separate_regions(
-        region,
+        rule.regions(surface),
         lambda positions: response.remainder(far, positions),
-        response.norm.reshape(n, 3),
+        response.norm.reshape(-1, 3),
         elasticity.mesh.lumped_mass,
         rule.regional,
         lambda fraction: progress("regions", fraction, NO_ERROR),

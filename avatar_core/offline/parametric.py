@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -40,7 +39,7 @@ from avatar_core.offline.linear import Modes, find_modes, rank_errors
 from avatar_core.offline.rule import BuildRule, Progress, silent
 from avatar_core.reduction.coordinates import Coordinate, node_values, problem_at
 from avatar_core.reduction.near_field import LocalBlocks
-from avatar_core.reduction.regional import RegionalField, regions_of, separate_regions
+from avatar_core.reduction.regional import RegionalField, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.certificate import Certificate
@@ -56,7 +55,9 @@ from avatar_core.vademecum.parametric import (
     ParametricResponse,
     galerkin_field,
     regional_load_of_basis,
+    stiffness_root,
 )
+from avatar_core.vademecum.tip_field import TipField
 
 _DRAWN = 6  # random values that a certificate is made at
 
@@ -65,8 +66,8 @@ _DRAWN = 6  # random values that a certificate is made at
 class _Snapshot:
     """The full solutions at one node, and the modes that PGD found there.
 
-    response : without its compliance, of which ``contact`` is what lies near
-    space : (3 n_nodes, n) float32; load : (n_loads, n)
+    response : without its compliance, of which ``contact`` is what lies near [m/N]
+    modes : Modes, their space (3 n_nodes, n) in single precision
     """
 
     elasticity: Elasticity
@@ -79,6 +80,8 @@ class _Snapshot:
 class _Basis:
     """A space basis and the terms of the stiffness in it.
 
+    field : V at the vertices (3 n_vertices, n), and V^T f (n_loads, n)
+    operators : ndarray, shape (n_terms, n, n), A_q
     n_global : functions of the global modes, those of the body last among them
     body : of all functions, or None
     """
@@ -117,24 +120,11 @@ def build_parametric_vademecum(
         for k, values in enumerate(nodes)
     ]
     basis = _project(snapshots, _principal(snapshots, rule), loads, rule)
-    whole, errors = _assemble(name, elasticity, surface, tuple(coordinates), rule, snapshots, basis)
-    last = errors[-1]
-    vademecum = Vademecum(
-        name=name,
-        mesh=elasticity.mesh,
-        regions=regions,
-        surface=surface,
-        element=elasticity.element,
-        tip_field=make_felt_field(elasticity.mesh, regions, surface.patch_radius, outline),
-        provenance=provenance,
-        convergence=Convergence(
-            rule.is_met(last.mean, last.worst),
-            rule.tolerance,
-            tuple(report for snapshot in snapshots for report in snapshot.modes.history),
-            errors,
-        ),
-        **whole,
+    field = make_felt_field(elasticity.mesh, regions, surface.patch_radius, outline)
+    vademecum = _assemble(
+        name, elasticity, regions, surface, tuple(coordinates), rule, snapshots, basis, field
     )
+    vademecum = replace(vademecum, provenance=provenance)
     return at_values(vademecum, _inside(coordinates, elasticity))
 
 
@@ -231,13 +221,15 @@ def _projected_terms(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
 def _assemble(
     name: str,
     elasticity: Elasticity,
+    regions: Regions,
     surface: LoadSurface,
     coordinates: tuple[Coordinate, ...],
     rule: BuildRule,
     snapshots: Sequence[_Snapshot],
     basis: _Basis,
-) -> tuple[dict[str, Any], tuple[RankError, ...]]:
-    """The fields of a vademecum at the first node and the data of its coordinates; its errors."""
+    tip_field: TipField,
+) -> Vademecum:
+    """Regional modes of all nodes, near fields at each; the own fields are those of the first."""
     single = SeparatedField(
         basis.field.space.astype(np.float32), basis.field.load.astype(np.float32)
     )
@@ -253,35 +245,47 @@ def _assemble(
         young_modulus=elasticity.material.young_modulus,
         body=basis.body,
     )
-    fields = [galerkin_field(parametric, s.elasticity.factors) for s in snapshots]
+    roots = [stiffness_root(parametric, s.elasticity.factors) for s in snapshots]
+    fields = [galerkin_field(parametric, root) for root in roots]
     regional, load, errors = _regional(snapshots, [far for far, _, _ in fields], surface, rule)
     mass = elasticity.mesh.lumped_mass
     projection = regional.coefficients(single.space, mass).astype(np.float32)
     parametric = replace(parametric, projection=projection)
     left = load.copy()
-    for k, (snapshot, (_, trailing, _)) in enumerate(zip(snapshots, fields, strict=True)):
-        factors = snapshot.elasticity.factors
-        left[k] -= regional_load_of_basis(parametric, factors, trailing, regional)
+    for k, (root, (_, trailing, _)) in enumerate(zip(roots, fields, strict=True)):
+        left[k] -= regional_load_of_basis(parametric, root, trailing, regional)
     support = rule.contact_support * surface.patch_radius
     contact = [
         contact_near(s.contact, np.hstack([far.load, trailing]), surface, support)
         for s, (far, trailing, _) in zip(snapshots, fields, strict=True)
     ]
     first, (far, trailing, body) = snapshots[0].elasticity, fields[0]
-    return {
-        "material": first.material,
-        "far": far,
-        "trailing": trailing,
-        "body": body,
-        "regional": replace(regional, load=load[0]),
-        "contact_near": contact[0],
-        "parametric": replace(
+    last = errors[-1]
+    history = tuple(report for snapshot in snapshots for report in snapshot.modes.history)
+    return Vademecum(
+        name=name,
+        mesh=elasticity.mesh,
+        regions=regions,
+        material=first.material,
+        element=elasticity.element,
+        surface=surface,
+        far=far,
+        regional=replace(regional, load=load[0]),
+        trailing=trailing,
+        contact_near=contact[0],
+        tip_field=tip_field,
+        convergence=Convergence(
+            rule.is_met(last.mean, last.worst), rule.tolerance, history, errors
+        ),
+        provenance=Provenance(name, ""),
+        parametric=replace(
             parametric,
             regional_load=left,
             contact_near=np.stack([blocks.block for blocks in contact]),
         ),
-        "contrast": first.inclusion.contrast if first.inclusion else None,
-    }, errors
+        contrast=first.inclusion.contrast if first.inclusion else None,
+        body=body,
+    )
 
 
 def _regional(
@@ -298,7 +302,7 @@ def _regional(
         return np.concatenate([s.response.remainder(f, positions) for s, f in pairs], axis=2)
 
     regional, errors = separate_regions(
-        regions_of(surface.centers, rule.n_regions(surface.area, surface.patch_radius, n)),
+        rule.regions(surface),
         columns,
         np.hstack([s.response.norm.reshape(n, 3) for s in snapshots]),
         snapshots[0].elasticity.mesh.lumped_mass,

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from avatar_core.reduction.regional import RegionalRule
+from avatar_core.common.arrays import IntArray
+from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.reduction.regional import RegionalRule, regions_of
 
 Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
 NO_ERROR = float("nan")
@@ -52,10 +54,10 @@ class BuildRule:
         most = self.max_modes - self.n_global
         return RegionalRule(self.tolerance, self.worst_over_mean * self.tolerance, most)
 
-    def n_regions(self, area: float, radius: float, n_positions: int) -> int:
-        """Regions of a load surface of some area [m^2] and patch radius [m]."""
-        wanted = round(area / (self.region_area * radius**2))
-        return max(1, min(wanted, n_positions // _REGION_POSITIONS))
+    def regions(self, surface: LoadSurface) -> IntArray:
+        """Region of each load position, shape (n_positions,) int32."""
+        wanted = round(surface.area / (self.region_area * surface.patch_radius**2))
+        return regions_of(surface.centers, min(wanted, surface.n_positions // _REGION_POSITIONS))
 
     def is_met(self, mean: float, worst: float) -> bool:
         """Whether errors over the build's own loads are as small as asked for."""

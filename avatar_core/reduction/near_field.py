@@ -38,6 +38,10 @@ class LocalBlocks:
         """Row of every block, shape (n_blocks,)."""
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
 
+    def distances(self, centers: np.ndarray) -> np.ndarray:
+        """Between the two positions of every block, of positions (n, 3) [m], shape (n_blocks,)."""
+        return np.asarray(np.linalg.norm(centers[self.position] - centers[self.target], axis=1))
+
     @property
     def is_upper(self) -> np.ndarray:
         """Whether a block's target is its position or after it, shape (n_blocks,)."""

@@ -17,7 +17,7 @@ once (a subspace iteration, each pair normalized against the others). ``block = 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
@@ -178,15 +178,12 @@ class LoadProblem:
 
     elasticity : Elasticity, solves with and applies K
     loads : sparse, shape (3 n_nodes, n_loads)
-    single : solve in single precision; modes are K-orthonormal, and Y = F^T X, in double all the
-        same
     """
 
     elasticity: Elasticity
     loads: sp.csr_matrix
     weights: np.ndarray
     energy: np.ndarray
-    single: bool = False
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -197,7 +194,7 @@ class LoadProblem:
         return 1e-6
 
     def solve(self, amounts: np.ndarray) -> np.ndarray:
-        return self.elasticity.solve(self.loads @ amounts, self.single).astype(float)
+        return self.elasticity.solve(self.loads @ amounts)
 
     def observe(self, space: np.ndarray) -> np.ndarray:
         return np.asarray(self.loads.T @ space)
@@ -240,10 +237,7 @@ class SolvedLoads:
 
 
 def solve_pgd(
-    problem: PGDProblem,
-    rule: PGDRule,
-    progress: Callable[[int], None] = lambda rank: None,
-    reweigh: Callable[[np.ndarray, np.ndarray], np.ndarray | None] | None = None,
+    problem: PGDProblem, rule: PGDRule, progress: Callable[[int], None] = lambda rank: None
 ) -> PGDSolution:
     """Greedy enrichment with alternating directions until the rule stops it.
 
@@ -252,9 +246,6 @@ def solve_pgd(
     problem : LoadProblem or SolvedLoads
     rule : PGDRule
     progress : called with the rank after every enrichment
-    reweigh : called with the new space and load functions; returns the weights of the loads for
-        the next enrichment, so that the norm can follow the error that matters, or None to stop
-        because that error is small enough
 
     Raises
     ------
@@ -270,12 +261,6 @@ def solve_pgd(
         report = _enrich(expansion, rule)
         history.append(report)
         progress(expansion.rank)
-        if reweigh is not None:
-            new = slice(expansion.rank - report.modes, expansion.rank)
-            weights = reweigh(expansion.space[:, new], expansion.load[:, new])
-            if weights is None:
-                break
-            expansion.problem = replace(expansion.problem, weights=weights)  # type: ignore[type-var]
         if report.status is EnrichmentStatus.EXHAUSTED:
             break
     return PGDSolution(expansion.space.copy(), expansion.load.copy(), tuple(history))

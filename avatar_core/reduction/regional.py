@@ -41,16 +41,6 @@ class RegionalField:
     space: FloatArray
     load: FloatArray
 
-    @classmethod
-    def none(cls, n_vertices: int, n_positions: int, n_loads: int = 3) -> RegionalField:
-        """A field that is zero: one region without modes."""
-        return cls(
-            np.zeros(n_positions, np.int32),
-            np.zeros(2, np.int64),
-            np.zeros((3 * n_vertices, 0), np.float16),
-            np.zeros((n_positions, n_loads, 0), np.float32),
-        )
-
     @property
     def n_regions(self) -> int:
         """Number of regions."""

@@ -11,7 +11,12 @@ from avatar_core.fem.elasticity import Material, factors_at
 from avatar_core.reduction.coordinates import node_weights, require_known
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.model import Vademecum
-from avatar_core.vademecum.parametric import combined, galerkin_field, regional_load_of_basis
+from avatar_core.vademecum.parametric import (
+    combined,
+    galerkin_field,
+    regional_load_of_basis,
+    stiffness_root,
+)
 
 
 def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
@@ -42,9 +47,9 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     material = replace(material, poisson_ratio=point.get("poisson", material.poisson_ratio))
     contrast = point.get("contrast", vademecum.contrast)
     reference = replace(material, young_modulus=parametric.young_modulus)
-    factors = factors_at(reference, contrast)
-    far, trailing, body = galerkin_field(parametric, factors)
-    regional_load = regional_load_of_basis(parametric, factors, trailing, vademecum.regional)
+    root = stiffness_root(parametric, factors_at(reference, contrast))
+    far, trailing, body = galerkin_field(parametric, root)
+    regional_load = regional_load_of_basis(parametric, root, trailing, vademecum.regional)
     regional_load += combined(parametric.regional_load, weights)
     at_reference = replace(
         vademecum,

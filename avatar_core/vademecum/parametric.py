@@ -57,8 +57,14 @@ class ParametricResponse:
     body: BodyResponse | None = None
 
 
+def stiffness_root(parametric: ParametricResponse, factors: np.ndarray) -> np.ndarray:
+    """L of A(p) = L L^T for the factors theta_q(p), lower triangular, shape (n, n)."""
+    stiffness = np.tensordot(factors, parametric.operators, axes=1)
+    return np.asarray(np.linalg.cholesky((stiffness + stiffness.T) / 2.0))
+
+
 def galerkin_field(
-    parametric: ParametricResponse, factors: np.ndarray
+    parametric: ParametricResponse, root: np.ndarray
 ) -> tuple[SeparatedField, np.ndarray, BodyResponse | None]:
     """The K(p)-orthonormal response in the space of the basis.
 
@@ -68,17 +74,15 @@ def galerkin_field(
     Parameters
     ----------
     parametric : ParametricResponse
-    factors : theta_q(p)
+    root : L, of :func:`stiffness_root`
 
     Returns
     -------
     far : the global modes, those of the body last
-    trailing : ndarray, load functions of further modes up to the rank
+    trailing : ndarray, shape (3 n_positions, rank - n_global), load functions of further modes
     body : of the global modes; None for modes of surface loads alone
     """
     basis, body, n = parametric.basis, parametric.body, parametric.n_global
-    stiffness = np.tensordot(factors, parametric.operators, axes=1)
-    root = np.linalg.cholesky((stiffness + stiffness.T) / 2.0)
     load = scipy.linalg.solve_triangular(root, basis.load.T, lower=True)[: parametric.rank].T
     first = root[:n, :n]
     space = scipy.linalg.solve_triangular(first, basis.space[:, :n].T, lower=True).T
@@ -89,17 +93,16 @@ def galerkin_field(
 
 
 def regional_load_of_basis(
-    parametric: ParametricResponse, factors: np.ndarray, trailing: np.ndarray, field: RegionalField
+    parametric: ParametricResponse, root: np.ndarray, trailing: np.ndarray, field: RegionalField
 ) -> np.ndarray:
-    """The response beyond the global modes in the regional modes, (n_positions, 3, most).
+    """The response beyond the global modes in the regional modes, (n_positions, 3, most) [m/N].
 
-    trailing : of :func:`galerkin_field`
+    root, trailing : of :func:`stiffness_root` and :func:`galerkin_field`
     field : of which the regions and modes are taken
     """
     n, rank = parametric.n_global, parametric.rank
-    stiffness = np.tensordot(factors, parametric.operators, axes=1)[:rank, :rank]
-    root = np.linalg.cholesky((stiffness + stiffness.T) / 2.0)
-    modes = scipy.linalg.solve_triangular(root, parametric.projection[:, :rank].T, lower=True).T
+    functions = parametric.projection[:, :rank].T
+    modes = scipy.linalg.solve_triangular(root[:rank, :rank], functions, lower=True).T
     load = trailing.reshape(len(field.region), 3, rank - n).astype(np.float32)
     out = np.zeros((len(field.region), 3, field.rank), np.float32)
     for r in range(field.n_regions):

@@ -101,12 +101,6 @@ def test_regions_are_compact_and_the_same_every_time() -> None:
     assert set(regions_of(centers[:2], 12)) == {0, 1}
 
 
-def test_no_field_has_no_modes_and_no_displacement() -> None:
-    none = RegionalField.none(N_VERTICES, N_POSITIONS)
-    assert none.rank == 0 and none.n_regions == 1
-    assert not none.combined(np.array([0, 5]), np.ones(2)).any()
-
-
 def test_displacement_and_force_cross_borders_of_regions_without_a_jump(
     phantom_vademecum: Vademecum,
 ) -> None:

@@ -80,6 +80,12 @@ def test_file_gives_back_the_same_vademecum(phantom_vademecum: Vademecum, tmp_pa
     assert len(v.id) == 64
 
 
+def require_refused(damaged: Vademecum, file: Path, message: str) -> None:
+    save_vademecum(damaged, file)
+    with pytest.raises(StorageError, match=message):
+        load_vademecum(file)
+
+
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
@@ -99,11 +105,8 @@ def test_a_shift_of_balls_that_does_not_fit_is_refused(
 ) -> None:
     field = phantom_vademecum.tip_field
     shift = field.shift._replace(**{name: change(getattr(field.shift, name))})
-    save_vademecum(
-        replace(phantom_vademecum, tip_field=field._replace(shift=shift)), tmp_path / "a.h5"
-    )
-    with pytest.raises(StorageError, match=message):
-        load_vademecum(tmp_path / "a.h5")
+    damaged = replace(phantom_vademecum, tip_field=field._replace(shift=shift))
+    require_refused(damaged, tmp_path / "a.h5", message)
 
 
 def test_files_keep_their_names_for_the_force_on_a_tip(
@@ -206,6 +209,4 @@ def test_regions_that_do_not_fit_are_refused(
 ) -> None:
     regional = phantom_vademecum.regional
     damaged = replace(regional, **{name: change(getattr(regional, name))})
-    save_vademecum(replace(phantom_vademecum, regional=damaged), tmp_path / "a.h5")
-    with pytest.raises(StorageError, match=message):
-        load_vademecum(tmp_path / "a.h5")
+    require_refused(replace(phantom_vademecum, regional=damaged), tmp_path / "a.h5", message)
