@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -73,8 +74,8 @@ def test_arrays_that_do_not_fit_are_refused(
 
     encoded = hdf5.encoded
 
-    def spoiled(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> memoryview:
-        return encoded({**arrays, key: spoil(arrays[key])}, attributes)
+    def spoiled(arrays: dict[str, np.ndarray], *others: Any) -> memoryview:
+        return encoded({**arrays, key: spoil(arrays[key])}, *others)
 
     monkeypatch.setattr(hdf5, "encoded", spoiled)  # with a checksum that is right
     save_atlas(atlas, tmp_path / "a.h5")
