@@ -47,24 +47,31 @@ def bench_step(
     unit: Unit = "mm",
     axes: Axes = None,
     label: Label = None,
-    small: Annotated[
-        int, typer.Option(help="approximate number of vertices of the small mesh")
-    ] = 2850,
-    large: Annotated[
-        int, typer.Option(help="the same of the large mesh (P1 elements); 0: none")
-    ] = 20000,
+    vertices: Vertices = 2850,
+    displayed: Annotated[
+        list[int] | None,
+        typer.Option(
+            help="approximate vertices of a displayed surface, may be repeated; 0: none; "
+            "default: 20000 and 100000"
+        ),
+    ] = None,
     output: Json = None,
 ) -> None:
-    """Time the contact step, a dense table and a direct solve (building takes minutes)."""
+    """Time the contact step, a dense table and a direct solve (building takes a minute)."""
+    from avatar_core.geometry.resampling import require_displayable
     from avatar_core.studies.bench.methods import load_average
     from avatar_core.studies.bench.step import run_step_bench
 
     _require_json(output, surface)
+    shown = [n for n in displayed or (20_000, 100_000) if n != 0]
+    for n in shown:
+        require_displayable(n)
     organ = read_organ(surface, unit, axes, label)
     with BuildBar() as progress:
-        rows, summary = run_step_bench(organ, small, large, progress)
+        rows, summary = run_step_bench(organ, vertices, shown, progress)
     print(
-        f"load average {load_average():.2f}; 10 mm spheres sliding 5 mm deep, field at all vertices"
+        f"load average {load_average():.2f}; 10 mm spheres sliding 5 mm deep, field at all shown "
+        "vertices"
     )
     print(_step_table(rows))
     for key, value in summary.items():

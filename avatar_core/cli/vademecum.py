@@ -67,10 +67,7 @@ def vademecum(
     ] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option(
-            help="target for the mean relative error of displacement [-]; default: 0.045, or 0.02 "
-            "with large deformation"
-        ),
+        typer.Option(help="target for the mean relative error of displacement [-]; default: 0.006"),
     ] = None,
     groups: Annotated[
         Path | None,
@@ -133,6 +130,13 @@ def vademecum(
             "--mesh-error", help="also measure the discretisation error of the mesh (slow)"
         ),
     ] = False,
+    displayed: Annotated[
+        int | None,
+        typer.Option(
+            help="approximate number of vertices of the displayed surface, such as 20000; "
+            "default: that of the mesh"
+        ),
+    ] = None,
     timings: Timings = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -187,6 +191,7 @@ def vademecum(
         n_contact_sites=contact_sites,
         seed=seed,
         with_mesh_error=mesh_error,
+        n_displayed=displayed,
     )
     for notice in (*organ.notices, *(lesion.notices if lesion else ())):
         print(f"notice: {notice}", file=sys.stderr)
@@ -320,6 +325,8 @@ def show_text(v: Vademecum) -> None:
         f"{info.volume * 1e6:.0f} ml, {v.element}, E {info.young_modulus:g} Pa, "
         f"nu {info.poisson_ratio:g}"
     )
+    if v.display is not None:
+        print(f"  displayed surface: {len(v.display.vertices)} vertices, interpolated")
     print(
         f"  {info.n_load_positions} load positions, patch radius {info.patch_radius * 1e3:.1f} mm, "
         f"{info.n_modes} modes at a place, {info.n_regions} regions, {info.bytes / 1e6:.1f} MB"

@@ -16,7 +16,7 @@ import numpy as np
 
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.cloud import BLOCK
-from avatar_core.contact.dent import add_dents
+from avatar_core.contact.display import show_dents
 from avatar_core.contact.effects.large_deformation import add_nonlinear_load, powers_of_depth
 from avatar_core.contact.effects.respiration import shift_cloud
 from avatar_core.contact.effects.viscoelasticity import least_shown
@@ -32,8 +32,7 @@ def deform(model, state, out, effects):  # type: ignore[no-untyped-def]
     _displace(
         model, state, out, e.superposition, e.large_deformation, e.friction, e.viscoelasticity
     )
-    add_dents(model, state, e.tip_law, e.dent)
-    write_cloud(model.rest, state.field, out.cloud)
+    finish_cloud(model, state, out, e.tip_law, e.dent, e.display)
     shift_cloud(e.respiration, out.cloud)
 
 
@@ -56,7 +55,17 @@ def _displace(  # type: ignore[no-untyped-def]
 
 
 @fast
-def write_cloud(rest, field, cloud):  # type: ignore[no-untyped-def]
+def finish_cloud(model, state, out, tip_law, dent, display):  # type: ignore[no-untyped-def]
+    """The cloud, from the displacement of the modes in ``state.field``."""
+    show_dents(model, state, tip_law, dent, display)
+    if display is None:
+        _write(model.rest, state.field, out.cloud)
+    else:
+        _write(model.rest, display.moved, out.cloud)
+
+
+@fast
+def _write(rest, field, cloud):  # type: ignore[no-untyped-def]
     """Deformed position and displacement of every point (n_points, 6)."""
     n_points = cloud.shape[0]
     flat_rest, flat_cloud = rest.reshape(6 * n_points), cloud.reshape(6 * n_points)

@@ -86,7 +86,7 @@ def dent_arrays(
     positions : ndarray, shape (n_positions, 3), of the patches [m]
     """
     theta, weight = quarter_turn(NODES)
-    start, around = _around(points, positions, (REACH + _ASIDE) * patch_radius)
+    start, around = points_around(points, positions, patch_radius)
     part = np.linspace(0.0, 1.0, INTERVALS + 1)
     return DentArrays(
         patch_dent(REACH * np.sqrt(part)) / PATCH,
@@ -122,8 +122,12 @@ def quarter_turn(n: int) -> tuple[np.ndarray, np.ndarray]:
     return 0.25 * np.pi * (node + 1.0), 0.25 * np.pi * weight
 
 
-def _around(points: np.ndarray, centres: np.ndarray, radius: float) -> tuple[np.ndarray, ...]:
-    """Points within a radius of each centre: start (n + 1,), and their numbers, nearest first."""
+def points_around(
+    points: np.ndarray, centres: np.ndarray, patch_radius: float
+) -> tuple[np.ndarray, ...]:
+    """Points that a tip near each centre may move: start (n + 1,), and their numbers, nearest
+    first."""
+    radius = (REACH + _ASIDE) * patch_radius
     if len(points) == 0:
         return np.zeros(len(centres) + 1, np.int64), np.zeros(0, np.int32)
     # nearest first: which of them are near a tip is then easily foretold by the processor
@@ -134,24 +138,29 @@ def _around(points: np.ndarray, centres: np.ndarray, radius: float) -> tuple[np.
 
 
 @fast
-def add_dents(model, state, law, dents):  # type: ignore[no-untyped-def]
-    """Replace the dent of the patch by that of each tip in contact, in ``state.field``."""
+def add_dents(model, state, law, dents, near, rest, field, tip, patch):  # type: ignore[no-untyped-def]
+    """Replace the dent of the patch by that of each tip in contact, in a displacement.
+
+    near : ``start`` and ``around``, of points near load positions; rest : of all points [m]
+    field : their displacement, three components a point, is changed
+    tip, patch : 1 or 0, whether the dent of the tip is put in, and that of the patch taken off
+    """
     if law is None or dents is None:
         return
     for t in range(state.passage.shape[0]):
         if state.force[t] > 0.0 and law.elastic[t] > 0.0:
-            _add_dent(model, state, law, dents, t)
+            _add_dent(model, state, law, dents, t, near, rest, field, tip, patch)
 
 
 @fast
-def _add_dent(model, state, law, dents, t):  # type: ignore[no-untyped-def]
-    """Of one tip. Far from all load positions, which is rare, every point of the cloud is tried."""
+def _add_dent(model, state, law, dents, t, near, rest, field, tip, patch):  # type: ignore[no-untyped-def]
+    """Of one tip. Far from all load positions, which is rare, every point is tried."""
     delta, _, _, a = dent(law, t)
     far = _lay_springs(law, dents, t, delta)
     s, n = state.point[t], state.normal[t]
     # held in registers: what is read from an array is read again after every write to the field
     place, normal = (s[0], s[1], s[2]), (n[0], n[1], n[2])
-    taken = law.elastic[t] * law.value[t, TAKEN]
+    shares = (tip, patch * law.elastic[t] * law.value[t, TAKEN])
     contact = (
         a * a,
         delta,
@@ -159,16 +168,16 @@ def _add_dent(model, state, law, dents, t):  # type: ignore[no-untyped-def]
         0.5 * law.value[t, KAPPA],
         1.0 / law.radius[t],
     )
-    near = (REACH * dents.patch_radius[0]) ** 2
+    reach = (REACH * dents.patch_radius[0]) ** 2
     height = dents.height[t]
     j, square = _nearest_position(model, state, t)
     if square <= (_ASIDE * dents.patch_radius[0]) ** 2:
-        for e in range(dents.start[j], dents.start[j + 1]):
-            v = dents.around[e]
-            _move(model, state, dents, v, place, normal, near, taken, contact, far, height)
+        for e in range(near.start[j], near.start[j + 1]):
+            v = near.around[e]
+            _move(rest, field, dents, v, place, normal, reach, shares, contact, far, height)
     else:
-        for v in range(model.rest.shape[0]):
-            _move(model, state, dents, v, place, normal, near, taken, contact, far, height)
+        for v in range(rest.shape[0]):
+            _move(rest, field, dents, v, place, normal, reach, shares, contact, far, height)
 
 
 @fast
@@ -212,19 +221,19 @@ def _lay_springs(law, dents, t, delta):  # type: ignore[no-untyped-def]
 
 @fast
 def _move(  # type: ignore[no-untyped-def]
-    model, state, dents, v, place, normal, near, taken, contact, far, height
+    rest, field, dents, v, place, normal, reach, shares, contact, far, height
 ):
-    """Change one point of the cloud, if it is near enough.
+    """Change the displacement of one point, if it is near enough.
 
-    near : (2 R_p)^2 [m^2]; taken : c F [m]; contact : a^2, delta, tau / 6, kappa / 2, 1 / radius;
-    far : sums of the series
+    reach : (2 R_p)^2 [m^2]; shares : 1 or 0, of the tip's dent, and c F or 0 [m]; contact : a^2,
+    delta, tau / 6, kappa / 2, 1 / radius; far : sums of the series
     """
-    rest = model.rest[v]
-    x, y, z = rest[0] - place[0], rest[1] - place[1], rest[2] - place[2]
+    at = rest[v]
+    x, y, z = at[0] - place[0], at[1] - place[1], at[2] - place[2]
     square = x * x + y * y + z * z
-    if square >= near:
+    if square >= reach:
         return
-    part = square / near
+    part = square / reach
     if square < contact[0]:
         tip = _inside(contact, height, np.sqrt(square))
     elif square < _SERIES**2 * contact[0]:
@@ -232,9 +241,10 @@ def _move(  # type: ignore[no-untyped-def]
     else:
         tip = _far_off(far, square)
     left = min(1.0, (1.0 - part) / (1.0 - (FADE / REACH) ** 2))
-    change = left * left * (3.0 - 2.0 * left) * (tip - taken * _in_table(dents.patch, part))
+    moved = shares[0] * tip - shares[1] * _in_table(dents.patch, part)
+    change = left * left * (3.0 - 2.0 * left) * moved
     for d in range(3):
-        state.field[3 * v + d] -= np.float32(change * normal[d])
+        field[3 * v + d] -= np.float32(change * normal[d])
 
 
 @fast

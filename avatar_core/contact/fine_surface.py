@@ -65,7 +65,7 @@ class Touch(NamedTuple):
 def fine_surface(
     vademecum: Vademecum, points: np.ndarray, tip: Tip, pose: np.ndarray
 ) -> FineSurface:
-    """The surface of an organ under a cloud, split around a tip that presses.
+    """The surface of an organ under a cloud, split around a tip that presses, if it is coarse.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def fine_surface(
     moved = points[:, 3:]
     breath = points[0, :3] - rest[0] - moved[0]  # of an organ whose frame moves
     touch = find_touch(vademecum, tip, np.asarray(pose, float) - breath)
-    if touch is None:
+    if touch is None or vademecum.display is not None:  # which shows dents itself
         return FineSurface(points[:, :3], moved, faces)
     patch_radius = vademecum.surface.patch_radius
     near = np.linalg.norm(rest - touch.point, axis=1) < REACH * patch_radius

@@ -15,6 +15,7 @@ from avatar_core.contact import kernels
 from avatar_core.contact.ball_shift import shifts_of
 from avatar_core.contact.cloud import cloud_arrays
 from avatar_core.contact.dent import dent_arrays
+from avatar_core.contact.display import display_arrays
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.large_deformation import (
     LargeDeformationArrays,
@@ -158,7 +159,8 @@ def lay_out_details(
         shown = cloud_arrays(
             vademecum, detail.modes, detail.cloud, detail.precision, large.terms if large else None
         )
-        points = vademecum.mesh.vertices[shown.points]
+        display = vademecum.display if detail.cloud == "surface" else None
+        points = display.vertices if display else vademecum.mesh.vertices[shown.points]
         arrays = ModelArrays(
             distance=field.distance,
             access=field.access,
@@ -189,10 +191,16 @@ def lay_out_details(
         nonlinear = (
             _nonlinear_arrays(vademecum, large, response, shown.large_start) if large else None
         )
-        dent = dent_arrays(tips, points, surface.centers, surface.patch_radius) if law else None
+        places = (surface.centers, surface.patch_radius)
+        dent = dent_arrays(tips, points, *places) if law else None
+        fine = None
+        if display:
+            fine = display_arrays(display, shown.points, vademecum.mesh.vertices, *places)
         yield Layout(
             arrays,
-            selected_arrays(vademecum, effects, mass, nonlinear, reach, period, law, dent, tilt),
+            selected_arrays(
+                vademecum, effects, mass, nonlinear, reach, period, law, dent, tilt, fine
+            ),
         )
 
 

@@ -19,6 +19,7 @@ from avatar_core.geometry.mesh import (
     tetrahedralize,
 )
 from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.resampling import require_displayable
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tumour import volume_fraction_inside
 from avatar_core.offline.certify.combinations import COMBINATIONS, DEPTH_FRACTIONS, push_errors
@@ -34,6 +35,7 @@ from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.parametric import build_parametric_vademecum, certify_range
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.vademecum.display import display_surface
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
 from avatar_core.vademecum.tip_field import with_tumour
@@ -63,10 +65,11 @@ class OrganOptions:
     n_contact_sites : places, 0 or at least 3, at which contacts of real tips are resolved for the
         certificate; ``seed`` draws them too
     with_mesh_error : also solve on the same mesh refined once (slow)
+    n_displayed : vertices of the surface that is displayed, about; None for that of the mesh
 
     Raises
     ------
-    ContactError, CoordinateError, MaterialError, MeshError
+    ContactError, CoordinateError, MaterialError, MeshError, SurfaceError
         For options that exclude each other, and for a file that does not exist, before any work.
     """
 
@@ -86,6 +89,7 @@ class OrganOptions:
     n_contact_sites: int = 0
     seed: int = 0
     with_mesh_error: bool = False
+    n_displayed: int | None = None
 
     def __post_init__(self) -> None:
         names = [c.name for c in self.coordinates]
@@ -120,6 +124,8 @@ class OrganOptions:
                 f"a patch of radius {self.patch_radius:g} m is no tool's; give 1e-3 to 0.1 "
                 "(12e-3: 12 mm)"
             )
+        if self.n_displayed is not None:
+            require_displayable(self.n_displayed)
         if self.groups is not None and not self.groups.is_file():
             raise MeshError(f"cannot read node groups from {self.groups}: there is no such file")
 
@@ -161,6 +167,9 @@ def build(
     if options.tumour is not None:
         field = with_tumour(vademecum.tip_field, options.tumour, loads.patch_radius)
         vademecum = replace(vademecum, tip_field=field)
+    if options.n_displayed is not None:
+        shown = display_surface(mesh, surface, options.n_displayed)
+        vademecum = replace(vademecum, display=shown)
     if options.large:
         vademecum = _with_large(vademecum, options, progress)
     if options.with_mesh_error:

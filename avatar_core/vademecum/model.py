@@ -22,6 +22,7 @@ from avatar_core.reduction.pgd import EnrichmentReport
 from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.certificate import Certificate
+from avatar_core.vademecum.display import DisplaySurface
 from avatar_core.vademecum.large_deformation import LargeCertificate, LargeDeformation, Push
 from avatar_core.vademecum.modal_mass import BodyResponse
 from avatar_core.vademecum.parametric import ParametricResponse
@@ -102,7 +103,7 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "3.0"
+SCHEMA_VERSION = "3.1"
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,7 @@ class Vademecum:
     contrast : Young's modulus inside the tumour over that outside; None without a tumour
     large : LargeDeformation or None, the load's magnitude as a coordinate
     body : BodyResponse or None, mass and weight as the far modes see them
+    display : DisplaySurface or None, what is displayed; None for the boundary of the mesh
     """
 
     name: str
@@ -142,6 +144,7 @@ class Vademecum:
     contrast: float | None = None
     large: LargeDeformation | None = None
     body: BodyResponse | None = None
+    display: DisplaySurface | None = None
     id: str = field(default="", compare=False)
     nbytes: int = field(default=0, compare=False)
 
@@ -287,13 +290,27 @@ class Vademecum:
 
     @property
     def surface_vertices(self) -> np.ndarray:
-        """Rest positions of the boundary vertices, shape (n, 3) float32 [m]."""
+        """Rest positions of the displayed vertices, shape (n, 3) float32 [m]."""
+        if self.display is not None:
+            return self.display.vertices
         return self.mesh.vertices[self.mesh.surface_vertices].astype(np.float32)
 
     @property
     def surface_faces(self) -> np.ndarray:
-        """Boundary triangles over :attr:`surface_vertices`, shape (m, 3)."""
+        """Displayed triangles over :attr:`surface_vertices`, shape (m, 3)."""
+        if self.display is not None:
+            return self.display.faces
         return np.searchsorted(self.mesh.surface_vertices, self.mesh.boundary_faces)
+
+    @property
+    def clamped_faces(self) -> np.ndarray:
+        """Which of :attr:`surface_faces` are clamped, shape (m,) bool."""
+        if self.display is None:
+            return self.regions.clamped
+        held = np.zeros(len(self.mesh.vertices))
+        held[self.mesh.boundary_faces[self.regions.clamped]] = 1.0
+        part = (held[self.display.corners] * self.display.weights).sum(axis=1)
+        return np.asarray((part[self.display.faces] > 0.5).all(axis=1))
 
     def info(self) -> VademecumInfo:
         """The summary."""

@@ -79,6 +79,12 @@ _LARGE: Shapes = {
     "large/depth": "f: 2 positions",
     "large/reach": "f: positions",
 }
+_DISPLAY: Shapes = {
+    "display/vertices": "f: displayed 3",
+    "display/faces": "i: display_faces 3",
+    "display/corners": "i: displayed 3",
+    "display/weights": "f: displayed 3",
+}
 BODY_KEYS = tuple(_BODY)
 PARAMETRIC_KEYS = tuple(_PARAMETRIC)
 PARAMETRIC_BODY_KEYS = tuple(_PARAMETRIC_BODY)
@@ -86,9 +92,10 @@ LARGE_KEYS = tuple(_LARGE)
 PROFILE_KEYS = tuple(_PROFILE)
 TUMOUR_KEYS = tuple(_TUMOUR)
 SHIFT_KEYS = tuple(_SHIFT)
+DISPLAY_KEYS = tuple(_DISPLAY)
 
 # Each is present or absent as a whole; its first key decides.
-_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE, _PROFILE, _TUMOUR, _SHIFT)
+_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE, _PROFILE, _TUMOUR, _SHIFT, _DISPLAY)
 
 
 def shapes_of(held: Container[str]) -> dict[str, str]:
@@ -120,6 +127,8 @@ def require_sound(arrays: Arrays) -> None:
         _require_range("parametric/rank", float(arrays["parametric/rank"]), (1, sizes["basis"]))
         rank, n_global = arrays["parametric/rank"], arrays["parametric/n_global"]
         _require_range("parametric/n_global", float(n_global), (1, float(rank)))
+    if "displayed" in sizes:
+        _require_display(arrays, sizes)
     if "large/reach" in arrays:
         _require_regions(arrays, "large/terms", sizes["large"], sizes["large_most"])
         if not np.array_equal(arrays["large/terms/region"], arrays["regional/region"]):
@@ -152,6 +161,19 @@ def _require_surface(arrays: Arrays, sizes: Mapping[str, int]) -> None:
             "'surface/centers' are neither the corners nor these and all edge midpoints; build the "
             "file again"
         )
+
+
+def _require_display(arrays: Arrays, sizes: Mapping[str, int]) -> None:
+    """Vertices of an organ's size, hung within triangles of the mesh's boundary."""
+    _require_lengths(arrays, "display/vertices")
+    require_indices("display/faces", arrays["display/faces"], sizes["displayed"])
+    require_indices("display/corners", arrays["display/corners"], sizes["vertices"])
+    mesh = TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"])
+    if not np.isin(arrays["display/corners"], mesh.surface_vertices).all():
+        raise StorageError("'display/corners' lie inside the organ; build the file again")
+    weights = arrays["display/weights"]
+    if weights.min(initial=0.0) < 0.0 or np.abs(weights.sum(axis=1) - 1.0).max(initial=0.0) > 1e-5:
+        raise StorageError("'display/weights' are no parts of a whole; build the file again")
 
 
 def _require_regions(arrays: Arrays, name: str, n_modes: int, most: int) -> None:

@@ -1,6 +1,6 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 3.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 3.1), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
 ``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve. Datasets:
@@ -28,7 +28,12 @@ A vademecum with coordinates of the material has the JSON attributes ``coordinat
     parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N], as of contact_near
 
 one with the organ's mass body/mass (rank, rank) and body/weight (rank, 3),
-and the same under parametric/body for that basis; one with large deformation the JSON attribute
+and the same under parametric/body for that basis; one with a finer surface to display
+
+    display/vertices (n, 3) [m]          display/faces (m, 3)
+    display/corners (n, 3)               display/weights (n, 3), of the mesh's vertices
+
+one with large deformation the JSON attribute
 ``large`` (material, certificate) and, for k = 2, 3,
 
     large/terms/region, start, space, load (n_s, 2, most) [m^(1-k)], as of regional
@@ -60,6 +65,7 @@ from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.accuracy import AccuracyCurve, Cloud, Precision
 from avatar_core.vademecum.certificate import Certificate
+from avatar_core.vademecum.display import DisplaySurface
 from avatar_core.vademecum.large_deformation import (
     LargeCertificate,
     LargeDeformation,
@@ -70,6 +76,7 @@ from avatar_core.vademecum.model import SCHEMA_VERSION, Convergence, Provenance,
 from avatar_core.vademecum.parametric import ParametricResponse
 from avatar_core.vademecum.schema import (
     BODY_KEYS,
+    DISPLAY_KEYS,
     LARGE_KEYS,
     PARAMETRIC_BODY_KEYS,
     PARAMETRIC_KEYS,
@@ -183,6 +190,7 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
     held += PROFILE_KEYS[:1] * (v.tip_field.curvature is not None)
     held += TUMOUR_KEYS[:1] * (v.tip_field.tumour is not None)
     held += SHIFT_KEYS[:1] * (v.tip_field.shift is not None)
+    held += DISPLAY_KEYS[:1] * bool(v.display)
     held += PARAMETRIC_BODY_KEYS[:1] * bool(v.parametric and v.parametric.body)
     for key in shapes_of(held):
         value: Any = v
@@ -261,7 +269,14 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         contrast=_contrast(plain["contrast"]),
         large=_large(arrays, plain["large"]),
         body=_body(arrays, BODY_KEYS),
+        display=_display(arrays),
     )
+
+
+def _display(arrays: dict[str, np.ndarray]) -> DisplaySurface | None:
+    if DISPLAY_KEYS[0] not in arrays:
+        return None
+    return DisplaySurface(*(arrays[key] for key in DISPLAY_KEYS))
 
 
 def _regional(arrays: dict[str, np.ndarray], name: str) -> RegionalField:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from avatar_core.contact.dent import DentArrays, dent_state
+from avatar_core.contact.display import DisplayArrays, display_state
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.friction import (
     Friction,
@@ -63,6 +64,7 @@ class Constants(NamedTuple):
     """Constant arrays of each effect, in the order of the step's arguments; None if not chosen.
 
     tip_law, dent : no effects, but absent where the load is the vademecum's own patch
+    display : no effect either, but absent where the mesh's own vertices are shown
     """
 
     several_tools: Any = None
@@ -75,6 +77,7 @@ class Constants(NamedTuple):
     tip_law: Any = None
     dent: Any = None
     tilt: Any = None
+    display: Any = None
 
 
 class Selection(NamedTuple):
@@ -94,6 +97,7 @@ class Selection(NamedTuple):
     respiration: Any
     tip_law: Any
     dent: Any
+    display: Any
 
 
 ARRAYS: dict[str, Any] = {
@@ -107,6 +111,7 @@ ARRAYS: dict[str, Any] = {
     "tip_law": TipLawArrays,
     "dent": DentArrays,
     "tilt": TiltArrays,
+    "display": DisplayArrays,
 }
 NO_EFFECTS = Constants()
 
@@ -151,8 +156,10 @@ def selected_arrays(
     tip_law: TipLawArrays | None = None,
     dent: DentArrays | None = None,
     tilt: TiltArrays | None = None,
+    display: DisplayArrays | None = None,
 ) -> Constants:
-    """Constant arrays of the chosen effects; those of large deformation and tips come in complete.
+    """Constant arrays of the chosen effects; those of large deformation, tips and the display come
+    in complete.
 
     mass : of each mode, from :func:`adapted_vademecum`
     contact_reach : longest distance that the near field of contact spans [m]
@@ -172,13 +179,14 @@ def selected_arrays(
         tip_law,
         dent,
         tilt,
+        display,
     )
 
 
 def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int) -> Selection:
     """State and scratch around the constant arrays: the organ at rest, no tool near it."""
     several_tools, large_deformation, friction, viscoelasticity, inertia, weight = constants[:6]
-    respiration, tip_law, dent, tilt = constants[6:]
+    respiration, tip_law, dent, tilt, display = constants[6:]
     n_terms = len(viscoelasticity.decay) if viscoelasticity else 0
     if weight is not None:
         weight = SelfWeightArrays(np.pad(weight.amplitude, (0, n_modes - len(weight.amplitude))))
@@ -194,4 +202,5 @@ def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int)
         respiration_state(respiration) if respiration else None,
         tip_law_state(tip_law, n_terms, tilt_state(tilt) if tilt else None) if tip_law else None,
         dent_state(dent) if dent else None,
+        display_state(display) if display else None,
     )

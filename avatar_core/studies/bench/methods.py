@@ -14,8 +14,8 @@ import numpy as np
 
 from avatar_core.common.jit import compiled
 from avatar_core.contact import kernels
-from avatar_core.contact.cloud_kernels import write_cloud
-from avatar_core.contact.dent import add_dents
+from avatar_core.contact.cloud import shown_vertices
+from avatar_core.contact.cloud_kernels import finish_cloud
 from avatar_core.contact.effects.tip_surface import sample_surface
 from avatar_core.contact.locate import locate
 from avatar_core.contact.model import ContactModel, prepare, step
@@ -24,6 +24,7 @@ from avatar_core.contact.tool_path import slide, starts_apart
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.tip import Tip
+from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.model import Vademecum
 
 RADIUS, DEPTH = 10e-3, 5e-3  # [m] of the benchmark's tip, and how deep it slides
@@ -38,6 +39,7 @@ Clock = Callable[[], float]  # in seconds
 class StepRow:
     """Step times of one method.
 
+    vertices : that are shown
     p50_us, p99_us : of the whole step, contact and full field, medians over five slides [us]; NaN
         if it does not fit
     contacts_mean, contacts_min : active contacts in the steps that were timed
@@ -54,12 +56,17 @@ class StepRow:
     bytes: int
 
 
+def shown_cloud(vademecum: Vademecum) -> Cloud:
+    """What a step shows here: the displayed surface if there is one, or else all vertices."""
+    return "volume" if vademecum.display is None else "surface"
+
+
 def time_steps(vademecum: Vademecum, n_tools: int, modes: int | None = None) -> StepRow:
-    """Slide ``n_tools`` spheres of 10 mm, 5 mm deep, with the field at all vertices.
+    """Slide ``n_tools`` spheres of 10 mm, 5 mm deep, with the field at all shown vertices.
 
     modes : that are shown at a place; None for all
     """
-    model = prepare(vademecum, (SPHERE,) * n_tools, modes, cloud="volume")
+    model = prepare(vademecum, (SPHERE,) * n_tools, modes, shown_cloud(vademecum))
     shown = model.n_modes
     return _timed("vademecum", vademecum, model, shown, n_tools, lambda tips: step(model, tips))
 
@@ -83,14 +90,15 @@ def time_tip_over_patch(
 def time_dense_table(
     vademecum: Vademecum, n_tools: int, clock: Clock = time.perf_counter
 ) -> StepRow:
-    """The same contacts and field from stored columns."""
-    n_v, n_s = len(vademecum.mesh.vertices), vademecum.surface.n_positions
+    """The same contacts and field from stored columns, displayed by the same interpolation."""
+    cloud = shown_cloud(vademecum)
+    n_v, n_s = len(shown_vertices(vademecum, cloud)), vademecum.surface.n_positions
     size = 4 * 9 * n_s * (n_v + n_s)
     if size > MAX_TABLE_BYTES:
         nan = float("nan")
         return StepRow("dense table", n_v, 0, n_tools, nan, 0, nan, nan, size)
-    model = prepare(vademecum, (SPHERE,) * n_tools, cloud="volume")
-    columns = _columns(vademecum)
+    model = prepare(vademecum, (SPHERE,) * n_tools, cloud=cloud)
+    columns = _columns(vademecum, cloud)
     compliance = _compliance(vademecum)
 
     effects = model.effects._replace(large_deformation=None)
@@ -147,7 +155,7 @@ def _timed(
     contacts = np.concatenate([contacts for _, contacts in passes])
     return StepRow(
         method,
-        len(vademecum.mesh.vertices),
+        len(model.out.cloud),
         modes,
         n_tools,
         float(contacts.mean()),
@@ -187,13 +195,15 @@ def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000, tip: Tip = SPH
     return np.ascontiguousarray(np.stack(paths, axis=1))
 
 
-def _columns(vademecum: Vademecum) -> np.ndarray:
-    """Displacement under every load, shape (n_positions, 3, 3 n_vertices)."""
+def _columns(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
+    """Displacement of the mesh's points under every load, shape (n_positions, 3, 3 n_points)."""
     far, regional = vademecum.far, vademecum.regional
     n = vademecum.surface.n_positions
-    out = (far.load @ far.space.T).reshape(n, 3, -1).astype(np.float32)
+    points = shown_vertices(vademecum, cloud)
+    rows = (3 * points[:, None] + np.arange(3)).ravel()
+    out = (far.load @ far.space[rows].T).reshape(n, 3, -1).astype(np.float32)
     for r in range(regional.n_regions):
-        at, modes = regional.region == r, regional.modes(r)
+        at, modes = regional.region == r, regional.modes(r)[rows]
         out[at] += regional.load[at, :, : modes.shape[1]] @ modes.T
     return np.ascontiguousarray(out)
 
@@ -228,7 +238,7 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
         model, state, tips, e.superposition, e.several_tools, None, None, e.tip_law
     )
     kernels.write_forces(model, state, out, tips, e)
-    u = state.field[: 3 * out.cloud.shape[0]]
+    u = state.field[: columns.shape[2]]
     u[:] = np.float32(0.0)
     for t in range(tips.shape[0]):
         for i in range(state.n_nodes[t] if state.force[t] > 0.0 else 0):
@@ -237,8 +247,7 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
                 row, f = columns[state.nodes[t, i], c], np.float32(force * state.normal[t, c])
                 for k in range(u.shape[0]):
                     u[k] += f * row[k]
-    add_dents(model, state, e.tip_law, e.dent)
-    write_cloud(model.rest, u, out.cloud)
+    finish_cloud(model, state, out, e.tip_law, e.dent, e.display)
 
 
 @compiled(fastmath=True)

@@ -52,7 +52,7 @@ class Organ:
             vademecum=v,
             vertices=vertices,
             faces=v.surface_faces,
-            clamped=v.regions.clamped,
+            clamped=v.clamped_faces,
             centre=0.5 * (low + high),
             size=float((high - low).max()),
             start=v.surface.centers[j],

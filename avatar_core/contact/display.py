@@ -1,0 +1,89 @@
+"""The compiled step's part for a displayed surface that is finer than the mesh.
+
+A displayed vertex x hangs on three vertices x_i of the mesh
+(:mod:`avatar_core.vademecum.display`). Near a tip the field of a patch bends within a triangle, but
+is known there (:mod:`avatar_core.contact.dent`): with p its displacement on a half-space, faded by
+h, and u_tip that of the tip, along the inward normal,
+
+    u(x) = sum_i w_i [u(x_i) + n h p(x_i)]  -  n h u_tip(x),
+
+so that only what is smooth is interpolated.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avatar_core.common.jit import fast
+from avatar_core.contact.dent import add_dents, points_around
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum.display import DisplaySurface
+
+DisplayArrays = namedtuple(
+    "DisplayArrays",
+    [
+        "corner",  # (n, 3) points of the mesh that carry each displayed vertex
+        "weight",  # (n, 3) float32
+        "rest",  # (n_mesh_points, 3) float32, at rest [m]
+        "start",  # (n_positions + 1,) of the mesh's points around each load position, in
+        "around",  # (m,) points that a tip near the load position may move
+    ],
+)
+DisplayState = namedtuple(
+    "DisplayState",
+    ["corner", "weight", "rest", "start", "around", "moved"],  # (3 n,) displacement [m]
+)
+
+
+def display_arrays(
+    display: DisplaySurface,
+    points: np.ndarray,
+    vertices: np.ndarray,
+    positions: np.ndarray,
+    patch_radius: float,
+) -> DisplayArrays:
+    """Of a displayed surface.
+
+    points : vertices of the mesh that are summed from modes, ascending
+    vertices : ndarray, shape (n_vertices, 3), of the mesh [m]
+    positions : ndarray, shape (n_positions, 3), of the patches [m]
+    """
+    rest = vertices[points]
+    return DisplayArrays(
+        np.searchsorted(points, display.corners).astype(np.int32),
+        display.weights,
+        rest.astype(np.float32),
+        *points_around(rest, positions, patch_radius),
+    )
+
+
+def display_state(arrays: DisplayArrays) -> DisplayState:
+    """The constant arrays, with room for the displacement."""
+    return DisplayState(*arrays, np.zeros(3 * len(arrays.corner), np.float32))
+
+
+@fast
+def show_dents(model, state, law, dents, display):  # type: ignore[no-untyped-def]
+    """From what the modes displace in ``state.field`` to what is shown: with the dents of tips, on
+    the displayed surface if there is one."""
+    if display is None:
+        add_dents(model, state, law, dents, dents, model.rest, state.field, 1.0, 1.0)
+        return
+    add_dents(model, state, law, dents, display, display.rest, state.field, 0.0, 1.0)
+    _interpolate(display, state.field)
+    add_dents(model, state, law, dents, dents, model.rest, display.moved, 1.0, 0.0)
+
+
+@fast
+def _interpolate(display, field):  # type: ignore[no-untyped-def]
+    """The displacement of the displayed vertices from that of the mesh's."""
+    corner, weight, moved = display.corner, display.weight, display.moved
+    for v in range(corner.shape[0]):
+        a, b, c = 3 * corner[v, 0], 3 * corner[v, 1], 3 * corner[v, 2]
+        wa, wb, wc = weight[v, 0], weight[v, 1], weight[v, 2]
+        for d in range(3):
+            moved[3 * v + d] = wa * field[a + d] + wb * field[b + d] + wc * field[c + d]

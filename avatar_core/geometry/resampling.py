@@ -1,0 +1,66 @@
+"""A closed triangulated surface with about so many vertices as are wanted, for display."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+
+from avatar_core.errors import SurfaceError
+from avatar_core.geometry.skin import weld
+
+MOST_VERTICES = 1_000_000
+
+_LIMITS = (100, MOST_VERTICES)
+
+
+def require_displayable(n: int) -> None:
+    """Raise SurfaceError unless a surface of n vertices can be displayed."""
+    if not _LIMITS[0] <= n <= _LIMITS[1]:
+        raise SurfaceError(
+            f"{n} displayed vertices; ask for {_LIMITS[0]} to {_LIMITS[1]:,}, such as 20000"
+        )
+
+
+def resampled(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A surface with about n vertices: subdivided by Loop's scheme, then edges collapsed.
+
+    Loop's limit surface is smooth (Loop, 1987); edges collapse in the order of the quadric error
+    (Garland & Heckbert, 1997). A surface that is no manifold has flat triangles split in four
+    instead, and gets n vertices at least.
+
+    Parameters
+    ----------
+    vertices, faces : of a closed surface, shapes (m, 3)
+    n : vertices wanted, fewer or more than the surface has
+    """
+    vertices, faces = np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64)
+    manifold = is_manifold(faces)
+    split = igl.loop if manifold else igl.upsample
+    while len(vertices) < n:
+        vertices, faces = split(vertices, faces)
+    n_faces = len(faces) - 2 * (len(vertices) - n)  # a collapse takes a vertex and two triangles
+    if manifold and n_faces < len(faces):
+        fortran = np.asfortranarray(vertices), np.asfortranarray(faces, dtype=np.int32)
+        vertices, faces, _, _ = igl.qslim(*fortran, n_faces)
+    return np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
+
+
+def unified(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Triangles whose corners coincide, made to share them."""
+    index = weld(vertices)
+    _, first = np.unique(index, return_index=True)
+    shared = index[faces]
+    flat = (shared == np.roll(shared, 1, axis=1)).any(axis=1)
+    return vertices[first], shared[~flat]
+
+
+def is_manifold(faces: NDArray[np.int64]) -> bool:
+    """Whether two triangles meet on every edge, and one fan of them at every vertex."""
+    faces = np.ascontiguousarray(faces, np.int64)
+    closed = len(igl.boundary_facets(faces)[0]) == 0
+    return bool(closed and igl.is_edge_manifold(faces)[0] and igl.is_vertex_manifold(faces).all())
