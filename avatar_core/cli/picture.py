@@ -107,7 +107,7 @@ def _resolved(
 
 def _draw_organ(figure, vademecum: Vademecum, cloud: np.ndarray, tip: np.ndarray) -> None:  # type: ignore[no-untyped-def]
     axes = figure.add_subplot(1, 2, 1)
-    faces = vademecum.surface_faces
+    faces = vademecum.organ_faces
     corner = cloud[faces]
     front = np.argsort(corner[:, :, 1].mean(axis=1))  # painter's order, seen from anterior
     seen = np.cross(corner[:, 1, :3] - corner[:, 0, :3], corner[:, 2, :3] - corner[:, 0, :3])

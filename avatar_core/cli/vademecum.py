@@ -326,7 +326,8 @@ def show_text(v: Vademecum) -> None:
         f"nu {info.poisson_ratio:g}"
     )
     if v.display is not None:
-        print(f"  displayed surface: {len(v.display.vertices)} vertices, interpolated")
+        inside = f"; inside: {', '.join(v.structures)}" if v.structures else ""
+        print(f"  displayed: {len(set(v.organ_faces.flat))} vertices{inside}")
     print(
         f"  {info.n_load_positions} load positions, patch radius {info.patch_radius * 1e3:.1f} mm, "
         f"{info.n_modes} modes at a place, {info.n_regions} regions, {info.bytes / 1e6:.1f} MB"

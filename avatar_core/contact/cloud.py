@@ -65,10 +65,13 @@ def _at(space: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
-    """Vertices of the mesh in a cloud, ascending."""
+    """Vertices of the mesh that a cloud shows, or that carry what it shows, ascending."""
+    mesh, display = vademecum.mesh, vademecum.display
     if cloud == "surface":
-        return vademecum.mesh.surface_vertices
-    return np.arange(len(vademecum.mesh.vertices) if cloud == "volume" else 0)
+        if display is None:
+            return mesh.surface_vertices
+        return np.union1d(mesh.surface_vertices, display.corners)
+    return np.arange(len(mesh.vertices) if cloud == "volume" else 0)
 
 
 def in_blocks(space: np.ndarray, precision: Precision = "int16") -> tuple[np.ndarray, np.ndarray]:

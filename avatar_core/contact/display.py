@@ -1,6 +1,6 @@
-"""The compiled step's part for a displayed surface that is finer than the mesh.
+"""The compiled step's part for what is displayed in the place of the mesh's own vertices.
 
-A displayed vertex x hangs on three vertices x_i of the mesh
+A displayed vertex x hangs on four vertices x_i of the mesh
 (:mod:`avatar_core.vademecum.display`). Near a tip the field of a patch bends within a triangle, but
 is known there (:mod:`avatar_core.contact.dent`): with p its displacement on a half-space, faded by
 h, and u_tip that of the tip, along the inward normal,
@@ -21,13 +21,13 @@ from avatar_core.common.jit import fast
 from avatar_core.contact.dent import add_dents, points_around
 
 if TYPE_CHECKING:
-    from avatar_core.vademecum.display import DisplaySurface
+    from avatar_core.vademecum.display import Display
 
 DisplayArrays = namedtuple(
     "DisplayArrays",
     [
-        "corner",  # (n, 3) points of the mesh that carry each displayed vertex
-        "weight",  # (n, 3) float32
+        "corner",  # (n, 4) points of the mesh that carry each displayed vertex
+        "weight",  # (n, 4) float32
         "rest",  # (n_mesh_points, 3) float32, at rest [m]
         "start",  # (n_positions + 1,) of the mesh's points around each load position, in
         "around",  # (m,) points that a tip near the load position may move
@@ -40,13 +40,13 @@ DisplayState = namedtuple(
 
 
 def display_arrays(
-    display: DisplaySurface,
+    display: Display,
     points: np.ndarray,
     vertices: np.ndarray,
     positions: np.ndarray,
     patch_radius: float,
 ) -> DisplayArrays:
-    """Of a displayed surface.
+    """Of what is displayed.
 
     points : vertices of the mesh that are summed from modes, ascending
     vertices : ndarray, shape (n_vertices, 3), of the mesh [m]
@@ -68,8 +68,8 @@ def display_state(arrays: DisplayArrays) -> DisplayState:
 
 @fast
 def show_dents(model, state, law, dents, display):  # type: ignore[no-untyped-def]
-    """From what the modes displace in ``state.field`` to what is shown: with the dents of tips, on
-    the displayed surface if there is one."""
+    """From what the modes displace in ``state.field`` to what is shown: with the dents of tips, at
+    the displayed vertices if they are not the mesh's."""
     if display is None:
         add_dents(model, state, law, dents, dents, model.rest, state.field, 1.0, 1.0)
         return
@@ -83,7 +83,9 @@ def _interpolate(display, field):  # type: ignore[no-untyped-def]
     """The displacement of the displayed vertices from that of the mesh's."""
     corner, weight, moved = display.corner, display.weight, display.moved
     for v in range(corner.shape[0]):
-        a, b, c = 3 * corner[v, 0], 3 * corner[v, 1], 3 * corner[v, 2]
-        wa, wb, wc = weight[v, 0], weight[v, 1], weight[v, 2]
+        a, b = 3 * corner[v, 0], 3 * corner[v, 1]
+        c, e = 3 * corner[v, 2], 3 * corner[v, 3]
+        wa, wb, wc, we = weight[v, 0], weight[v, 1], weight[v, 2], weight[v, 3]
         for d in range(3):
-            moved[3 * v + d] = wa * field[a + d] + wb * field[b + d] + wc * field[c + d]
+            inside = wc * field[c + d] + we * field[e + d]
+            moved[3 * v + d] = wa * field[a + d] + wb * field[b + d] + inside

@@ -67,17 +67,20 @@ def fine_surface(
 ) -> FineSurface:
     """The surface of an organ under a cloud, split around a tip that presses, if it is coarse.
 
+    The points of the cloud stay the first, those of structures inside among them.
+
     Parameters
     ----------
     points : ndarray, shape (n_surface_vertices, 6), deformed positions and displacements [m]
     pose : ndarray, shape (3,), of the tip, in the frame of the positions [m]
     """
-    rest, faces = vademecum.surface_vertices, vademecum.surface_faces
+    rest, faces = vademecum.surface_vertices, vademecum.organ_faces
     points = np.asarray(points, float)
     moved = points[:, 3:]
     breath = points[0, :3] - rest[0] - moved[0]  # of an organ whose frame moves
     touch = find_touch(vademecum, tip, np.asarray(pose, float) - breath)
-    if touch is None or vademecum.display is not None:  # which shows dents itself
+    is_fine = len(faces) > len(vademecum.mesh.boundary_faces)
+    if touch is None or is_fine:
         return FineSurface(points[:, :3], moved, faces)
     patch_radius = vademecum.surface.patch_radius
     near = np.linalg.norm(rest - touch.point, axis=1) < REACH * patch_radius

@@ -35,7 +35,7 @@ from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.parametric import build_parametric_vademecum, certify_range
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.reduction.coordinates import Coordinate
-from avatar_core.vademecum.display import display_surface
+from avatar_core.vademecum.display import Display, boundary, display_of, outline, structure
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
 from avatar_core.vademecum.tip_field import with_tumour
@@ -167,9 +167,7 @@ def build(
     if options.tumour is not None:
         field = with_tumour(vademecum.tip_field, options.tumour, loads.patch_radius)
         vademecum = replace(vademecum, tip_field=field)
-    if options.n_displayed is not None:
-        shown = display_surface(mesh, surface, options.n_displayed)
-        vademecum = replace(vademecum, display=shown)
+    vademecum = replace(vademecum, display=_display(mesh, surface, options))
     if options.large:
         vademecum = _with_large(vademecum, options, progress)
     if options.with_mesh_error:
@@ -184,6 +182,16 @@ def build(
         )
     certificate = vademecum.certificate or certificate
     return vademecum.with_certificate(replace(certificate, build_cpu_seconds=cpu_seconds()))
+
+
+def _display(mesh: TetMesh, surface: SurfaceMesh, options: OrganOptions) -> Display | None:
+    """What is displayed, if it is more than the mesh's own surface."""
+    tumour, n = options.tumour, options.n_displayed
+    if tumour is None and n is None:
+        return None
+    organ = boundary(mesh) if n is None else outline(mesh, surface, n)
+    structures = [] if tumour is None else [(tumour.name, structure(tumour))]
+    return display_of(mesh, organ, structures)
 
 
 def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress) -> Vademecum:

@@ -10,15 +10,14 @@ Fields are thus transferred by sparse matrices whose rows sum to one and reprodu
 
 from __future__ import annotations
 
-import igl
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from avatar_core.errors import RegistrationError
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.mesh import Regions, TetMesh, without_islands
+from avatar_core.geometry.point_location import carriers, closest_points
 from avatar_core.shapes.registration import Registration
 from avatar_core.shapes.springs import barycentric_centroids
 
@@ -26,7 +25,6 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _PIECES = 3  # a patient's face is split into 3^2 pieces, whose majority decides on its region
-_SLACK = 1e-9  # barycentric coordinates down to minus this count as inside
 
 
 def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
@@ -111,14 +109,10 @@ def interpolation_matrix(mesh: TetMesh, points: FloatArray) -> sp.csr_matrix:
     -------
     sparse, shape (n, n_vertices), rows sum to one
     """
-    tet, barycentric = locate(mesh, points)
-    inside, outside = np.flatnonzero(tet >= 0), np.flatnonzero(tet < 0)
-    faces = mesh.boundary_faces
-    _, face, on_face = closest_points(mesh.vertices, faces, points[outside])
-    rows = np.concatenate([np.repeat(inside, 4), np.repeat(outside, 3)])
-    columns = np.concatenate([mesh.tets[tet[inside]].ravel(), faces[face].ravel()])
-    values = np.concatenate([barycentric[inside].ravel(), on_face.ravel()])
-    return sp.csr_matrix((values, (rows, columns)), shape=(len(points), len(mesh.vertices)))
+    corners, weights = carriers(mesh, points)
+    rows = np.repeat(np.arange(len(points)), 4)
+    shape = (len(points), len(mesh.vertices))
+    return sp.csr_matrix((weights.ravel(), (rows, corners.ravel())), shape=shape)
 
 
 def load_map(registration: Registration, loads: LoadSurface, points: FloatArray) -> sp.csr_matrix:
@@ -149,54 +143,6 @@ def load_map(registration: Registration, loads: LoadSurface, points: FloatArray)
     return sp.csr_matrix(
         (values.ravel(), (rows, columns.ravel())), shape=(len(points), len(positions))
     )
-
-
-def locate(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Tetrahedra that hold points, and barycentric coordinates in them.
-
-    Returns
-    -------
-    tet : ndarray of int, shape (n,), -1 outside
-    barycentric : ndarray, shape (n, 4), rows sum to one; zero outside
-    """
-    corners = mesh.vertices[mesh.tets]
-    center = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
-    near = cKDTree(points).query_ball_point(center, reach * (1.0 + 1e-9))
-    size = np.array([len(hits) for hits in near])
-    tet = np.repeat(np.arange(len(near)), size)
-    point = np.fromiter((i for hits in near for i in hits), np.int64, size.sum())
-    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    local = np.linalg.inv(edges)[tet] @ (points[point] - corners[tet, 0])[:, :, None]
-    candidate = np.concatenate([1.0 - local.sum(axis=1), local[:, :, 0]], axis=1)
-    depth = candidate.min(axis=1)
-    order = np.argsort(depth, kind="stable")  # of several tetrahedra, the deepest is written last
-    order = order[depth[order] >= -_SLACK]
-    found, barycentric = np.full(len(points), -1), np.zeros((len(points), 4))
-    found[point[order]], barycentric[point[order]] = tet[order], candidate[order]
-    return found, barycentric
-
-
-def closest_points(
-    vertices: FloatArray, faces: IntArray, points: FloatArray
-) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Closest points of a triangulation.
-
-    Returns
-    -------
-    nearest : ndarray, shape (n, 3) [m]
-    face : ndarray of int, shape (n,), the faces they lie on
-    barycentric : ndarray, shape (n, 3), their coordinates there, rows sum to one
-    """
-    faces = faces.astype(np.int64)
-    if len(points) == 0:
-        return np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros((0, 3))
-    _, face, nearest = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(points), vertices, faces
-    )
-    a, b, c = (np.ascontiguousarray(vertices[faces[face, k]]) for k in range(3))
-    barycentric = np.clip(igl.barycentric_coordinates(nearest, a, b, c), 0.0, 1.0)
-    return nearest, face, barycentric / barycentric.sum(axis=1, keepdims=True)
 
 
 def _require_same_place(registration: Registration, patient: TetMesh) -> None:

@@ -27,8 +27,9 @@ from avatar_core.common.processes import repeatable
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.level_set import distance_grid, isosurface, signed_distance
 from avatar_core.geometry.mesh import Regions, TetMesh, regions_by_rule, tetrahedralize
+from avatar_core.geometry.point_location import closest_points
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.correspondence import closest_points, interpolation_matrix
+from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
 from avatar_core.studies.shapes import Livers, read_livers
 from avatar_core.studies.study import Study, Value, follow, mean_and_worst

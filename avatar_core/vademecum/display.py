@@ -1,8 +1,9 @@
-"""A fine surface that is displayed in the place of the mesh's own, moved by interpolation.
+"""What is displayed of an organ: a surface finer than the mesh, and structures inside it.
 
 The mesh is as fine as its mechanics need, some millimetres; eyes want the organ as it was
-segmented. A vertex x of the displayed surface is tied to the nearest point of the mesh's boundary,
-sum_i w_i x_i in the triangle of the vertices i, and moves with it,
+segmented, and its tumour in its place. A vertex x of the surface hangs on the
+nearest point of the mesh's boundary, one of a structure on the tetrahedron that holds it,
+sum_i w_i x_i, and moves with it,
 
     u(x) = sum_i w_i u(x_i).
 
@@ -14,61 +15,93 @@ vertices.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import igl
 import numpy as np
 
 from avatar_core.geometry.mesh import TetMesh
+from avatar_core.geometry.point_location import carriers, closest_points
 from avatar_core.geometry.resampling import is_manifold, resampled, unified
 from avatar_core.geometry.surface import SurfaceMesh
 
+ORGAN = "organ"  # the first part
+MOST_OF_STRUCTURE = 4000  # vertices
+Triangles = tuple[np.ndarray, np.ndarray]  # vertices (n, 3) [m], faces (m, 3)
+
 
 @dataclass(frozen=True, eq=False)
-class DisplaySurface:
-    """The displayed surface at rest, and how it hangs on the mesh.
+class Display:
+    """Displayed triangles at rest, part by part, and how they hang on the mesh.
 
     vertices : ndarray, shape (n, 3) float32 [m]
     faces : ndarray of int32, shape (m, 3), counter-clockwise seen from outside
-    corners : ndarray of int32, shape (n, 3), vertices of the mesh that carry each vertex
-    weights : ndarray, shape (n, 3) float32, of the corners; they add up to 1
+    corners : ndarray of int32, shape (n, 4), vertices of the mesh that carry each vertex
+    weights : ndarray, shape (n, 4) float32, of the corners; they add up to 1
+    first_face : ndarray of int64, shape (n_parts + 1,), of each part; vertices likewise follow each
+        other
+    names : of the parts; the first is the organ's surface
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     corners: np.ndarray
     weights: np.ndarray
+    first_face: np.ndarray
+    names: tuple[str, ...]
+
+    def faces_of(self, part: int) -> np.ndarray:
+        """The triangles of a part, over all displayed vertices."""
+        return self.faces[self.first_face[part] : self.first_face[part + 1]]
 
 
-def display_surface(mesh: TetMesh, surface: SurfaceMesh, n: int) -> DisplaySurface:
-    """The surface that a mesh was made of, with about n vertices, tied to the mesh.
+def display_of(
+    mesh: TetMesh, organ: Triangles, structures: Sequence[tuple[str, Triangles]] = ()
+) -> Display:
+    """The organ's surface and named structures inside, tied to a mesh."""
+    inside = [triangles for _, triangles in structures]
+    tied = [_on_boundary(mesh, organ[0]), *(carriers(mesh, points) for points, _ in inside)]
+    parts = [organ, *inside]
+    before = np.cumsum([0, *(len(points) for points, _ in parts)])
+    faces = [triangles + n for (_, triangles), n in zip(parts, before[:-1], strict=True)]
+    weights = np.maximum(np.concatenate([part for _, part in tied]), 0.0)
+    return Display(
+        np.concatenate([points for points, _ in parts]).astype(np.float32),
+        np.concatenate(faces).astype(np.int32),
+        np.concatenate([part for part, _ in tied]).astype(np.int32),
+        (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32),
+        np.cumsum([0, *(len(part) for part in faces)]),
+        (ORGAN, *(name for name, _ in structures)),
+    )
+
+
+def _on_boundary(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`carriers`, but of the nearest points of the boundary."""
+    faces = mesh.boundary_faces
+    _, face, weights = closest_points(mesh.vertices, faces, np.asarray(points, float))
+    return faces[face][:, [0, 1, 2, 0]], np.pad(weights, ((0, 0), (0, 1)))
+
+
+def boundary(mesh: TetMesh) -> Triangles:
+    """The mesh's own surface."""
+    index = mesh.surface_vertices
+    return mesh.vertices[index], np.searchsorted(index, mesh.boundary_faces)
+
+
+def outline(mesh: TetMesh, surface: SurfaceMesh, n: int) -> Triangles:
+    """The surface that a mesh was made of, with about n vertices.
 
     Where triangles of the file cross or do not close, the boundary of the mesh is refined instead.
-
-    Parameters
-    ----------
-    n : wanted vertices
     """
-    outline = unified(*surface.skin.boundary)
-    if not is_manifold(outline[1]):
-        index = mesh.surface_vertices
-        outline = mesh.vertices[index], np.searchsorted(index, mesh.boundary_faces)
-    return tied(mesh, *resampled(*outline, n))
+    vertices, faces = unified(*surface.skin.boundary)
+    if not is_manifold(faces):
+        vertices, faces = boundary(mesh)
+    return resampled(vertices, faces, n)
 
 
-def tied(mesh: TetMesh, vertices: np.ndarray, faces: np.ndarray) -> DisplaySurface:
-    """A surface tied to the nearest points of a mesh's boundary."""
-    triangles = np.ascontiguousarray(mesh.boundary_faces, np.int64)
-    points = np.ascontiguousarray(mesh.vertices, float)
-    _, face, nearest = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(vertices, float), points, triangles
-    )
-    corners = triangles[face]
-    weights = igl.barycentric_coordinates(nearest, *(points[corners[:, i]] for i in range(3)))
-    weights = np.clip(weights, 0.0, 1.0)
-    return DisplaySurface(
-        np.asarray(vertices, np.float32),
-        np.asarray(faces, np.int32),
-        corners.astype(np.int32),
-        (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32),
-    )
+def structure(surface: SurfaceMesh) -> Triangles:
+    """A surface inside an organ, such as that of a tumour, with no more vertices than is useful."""
+    vertices, faces = unified(*surface.skin.boundary)
+    if len(vertices) > MOST_OF_STRUCTURE:
+        return resampled(vertices, faces, MOST_OF_STRUCTURE)
+    return vertices, faces

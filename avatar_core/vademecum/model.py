@@ -22,7 +22,7 @@ from avatar_core.reduction.pgd import EnrichmentReport
 from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.certificate import Certificate
-from avatar_core.vademecum.display import DisplaySurface
+from avatar_core.vademecum.display import Display
 from avatar_core.vademecum.large_deformation import LargeCertificate, LargeDeformation, Push
 from avatar_core.vademecum.modal_mass import BodyResponse
 from avatar_core.vademecum.parametric import ParametricResponse
@@ -123,7 +123,8 @@ class Vademecum:
     contrast : Young's modulus inside the tumour over that outside; None without a tumour
     large : LargeDeformation or None, the load's magnitude as a coordinate
     body : BodyResponse or None, mass and weight as the far modes see them
-    display : DisplaySurface or None, what is displayed; None for the boundary of the mesh
+    display : Display or None, a finer surface, and structures inside; None for the boundary of the
+        mesh alone
     """
 
     name: str
@@ -144,7 +145,7 @@ class Vademecum:
     contrast: float | None = None
     large: LargeDeformation | None = None
     body: BodyResponse | None = None
-    display: DisplaySurface | None = None
+    display: Display | None = None
     id: str = field(default="", compare=False)
     nbytes: int = field(default=0, compare=False)
 
@@ -297,20 +298,33 @@ class Vademecum:
 
     @property
     def surface_faces(self) -> np.ndarray:
-        """Displayed triangles over :attr:`surface_vertices`, shape (m, 3)."""
+        """Displayed triangles over :attr:`surface_vertices`, of structures too, shape (m, 3)."""
         if self.display is not None:
             return self.display.faces
         return np.searchsorted(self.mesh.surface_vertices, self.mesh.boundary_faces)
 
     @property
+    def organ_faces(self) -> np.ndarray:
+        """Those of :attr:`surface_faces` that are the organ's own, shape (m, 3)."""
+        return self.surface_faces if self.display is None else self.display.faces_of(0)
+
+    @property
+    def structures(self) -> dict[str, np.ndarray]:
+        """Triangles of what is displayed inside, by name, over :attr:`surface_vertices`."""
+        display = self.display
+        if display is None:
+            return {}
+        return {name: display.faces_of(k) for k, name in enumerate(display.names) if k > 0}
+
+    @property
     def clamped_faces(self) -> np.ndarray:
-        """Which of :attr:`surface_faces` are clamped, shape (m,) bool."""
+        """Which of :attr:`organ_faces` are clamped, shape (m,) bool."""
         if self.display is None:
             return self.regions.clamped
         held = np.zeros(len(self.mesh.vertices))
         held[self.mesh.boundary_faces[self.regions.clamped]] = 1.0
         part = (held[self.display.corners] * self.display.weights).sum(axis=1)
-        return np.asarray((part[self.display.faces] > 0.5).all(axis=1))
+        return np.asarray((part[self.organ_faces] > 0.5).all(axis=1))
 
     def info(self) -> VademecumInfo:
         """The summary."""

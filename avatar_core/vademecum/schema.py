@@ -82,8 +82,9 @@ _LARGE: Shapes = {
 _DISPLAY: Shapes = {
     "display/vertices": "f: displayed 3",
     "display/faces": "i: display_faces 3",
-    "display/corners": "i: displayed 3",
-    "display/weights": "f: displayed 3",
+    "display/corners": "i: displayed 4",
+    "display/weights": "f: displayed 4",
+    "display/first_face": "i: parts",
 }
 BODY_KEYS = tuple(_BODY)
 PARAMETRIC_KEYS = tuple(_PARAMETRIC)
@@ -164,13 +165,14 @@ def _require_surface(arrays: Arrays, sizes: Mapping[str, int]) -> None:
 
 
 def _require_display(arrays: Arrays, sizes: Mapping[str, int]) -> None:
-    """Vertices of an organ's size, hung within triangles of the mesh's boundary."""
+    """Vertices of an organ's size, hung within tetrahedra; faces in parts of one at least."""
     _require_lengths(arrays, "display/vertices")
     require_indices("display/faces", arrays["display/faces"], sizes["displayed"])
     require_indices("display/corners", arrays["display/corners"], sizes["vertices"])
-    mesh = TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"])
-    if not np.isin(arrays["display/corners"], mesh.surface_vertices).all():
-        raise StorageError("'display/corners' lie inside the organ; build the file again")
+    first = arrays["display/first_face"].astype(np.int64)
+    whole = len(first) > 1 and first[0] == 0 and first[-1] == sizes["display_faces"]
+    if not (whole and (np.diff(first) > 0).all()):
+        raise StorageError("'display/first_face' does not fit its faces; build the file again")
     weights = arrays["display/weights"]
     if weights.min(initial=0.0) < 0.0 or np.abs(weights.sum(axis=1) - 1.0).max(initial=0.0) > 1e-5:
         raise StorageError("'display/weights' are no parts of a whole; build the file again")

@@ -28,10 +28,12 @@ A vademecum with coordinates of the material has the JSON attributes ``coordinat
     parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N], as of contact_near
 
 one with the organ's mass body/mass (rank, rank) and body/weight (rank, 3),
-and the same under parametric/body for that basis; one with a finer surface to display
+and the same under parametric/body for that basis; one with a finer surface or structures
+to display
 
     display/vertices (n, 3) [m]          display/faces (m, 3)
-    display/corners (n, 3)               display/weights (n, 3), of the mesh's vertices
+    display/corners (n, 4)               display/weights (n, 4), of the mesh's vertices
+    display/first_face (n_parts + 1,), with the JSON attribute ``parts``, their names
 
 one with large deformation the JSON attribute
 ``large`` (material, certificate) and, for k = 2, 3,
@@ -65,7 +67,7 @@ from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.accuracy import AccuracyCurve, Cloud, Precision
 from avatar_core.vademecum.certificate import Certificate
-from avatar_core.vademecum.display import DisplaySurface
+from avatar_core.vademecum.display import ORGAN, Display
 from avatar_core.vademecum.large_deformation import (
     LargeCertificate,
     LargeDeformation,
@@ -92,7 +94,7 @@ FORMAT = "avatar vademecum"
 MAX_FILE_BYTES = 4 << 30
 
 _JSON = ("material", "provenance", "convergence", "certificate")
-_JSON_LATER = ("coordinates", "contrast", "large", "accuracy")
+_JSON_LATER = ("coordinates", "contrast", "large", "accuracy", "parts")
 # What files call fields of the certificate.
 _STORED_AS = {"tip_force_mean": "felt_mean", "tip_force_worst": "felt_worst"}
 
@@ -233,6 +235,7 @@ def _attributes(v: Vademecum) -> dict[str, str]:
         "coordinates": json.dumps(coordinates),
         "contrast": json.dumps(v.contrast),
         "large": json.dumps(_large_attribute(v.large)),
+        "parts": json.dumps(v.display.names if v.display else None),
     }
 
 
@@ -269,14 +272,20 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         contrast=_contrast(plain["contrast"]),
         large=_large(arrays, plain["large"]),
         body=_body(arrays, BODY_KEYS),
-        display=_display(arrays),
+        display=_display(arrays, plain["parts"]),
     )
 
 
-def _display(arrays: dict[str, np.ndarray]) -> DisplaySurface | None:
+def _display(arrays: dict[str, np.ndarray], stored: Any) -> Display | None:
     if DISPLAY_KEYS[0] not in arrays:
         return None
-    return DisplaySurface(*(arrays[key] for key in DISPLAY_KEYS))
+    names = of_plain(tuple[str, ...], stored, "parts")
+    if len(names) + 1 != len(arrays["display/first_face"]) or names[0] != ORGAN:
+        raise StorageError("'parts' do not fit 'display/first_face'; build the file again")
+    for name in names:
+        require_name(name, "parts")
+    vertices, faces, corners, weights, first_face = (arrays[key] for key in DISPLAY_KEYS)
+    return Display(vertices, faces, corners, weights, first_face, names)
 
 
 def _regional(arrays: dict[str, np.ndarray], name: str) -> RegionalField:

@@ -15,13 +15,12 @@ from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.point_location import closest_points, locate
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.shapes.correspondence import (
     carry_regions,
-    closest_points,
     interpolation_matrix,
     load_map,
-    locate,
     registered_positions,
 )
 from avatar_core.shapes.distortion import Distortion

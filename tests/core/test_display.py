@@ -1,4 +1,4 @@
-"""A displayed surface that is finer than the mesh: made, tied, moved, stored."""
+"""What is displayed beside the mesh: a finer surface, and structures that move with the organ."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from avatar_core.contact.model import prepare
 from avatar_core.errors import StorageError, SurfaceError
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.resampling import is_manifold, resampled, unified
+from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline.pipeline import OrganOptions
-from avatar_core.vademecum.display import DisplaySurface, display_surface, tied
+from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.offline.rule import BuildRule
+from avatar_core.vademecum.display import boundary, display_of, outline, structure
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import _arrays, _attributes, load_vademecum, save_vademecum
 
@@ -24,15 +26,17 @@ from .box_organ import PATCH_RADIUS, UP, organ, top
 from .test_dent import ASIDE, DEPTH, END, SPHERE, pressed, sneddon_dent, without
 
 
-def outline(v: Vademecum) -> tuple[np.ndarray, np.ndarray]:
-    """The boundary of the mesh."""
-    index = v.mesh.surface_vertices
-    return v.mesh.vertices[index], np.searchsorted(index, v.mesh.boundary_faces)
-
-
 def finer(v: Vademecum, times: int = 2) -> Vademecum:
     """The same with every triangle of the boundary split into four, so many times."""
-    return replace(v, display=tied(v.mesh, *igl.upsample(*outline(v), times)))
+    return replace(v, display=display_of(v.mesh, igl.upsample(*boundary(v.mesh), times)))
+
+
+def ball(centre: np.ndarray, radius: float) -> SurfaceMesh:
+    corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+    points, triangles = igl.upsample(corners, np.array(faces), 3)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return SurfaceMesh(centre + radius * points, triangles, "lesion")
 
 
 @pytest.mark.parametrize("n", [300, 1500, 9000])
@@ -72,7 +76,7 @@ def test_what_is_tied_moves_with_a_linear_field() -> None:
 
 def test_the_meshs_own_vertices_are_shown_as_without() -> None:
     own = organ("cube")
-    hung = replace(own, display=tied(own.mesh, *outline(own)))
+    hung = replace(own, display=display_of(own.mesh, boundary(own.mesh)))
     for aside in ASIDE:
         place = top("cube") + np.array([aside[0], 0.0, aside[1]])
         clouds = [
@@ -94,7 +98,7 @@ def test_a_fine_cube_shows_sneddons_dent() -> None:
         at = (place[None], UP[None], DEPTH)
         shown, plain = (pressed(each, (SPHERE,), *at)[:, 1] for each in (model, patch))
         cloud = pressed(prepare(coarse, (SPHERE,), effects=()), (SPHERE,), *at)
-        display = tied(coarse.mesh, *igl.upsample(*outline(coarse), 2))
+        display = display_of(coarse.mesh, igl.upsample(*boundary(coarse.mesh), 2))
         index = np.searchsorted(coarse.mesh.surface_vertices, display.corners)
         linear = np.einsum("vk,vkd->vd", display.weights, cloud[index])[:, 1]
         distance = np.linalg.norm(rest - place, axis=1)
@@ -127,19 +131,66 @@ def test_the_volume_shows_the_mesh() -> None:
     assert fine.info().n_surface_vertices == len(fine.mesh.surface_vertices)
 
 
+def test_a_structure_moves_with_the_organ() -> None:
+    """As the volume does between the vertices of the mesh; the organ's own part is as without."""
+    cube, lesion = organ("cube"), ball(top("cube") + np.array([2e-3, -12e-3, 1e-3]), 8e-3)
+    display = display_of(cube.mesh, boundary(cube.mesh), [("lesion", structure(lesion))])
+    with_lesion = replace(cube, display=display)
+    tip = Tip("patch", SPHERE.radius)  # whose field the modes hold as a whole
+    at = (top("cube")[None], UP[None], DEPTH)
+    cloud = pressed(prepare(with_lesion, (tip,), effects=()), (tip,), *at)
+    n, volume = len(cube.surface_vertices), prepare(cube, (tip,), cloud="volume", effects=())
+    whole = pressed(volume, (tip,), *at)
+    inside = np.unique(with_lesion.structures["lesion"])
+    np.testing.assert_array_equal(inside, np.arange(n, len(cloud)))
+    exact = np.einsum("vk,vkd->vd", display.weights[inside], whole[display.corners[inside]])
+    np.testing.assert_allclose(cloud[inside], exact, atol=2e-7)
+    np.testing.assert_allclose(cloud[:n], whole[cube.mesh.surface_vertices], atol=2e-7)
+    rest = np.einsum("vk,vkd->vd", display.weights, cube.mesh.vertices[display.corners])
+    np.testing.assert_allclose(rest, display.vertices, atol=1e-6)
+    moved = np.linalg.norm(cloud[inside], axis=1)
+    assert 0.2 * DEPTH < moved.mean() < 0.8 * DEPTH and np.ptp(moved) > 0.1 * DEPTH
+    assert len(with_lesion.organ_faces) == len(cube.surface_faces)
+
+
+def test_a_structure_with_too_many_vertices_is_thinned() -> None:
+    lesion = ball(np.zeros(3), 0.02)
+    fine = SurfaceMesh(*igl.upsample(lesion.vertices, lesion.faces.astype(np.int64), 3))
+    assert len(fine.vertices) > 4000 >= len(structure(fine)[0]) > 3900
+    assert len(structure(lesion)[0]) == len(lesion.vertices)
+
+
+def test_a_tumour_is_stored_with_its_organ_and_stays_there(tmp_path: Path) -> None:
+    liver = phantom_liver(12e-3)
+    lesion = ball(liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0]), 0.02)
+    options = OrganOptions(
+        n_vertices=450, rule=BuildRule(max_modes=20), tumour=lesion, contrast=5.0, n_certified=2
+    )
+    save_vademecum(build(liver, options), tmp_path / "sick.h5")
+    sick = load_vademecum(tmp_path / "sick.h5")
+    assert list(sick.structures) == ["lesion"]
+    used = sick.surface_vertices[np.unique(sick.structures["lesion"])]
+    assert np.linalg.norm(used - lesion.vertices.mean(axis=0), axis=1) == pytest.approx(
+        0.02, abs=1e-4
+    )
+    assert len(sick.organ_faces) == len(sick.mesh.boundary_faces)
+
+
 def test_a_display_is_stored(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
-    display = display_surface(phantom_vademecum.mesh, phantom_liver(), 3000)
+    mesh, lesion = phantom_vademecum.mesh, ball(phantom_vademecum.mesh.vertices.mean(axis=0), 9e-3)
+    display = display_of(
+        mesh, outline(mesh, phantom_liver(), 3000), [("lesion", structure(lesion))]
+    )
     fine = replace(phantom_vademecum, display=display)
     before = save_vademecum(phantom_vademecum, tmp_path / "plain.h5")
     assert save_vademecum(fine, tmp_path / "fine.h5") != before
     read = load_vademecum(tmp_path / "fine.h5").display
     assert read is not None
-    for name in DisplaySurface.__dataclass_fields__:
-        np.testing.assert_array_equal(getattr(read, name), getattr(display, name))
+    for name, value in vars(display).items():
+        np.testing.assert_array_equal(getattr(read, name), value)
     assert load_vademecum(tmp_path / "plain.h5").display is None
-    assert len(fine.clamped_faces) == len(fine.surface_faces)
-    held = fine.surface_vertices[fine.surface_faces[fine.clamped_faces]].mean(axis=(0, 1))
-    mesh = phantom_vademecum.mesh
+    assert len(fine.clamped_faces) == len(fine.organ_faces)
+    held = fine.surface_vertices[fine.organ_faces[fine.clamped_faces]].mean(axis=(0, 1))
     clamp = mesh.boundary_faces[phantom_vademecum.regions.clamped]
     assert np.linalg.norm(held - mesh.vertices[clamp].mean(axis=(0, 1))) < PATCH_RADIUS
 
@@ -148,7 +199,9 @@ def test_a_display_is_stored(phantom_vademecum: Vademecum, tmp_path: Path) -> No
     ("key", "spoil", "message"),
     [
         ("faces", lambda a: a + len(a), "points outside"),
-        ("corners", lambda a: a - 1, "points outside|lie inside"),
+        ("corners", lambda a: a - 1, "points outside"),
+        ("first_face", lambda a: a[::-1], "first_face"),
+        ("first_face", lambda a: a[[0, -1]], "parts"),
         ("weights", lambda a: 2.0 * a, "no parts of a whole"),
         ("weights", lambda a: a * np.nan, "NaN"),
         ("weights", lambda a: a[:-1], "does not fit"),
@@ -162,7 +215,10 @@ def test_a_spoilt_display_is_refused(
     phantom_vademecum: Vademecum,
     tmp_path: Path,
 ) -> None:
-    display = display_surface(phantom_vademecum.mesh, phantom_liver(), 3000)
+    mesh, lesion = phantom_vademecum.mesh, ball(phantom_vademecum.mesh.vertices.mean(axis=0), 9e-3)
+    display = display_of(
+        mesh, outline(mesh, phantom_liver(), 3000), [("lesion", structure(lesion))]
+    )
     fine = replace(phantom_vademecum, display=display)
     arrays, attributes = _arrays(fine), _attributes(fine)
     arrays[f"display/{key}"] = spoil(arrays[f"display/{key}"])

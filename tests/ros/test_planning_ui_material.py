@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,6 +26,7 @@ from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.storage import save_vademecum
+from avatar_ros.srv import LoadVademecum
 from tests.hard.small_files import ball
 from tests.ros.browser import (
     CHROMIUM,
@@ -77,7 +79,10 @@ def _library() -> dict[str, bytes]:
             n_certified=4,
         )
         save_vademecum(build(liver, options), organ)
-        return {file.name: file.read_bytes() for file in (tumour, organ)}
+        healthy = Path(name, "healthy.h5")
+        options = OrganOptions(n_vertices=600, rule=BuildRule(max_modes=20), n_certified=4)
+        save_vademecum(build(replace(liver, name="healthy"), options), healthy)
+        return {file.name: file.read_bytes() for file in (organ, healthy)}
 
 
 @pytest.fixture(scope="module")
@@ -91,15 +96,7 @@ def page(folder: Path, own_domain: dict[str, str], shots: Path) -> Iterator[Any]
     arguments = {
         "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
         "contact": [*PATIENT[1:], "-p", f"material.young_modulus:={CHOSEN_BY_ANOTHER}"],
-        "planning_ui": [
-            *library,
-            "-p",
-            f"port:={port}",
-            "-p",
-            f"token:={TOKEN}",
-            "-p",
-            "tumour:=tumour.stl",
-        ],
+        "planning_ui": [*library, "-p", f"port:={port}", "-p", f"token:={TOKEN}"],
     }
     with nodes_of_a_page(arguments, own_domain), opened(port, shots) as page:
         yield page
@@ -120,14 +117,19 @@ def in_force(probe: Probe, name: str) -> float:
     return float(parameter_value_to_python(value))
 
 
-def test_a_tumour_is_seen_in_the_organ(page: Any, shots: Path) -> None:
+def vermilion(page: Any, shot: Path) -> np.ndarray:
+    """Pixels of the tumour, seen through violet, (n, 2): down, right."""
     from PIL import Image
 
-    page.wait_for_timeout(2000)
-    page.screenshot(path=shots / "tumour.png")
-    left = np.asarray(Image.open(shots / "tumour.png").convert("RGB"))[:, :900].astype(float)
+    page.screenshot(path=shot)
+    left = np.asarray(Image.open(shot).convert("RGB"))[:, :900].astype(float)
     red, others = left[:, :, 0], left[:, :, 1:].max(axis=2)
-    assert (red > 1.5 * others).sum() > 500  # vermilion, through violet
+    return np.argwhere(red > 1.5 * others)
+
+
+def test_a_tumour_is_seen_in_the_organ(page: Any, shots: Path) -> None:
+    page.wait_for_timeout(2000)
+    assert len(vermilion(page, shots / "tumour.png")) > 500
 
 
 def test_what_another_client_chose_is_shown(page: Any) -> None:
@@ -173,3 +175,16 @@ def pressed(page: Any) -> None:
         page.get_by_text("press 1 mm", exact=True).click()
         page.wait_for_timeout(300)
     raise AssertionError("no force")
+
+
+def test_no_tumour_is_drawn_in_an_organ_without_one(
+    page: Any, shots: Path, lasting_probe: Probe
+) -> None:
+    """Last, as it changes the organ."""
+    request = LoadVademecum.Request(name="healthy.h5")
+    assert lasting_probe.ask(LoadVademecum, "load_vademecum", request).success
+    page.get_by_text("healthy", exact=False).first.wait_for(timeout=30e3)
+    until(page, lambda: len(vermilion(page, shots / "healthy.png")) == 0, "no tumour", 30.0)
+    request = LoadVademecum.Request(name="liver.h5")
+    assert lasting_probe.ask(LoadVademecum, "load_vademecum", request).success
+    until(page, lambda: len(vermilion(page, shots / "again.png")) > 500, "the tumour again", 30.0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -97,17 +97,40 @@ def time_dense_table(
     if size > MAX_TABLE_BYTES:
         nan = float("nan")
         return StepRow("dense table", n_v, 0, n_tools, nan, 0, nan, nan, size)
-    model = prepare(vademecum, (SPHERE,) * n_tools, cloud=cloud)
-    columns = _columns(vademecum, cloud)
-    compliance = _compliance(vademecum)
+    model, call = _dense(vademecum, n_tools)
+    row = _timed("dense table", vademecum, model, 0, n_tools, call, clock)
+    return replace(row, bytes=size)
 
+
+def table_over_steps(vademecum: Vademecum, clock: Clock = time.process_time) -> float:
+    """Median step of the dense table over that of the vademecum with all modes, one tool.
+
+    Both slide in turn, so that a machine that slows down slows both; the median over the pairs.
+    """
+    tips = tool_paths(vademecum, 1)
+    model = prepare(vademecum, (SPHERE,), cloud=shown_cloud(vademecum))
+    dense, call = _dense(vademecum, 1)
+
+    def ratio() -> float:
+        table = np.median(one_pass(dense, tips, call, clock)[0])
+        return float(table / np.median(one_pass(model, tips, lambda at: step(model, at), clock)[0]))
+
+    return float(np.median([ratio() for _ in range(PASSES)]))
+
+
+def _dense(
+    vademecum: Vademecum, n_tools: int
+) -> tuple[ContactModel, Callable[[np.ndarray], object]]:
+    """A model whose state the dense table uses, and its step."""
+    cloud = shown_cloud(vademecum)
+    model = prepare(vademecum, (SPHERE,) * n_tools, cloud=cloud)
+    columns, compliance = _columns(vademecum, cloud), _compliance(vademecum)
     effects = model.effects._replace(large_deformation=None)
 
     def dense(tips: np.ndarray) -> None:
         _dense_step(model.arrays, model.state, model.out, tips, effects, columns, compliance)
 
-    row = _timed("dense table", vademecum, model, 0, n_tools, dense, clock)
-    return StepRow(**{**row.__dict__, "bytes": columns.nbytes + compliance.nbytes})
+    return model, dense
 
 
 def time_direct(

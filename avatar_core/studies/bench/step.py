@@ -18,7 +18,7 @@ from avatar_core.studies.bench.methods import (
     time_steps,
     time_tip_over_patch,
 )
-from avatar_core.vademecum.display import display_surface
+from avatar_core.vademecum.display import display_of, outline
 from avatar_core.vademecum.model import Provenance, Vademecum
 
 MODES = (11, 50)  # shown at a place, and all
@@ -44,7 +44,7 @@ def run_step_bench(
         "direct_p99_us": rows[-1].p99_us,
     }
     for n in displayed:
-        fine = replace(organ, display=display_surface(organ.mesh, surface, n))
+        fine = replace(organ, display=display_of(organ.mesh, outline(organ.mesh, surface, n)))
         more = _rows(fine, (organ.n_modes,))
         summary[f"step_{n // 1000}k_p50_us"] = _row(more, 1).p50_us
         summary[f"step_{n // 1000}k_p99_us"] = _row(more, N_TOOLS).p99_us

@@ -20,7 +20,6 @@ except ImportError as error:
 
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
-from avatar_core.geometry.tumour import read_tumour
 from avatar_core.scene.file import read_scene, shipped_scenes
 from avatar_core.scene.model import Scene
 from avatar_core.vademecum.storage import parse_vademecum
@@ -58,9 +57,6 @@ PLANNING_UI = (
     Parameter("token", "", "at the end of the page's address; empty: a new one at each start"),
     Parameter("library_dir", ".", "directory of the loader's files; recordings are written there"),
     Parameter("tool", "tool", "name of the tool to move, one of those of contact"),
-    Parameter(
-        "tumour", "", "surface of the tumour in library_dir, shown in the organ; empty: none"
-    ),
 )
 
 
@@ -93,7 +89,6 @@ class PlanningNode(ManagedNode):
         if not folder.is_dir():
             raise ParameterError(f"parameter library_dir: {folder} is not a directory")
         self._library = Library(folder.resolve())
-        self._tumour = value["tumour"]
         self._tool = value["tool"]
         guard = Guard(value["host"], value["token"])
         with guarded(guard):
@@ -171,7 +166,6 @@ class PlanningNode(ManagedNode):
             data = bytes(message.data)
             name = "the announced vademecum"
             organ = Organ.of(self._reader.read(name, len(data), parse_vademecum, data, name))
-            tumour = read_tumour(self._library.folder / self._tumour) if self._tumour else None
         except AvatarError as error:
             self._say(str(error))
             return
@@ -179,7 +173,7 @@ class PlanningNode(ManagedNode):
         self._material = {}
         tip = self._tip()
         self._state.live["target"][0] = organ.above(tip.offset + CLEARANCE)
-        self._view.show(organ, tumour, tip)
+        self._view.show(organ, tip)
         self._panels.show_organ(organ)
         self._organ = organ
         self._listen_to_clouds()

@@ -16,7 +16,8 @@ YOUNG_RANGE = (0.25, 4.0)  # of the slider, times that of the vademecum
 class Organ:
     """An organ at rest.
 
-    vertices : ndarray, shape (n, 3) float32 [m]; faces : (m, 3)
+    vertices : ndarray, shape (n, 3) float32, of the cloud [m]; faces : (m, 3), of the organ
+    structures : faces of what lies inside, by name
     clamped : ndarray of bool, shape (m,)
     centre : of the bounding box [m]; size : its longest side [m]
     start, normal : a point in the middle of the accessible surface [m], and the normal there
@@ -28,6 +29,7 @@ class Organ:
     vademecum: Vademecum
     vertices: np.ndarray
     faces: np.ndarray
+    structures: dict[str, np.ndarray]
     clamped: np.ndarray
     centre: np.ndarray
     size: float
@@ -51,7 +53,8 @@ class Organ:
             name=v.name,
             vademecum=v,
             vertices=vertices,
-            faces=v.surface_faces,
+            faces=v.organ_faces,
+            structures=v.structures,
             clamped=v.clamped_faces,
             centre=0.5 * (low + high),
             size=float((high - low).max()),

@@ -1,4 +1,4 @@
-"""The three-dimensional part of the planning page: organ, clamp, tumour, tool and force."""
+"""The three-dimensional part of the planning page: organ, what is in it, tool and force."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import viser
 
 from avatar_core.contact.fine_surface import FineSurface, fine_surface
-from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_ros.ui.colours import table, top_for
 from avatar_ros.ui.organ import Organ
@@ -17,7 +16,7 @@ from avatar_ros.ui.tip_body import tip_body, turn_to
 
 N_BANDS = 10  # of the colour scale; a mesh has a single colour
 CLAMP = (90, 90, 90)
-TUMOUR = (213, 94, 0)  # vermilion and blue of Okabe and Ito, distinguishable for all
+STRUCTURE = (213, 94, 0)  # vermilion and blue of Okabe and Ito, distinguishable for all
 TOOL = (0, 114, 178)
 ARROW = (213, 94, 0)
 FORCE_SCALE = 0.004  # length of the arrow per force [m/N]
@@ -54,6 +53,12 @@ def _draw(mesh: Any, vertices: np.ndarray, faces: np.ndarray) -> None:
         mesh.faces, mesh.vertices = faces, vertices
 
 
+def _own(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The points that some faces use, and the faces over these alone."""
+    used, local = np.unique(faces, return_inverse=True)
+    return used, local.reshape(faces.shape)
+
+
 class OrganView:
     """Draws into a viser server; everything in metres, in the organ's frame.
 
@@ -65,6 +70,8 @@ class OrganView:
         self._on_drag = on_drag
         self._organ: Organ | None = None
         self._bands: list[Any] = []
+        self._structures: list[Any] = []
+        self._inside: list[np.ndarray] = []  # points of the cloud, of each structure
         self._tool: Any = None
         self._tip: Tip | None = None
         self._arrow: Any = None
@@ -73,15 +80,14 @@ class OrganView:
         server.scene.world_axes.visible = False
         server.scene.add_light_ambient("/light", intensity=1.2)  # the first colours are dark
 
-    def show(self, organ: Organ, tumour: SurfaceMesh | None, tip: Tip) -> None:
-        """Show another organ, at rest."""
+    def show(self, organ: Organ, tip: Tip) -> None:
+        """Show another organ, at rest, with the structures of its own file and no others."""
         scene, first = self._server.scene, self._organ is None
         self._organ, self.top = organ, top_for(0.0)
         clamp = organ.faces[organ.clamped]
         # slightly outside the moving surface, so that it is visible
         lifted = organ.centre + 1.003 * (organ.vertices - organ.centre)
         scene.add_mesh_simple("/clamp", lifted, clamp, color=CLAMP, side="double")
-        is_transparent = tumour is not None
         self._bands = [
             scene.add_mesh_simple(
                 f"/organ/{i}",
@@ -89,17 +95,20 @@ class OrganView:
                 _NO_FACE if i else organ.faces,
                 color=tuple(shade),
                 side="double",
-                opacity=0.55 if is_transparent else None,
+                opacity=0.55 if organ.structures else None,
                 cast_shadow=False,
             )
             for i, shade in enumerate(band_shades().tolist())
         ]
-        if tumour is not None:
+        for mesh in self._structures:
+            mesh.remove()
+        self._structures = [
             scene.add_mesh_simple(
-                "/tumour", tumour.vertices, tumour.faces, color=TUMOUR, side="double"
+                f"/structures/{i}", organ.vertices[used], local, color=STRUCTURE, side="double"
             )
-        else:
-            scene.remove_by_name("/tumour")
+            for i, (used, local) in enumerate(map(_own, organ.structures.values()))
+        ]
+        self._inside = [np.unique(faces) for faces in organ.structures.values()]
         self._add_tool(tip, organ.above(tip.offset + CLEARANCE))
         self._arrow = scene.add_arrows(
             "/force",
@@ -155,7 +164,7 @@ class OrganView:
         else:
             shown = FineSurface(points[:, :3], points[:, 3:], organ.faces)
         size = np.linalg.norm(shown.displacements, axis=1)
-        largest = float(size.max())
+        largest = float(size[shown.faces].max())
         self.top = top_for(largest, self.top)
         of_face = size[shown.faces].mean(axis=1)
         band = np.minimum((of_face * (N_BANDS / self.top)).astype(int), N_BANDS - 1)
@@ -166,6 +175,8 @@ class OrganView:
                 if len(faces) == 0 and len(mesh.faces) == 1:
                     continue  # still empty
                 _draw(mesh, positions, faces.astype(np.uint32) if len(faces) else _NO_FACE)
+            for mesh, points_inside in zip(self._structures, self._inside, strict=True):
+                mesh.vertices = positions[points_inside]
         return largest
 
     def place_tool(self, tip: np.ndarray, force: np.ndarray) -> None:

@@ -1,0 +1,83 @@
+"""Where points lie in a mesh: in which tetrahedron, or nearest to which triangle."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from avatar_core.geometry.mesh import TetMesh
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_SLACK = 1e-9  # barycentric coordinates down to minus this count as inside
+
+
+def carriers(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Vertices of a mesh between which a field is interpolated linearly at points.
+
+    Points in a tetrahedron take its barycentric coordinates, points outside those of the closest
+    point of the surface, which has three corners: the last has no weight.
+
+    Returns
+    -------
+    corners : ndarray of int, shape (n, 4)
+    weights : ndarray, shape (n, 4), rows sum to one
+    """
+    tet, weights = locate(mesh, points)
+    corners, outside = mesh.tets[tet].astype(np.int64), np.flatnonzero(tet < 0)
+    faces = mesh.boundary_faces
+    _, face, on_face = closest_points(mesh.vertices, faces, points[outside])
+    corners[outside] = faces[face][:, [0, 1, 2, 0]]
+    weights[outside] = np.pad(on_face, ((0, 0), (0, 1)))
+    return corners, weights
+
+
+def locate(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Tetrahedra that hold points, and barycentric coordinates in them.
+
+    Returns
+    -------
+    tet : ndarray of int, shape (n,), -1 outside
+    barycentric : ndarray, shape (n, 4), rows sum to one; zero outside
+    """
+    corners = mesh.vertices[mesh.tets]
+    center = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
+    near = cKDTree(points).query_ball_point(center, reach * (1.0 + 1e-9))
+    size = np.array([len(hits) for hits in near])
+    tet = np.repeat(np.arange(len(near)), size)
+    point = np.fromiter((i for hits in near for i in hits), np.int64, size.sum())
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    local = np.linalg.inv(edges)[tet] @ (points[point] - corners[tet, 0])[:, :, None]
+    candidate = np.concatenate([1.0 - local.sum(axis=1), local[:, :, 0]], axis=1)
+    depth = candidate.min(axis=1)
+    order = np.argsort(depth, kind="stable")  # of several tetrahedra, the deepest is written last
+    order = order[depth[order] >= -_SLACK]
+    found, barycentric = np.full(len(points), -1), np.zeros((len(points), 4))
+    found[point[order]], barycentric[point[order]] = tet[order], candidate[order]
+    return found, barycentric
+
+
+def closest_points(
+    vertices: FloatArray, faces: IntArray, points: FloatArray
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Closest points of a triangulation.
+
+    Returns
+    -------
+    nearest : ndarray, shape (n, 3) [m]
+    face : ndarray of int, shape (n,), the faces they lie on
+    barycentric : ndarray, shape (n, 3), their coordinates there, rows sum to one
+    """
+    faces = faces.astype(np.int64)
+    if len(points) == 0:
+        return np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros((0, 3))
+    _, face, nearest = igl.point_mesh_squared_distance(
+        np.ascontiguousarray(points), vertices, faces
+    )
+    a, b, c = (np.ascontiguousarray(vertices[faces[face, k]]) for k in range(3))
+    barycentric = np.clip(igl.barycentric_coordinates(nearest, a, b, c), 0.0, 1.0)
+    return nearest, face, barycentric / barycentric.sum(axis=1, keepdims=True)
