@@ -16,7 +16,7 @@ import numpy as np
 
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.cloud import BLOCK
-from avatar_core.contact.display import show_dents
+from avatar_core.contact.display import write_cloud
 from avatar_core.contact.effects.large_deformation import add_nonlinear_load, powers_of_depth
 from avatar_core.contact.effects.respiration import shift_cloud
 from avatar_core.contact.effects.viscoelasticity import least_shown
@@ -32,7 +32,7 @@ def deform(model, state, out, effects):  # type: ignore[no-untyped-def]
     _displace(
         model, state, out, e.superposition, e.large_deformation, e.friction, e.viscoelasticity
     )
-    finish_cloud(model, state, out, e.tip_law, e.dent, e.display)
+    write_cloud(model, state, out.cloud, e.tip_law, e.dent, e.display)
     shift_cloud(e.respiration, out.cloud)
 
 
@@ -52,26 +52,6 @@ def _displace(  # type: ignore[no-untyped-def]
         if state.force[t] > 0.0:
             _load_regions(model, state, large_deformation, friction, viscoelasticity, t)
     _sum_modes(model, state, large_deformation)
-
-
-@fast
-def finish_cloud(model, state, out, tip_law, dent, display):  # type: ignore[no-untyped-def]
-    """The cloud, from the displacement of the modes in ``state.field``."""
-    show_dents(model, state, tip_law, dent, display)
-    if display is None:
-        _write(model.rest, state.field, out.cloud)
-    else:
-        _write(model.rest, display.moved, out.cloud)
-
-
-@fast
-def _write(rest, field, cloud):  # type: ignore[no-untyped-def]
-    """Deformed position and displacement of every point (n_points, 6)."""
-    n_points = cloud.shape[0]
-    flat_rest, flat_cloud = rest.reshape(6 * n_points), cloud.reshape(6 * n_points)
-    for v in range(n_points):
-        for d in range(6):
-            flat_cloud[6 * v + d] = flat_rest[6 * v + d] + field[3 * v + d % 3]
 
 
 @fast

@@ -138,22 +138,27 @@ def points_around(
 
 
 @fast
-def add_dents(model, state, law, dents, near, rest, field, tip, patch):  # type: ignore[no-untyped-def]
+def add_dents(  # type: ignore[no-untyped-def]
+    model, state, law, dents, near, rest, field, width, tip, patch
+):
     """Replace the dent of the patch by that of each tip in contact, in a displacement.
 
     near : ``start`` and ``around``, of points near load positions; rest : of all points [m]
-    field : their displacement, three components a point, is changed
+    field : numbers of the points that are changed, ``width`` of each: 3, their displacement, or 6,
+        their position and displacement
     tip, patch : 1 or 0, whether the dent of the tip is put in, and that of the patch taken off
     """
     if law is None or dents is None:
         return
     for t in range(state.passage.shape[0]):
         if state.force[t] > 0.0 and law.elastic[t] > 0.0:
-            _add_dent(model, state, law, dents, t, near, rest, field, tip, patch)
+            _add_dent(model, state, law, dents, t, near, rest, field, width, tip, patch)
 
 
 @fast
-def _add_dent(model, state, law, dents, t, near, rest, field, tip, patch):  # type: ignore[no-untyped-def]
+def _add_dent(  # type: ignore[no-untyped-def]
+    model, state, law, dents, t, near, rest, field, width, tip, patch
+):
     """Of one tip. Far from all load positions, which is rare, every point is tried."""
     delta, _, _, a = dent(law, t)
     far = _lay_springs(law, dents, t, delta)
@@ -174,10 +179,10 @@ def _add_dent(model, state, law, dents, t, near, rest, field, tip, patch):  # ty
     if square <= (_ASIDE * dents.patch_radius[0]) ** 2:
         for e in range(near.start[j], near.start[j + 1]):
             v = near.around[e]
-            _move(rest, field, dents, v, place, normal, reach, shares, contact, far, height)
+            _move(rest, field, width, dents, v, place, normal, reach, shares, contact, far, height)
     else:
         for v in range(rest.shape[0]):
-            _move(rest, field, dents, v, place, normal, reach, shares, contact, far, height)
+            _move(rest, field, width, dents, v, place, normal, reach, shares, contact, far, height)
 
 
 @fast
@@ -221,7 +226,7 @@ def _lay_springs(law, dents, t, delta):  # type: ignore[no-untyped-def]
 
 @fast
 def _move(  # type: ignore[no-untyped-def]
-    rest, field, dents, v, place, normal, reach, shares, contact, far, height
+    rest, field, width, dents, v, place, normal, reach, shares, contact, far, height
 ):
     """Change the displacement of one point, if it is near enough.
 
@@ -243,8 +248,8 @@ def _move(  # type: ignore[no-untyped-def]
     left = min(1.0, (1.0 - part) / (1.0 - (FADE / REACH) ** 2))
     moved = shares[0] * tip - shares[1] * _in_table(dents.patch, part)
     change = left * left * (3.0 - 2.0 * left) * moved
-    for d in range(3):
-        field[3 * v + d] -= np.float32(change * normal[d])
+    for d in range(width):
+        field[width * v + d] -= np.float32(change * normal[d % 3])
 
 
 @fast

@@ -33,10 +33,6 @@ DisplayArrays = namedtuple(
         "around",  # (m,) points that a tip near the load position may move
     ],
 )
-DisplayState = namedtuple(
-    "DisplayState",
-    ["corner", "weight", "rest", "start", "around", "moved"],  # (3 n,) displacement [m]
-)
 
 
 def display_arrays(
@@ -61,31 +57,39 @@ def display_arrays(
     )
 
 
-def display_state(arrays: DisplayArrays) -> DisplayState:
-    """The constant arrays, with room for the displacement."""
-    return DisplayState(*arrays, np.zeros(3 * len(arrays.corner), np.float32))
-
-
 @fast
-def show_dents(model, state, law, dents, display):  # type: ignore[no-untyped-def]
-    """From what the modes displace in ``state.field`` to what is shown: with the dents of tips, at
-    the displayed vertices if they are not the mesh's."""
+def write_cloud(model, state, cloud, law, dents, display):  # type: ignore[no-untyped-def]
+    """The cloud, from what the modes displace in ``state.field``: with the dents of tips, at the
+    displayed vertices if they are not the mesh's."""
     if display is None:
-        add_dents(model, state, law, dents, dents, model.rest, state.field, 1.0, 1.0)
+        add_dents(model, state, law, dents, dents, model.rest, state.field, 3, 1.0, 1.0)
+        _write(model.rest, state.field, cloud)
         return
-    add_dents(model, state, law, dents, display, display.rest, state.field, 0.0, 1.0)
-    _interpolate(display, state.field)
-    add_dents(model, state, law, dents, dents, model.rest, display.moved, 1.0, 0.0)
+    add_dents(model, state, law, dents, display, display.rest, state.field, 3, 0.0, 1.0)
+    _interpolate(display, model.rest, state.field, cloud)
+    flat = cloud.reshape(6 * cloud.shape[0])
+    add_dents(model, state, law, dents, dents, model.rest, flat, 6, 1.0, 0.0)
 
 
 @fast
-def _interpolate(display, field):  # type: ignore[no-untyped-def]
-    """The displacement of the displayed vertices from that of the mesh's."""
-    corner, weight, moved = display.corner, display.weight, display.moved
+def _write(rest, field, cloud):  # type: ignore[no-untyped-def]
+    """Deformed position and displacement of every point (n_points, 6)."""
+    n_points = cloud.shape[0]
+    flat_rest, flat_cloud = rest.reshape(6 * n_points), cloud.reshape(6 * n_points)
+    for v in range(n_points):
+        for d in range(6):
+            flat_cloud[6 * v + d] = flat_rest[6 * v + d] + field[3 * v + d % 3]
+
+
+@fast
+def _interpolate(display, rest, field, cloud):  # type: ignore[no-untyped-def]
+    """The same of displayed vertices, from the displacement of the mesh's."""
+    corner, weight = display.corner, display.weight
     for v in range(corner.shape[0]):
         a, b = 3 * corner[v, 0], 3 * corner[v, 1]
         c, e = 3 * corner[v, 2], 3 * corner[v, 3]
         wa, wb, wc, we = weight[v, 0], weight[v, 1], weight[v, 2], weight[v, 3]
         for d in range(3):
             inside = wc * field[c + d] + we * field[e + d]
-            moved[3 * v + d] = wa * field[a + d] + wb * field[b + d] + inside
+            u = wa * field[a + d] + wb * field[b + d] + inside
+            cloud[v, d], cloud[v, 3 + d] = rest[v, d] + u, u

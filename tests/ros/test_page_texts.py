@@ -1,24 +1,121 @@
-"""What the planning page writes about a force."""
+"""What the planning page writes and holds: one period's force and shape, and no others."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.ui.texts import frame_text
+from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
+from avatar_ros.ui.texts import frame_text, recorded_text, warnings
+from avatar_ros.ui.tool_state import N_RECENT, ROW, SharedToolState
+
+from avatar_core.scene.recording import Clouds, Periods, Recording
+from avatar_ros.msg import ContactState
 
 pytestmark = pytest.mark.ros
+
+OK, OUT = ContactState.STATUS_OK, ContactState.STATUS_OUT_OF_RANGE
+TIP = np.array([0.0, 0.1, 0.0])
+
+
+def shown(force: float, error: float, fraction: float, largest: float) -> ShownPeriod:
+    return ShownPeriod(TIP, np.array([0.0, force, 0.0]), error, fraction, largest, is_held=False)
+
+
+def row(status: int, force: float, stamp: int = 1) -> np.ndarray:
+    out = np.zeros(1, ROW)[0]
+    out["status"], out["stamp"], out["tip"] = status, stamp, TIP
+    out["force"], out["touches"], out["sent_fraction"] = (0.0, force, 0.0), force > 0.0, 1.0
+    return out
 
 
 def test_a_limited_force_is_no_measurement() -> None:
     """The organ pushes with 25 N; the device gets its 20 N, and the page says both."""
-    text = frame_text(25.0, 2.7, 0.8, 0.0071, None)
+    text = frame_text(shown(25.0, 2.7, 0.8, 0.0071), None)
     assert "Force **25.00 N** ± 2.70 N, **limited: the device gets 20.00 N**" in text
     assert "**7.1 mm**" in text
 
 
 def test_a_force_that_the_device_gets_is_written_once() -> None:
-    assert "limited" not in frame_text(3.3, 0.1, 1.0, 0.001, 12)
-    assert "limited" not in frame_text(0.0, 0.0, 0.0, 0.0, None)  # nothing is held back
+    assert "limited" not in frame_text(shown(3.3, 0.1, 1.0, 0.001), 12)
+    assert "limited" not in frame_text(shown(0.0, 0.0, 0.0, 0.0), None)  # nothing is held back
+
+
+def test_no_displacement_is_not_none() -> None:
+    """Without a surface from the contact node, 20 N stand beside no 0.0 mm."""
+    text = frame_text(shown(20.0, 1.0, 1.0, float("nan")), None)
+    assert "20.00 N" in text and "mm" not in text and "sends no surface" in text
+
+
+def test_a_force_is_that_of_the_clouds_period() -> None:
+    state = SharedToolState.make()
+    assert state.period(5) is None
+    for n in range(3 * N_RECENT):
+        state.recent[n % N_RECENT] = row(OK, 0.001 * n, stamp=1000 + n)
+        state.live["n_recent"][0] = n + 1
+    found = state.period(1000 + 3 * N_RECENT - 100)
+    assert found is not None and found["force"][1] == 0.001 * (3 * N_RECENT - 100)
+    newest = state.period(77)  # of a cloud whose state has not come: the newest
+    assert newest is not None and newest["stamp"] == 1000 + 3 * N_RECENT - 1
+
+
+def test_beyond_the_range_the_last_valid_shape_stays() -> None:
+    chooser = PeriodChooser()
+    for force in (1.0, 20.0):
+        assert chooser.take(row(OK, force))
+        chooser.drawn(row(OK, force), 1e-4 * force, TIP)
+    for _ in range(3):  # the organ of these periods lies at rest
+        assert not chooser.take(row(OUT, 0.0))
+        held = chooser.drawn(row(OUT, 0.0), float("nan"), TIP)
+        assert held.is_held and held.force[1] == 20.0 and held.largest == 2e-3
+    text = frame_text(held, None)
+    assert "No force" in text and "beyond" in text and "20.00 N" in text and "2.0 mm" in text
+    assert chooser.take(row(OK, 0.0))
+    assert not chooser.drawn(row(OK, 0.0), 0.0, TIP).is_held
+
+
+def test_a_tool_that_never_touched_holds_nothing() -> None:
+    chooser = PeriodChooser()
+    assert chooser.take(row(OUT, 0.0))
+    assert not chooser.drawn(row(OUT, 0.0), 0.0, TIP).is_held
+    chooser.take(row(OK, 3.0))
+    chooser.drawn(row(OK, 3.0), 1e-3, TIP)
+    chooser.forget()  # another organ
+    assert chooser.take(row(OUT, 0.0))
+
+
+def test_a_tool_without_a_pose_is_drawn_where_it_was_sent() -> None:
+    chooser, far = PeriodChooser(), row(ContactState.STATUS_STALE_POSE, 0.0)
+    for away in (np.full(3, 1e3), np.full(3, np.nan)):
+        far["tip"] = away
+        chooser.take(far)
+        np.testing.assert_array_equal(chooser.drawn(far, 0.0, TIP).tip, TIP)
+
+
+def test_missed_periods_are_said_beside_nodes_that_answer() -> None:
+    assert warnings((), True, OK, 0.001) == "**All nodes answer.**"
+    busy = warnings((), True, OK, 0.2)
+    assert "All nodes answer" not in busy and "20% of the periods come late" in busy
+
+
+def test_a_recording_says_what_it_lacks() -> None:
+    number = np.concatenate([np.arange(300), np.arange(310, 500)])
+    n = len(number)
+    periods = Periods(
+        number=number,
+        stamp=1_000_000 * np.linspace(0, 999, n).astype(np.int64),
+        tip=np.zeros((n, 1, 3)),
+        turn=np.zeros((n, 1, 3)),
+        status=np.zeros((n, 1), np.uint8),
+        force=np.zeros((n, 1, 3)),
+        error=np.zeros((n, 1)),
+        sent_fraction=np.ones((n, 1)),
+    )
+    clouds = Clouds(np.zeros(0, np.int64), np.zeros((0, 0, 3), np.float32))
+    made = Recording("0" * 64, "liver", "", 1000.0, True, periods, clouds)
+    assert recorded_text(made) == (
+        "recorded 1.0 s, 490 of 1,000 periods (500 came late in the loop, 10 lost)"
+    )

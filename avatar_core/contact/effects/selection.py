@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from avatar_core.contact.dent import DentArrays, dent_state
-from avatar_core.contact.display import DisplayArrays, display_state
+from avatar_core.contact.display import DisplayArrays
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.friction import (
     Friction,
@@ -202,5 +202,5 @@ def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int)
         respiration_state(respiration) if respiration else None,
         tip_law_state(tip_law, n_terms, tilt_state(tilt) if tilt else None) if tip_law else None,
         dent_state(dent) if dent else None,
-        display_state(display) if display else None,
+        display,
     )

@@ -15,7 +15,7 @@ import numpy as np
 from avatar_core.common.jit import compiled
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud import shown_vertices
-from avatar_core.contact.cloud_kernels import finish_cloud
+from avatar_core.contact.display import write_cloud
 from avatar_core.contact.effects.tip_surface import sample_surface
 from avatar_core.contact.locate import locate
 from avatar_core.contact.model import ContactModel, prepare, step
@@ -270,7 +270,7 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
                 row, f = columns[state.nodes[t, i], c], np.float32(force * state.normal[t, c])
                 for k in range(u.shape[0]):
                     u[k] += f * row[k]
-    finish_cloud(model, state, out, e.tip_law, e.dent, e.display)
+    write_cloud(model, state, out.cloud, e.tip_law, e.dent, e.display)
 
 
 @compiled(fastmath=True)

@@ -27,6 +27,7 @@ from avatar_ros.framework import qos
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import AUTOSTART, Parameter, ParameterError, values
 from avatar_ros.framework.reader import Reader
+from avatar_ros.framework.templates import stamp_nanoseconds
 from avatar_ros.loop.settings import MATERIAL, TIP, chosen_tips
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
 from avatar_ros.prepare.scenes import scene_file
@@ -37,7 +38,8 @@ from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.panels import Actions, Panels
 from avatar_ros.ui.recorder import Recorder, scene_in_force
 from avatar_ros.ui.requests import Requests
-from avatar_ros.ui.texts import frame_text, scene_texts, warnings
+from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
+from avatar_ros.ui.texts import frame_text, recorded_text, scene_texts, warnings
 from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess
 from avatar_ros.ui.view import CLEARANCE, OrganView
 
@@ -77,6 +79,9 @@ class PlanningNode(ManagedNode):
         self._was_missing, self._is_to_restore = True, False
         self._frame, self._frame_id = 0, FRAME
         self._began = time.monotonic()
+        self._periods = PeriodChooser()
+        self._shown: ShownPeriod | None = None
+        self._last_cloud, self._missed = 0.0, 0.0  # [s], part of the periods
         self._own_subscriptions: list[Any] = []
         self._timer: Any = None
         super().__init__("planning_ui", PLANNING_UI)
@@ -174,6 +179,7 @@ class PlanningNode(ManagedNode):
         tip = self._tip()
         self._state.live["target"][0] = organ.above(tip.offset + CLEARANCE)
         self._view.show(organ, tip)
+        self._periods.forget()
         self._panels.show_organ(organ)
         self._organ = organ
         self._listen_to_clouds()
@@ -182,6 +188,7 @@ class PlanningNode(ManagedNode):
 
     def _take_statistics(self, window: LoopStatistics) -> None:
         now = time.monotonic() - self._began
+        self._missed = window.missed / max(window.periods, 1)
         self._panels.show_loop(now, window.step_p99, window.missed / max(window.window, 1e-3))
 
     def _tip(self) -> Tip:
@@ -194,28 +201,44 @@ class PlanningNode(ManagedNode):
 
     def _show(self) -> None:
         """Update the page; called for every frame."""
-        live, organ = self._state.live[0], self._organ
+        organ = self._organ
         self._frame += 1
         if self._frame % _POLL_FRAMES == 1:
             self._poll_cell()
         if organ is None or self._cloud is None:
             return
-        taken = self._cloud.take()
-        tip, force = live["tip"].copy(), live["force"] if self._answers() else np.zeros(3)
-        fraction = float(live["sent_fraction"])
-        largest = 0.0
-        if taken is not None:
-            largest = self._view.move(taken[1], tip, force)
-            if self._recorder.is_on:
-                self._recorder.note_cloud(taken[1][:, 3:])
-        self._view.place_tool(tip, fraction * force)
+        shown = self._shown = self._period_to_show()
+        self._view.place_tool(shown.tip, (0.0 if shown.is_held else shown.fraction) * shown.force)
         if self._frame % _PLOT_FRAMES == 0:
-            size = float(np.linalg.norm(force))
-            error = float(live["error"]) if np.isfinite(live["error"]) else 0.0
             n_kept = self._recorder.n_periods if self._recorder.is_on else None
-            self._panels.readout.content = frame_text(size, error, fraction, largest, n_kept)
+            self._panels.readout.content = frame_text(shown, n_kept)
             self._panels.show_scale(self._view.top)
-            self._panels.show_force(time.monotonic() - self._began, size, error)
+            size = 0.0 if shown.is_held else float(np.linalg.norm(shown.force))
+            self._panels.show_force(time.monotonic() - self._began, size, shown.error)
+
+    def _period_to_show(self) -> ShownPeriod:
+        """Draw the newest cloud, and return what belongs to it."""
+        sent, cloud, now = self._state.live[0]["tip"].copy(), self._cloud, time.monotonic()
+        taken = cloud.take() if cloud is not None else None
+        if not self._answers():
+            largest = self._view.move(taken[1], sent, np.zeros(3)) if taken else float("nan")
+            return ShownPeriod(sent, np.zeros(3), 0.0, 1.0, largest, is_held=False)
+        if taken is not None:
+            self._last_cloud = now
+            row = self._state.period(stamp_nanoseconds(taken[0]))
+        elif self._shown is not None and now - self._last_cloud < _SILENCE:
+            return self._shown
+        else:  # the contact node sends another cloud, or none
+            row = self._state.period()
+        if row is None:
+            return ShownPeriod(sent, np.zeros(3), 0.0, 1.0, float("nan"), is_held=False)
+        largest = float("nan")
+        if self._periods.take(row) and taken is not None:
+            largest = self._view.move(taken[1], row["tip"], row["force"])
+        self._view.grey(self._periods.is_held)
+        if taken is not None and self._recorder.is_on:
+            self._recorder.note_cloud(taken[1][:, 3:])
+        return self._periods.drawn(row, largest, sent)
 
     def _answers(self) -> bool:
         """Whether the contact node answered recently."""
@@ -226,7 +249,8 @@ class PlanningNode(ManagedNode):
         """Check which nodes run, what the library holds, and that the tool driver runs."""
         missing = self._requests.missing
         status = int(self._state.live["status"][0]) if self._answers() else None
-        self._panels.warnings.content = warnings(missing, self._organ is not None, status)
+        has_organ = self._organ is not None
+        self._panels.warnings.content = warnings(missing, has_organ, status, self._missed)
         self._panels.offer(*self._library.offer())
         if self._organ is not None:
             self._driver.ensure_running(self._tool, self._frame_id)
@@ -309,8 +333,14 @@ class PlanningNode(ManagedNode):
         def load(file: str) -> None:
             if file:
                 self._panels.show_progress("done", 1.0, float("nan"))
+                self._panels.offer(*self._library.offer())
+                self._panels.choose_file(file)
                 self._requests.load_vademecum(file, self._say)
+            else:
+                self._panels.show_progress("not built", 0.0, float("nan"))
 
+        self._say("")  # nothing of the last build stays
+        self._panels.show_progress("begins", 0.0, float("nan"))
         self._requests.build_patient(
             surface, fidelity, tolerance, self._panels.show_progress, self._say, load
         )
@@ -336,11 +366,14 @@ class PlanningNode(ManagedNode):
         self._panels.show_recording(True)
 
         def begin(switched: bool) -> None:
-            if switched:
+            touches = bool(self._state.live["touches"][0])  # half a minute after the click
+            if switched and not touches:
                 self._recorder.begin()
-            else:
-                self._recorder.drop()
-                self._panels.show_recording(False)
+                return
+            self._recorder.drop()
+            self._panels.show_recording(False)
+            if touches:
+                self._say("not recorded: the tool touched the organ again; lift it, and record")
 
         self._requests.load_scene(scene.name, self._say, yaml=text, then=begin)
 
@@ -371,8 +404,7 @@ class PlanningNode(ManagedNode):
             self._say(f"nothing was recorded{because}")
             return
         path, recording = saved
-        lost = int(recording.periods.lost.sum())
-        self._say(f"recorded {recording.seconds:.1f} s ({lost} periods lost){because}: {path.name}")
+        self._say(f"{recorded_text(recording)}{because}: {path.name}")
 
 
 def main() -> int:

@@ -185,6 +185,12 @@ class Panels:
         _set_options(self._files, files)
         _set_options(self._surfaces, surfaces)
 
+    def choose_file(self, file: str) -> None:
+        """Show a file as the chosen one, if it is offered."""
+        files: Any = self._files
+        if file in files.options:
+            files.value = file
+
     def offer_scenes(self, texts: dict[str, str]) -> None:
         """Offer scenes by name, with their descriptions."""
         self._scene_texts = texts

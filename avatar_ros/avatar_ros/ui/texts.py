@@ -4,19 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from avatar_core.scene.file import read_scene, shipped_scenes
+from avatar_core.scene.recording import Recording
 from avatar_ros.loop.statuses import EXPLANATIONS, explanation
 from avatar_ros.msg import ContactState
 from avatar_ros.ui.requests import START
+from avatar_ros.ui.shown_period import ShownPeriod
 
+_MANY_MISSED = 0.02  # part of the periods that may come late without a word
 _SHOWN_FORCE = 0.01  # smallest difference that is written [N]
 NO_ORGAN = "no organ yet: choose a vademecum under Organ"
 
 
-def warnings(missing: Sequence[str], has_organ: bool, status: int | None) -> str:
+def warnings(
+    missing: Sequence[str], has_organ: bool, status: int | None, missed: float = 0.0
+) -> str:
     """Everything that keeps the page from working, as Markdown; one line if nothing does.
 
     status : of the last ContactState; None if none came lately
+    missed : part of the loop's periods that came late, of the last second
     """
     lines = [START[name] for name in missing if name != "patient_interpolation"]
     if not has_organ and "vademecum_loader" not in missing:
@@ -25,31 +33,44 @@ def warnings(missing: Sequence[str], has_organ: bool, status: int | None) -> str
         lines.append("the contact node does not answer yet")
     if "contact" not in missing and status in EXPLANATIONS:
         lines.append(explanation(status))
+    if "contact" not in missing and missed > _MANY_MISSED:
+        lines.append(
+            f"the machine is too busy for 1 kHz: {missed:.0%} of the periods come late; close "
+            "other programs"
+        )
     if not lines:
         engaging = status == ContactState.STATUS_ENGAGING
         return "**All nodes answer.**" + (" The force is being faded in." if engaging else "")
     return "\n\n".join(f"⚠ {line[0].upper()}{line[1:]}." for line in lines)
 
 
-def frame_text(
-    force: float, error: float, fraction: float, largest: float, n_kept: int | None
-) -> str:
-    """What a frame shows, as Markdown.
-
-    Parameters
-    ----------
-    force, error : of the organ [N]
-    fraction : of the force that the device gets; less while it is limited or faded in or out
-    largest : displacement [m]
-    n_kept : recorded periods, or None
-    """
+def frame_text(shown: ShownPeriod, n_kept: int | None) -> str:
+    """What a frame shows, as Markdown; n_kept : recorded periods, or None."""
     recorded = "" if n_kept is None else f"; recording, {n_kept} periods"
-    less = force * (1.0 - fraction) >= _SHOWN_FORCE
-    device = f", **limited: the device gets {force * fraction:.2f} N**" if less else ""
-    return (
-        f"Force **{force:.2f} N** ± {error:.2f} N{device}, largest displacement "
-        f"**{1e3 * largest:.1f} mm**{recorded}"
-    )
+    force = float(np.linalg.norm(shown.force))
+    numbers = f"**{force:.2f} N** ± {shown.error:.2f} N"
+    moved = f"**{1e3 * shown.largest:.1f} mm**"
+    if shown.is_held:
+        return (
+            "**No force: the tool is beyond what the vademecum covers**, too deep or off the "
+            f"accessible surface. In grey, the last valid shape: {numbers}, {moved}{recorded}"
+        )
+    less = force * (1.0 - shown.fraction) >= _SHOWN_FORCE
+    device = f", **limited: the device gets {force * shown.fraction:.2f} N**" if less else ""
+    if np.isnan(shown.largest):
+        return f"Force {numbers}{device}; no displacement: the contact node sends no surface"
+    return f"Force {numbers}{device}, largest displacement {moved}{recorded}"
+
+
+def recorded_text(recording: Recording) -> str:
+    """How much of the time was recorded."""
+    n, lost = len(recording.periods), int(recording.periods.lost.sum())
+    expected = round(recording.seconds * recording.rate) + 1
+    late = max(expected - n - lost, 0)
+    text = f"recorded {recording.seconds:.1f} s, {n:,} of {expected:,} periods"
+    reasons = [f"{late:,} came late in the loop" * (late > 0), f"{lost:,} lost" * (lost > 0)]
+    why = ", ".join(filter(None, reasons))
+    return f"{text} ({why})" if why else text
 
 
 def scene_texts() -> dict[str, str]:

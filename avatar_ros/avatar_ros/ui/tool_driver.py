@@ -26,7 +26,7 @@ from avatar_ros.framework.ports import PolledSubscriptions
 from avatar_ros.framework.templates import PoseTemplate, stamp_bytes
 from avatar_ros.loop.tool_channel import FAR_AWAY
 from avatar_ros.msg import ContactState
-from avatar_ros.ui.tool_state import N_ROWS, SharedToolState
+from avatar_ros.ui.tool_state import N_RECENT, N_ROWS, SharedToolState
 
 PERIOD = 1_000_000  # [ns]
 _APPROACH = 0.04  # part of the remaining distance moved in a period: lags the mouse by 25 ms
@@ -54,7 +54,7 @@ class ToolDriver:
 
     def __init__(self, node: Any, tool: str, frame_id: str, state: SharedToolState) -> None:
         self._tool = tool
-        self._live, self._rows = state.live, state.rows
+        self._live, self._recent, self._rows = state.live, state.recent, state.rows
         self._publisher = node.create_publisher(PoseStamped, f"{tool}/measured_cp", qos.NEWEST)
         self._states = node.create_subscription(
             ContactState,
@@ -106,14 +106,19 @@ class ToolDriver:
         live["status"][0], live["touches"][0] = state.status, len(state.contacts)
         live["heard"][0] = time.monotonic_ns()
         live["n_states"][0] += 1
+        stamp = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
+        recent = int(live["n_recent"][0])
+        row = self._recent[recent % N_RECENT]
+        row["stamp"] = 0  # until it is whole
+        row["number"], row["touches"] = info["publication_sequence_number"], len(state.contacts)
+        row["tip"] = self._used(state.status, stamp)
+        row["force"], row["error"] = force, state.force_error
+        row["sent_fraction"], row["status"] = state.force_share, state.status
+        row["stamp"] = stamp
+        live["n_recent"][0] = recent + 1
         n = int(live["n_rows"][0])
         if live["recording"][0] and n < N_ROWS:
-            stamp = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
-            row = self._rows[n]
-            row["number"], row["stamp"] = info["publication_sequence_number"], stamp
-            row["tip"] = self._used(state.status, stamp)
-            row["force"], row["error"] = force, state.force_error
-            row["sent_fraction"], row["status"] = state.force_share, state.status
+            self._rows[n] = row
             live["n_rows"][0] = n + 1
 
     def _used(self, status: int, stamp: int) -> Any:

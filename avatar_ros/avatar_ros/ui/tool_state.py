@@ -1,8 +1,8 @@
 """The process that drives the tool of the planning page, and the memory it shares with the node.
 
 Each field is written by one side and read by the other: the node writes the target and whether to
-record, the driver writes the tool's state and the recorded periods. The driver increases the
-number of rows after it has written a row.
+record, the driver writes the tool's state, the recorded periods and the recent ones. The driver
+increases the number of rows after it has written a row; the stamp of a recent row is written last.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from avatar_ros.framework import realtime
 
 SECONDS = 600  # of a recording, at most
 N_ROWS = SECONDS * 1000
+N_RECENT = 512  # periods that are kept to be shown with the cloud of the same period
 
 LIVE = np.dtype(
     [
@@ -34,6 +35,7 @@ LIVE = np.dtype(
         ("n_poses", np.int64),  # sent
         ("n_states", np.int64),  # received
         ("n_rows", np.int64),
+        ("n_recent", np.int64),
     ],
     align=True,
 )
@@ -46,27 +48,40 @@ ROW = np.dtype(
         ("error", np.float64),
         ("sent_fraction", np.float64),
         ("status", np.int64),
+        ("touches", np.int64),
     ],
     align=True,
 )
 
 
 class SharedToolState:
-    """The shared memory as two arrays: ``live``, of one entry, and the recorded ``rows``."""
+    """The shared memory as arrays: ``live``, of one entry, ``recent`` and recorded ``rows``."""
 
     def __init__(self, handle: int) -> None:
         self.handle = handle
-        size = LIVE.itemsize + N_ROWS * ROW.itemsize
+        size = LIVE.itemsize + (N_RECENT + N_ROWS) * ROW.itemsize
         if os.fstat(handle).st_size < size:
             os.ftruncate(handle, size)
         memory = mmap.mmap(handle, size)
         self.live = np.frombuffer(memory, LIVE, 1)[0:1]
-        self.rows = np.frombuffer(memory, ROW, N_ROWS, LIVE.itemsize)
+        self.recent = np.frombuffer(memory, ROW, N_RECENT, LIVE.itemsize)
+        self.rows = np.frombuffer(memory, ROW, N_ROWS, LIVE.itemsize + self.recent.nbytes)
 
     @staticmethod
     def make() -> SharedToolState:
         """New memory, all zero."""
         return SharedToolState(os.memfd_create("avatar-tool", os.MFD_CLOEXEC))
+
+    def period(self, stamp: int | None = None) -> np.ndarray | None:
+        """A copy of the recent row of a stamp [ns], or else of the newest; None before the first.
+
+        A cloud and the state of its period carry the same stamp.
+        """
+        n = int(self.live["n_recent"][0])
+        if n == 0:
+            return None
+        found = np.flatnonzero(self.recent["stamp"] == stamp)
+        return self.recent[found[0] if len(found) else (n - 1) % N_RECENT].copy()
 
     def recorded(self, begin: int = 0) -> np.ndarray:
         """A copy of the recorded rows from ``begin`` on."""

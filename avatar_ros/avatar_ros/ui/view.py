@@ -16,6 +16,7 @@ from avatar_ros.ui.tip_body import tip_body, turn_to
 
 N_BANDS = 10  # of the colour scale; a mesh has a single colour
 CLAMP = (90, 90, 90)
+HELD = (170, 170, 170)  # of a shape that is not that of now
 STRUCTURE = (213, 94, 0)  # vermilion and blue of Okabe and Ito, distinguishable for all
 TOOL = (0, 114, 178)
 ARROW = (213, 94, 0)
@@ -75,6 +76,7 @@ class OrganView:
         self._tool: Any = None
         self._tip: Tip | None = None
         self._arrow: Any = None
+        self._is_grey = False
         self.top = top_for(0.0)
         server.scene.set_up_direction("+z")
         server.scene.world_axes.visible = False
@@ -83,7 +85,7 @@ class OrganView:
     def show(self, organ: Organ, tip: Tip) -> None:
         """Show another organ, at rest, with the structures of its own file and no others."""
         scene, first = self._server.scene, self._organ is None
-        self._organ, self.top = organ, top_for(0.0)
+        self._organ, self.top, self._is_grey = organ, top_for(0.0), False
         clamp = organ.faces[organ.clamped]
         # slightly outside the moving surface, so that it is visible
         lifted = organ.centre + 1.003 * (organ.vertices - organ.centre)
@@ -178,6 +180,15 @@ class OrganView:
             for mesh, points_inside in zip(self._structures, self._inside, strict=True):
                 mesh.vertices = positions[points_inside]
         return largest
+
+    def grey(self, held: bool) -> None:
+        """Draw the organ in grey while its shape is the last valid one, or in colours again."""
+        if held == self._is_grey:
+            return
+        self._is_grey = held
+        with self._server.atomic():
+            for mesh, shade in zip(self._bands, band_shades().tolist(), strict=True):
+                mesh.color = HELD if held else tuple(shade)
 
     def place_tool(self, tip: np.ndarray, force: np.ndarray) -> None:
         """Show the tool at its tip [m], with the force on it [N]."""
