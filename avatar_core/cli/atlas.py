@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from avatar_core.atlas.growth import Growth, Source
     from avatar_core.atlas.model import Atlas
 
-SUFFIXES = (".obj", ".stl", ".ply", ".vtk", ".off", ".nii", ".nii.gz", ".nrrd")
+SUFFIXES = (".obj", ".stl", ".ply", ".vtk", ".off", ".nii", ".nii.gz", ".nrrd", ".dcm")
 
 EXIT_STOPPED = 130
 
@@ -33,8 +33,8 @@ Surfaces = Annotated[
     list[str],
     typer.Argument(
         metavar="SURFACE...",
-        help="surface files (OBJ, STL, PLY, VTK, OFF), label maps (.nii, .nii.gz, .nrrd), folders "
-        "of these, or 'phantom', the built-in liver",
+        help="surface files (OBJ, STL, PLY, VTK, OFF), label maps (.nii, .nii.gz, .nrrd, .dcm), "
+        "folders of these, or 'phantom', the built-in liver",
     ),
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the files: mm, cm or m")]

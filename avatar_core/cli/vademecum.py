@@ -27,8 +27,8 @@ EXIT_NOT_CONVERGED = 3
 Surface = Annotated[
     str,
     typer.Argument(
-        help="surface file (OBJ, STL, PLY, VTK, OFF) or label map (.nii, .nii.gz, .nrrd); "
-        "'phantom': the built-in liver"
+        help="surface file (OBJ, STL, PLY, VTK, OFF) or label map (.nii, .nii.gz, .nrrd, DICOM SEG "
+        "as .dcm); 'phantom': the built-in liver"
     ),
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the file: mm, cm or m")]
@@ -40,7 +40,7 @@ Axes = Annotated[
     ),
 ]
 Label = Annotated[
-    str | None, typer.Option(help="number or name (.seg.nrrd) of the organ in a label map")
+    str | None, typer.Option(help="number or name (.seg.nrrd, .dcm) of the organ in a label map")
 ]
 Vertices = Annotated[int, typer.Option(help="approximate number of mesh vertices")]
 

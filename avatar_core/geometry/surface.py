@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry.label_maps import is_label_map
+from avatar_core.geometry.label_files import is_label_map
 from avatar_core.geometry.skin import Skin, components, directed_edges, skin_of, weld
 from avatar_core.geometry.surface_files import content_of, parse, stated_axes
 

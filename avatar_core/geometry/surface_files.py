@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from avatar_core.common import files
 from avatar_core.errors import SurfaceError, one_line
-from avatar_core.geometry.label_maps import is_label_map, surface_of_label
+from avatar_core.geometry.label_files import is_label_map
+from avatar_core.geometry.label_maps import surface_of_label
 from avatar_core.geometry.vtk_files import read_polydata
 
 FloatArray = NDArray[np.float64]
@@ -97,7 +98,8 @@ def parse(path: Path, label: int | str | None) -> Soup:
     kind = ".nii" if path.name.lower().endswith(".nii.gz") else path.suffix.lower()
     if kind not in _READERS and not is_label_map(path):
         raise SurfaceError(
-            f"{path.name}: format not supported; use {', '.join(_READERS)}, .nii (.gz) or .nrrd"
+            f"{path.name}: format not supported; use {', '.join(_READERS)}, .nii (.gz), "
+            ".nrrd or .dcm"
         )
     try:
         return surface_of_label(path, label) if is_label_map(path) else _READERS[kind](path)

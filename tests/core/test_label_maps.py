@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry import label_maps, surface_files
+from avatar_core.geometry import label_files, surface_files
 from avatar_core.geometry.surface import read_surface
 from avatar_core.geometry.tumour import read_tumour
 
@@ -142,7 +142,7 @@ def test_a_segmentation_that_cannot_be_read_says_why(tmp_path, monkeypatch):
     cut = tmp_path / "cut.seg.nrrd"
     cut.write_bytes(whole.read_bytes()[:-400])
     refused(cut, "bytes of voxels", label="liver")
-    monkeypatch.setattr(label_maps, "MAX_LABEL_BYTES", 1000)
+    monkeypatch.setattr(label_files, "MAX_LABEL_BYTES", 1000)
     refused(whole, "crop it", label="liver")
 
 
@@ -173,5 +173,101 @@ def test_a_damaged_segmentation_is_refused_or_read(tmp_path):
 
 def test_label_map_is_bounded_before_it_is_loaded(tmp_path, monkeypatch):
     path = label_map(tmp_path / "organ.nii.gz", np.diag([4.0, 4.0, 4.0, 1.0]))
-    monkeypatch.setattr(label_maps, "MAX_LABEL_BYTES", 1000)
+    monkeypatch.setattr(label_files, "MAX_LABEL_BYTES", 1000)
     refused(path, "crop it")
+
+
+def dicom_segmentation(path: Path, tilt: float = 20.0) -> Path:
+    """A liver and a lesion as highdicom writes them, on oblique CT slices of 2 x 2 x 5 mm."""
+    pytest.importorskip("highdicom", reason="highdicom is missing: '.[dicom]'")
+    from highdicom.seg import Segmentation, SegmentDescription
+    from pydicom.dataset import Dataset, FileMetaDataset
+    from pydicom.sr.codedict import codes
+    from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+
+    rows, columns, slices = 110, 80, 40  # of y, x, z
+    turn = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+    origin = np.array([-90.0, -60.0, -90.0])  # LPS
+    study, series, frame = generate_uid(), generate_uid(), generate_uid()
+    images = []
+    for k in range(slices):
+        image = Dataset()
+        image.file_meta = FileMetaDataset()
+        image.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        image.SOPClassUID, image.SOPInstanceUID = CTImageStorage, generate_uid()
+        image.StudyInstanceUID, image.SeriesInstanceUID = study, series
+        image.FrameOfReferenceUID, image.Modality = frame, "CT"
+        image.PatientID = image.AccessionNumber = "1"
+        image.PatientName = "Drawn^Nobody"
+        image.PatientBirthDate = image.StudyDate = image.StudyTime = ""
+        image.PatientSex, image.StudyID, image.ReferringPhysicianName = "O", "1", ""
+        image.InstanceNumber, image.SeriesNumber = k + 1, 1
+        image.Rows, image.Columns, image.PixelSpacing = rows, columns, [2.0, 2.0]
+        image.SliceThickness, image.ImageOrientationPatient = 5.0, turn.T[:2].ravel().tolist()
+        image.ImagePositionPatient = (origin + 5.0 * k * turn[:, 2]).tolist()
+        image.BitsAllocated, image.BitsStored, image.HighBit = 16, 16, 15
+        image.SamplesPerPixel, image.PixelRepresentation = 1, 0
+        image.PhotometricInterpretation = "MONOCHROME2"
+        image.PixelData = bytes(2 * rows * columns)
+        images.append(image)
+    z, y, x = np.meshgrid(*map(np.arange, (slices, rows, columns)), indexing="ij")
+    world = origin + np.stack([2.0 * x, 2.0 * y, 5.0 * z], axis=-1) @ turn.T
+    world = world * [-1.0, -1.0, 1.0]  # RAS
+    sizes = {"liver": ([10, -20, 30], [40, 50, 60]), "lesion": ([10, 0, 30], [25, 20, 22])}
+    masks = [np.linalg.norm((world - c) / r, axis=-1) < 1 for c, r in sizes.values()]
+    about = [
+        SegmentDescription(
+            segment_number=n + 1,
+            segment_label=name,
+            segmented_property_category=codes.SCT.Organ,
+            segmented_property_type=codes.SCT.Liver,
+            algorithm_type="MANUAL",
+        )
+        for n, name in enumerate(sizes)
+    ]
+    Segmentation(
+        source_images=images,
+        pixel_array=np.stack(masks, axis=-1).astype(np.uint8),
+        segmentation_type="BINARY",
+        segment_descriptions=about,
+        series_instance_uid=generate_uid(),
+        series_number=2,
+        sop_instance_uid=generate_uid(),
+        instance_number=1,
+        manufacturer="drawn",
+        manufacturer_model_name="drawn",
+        software_versions="1",
+        device_serial_number="1",
+    ).save_as(path)
+    return path
+
+
+def test_a_dicom_segmentation_lies_in_the_patient(tmp_path):
+    path = dicom_segmentation(tmp_path / "organs.dcm")
+    refused(path, "liver (1), lesion (1)", "--label")
+    liver = read_surface(path, label="liver")
+    low, high = liver.bounding_box
+    np.testing.assert_allclose(0.5e3 * (low + high), [10, -20, 30], atol=2.0)
+    np.testing.assert_allclose(1e3 * (high - low), [80, 100, 120], atol=5.0)
+    assert liver.volume == pytest.approx(4 / 3 * np.pi * 0.04 * 0.05 * 0.06, rel=0.02)
+    assert liver.notices == ()  # one body, in known axes
+    lesion = read_tumour(path, label="lesion")
+    np.testing.assert_allclose(1e3 * lesion.vertices.mean(axis=0), [10, 0, 30], atol=1.0)
+    assert lesion.volume == pytest.approx(4 / 3 * np.pi * 0.025 * 0.020 * 0.022, rel=0.05)
+
+
+def test_other_dicom_files_are_refused(tmp_path, monkeypatch):
+    path = dicom_segmentation(tmp_path / "organs.dcm")
+    content = path.read_bytes()
+    (tmp_path / "cut.dcm").write_bytes(content[: len(content) // 3])
+    refused(tmp_path / "cut.dcm", "cut.dcm", label="liver")
+    (tmp_path / "no.dcm").write_bytes(b"nothing of the kind")
+    refused(tmp_path / "no.dcm", "not a readable DCM file")
+    from pydicom import dcmread
+
+    image = dcmread(path)
+    image.Modality = "CT"
+    image.save_as(tmp_path / "image.dcm")
+    refused(tmp_path / "image.dcm", "no segmentation")
+    monkeypatch.setattr(label_files, "MAX_LABEL_BYTES", 1000)
+    refused(path, "crop it", label="liver")

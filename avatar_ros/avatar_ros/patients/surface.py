@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from avatar_core.geometry.label_maps import MAX_LABEL_BYTES
+from avatar_core.geometry.label_files import MAX_LABEL_BYTES
 from avatar_core.geometry.surface import (
     SurfaceMesh,
     keep_organ,
@@ -26,7 +26,9 @@ def read_confined(request: PatientRequest, reader: Reader) -> SurfaceMesh:
         return reader.read(
             "mesh", request.vertices.nbytes + request.faces.nbytes, surface_of, request
         )
-    packed = request.surface.endswith((".gz", ".nii", ".nrrd"))  # may unpack to MAX_LABEL_BYTES
+    packed = request.surface.endswith(
+        (".gz", ".nii", ".nrrd", ".dcm")
+    )  # may unpack to MAX_LABEL_BYTES
     n_bytes = MAX_LABEL_BYTES if packed else os.path.getsize(request.surface)
     return reader.read(os.path.basename(request.surface), n_bytes, surface_of, request)
 
