@@ -203,6 +203,8 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
         # --- regions of the load positions -----------------------------------------------------
         amplitude, scales, start = state.amplitude, model.space_scale, model.region_start
         region_weight, n_global, n_touched, kept = state.region_weight, start[0], 0, 0.0
+        for i in range(state.n_touched[0]):
+            state.is_touched[state.touched[i]] = False
         drive = np.float32(force * a)
         for k in range(n_global):
             amplitude[k] = -drive * mode[k]
@@ -232,8 +234,7 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
             load, first = model.regional_load[j], start[r]
             for k in range(start[r + 1] - first):
                 amplitude[first + k] += load[0, k] * w0 + load[1, k] * w1 + load[2, k] * w2
-        for i in range(n_touched):
-            state.is_touched[state.touched[i]] = False
+        state.n_touched[0] = n_touched
         # --- modes -----------------------------------------------------------------------------
         for block in range(model.space.shape[0]):
             u = field[block * BLOCK : (block + 1) * BLOCK]

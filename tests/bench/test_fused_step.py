@@ -13,7 +13,7 @@ from avatar_core.contact.tool_path import slide
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.pipeline import OrganOptions, build
-from avatar_core.studies.bench.fused import module_of
+from avatar_core.studies.bench.fused import fused_ratio, module_of
 from avatar_core.vademecum.model import Vademecum
 
 TIP = 10e-3
@@ -53,3 +53,11 @@ def test_the_bare_step_agrees_with_the_one_fused_by_hand(
         assert other.out.n_contacts[0] == bare.out.n_contacts[0]
         touched += int(bare.out.n_contacts[0])
     assert 100 < touched < len(path)
+
+
+@pytest.mark.long
+def test_both_work_on_the_same_arrays_in_turn(fused: ModuleType, organ: Vademecum) -> None:
+    """As the benchmark has them do, over borders of regions too."""
+    bare = prepare(organ, (PATCH,), cloud="volume", effects=())
+    path = slide(organ, TIP, 5e-3, 60e-3, step=1e-4)[:, None]
+    assert fused_ratio(bare, fused.fused_step, np.ascontiguousarray(path)) > 0.0

@@ -26,9 +26,8 @@ def read_confined(request: PatientRequest, reader: Reader) -> SurfaceMesh:
         return reader.read(
             "mesh", request.vertices.nbytes + request.faces.nbytes, surface_of, request
         )
-    packed = request.surface.endswith(
-        (".gz", ".nii", ".nrrd", ".dcm")
-    )  # may unpack to MAX_LABEL_BYTES
+    # these may unpack to MAX_LABEL_BYTES
+    packed = request.surface.endswith((".gz", ".nii", ".nrrd", ".dcm"))
     n_bytes = MAX_LABEL_BYTES if packed else os.path.getsize(request.surface)
     return reader.read(os.path.basename(request.surface), n_bytes, surface_of, request)
 
