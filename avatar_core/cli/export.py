@@ -1,19 +1,31 @@
-"""``avatar export``: a vademecum as a mesh that ParaView opens."""
+"""``avatar export``: a vademecum as a mesh for ParaView, or as deformed surfaces for 3D Slicer."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from avatar_core.cli.output import require_output
 from avatar_core.cli.vademecum import require
 
+if TYPE_CHECKING:
+    from avatar_core.vademecum.model import Vademecum
+
 
 def export(
     file: Annotated[Path, typer.Argument(help="vademecum to export (.h5)")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="mesh to write (.vtu or .xdmf)")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            help="file to write: .vtu or .xdmf, the organ at rest with displacement and modes; "
+            ".stl or .obj, the deformed surface, and structures inside in files of their own",
+        ),
+    ],
     at: Annotated[
         str | None,
         typer.Option(
@@ -28,28 +40,62 @@ def export(
         ),
     ] = "1",
     modes: Annotated[int, typer.Option(help="number of global modes to write")] = 10,
+    unit: Annotated[str, typer.Option(help="of surfaces: mm, cm or m")] = "mm",
+    axes: Annotated[
+        str, typer.Option(help="of surfaces: LPS or RAS, which the header states")
+    ] = "LPS",
 ) -> None:
-    """Export an organ for ParaView: at rest, with its first modes and its displacement."""
+    """Export an organ under a load: a mesh for ParaView, or deformed surfaces for 3D Slicer."""
     from avatar_core.contact.tool_path import middle_of_access
-    from avatar_core.scene.export import FORMATS
-    from avatar_core.scene.export import export as exported
+    from avatar_core.scene.export import FORMATS, organ_mesh, write_mesh
+    from avatar_core.scene.surface_export import AXES, SURFACE_FORMATS, UNITS, export_surfaces
     from avatar_core.vademecum.storage import load_vademecum
 
     require(modes >= 0, f"--modes is {modes}; ask for 0 or more")
-    require_output(output, FORMATS, [file])
+    require(unit in UNITS, f"--unit is {unit}; choose {', '.join(UNITS)}")
+    require(axes in AXES, f"--axes is {axes}; choose {' or '.join(AXES)}")
+    require_output(output, [*FORMATS, *SURFACE_FORMATS], [file])
     newtons = _numbers("--force", force, (1, 3), "one number or three, as 0,-1,0.5")
     given = None if at is None else _numbers("--at", at, (3,), "three numbers, as 0,0.07,0.005")
     vademecum = load_vademecum(file)
     point = vademecum.surface.centers[middle_of_access(vademecum)] if given is None else given
-    mesh = exported(vademecum, output, point, newtons, modes)
-    moved = ((mesh.point_data["displacement"] ** 2).sum(axis=1) ** 0.5).max()
-    x, y, z = vademecum.surface.nearest(point).point
-    n_modes = sum(name.startswith("mode_") for name in mesh.point_data)
+    displacement = vademecum.displacement_at(point, newtons)
+    if output.suffix in FORMATS:
+        mesh = organ_mesh(vademecum, point, newtons, modes)
+        write_mesh(mesh, output)
+        n_modes = sum(name.startswith("mode_") for name in mesh.point_data)
+        print(f"{output}: {len(mesh.points)} vertices, {n_modes} modes, at rest, in m and RAS")
+    else:
+        for path, (vertices, _) in export_surfaces(
+            vademecum, output, displacement, unit, axes
+        ).items():
+            print(f"{path}: {len(vertices)} vertices, deformed, in {unit} and {axes}")
+    _say_load(vademecum, point, newtons, float((displacement**2).sum(axis=1).max() ** 0.5))
+
+
+def _say_load(vademecum: Vademecum, point: Any, newtons: list[float], moved: float) -> None:
+    """The load, the largest displacement [m], and what is known of its error."""
+    from avatar_core.contact.locate import MAX_DEPTH
+
+    place = vademecum.surface.nearest(point)
+    x, y, z = place.point
     newton = sum(number * number for number in newtons) ** 0.5
+    certificate = vademecum.certificate
+    known = f", {certificate.l2_mean:.1%} off in the mean" if certificate else ", of unknown error"
     print(
-        f"{output}: {len(mesh.points)} vertices, {n_modes} modes; "
-        f"{newton:g} N at ({x:.4f}, {y:.4f}, {z:.4f}) m move it by {1e3 * moved:.2f} mm at most"
+        f"{newton:g} N at ({x:.4f}, {y:.4f}, {z:.4f}) m move it by {1e3 * moved:.2f} mm at "
+        f"most{known}"
     )
+    pressing = newtons[0] if len(newtons) == 1 else -float(place.normal @ newtons)
+    push = vademecum.push(place.positions, place.weights, max(pressing, 0.0))
+    if not push.within:
+        print("warning: a deeper push than was computed; extrapolated", file=sys.stderr)
+    elif moved > MAX_DEPTH:
+        print(
+            f"warning: farther than the {1e3 * MAX_DEPTH:g} mm up to which contact is covered, and "
+            "than small strains allow; press with less force",
+            file=sys.stderr,
+        )
 
 
 def _numbers(option: str, text: str, counts: tuple[int, ...], remedy: str) -> list[float]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 import meshio
@@ -11,11 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from avatar_core.contact.tool_path import middle_of_access
-from avatar_core.errors import StorageError, one_line
+from avatar_core.errors import StorageError
+from avatar_core.scene.written import replaced
 from avatar_core.vademecum.model import Vademecum
 
 # Options of meshio by suffix, each for a single file: XDMF with HDF5 would write a second one, with
 # the name of the vademecum.
+DISPLACEMENT = "displacement [m]"
 FORMATS = {".vtu": {"file_format": "vtu"}, ".xdmf": {"file_format": "xdmf", "data_format": "XML"}}
 
 
@@ -56,12 +56,12 @@ def organ_mesh(
 ) -> meshio.Mesh:
     """The mesh at rest [m] with point data.
 
-    displacement (n_vertices, 3) [m] under a force, by :meth:`Vademecum.displacement_at`;
+    "displacement [m]" (n_vertices, 3) under a force, by :meth:`Vademecum.displacement_at`;
     mode_001 and so on, (n_vertices, 3), as in the file; clamped, accessible (n_vertices,), 1 on
     these parts of the surface
     """
     mesh, far = vademecum.mesh, vademecum.far
-    data = {"displacement": vademecum.displacement_at(point, force)}
+    data = {DISPLACEMENT: vademecum.displacement_at(point, force)}
     for name in ("clamped", "accessible"):
         faces = mesh.boundary_faces[getattr(vademecum.regions, name)]
         data[name] = np.isin(np.arange(len(mesh.vertices)), faces).astype(np.int32)
@@ -81,15 +81,5 @@ def write_mesh(mesh: meshio.Mesh, path: str | Path) -> None:
     path = Path(path)
     if path.suffix not in FORMATS:
         raise StorageError(f"{path} ends in '{path.suffix}'; choose {' or '.join(FORMATS)}")
-    if not path.parent.is_dir():
-        raise StorageError(f"folder {path.parent} does not exist; create it first")
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            whole = Path(folder) / path.name
-            meshio.write(whole, mesh, **FORMATS[path.suffix])
-            os.replace(whole, path)
-    except OSError as error:
-        raise StorageError(
-            f"cannot write {path} ({one_line(error, 120)}); "
-            "free disk space or choose another folder"
-        ) from error
+    with replaced(path) as whole:
+        meshio.write(whole, mesh, **FORMATS[path.suffix])

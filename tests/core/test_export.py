@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from avatar_core.cli import main as cli
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import LoadError
 from avatar_core.fem.patch_loads import SurfacePoint
+from avatar_core.geometry.surface import read_surface
+from avatar_core.geometry.tumour import read_tumour
+from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
 
@@ -43,7 +48,7 @@ def test_the_file_holds_mesh_modes_and_displacement(
     unit = straight.displacement(np.array([j]), np.ones(1))
     expected = (unit @ np.array([0.5, -2.0, 1.0])).reshape(-1, 3)
     # a load position is interpolated from itself alone, up to the rounding of its coordinates
-    np.testing.assert_allclose(read.point_data["displacement"], expected, atol=1e-9)
+    np.testing.assert_allclose(read.point_data["displacement [m]"], expected, atol=1e-9)
     assert {name for name in read.point_data if name.startswith("mode")} == {
         "mode_001",
         "mode_002",
@@ -54,7 +59,7 @@ def test_the_file_holds_mesh_modes_and_displacement(
         np.flatnonzero(held), np.unique(straight.mesh.boundary_faces[straight.regions.clamped])
     )
     # the clamp does not move but by what truncated modes leave of it
-    moved = np.linalg.norm(read.point_data["displacement"], axis=1)
+    moved = np.linalg.norm(read.point_data["displacement [m]"], axis=1)
     assert moved[held].max() < 1e-3 * moved.max()
     assert file.read_bytes() == before
     assert sorted(path.name for path in file.parent.iterdir() if path.suffix == suffix) == [
@@ -140,11 +145,74 @@ def test_point_and_force_are_written_alike(
     point, output = ",".join(map(repr, place.tolist())), tmp_path / "out.vtu"
     assert run(monkeypatch, file, "-o", output, "--at", point, "--force", "0,0,-2") == 0
     expected = straight.displacement_at(place, [0.0, 0.0, -2.0])
-    np.testing.assert_allclose(meshio.read(output).point_data["displacement"], expected, atol=1e-12)
+    np.testing.assert_allclose(
+        meshio.read(output).point_data["displacement [m]"], expected, atol=1e-12
+    )
 
 
 def test_another_suffix_is_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], file: Path, tmp_path: Path
 ) -> None:
-    assert run(monkeypatch, file, "-o", tmp_path / "out.stl") == 1
-    assert "choose .vtu or .xdmf" in capsys.readouterr().err
+    assert run(monkeypatch, file, "-o", tmp_path / "out.ply") == 1
+    assert "choose .vtu or .xdmf or .stl or .obj" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj"])
+@pytest.mark.parametrize(("unit", "axes"), [("mm", "LPS"), ("m", "RAS")])
+def test_a_surface_comes_back_to_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+    straight: Vademecum,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    suffix: str,
+    unit: str,
+    axes: str,
+) -> None:
+    """As Slicer writes it: the header states the axes, which our reader honours."""
+    centre = straight.mesh.vertices.mean(axis=0)
+    corners = 8e-3 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, -1, -1]], float)
+    lesion = (centre + corners, np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]))
+    mesh = straight.mesh
+    sick = replace(straight, display=display_of(mesh, boundary(mesh), [("seg. 4 lesion", lesion)]))
+    save_vademecum(sick, tmp_path / "sick.h5")
+    output = tmp_path / f"liver{suffix}"
+    options = ("--force", "3", "--unit", unit, "--axes", axes)
+    assert run(monkeypatch, tmp_path / "sick.h5", "-o", output, *options) == 0
+    said = capsys.readouterr().out
+    assert f"in {unit} and {axes}" in said and "off in the mean" in said
+    read = read_surface(output, unit=unit)
+    u = straight.displacement_at(middle(straight).point, 3.0)
+    moved = mesh.vertices[mesh.surface_vertices] + u[mesh.surface_vertices]
+    distance, _ = cKDTree(read.vertices).query(moved)
+    assert distance.max() < 2e-8 and len(moved) == len(np.unique(read.vertices, axis=0))
+    assert read.volume == pytest.approx(mesh.volume, rel=0.02)
+    inside = read_tumour(tmp_path / f"liver_seg__4_lesion{suffix}", unit)
+    at = sick.display
+    assert at is not None
+    exact = lesion[0] + np.einsum("vk,vkd->vd", at.weights[-4:], u[at.corners[-4:]])
+    assert cKDTree(inside.vertices).query(exact)[0].max() < 2e-8
+
+
+def test_a_force_beyond_all_bounds_is_warned_of(
+    monkeypatch: pytest.MonkeyPatch, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, file, "-o", tmp_path / "far.stl", "--force", "2000") == 0
+    assert "farther than the 25 mm" in capsys.readouterr().err
+    assert run(monkeypatch, file, "-o", tmp_path / "near.stl", "--force", "0.1") == 0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"), [(["--unit", "inch"], "mm, cm, m"), (["--axes", "RSP"], "LPS or RAS")]
+)
+def test_units_and_axes_that_nobody_reads_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+    file: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    reason: str,
+) -> None:
+    assert run(monkeypatch, file, "-o", tmp_path / "liver.stl", *options) != 0
+    assert reason in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,103 @@
+"""Deformed surfaces for 3D Slicer: STL and OBJ in millimetres, whose header states their axes.
+
+Slicer takes coordinates as LPS (left, posterior, superior) unless a file says ``SPACE=RAS``, and so
+does :func:`avatar_core.geometry.surface.read_surface`: what is written comes back to its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from avatar_core.errors import StorageError
+from avatar_core.scene.written import replaced
+from avatar_core.vademecum.model import Vademecum
+
+AXES = ("LPS", "RAS")
+UNITS = {"mm": 1e3, "cm": 1e2, "m": 1.0}  # of a metre
+
+Write = Callable[[Path, np.ndarray, np.ndarray, str], None]
+
+
+def export_surfaces(
+    vademecum: Vademecum,
+    path: str | Path,
+    displacement: np.ndarray,
+    unit: str = "mm",
+    axes: str = "LPS",
+) -> dict[Path, tuple[np.ndarray, np.ndarray]]:
+    """Write the deformed organ, and each structure inside into a file of its own.
+
+    A structure ``lesion`` of ``liver.stl`` is written to ``liver_lesion.stl``.
+
+    Parameters
+    ----------
+    path : .stl or .obj, of the organ
+    displacement : ndarray, shape (n_vertices, 3), of the mesh [m]
+    unit, axes : of what is written
+
+    Returns
+    -------
+    Vertices, in ``unit`` and ``axes``, and faces of each file.
+
+    Raises
+    ------
+    StorageError
+        For another suffix, unit or axes, a missing folder or a full disk.
+    """
+    path = Path(path)
+    if path.suffix not in SURFACE_FORMATS:
+        raise StorageError(f"{path} ends in '{path.suffix}'; choose {' or '.join(SURFACE_FORMATS)}")
+    if unit not in UNITS or axes not in AXES:
+        raise StorageError(
+            f"unit '{unit}', axes '{axes}'; choose {', '.join(UNITS)} and {' or '.join(AXES)}"
+        )
+    points = UNITS[unit] * displaced(vademecum, displacement)
+    points = points * ([-1.0, -1.0, 1.0] if axes == "LPS" else [1.0, 1.0, 1.0])
+    parts = {path: vademecum.organ_faces}
+    for name, faces in vademecum.structures.items():
+        parts[path.with_name(f"{path.stem}_{_plain(name)}{path.suffix}")] = faces
+    written = {}
+    for file, faces in parts.items():
+        used, local = np.unique(faces, return_inverse=True)
+        written[file] = points[used], local.reshape(faces.shape)
+        with replaced(file) as whole:
+            SURFACE_FORMATS[path.suffix](whole, *written[file], axes)
+    return written
+
+
+def displaced(vademecum: Vademecum, displacement: np.ndarray) -> np.ndarray:
+    """Displayed vertices moved by a displacement of the mesh, shape (n, 3) [m]."""
+    display = vademecum.display
+    if display is None:
+        moved = displacement[vademecum.mesh.surface_vertices]
+    else:
+        moved = np.einsum("vk,vkd->vd", display.weights, displacement[display.corners])
+    return np.asarray(vademecum.surface_vertices + moved, float)
+
+
+def _plain(name: str) -> str:
+    """A name without letters that files must not have."""
+    return "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)
+
+
+def _write_stl(path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str) -> None:
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    rows = np.zeros(len(faces), [("normal", "<3f4"), ("corners", "<9f4"), ("attribute", "<u2")])
+    rows["normal"], rows["corners"] = normal, corners.reshape(-1, 9)
+    header = f"avatar SPACE={axes}".encode().ljust(80)
+    path.write_bytes(header + np.array(len(faces), "<u4").tobytes() + rows.tobytes())
+
+
+def _write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str) -> None:
+    lines = [f"# avatar SPACE={axes}"]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
+    lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    path.write_text("\n".join(lines) + "\n")
+
+
+SURFACE_FORMATS: dict[str, Write] = {".stl": _write_stl, ".obj": _write_obj}
