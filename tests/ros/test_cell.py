@@ -257,6 +257,23 @@ def test_a_good_file_is_loaded(cell: Any, probe: Any, organ: Any, library: Path)
     assert answer.info.header.frame_id == "organ"
 
 
+def test_an_inactive_loader_says_so(cell: Any, probe: Any) -> None:
+    """Its service exists as long as the node; the announced vademecum is kept."""
+    from lifecycle_msgs.msg import Transition
+    from lifecycle_msgs.srv import ChangeState
+
+    def change(transition: int) -> None:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert probe.call(ChangeState, "vademecum_loader/change_state", request).success
+
+    change(Transition.TRANSITION_DEACTIVATE)
+    request = LoadVademecum.Request(name="liver.h5")
+    answer = probe.call(LoadVademecum, "load_vademecum", request)
+    assert not answer.success and "inactive; activate it" in answer.message
+    change(Transition.TRANSITION_ACTIVATE)
+    assert probe.call(LoadVademecum, "load_vademecum", request).success
+
+
 @pytest.mark.parametrize("n_swaps", [2, pytest.param(6, marks=pytest.mark.long)])
 def test_another_vademecum_is_felt_soon_and_timed_later(
     cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndarray], n_swaps: int

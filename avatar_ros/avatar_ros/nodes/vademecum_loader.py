@@ -10,7 +10,7 @@ from rclpy.node import Node
 from shape_msgs.msg import Mesh
 from std_msgs.msg import Header
 
-from avatar_core.errors import AvatarError, one_line
+from avatar_core.errors import AvatarError, StorageError, one_line
 from avatar_core.vademecum import storage
 from avatar_ros.framework import conversions, qos
 from avatar_ros.framework.library import read_in_library
@@ -63,8 +63,10 @@ class LoaderNode(ManagedNode):
         self._settings: LoaderSettings | None = None
         self._reader: Reader | None = None
         self._outlets: dict[type, Any] = {}
-        self._service: Any = None
+        self._is_active = False
         super().__init__("vademecum_loader", VADEMECUM_LOADER)
+        # Exists as long as the node: an inactive one says so, where a client would wait for ever.
+        self.create_service(LoadVademecum, "load_vademecum", self._answer)
         started = self.get_parameter("vademecum").value
         self._state = SavedState(self, {"vademecum": started})
 
@@ -87,12 +89,10 @@ class LoaderNode(ManagedNode):
     def activate(self) -> None:
         assert self._settings is not None
         self._load_first(self._settings.vademecum)
-        self._service = self.create_service(LoadVademecum, "load_vademecum", self._answer)
+        self._is_active = True
 
     def deactivate(self) -> None:
-        if self._service is not None:
-            self.destroy_service(self._service)
-            self._service = None
+        self._is_active = False
 
     def clean_up(self) -> None:
         if self._reader is not None:
@@ -141,6 +141,8 @@ class LoaderNode(ManagedNode):
         self, request: LoadVademecum.Request, response: LoadVademecum.Response
     ) -> LoadVademecum.Response:
         try:
+            if not self._is_active:
+                raise StorageError("the node is inactive; activate it first")
             response.info = self.load(request.name)
             self._state.save({"vademecum": request.name})
             response.success = True
