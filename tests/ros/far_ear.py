@@ -33,7 +33,7 @@ def main() -> None:
     def state(message: ContactState) -> None:
         heard["status"], heard["id"] = message.status, message.vademecum_id
 
-    node.create_subscription(WrenchStamped, "tool/spatial/servo_cf", force, qos.COMMAND)
+    node.create_subscription(WrenchStamped, "tool/servo_cf", force, qos.COMMAND)
     node.create_subscription(ContactState, "contact_state", state, qos.NEWEST)
     said = time.monotonic()
     while True:

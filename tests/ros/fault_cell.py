@@ -97,7 +97,7 @@ class Ear:
         every = QoSProfile(depth=4000, reliability=qos.COMMAND.reliability)
         self._node.create_subscription(
             WrenchStamped,
-            "tool/spatial/servo_cf",
+            "tool/servo_cf",
             lambda raw, info: self.heard.append((_sent(info), raw)),
             every,
             raw=True,

@@ -78,7 +78,7 @@ def felt(probe: Any, hand: Hand, timeout: float = 60.0) -> tuple[ContactState, n
     wrenches: dict[tuple[int, int], np.ndarray] = {}
     listener = probe.node.create_subscription(
         WrenchStamped,
-        "tool/spatial/servo_cf",
+        "tool/servo_cf",
         lambda w: wrenches.update({_stamp(w): _force(w)}),
         qos.COMMAND,
     )
@@ -102,7 +102,7 @@ def test_a_touch_is_felt(cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndar
     hand = Hand(probe, tip)
     wrench = probe.next(
         WrenchStamped,
-        "tool/spatial/servo_cf",
+        "tool/servo_cf",
         qos.COMMAND,
         lambda w: np.linalg.norm(_force(w)) > 0.1,
         10.0,
@@ -178,7 +178,7 @@ def test_a_bad_pose_gives_no_force(
         setattr(getattr(hand.pose.pose, part), name, value)
     assert not _status(probe, status, hand).contacts
     gone = lambda wrench: not _force(wrench).any()  # noqa: E731
-    probe.next(WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND, gone, 10.0, hand)
+    probe.next(WrenchStamped, "tool/servo_cf", qos.COMMAND, gone, 10.0, hand)
 
 
 def test_a_pose_that_stops_coming_is_stale(
@@ -195,7 +195,7 @@ def test_a_pose_that_stops_coming_is_stale(
         5.0,
     )
     gone = lambda wrench: not _force(wrench).any()  # noqa: E731
-    wrench = probe.next(WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND, gone, 5.0)
+    wrench = probe.next(WrenchStamped, "tool/servo_cf", qos.COMMAND, gone, 5.0)
     assert not stale.contacts
     assert _stamp(wrench) in hand.stamps  # of the last pose, not of some clock
 

@@ -68,7 +68,7 @@ def test_without_vademecum_the_wrench_is_zero_and_a_broken_one_changes_nothing(
         state = probe.next(ContactState, "contact_state", qos.state(1))
         assert state.status == ContactState.STATUS_NO_MODEL
         assert (state.vademecum_id, list(state.contacts)) == ("", [])
-        wrench = probe.next(WrenchStamped, "tool/spatial/servo_cf", qos.COMMAND)
+        wrench = probe.next(WrenchStamped, "tool/servo_cf", qos.COMMAND)
         assert wrench == WrenchStamped(header=wrench.header)
         assert wrench.header.frame_id == "organ"
         assert (wrench.header.stamp.sec, wrench.header.stamp.nanosec) == (0, 0)
@@ -88,7 +88,7 @@ def test_two_tools_have_topics_of_their_own(own_domain: dict[str, str], probe: A
     process = Module("contact", ["--ros-args", *arguments], own_domain)
     try:
         for tool in ("left", "right"):
-            probe.next(WrenchStamped, f"{tool}/spatial/servo_cf", qos.COMMAND)
+            probe.next(WrenchStamped, f"{tool}/servo_cf", qos.COMMAND)
             probe.next(ContactState, "contact_state", qos.state(2), lambda s, t=tool: s.tool == t)
     finally:
         assert process.finish() == 0
@@ -96,7 +96,7 @@ def test_two_tools_have_topics_of_their_own(own_domain: dict[str, str], probe: A
 
 def test_the_contact_node_is_managed(own_domain: dict[str, str], probe: Any) -> None:
     process = Module("contact", ["--ros-args", "-p", "autostart:=false"], own_domain)
-    topic = "tool/spatial/servo_cf"
+    topic = "tool/servo_cf"
     try:
         assert _state(probe, "contact") == "unconfigured"
         for _ in range(2):  # once more after cleaning up

@@ -31,7 +31,7 @@ from tests.slowness import slowness
 pytestmark = pytest.mark.ros
 
 POSES = "qos_overrides./tool/measured_cp.subscription"
-WRENCHES = "qos_overrides./tool/spatial/servo_cf.publisher"
+WRENCHES = "qos_overrides./tool/servo_cf.publisher"
 RELIABLE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -94,7 +94,7 @@ from sensor_msgs.msg import PointCloud2
 rclpy.init()
 node = rclpy.create_node("sleeper", enable_rosout=False)
 first = []
-node.create_subscription(WrenchStamped, "tool/spatial/servo_cf", first.append, 1)
+node.create_subscription(WrenchStamped, "tool/servo_cf", first.append, 1)
 node.create_subscription(PointCloud2, "deformation", lambda _: None, 1)
 while not first:
     rclpy.spin_once(node)
@@ -159,7 +159,7 @@ overridden = pytest.mark.parametrize("contact", [OVERRIDES], indirect=True, ids=
 
 @overridden
 def test_an_override_is_what_others_see(contact: Module, probe: Any) -> None:
-    topic = "/tool/spatial/servo_cf"
+    topic = "/tool/servo_cf"
     probe.until(lambda: bool(probe.node.get_publishers_info_by_topic(topic)), 60.0)
     (end,) = probe.node.get_publishers_info_by_topic(topic)
     assert end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
@@ -178,7 +178,7 @@ def test_a_driver_learns_by_its_deadline_that_the_wrenches_ended(
     )
     probe.node.create_subscription(
         WrenchStamped,
-        "tool/spatial/servo_cf",
+        "tool/servo_cf",
         heard.append,
         asked,
         event_callbacks=SubscriptionEventCallbacks(deadline=missed.append),

@@ -78,7 +78,7 @@ class State:
         wrenches: dict[tuple[int, int], np.ndarray] = {}
         listener = self._probe.node.create_subscription(
             WrenchStamped,
-            "tool/spatial/servo_cf",
+            "tool/servo_cf",
             lambda w: wrenches.update({_stamp(w): _force(w)}),
             qos.COMMAND,
         )

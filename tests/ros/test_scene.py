@@ -59,7 +59,7 @@ class Palpation:
         self.felt: list[np.ndarray] = []
         every = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
         self._listener = probe.node.create_subscription(
-            WrenchStamped, "tool/spatial/servo_cf", lambda w: self.felt.append(_force(w)), every
+            WrenchStamped, "tool/servo_cf", lambda w: self.felt.append(_force(w)), every
         )
         self._timer = probe.node.create_timer(1e-3, self.hand)
 

@@ -112,7 +112,7 @@ def _ease(x: np.ndarray) -> np.ndarray:
 
 
 class ScriptedTool:
-    """Publishes ``NAME/measured_cp`` on time and listens to ``NAME/spatial/servo_cf`` between."""
+    """Publishes ``NAME/measured_cp`` on time and listens to ``NAME/servo_cf`` between."""
 
     def __init__(self, node: Node, name: str, frame_id: str, rate: float) -> None:
         self._node = node
@@ -120,7 +120,7 @@ class ScriptedTool:
         self._period = round(1e9 / rate)
         self._publisher = node.create_publisher(PoseStamped, f"{name}/measured_cp", qos.NEWEST)
         self._subscription = node.create_subscription(
-            WrenchStamped, f"{name}/spatial/servo_cf", lambda _: None, qos.COMMAND, raw=True
+            WrenchStamped, f"{name}/servo_cf", lambda _: None, qos.COMMAND, raw=True
         )
         self._pose = PoseTemplate(frame_id)
         self._reader = WrenchReader(frame_id)

@@ -11,6 +11,8 @@ from avatar_core.contact.haptics.passivity import MAX_DELAY, Passivity, make_pas
 from avatar_ros.framework.parameters import Parameter, ParameterError
 
 PASSIVITY = ("off", "observe", "control")
+# How a wrench is given, and the topic below that of the tool, as CRTK calls them.
+WRENCHES = {"absolute": "servo_cf", "body": "body/servo_cf", "spatial": "spatial/servo_cf"}
 _DEVICE = "sigma"
 _IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -65,6 +67,12 @@ SAFETY = (
         list(_IDENTITY),
         "pose of tool_frame in frame_id: x y z [m] and quaternion x y z w",
     ),
+    Parameter(
+        "tool_wrench",
+        "absolute",
+        "how wrenches are given: absolute (axes of tool_frame, about the pose), body (axes of the "
+        "pose, about it) or spatial (axes and origin of tool_frame)",
+    ),
 )
 
 
@@ -78,6 +86,7 @@ class Safety:
     resolution : [m]
     frame : of the poses; empty for the organ's
     transform : pose of that frame in the organ's, x y z [m] and quaternion x y z w
+    wrench : one of ``WRENCHES``
     """
 
     limits: ForceLimits = DEVICES[_DEVICE]
@@ -87,6 +96,7 @@ class Safety:
     resolution: float = 1e-5
     frame: str = ""
     transform: tuple[float, ...] = _IDENTITY
+    wrench: str = "absolute"
 
     def observer(self, n_tools: int, period: float) -> Passivity | None:
         """The observer of the energies; None if passivity is off."""
@@ -107,6 +117,8 @@ def chosen_safety(value: dict[str, Any]) -> Safety:
         raise ParameterError(f"parameter safety.device: give one of {', '.join(DEVICES)}")
     if value["safety.passivity"] not in PASSIVITY:
         raise ParameterError(f"parameter safety.passivity: give one of {', '.join(PASSIVITY)}")
+    if value["tool_wrench"] not in WRENCHES:
+        raise ParameterError(f"parameter tool_wrench: give one of {', '.join(WRENCHES)}")
     limits = ForceLimits(
         value["safety.max_force"] or device.force, value["safety.max_slew"] or device.slew
     )
@@ -118,6 +130,7 @@ def chosen_safety(value: dict[str, Any]) -> Safety:
         value["safety.resolution"],
         value["tool_frame"],
         _transform(value["tool_transform"]),
+        value["tool_wrench"],
     )
 
 

@@ -17,7 +17,7 @@ from avatar_ros.framework.templates import (
     rotated,
     rotation_between,
 )
-from avatar_ros.loop.safety import Safety
+from avatar_ros.loop.safety import WRENCHES, Safety
 from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.msg import ContactState
 
@@ -79,6 +79,8 @@ class ToolChannel:
         self._last_decrease = -_ALTERNATION  # when the numbers last decreased [ns]
         self._several_until = 0  # [ns]
         self._orientation: tuple[float, float, float, float] | None = None  # of the last valid pose
+        self._kind = safety.wrench
+        self._axes = (0.0, 0.0, 0.0, 1.0)  # of the last valid pose, as long as the channel exists
 
     def take(
         self, now: int, timeout: int, tip: np.ndarray, turn: np.ndarray, leap: float = math.inf
@@ -120,11 +122,21 @@ class ToolChannel:
             axis[:] = self._turned
 
     def answer(self) -> None:
-        """Send ``wrench``, given in the organ's frame, in the tool's frame. Real-time safe."""
+        """Send ``wrench``, given in the organ's frame, as the tool takes it. Real-time safe."""
+        force, torque = self.wrench.force, self.wrench.torque
         if self._is_turned:
-            for part in (self.wrench.force, self.wrench.torque):
+            for part in (force, torque):
                 np.dot(part, self._rotation, out=self._turned)  # R^T v
                 part[:] = self._turned
+        if self._kind == "body":
+            i, j, k, w = self._axes
+            for part in (force, torque):
+                part[:] = rotated((part[0], part[1], part[2]), (-i, -j, -k, w))
+        elif self._kind == "spatial" and self.stamp != NO_STAMP:
+            x, y, z = self._last
+            torque[0] += y * force[2] - z * force[1]
+            torque[1] += z * force[0] - x * force[2]
+            torque[2] += x * force[1] - y * force[0]
         self.publisher.handle.publish_raw(self.wrench.serialise(self.stamp))
 
     def _judge(self, taken: Any, now: int, timeout: int, leap: float) -> int:
@@ -181,7 +193,7 @@ class ToolChannel:
                 np.dot(self._rotation, part, out=self._turned)
                 part[:] = self._turned
         tip += self._origin
-        self._orientation = self._reader.orientation
+        self._orientation = self._axes = self._reader.orientation
 
 
 def tool_channels(ports: Ports, settings: ContactSettings) -> list[ToolChannel]:
@@ -203,7 +215,9 @@ def tool_channels(ports: Ports, settings: ContactSettings) -> list[ToolChannel]:
                 callback_group=polled,
                 raw=True,
             ),
-            ports.publisher(WrenchStamped, f"{name}/spatial/servo_cf", qos.wrenches(period)),
+            ports.publisher(
+                WrenchStamped, f"{name}/{WRENCHES[settings.safety.wrench]}", qos.wrenches(period)
+            ),
             settings.frame_id,
             settings.safety,
         )
