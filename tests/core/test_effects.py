@@ -44,7 +44,7 @@ def test_an_effect_is_absent_from_the_step_when_off(
 
 
 def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -> None:
-    """Its last argument is none, but for the law of a tip that is no patch."""
+    """Its last argument is none, but for the law of a tip that is no patch, and for a display."""
     import numba
 
     from avatar_core.contact import kernels
@@ -53,7 +53,8 @@ def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -
         model = prepare(phantom_vademecum, (tip,), cloud="off", effects=())
         arguments = (model.arrays, model.state, model.out, model.tips, model.effects)
         signature = tuple(numba.typeof(argument) for argument in arguments)
-        *others, law, dent = (str(kind) for kind in signature[4])
+        *others, law, dent, display = (str(kind) for kind in signature[4])
+        assert display == "none" and phantom_vademecum.display is None
         assert others == ["none"] * 8
         assert (law == "none") == (dent == "none") == (tip is PATCH)
         assert signature in kernels.contact_step.overloads

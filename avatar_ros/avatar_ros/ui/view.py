@@ -56,8 +56,10 @@ def _draw(mesh: Any, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 def _own(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The points that some faces use, and the faces over these alone."""
-    used, local = np.unique(faces, return_inverse=True)
-    return used, local.reshape(faces.shape)
+    is_used = np.zeros(int(faces.max()) + 1, bool)
+    is_used[faces] = True
+    place = np.cumsum(is_used, dtype=np.uint32) - np.uint32(1)
+    return np.flatnonzero(is_used), place[faces]
 
 
 class OrganView:
@@ -176,7 +178,8 @@ class OrganView:
                 faces = shown.faces[band == i]
                 if len(faces) == 0 and len(mesh.faces) == 1:
                     continue  # still empty
-                _draw(mesh, positions, faces.astype(np.uint32) if len(faces) else _NO_FACE)
+                used, local = _own(faces if len(faces) else _NO_FACE)
+                _draw(mesh, positions[used], local)  # the vertices of all would be sent ten times
             for mesh, points_inside in zip(self._structures, self._inside, strict=True):
                 mesh.vertices = positions[points_inside]
         return largest
