@@ -235,16 +235,29 @@ def test_a_tolerance_shows_fewer_modes_and_leaves_the_force(
     statistics(probe, hand, lambda s: s.modes == rank)
 
 
-def test_an_infeasible_budget_gives_way_to_the_one_before(probe: Any, hand: Hand) -> None:
-    assert set_budget(probe, tolerance=1e-6).successful  # known to be infeasible when chosen
+def test_a_tolerance_beyond_every_detail_is_refused_in_the_answer(
+    probe: Any, hand: Hand, organ: Any
+) -> None:
+    statistics(probe, hand, lambda s: s.modes > 0)  # a vademecum is in use
+    answer = set_budget(probe, tolerance=1e-6)
+    best = min(p.l2 for p in organ.certificate.curve.of("surface").points)
+    assert not answer.successful
+    assert f"within 1e-06 of l2; the most exact is within {best:.3g}" in answer.reason
+    request = GetParameters.Request(names=["accuracy.tolerance"])
+    kept = probe.ask(GetParameters, "/contact/get_parameters", request)
+    assert kept.values[0].double_value == 0.0
 
-    def tolerance() -> float:
-        request = GetParameters.Request(names=["accuracy.tolerance"])
+
+def test_an_infeasible_deadline_gives_way_to_the_one_before(probe: Any, hand: Hand) -> None:
+    assert set_budget(probe, deadline=1e-7).successful  # known when steps have been timed
+
+    def deadline() -> float:
+        request = GetParameters.Request(names=["accuracy.deadline"])
         answer = probe.ask(GetParameters, "/contact/get_parameters", request)
         return float(answer.values[0].double_value)
 
     passed = Deadline(2 * START_TIMEOUT)
-    while tolerance() != 0.0:
+    while deadline() != 0.0:
         assert not passed
         hand()
         probe.spin(0.1)

@@ -71,6 +71,7 @@ class ContactNode(ManagedNode):
         self._outputs: Publishers | None = None
         self._timers: list[Any] = []
         self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
+        self._least_error: dict[str, float] = {}  # of any detail of it, by quantity
         self._n_awaited = 0
         self._changing = threading.RLock()
         super().__init__("contact", CONTACT)
@@ -190,7 +191,7 @@ class ContactNode(ManagedNode):
             return
         model = contact.make_model(Layout.of(prepared.arrays), halves=True)
         replaced = loop.active
-        self._ranges = prepared.ranges
+        self._ranges, self._least_error = prepared.ranges, prepared.least_error
         curve = AccuracyCurve.of_plain(prepared.curve) if prepared.curve else None
         kept = self._budget.in_force if self._budget is not None else None
         shown_modes = ShownModes(model, curve, _deadline(kept))
@@ -300,6 +301,9 @@ class ContactNode(ManagedNode):
             safety = chosen_safety(self._values(tuple(p.name for p in SAFETY), changes))
         except (AccuracyError, ParameterError) as error:
             return SetParametersResult(successful=False, reason=str(error))
+        refusal = self._refusal_of_budget(budget)
+        if refusal:
+            return SetParametersResult(successful=False, reason=refusal)
         material = dict(settings.material)
         for change in changes:
             name = MATERIAL.get(change.name)
@@ -338,6 +342,19 @@ class ContactNode(ManagedNode):
     def _log_refused_material(self, prepared: PreparedModel | None, refusal: str) -> None:
         if refusal and refusal != SUPERSEDED:
             self.get_logger().error(f"material refused: {refusal}")
+
+    def _refusal_of_budget(self, budget: Budget | None) -> str:
+        """Why no detail of the vademecum in use is so exact; empty if one is, or if none is known.
+
+        Whether it is fast enough as well is found out later, in the worker process.
+        """
+        least = self._least_error.get(budget.quantity) if budget is not None else None
+        if budget is None or least is None or budget.tolerance >= least:
+            return ""
+        return (
+            f"no detail of this vademecum is within {budget.tolerance:.3g} of {budget.quantity}; "
+            f"the most exact is within {least:.3g}"
+        )
 
     def _refusal_of(self, name: str, value: float) -> str:
         """Why a value of the material lies outside the vademecum in use; empty if it does not."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from avatar_core.contact.model import ContactModel
     from avatar_core.scene.prepare import ModelSpec
-    from avatar_core.vademecum.accuracy import AccuracyCurve, Detail
+    from avatar_core.vademecum.accuracy import AccuracyCurve, Detail, Quantity
     from avatar_ros.prepare.requests import PreparationRequest
 
 
@@ -98,3 +98,11 @@ class DetailChooser:
         key = (spec.vademecum.id, spec.tips, spec.cloud, spec.effect_names)
         if key != self._key:
             self._key, self._timed, self._rows = key, None, {}
+
+
+def least_error(spec: ModelSpec) -> dict[str, float]:
+    """The error of the most exact detail, by quantity; empty if none were measured."""
+    quantities: tuple[Quantity, ...] = ("l2", "force")
+    points = spec.curve.points if spec.curve else ()
+    found = {name: [p.error(name) for p in points if p.error(name) >= 0.0] for name in quantities}
+    return {name: min(errors) for name, errors in found.items() if errors}

@@ -47,6 +47,7 @@ class ModelReady:
     effects: tuple[str, ...]
     cloud_divisor: int | None
     curve: dict[str, Any] | None
+    least_error: dict[str, float]
 
     def map(self, handle: int) -> PreparedModel:
         """The model, with its arrays mapped into this process; closes the descriptor."""
@@ -58,6 +59,7 @@ class ModelReady:
             tuple(self.effects),
             self.cloud_divisor,
             self.curve,
+            self.least_error,
         )
 
 

@@ -51,6 +51,7 @@ class PreparedModel:
     cloud_divisor : that of the scene; None without a scene
     curve : plain form of the AccuracyCurve for the modes in use and fewer; times that were not
         measured yet are NaN; None if no errors were measured
+    least_error : of any detail of the cloud, by quantity; empty if no errors were measured
     """
 
     id: str
@@ -60,3 +61,4 @@ class PreparedModel:
     effects: tuple[str, ...] = ()
     cloud_divisor: int | None = None
     curve: dict[str, Any] | None = None
+    least_error: dict[str, float] = field(default_factory=dict)

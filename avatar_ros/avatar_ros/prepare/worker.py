@@ -128,6 +128,7 @@ class ModelPreparer:
         from avatar_core.contact.layout import Layout
         from avatar_core.contact.model import make_model
         from avatar_core.scene.file import parse_scene
+        from avatar_ros.prepare.detail_chooser import least_error
         from avatar_ros.prepare.scenes import model_spec
 
         scene = parse_scene(request.scene, "scene") if request.scene else None
@@ -149,6 +150,7 @@ class ModelPreparer:
                 effects=spec.effect_names,
                 cloud_divisor=scene.cloud_divisor if scene else None,
                 curve=self._chooser.curve(spec, detail),
+                least_error=least_error(spec),
             )
             self._send(ready, handle)
         finally:

@@ -95,7 +95,7 @@ class OrganView:
         self._bands = [
             scene.add_mesh_simple(
                 f"/organ/{i}",
-                organ.vertices,
+                organ.vertices[:1] if i else organ.vertices,
                 _NO_FACE if i else organ.faces,
                 color=tuple(shade),
                 side="double",
