@@ -21,6 +21,7 @@ from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.display import boundary, display_of, outline, structure
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import _arrays, _attributes, load_vademecum, save_vademecum
+from tests.hard.small_files import ball
 
 from .box_organ import PATCH_RADIUS, UP, organ, top
 from .test_dent import ASIDE, DEPTH, END, SPHERE, pressed, sneddon_dent, without
@@ -31,12 +32,9 @@ def finer(v: Vademecum, times: int = 2) -> Vademecum:
     return replace(v, display=display_of(v.mesh, igl.upsample(*boundary(v.mesh), times)))
 
 
-def ball(centre: np.ndarray, radius: float) -> SurfaceMesh:
-    corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
-    faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
-    points, triangles = igl.upsample(corners, np.array(faces), 3)
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return SurfaceMesh(centre + radius * points, triangles, "lesion")
+def lesion_at(centre: np.ndarray, radius: float) -> SurfaceMesh:
+    points, faces = ball(360, radius)
+    return SurfaceMesh(centre + points, faces, "lesion")
 
 
 @pytest.mark.parametrize("n", [300, 1500, 9000])
@@ -133,7 +131,7 @@ def test_the_volume_shows_the_mesh() -> None:
 
 def test_a_structure_moves_with_the_organ() -> None:
     """As the volume does between the vertices of the mesh; the organ's own part is as without."""
-    cube, lesion = organ("cube"), ball(top("cube") + np.array([2e-3, -12e-3, 1e-3]), 8e-3)
+    cube, lesion = organ("cube"), lesion_at(top("cube") + np.array([2e-3, -12e-3, 1e-3]), 8e-3)
     display = display_of(cube.mesh, boundary(cube.mesh), [("lesion", structure(lesion))])
     with_lesion = replace(cube, display=display)
     tip = Tip("patch", SPHERE.radius)  # whose field the modes hold as a whole
@@ -154,7 +152,7 @@ def test_a_structure_moves_with_the_organ() -> None:
 
 
 def test_a_structure_with_too_many_vertices_is_thinned() -> None:
-    lesion = ball(np.zeros(3), 0.02)
+    lesion = lesion_at(np.zeros(3), 0.02)
     fine = SurfaceMesh(*igl.upsample(lesion.vertices, lesion.faces.astype(np.int64), 3))
     assert len(fine.vertices) > 4000 >= len(structure(fine)[0]) > 3900
     assert len(structure(lesion)[0]) == len(lesion.vertices)
@@ -162,7 +160,7 @@ def test_a_structure_with_too_many_vertices_is_thinned() -> None:
 
 def test_a_tumour_is_stored_with_its_organ_and_stays_there(tmp_path: Path) -> None:
     liver = phantom_liver(12e-3)
-    lesion = ball(liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0]), 0.02)
+    lesion = lesion_at(liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0]), 0.02)
     options = OrganOptions(
         n_vertices=450, rule=BuildRule(max_modes=20), tumour=lesion, contrast=5.0, n_certified=2
     )
@@ -177,7 +175,10 @@ def test_a_tumour_is_stored_with_its_organ_and_stays_there(tmp_path: Path) -> No
 
 
 def test_a_display_is_stored(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
-    mesh, lesion = phantom_vademecum.mesh, ball(phantom_vademecum.mesh.vertices.mean(axis=0), 9e-3)
+    mesh, lesion = (
+        phantom_vademecum.mesh,
+        lesion_at(phantom_vademecum.mesh.vertices.mean(axis=0), 9e-3),
+    )
     display = display_of(
         mesh, outline(mesh, phantom_liver(), 3000), [("lesion", structure(lesion))]
     )
@@ -215,7 +216,10 @@ def test_a_spoilt_display_is_refused(
     phantom_vademecum: Vademecum,
     tmp_path: Path,
 ) -> None:
-    mesh, lesion = phantom_vademecum.mesh, ball(phantom_vademecum.mesh.vertices.mean(axis=0), 9e-3)
+    mesh, lesion = (
+        phantom_vademecum.mesh,
+        lesion_at(phantom_vademecum.mesh.vertices.mean(axis=0), 9e-3),
+    )
     display = display_of(
         mesh, outline(mesh, phantom_liver(), 3000), [("lesion", structure(lesion))]
     )
