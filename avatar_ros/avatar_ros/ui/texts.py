@@ -34,9 +34,10 @@ def warnings(
     if "contact" not in missing and status in EXPLANATIONS:
         lines.append(explanation(status))
     if "contact" not in missing and missed > _MANY_MISSED:
+        whole = "" if lines else "all nodes answer, but "
         lines.append(
-            f"the machine is too busy for 1 kHz: {missed:.0%} of the periods come late; close "
-            "other programs"
+            f"{whole}the machine is too busy for 1 kHz: {missed:.0%} of the periods come late; "
+            "close other programs"
         )
     if not lines:
         engaging = status == ContactState.STATUS_ENGAGING
