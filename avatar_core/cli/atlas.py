@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from avatar_core.atlas.growth import Growth, Source
     from avatar_core.atlas.model import Atlas
 
-SUFFIXES = (".obj", ".stl", ".ply", ".vtk", ".off", ".nii", ".nii.gz", ".nrrd", ".dcm")
-
 EXIT_STOPPED = 130
 
 atlas = typer.Typer(
@@ -255,6 +253,8 @@ def _sources(
 def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
+    from avatar_core.geometry.surface_files import SUFFIXES
+
     found = sorted(one for one in path.iterdir() if one.name.lower().endswith(SUFFIXES))
     if not found:
         raise AvatarError(f"no surface in {path}; it should hold files of {', '.join(SUFFIXES)}")

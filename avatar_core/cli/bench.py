@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from avatar_core.cli.build_bar import BuildBar
 from avatar_core.cli.output import require_output
 from avatar_core.cli.vademecum import (
     Axes,
-    BuildBar,
     Label,
     Surface,
     Unit,

@@ -47,25 +47,27 @@ def export(
 ) -> None:
     """Export an organ under a load: a mesh for ParaView, or deformed surfaces for 3D Slicer."""
     from avatar_core.contact.tool_path import middle_of_access
-    from avatar_core.scene.export import FORMATS, organ_mesh, write_mesh
-    from avatar_core.scene.surface_export import AXES, SURFACE_FORMATS, UNITS, export_surfaces
+    from avatar_core.geometry.surface import METRES
+    from avatar_core.scene.export import DISPLACEMENT, FORMATS, organ_mesh, write_mesh
+    from avatar_core.scene.surface_export import AXES, SURFACE_FORMATS, export_surfaces
     from avatar_core.vademecum.storage import load_vademecum
 
     require(modes >= 0, f"--modes is {modes}; ask for 0 or more")
-    require(unit in UNITS, f"--unit is {unit}; choose {', '.join(UNITS)}")
+    require(unit in METRES, f"--unit is {unit}; choose {', '.join(METRES)}")
     require(axes in AXES, f"--axes is {axes}; choose {' or '.join(AXES)}")
     require_output(output, [*FORMATS, *SURFACE_FORMATS], [file])
     newtons = _numbers("--force", force, (1, 3), "one number or three, as 0,-1,0.5")
     given = None if at is None else _numbers("--at", at, (3,), "three numbers, as 0,0.07,0.005")
     vademecum = load_vademecum(file)
     point = vademecum.surface.centers[middle_of_access(vademecum)] if given is None else given
-    displacement = vademecum.displacement_at(point, newtons)
     if output.suffix in FORMATS:
         mesh = organ_mesh(vademecum, point, newtons, modes)
+        displacement = mesh.point_data[DISPLACEMENT]
         write_mesh(mesh, output)
         n_modes = sum(name.startswith("mode_") for name in mesh.point_data)
         print(f"{output}: {len(mesh.points)} vertices, {n_modes} modes, at rest, in m and RAS")
     else:
+        displacement = vademecum.displacement_at(point, newtons)
         for path, (vertices, _) in export_surfaces(
             vademecum, output, displacement, unit, axes
         ).items():

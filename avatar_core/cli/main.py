@@ -10,6 +10,7 @@ import typer
 
 from avatar_core.cli.atlas import atlas
 from avatar_core.cli.bench import bench, require_ros, run_cell
+from avatar_core.cli.build_bar import BuildBar
 from avatar_core.cli.cell import Host, Port, cell, require_ui, run_page
 from avatar_core.cli.export import export
 from avatar_core.cli.output import require_output
@@ -17,7 +18,7 @@ from avatar_core.cli.patient import patient
 from avatar_core.cli.replay import replay
 from avatar_core.cli.scene import scene
 from avatar_core.cli.study import study
-from avatar_core.cli.vademecum import BuildBar, Vertices, show, show_text, vademecum
+from avatar_core.cli.vademecum import Vertices, show, show_text, vademecum
 from avatar_core.errors import AvatarError
 
 EXIT_STOPPED = 130  # by Ctrl-C, as shells count it

@@ -65,7 +65,7 @@ class LabelMap:
 
 def is_label_map(path: Path) -> bool:
     """Whether a file's name is that of a label map."""
-    return path.name.lower().endswith(tuple(_READERS))
+    return path.name.lower().endswith(LABEL_SUFFIXES)
 
 
 def read_label_map(path: Path) -> LabelMap:
@@ -204,3 +204,4 @@ _READERS: dict[str, Callable[[Path], LabelMap]] = {
     ".nrrd": _read_nrrd,
     ".dcm": _read_dicom,
 }
+LABEL_SUFFIXES = tuple(_READERS)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from avatar_core.common import files
 from avatar_core.errors import SurfaceError, one_line
-from avatar_core.geometry.label_files import is_label_map
+from avatar_core.geometry.label_files import LABEL_SUFFIXES, is_label_map
 from avatar_core.geometry.label_maps import surface_of_label
 from avatar_core.geometry.vtk_files import read_polydata
 
@@ -169,3 +169,4 @@ _READERS: dict[str, Callable[..., Soup]] = {
     ".off": _by_meshio("off"),
     ".vtk": _read_vtk,
 }
+SUFFIXES = (*_READERS, *LABEL_SUFFIXES)  # of all files that hold a surface or labels

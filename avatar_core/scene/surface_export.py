@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from avatar_core.errors import StorageError
+from avatar_core.geometry.surface import METRES
 from avatar_core.scene.written import replaced
 from avatar_core.vademecum.model import Vademecum
 
 AXES = ("LPS", "RAS")
-UNITS = {"mm": 1e3, "cm": 1e2, "m": 1.0}  # of a metre
 
 Write = Callable[[Path, np.ndarray, np.ndarray, str], None]
 
@@ -50,11 +50,11 @@ def export_surfaces(
     path = Path(path)
     if path.suffix not in SURFACE_FORMATS:
         raise StorageError(f"{path} ends in '{path.suffix}'; choose {' or '.join(SURFACE_FORMATS)}")
-    if unit not in UNITS or axes not in AXES:
+    if unit not in METRES or axes not in AXES:
         raise StorageError(
-            f"unit '{unit}', axes '{axes}'; choose {', '.join(UNITS)} and {' or '.join(AXES)}"
+            f"unit '{unit}', axes '{axes}'; choose {', '.join(METRES)} and {' or '.join(AXES)}"
         )
-    points = UNITS[unit] * displaced(vademecum, displacement)
+    points = displaced(vademecum, displacement) / METRES[unit]
     points = points * ([-1.0, -1.0, 1.0] if axes == "LPS" else [1.0, 1.0, 1.0])
     parts = {path: vademecum.organ_faces}
     for name, faces in vademecum.structures.items():

@@ -174,24 +174,25 @@ def test_a_tumour_is_stored_with_its_organ_and_stays_there(tmp_path: Path) -> No
     assert len(sick.organ_faces) == len(sick.mesh.boundary_faces)
 
 
+def with_both(v: Vademecum) -> Vademecum:
+    """A phantom with a finer surface and a lesion."""
+    lesion = structure(lesion_at(v.mesh.vertices.mean(axis=0), 9e-3))
+    organ_surface = outline(v.mesh, phantom_liver(), 3000)
+    return replace(v, display=display_of(v.mesh, organ_surface, [("lesion", lesion)]))
+
+
 def test_a_display_is_stored(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
-    mesh, lesion = (
-        phantom_vademecum.mesh,
-        lesion_at(phantom_vademecum.mesh.vertices.mean(axis=0), 9e-3),
-    )
-    display = display_of(
-        mesh, outline(mesh, phantom_liver(), 3000), [("lesion", structure(lesion))]
-    )
-    fine = replace(phantom_vademecum, display=display)
+    fine = with_both(phantom_vademecum)
     before = save_vademecum(phantom_vademecum, tmp_path / "plain.h5")
     assert save_vademecum(fine, tmp_path / "fine.h5") != before
     read = load_vademecum(tmp_path / "fine.h5").display
     assert read is not None
-    for name, value in vars(display).items():
+    for name, value in vars(fine.display).items():
         np.testing.assert_array_equal(getattr(read, name), value)
     assert load_vademecum(tmp_path / "plain.h5").display is None
     assert len(fine.clamped_faces) == len(fine.organ_faces)
     held = fine.surface_vertices[fine.organ_faces[fine.clamped_faces]].mean(axis=(0, 1))
+    mesh = phantom_vademecum.mesh
     clamp = mesh.boundary_faces[phantom_vademecum.regions.clamped]
     assert np.linalg.norm(held - mesh.vertices[clamp].mean(axis=(0, 1))) < PATCH_RADIUS
 
@@ -216,14 +217,7 @@ def test_a_spoilt_display_is_refused(
     phantom_vademecum: Vademecum,
     tmp_path: Path,
 ) -> None:
-    mesh, lesion = (
-        phantom_vademecum.mesh,
-        lesion_at(phantom_vademecum.mesh.vertices.mean(axis=0), 9e-3),
-    )
-    display = display_of(
-        mesh, outline(mesh, phantom_liver(), 3000), [("lesion", structure(lesion))]
-    )
-    fine = replace(phantom_vademecum, display=display)
+    fine = with_both(phantom_vademecum)
     arrays, attributes = _arrays(fine), _attributes(fine)
     arrays[f"display/{key}"] = spoil(arrays[f"display/{key}"])
     replace_file(tmp_path / "spoilt.h5", arrays, attributes, packed=True)

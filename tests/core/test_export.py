@@ -203,7 +203,7 @@ def test_a_force_beyond_all_bounds_is_warned_of(
 
 
 @pytest.mark.parametrize(
-    ("options", "reason"), [(["--unit", "inch"], "mm, cm, m"), (["--axes", "RSP"], "LPS or RAS")]
+    ("options", "reason"), [(["--unit", "inch"], "m, cm, mm"), (["--axes", "RSP"], "LPS or RAS")]
 )
 def test_units_and_axes_that_nobody_reads_are_refused(
     monkeypatch: pytest.MonkeyPatch,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from avatar_core.geometry.surface_files import SUFFIXES
 from avatar_core.vademecum.storage import is_vademecum
-
-SURFACES = (".obj", ".stl", ".ply", ".vtk", ".off", ".nii", ".nii.gz", ".nrrd", ".dcm")
 
 
 class Library:
@@ -20,7 +19,7 @@ class Library:
         """Names of the vademecums and of the surfaces, sorted."""
         files = sorted(path for path in self.folder.iterdir() if path.is_file())
         vademecums = [path.name for path in files if path.suffix == ".h5" and self._is_one(path)]
-        surfaces = [path.name for path in files if path.name.lower().endswith(SURFACES)]
+        surfaces = [path.name for path in files if path.name.lower().endswith(SUFFIXES)]
         return vademecums, surfaces
 
     def _is_one(self, path: Path) -> bool:
