@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numba
 import numpy as np
 
+from avatar_core.common.array_table import ArrayTable
 from avatar_core.contact import kernels, locate
 from avatar_core.contact.ball_shift import no_shift
 from avatar_core.contact.cloud import BLOCK
@@ -49,15 +50,21 @@ class Status(IntEnum):
 
 
 class Compiled(NamedTuple):
-    """The halves of a step or the whole, and the error, compiled for the types of one model.
-
-    Called without numba's look-up of argument types, which takes 4 us for so many arrays.
-    """
+    """The halves of a step or the whole, and the error, compiled for the types of one model."""
 
     solve: Callable[..., int] | None
     deform: Callable[..., None] | None
     step: Callable[..., int] | None
     error: Callable[..., None]
+
+
+class Tables(NamedTuple):
+    """The arguments of a step but the tips."""
+
+    arrays: ArrayTable
+    state: ArrayTable
+    out: ArrayTable
+    effects: ArrayTable
 
 
 @dataclass(frozen=True)
@@ -75,6 +82,7 @@ class ContactModel:
         n_contacts (1,), then contact_tool, contact_position, contact_normal (organ to tool),
         contact_force (on the tool), contact_penetration of the active contacts
     tips : ndarray, shape (n_tools, 3), sphere centres of the present step [m]
+    tables : where all these arrays lie, for compiled code
     compiled : Compiled
     """
 
@@ -83,6 +91,7 @@ class ContactModel:
     effects: Selection
     out: Any
     tips: np.ndarray
+    tables: Tables
     compiled: Compiled
 
     @property
@@ -212,15 +221,17 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     """
     arrays, state, out, effects = layout.arrays, _state(layout), _out(layout), _effects(layout)
     far_away = np.full((len(arrays.tip_offset), 3), FAR_AWAY)
-    error = _compiled(kernels.force_error, arrays, state, out, far_away, effects.tip_law)
+    tables = Tables(*map(ArrayTable, (arrays, state, out, effects)))
+    around = (*tables[:3], far_away, tables.effects)
+    error = compiled_for(kernels.force_error, *around)
     if halves:
-        first = _compiled(kernels.contact_solve, arrays, state, out, far_away, effects)
-        second = _compiled(kernels.contact_deform, arrays, state, out, effects)
+        first = compiled_for(kernels.contact_solve, *around)
+        second = compiled_for(kernels.contact_deform, *tables)
         compiled = Compiled(first, second, None, error)
     else:
-        whole = _compiled(kernels.contact_step, arrays, state, out, far_away, effects)
+        whole = compiled_for(kernels.contact_step, *around)
         compiled = Compiled(None, None, whole, error)
-    model = ContactModel(layout, state, effects, out, far_away, compiled)
+    model = ContactModel(layout, state, effects, out, far_away, tables, compiled)
     model.reset()
     return model
 
@@ -291,8 +302,11 @@ def _effects(layout: Layout) -> Selection:
     return allocate(layout.effects, len(layout.arrays.tip_offset), n_modes, n_positions)
 
 
-def _compiled(kernel: Any, *arguments: Any) -> Any:
-    """A kernel compiled for the types of these arguments, after one run with them."""
+def compiled_for(kernel: Any, *arguments: Any) -> Any:
+    """A kernel compiled for the types of these arguments, after one run with them.
+
+    Called without numba's look-up of these types.
+    """
     kernel(*arguments)
     return kernel.get_overload(tuple(numba.typeof(argument) for argument in arguments))
 
@@ -317,24 +331,22 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
     """
     model.tips[:] = tips
     assert model.compiled.step is not None
-    return model.compiled.step(
-        model.layout.arrays, model.state, model.out, model.tips, model.effects
-    )
+    arrays, state, out, effects = model.tables
+    return model.compiled.step(arrays, state, out, model.tips, effects)
 
 
 def solve(model: ContactModel, tips: np.ndarray) -> int:
     """The first half of :func:`step`: forces and contacts. Real-time safe, as :func:`step`."""
     model.tips[:] = tips
     assert model.compiled.solve is not None
-    return model.compiled.solve(
-        model.layout.arrays, model.state, model.out, model.tips, model.effects
-    )
+    arrays, state, out, effects = model.tables
+    return model.compiled.solve(arrays, state, out, model.tips, effects)
 
 
 def deform(model: ContactModel) -> None:
     """The second half of :func:`step`: the cloud. Real-time safe, as :func:`step`."""
     assert model.compiled.deform is not None
-    model.compiled.deform(model.layout.arrays, model.state, model.out, model.effects)
+    model.compiled.deform(*model.tables)
 
 
 def estimate_error(model: ContactModel) -> None:
@@ -344,9 +356,8 @@ def estimate_error(model: ContactModel) -> None:
     vademecum was not measured. Real-time safe, as :func:`step`; separate, so that it can follow
     the sending of the forces.
     """
-    model.compiled.error(
-        model.layout.arrays, model.state, model.out, model.tips, model.effects.tip_law
-    )
+    arrays, state, out, effects = model.tables
+    model.compiled.error(arrays, state, out, model.tips, effects)
 
 
 def warm_up(n_tools: int = 1) -> None:

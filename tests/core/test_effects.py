@@ -51,9 +51,10 @@ def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -
 
     for tip in (PATCH, SPHERE):
         model = prepare(phantom_vademecum, (tip,), cloud="off", effects=())
-        arguments = (model.arrays, model.state, model.out, model.tips, model.effects)
+        arrays, state, out, effects = model.tables
+        arguments = (arrays, state, out, model.tips, effects)
         signature = tuple(numba.typeof(argument) for argument in arguments)
-        *others, law, dent, display = (str(kind) for kind in signature[4])
+        *others, law, dent, display = map(str, effects.numba_type.members.values())
         assert display == "none" and phantom_vademecum.display is None
         assert others == ["none"] * 8
         assert (law == "none") == (dent == "none") == (tip is PATCH)

@@ -17,10 +17,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numba
 import numpy as np
 
-from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.contact.model import ContactModel, compiled_for, prepare, step
 from avatar_core.studies.bench.methods import PATCH
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
@@ -72,14 +71,14 @@ def fused_ratio(bare: ContactModel, fused: Callable[..., int], path: np.ndarray)
     AssertionError
         If the two disagree by more than 1e-12 of the force, or in the cloud.
     """
-    arguments = (bare.layout.arrays, bare.state, bare.out, bare.tips)
+    arrays, state, out, effects = bare.tables
+    arguments = (arrays, state, out, bare.tips)
     bare.tips[:] = path[0]
-    fused(*arguments)
-    overload: Any = fused.get_overload(tuple(map(numba.typeof, arguments)))  # type: ignore[attr-defined]
+    overload = compiled_for(fused, *arguments)
     compiled = bare.compiled.step
     assert compiled is not None
     _agree(bare, lambda: overload(*arguments), path[::50])
-    calls = (lambda: overload(*arguments), lambda: compiled(*arguments, bare.effects))
+    calls = (lambda: overload(*arguments), lambda: compiled(*arguments, effects))
     ratios = []
     for first in range(_WARM, len(path) - 100, 100):
         for _ in range(3):

@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from avatar_core.common.array_table import ArrayTable
 from avatar_core.common.jit import compiled
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud import shown_vertices
 from avatar_core.contact.display import write_cloud
 from avatar_core.contact.effects.tip_surface import sample_surface
 from avatar_core.contact.locate import locate
-from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.contact.model import ContactModel, compiled_for, prepare, step
 from avatar_core.contact.tip_compliance import assemble_own, near_along_normal
 from avatar_core.contact.tool_path import slide, starts_apart
 from avatar_core.fem.elasticity import Elasticity
@@ -125,10 +126,14 @@ def _dense(
     cloud = shown_cloud(vademecum)
     model = prepare(vademecum, (SPHERE,) * n_tools, cloud=cloud)
     columns, compliance = _columns(vademecum, cloud), _compliance(vademecum)
-    effects = model.effects._replace(large_deformation=None)
+    arrays, state, out, _ = model.tables
+    effects = ArrayTable(model.effects._replace(large_deformation=None))
+    around = (arrays, state, out, model.tips, effects, columns, compliance)
+    compiled_step = compiled_for(_dense_step, *around)
 
     def dense(tips: np.ndarray) -> None:
-        _dense_step(model.arrays, model.state, model.out, tips, effects, columns, compliance)
+        model.tips[:] = tips
+        compiled_step(*around)
 
     return model, dense
 
