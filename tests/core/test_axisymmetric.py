@@ -77,9 +77,8 @@ def test_the_law_is_that_of_the_elements() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("nu", [0.1, 0.43])
-def test_the_law_is_that_of_the_elements_between_its_rows(nu: float) -> None:
-    against_elements(nu, [0.2, 0.5, 1.0, 1.5], Domain(0.1), 2.0 * FITTED)
+def test_the_law_is_that_of_the_elements_between_its_rows() -> None:
+    against_elements(0.43, [0.2, 0.5, 1.0, 1.5], Domain(0.1), 2.0 * FITTED)
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.44, 0.49])

@@ -369,7 +369,7 @@ def test_towards_incompressibility_on_taylor_hood() -> None:
         n_vertices=800,
         rule=BuildRule(max_modes=60),
         coordinates=(Coordinate("poisson", 0.40, 0.499),),
-        n_certified=64,
+        n_certified=16,
     )
     found = build(phantom_liver(12e-3), options)
     assert found.element == "Taylor-Hood"

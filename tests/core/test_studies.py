@@ -153,7 +153,7 @@ def test_coordinates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the real tumours, whose two coordinates alone take minutes."""
     monkeypatch.setattr(coordinates, "TUMOUR_FOLDER", tmp_path)
     organ = phantom_liver(12e-3)
-    settings = coordinates.CoordinatesSettings(400, 400, 8, 8, 2, 1, 30e-3)
+    settings = coordinates.CoordinatesSettings(300, 300, 4, 6, 2, 1, 30e-3)
     found = coordinates.study(organ, organ, settings)
     summary = checked_files(found, tmp_path)
     assert summary["poisson_mean"] < summary["poisson_canonical_small_mesh_mean"]
@@ -164,7 +164,7 @@ def test_coordinates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.long
 def test_indentation(tmp_path: Path) -> None:
-    settings = replace(indentation.QUICK, halved=())
+    settings = replace(indentation.QUICK, halved=(), ratios=(0.3, 0.49))
     found = indentation.study(settings)
     summary = checked_files(found, tmp_path)
     assert summary["small_strain_vs_sneddon"] < 0.02  # on the wide elements of the quick version
@@ -311,7 +311,7 @@ def test_json_has_no_nan(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_accuracy_time(tmp_path: Path) -> None:
     settings = accuracy_time.AccuracyTimeSettings(
-        500, 60, 40, 150, (300,), (20e-3, 10e-3), 8, 3, 300
+        400, 40, 40, 150, (300,), (20e-3, 10e-3), 6, 3, 250
     )
     found = accuracy_time.study(None, settings, tmp_path)
     summary = checked_files(found, tmp_path)

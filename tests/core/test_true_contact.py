@@ -238,5 +238,5 @@ def errors_at(
 
 @pytest.mark.long
 def test_two_tips_on_the_phantom_feel_resolved_contacts(phantom_vademecum: Vademecum) -> None:
-    errors = pair_errors(phantom_vademecum, phantom_liver(), 3)
-    assert errors.shape == (3, 2, 2) and np.abs(errors).max() < 0.10
+    errors = pair_errors(phantom_vademecum, phantom_liver(), 2)
+    assert errors.shape == (2, 2, 2) and np.abs(errors).max() < 0.10

@@ -178,5 +178,5 @@ def test_half_a_minute_changes_nothing(figure: Figure) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("scene", SCENES)
-def test_ten_minutes_change_nothing(scene: str, figure: Figure) -> None:
-    figure(endure(scene, 10.0, 40))
+def test_three_minutes_change_nothing(scene: str, figure: Figure) -> None:
+    figure(endure(scene, 3.0, 12))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -195,27 +195,48 @@ def test_effects_are_switched(page: Any, shots: Path) -> None:
     page.screenshot(path=shots / "scene.png")
 
 
+def settle(page: Any, misplaced: Callable[[], list[str]], tab: str) -> None:
+    """Wait until nothing is misplaced any more."""
+    for _ in range(40):
+        found = misplaced()
+        if not found:
+            return
+        page.wait_for_timeout(250)
+    raise AssertionError(f"{tab}: {'; '.join(found)}")
+
+
+def misplaced(boxes: list[Any], width: int) -> list[str]:
+    """Controls that are missing, cut, or lie over others."""
+    found = [] if len(boxes) >= len(TABS) else [f"{len(boxes)} controls"]
+    found += [f"{b[0]} is cut" for b in boxes if b[1] < 0 or b[3] > width or b[2] < 0]
+    for i, a in enumerate(boxes):
+        for b in boxes[:i]:
+            across = min(a[3], b[3]) - max(a[1], b[1])
+            down = min(a[4], b[4]) - max(a[2], b[2])
+            least = min(a[3] - a[1], b[3] - b[1]), min(a[4] - a[2], b[4] - b[2])
+            within = across >= least[0] - 1 and down >= least[1] - 1  # arrows of a number
+            if across >= 2 and down >= 2 and not within:
+                found.append(f"{a[0]} lies over {b[0]}")
+    return found
+
+
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 def test_nothing_overlaps_or_is_cut(page: Any, shots: Path, size: tuple[int, int]) -> None:
     page.set_viewport_size({"width": size[0], "height": size[1]})
     page.wait_for_timeout(1500)
     for tab in TABS:
         open_tab(page, tab)
+        # a busy browser lays out late
+        settle(page, lambda: misplaced(page.evaluate(CONTROLS), size[0]), tab)
         page.screenshot(path=shots / f"{tab}-{size[0]}.png")
-        boxes = page.evaluate(CONTROLS)
-        assert len(boxes) >= len(TABS)
-        for name, left, top, right, _ in boxes:
-            assert left >= 0 and right <= size[0] and top >= 0, f"{tab}: {name} is cut"
-        for i, a in enumerate(boxes):
-            for b in boxes[:i]:
-                across = min(a[3], b[3]) - max(a[1], b[1])
-                down = min(a[4], b[4]) - max(a[2], b[2])
-                least = min(a[3] - a[1], b[3] - b[1]), min(a[4] - a[2], b[4] - b[2])
-                within = across >= least[0] - 1 and down >= least[1] - 1  # arrows of a number
-                assert across < 2 or down < 2 or within, f"{tab}: {a[0]} lies over {b[0]}"
     open_tab(page, "Tool")
-    low = page.get_by_role("button", name="Record").bounding_box()
-    assert low["y"] + low["height"] <= size[1], "Record is not on the screen"
+    record = page.get_by_role("button", name="Record")
+
+    def is_seen() -> bool:
+        box = record.bounding_box()
+        return box is not None and box["y"] + box["height"] <= size[1]
+
+    until(page, is_seen, "Record on the screen", 10.0)
     page.set_viewport_size({"width": SIZES[0][0], "height": SIZES[0][1]})
     page.wait_for_timeout(1000)
 
