@@ -31,8 +31,8 @@ Surfaces = Annotated[
     list[str],
     typer.Argument(
         metavar="SURFACE...",
-        help="surface files (OBJ, STL, PLY, VTK, OFF), label maps (.nii, .nii.gz, .nrrd, .dcm), "
-        "folders of these, or 'phantom', the built-in liver",
+        help="surface files (OBJ, STL, PLY, VTK, VTP, OFF), label maps (.nii, .nii.gz, .nrrd, "
+        ".dcm), folders of these, or 'phantom', the built-in liver",
     ),
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the files: mm, cm or m")]

@@ -28,8 +28,8 @@ EXIT_NOT_CONVERGED = 3
 Surface = Annotated[
     str,
     typer.Argument(
-        help="surface file (OBJ, STL, PLY, VTK, OFF) or label map (.nii, .nii.gz, .nrrd, DICOM SEG "
-        "as .dcm); 'phantom': the built-in liver"
+        help="surface file (OBJ, STL, PLY, VTK, VTP, OFF) or label map (.nii, .nii.gz, .nrrd, "
+        "DICOM SEG as .dcm); 'phantom': the built-in liver"
     ),
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the file: mm, cm or m")]

@@ -1,6 +1,6 @@
 """Surface file formats: each reader returns vertices and triangles, unconnected and unchecked.
 
-OBJ, STL, PLY, VTK and OFF give triangles in the file's coordinates; of label maps
+OBJ, STL, PLY, VTK (legacy and .vtp) and OFF give triangles in the file's coordinates; of label maps
 (:mod:`avatar_core.geometry.label_maps`) the surface of one label is made.
 Nothing is checked here but that the file can be read; :mod:`avatar_core.geometry.surface` decides.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from avatar_core.errors import SurfaceError, one_line
 from avatar_core.geometry.label_files import LABEL_SUFFIXES, is_label_map
 from avatar_core.geometry.label_maps import surface_of_label
 from avatar_core.geometry.vtk_files import read_polydata
+from avatar_core.geometry.vtk_xml_files import read_vtp, stated_axes_of
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -44,8 +46,9 @@ def stated_axes(path: Path) -> str | None:
     """The axes that a file's header states, "RAS" or "LPS"; None if it states none.
 
     3D Slicer writes ``SPACE=LPS`` or ``SPACE=RAS`` into the header of STL, the comments of OBJ and
-    PLY, and the title of legacy VTK. No more than ``HEADER_BYTES`` are read. Label maps say where
-    their voxels lie, and are read in RAS.
+    PLY, and the title of legacy VTK, and ``LPS`` or ``RAS`` as the field ``SPACE`` of VTK's XML,
+    which alone may lie behind the first ``HEADER_BYTES``. Label maps say where their voxels lie,
+    and are read in RAS.
 
     Raises SurfaceError if there is no such ordinary file.
     """
@@ -56,7 +59,7 @@ def stated_axes(path: Path) -> str | None:
         return None
     try:
         with files.opened(path, MAX_FILE_BYTES) as source:
-            head = source.read(HEADER_BYTES)
+            head = source.read(-1 if path.suffix.lower() == ".vtp" else HEADER_BYTES)
     except (files.FileError, OSError) as error:
         raise SurfaceError(
             f"cannot read {path}: {error}; check the path and its permissions"
@@ -85,11 +88,19 @@ def _vtk_comments(head: bytes) -> bytes:
     return b"".join(head.splitlines()[1:2])
 
 
+def _vtp_comments(content: bytes) -> bytes:
+    """The field of that name; nothing of a file that is refused later, when it is read."""
+    with suppress(Exception):
+        return f"SPACE={stated_axes_of(content)}".encode()
+    return b""
+
+
 _COMMENTS: dict[str, Callable[[bytes], bytes]] = {
     ".obj": _obj_comments,
     ".ply": _ply_comments,
     ".stl": _stl_comments,
     ".vtk": _vtk_comments,
+    ".vtp": _vtp_comments,
 }
 
 
@@ -105,7 +116,7 @@ def parse(path: Path, label: int | str | None) -> Soup:
         return surface_of_label(path, label) if is_label_map(path) else _READERS[kind](path)
     except SurfaceError:
         raise
-    except Exception as error:  # parsers of seven formats, each with errors of its own
+    except Exception as error:  # parsers of eight formats, each with errors of its own
         raise SurfaceError(
             f"{path.name}: not a readable {kind[1:].upper()} file ({one_line(error, 80)}); "
             "export it again"
@@ -168,5 +179,6 @@ _READERS: dict[str, Callable[..., Soup]] = {
     ".ply": _by_meshio("ply"),
     ".off": _by_meshio("off"),
     ".vtk": _read_vtk,
+    ".vtp": lambda path: read_vtp(path.read_bytes()),
 }
 SUFFIXES = (*_READERS, *LABEL_SUFFIXES)  # of all files that hold a surface or labels

@@ -74,19 +74,19 @@ class _Reader:
     def polydata(self) -> tuple[FloatArray, IntArray]:
         self._header()
         points: FloatArray = np.empty((0, 3))
-        polygons = strips = _no_triangles()
+        polygons = in_strips = _no_triangles()
         while (keyword := self._word()) not in ("", "POINT_DATA", "CELL_DATA"):
             if keyword == "DATASET":
                 self._expect("POLYDATA")
             elif keyword == "POINTS":
                 points = self._points()
             elif keyword == "POLYGONS":
-                polygons = _fans(*self._cells())
+                polygons = fans(*self._cells())
             elif keyword == "TRIANGLE_STRIPS":
-                strips = _strips(*self._cells())
+                in_strips = strips(*self._cells())
             else:
                 self._skip(keyword)
-        return points, np.vstack([polygons, strips])
+        return points, np.vstack([polygons, in_strips])
 
     # --- sections -------------------------------------------------------------------------------
 
@@ -289,13 +289,13 @@ def _windows(starts: IntArray) -> tuple[IntArray, IntArray]:
     return first, place
 
 
-def _fans(starts: IntArray, corners: IntArray) -> IntArray:
+def fans(starts: IntArray, corners: IntArray) -> IntArray:
     """Polygons as triangles about their first corners, shape (m, 3)."""
     first, place = _windows(starts)
     return corners[np.column_stack([first, first + place + 1, first + place + 2])]
 
 
-def _strips(starts: IntArray, corners: IntArray) -> IntArray:
+def strips(starts: IntArray, corners: IntArray) -> IntArray:
     """Triangles of strips, every second one turned so that all face one way, shape (m, 3)."""
     first, place = _windows(starts)
     turned = place % 2

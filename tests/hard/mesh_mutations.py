@@ -15,8 +15,21 @@ import numpy as np
 
 from tests.hard.byte_mutations import OF_BYTES, pick, some
 from tests.hard.small_files import ball
+from tests.vtp_writer import VtpFile
 
-SUFFIXES = ("obj", "stl", "stl-text", "ply", "ply-text", "off", "vtk", "vtk-polydata", "nii.gz")
+SUFFIXES = (
+    "obj",
+    "stl",
+    "stl-text",
+    "ply",
+    "ply-text",
+    "off",
+    "vtk",
+    "vtk-polydata",
+    "vtp",
+    "vtp-raw",
+    "nii.gz",
+)
 RADIUS = 60.0  # [mm]
 _NUMBERS = ("nan", "inf", "-inf", "1e300", "-1e300", "1e-320", "0", "99999999999", "-1", "1.5", "x")
 _COUNTS = (-1, 0, 1, 3, 2**31 - 1, 2**31, 2**32 - 1, 10**9, 10**12, 2**62, 2**63, 10**30)
@@ -150,6 +163,15 @@ def _vtk_polydata(soup: Soup) -> bytes:
     return "\n".join([*lines, ""]).encode()
 
 
+def _vtp(soup: Soup) -> bytes:
+    file = VtpFile("binary", "vtkZLibDataCompressor")
+    return file.piece(soup.vertices, soup.faces.tolist()).content()
+
+
+def _vtp_raw(soup: Soup) -> bytes:
+    return VtpFile("raw").piece(soup.vertices, soup.faces.tolist()).content()
+
+
 def _nifti(_: Soup) -> bytes:
     """A label map of a ball; it has no surface that something could have happened to."""
     import nibabel
@@ -171,6 +193,8 @@ _ENCODERS: dict[str, Callable[[Soup], bytes]] = {
     "off": _off,
     "vtk": _vtk,
     "vtk-polydata": _vtk_polydata,
+    "vtp": _vtp,
+    "vtp-raw": _vtp_raw,
     "nii.gz": _nifti,
 }
 
