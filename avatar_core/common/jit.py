@@ -5,9 +5,10 @@ it, so that counting their users would cost a third of its time for nothing; and
 refuses, when it compiles, whatever would create an array. Every function but the entries is inlined
 into these. A division by zero gives an infinity instead of an exception.
 
-What is inlined has no wrapper for Python: wrappers for named tuples of many arrays took 40 % of the
-time to compile a step. Called from Python, such a part runs as plain Python. What was compiled is
-kept on disk (:mod:`avatar_core.common.compiled_cache`).
+What is inlined has no wrapper for Python, which would be compiled for nothing. Called from Python,
+such a part runs as plain Python. Arrays come in as an
+:class:`avatar_core.common.array_table.ArrayTable`. What was compiled is kept on disk
+(:mod:`avatar_core.common.compiled_cache`).
 """
 
 from __future__ import annotations
