@@ -26,11 +26,18 @@ MAX_PAST = 4  # regions whose history of loads is shown
 
 
 @fast
-def deform(model, state, out, effects):  # type: ignore[no-untyped-def]
+def deform(model, space, state, out, effects):  # type: ignore[no-untyped-def]
     """The cloud under the forces of a period."""
     e = effects
     _displace(
-        model, state, out, e.superposition, e.large_deformation, e.friction, e.viscoelasticity
+        model,
+        space,
+        state,
+        out,
+        e.superposition,
+        e.large_deformation,
+        e.friction,
+        e.viscoelasticity,
     )
     write_cloud(model, state, out.cloud, e.tip_law, e.dent, e.display)
     shift_cloud(e.respiration, out.cloud)
@@ -38,7 +45,7 @@ def deform(model, state, out, effects):  # type: ignore[no-untyped-def]
 
 @fast
 def _displace(  # type: ignore[no-untyped-def]
-    model, state, out, superposition, large_deformation, friction, viscoelasticity
+    model, space, state, out, superposition, large_deformation, friction, viscoelasticity
 ):
     """The displacement of all points into ``state.field``."""
     if superposition is None and out.n_contacts[0] == 0:
@@ -51,7 +58,7 @@ def _displace(  # type: ignore[no-untyped-def]
     for t in range(state.passage.shape[0]):
         if state.force[t] > 0.0:
             _load_regions(model, state, large_deformation, friction, viscoelasticity, t)
-    _sum_modes(model, state, large_deformation)
+    _sum_modes(model, space, state, large_deformation)
 
 
 @fast
@@ -194,13 +201,13 @@ def _fade_regions(model, state):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _sum_modes(model, state, large_deformation):  # type: ignore[no-untyped-def]
+def _sum_modes(model, space, state, large_deformation):  # type: ignore[no-untyped-def]
     """sum_k X_k a_k over the global modes that are shown, then over those of touched regions."""
     amplitude, scale, start = state.amplitude, model.space_scale, model.region_start
     n_global = min(state.shown[0], start[0])
     n_regional = max(state.shown[0] - start[0], 0)
-    for b in range(model.space.shape[0]):
-        u, x = state.field[b * BLOCK : (b + 1) * BLOCK], model.space[b]
+    for b in range(space.shape[0]):
+        u, x = state.field[b * BLOCK : (b + 1) * BLOCK], space[b]
         for i in range(BLOCK):
             u[i] = np.float32(0.0)
         _add_modes(amplitude, scale, x, u, 0, n_global)

@@ -19,9 +19,11 @@ For one tip on an organ at rest, W = lambda gamma lambda / 2,
 the normal force, and the small tangential one by which a frictionless tip slides towards softer
 tissue. Without it a closed path would gain or lose energy.
 
-``effects`` holds the effects of a scene (:mod:`avatar_core.contact.effects.selection`), each None
-or its arrays. A stage takes those it needs as arguments of their own and does nothing for None:
-numba compiles the step for every selection of effects, without the branches on what is None.
+``space`` holds the modes of the cloud apart from the rest of the model, so that what does not read
+them is compiled once for all of their precisions. ``effects`` holds the effects of a scene
+(:mod:`avatar_core.contact.effects.selection`), each None or its arrays. A stage takes those it
+needs as arguments of their own and does nothing for None: numba compiles the step for every
+selection of effects, without the branches on what is None.
 
 Every iteration here is bounded; where one ends unconverged, the status of all tips in contact is
 NOT_CONVERGED.
@@ -172,13 +174,13 @@ Out = namedtuple(
 
 
 @entry
-def contact_step(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
+def contact_step(model, space, state, out, tips, effects):  # type: ignore[no-untyped-def]
     """One period: forces, then the deformed cloud. Returns the worst status.
 
     Real-time safe: allocates nothing, raises nothing, bounded iterations.
     """
     status = _solve_period(model, state, out, tips, effects)
-    deform(model, state, out, effects)
+    deform(model, space, state, out, effects)
     return status
 
 
@@ -189,9 +191,9 @@ def contact_solve(model, state, out, tips, effects):  # type: ignore[no-untyped-
 
 
 @entry
-def contact_deform(model, state, out, effects):  # type: ignore[no-untyped-def]
+def contact_deform(model, space, state, out, effects):  # type: ignore[no-untyped-def]
     """Second half: the cloud under these forces. Real-time safe, as :func:`contact_step`."""
-    deform(model, state, out, effects)
+    deform(model, space, state, out, effects)
 
 
 @entry

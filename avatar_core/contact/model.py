@@ -59,9 +59,14 @@ class Compiled(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """The arguments of a step but the tips."""
+    """The arguments of a step but the tips.
+
+    arrays : of the model, but for its ``space``
+    space : modes of the cloud
+    """
 
     arrays: ArrayTable
+    space: np.ndarray
     state: ArrayTable
     out: ArrayTable
     effects: ArrayTable
@@ -221,15 +226,20 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     """
     arrays, state, out, effects = layout.arrays, _state(layout), _out(layout), _effects(layout)
     far_away = np.full((len(arrays.tip_offset), 3), FAR_AWAY)
-    tables = Tables(*map(ArrayTable, (arrays, state, out, effects)))
-    around = (*tables[:3], far_away, tables.effects)
-    error = compiled_for(kernels.force_error, *around)
+    tables = Tables(
+        ArrayTable(arrays._replace(space=None)),
+        arrays.space,
+        *map(ArrayTable, (state, out, effects)),
+    )
+    forces = (tables.arrays, tables.state, tables.out, far_away, tables.effects)
+    error = compiled_for(kernels.force_error, *forces)
     if halves:
-        first = compiled_for(kernels.contact_solve, *around)
+        first = compiled_for(kernels.contact_solve, *forces)
         second = compiled_for(kernels.contact_deform, *tables)
         compiled = Compiled(first, second, None, error)
     else:
-        whole = compiled_for(kernels.contact_step, *around)
+        *before, last = tables
+        whole = compiled_for(kernels.contact_step, *before, far_away, last)
         compiled = Compiled(None, None, whole, error)
     model = ContactModel(layout, state, effects, out, far_away, tables, compiled)
     model.reset()
@@ -331,15 +341,15 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
     """
     model.tips[:] = tips
     assert model.compiled.step is not None
-    arrays, state, out, effects = model.tables
-    return model.compiled.step(arrays, state, out, model.tips, effects)
+    arrays, space, state, out, effects = model.tables
+    return model.compiled.step(arrays, space, state, out, model.tips, effects)
 
 
 def solve(model: ContactModel, tips: np.ndarray) -> int:
     """The first half of :func:`step`: forces and contacts. Real-time safe, as :func:`step`."""
     model.tips[:] = tips
     assert model.compiled.solve is not None
-    arrays, state, out, effects = model.tables
+    arrays, _, state, out, effects = model.tables
     return model.compiled.solve(arrays, state, out, model.tips, effects)
 
 
@@ -356,7 +366,7 @@ def estimate_error(model: ContactModel) -> None:
     vademecum was not measured. Real-time safe, as :func:`step`; separate, so that it can follow
     the sending of the forces.
     """
-    arrays, state, out, effects = model.tables
+    arrays, _, state, out, effects = model.tables
     model.compiled.error(arrays, state, out, model.tips, effects)
 
 

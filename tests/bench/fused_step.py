@@ -21,7 +21,7 @@ HASH = 2654435761
     error_model="numpy",
     _nrt=False,
 )
-def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
+def fused_step(model, space, state, out, tips):  # type: ignore[no-untyped-def]
     """One period of one tool: status; force, contact and cloud into ``out``."""
     out.force[0] = 0.0
     out.torque[0] = 0.0
@@ -236,9 +236,9 @@ def fused_step(model, state, out, tips):  # type: ignore[no-untyped-def]
                 amplitude[first + k] += load[0, k] * w0 + load[1, k] * w1 + load[2, k] * w2
         state.n_touched[0] = n_touched
         # --- modes -----------------------------------------------------------------------------
-        for block in range(model.space.shape[0]):
+        for block in range(space.shape[0]):
             u = field[block * BLOCK : (block + 1) * BLOCK]
-            shapes = model.space[block]
+            shapes = space[block]
             for i in range(BLOCK):
                 u[i] = np.float32(0.0)
             for q in range(n_touched + 1):

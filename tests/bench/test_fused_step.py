@@ -46,7 +46,7 @@ def test_the_bare_step_agrees_with_the_one_fused_by_hand(
     touched = 0
     for tip in path:
         status = step(bare, tip[None])
-        assert fused.fused_step(*other.tables[:3], tip[None].copy()) == status
+        assert fused.fused_step(*other.tables[:4], tip[None].copy()) == status
         scale = max(1.0, np.abs(bare.out.force).max())
         np.testing.assert_allclose(other.out.force, bare.out.force, rtol=0, atol=1e-12 * scale)
         np.testing.assert_allclose(other.out.cloud, bare.out.cloud, rtol=0, atol=1e-12)

@@ -51,8 +51,8 @@ def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -
 
     for tip in (PATCH, SPHERE):
         model = prepare(phantom_vademecum, (tip,), cloud="off", effects=())
-        arrays, state, out, effects = model.tables
-        arguments = (arrays, state, out, model.tips, effects)
+        *before, effects = model.tables
+        arguments = (*before, model.tips, effects)
         signature = tuple(numba.typeof(argument) for argument in arguments)
         *others, law, dent, display = map(str, effects.numba_type.members.values())
         assert display == "none" and phantom_vademecum.display is None

@@ -71,8 +71,8 @@ def fused_ratio(bare: ContactModel, fused: Callable[..., int], path: np.ndarray)
     AssertionError
         If the two disagree by more than 1e-12 of the force, or in the cloud.
     """
-    arrays, state, out, effects = bare.tables
-    arguments = (arrays, state, out, bare.tips)
+    *tables, effects = bare.tables
+    arguments = (*tables, bare.tips)
     bare.tips[:] = path[0]
     overload = compiled_for(fused, *arguments)
     compiled = bare.compiled.step

@@ -126,7 +126,7 @@ def _dense(
     cloud = shown_cloud(vademecum)
     model = prepare(vademecum, (SPHERE,) * n_tools, cloud=cloud)
     columns, compliance = _columns(vademecum, cloud), _compliance(vademecum)
-    arrays, state, out, _ = model.tables
+    arrays, _, state, out, _ = model.tables
     effects = ArrayTable(model.effects._replace(large_deformation=None))
     around = (arrays, state, out, model.tips, effects, columns, compliance)
     compiled_step = compiled_for(_dense_step, *around)
