@@ -197,17 +197,11 @@ def contact_deform(model, space, state, out, effects):  # type: ignore[no-untype
 
 
 @entry
-def force_error(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
-    """Expected error of the forces. Real-time safe, as :func:`contact_step`."""
-    _write_error(model, state, out, tips, effects.tip_law)
-
-
-@inlined
-def _write_error(model, state, out, tips, tip_law):  # type: ignore[no-untyped-def]
+def force_error(model, state, out, tips, tip_law):  # type: ignore[no-untyped-def]
     """Expected error of the forces: the relative error at the tip, times the force.
 
     Of a real tip, the patch's error counts with the part of the depth that is the patch's, and that
-    of the law is added.
+    of the law is added. Real-time safe, as :func:`contact_step`.
     """
     for t in range(tips.shape[0]):
         force = out.force[t]

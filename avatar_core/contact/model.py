@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numba
@@ -50,7 +51,8 @@ class Status(IntEnum):
 
 
 class Compiled(NamedTuple):
-    """The halves of a step or the whole, and the error, compiled for the types of one model."""
+    """The halves of a step or the whole, compiled for the types of one model; and the error of its
+    forces, with its arguments."""
 
     solve: Callable[..., int] | None
     deform: Callable[..., None] | None
@@ -231,10 +233,11 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
         arrays.space,
         *map(ArrayTable, (state, out, effects)),
     )
-    forces = (tables.arrays, tables.state, tables.out, far_away, tables.effects)
-    error = compiled_for(kernels.force_error, *forces)
+    around = (tables.arrays, tables.state, tables.out, far_away)
+    law = None if effects.tip_law is None else ArrayTable(effects.tip_law)
+    error = partial(compiled_for(kernels.force_error, *around, law), *around, law)
     if halves:
-        first = compiled_for(kernels.contact_solve, *forces)
+        first = compiled_for(kernels.contact_solve, *around, tables.effects)
         second = compiled_for(kernels.contact_deform, *tables)
         compiled = Compiled(first, second, None, error)
     else:
@@ -366,8 +369,7 @@ def estimate_error(model: ContactModel) -> None:
     vademecum was not measured. Real-time safe, as :func:`step`; separate, so that it can follow
     the sending of the forces.
     """
-    arrays, _, state, out, effects = model.tables
-    model.compiled.error(arrays, state, out, model.tips, effects)
+    model.compiled.error()
 
 
 def warm_up(n_tools: int = 1) -> None:
