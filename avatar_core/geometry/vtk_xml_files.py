@@ -33,8 +33,6 @@ _AXES = "SPACE"  # the field in which 3D Slicer states them
 def read_vtp(content: bytes) -> tuple[FloatArray, IntArray]:
     """Points and triangles of all pieces; polygons become fans, strips come last in each piece.
 
-    Whether their corners exist is not checked.
-
     Returns
     -------
     points : ndarray, shape (n, 3)
@@ -43,7 +41,8 @@ def read_vtp(content: bytes) -> tuple[FloatArray, IntArray]:
     Raises
     ------
     ValueError and errors of the parsers
-        The file is no such file, ends too early, or contradicts itself.
+        The file is no such file, ends too early, or contradicts itself, as with corners that do
+        not exist.
     """
     file = _File(content)
     points: list[FloatArray] = [np.empty((0, 3))]
@@ -131,11 +130,11 @@ class _File:
         _, whole, last, *packed = self._sizes(data, 3 + n_blocks, is_raw)
         header = (3 + n_blocks) * self._size.itemsize
         data = data[header if is_raw else _n_letters(header) :]
-        rest, out = _part(data, 0, sum(packed), is_raw), []
+        blocks, at, out = _part(data, 0, sum(packed), is_raw), 0, []
         for k, n in enumerate(packed):
             size = last if k == n_blocks - 1 and last else whole
-            out.append(_unpacked(rest[:n], size, compressor))
-            rest = rest[n:]
+            out.append(_unpacked(blocks[at : at + n], size, compressor))
+            at += n
         return b"".join(out)
 
     def _sizes(self, data: bytes, n: int, is_raw: bool) -> list[int]:
@@ -161,6 +160,8 @@ def _unpacked(block: bytes, size: int, compressor: str) -> bytes:
     """A block that holds ``size`` bytes."""
     if size > _MOST * (len(block) + 64):
         raise ValueError("a block claims more than it can hold")
+    if size == 0:  # to a decompressor, no limit
+        raise ValueError("a block claims to hold nothing")
     if compressor == "vtkZLibDataCompressor":
         out = zlib.decompressobj().decompress(block, size)
     elif compressor == "vtkLZMADataCompressor":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -83,13 +84,19 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, words: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_block_that_claims_too_much_is_not_unpacked(tmp_path: Path) -> None:
-    sizes = np.array([1, 2**31, 0, 40], "<u4").tobytes()
-    data = base64.b64encode(sizes) + base64.b64encode(bytes(40))
+@pytest.mark.parametrize(
+    ("claim", "words"), [(2**31, "more than it can hold"), (0, "claims to hold nothing")]
+)
+def test_a_block_that_claims_what_it_cannot_hold_is_not_unpacked(
+    tmp_path: Path, claim: int, words: str
+) -> None:
+    packed = zlib.compress(bytes(24))
+    sizes = np.array([1, claim, 0, len(packed)], "<u4").tobytes()
+    data = base64.b64encode(sizes) + base64.b64encode(packed)
     text = f'<DataArray type="Float64" Name="Points" format="binary">{data.decode()}</DataArray>'
     content = (
         '<VTKFile type="PolyData" compressor="vtkZLibDataCompressor"><PolyData><Piece>'
         f"<Points>{text}</Points></Piece></PolyData></VTKFile>"
     )
-    with pytest.raises(SurfaceError, match="more than it can hold"):
+    with pytest.raises(SurfaceError, match=words):
         parse(at(tmp_path, content.encode()), None)
