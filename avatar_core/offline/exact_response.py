@@ -14,7 +14,7 @@ from avatar_core.offline.rule import NO_ERROR, Progress
 from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 from avatar_core.reduction.separated import SeparatedField
 
-_BATCH = 40  # load positions solved at once
+_BATCH = 80  # load positions solved at once: fewer take longer each
 _TRIED = 2  # load positions on which single precision is tried,
 SINGLE_ERROR = 1e-3  # and the relative error up to which it does: modes leave six times it
 
@@ -59,8 +59,7 @@ def exact_response(
     columns = np.empty((n_rows, 3 * n), np.float32, order="F")
     compliance = np.empty((3 * n, 3 * n), np.float32, order="F")
     by_column, average = loads.tocsc(), loads.T.tocsr()
-    tried = min(n, _TRIED)
-    single = single and elasticity.single_error(by_column[:, : 3 * tried]) < SINGLE_ERROR
+    single = single and single_serves(elasticity, by_column[:, : 3 * _TRIED])
     for first in range(0, 3 * n, 3 * _BATCH):
         batch = slice(first, min(first + 3 * _BATCH, 3 * n))
         solution = elasticity.solve(by_column[:, batch], single)
@@ -72,6 +71,11 @@ def exact_response(
     batches = range(0, 3 * n, 3 * _BATCH)
     norm = np.concatenate([l2_norm(columns[:, k : k + 3 * _BATCH], mass) for k in batches])
     return ExactResponse(columns, compliance, norm)
+
+
+def single_serves(elasticity: Elasticity, loads: sp.csc_matrix) -> bool:
+    """Whether solutions in single precision are good enough, by trying it on these loads."""
+    return elasticity.single_error(loads) < SINGLE_ERROR
 
 
 def _symmetrize(matrix: np.ndarray) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import igl
 import numpy as np
+import scipy.sparse as sp
 
 from avatar_core.common.splines import evaluate
 from avatar_core.errors import ConvergenceError
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 HEIGHTS = (0.0, 6e-3)  # of a tip's centre above the surface, pressed in or just touching [m]
 _OPEN = 0.999  # access from which a tip may touch without the force fading
 _WAY = np.linspace(1 / 3, 7 / 3, 8)  # heights above a tip along its approach [HEIGHTS[1]]
-_BATCH = 40  # patches solved at once
+_BATCH = 200  # patches solved at once
 MAX_DRAWS = 1000  # for one contact, on average; on livers most draws succeed
 
 
@@ -36,14 +37,16 @@ class UnseenContacts:
     place: np.ndarray
     normal: np.ndarray
 
-    def true_compliance(self, surface: LoadSurface, elasticity: Elasticity) -> np.ndarray:
+    def true_compliance(
+        self, surface: LoadSurface, elasticity: Elasticity, single: bool = False
+    ) -> np.ndarray:
         """n . C n of full finite elements, for patches at the places (n,) [m/N]."""
         out = np.empty(len(self.tip))
         for batch in np.array_split(np.arange(len(out)), -(-len(out) // _BATCH)):
             loads = patch_loads(elasticity, self.place[batch], surface.patch_radius)
-            average = (loads.T @ elasticity.solve(loads)).reshape(len(batch), 3, len(batch), 3)
-            n, own = self.normal[batch], np.arange(len(batch))
-            out[batch] = np.einsum("ia,iab,ib->i", n, average[own, :, own], n)
+            along = loads @ sp.block_diag(self.normal[batch][:, :, None])
+            solution = elasticity.solve(along, single)
+            out[batch] = along.multiply(solution).sum(axis=0).ravel()
         return out
 
 
