@@ -29,7 +29,6 @@ from avatar_core.fem.half_space_contact import loads_on_heights, ring_radii, sec
 from avatar_core.geometry.local_profile import heights_around
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.offsets import OffsetGrid
-from avatar_core.geometry.skin import Soup
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.tip_field import BallShift, TipField, make_tip_field
@@ -55,17 +54,17 @@ def make_felt_field(
     mesh: TetMesh, regions: Regions, patch_radius: float, outline: SurfaceMesh | None = None
 ) -> TipField:
     """:func:`avatar_core.vademecum.tip_field.make_tip_field` with psi for balls of ``RADII``."""
-    field = make_tip_field(mesh, regions, patch_radius, outline)
     surface = (mesh.vertices, mesh.boundary_faces) if outline is None else outline.skin.boundary
-    return with_ball_shift(field, surface)
+    offsets = OffsetGrid(surface)
+    field = make_tip_field(mesh, regions, patch_radius, outline, offsets)
+    return with_ball_shift(field, offsets)
 
 
-def with_ball_shift(field: TipField, surface: Soup) -> TipField:
-    """The tip field with psi for balls of ``RADII`` that press on a surface."""
+def with_ball_shift(field: TipField, offsets: OffsetGrid) -> TipField:
+    """The tip field with psi for balls of ``RADII`` that press on the surface of some offsets."""
     extent = (np.array(field.distance.shape) - 1) * float(field.spacing[0])
     n_bricks = ((extent / SPACING).astype(int) + 2) // BRICK + 1
     grid = _Grid(field, n_bricks, SPACING)
-    offsets = OffsetGrid(surface)
     shift = np.stack([grid.splines(*grid.pressed(offsets, radius), radius) for radius in RADII])
     brick = _used(shift)
     cut = np.stack([_in_bricks(values, brick) for values in shift])

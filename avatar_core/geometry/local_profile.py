@@ -16,14 +16,11 @@ the square of half the difference of the principal curvatures where the surface 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from avatar_core.geometry.offsets import exact_offsets
-from avatar_core.geometry.skin import Soup
+from avatar_core.geometry.offsets import Offsets
 
 RADII = 1e-3 * np.array([1.5, 3.0, 4.5, 6.0])  # of the circles [m]
 DIRECTIONS = 7  # odd: on a ridge, as good as twice as many
@@ -45,17 +42,16 @@ class LocalProfile(NamedTuple):
     anisotropy: np.ndarray
 
 
-def local_profile(surface: Soup, points: np.ndarray, normals: np.ndarray) -> LocalProfile:
+def local_profile(offsets: Offsets, points: np.ndarray, normals: np.ndarray) -> LocalProfile:
     """kappa and tau around points of a surface, by least squares of h(r) / r up to 6 mm, and D.
 
     Parameters
     ----------
-    surface : vertices (m, 3) [m] and triangles (k, 3)
+    offsets : from the surface, exact or of a grid
     points : ndarray, shape (n, 3), on the surface [m]
     normals : ndarray, shape (n, 3), unit vectors, outward
     """
     angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    offsets = partial(exact_offsets, surface)
     height = heights_around(offsets, points, normals, RADII, angle, STEEPEST)
     height = np.clip(height, -RADII[:, None], RADII[:, None])
     terms = np.stack([RADII / 2.0, RADII**2 / 6.0], axis=1)
@@ -65,7 +61,7 @@ def local_profile(surface: Soup, points: np.ndarray, normals: np.ndarray) -> Loc
 
 
 def heights_around(
-    offsets: Callable[[np.ndarray], np.ndarray],
+    offsets: Offsets,
     points: np.ndarray,
     normals: np.ndarray,
     radii: np.ndarray,
@@ -79,8 +75,7 @@ def heights_around(
 
     Parameters
     ----------
-    offsets : q - c of points q (k, 3), exact or :class:`avatar_core.geometry.offsets.OffsetGrid`
-    points, normals : as of :func:`local_profile`, points beside the surface as well
+    offsets, points, normals : as of :func:`local_profile`, points beside the surface as well
     radii : ndarray, shape (m,) or (m, n), of the circles [m]
     angles : ndarray, directions on the circles
     steepest : squared cosine of the side that counts as the steepest
@@ -91,8 +86,8 @@ def heights_around(
     for k, radius in enumerate(radii):
         q = (points + np.reshape(radius, (-1, 1)) * around).reshape(-1, 3)
         offset = offsets(q).reshape(around.shape)
-        rise = (offset * normals).sum(axis=2)
-        square = np.maximum((offset**2).sum(axis=2), 1e-30)
+        rise = np.einsum("and,nd->an", offset, normals)
+        square = np.maximum(np.einsum("and,and->an", offset, offset), 1e-30)
         out[:, k] = (rise / np.maximum(rise**2 / square, steepest)).T
     return out
 

@@ -10,6 +10,8 @@ mm, by hundredths of a millimetre.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import igl
 import numpy as np
 
@@ -17,6 +19,8 @@ from avatar_core.common.jit import compiled
 from avatar_core.geometry.skin import Soup
 
 SPACING = 1e-3  # of the grid [m]
+Offsets = Callable[[np.ndarray], np.ndarray]  # q - c(q) of points q (n, 3), shape (n, 3) [m]
+
 MARGIN = 20e-3  # of the grid around the surface [m]; points beyond count as at its border
 
 

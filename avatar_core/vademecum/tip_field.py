@@ -38,6 +38,7 @@ from scipy.ndimage import (
 
 from avatar_core.geometry.local_profile import LocalProfile, local_profile
 from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.geometry.offsets import OffsetGrid, Offsets
 from avatar_core.geometry.skin import Skin, Soup
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tumour import strained_fraction
@@ -87,7 +88,11 @@ BallShift = namedtuple("BallShift", ["brick", "value", "spacing", "radius"])
 
 
 def make_tip_field(
-    mesh: TetMesh, regions: Regions, patch_radius: float, outline: SurfaceMesh | None = None
+    mesh: TetMesh,
+    regions: Regions,
+    patch_radius: float,
+    outline: SurfaceMesh | None = None,
+    offsets: OffsetGrid | None = None,
 ) -> TipField:
     """Sample phi, chi and the local profile around the accessible surface.
 
@@ -99,6 +104,7 @@ def make_tip_field(
     mesh, regions : the organ
     patch_radius : R [m]
     outline : the surface of which the mesh was made; None for the mesh's own boundary
+    offsets : from that surface, which keeps what is found; None for new ones
 
     Raises
     ------
@@ -122,7 +128,8 @@ def make_tip_field(
         spline_filter(smoothed(values, SMOOTHING), order=2)
         for values in (distance, _deepened(distance))
     )
-    profile = _profile(skin.boundary, near, plain, access, origin)
+    offsets = offsets or OffsetGrid(skin.boundary)
+    profile = _profile(offsets, near, plain, access, origin)
     distance, access = distance.astype(np.float32), access.astype(np.float32)
     return TipField(distance, access, origin, np.array([SPACING]), *profile)
 
@@ -188,7 +195,7 @@ def _deepened(distance: np.ndarray) -> np.ndarray:
 
 
 def _profile(
-    outline: Soup, near: Soup, distance: np.ndarray, access: np.ndarray, origin: np.ndarray
+    offsets: Offsets, near: Soup, distance: np.ndarray, access: np.ndarray, origin: np.ndarray
 ) -> LocalProfile:
     """kappa, tau and D of the outline on the grid, around the closest points.
 
@@ -198,7 +205,7 @@ def _profile(
     known, normals = _around(distance, access)
     closest = _closest(near, origin + SPACING * np.argwhere(known))[2]
     first, group = _shared(closest, normals)
-    some = local_profile(outline, closest[first], normals[first])
+    some = local_profile(offsets, closest[first], normals[first])
 
     halfway = np.argwhere(known).T - HALFWAY / SPACING * (distance[known][:, None] * normals).T
 

@@ -23,6 +23,7 @@ from avatar_core.fem.elasticity import Material
 from avatar_core.fem.half_space_contact import loads_on_heights, ring_radii, sector_angles
 from avatar_core.fem.signorini import half_space_radius
 from avatar_core.geometry.mesh import TetMesh
+from avatar_core.geometry.offsets import OffsetGrid
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.tip_field import TipField
 
@@ -119,7 +120,7 @@ def test_a_ball_between_two_radii_feels_what_lies_between() -> None:
     between = psi(field, radius, at)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("avatar_core.contact.ball_shift.RADII", (radius,))
-        own = with_ball_shift(field, (block().vertices, block().boundary_faces))
+        own = with_ball_shift(field, OffsetGrid((block().vertices, block().boundary_faces)))
     np.testing.assert_allclose(between, psi(own, radius, at), rtol=0.1, atol=3e-5)
 
 

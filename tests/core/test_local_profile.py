@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from avatar_core.geometry.local_profile import OUTER, RADII, LocalProfile, local_profile
+from avatar_core.geometry.offsets import Offsets, exact_offsets
 from avatar_core.geometry.skin import Soup
 from tests.hard.surfaces import ball
 
@@ -35,8 +38,12 @@ def tube(radius: float) -> Soup:
     return corners, np.concatenate([np.stack(each, axis=1) for each in faces])
 
 
+def from_surface(surface: Soup) -> Offsets:
+    return partial(exact_offsets, surface)
+
+
 def at_origin(surface: Soup) -> LocalProfile:
-    return local_profile(surface, np.zeros((1, 3)), Z[None])
+    return local_profile(from_surface(surface), np.zeros((1, 3)), Z[None])
 
 
 def mean_heights(profile: LocalProfile) -> np.ndarray:
@@ -50,7 +57,7 @@ def test_a_ball_is_all_curvature_from_outside_and_from_inside(side: float) -> No
     surface = ball(RADIUS, level=5)
     points = surface.vertices[surface.faces[::97]].mean(axis=1)
     normals = side * points / np.linalg.norm(points, axis=1, keepdims=True)
-    profile = local_profile((surface.vertices, surface.faces), points, normals)
+    profile = local_profile(from_surface((surface.vertices, surface.faces)), points, normals)
     expected = np.tile(side * RADII**2 / (2.0 * RADIUS), (len(points), 1))
     np.testing.assert_allclose(mean_heights(profile), expected, rtol=0.05)
     assert profile.anisotropy.max() < (0.05 / RADIUS) ** 2
@@ -58,7 +65,7 @@ def test_a_ball_is_all_curvature_from_outside_and_from_inside(side: float) -> No
 
 def test_a_plane_has_no_shape() -> None:
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3)) * [1, 1, 0]
-    profile = local_profile(roof(0.0), points, np.tile(Z, (50, 1)))
+    profile = local_profile(from_surface(roof(0.0)), points, np.tile(Z, (50, 1)))
     assert abs(mean_heights(profile)).max() < 1e-12
     assert profile.anisotropy.max() < 1e-12
 
@@ -95,7 +102,7 @@ def test_a_ridge_beside_the_point_does_not_lift_the_plane() -> None:
     angle = np.radians(15.0)
     point = 5e-3 * np.array([[np.cos(angle), 0.0, -np.sin(angle)]])
     normal = np.array([[np.sin(angle), 0.0, np.cos(angle)]])
-    height = mean_heights(local_profile(roof(angle), point, normal))[0]
+    height = mean_heights(local_profile(from_surface(roof(angle)), point, normal))[0]
     assert abs(height[:3]).max() < 0.02 * RADII[2] * np.tan(angle)
 
 
