@@ -65,11 +65,11 @@ class CoordinatesSettings:
     """
 
     n_vertices: int = 2850
-    n_vertices_canonical: int = 1000
-    n_loads: int = 160
-    n_canonical: int = 60
-    n_pushed: int = 12
-    n_combined: int = 4
+    n_vertices_canonical: int = 700
+    n_loads: int = 80
+    n_canonical: int = 40
+    n_pushed: int = 6
+    n_combined: int = 2
     patch_radius: float | None = None
 
 
