@@ -63,3 +63,13 @@ def inlined(function: Callable[..., Any]) -> Any:
 def fast(function: Callable[..., Any]) -> Any:
     """Part of the step that may be reordered for speed."""
     return _part(function, fastmath=True)
+
+
+@entry
+def _nothing(n):  # type: ignore[no-untyped-def]
+    return n
+
+
+def load_compiler() -> None:
+    """Load what the first compiled function of a process takes half a second for."""
+    _nothing(0)

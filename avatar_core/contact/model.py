@@ -17,13 +17,11 @@ import numpy as np
 
 from avatar_core.common.array_table import ArrayTable
 from avatar_core.contact import kernels, locate
-from avatar_core.contact.ball_shift import no_shift
 from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.selection import NO_EFFECTS, Selection, allocate
-from avatar_core.contact.effects.several_tools import SeveralToolsArrays
+from avatar_core.contact.effects.selection import Selection, allocate
 from avatar_core.contact.effects.tip_law import dent_energy
-from avatar_core.contact.kernels import ModelArrays, Out, State
+from avatar_core.contact.kernels import Out, State
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
 from avatar_core.contact.tip_response import MAX_STENCIL
 from avatar_core.geometry.tip import Tip
@@ -370,42 +368,6 @@ def estimate_error(model: ContactModel) -> None:
     the sending of the forces.
     """
     model.compiled.error()
-
-
-def warm_up(n_tools: int = 1) -> None:
-    """Compile the halves of a step or read them from the cache. Not real-time safe."""
-    single, double = np.float32, np.float64
-    n, rank, points = 1, 1, 1
-    shift = no_shift(8.0, np.zeros(n_tools))
-    arrays = ModelArrays(
-        distance=np.full((8, 8, 8), 1.0, single),
-        access=np.zeros((8, 8, 8), single),
-        origin=np.zeros(3, double),
-        spacing=np.ones(1, double),
-        brick=shift.brick,
-        shift=shift.value,
-        shift_spacing=shift.spacing,
-        row=np.full((8, 8, 8), -1, np.int32),
-        carrier=np.zeros((0, 6), np.int32),
-        carrier_weight=np.zeros((0, 6), single),
-        self_compliance=np.full((8, 8, 8), 1.0, single),
-        force_error=np.zeros((8, 8, 8), single),
-        position=np.zeros((n, 3), double),
-        load=np.zeros((n, 3, rank), single),
-        contact_start=np.array([0, 2], np.int64),
-        contact_slot=np.full((2, 2), -1, np.int32),
-        contact_block=np.zeros((0, 3, 3), single),
-        softness=np.ones(1, double),
-        space=np.zeros((1, rank, BLOCK), np.int16),
-        space_scale=np.zeros(rank, single),
-        region=np.zeros(n, np.int32),
-        region_start=np.full(2, rank, np.int64),
-        regional_load=np.zeros((n, 3, 0), single),
-        rest=np.zeros((points, 6), single),
-        tip_offset=np.full(n_tools, 5e-3, double),
-    )
-    several_tools = SeveralToolsArrays(np.ones(1)) if n_tools > 1 else None
-    make_model(Layout(arrays, NO_EFFECTS._replace(several_tools=several_tools)), halves=True)
 
 
 def stored_energy(model: ContactModel) -> float:

@@ -411,17 +411,6 @@ def test_solve_then_deform_is_a_step(phantom_vademecum: Vademecum, model: Contac
     np.testing.assert_allclose(halves.out.cloud, model.out.cloud, rtol=0, atol=2e-8)
 
 
-def test_warm_up_compiles_what_a_vademecum_needs(phantom_vademecum: Vademecum) -> None:
-    """After warm_up, preparing a real model compiles nothing more."""
-    from avatar_core.contact import kernels as contact_kernels
-    from avatar_core.contact.model import warm_up
-
-    warm_up(1)
-    before = len(contact_kernels.contact_solve.signatures)
-    prepare(phantom_vademecum, (SPHERE,), cloud="volume", halves=True)
-    assert len(contact_kernels.contact_solve.signatures) == before
-
-
 def test_the_step_cannot_allocate() -> None:
     """Whoever writes an array into it is told when it compiles."""
     import numba

@@ -23,6 +23,7 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
 
+from avatar_core.common.jit import load_compiler
 from avatar_core.contact import model as contact
 from avatar_core.contact.haptics import passivity
 from avatar_core.contact.layout import Layout
@@ -96,7 +97,7 @@ class ContactNode(ManagedNode):
         settings = self._settings()
         if settings.scene:
             self._set_cloud_divisor(settings.cloud_divisor)
-        contact.warm_up(len(settings.tools))
+        load_compiler()
         if settings.safety.passivity != "off":
             passivity.warm_up()
         period = 1.0 / settings.rate
