@@ -17,7 +17,7 @@ from geometry_msgs.msg import WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
-from avatar_ros.msg import ContactState, VademecumFile
+from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile
 from tests.ros.refusals import refusal
 from tests.slowness import end_of
 
@@ -72,6 +72,8 @@ def test_without_vademecum_the_wrench_is_zero_and_a_broken_one_changes_nothing(
         assert wrench == WrenchStamped(header=wrench.header)
         assert wrench.header.frame_id == "organ"
         assert (wrench.header.stamp.sec, wrench.header.stamp.nanosec) == (0, 0)
+        window = probe.next(LoopStatistics, "statistics", 1)
+        assert 0.0 < window.rate < 250.0  # there is no force to be late
         publisher = probe.node.create_publisher(VademecumFile, "vademecum", qos.LATCHED)
         publisher.publish(vademecum_file("0" * 64, "forged", b"x" * 1000))
         probe.until(lambda: "'forged' refused" in process.said(), 30.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -134,6 +135,21 @@ def across(touch: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
 
 FRICTION = Friction(static=1.0, kinetic=1.0)
 RELAXING = Viscoelasticity(g=(0.5,), tau=(0.2,))
+
+
+@pytest.mark.parametrize(("timeout", "periods"), [(0.02, 5), (0.004, 1)])
+def test_without_a_model_the_loop_steps_seldom_but_sees_every_stream(
+    bench: Bench, timeout: float, periods: int
+) -> None:
+    """A pose that waits for the next step must not look late."""
+    loop = bench.loop
+    loop.settings = replace(SETTINGS, pose_timeout=timeout)
+    loop._step()
+    assert loop._due - loop._step_start == pytest.approx(1e6 * periods, rel=0.5)
+    bench.use()
+    loop._step()
+    assert loop._due - loop._step_start < 1.5e6
+    assert loop.record.nominal == 1e6 * (1 + periods)
 
 
 def test_the_force_moves_linearly_from_one_selection_of_effects_to_the_next(

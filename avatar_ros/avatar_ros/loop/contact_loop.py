@@ -1,7 +1,9 @@
 """The loop of the contact node: a thread that waits for a pose, steps and publishes.
 
-It waits for nothing but poses. An exception ends it, with a last wrench of zero. The node exchanges
-two references with it: the model in use and the record of times.
+It waits for nothing but poses. Without a model it steps every fifth period, and no pose wakes it:
+there is no force to be late, and the wrench of zero keeps its deadline. An exception ends it, with
+a last wrench of zero. The node exchanges two references with it: the model in use and the record
+of times.
 
 When a model replaces another, the loop steps both for ``BLEND`` seconds and publishes a mean of
 both whose weight moves linearly from the old model to the new one.
@@ -41,6 +43,7 @@ INACTIVE = int(ContactState.STATUS_INACTIVE)
 BLEND = 0.1  # [s]
 _LONGEST_WAIT = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own
 _SHORTEST_PERIOD = 0.5  # periods between two answers to poses, however fast they come
+_IDLE = 5  # periods from step to step without a model; the wrench has a deadline of ten
 _NO_ERROR = float("nan")  # of a force that no model gave
 
 
@@ -123,6 +126,7 @@ class ContactLoop:
         self._thread: threading.Thread | None = None
         self._step_start = 0  # of the last step [ns]
         self._due = 0  # the next step, if no pose comes before [ns]
+        self._nominal = self._period  # from the last step to the next [ns]
         self._answered = 0  # start of the last step that had a new pose [ns]
         self._cycle = 0
 
@@ -169,6 +173,9 @@ class ContactLoop:
 
     def _wait(self) -> None:
         """Wait for a pose, at most until the step is due. Real-time safe."""
+        if self._nominal > self._period:
+            realtime.sleep_until(self._due)
+            return
         realtime.sleep_until(self._answered + round(_SHORTEST_PERIOD * self._period))
         wait_set = self._wait_set
         wait_set.clear_entities()
@@ -187,8 +194,9 @@ class ContactLoop:
         for tool, tip, turn in zip(self._tools, self._tips, self._rotations, strict=True):
             if tool.take(start, timeout, tip, turn, settings.safety.leap):
                 fresh, answered = True, tool.stamp
-        record.note_period(start - self._step_start)
+        record.note_period(start - self._step_start, self._nominal)
         self._step_start = start
+        self._nominal = self._period if active.model is not None else self._idle_period(timeout)
         self._due = self._next_due(start, fresh)
         if fresh:
             self._answered = start
@@ -244,12 +252,16 @@ class ContactLoop:
                 tool.point(model.shaft, axis)
         contact.solve(model, self._tips)
 
+    def _idle_period(self, timeout: int) -> int:
+        """From step to step without a model; short enough that no pose seems late [ns]."""
+        return self._period * max(1, min(_IDLE, timeout // (4 * self._period)))
+
     def _next_due(self, start: int, fresh: bool) -> int:
         """When to step without a pose; later if one is expected. Real-time safe."""
-        if fresh:
+        if fresh and self._nominal == self._period:
             return start + round(_LONGEST_WAIT * self._period)
-        due = self._due + self._period
-        return due if due > start else start + self._period
+        due = self._due + self._nominal
+        return due if due > start else start + self._nominal
 
     def _publish_wrenches(self, now: float, model: Any) -> None:
         """Send the guarded forces; zero without a model or a pose. Real-time safe."""

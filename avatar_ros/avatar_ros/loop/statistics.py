@@ -17,6 +17,8 @@ class TimingRecord:
     def __init__(self, begin: int) -> None:
         self.begin = begin
         self.n_periods = 0
+        self.n_missed = 0
+        self.nominal = 0  # sum of the periods as they should have been
         self.n_steps = 0
         self.n_ages = 0
         self.n_models = 0
@@ -25,10 +27,17 @@ class TimingRecord:
         self.ages = np.zeros(self.CAPACITY, np.int64)
         self.models = np.zeros(self.CAPACITY, np.int64)
 
-    def note_period(self, period: int) -> None:
+    def note_period(self, period: int, nominal: int) -> None:
         if self.n_periods < self.CAPACITY:
             self.periods[self.n_periods] = period
             self.n_periods += 1
+            self.n_missed += period > LATE * nominal
+            self.nominal += nominal
+
+    @property
+    def nominal_rate(self) -> float:
+        """Periods per second as they should have been [Hz]; NaN of none."""
+        return 1e9 * self.n_periods / self.nominal if self.nominal else float("nan")
 
     def note_step(self, compute: int) -> None:
         if self.n_steps < self.CAPACITY:
@@ -47,8 +56,8 @@ class TimingRecord:
             self.n_ages += 1
 
 
-def statistics(record: TimingRecord, end: int, rate: float) -> LoopStatistics:
-    """Summary of a record that ended at ``end`` [ns] of a loop with a nominal rate [Hz]."""
+def statistics(record: TimingRecord, end: int) -> LoopStatistics:
+    """Summary of a record that ended at ``end`` [ns]."""
     periods = record.periods[: record.n_periods] * 1e-9
     computes = record.computes[: record.n_steps] * 1e-9
     ages = record.ages[: record.n_ages] * 1e-9
@@ -61,7 +70,7 @@ def statistics(record: TimingRecord, end: int, rate: float) -> LoopStatistics:
         window=window,
         rate=len(periods) / window,
         periods=len(periods),
-        missed=int(np.count_nonzero(periods > LATE / rate)),
+        missed=record.n_missed,
         period_p50=period_p50,
         period_p99=period_p99,
         period_max=period_max,

@@ -45,12 +45,12 @@ class ContactReports:
         """Publish statistics and diagnostics of the window that ends now."""
         loop, end = self._loop, time.monotonic_ns()
         record, loop.record = loop.record, TimingRecord(end)
-        window = statistics(record, end, loop.settings.rate)
+        window = statistics(record, end)
         window.header.stamp = self._node.get_clock().now().to_msg()
         shown_modes = loop.active.shown_modes
         report = shown_modes.update(window, self._is_watched()) if shown_modes is not None else None
         self._publishers.statistics.publish(window)
-        self._publish_diagnostics(window, report)
+        self._publish_diagnostics(window, record.nominal_rate, report)
         gc.collect()  # the loop's process does it nowhere else
 
     def _is_watched(self) -> bool:
@@ -59,13 +59,15 @@ class ContactReports:
         touched = model is not None and model.out.n_contacts[0] > 0
         return touched or self._publishers.deformation.get_subscription_count() > 0
 
-    def _publish_diagnostics(self, window: LoopStatistics, report: ShownModesReport | None) -> None:
+    def _publish_diagnostics(
+        self, window: LoopStatistics, nominal: float, report: ShownModesReport | None
+    ) -> None:
         node, loop, active = self._node, self._loop, self._loop.active
         name = node.get_name()
         limits = {p.name: node.get_parameter(p.name).value for p in THRESHOLDS}
         promise = active.shown_modes.promise if active.shown_modes is not None else ""
         statuses = [
-            diagnostics.loop_status(name, window, loop.settings.rate, limits),
+            diagnostics.loop_status(name, window, nominal, limits),
             diagnostics.vademecum_status(name, active.id, promise),
             diagnostics.qos_status(name, self._ports.mismatches()),
         ]
