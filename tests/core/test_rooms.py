@@ -29,7 +29,17 @@ ORDER = {
         "studies",
         "cli",
     ),
-    "avatar_ros": ("framework", "loop", "prepare", "patients", "ui", "nodes", "bench", "__init__"),
+    "avatar_ros": (
+        "framework",
+        "loop",
+        "prepare",
+        "patients",
+        "ui",
+        "slicer",
+        "nodes",
+        "bench",
+        "__init__",
+    ),
 }
 GENERATED = {"msg", "srv", "action"}  # of avatar_ros, by rosidl
 FREE_OF_ROS = ("avatar_ros", "rclpy", "rcl_interfaces", "ament_index_python", "launch")

@@ -30,6 +30,7 @@ def test_colcon_builds_it_and_what_it_built_runs(tmp_path: Path) -> None:
         "organ_markers",
         "patient_interpolation",
         "planning_ui",
+        "slicer_bridge",
         "vademecum_loader",
     }
     assert (installed / "bin" / "avatar").is_file()

@@ -34,6 +34,7 @@ EXECUTABLES = {
     "organ_markers",
     "patient_interpolation",
     "planning_ui",
+    "slicer_bridge",
     "vademecum_loader",
 }
 

@@ -1,0 +1,75 @@
+"""The organ and its tool as OpenIGTLink has them: mm and RAS, where the cell has metres.
+
+The organ's frame has the axes RAS (right, anterior, superior), as Slicer's world does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pyigtl import PolyDataMessage, StringMessage, TransformMessage
+
+ORGAN, DEFORMED, TOOL, CONTACT = "Organ", "OrganDeformed", "Tool", "Contact"  # sent
+TARGET, BUILD = "ToolTarget", "BuildPatient"  # heard; BUILD is sent too
+
+_MM = 1e3
+_MOST_TEXT = 500  # letters
+
+
+def surface(device: str, points: np.ndarray, polygons: np.ndarray) -> PolyDataMessage:
+    """Triangles (:func:`polygons_of`) between points (n, 3) [m]."""
+    return PolyDataMessage(points=_MM * points, polygons=polygons, device_name=device)
+
+
+def polygons_of(faces: np.ndarray) -> np.ndarray:
+    """Triangles (m, 3) in VTK's order: 3 and three points for each, shape (4 m,)."""
+    return np.insert(faces, 0, 3, axis=1).astype(np.uint32).ravel()
+
+
+def pose(device: str, position: np.ndarray, quaternion: np.ndarray) -> TransformMessage:
+    """A pose at a position (3,) [m] with a unit quaternion x, y, z, w."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = _rotation(quaternion)
+    matrix[:3, 3] = _MM * position
+    return TransformMessage(matrix, device_name=device)
+
+
+def text(device: str, line: str) -> StringMessage:
+    """One line, in ASCII: pyigtl sends no other."""
+    plain = line.encode("ascii", "replace").decode()
+    return StringMessage(plain[:_MOST_TEXT], device_name=device)
+
+
+def pose_of(message: TransformMessage) -> tuple[np.ndarray, np.ndarray] | None:
+    """Position [m] and unit quaternion of a transform; None if it is no rigid motion."""
+    matrix = np.asarray(message.matrix, float)
+    rotation, position = matrix[:3, :3], matrix[:3, 3] / _MM
+    if not np.isfinite(matrix).all() or np.linalg.det(rotation) <= 0.0:
+        return None
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3:
+        return None
+    return position, _quaternion(rotation)
+
+
+def _rotation(q: np.ndarray) -> np.ndarray:
+    x, y, z, w = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """x, y, z, w: the eigenvector of Bar-Itzhack's matrix (J. Guid. Control Dyn. 23:1085, 2000)."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    k = np.array(
+        [
+            [a - e - i, b + d, c + g, h - f],
+            [b + d, e - a - i, f + h, c - g],
+            [c + g, f + h, i - a - e, d - b],
+            [h - f, c - g, d - b, a + e + i],
+        ]
+    )
+    return np.asarray(np.linalg.eigh(k)[1][:, -1])
