@@ -13,6 +13,7 @@ from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress
 from avatar_core.studies.bench.methods import (
     StepRow,
+    table_over_steps,
     time_dense_table,
     time_direct,
     time_steps,
@@ -38,6 +39,7 @@ def run_step_bench(
     rows.append(time_direct(elasticity, organ))
     summary = {
         "tip_over_patch": time_tip_over_patch(organ, 50),
+        "table_over_step": table_over_steps(organ),
         "step_p50_us": _row(rows, 1).p50_us,
         "step_p99_us": _row(rows, N_TOOLS).p99_us,
         "rival_p99_us": _row(rows, N_TOOLS, "dense table").p99_us,
