@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from avatar_core.contact import ball_shift
 from avatar_core.geometry.mesh import Regions, TetMesh
-from avatar_core.geometry.offsets import OffsetGrid
+from avatar_core.geometry.offsets import Offsets
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.vademecum import tip_field
 from avatar_core.vademecum.tip_field import TipField
@@ -37,7 +37,7 @@ def smooth(
     regions: Regions,
     patch_radius: float,
     outline: SurfaceMesh | None = None,
-    offsets: OffsetGrid | None = None,  # which follow from the others
+    offsets: Offsets | None = None,  # which follow from the others
 ) -> TipField:
     """In the place of ``make_tip_field``; what it refuses is not kept."""
     return _found(ByContent(mesh, regions, float(patch_radius), outline))

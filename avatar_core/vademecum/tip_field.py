@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Callable
+from functools import partial
 
 import igl
 import numpy as np
@@ -38,7 +39,7 @@ from scipy.ndimage import (
 
 from avatar_core.geometry.local_profile import LocalProfile, local_profile
 from avatar_core.geometry.mesh import Regions, TetMesh
-from avatar_core.geometry.offsets import OffsetGrid, Offsets
+from avatar_core.geometry.offsets import Offsets, exact_offsets
 from avatar_core.geometry.skin import Skin, Soup
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tumour import strained_fraction
@@ -92,7 +93,7 @@ def make_tip_field(
     regions: Regions,
     patch_radius: float,
     outline: SurfaceMesh | None = None,
-    offsets: OffsetGrid | None = None,
+    offsets: Offsets | None = None,
 ) -> TipField:
     """Sample phi, chi and the local profile around the accessible surface.
 
@@ -104,7 +105,7 @@ def make_tip_field(
     mesh, regions : the organ
     patch_radius : R [m]
     outline : the surface of which the mesh was made; None for the mesh's own boundary
-    offsets : from that surface, which keeps what is found; None for new ones
+    offsets : from that surface; None for exact ones
 
     Raises
     ------
@@ -128,7 +129,7 @@ def make_tip_field(
         spline_filter(smoothed(values, SMOOTHING), order=2)
         for values in (distance, _deepened(distance))
     )
-    offsets = offsets or OffsetGrid(skin.boundary)
+    offsets = offsets or partial(exact_offsets, skin.boundary)
     profile = _profile(offsets, near, plain, access, origin)
     distance, access = distance.astype(np.float32), access.astype(np.float32)
     return TipField(distance, access, origin, np.array([SPACING]), *profile)
