@@ -40,7 +40,10 @@ class UnseenContacts:
     def true_compliance(
         self, surface: LoadSurface, elasticity: Elasticity, single: bool = False
     ) -> np.ndarray:
-        """n . C n of full finite elements, for patches at the places (n,) [m/N]."""
+        """n . C n of full finite elements, for patches at the places (n,) [m/N].
+
+        single : solved in single precision
+        """
         out = np.empty(len(self.tip))
         for batch in np.array_split(np.arange(len(out)), -(-len(out) // _BATCH)):
             loads = patch_loads(elasticity, self.place[batch], surface.patch_radius)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from pyigtl import PolyDataMessage, StringMessage, TransformMessage
+from scipy.spatial.transform import Rotation
 
 ORGAN, DEFORMED, TOOL, CONTACT = "Organ", "OrganDeformed", "Tool", "Contact"  # sent
 TARGET, BUILD = "ToolTarget", "BuildPatient"  # heard; BUILD is sent too
@@ -28,7 +29,7 @@ def polygons_of(faces: np.ndarray) -> np.ndarray:
 def pose(device: str, position: np.ndarray, quaternion: np.ndarray) -> TransformMessage:
     """A pose at a position (3,) [m] with a unit quaternion x, y, z, w."""
     matrix = np.eye(4)
-    matrix[:3, :3] = _rotation(quaternion)
+    matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     matrix[:3, 3] = _MM * position
     return TransformMessage(matrix, device_name=device)
 
@@ -47,29 +48,4 @@ def pose_of(message: TransformMessage) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3:
         return None
-    return position, _quaternion(rotation)
-
-
-def _rotation(q: np.ndarray) -> np.ndarray:
-    x, y, z, w = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """x, y, z, w: the eigenvector of Bar-Itzhack's matrix (J. Guid. Control Dyn. 23:1085, 2000)."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    k = np.array(
-        [
-            [a - e - i, b + d, c + g, h - f],
-            [b + d, e - a - i, f + h, c - g],
-            [c + g, f + h, i - a - e, d - b],
-            [h - f, c - g, d - b, a + e + i],
-        ]
-    )
-    return np.asarray(np.linalg.eigh(k)[1][:, -1])
+    return position, Rotation.from_matrix(rotation).as_quat()
