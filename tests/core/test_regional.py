@@ -131,7 +131,7 @@ def test_a_history_in_many_regions_is_shown_without_a_jump(phantom_vademecum: Va
     v, tip = phantom_vademecum, Tip("sphere", 8e-3)
     slow = Viscoelasticity((0.95,), (2.0,))
     model = prepare(v, (tip,), cloud="volume", precision="float32", effects=(slow,))
-    path = slide(v, tip.offset, 4e-3, 0.25)
+    path = slide(v, tip.offset, 4e-3, 0.4)
     shown, change, turns, before = [], [], [], None
     for at in path:
         step(model, at[None].copy())
