@@ -16,6 +16,7 @@ error of the mesh itself, by one refinement.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +30,7 @@ from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahe
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.studies.shapes import read_livers
-from avatar_core.studies.study import Study, Value, follow
+from avatar_core.studies.study import RowFile, Study, Value, follow
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,13 +58,18 @@ FULL = MeshesSettings()
 QUICK = MeshesSettings(n_livers=6, n_built=0, n_refined=0, n_again=1)
 
 
-def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
+def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
     """The study on a folder of surfaces; None for the default one."""
-    return study(surfaces, QUICK if quick else FULL)
+    file = RowFile(folder / "meshes.rows.jsonl")
+    return study(surfaces, QUICK if quick else FULL, file.add)
 
 
-def study(folder: Path | None, settings: MeshesSettings) -> Study:
-    """One row for each surface."""
+def study(
+    folder: Path | None,
+    settings: MeshesSettings,
+    row_done: Callable[[Mapping[str, Value]], None] | None = None,
+) -> Study:
+    """One row for each surface; ``row_done`` is called with each when it is measured."""
     livers = read_livers(folder, settings.n_livers, settings.phantoms)
     n = len(livers.surfaces)
     built, refined, again = (
@@ -78,6 +84,8 @@ def study(folder: Path | None, settings: MeshesSettings) -> Study:
         if i in built:
             row |= _certified(surface, settings, i in refined)
         rows.append(row)
+        if row_done is not None:
+            row_done(row)
     summary = _summary(rows)
     return Study(
         name="meshes",

@@ -92,6 +92,24 @@ def machine() -> dict[str, Value]:
     return found
 
 
+class RowFile:
+    """Rows of a study as they are measured, one JSON object a line in ``NAME.rows.jsonl``.
+
+    A study that is interrupted after an hour leaves what it had found.
+
+    path : of the file, which is begun anew
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        path.write_text("")
+
+    def add(self, row: Mapping[str, Value]) -> None:
+        """Append a row."""
+        with self._path.open("a") as file:
+            file.write(json.dumps(_plain(dict(row)), allow_nan=False) + "\n")
+
+
 def follow(items: Iterable[Item], text: str) -> Iterator[Item]:
     """Iterate with a progress bar, which is shown on a terminal only."""
     from tqdm import tqdm

@@ -41,7 +41,7 @@ from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.shapes.registration import Registration, register
 from avatar_core.studies.shapes import SAME_SUBJECT, read_livers
-from avatar_core.studies.study import Study, Value, follow
+from avatar_core.studies.study import RowFile, Study, Value, follow
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
 
@@ -141,7 +141,8 @@ def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
     skipped = tuple(
         f"{surface.name}: not in the atlas" for surface in livers.surfaces if surface not in members
     )
-    found = transport(members, base, quick)
+    file = RowFile(folder / "transport.rows.jsonl")
+    found = transport(members, base, quick, row_done=lambda row: file.add(_flat(row)))
     summary = found.summary
     sentence = (
         f"{len(found.rows)} patients, each left out of {len(base.names)} livers: interpolated "
@@ -188,6 +189,7 @@ def transport(
     quick: bool = False,
     same_person: Collection[Collection[str]] = SAME_SUBJECT,
     options: PatientOptions | None = None,
+    row_done: Callable[[TransportRow], None] | None = None,
 ) -> Transport:
     """Leave-one-out over livers that are members of the base, one scan of each person.
 
@@ -195,18 +197,19 @@ def transport(
     ----------
     surfaces : of the members, ``surface.name`` in ``base.names``
     quick : three patients on coarse meshes instead of twelve
+    row_done : called with each row when it is measured
     """
     options = options or PatientOptions(n_vertices=700 if quick else 2850)
     further = {name for scans in same_person for name in sorted(scans)[1:]}
     surfaces = [surface for surface in surfaces if surface.name not in further]
     count = min(N_QUICK if quick else N_PATIENTS, len(surfaces))
     chosen = np.linspace(0, len(surfaces) - 1, count).astype(int)
-    return Transport(
-        tuple(
-            transport_row(surfaces[i], base, same_person, options)
-            for i in follow(chosen, "patients")
-        )
-    )
+    rows: list[TransportRow] = []
+    for i in follow(chosen, "patients"):
+        rows.append(transport_row(surfaces[i], base, same_person, options))
+        if row_done is not None:
+            row_done(rows[-1])
+    return Transport(tuple(rows))
 
 
 def transport_row(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +34,7 @@ from avatar_core.studies import (
 )
 from avatar_core.studies.response import carried, relative_errors, trilinear
 from avatar_core.studies.shapes import paper_box, read_livers, subject_numbers
-from avatar_core.studies.study import Study, mean_and_worst, write_study
+from avatar_core.studies.study import RowFile, Study, Value, mean_and_worst, write_study
 
 COARSE = (16, 13, 14)
 
@@ -87,6 +88,23 @@ def test_meshes(tmp_path: Path) -> None:
     assert summary["volume_error_worst"] < 0.02
     assert 0.0 < summary["distance_rms_worst_mm"] < 2.0
     assert summary["min_dihedral_deg"] > 5.0
+
+
+def test_an_interrupted_study_leaves_its_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = meshes.MeshesSettings(n_built=0, n_again=0, n_vertices=300, n_points=200)
+    rows = RowFile(tmp_path / "meshes.rows.jsonl")
+
+    def then_stop(row: Mapping[str, Value]) -> None:
+        rows.add(row)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        meshes.study(write_phantoms(tmp_path, 3), settings, then_stop)
+    (line,) = (tmp_path / "meshes.rows.jsonl").read_text().splitlines()
+    assert json.loads(line)["liver"] == "LiTS-5"
+    assert json.loads(line)["n_vertices"] > 100
 
 
 @pytest.mark.usefixtures("no_folder")
