@@ -32,7 +32,7 @@ from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions, TetMesh, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import certify
-from avatar_core.offline.exact_response import remainder
+from avatar_core.offline.full_response import remainder
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.compact_response import CompactResponse

@@ -335,6 +335,16 @@ def _trace(elasticity: Elasticity, points: _SurfacePoints) -> sp.csr_matrix:
     )
 
 
+def scaled_gram(elasticity: Elasticity, loads: sp.spmatrix) -> sp.csr_matrix:
+    """F^T D^-1 F of loads F and D = diag K, by which residuals are measured, (n_loads, n_loads)."""
+    return (loads.T @ sp.diags(1.0 / elasticity.diagonal) @ loads).tocsr()
+
+
+def triples(positions: np.ndarray) -> np.ndarray:
+    """Numbers of the three loads of each position, shape (3 n,)."""
+    return np.asarray((3 * np.asarray(positions)[:, None] + np.arange(3)).ravel())
+
+
 def subdivided_rule(pieces: int) -> tuple[np.ndarray, np.ndarray]:
     """A rule of degree 5 on each of pieces^2 equal sub-triangles; weights sum to one."""
     local, weight = get_quadrature(RefTri, 5)

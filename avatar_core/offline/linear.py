@@ -21,12 +21,8 @@ from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.exact_response import (
-    ExactResponse,
-    contact_blocks,
-    contact_near,
-    exact_response,
-)
+from avatar_core.offline.completion import completed_response
+from avatar_core.offline.full_response import FullResponse, contact_blocks, contact_near
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.reduction.pgd import EnrichmentReport, PGDRule, SolvedLoads, solve_pgd
 from avatar_core.reduction.regional import RegionalField, separate_regions
@@ -74,7 +70,7 @@ def build_vademecum(
     ``convergence.converged`` is False.
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
-    response = exact_response(elasticity, surface, loads, progress, single=True)
+    response = completed_response(elasticity, surface, loads, rule.completion, progress)
     with_body = rule.max_modes >= LEAST_MODES
     n_body = N_BODY if with_body else 0
     modes = find_modes(elasticity, loads, response, rule.contact_modes - n_body, progress)
@@ -116,7 +112,7 @@ def build_vademecum(
 def find_modes(
     elasticity: Elasticity,
     loads: sp.csr_matrix,
-    response: ExactResponse,
+    response: FullResponse,
     n_modes: int,
     progress: Progress,
 ) -> Modes:
@@ -169,7 +165,7 @@ def _with_body(
 
 def regional_field(
     far: SeparatedField,
-    response: ExactResponse,
+    response: FullResponse,
     surface: LoadSurface,
     elasticity: Elasticity,
     rule: BuildRule,

@@ -29,11 +29,11 @@ from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import certificate_of, measured
-from avatar_core.offline.exact_response import (
-    ExactResponse,
+from avatar_core.offline.full_response import (
+    FullResponse,
     contact_blocks,
     contact_near,
-    exact_response,
+    full_response,
 )
 from avatar_core.offline.linear import Modes, find_modes, rank_errors
 from avatar_core.offline.rule import BuildRule, Progress, silent
@@ -71,7 +71,7 @@ class _Snapshot:
     """
 
     elasticity: Elasticity
-    response: ExactResponse
+    response: FullResponse
     contact: LocalBlocks
     modes: Modes
 
@@ -149,7 +149,7 @@ def _solved(
     def second(stage: str, fraction: float, error: float) -> None:
         progress("solve", half + half * fraction, error)
 
-    response = exact_response(elasticity, surface, loads, first)
+    response = full_response(elasticity, loads, first)
     modes = find_modes(elasticity, loads, response, rule.contact_modes, second)
     contact = contact_blocks(response, surface, rule.contact_support * surface.patch_radius)
     elasticity = elasticity.at(elasticity.material)  # drops the factorization, 0.5 GB

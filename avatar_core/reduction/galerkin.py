@@ -29,11 +29,15 @@ from numpy.typing import NDArray
 from avatar_core.common.arrays import FloatArray
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm, require_orthonormal
-from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.fem.patch_loads import LoadSurface, scaled_gram, triples
 from avatar_core.reduction.compact_response import CompactResponse, positive_part
 from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 
-_DEPENDENT = 1e-10  # part of the largest energy below which a direction is rounding
+# In double and in single precision: part of the energy below which a direction is rounding, and
+# what the Gram matrix of orthonormal functions may be off.
+_DEPENDENT = {False: 1e-10, True: 1e-6}
+_ORTHONORMAL = {False: 1e-6, True: 0.05}
+_TRIED = 2  # load positions on which single precision is tried
 WORST_OVER_MEAN = 1.75  # estimated, of the mean asked for; the true worst was up to 2.4 times that
 
 
@@ -70,29 +74,31 @@ class GalerkinErrorEstimate:
 
 
 class GalerkinBasis:
-    """K-orthonormal space functions X, their forces K X and load functions Y = F^T X.
+    """K-orthonormal space functions X of forces F A, at the vertices, and their load functions Y.
+
+    All but X itself is done with load functions, K X = F A and Y = F^T X: products of two
+    functions are Y^T A, and no product by K is needed.
 
     Parameters
     ----------
     elasticity : Elasticity of the patient's own mesh
     loads : sparse, shape (3 n_nodes, n_loads), F
+    single : solve in single precision
 
     Attributes
     ----------
+    space : ndarray, shape (3 n_vertices, rank), X; applied, load : (n_loads, rank), A and Y
     load_norm : ndarray, shape (n_positions,), root of the trace of f . D^-1 f
     """
 
-    def __init__(self, elasticity: Elasticity, loads: sp.csr_matrix) -> None:
-        self.elasticity, self.loads = elasticity, loads
-        self.space = np.zeros((loads.shape[0], 0))
-        self.force = np.zeros((loads.shape[0], 0))
+    def __init__(self, elasticity: Elasticity, loads: sp.csr_matrix, single: bool = False) -> None:
+        self.elasticity, self.loads, self.single = elasticity, loads, single
+        self.space = np.zeros((3 * len(elasticity.mesh.vertices), 0))
+        self.applied = np.zeros((loads.shape[1], 0))
         self.load = np.zeros((loads.shape[1], 0))
         self.solutions = 0
-        self._loaded = np.flatnonzero(np.diff(loads.indptr))
-        root = np.sqrt(elasticity.stiffness.diagonal()[self._loaded])
-        self._inverse_root = 1.0 / root
-        self._scaled = (sp.diags(self._inverse_root) @ loads[self._loaded]).tocsc()
-        self._own = _products_of_triples(self._scaled)
+        self._gram = scaled_gram(elasticity, loads)
+        self._own = _blocks_of_triples(self._gram)
         self.load_norm = np.sqrt(np.trace(self._own, axis1=1, axis2=2))
 
     @property
@@ -100,40 +106,43 @@ class GalerkinBasis:
         """Number of basis functions."""
         return self.space.shape[1]
 
-    def enrich(self, forces: FloatArray) -> None:
-        """Add the solutions for some forces, shape (3 n_nodes, n) [N].
+    def enrich(self, functions: FloatArray) -> None:
+        """Add the solutions for forces F A with some load functions A, shape (n_loads, n).
 
         Raises
         ------
         ConvergenceError
             If the functions do not come out K-orthonormal.
         """
-        self.solutions += forces.shape[1]
-        space = self.elasticity.solve(forces)
+        self.solutions += functions.shape[1]
+        applied = np.asarray(functions, float)
+        solution = self.elasticity.solve(self.loads @ applied, self.single)
+        space, load = self.elasticity.at_vertices(solution).astype(float), self.loads.T @ solution
+        size = np.einsum("si,si->i", load, applied).max()
         for _ in range(2):  # once more for rounding
-            known = self.space.T @ forces
-            space, forces = space - self.space @ known, forces - self.force @ known
-        work = space.T @ forces  # the energy, with no product by K
+            known = self.load.T @ applied
+            space, load = space - self.space @ known, load - self.load @ known
+            applied = applied - self.applied @ known
+        work = load.T @ applied
         value, vector = np.linalg.eigh((work + work.T) / 2.0)
-        new = value > _DEPENDENT * value.max()
+        new = value > _DEPENDENT[self.single] * size
         scale = vector[:, new] / np.sqrt(value[new])
-        space, forces = space @ scale, forces @ scale
+        space, load, applied = space @ scale, load @ scale, applied @ scale
         self.space = np.hstack([self.space, space])
-        require_orthonormal(self.space, self.elasticity.apply(space), "basis functions")
-        self.force = np.hstack([self.force, forces])
-        self.load = np.hstack([self.load, self.loads.T @ space])
+        self.load = np.hstack([self.load, load])
+        require_orthonormal(self.load, applied, "basis functions", _ORTHONORMAL[self.single])
+        self.applied = np.hstack([self.applied, applied])
 
     def residual_blocks(self) -> NDArray[np.float64]:
         """r(s) . D^-1 r(s) of each position, by directions, shape (n_positions, 3, 3) [m/N].
 
-        Only the loaded nodes count: elsewhere no load acts. With F' = D^-1/2 f(s), K' = D^-1/2 K X
-        there, they are F'^T F' - F'^T K' Y^T - Y K'^T F' + Y K'^T K' Y^T.
+        With G = F^T D^-1 F and r = F (1 - A Y^T) they are the diagonal blocks of
+        G - G A Y^T - Y A^T G + Y A^T G A Y^T.
         """
-        force = self.force[self._loaded] * self._inverse_root[:, None]
-        mixed = self._scaled.T @ force
+        mixed = self._gram @ self.applied
         load, change = (
             part.reshape(-1, 3, self.rank)
-            for part in (self.load, self.load @ (force.T @ force) - mixed)
+            for part in (self.load, self.load @ (self.applied.T @ mixed) - mixed)
         )
         cross = mixed.reshape(-1, 3, self.rank) @ load.transpose(0, 2, 1)
         blocks = positive_part(self._own - cross + load @ change.transpose(0, 2, 1))
@@ -160,7 +169,7 @@ class Probes:
     def errors(self, basis: GalerkinBasis) -> FloatArray:
         """Relative mass-weighted L2 error of the Galerkin displacement at each probe, (n,)."""
         elasticity = basis.elasticity
-        estimate = elasticity.at_vertices(basis.space) @ basis.load[triples(self.positions)].T
+        estimate = basis.space @ basis.load[triples(self.positions)].T
         error, size = (
             np.linalg.norm(l2_norm(field, elasticity.mesh.lumped_mass).reshape(-1, 3), axis=1)
             for field in (estimate - self.columns, self.columns)
@@ -208,10 +217,11 @@ def reduce(
     rule = rule or ReductionRule()
     limit = max(int(rule.max_solution_fraction * loads.shape[1]), 3 * (rule.n_probes + 1))
     n_probes = min(rule.n_probes, limit // 6, surface.n_positions)
-    probes = solve_probes(elasticity, loads, n_probes)
-    basis = GalerkinBasis(elasticity, loads)
+    single = elasticity.single_serves(loads[:, : 3 * _TRIED].tocsc())
+    probes = solve_probes(elasticity, loads, n_probes, single)
+    basis = GalerkinBasis(elasticity, loads, single)
     basis.solutions = 3 * n_probes
-    basis.enrich(loads @ load_functions[:, : min(rule.n_start, limit - basis.solutions)])
+    basis.enrich(load_functions[:, : min(rule.n_start, limit - basis.solutions)])
     history: list[GalerkinErrorEstimate] = []
     while True:
         blocks = basis.residual_blocks()
@@ -222,17 +232,18 @@ def reduce(
         if converged or count == 0:
             break
         chosen = worst_positions(basis, surface, blocks, count, probes.positions)
-        basis.enrich(loads[:, triples(chosen)].toarray())
+        basis.enrich(_unit_functions(triples(chosen), loads.shape[1]))
     residual, support = residual_compliance(basis, probes, surface, blocks, rule)
-    space = elasticity.at_vertices(basis.space)
-    response = CompactResponse(space, basis.load, residual)
+    response = CompactResponse(basis.space, basis.load, residual)
     return ReducedResponse(response, support, tuple(history), converged)
 
 
-def solve_probes(elasticity: Elasticity, loads: sp.csr_matrix, n: int, seed: int = 0) -> Probes:
+def solve_probes(
+    elasticity: Elasticity, loads: sp.csr_matrix, n: int, single: bool = False, seed: int = 0
+) -> Probes:
     """Exact solutions for random load positions."""
     chosen = np.random.default_rng(seed).permutation(loads.shape[1] // 3)[:n]
-    solution = elasticity.solve(loads[:, triples(chosen)])
+    solution = elasticity.solve(loads[:, triples(chosen)], single)
     return Probes(chosen, elasticity.at_vertices(solution), loads.T @ solution)
 
 
@@ -343,16 +354,20 @@ def residual_compliance_blocks(
     return LocalBlocks(pairs.start, pairs.target, block.astype(np.float32))
 
 
-def _products_of_triples(columns: sp.csc_matrix) -> NDArray[np.float64]:
-    """Products of each three columns with each other, shape (n, 3, 3)."""
-    part = [columns[:, k::3] for k in range(3)]
-    product = [[part[a].multiply(part[b]).sum(axis=0) for b in range(3)] for a in range(3)]
-    return np.asarray(product, float).reshape(3, 3, -1).transpose(2, 0, 1)
+def _blocks_of_triples(matrix: sp.csr_matrix) -> NDArray[np.float64]:
+    """The 3 x 3 blocks on the diagonal of a sparse matrix, shape (n, 3, 3)."""
+    entries, blocks = matrix.tocoo(), np.zeros((matrix.shape[0] // 3, 3, 3))
+    own = entries.row // 3 == entries.col // 3
+    row, column = entries.row[own], entries.col[own]
+    blocks[row // 3, row % 3, column % 3] = entries.data[own]
+    return blocks
 
 
-def triples(positions: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers of the three loads of each position, shape (3 n,)."""
-    return (3 * np.asarray(positions)[:, None] + np.arange(3)).ravel()
+def _unit_functions(loads: NDArray[np.int64], n_loads: int) -> FloatArray:
+    """Load functions of single loads, shape (n_loads, n)."""
+    functions = np.zeros((n_loads, len(loads)))
+    functions[loads, np.arange(len(loads))] = 1.0
+    return functions
 
 
 def _root(blocks: FloatArray) -> FloatArray:
@@ -378,7 +393,7 @@ def compact_response(
     functions = np.random.default_rng(0).standard_normal((loads.shape[1], rank))
     functions = np.linalg.qr(loads.T @ elasticity.solve(loads @ functions))[0]
     basis = GalerkinBasis(elasticity, loads)
-    basis.enrich(loads @ functions)
+    basis.enrich(functions)
     blocks = basis.residual_blocks()
     probes = solve_probes(elasticity, loads, n_probes)
     exact = probes.compliance - basis.load @ basis.load[triples(probes.positions)].T
@@ -386,7 +401,7 @@ def compact_response(
     own = sum(np.trace(exact[j, :, k]) for k, j in enumerate(probes.positions))
     scale = max(own, 0.0) / np.trace(blocks[probes.positions], axis1=1, axis2=2).sum()
     return CompactResponse(
-        elasticity.at_vertices(basis.space).astype(np.float32),
+        basis.space.astype(np.float32),
         basis.load.astype(np.float32),
         (scale * blocks).astype(np.float32),
     )

@@ -19,7 +19,6 @@ from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
 from avatar_core.offline.certify.accuracy_curve import DisplayErrors, curve_of
 from avatar_core.offline.certify.unseen_contacts import HEIGHTS, draw_contacts
-from avatar_core.offline.exact_response import single_serves
 from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.force_error import calibrated
 
@@ -119,7 +118,7 @@ def measured(
 def _single_serves(vademecum: Vademecum, elasticity: Elasticity) -> bool:
     surface = vademecum.surface
     some = patch_loads(elasticity, surface.centroids[:_TRIED], surface.patch_radius)
-    return single_serves(elasticity, some.tocsc())
+    return elasticity.single_serves(some.tocsc())
 
 
 def _tip_force(

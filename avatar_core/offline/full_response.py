@@ -1,26 +1,27 @@
-"""The full solutions of a build, each computed once."""
+"""The response of an organ to every load, at its vertices."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
 
+from avatar_core.common.arrays import IntArray
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm
-from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.fem.patch_loads import LoadSurface, triples
 from avatar_core.offline.rule import NO_ERROR, Progress
 from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 from avatar_core.reduction.separated import SeparatedField
 
 _BATCH = 80  # load positions solved at once: fewer take longer each
-_TRIED = 2  # load positions on which single precision is tried,
-SINGLE_ERROR = 1e-3  # and the relative error up to which it does: modes leave six times it
+_TRIED = 2  # load positions on which single precision is tried
 
 
 @dataclass(frozen=True, eq=False)
-class ExactResponse:
+class FullResponse:
     """The response to every load, in single precision.
 
     columns : ndarray, shape (3 n_vertices, n_loads), displacement at the vertices [m/N]
@@ -44,38 +45,55 @@ class ExactResponse:
         return (self.columns[:, loads] - smooth).reshape(len(smooth), -1, 3)
 
 
-def exact_response(
-    elasticity: Elasticity,
-    surface: LoadSurface,
-    loads: sp.csr_matrix,
-    progress: Progress,
-    single: bool = False,
-) -> ExactResponse:
+class Solving:
+    """The arrays of a response, filled load position by load position.
+
+    Parameters
+    ----------
+    loads : sparse, shape (3 n_nodes, n_loads), three for each position
+    single : solve in single precision where that does, in half the time
+
+    Attributes
+    ----------
+    columns, compliance : of :class:`FullResponse`; columns of other loads are not set yet
+    """
+
+    def __init__(self, elasticity: Elasticity, loads: sp.csr_matrix, single: bool) -> None:
+        self._elasticity, self._average = elasticity, loads.T.tocsr()
+        self._by_column, n = loads.tocsc(), loads.shape[1]
+        self._single = single and elasticity.single_serves(self._by_column[:, : 3 * _TRIED])
+        self.columns = np.empty((3 * len(elasticity.mesh.vertices), n), np.float32, order="F")
+        self.compliance = np.empty((n, n), np.float32, order="F")
+
+    def solve(self, positions: IntArray) -> Iterator[int]:
+        """Solve for some positions, batch by batch; yields how many of them are done."""
+        for first in range(0, len(positions), _BATCH):
+            chosen = triples(positions[first : first + _BATCH])
+            solution = self._elasticity.solve(self._by_column[:, chosen], self._single)
+            self.columns[:, chosen] = self._elasticity.at_vertices(solution)
+            self.compliance[:, chosen] = self._average @ solution
+            yield min(first + _BATCH, len(positions))
+
+    def response(self) -> FullResponse:
+        """The response, once every column is set."""
+        _symmetrize(self.compliance)
+        columns, mass = self.columns, self._elasticity.mesh.lumped_mass.astype(np.float32)
+        batches = range(0, columns.shape[1], 3 * _BATCH)
+        norm = np.concatenate([l2_norm(columns[:, k : k + 3 * _BATCH], mass) for k in batches])
+        return FullResponse(columns, self.compliance, norm)
+
+
+def full_response(
+    elasticity: Elasticity, loads: sp.csr_matrix, progress: Progress, single: bool = False
+) -> FullResponse:
     """Solve for every load position.
 
     single : solve in single precision where that does, in half the time
     """
-    n, n_rows = surface.n_positions, 3 * len(elasticity.mesh.vertices)
-    columns = np.empty((n_rows, 3 * n), np.float32, order="F")
-    compliance = np.empty((3 * n, 3 * n), np.float32, order="F")
-    by_column, average = loads.tocsc(), loads.T.tocsr()
-    single = single and single_serves(elasticity, by_column[:, : 3 * _TRIED])
-    for first in range(0, 3 * n, 3 * _BATCH):
-        batch = slice(first, min(first + 3 * _BATCH, 3 * n))
-        solution = elasticity.solve(by_column[:, batch], single)
-        columns[:, batch] = elasticity.at_vertices(solution)
-        compliance[:, batch] = average @ solution
-        progress("solve", batch.stop / (3 * n), NO_ERROR)
-    _symmetrize(compliance)
-    mass = elasticity.mesh.lumped_mass.astype(np.float32)
-    batches = range(0, 3 * n, 3 * _BATCH)
-    norm = np.concatenate([l2_norm(columns[:, k : k + 3 * _BATCH], mass) for k in batches])
-    return ExactResponse(columns, compliance, norm)
-
-
-def single_serves(elasticity: Elasticity, loads: sp.csc_matrix) -> bool:
-    """Whether solutions in single precision are good enough, by trying it on these loads."""
-    return elasticity.single_error(loads) < SINGLE_ERROR
+    solving, n = Solving(elasticity, loads, single), loads.shape[1] // 3
+    for done in solving.solve(np.arange(n)):
+        progress("solve", done / n, NO_ERROR)
+    return solving.response()
 
 
 def _symmetrize(matrix: np.ndarray) -> None:
@@ -86,7 +104,7 @@ def _symmetrize(matrix: np.ndarray) -> None:
         matrix[k:, strip], matrix[strip, k:] = mean, mean.T
 
 
-def contact_blocks(response: ExactResponse, surface: LoadSurface, support: float) -> LocalBlocks:
+def contact_blocks(response: FullResponse, surface: LoadSurface, support: float) -> LocalBlocks:
     """The compliance between load positions up to a distance [m] apart."""
     pairs = near_pairs(surface.centers, surface.centers, support)
     exact = response.compliance.reshape(surface.n_positions, 3, surface.n_positions, 3)

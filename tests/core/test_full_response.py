@@ -5,22 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem import elasticity as module
+from avatar_core.fem.elasticity import SINGLE_ERROR, Elasticity
 from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import load_surface, patch_loads
-from avatar_core.offline import exact_response as module
-from avatar_core.offline.exact_response import SINGLE_ERROR, ExactResponse, exact_response
+from avatar_core.offline.full_response import FullResponse, full_response
 from avatar_core.offline.rule import silent
 from tests.core.conftest import box_mesh, box_regions
 
 DOUBLE = 1e-6  # columns are kept in float32
 
 
-def found(elasticity: Elasticity, single: bool) -> tuple[ExactResponse, float]:
+def found(elasticity: Elasticity, single: bool) -> tuple[FullResponse, float]:
     """The response of a box, and the largest error of its columns, relative to the largest."""
     surface = load_surface(elasticity.mesh, box_regions(elasticity.mesh), 0.03)
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
-    response = exact_response(elasticity, surface, loads, silent, single)
+    response = full_response(elasticity, loads, silent, single)
     exact = elasticity.at_vertices(elasticity.solve(loads))
     return response, float(np.abs(response.columns - exact).max() / np.abs(exact).max())
 
