@@ -1,6 +1,7 @@
 """The offline stage: from an organ's mesh to its vademecum.
 
-1. every patch is solved once;
+1. four patches in ten are solved, and the others projected on their solutions, see
+   :mod:`avatar_core.offline.completion`;
 2. PGD finds the modes that all loads share, and body functions join them; an orthogonal mixing
    sorts them by displacement norm. The first are the global modes of the displacement; the contact
    compliance uses all of them;
@@ -70,6 +71,7 @@ def build_vademecum(
     ``convergence.converged`` is False.
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
+    elasticity = elasticity.refining()
     response = completed_response(elasticity, surface, loads, rule.completion, progress)
     with_body = rule.max_modes >= LEAST_MODES
     n_body = N_BODY if with_body else 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatar_core.fem import elasticity as module
-from avatar_core.fem.elasticity import SINGLE_ERROR, Elasticity
+from avatar_core.fem.elasticity import SINGLE_ERROR, Elasticity, Material
 from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import load_surface, patch_loads
 from avatar_core.offline.full_response import FullResponse, full_response
@@ -60,3 +60,26 @@ def test_the_compliance_is_that_of_patches_under_patches(elasticity: Elasticity)
     np.testing.assert_allclose(
         response.norm, l2_norm(response.columns, elasticity.mesh.lumped_mass), rtol=1e-5
     )
+
+
+# --- refinement ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ratio", [0.48, 0.495])
+def test_refined_solutions_are_those_in_double_precision(ratio: float) -> None:
+    mesh = box_mesh(4)
+    elasticity = Elasticity(mesh, Material(poisson_ratio=ratio), box_regions(mesh).clamped)
+    loads = patch_loads(elasticity, mesh.vertices[[-1, -2]], 0.03)
+    exact, refining = elasticity.solve(loads), elasticity.at(elasticity.material).refining()
+    size = np.abs(exact).max()
+    assert np.abs(elasticity.solve(loads, single=True) - exact).max() > 1e-6 * size
+    assert np.abs(refining.solve(loads) - exact).max() < 1e-7 * size
+
+
+def test_what_refinement_does_not_solve_is_solved_in_double(
+    elasticity: Elasticity, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loads = patch_loads(elasticity, elasticity.mesh.vertices[[-1]], 0.03)
+    exact = elasticity.solve(loads)
+    monkeypatch.setattr(module, "_REFINED", 0.0)
+    np.testing.assert_array_equal(elasticity.refining().solve(loads), exact)

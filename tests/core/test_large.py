@@ -201,19 +201,20 @@ def certified(bent: Vademecum, certificate: LargeCertificate | None = None) -> V
 
 @pytest.mark.long
 def test_what_is_added_linearly_to_a_large_push_is_nearly_right(bent: Vademecum) -> None:
-    """Wrong by less than half; together less than without the bending of each tip for itself."""
+    """Wrong by less than half; at three sites less than without the bending of each tip itself."""
     shares: list[float] = []
     problem = hyperelastic_problem(bent, "neo-hookean")
-    rows = push_errors(bent, problem, (5e-3,), 1, progress=shares.append)
-    assert [row.combination for row in rows] == list(COMBINATIONS)
+    rows = push_errors(bent, problem, (5e-3,), 3, progress=shares.append)
+    assert [row.combination for row in rows] == 3 * list(COMBINATIONS)
     assert shares == sorted(shares) and shares[-1] == 1.0
-    assert {1 / 3, 2 / 3} < set(shares) and len(shares) > 9  # each Newton iteration says so
+    assert len(shares) > 27  # each Newton iteration says so
     for row in rows:
         assert row.within and row.depth == 5e-3
         assert row.contact < 0.5
     assert sum(row.contact for row in rows) < sum(row.linear_contact for row in rows)
     found = with_combinations(summary(bent, [], 0, 0), rows)
-    assert [getattr(found, key) for key in FIGURES] == [row.contact for row in rows]
+    means = [mean_error(rows, combination) for combination in COMBINATIONS]
+    assert [getattr(found, key) for key in FIGURES] == means
 
 
 def test_no_equilibrium_is_sought_beyond_the_range(bent: Vademecum) -> None:

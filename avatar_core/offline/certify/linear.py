@@ -85,6 +85,7 @@ def measured(
     """
     surface = vademecum.surface
     single = single and _single_serves(vademecum, elasticity)
+    elasticity = elasticity.refining() if single else elasticity
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(len(surface.corners))[:n_loads]
     normals = patch_normals(elasticity.mesh, surface.centroids, surface.patch_radius)
