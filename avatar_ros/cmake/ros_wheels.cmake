@@ -6,6 +6,7 @@
 # they live in the Python prefix, and that prefix is not an ament workspace.
 
 find_package(Python3 REQUIRED COMPONENTS Interpreter)
+set(CMAKE_PROJECT_tf2_msgs_INCLUDE "${CMAKE_CURRENT_LIST_FILE}") # vendor/tf2_msgs needs it, too
 
 # 1. The prefix the wheels' CMake packages are in.
 execute_process(

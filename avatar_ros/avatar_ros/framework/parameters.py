@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,6 +75,20 @@ def frame(name: str) -> str:
     if not name:
         raise ParameterError("parameter frame_id: give the name of the organ's frame")
     return name
+
+
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # as a pose: x y z, quaternion x y z w
+
+
+def pose(name: str, numbers: Any) -> tuple[float, ...]:
+    """A pose x y z [m], quaternion x y z w; raises ParameterError, naming it, if it is none."""
+    found = tuple(float(number) for number in numbers)
+    square = sum(number * number for number in found[3:])
+    if len(found) != 7 or not all(map(math.isfinite, found)) or not abs(square - 1.0) < 2e-3:
+        raise ParameterError(
+            f"parameter {name}: give x y z in metres and a quaternion x y z w of length 1"
+        )
+    return found
 
 
 AUTOSTART = Parameter(

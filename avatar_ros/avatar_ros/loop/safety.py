@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 from avatar_core.contact.haptics.force_guard import DEVICES, ForceLimits
 from avatar_core.contact.haptics.passivity import MAX_DELAY, Passivity, make_passivity
-from avatar_ros.framework.parameters import Parameter, ParameterError
+from avatar_ros.framework.parameters import IDENTITY, Parameter, ParameterError, pose
 
 PASSIVITY = ("off", "observe", "control")
 # How a wrench is given, and the topic below that of the tool, as CRTK calls them.
 WRENCHES = {"absolute": "servo_cf", "body": "body/servo_cf", "spatial": "spatial/servo_cf"}
 _DEVICE = "sigma"
-_IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 SAFETY = (
     Parameter(
@@ -64,7 +62,7 @@ SAFETY = (
     Parameter("tool_frame", "", "frame of the poses and of the wrenches; empty: frame_id"),
     Parameter(
         "tool_transform",
-        list(_IDENTITY),
+        list(IDENTITY),
         "pose of tool_frame in frame_id: x y z [m] and quaternion x y z w",
     ),
     Parameter(
@@ -95,7 +93,7 @@ class Safety:
     delay: int = 1
     resolution: float = 1e-5
     frame: str = ""
-    transform: tuple[float, ...] = _IDENTITY
+    transform: tuple[float, ...] = IDENTITY
     wrench: str = "absolute"
 
     def observer(self, n_tools: int, period: float) -> Passivity | None:
@@ -129,16 +127,6 @@ def chosen_safety(value: dict[str, Any]) -> Safety:
         value["safety.delay"],
         value["safety.resolution"],
         value["tool_frame"],
-        _transform(value["tool_transform"]),
+        pose("tool_transform", value["tool_transform"]),
         value["tool_wrench"],
     )
-
-
-def _transform(numbers: Any) -> tuple[float, ...]:
-    found = tuple(float(number) for number in numbers)
-    square = sum(number * number for number in found[3:])
-    if len(found) != 7 or not all(map(math.isfinite, found)) or not abs(square - 1.0) < 2e-3:
-        raise ParameterError(
-            "parameter tool_transform: give x y z in metres and a quaternion x y z w of length 1"
-        )
-    return found

@@ -10,7 +10,7 @@ from typing import Any, get_args
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Shape, Tip
 from avatar_core.vademecum.accuracy import Budget, Cloud, Quantity
-from avatar_ros.framework.parameters import AUTOSTART, FRAME_ID, Parameter, ParameterError
+from avatar_ros.framework.parameters import AUTOSTART, FRAME_ID, IDENTITY, Parameter, ParameterError
 from avatar_ros.framework.saved_state import STATE_DIR
 from avatar_ros.loop.safety import SAFETY, Safety
 
@@ -54,6 +54,16 @@ TIP = (
 CONTACT = (
     AUTOSTART,
     FRAME_ID,
+    Parameter(
+        "parent_frame",
+        "world",
+        "frame in which tf_static says where the organ lies; empty, or tool_frame: it does not say",
+    ),
+    Parameter(
+        "parent_transform",
+        list(IDENTITY),
+        "pose of frame_id in parent_frame, for tf_static: x y z [m] and quaternion x y z w",
+    ),
     Parameter("tools", ["tool"], "names of the tools; the topics of each are below NAME/"),
     *TIP,
     Parameter(
@@ -149,6 +159,7 @@ class ContactSettings:
     """Parameters of the contact node; rates [Hz], times [s].
 
     scene : YAML, checked; empty for the natural effects of the vademecum
+    parent_frame, parent_transform : for tf2; the pose of the organ's frame there, or an empty name
     material : values chosen, by name of the coordinate; the others are those of the vademecum
     budget : of error and time; None for none
     """
@@ -168,6 +179,8 @@ class ContactSettings:
     cpu: int
     lock_memory: bool
     safety: Safety = field(default_factory=Safety)
+    parent_frame: str = ""
+    parent_transform: tuple[float, ...] = IDENTITY
 
 
 def chosen_tips(value: dict[str, Any], n_tools: int) -> tuple[Tip, ...]:

@@ -22,6 +22,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
+from tf2_msgs.msg import TFMessage
 
 from avatar_core.common.jit import load_compiler
 from avatar_core.contact import model as contact
@@ -47,6 +48,7 @@ from avatar_ros.loop.shown_modes import ShownModes
 from avatar_ros.loop.statistics import TimingRecord
 from avatar_ros.loop.tool_channel import ToolChannel, tool_channels
 from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_ros.nodes import contact_frames
 from avatar_ros.nodes.contact_parameters import read_contact
 from avatar_ros.nodes.contact_reports import ContactReports
 from avatar_ros.prepare import scenes
@@ -70,6 +72,7 @@ class ContactNode(ManagedNode):
         self._budget: BudgetRequests | None = None
         self._tools: list[ToolChannel] = []
         self._outputs: Publishers | None = None
+        self._frames: Any = None  # publisher of the static transforms
         self._timers: list[Any] = []
         self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
         self._least_error: dict[str, float] = {}  # of any detail of it, by quantity
@@ -110,6 +113,7 @@ class ContactNode(ManagedNode):
             self.ports.publisher(LoopStatistics, "statistics", qos.reports(_REPORT_PERIOD)),
             self.ports.publisher(DiagnosticArray, "/diagnostics", qos.reports(_REPORT_PERIOD)),
         )
+        self._frames = self.create_publisher(TFMessage, contact_frames.TOPIC, qos.LATCHED)
         self._loop = ContactLoop(settings, self._tools, self._outputs, self.context)
         request = PreparationRequest(
             topic=self.resolve_topic_name("vademecum"),
@@ -145,6 +149,8 @@ class ContactNode(ManagedNode):
     def activate(self) -> None:
         assert self._loop is not None and self._outputs is not None
         settings = self._loop.settings
+        stamp = self.get_clock().now().to_msg()
+        self._frames.publish(contact_frames.static_transforms(settings, stamp))
         granted = realtime.claim(settings.priority, settings.cpu, settings.lock_memory)
         for refusal in granted.refusals:
             self.get_logger().warning(refusal)
@@ -178,9 +184,9 @@ class ContactNode(ManagedNode):
         for tool in self._tools:
             self.destroy_subscription(tool.subscription)
             self.destroy_publisher(tool.publisher)
-        for publisher in vars(self._outputs).values() if self._outputs else ():
+        for publisher in (*(vars(self._outputs).values() if self._outputs else ()), self._frames):
             self.destroy_publisher(publisher)
-        self._tools, self._outputs = [], None
+        self._tools, self._outputs, self._frames = [], None, None
 
     def _take_model(self, prepared: PreparedModel) -> None:
         """Put a model into use between two steps; called in the supplier's thread.

@@ -12,7 +12,7 @@ from avatar_core.errors import SceneError
 from avatar_core.scene.file import parse_scene, read_scene, write_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.vademecum.accuracy import Cloud
-from avatar_ros.framework.parameters import ParameterError, frame, values
+from avatar_ros.framework.parameters import ParameterError, frame, pose, values
 from avatar_ros.loop.safety import chosen_safety
 from avatar_ros.loop.settings import (
     CONTACT,
@@ -64,6 +64,8 @@ def read_contact(node: Node, saved_scene: str = "") -> ContactSettings:
         cpu=value["realtime.cpu"],
         lock_memory=value["realtime.lock_memory"],
         safety=chosen_safety(value),
+        parent_frame=value["parent_frame"],
+        parent_transform=pose("parent_transform", value["parent_transform"]),
     )
     if saved_scene:
         kept = _with_scene(settings, lambda: parse_scene(saved_scene, "kept"))

@@ -1,0 +1,35 @@
+"""The frames of the cell for tf2: where the organ lies, and where the tools' frame lies in it."""
+
+from __future__ import annotations
+
+import math
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
+from tf2_msgs.msg import TFMessage
+
+from avatar_ros.loop.settings import ContactSettings
+
+TOPIC = "/tf_static"  # whatever the namespace of the node, as tf2 has it
+
+
+def static_transforms(settings: ContactSettings, stamp: Time) -> TFMessage:
+    """Organ in ``parent_frame``, tools' frame in the organ's; each only if it is another frame."""
+    organ, tools, parent = settings.frame_id, settings.safety.frame, settings.parent_frame
+    found = []
+    if parent not in ("", organ, tools):
+        found.append(_transform(parent, organ, settings.parent_transform, stamp))
+    if tools not in ("", organ):
+        found.append(_transform(organ, tools, settings.safety.transform, stamp))
+    return TFMessage(transforms=found)
+
+
+def _transform(parent: str, child: str, pose: tuple[float, ...], stamp: Time) -> TransformStamped:
+    """``pose`` is that of the child in the parent, x y z [m] and quaternion x y z w."""
+    made = TransformStamped(child_frame_id=child)
+    made.header.frame_id, made.header.stamp = parent, stamp
+    to, turn = made.transform.translation, made.transform.rotation
+    to.x, to.y, to.z = pose[:3]
+    norm = math.hypot(*pose[3:])
+    turn.x, turn.y, turn.z, turn.w = (number / norm for number in pose[3:])
+    return made
