@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -285,21 +286,23 @@ def diagnostics(probe: Any, hand: Hand, wanted: Any) -> dict[str, DiagnosticStat
 
 def test_diagnostics_say_what_is_shown_and_how_the_loop_is(probe: Any, hand: Hand) -> None:
     state, _ = felt(probe, hand)
-    found = diagnostics(probe, hand, lambda named: "contact: accuracy" in named)
-    accuracy = found["contact: accuracy"]
+    found = diagnostics(probe, hand, lambda named: "/contact: accuracy" in named)
+    accuracy = found["/contact: accuracy"]
     assert accuracy.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
     assert "modes shown" in accuracy.message
-    assert {v.key: v.value for v in found["contact: vademecum"].values}["id"] == state.vademecum_id
-    loop = {v.key: float(v.value) for v in found["contact: loop"].values}
+    assert {v.key: v.value for v in found["/contact: vademecum"].values}["id"] == state.vademecum_id
+    loop = {v.key: float(v.value) for v in found["/contact: loop"].values}
     assert loop["rate [Hz]"] == pytest.approx(1e6 / loop["period mean [us]"], rel=1e-3)
     assert loop["execution mean [us]"] <= loop["execution max [us]"]
 
 
 def test_diagnostics_name_a_fault_its_remedy_and_its_end(probe: Any, hand: Hand) -> None:
     hand.pose.header.frame_id = "world"
-    fault = diagnostics(probe, hand, lambda n: "another frame" in n["contact: tool"].message)
-    assert fault["contact: tool"].level == DiagnosticStatus.WARN
-    assert "tool_transform" in fault["contact: tool"].message
+    fault = diagnostics(probe, hand, lambda n: "another frame" in n["/contact: tool"].message)
+    assert fault["/contact: tool"].level == DiagnosticStatus.WARN
+    assert "tool_transform" in fault["/contact: tool"].message
     hand.pose.header.frame_id = "organ"
-    sound = diagnostics(probe, hand, lambda n: n["contact: tool"].level == DiagnosticStatus.OK)
-    assert sound["contact: tool"].message == "poses sound, force sent whole"
+    sound = diagnostics(probe, hand, lambda n: n["/contact: tool"].level == DiagnosticStatus.OK)
+    assert sound["/contact: tool"].message == "poses sound, force sent whole"
+    assert sound["/contact: tool"].hardware_id == "/tool"  # as its driver is called
+    assert sound["/contact: loop"].hardware_id == socket.gethostname()

@@ -49,7 +49,7 @@ def running(node: str, domain: dict[str, str], *values: str) -> Iterator[Module]
 
 def diagnosis(probe: Any, wanted: Any) -> DiagnosticStatus:
     def found(array: DiagnosticArray) -> DiagnosticStatus:
-        return next(s for s in array.status if s.name == "contact: quality of service")
+        return next(s for s in array.status if s.name == "/contact: quality of service")
 
     array = probe.next(DiagnosticArray, "/diagnostics", qos.STATISTICS, lambda a: wanted(found(a)))
     return found(array)

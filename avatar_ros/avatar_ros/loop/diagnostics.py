@@ -1,7 +1,11 @@
-"""Diagnostics of the contact node: levels, texts and numbers for `/diagnostics`."""
+"""Diagnostics of the contact node: levels, texts and numbers for `/diagnostics`.
+
+The hardware of a tool is where its driver has it, such as ``/MTML``; that of all else the host.
+"""
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -124,7 +128,8 @@ def tool_status(
         text = f"force limited to {guard.limits.force:g} N and {guard.limits.slew:g} N/s"
     elif not text:
         text, level = "poses sound, force sent whole", OK
-    return _status(f"{name}: {tool_name}", level, text, values)
+    hardware = tool.subscription.topic_name.rpartition("/")[0]
+    return _status(f"{name}: {tool_name}", level, text, values, hardware)
 
 
 def vademecum_status(name: str, identity: str, promise: str) -> DiagnosticStatus:
@@ -164,9 +169,17 @@ def accuracy_status(name: str, text: str, shedding: bool, window: LoopStatistics
     )
 
 
-def _status(name: str, level: bytes, text: str, values: dict[str, Any]) -> DiagnosticStatus:
+def _status(
+    name: str, level: bytes, text: str, values: dict[str, Any], hardware: str = ""
+) -> DiagnosticStatus:
     shown = [
         KeyValue(key=key, value=f"{value:.6g}" if isinstance(value, float) else str(value))
         for key, value in values.items()
     ]
-    return DiagnosticStatus(name=name, level=level, message=text, hardware_id="", values=shown)
+    return DiagnosticStatus(
+        name=name,
+        level=level,
+        message=text,
+        hardware_id=hardware or socket.gethostname(),
+        values=shown,
+    )

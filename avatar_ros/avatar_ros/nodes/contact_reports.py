@@ -63,7 +63,7 @@ class ContactReports:
         self, window: LoopStatistics, nominal: float, report: ShownModesReport | None
     ) -> None:
         node, loop, active = self._node, self._loop, self._loop.active
-        name = node.get_name()
+        name = node.get_fully_qualified_name()
         limits = {p.name: node.get_parameter(p.name).value for p in THRESHOLDS}
         promise = active.shown_modes.promise if active.shown_modes is not None else ""
         statuses = [
