@@ -20,6 +20,7 @@ from avatar_ros.framework import qos
 from avatar_ros.ui.colours import colours, table, top_for
 from visualization_msgs.msg import Marker
 
+from tests.ros.pages import entry, index, topic
 from tests.ros.test_cell import Hand, _wait_for_model
 from tests.slowness import within
 
@@ -97,9 +98,30 @@ def test_a_scale_ends_on_a_round_number_and_never_shrinks() -> None:
     assert top_for(1e-3, 5e-3) == 5e-3
 
 
-@pytest.mark.parametrize("name", ["organ.rviz", "organ.foxglove.json"])
-def test_the_files_for_viewers_name_the_topics(name: str) -> None:
-    text = (PARAMS / name).read_text()
-    assert (yaml.safe_load if name.endswith("rviz") else json.loads)(text)
-    for topic in ("/organ_deformed", "/organ_rest", "/tool/measured_cp"):
-        assert topic in text
+TOPICS = {"/organ_deformed", "/organ_rest", "/tool/measured_cp", "/tool/servo_cf"}
+
+
+def test_rviz_shows_all_of_it_and_is_matched() -> None:
+    """Displays as RViz 2 names them; a policy that a publisher does not offer hears nothing."""
+    displays = yaml.safe_load((PARAMS / "organ.rviz").read_text())["Visualization Manager"][
+        "Displays"
+    ]
+    kinds = {display["Class"].removeprefix("rviz_default_plugins/") for display in displays}
+    assert kinds >= {"Marker", "Pose", "Wrench", "TF"}
+    topics = {d["Topic"]["Value"]: d["Topic"] for d in displays if "Topic" in d}
+    assert topics.keys() == TOPICS
+    for name, policy in topics.items():
+        (row,) = (row for row in index() if topic(row) == name)
+        offered = entry(row["page"], "QoS")
+        if row["direction"] == "out" and policy["Reliability Policy"] == "Reliable":
+            assert offered.startswith("RELIABLE"), name
+        latched = policy["Durability Policy"] == "Transient Local"
+        assert latched == ("TRANSIENT_LOCAL" in offered), name
+
+
+def test_foxglove_shows_all_of_it_under_titles() -> None:
+    layout = json.loads((PARAMS / "organ.foxglove.json").read_text())
+    text = json.dumps(layout)
+    assert all(name in text for name in TOPICS)
+    for panel in layout["configById"].values():
+        assert panel["foxglovePanelTitle"]  # the key of a title that shows; "title" does not
