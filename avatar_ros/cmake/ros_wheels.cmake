@@ -6,7 +6,9 @@
 # they live in the Python prefix, and that prefix is not an ament workspace.
 
 find_package(Python3 REQUIRED COMPONENTS Interpreter)
-set(CMAKE_PROJECT_tf2_msgs_INCLUDE "${CMAKE_CURRENT_LIST_FILE}") # vendor/tf2_msgs needs it, too
+foreach(_package crtk_msgs tf2_msgs) # those in vendor/ need it, too
+  set(CMAKE_PROJECT_${_package}_INCLUDE "${CMAKE_CURRENT_LIST_FILE}")
+endforeach()
 
 # 1. The prefix the wheels' CMake packages are in.
 execute_process(

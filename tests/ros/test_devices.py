@@ -17,10 +17,12 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from avatar_ros.bench.cell import Module
 from avatar_ros.loop.safety import WRENCHES, Safety
 from avatar_ros.loop.tool_channel import ToolChannel
+from crtk_msgs.msg import OperatingState
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 
+from avatar_ros.msg import ContactState
 from tests.ros.conftest import PATIENT
 from tests.ros.test_poses import bench, pose
 
@@ -29,6 +31,8 @@ __all__ = ["bench"]  # a fixture
 
 DEVICES = Path(__file__).resolve().parents[2] / "params" / "devices"
 CRTK = QoSProfile(depth=10)  # of crtk_python_client: reliable, the last ten
+# Of what cisst-ros publishes when it changes.
+LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def wrench(raw: bytes) -> tuple[np.ndarray, np.ndarray]:
@@ -82,10 +86,15 @@ def test_a_driver_feels_the_organ_by_its_file(
     name: str,
     hears: str,
 ) -> None:
-    """Started by the lines of msg_docs/devices.md; poses at 500 Hz, as crtk's clients send them."""
+    """Started by the lines of msg_docs/devices.md; poses at 500 Hz, as crtk's clients send them.
+
+    It feels nothing before it says that it is enabled and homed, and nothing any more when it is
+    paused or in fault.
+    """
     frame = {"arm": "base", "omega": "omega_base", "MTML": "MTML_base"}[name]
     own = "body/servo_cf" if name == "MTML" else "servo_cf"
-    remaps = [f"tool/measured_cp:=/{name}/measured_cp", f"tool/{own}:=/{name}/{hears}"]
+    topics = {"measured_cp": "measured_cp", "operating_state": "operating_state", own: hears}
+    remaps = [f"tool/{ours}:=/{name}/{theirs}" for ours, theirs in topics.items()]
     arguments = ["--ros-args", "--params-file", str(DEVICES / file)]
     for remap in remaps:
         arguments += ["-r", remap]
@@ -97,7 +106,12 @@ def test_a_driver_feels_the_organ_by_its_file(
     ]
     node, felt = probe.node, []
     poses = node.create_publisher(PoseStamped, f"/{name}/measured_cp", CRTK)
+    states = node.create_publisher(OperatingState, f"/{name}/operating_state", LATCHED)
     node.create_subscription(WrenchStamped, f"/{name}/{hears}", felt.append, CRTK)
+    now = {"status": -1}
+    node.create_subscription(
+        ContactState, "contact_state", lambda state: now.update(status=state.status), CRTK
+    )
     turn = Rotation.from_euler("z", 0.5)
 
     def send() -> None:
@@ -110,8 +124,30 @@ def test_a_driver_feels_the_organ_by_its_file(
 
     node.create_timer(2e-3, send)
     limit = {"arm": 2.0, "omega": 12.0, "MTML": 3.0}[name]
+
+    def says(state: str, homed: bool) -> None:
+        states.publish(OperatingState(state=state, is_homed=homed))
+
+    def reaches(status: int) -> None:
+        probe.until(lambda: now["status"] == status, 60.0)
+
     try:
-        probe.until(lambda: bool(felt) and _size(felt[-1]) > 0.9 * min(limit, 3.0), 60.0)
+        reaches(ContactState.STATUS_NO_OPERATING_STATE)
+        for state, homed, status in (
+            ("DISABLED", False, ContactState.STATUS_NOT_ENABLED),
+            ("ENABLED", False, ContactState.STATUS_NOT_HOMED),
+        ):
+            says(state, homed)
+            reaches(status)
+        assert not any(_size(message) for message in felt)
+        says("ENABLED", True)
+        probe.until(lambda: _size(felt[-1]) > 0.9 * min(limit, 3.0), 60.0)
+        for state in ("PAUSED", "FAULT"):
+            says(state, True)
+            probe.until(lambda: _size(felt[-1]) == 0.0, 60.0)
+            reaches(ContactState.STATUS_NOT_ENABLED)
+            says("ENABLED", True)
+            probe.until(lambda: _size(felt[-1]) > 0.9 * min(limit, 3.0), 60.0)
     finally:
         assert [process.finish() for process in processes] == [0, 0]
     forces = np.array([_size(message) for message in felt])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,11 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.loop.contact_loop import ActiveModel
+from avatar_ros.loop.device import Device
 from avatar_ros.loop.safety import Safety
 from avatar_ros.loop.tool_channel import ToolChannel
+from builtin_interfaces.msg import Time
+from crtk_msgs.msg import OperatingState
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 
@@ -35,6 +39,7 @@ ENGAGING, BARRED = ContactState.STATUS_ENGAGING, ContactState.STATUS_OUT_OF_RANG
 SOON = round(1e3 * SETTLING)  # periods
 AGAIN = round(1e3 * (SETTLING + ENGAGEMENT)) + 2
 SAFETY = Safety(leap=0.02)
+READY = OperatingState(state="ENABLED", is_homed=True)
 Fault = Callable[[Any, np.ndarray], Any]
 
 
@@ -120,8 +125,42 @@ def lost(cell: Cell) -> tuple[int, np.ndarray]:
     return ContactState.STATUS_LOST_TOOL, found
 
 
+def heard(cell: Cell) -> Device:
+    """The device of the cell's tool, which said that it is ready."""
+    device = Device(cell.tool, (), Time)
+    device.hear(READY)
+    return device
+
+
+def paused(cell: Cell) -> tuple[int, np.ndarray]:
+    device = heard(cell)
+    device.hear(OperatingState(state="PAUSED", is_homed=True))
+    found = cell.hold(12)
+    device.hear(READY)
+    return ContactState.STATUS_NOT_ENABLED, found
+
+
+def unhomed(cell: Cell) -> tuple[int, np.ndarray]:
+    device = heard(cell)
+    device.hear(OperatingState(state="ENABLED"))
+    found = cell.hold(12)
+    device.hear(READY)
+    return ContactState.STATUS_NOT_HOMED, found
+
+
+def unheard(cell: Cell) -> tuple[int, np.ndarray]:
+    """Its driver goes away, but its poses do not."""
+    device = heard(cell)
+    device.subscription = SimpleNamespace(get_publisher_count=lambda: 0)
+    device.attend()
+    found = cell.hold(12)
+    device.hear(READY)
+    return ContactState.STATUS_NO_OPERATING_STATE, found
+
+
 @pytest.mark.parametrize(
-    "fault", [silence, broken, foreign, leap, second_publisher, standstill, lost]
+    "fault",
+    [silence, broken, foreign, leap, second_publisher, standstill, lost, paused, unhomed, unheard],
 )
 def test_a_fault_ends_the_force_within_10_ms_and_it_comes_back_softly(
     cell: Cell, fault: Callable[[Cell], tuple[int, np.ndarray]]
@@ -142,6 +181,20 @@ def test_a_fault_ends_the_force_within_10_ms_and_it_comes_back_softly(
     grown = np.linalg.norm(cell.hold(AGAIN)[:, 1:], axis=1)
     assert grown[-1] == pytest.approx(np.linalg.norm(cell.force), rel=1e-6)
     assert np.diff(grown).max() < 0.06 * grown[-1]
+
+
+def test_a_device_that_is_not_ready_leaves_the_organ_pressed(cell: Cell) -> None:
+    heard(cell).hear(OperatingState(state="FAULT", is_homed=True))
+    found = cell.hold(30)
+    assert (found[:, 0] == ContactState.STATUS_NOT_ENABLED).all() and not found[10:, 1:].any()
+    assert np.linalg.norm(cell.loop.active.model.out.force[0]) > 1.0
+
+
+def test_what_the_poses_lack_is_said_before_what_the_device_does(cell: Cell) -> None:
+    heard(cell).hear(OperatingState(state="DISABLED"))
+    assert cell.hold(1, lambda: pose(cell.tip, frame="world"))[0, 0] == (
+        ContactState.STATUS_UNKNOWN_FRAME
+    )
 
 
 def test_a_tool_that_starts_again_is_one_publisher(cell: Cell) -> None:

@@ -19,6 +19,7 @@ from avatar_ros.framework.parameters import IDENTITY
 from avatar_ros.loop.safety import Safety
 from avatar_ros.nodes.contact_frames import static_transforms
 from builtin_interfaces.msg import Time
+from crtk_msgs.msg import OperatingState, StringStamped
 from geometry_msgs.msg import TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
@@ -29,7 +30,11 @@ pytestmark = pytest.mark.ros
 
 LISTENER = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # tf2's of tf_static
 # Of the originals, RIHS01 (REP 2016).
-HASHES = {TFMessage: "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"}
+HASHES = {
+    OperatingState: ("5cc57eea589b217fe5194bf2735b91d4a7f2dd5ac1245ae657f7ea7590c2c80e"),
+    StringStamped: ("83efb802e6596e03f69ac322e3231037329946f2bd13ed48874d97f5b8f5db1d"),
+    TFMessage: "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+}
 
 
 @contextmanager

@@ -276,7 +276,7 @@ class ContactLoop:
             wrench.force[:] = self._forces[i]
             wrench.torque[:] = 0.0 if model is None else model.out.torque[i]
             guard.limits = limits
-            guard.update(now, tool.status == OK and not self._stopping, wrench.force, wrench.torque)
+            guard.update(now, tool.fault == OK and not self._stopping, wrench.force, wrench.torque)
             if energies is not None:
                 energies.held[i, -1] = wrench.force
             tool.answer()
@@ -292,7 +292,7 @@ class ContactLoop:
         """Send the status and the contacts of one tool. Real-time safe."""
         template = active.states[i]
         guard = self.guards[i]
-        status = tool.status
+        status = tool.fault
         if self._stopping:
             status = INACTIVE
         elif active.model is None:

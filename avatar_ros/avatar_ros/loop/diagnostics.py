@@ -15,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from avatar_core.contact.haptics.force_guard import ForceGuard
 from avatar_core.contact.haptics.passivity import Passivity
+from avatar_ros.loop.device import OF_DEVICE
 from avatar_ros.loop.statuses import explanation
 from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.msg import ContactState, LoopStatistics
@@ -24,10 +25,14 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults of one tool in a window: how often each status was entered, and the present status."""
+    """Faults of one tool in a window: how often each status was entered, and the present one.
+
+    said : the operating state of its device, in words; empty if it is not asked or said none
+    """
 
     counts: dict[int, int]
     status: int
+    said: str = ""
 
     @property
     def text(self) -> str:
@@ -35,7 +40,10 @@ class Faults:
         status = self.status
         if status == ContactState.STATUS_OK and self.counts:
             status = max(self.counts, key=lambda key: self.counts[key])
-        return "" if status == ContactState.STATUS_OK else f"no force: {explanation(status)}"
+        if status == ContactState.STATUS_OK:
+            return ""
+        said = f" (it says {self.said})" if self.said and status in OF_DEVICE else ""
+        return f"no force: {explanation(status)}{said}"
 
 
 class FaultCounter:
@@ -53,7 +61,7 @@ class FaultCounter:
             new = now - self._seen[i]
             self._seen[i] = now
             counts = {int(k): int(new[k]) for k in np.flatnonzero(new) if k != 0}
-            found.append(Faults(counts, tool.status))
+            found.append(Faults(counts, tool.fault, tool.operating_state))
         return found
 
 
@@ -119,6 +127,8 @@ def tool_status(
         "largest force [N]": guard.limits.force,
         "largest slew [N/s]": guard.limits.slew,
     }
+    if tool.operating_state:
+        values["operating state"] = tool.operating_state
     values |= {f"status {key} entered": count for key, count in faults.counts.items()}
     if energies is not None:
         values["energy put in by the tool [mJ]"] = 1e3 * float(energies.energy[i])

@@ -12,6 +12,8 @@ from avatar_ros.framework.parameters import IDENTITY, Parameter, ParameterError,
 PASSIVITY = ("off", "observe", "control")
 # How a wrench is given, and the topic below that of the tool, as CRTK calls them.
 WRENCHES = {"absolute": "servo_cf", "body": "body/servo_cf", "spatial": "spatial/servo_cf"}
+# What tool_state_command may ask for, and the commands of CRTK that it takes.
+COMMANDS: dict[str, tuple[str, ...]] = {"": (), "enable": ("enable",), "home": ("enable", "home")}
 _DEVICE = "sigma"
 
 SAFETY = (
@@ -71,6 +73,17 @@ SAFETY = (
         "how wrenches are given: absolute (axes of tool_frame, about the pose), body (axes of the "
         "pose, about it) or spatial (axes and origin of tool_frame)",
     ),
+    Parameter(
+        "tool_operating_state",
+        False,
+        "hear NAME/operating_state, and send no force until the device is enabled and homed",
+    ),
+    Parameter(
+        "tool_state_command",
+        "",
+        "what a device that is not ready is asked for, once after activation, on "
+        "NAME/state_command: enable or home (it may move); empty: nothing",
+    ),
 )
 
 
@@ -85,6 +98,8 @@ class Safety:
     frame : of the poses; empty for the organ's
     transform : pose of that frame in the organ's, x y z [m] and quaternion x y z w
     wrench : one of ``WRENCHES``
+    hears_state : whether devices have to say that they are enabled and homed
+    commands : those of ``COMMANDS`` that a device may be sent
     """
 
     limits: ForceLimits = DEVICES[_DEVICE]
@@ -95,6 +110,8 @@ class Safety:
     frame: str = ""
     transform: tuple[float, ...] = IDENTITY
     wrench: str = "absolute"
+    hears_state: bool = False
+    commands: tuple[str, ...] = ()
 
     def observer(self, n_tools: int, period: float) -> Passivity | None:
         """The observer of the energies; None if passivity is off."""
@@ -117,6 +134,14 @@ def chosen_safety(value: dict[str, Any]) -> Safety:
         raise ParameterError(f"parameter safety.passivity: give one of {', '.join(PASSIVITY)}")
     if value["tool_wrench"] not in WRENCHES:
         raise ParameterError(f"parameter tool_wrench: give one of {', '.join(WRENCHES)}")
+    command, hears_state = value["tool_state_command"], value["tool_operating_state"]
+    if command not in COMMANDS:
+        raise ParameterError("parameter tool_state_command: give enable, home or an empty text")
+    if command and not hears_state:
+        raise ParameterError(
+            "parameter tool_state_command: set tool_operating_state to true, which tells when "
+            "the device needs it"
+        )
     limits = ForceLimits(
         value["safety.max_force"] or device.force, value["safety.max_slew"] or device.slew
     )
@@ -129,4 +154,6 @@ def chosen_safety(value: dict[str, Any]) -> Safety:
         value["tool_frame"],
         pose("tool_transform", value["tool_transform"]),
         value["tool_wrench"],
+        hears_state,
+        COMMANDS[command],
     )

@@ -45,6 +45,18 @@ EXPLANATIONS: dict[int, tuple[str, str]] = {
         "no node sends poses of the tool any more",
         "start its driver again",
     ),
+    ContactState.STATUS_NO_OPERATING_STATE: (
+        "the tool's device has not said in what state it is",
+        "start its driver, remap NAME/operating_state to it, or set tool_operating_state to false",
+    ),
+    ContactState.STATUS_NOT_ENABLED: (
+        "the tool's device is not enabled",
+        "enable it, or resume it if it was paused, at its console or by NAME/state_command",
+    ),
+    ContactState.STATUS_NOT_HOMED: (
+        "the tool's device is not homed",
+        "home it at its console, by hand or by NAME/state_command, as its maker says",
+    ),
     ContactState.STATUS_INACTIVE: ("the contact node is being stopped", "activate it again"),
 }
 

@@ -51,6 +51,8 @@ class ToolChannel:
     status : OK with a usable pose, otherwise the reason why there is none
     stamp : of the last valid pose, eight bytes; zero before the first
     publishers : of its poses, as the node last counted them; one that was killed counts for a while
+    device : OK if its device takes forces or is not asked, otherwise why it does not; the node's
+    operating_state : what its device said last, in words; empty before, the node's likewise
     faults : how often each status was entered since the node started, by its number
     """
 
@@ -65,6 +67,8 @@ class ToolChannel:
         self.status = NO_POSE
         self.stamp = NO_STAMP
         self.publishers = 1
+        self.device = OK
+        self.operating_state = ""
         self.faults = np.zeros(_N_STATUS, np.int64)
         self._reader = PoseReader(frame)
         self._rotation = _rotation(safety.transform[3:])  # of the tool's frame in the organ's
@@ -81,6 +85,11 @@ class ToolChannel:
         self._orientation: tuple[float, float, float, float] | None = None  # of the last valid pose
         self._kind = safety.wrench
         self._axes = (0.0, 0.0, 0.0, 1.0)  # of the last valid pose, as long as the channel exists
+
+    @property
+    def fault(self) -> int:
+        """Why no force is sent, for its poses or else its device; OK if it is. Real-time safe."""
+        return self.status if self.status != OK else self.device
 
     def take(
         self, now: int, timeout: int, tip: np.ndarray, turn: np.ndarray, leap: float = math.inf

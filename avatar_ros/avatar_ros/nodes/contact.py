@@ -35,6 +35,7 @@ from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop, Publishers
+from avatar_ros.loop.device import Device, devices
 from avatar_ros.loop.safety import SAFETY, chosen_safety
 from avatar_ros.loop.settings import (
     CHANGEABLE,
@@ -71,6 +72,7 @@ class ContactNode(ManagedNode):
         self._supplier: ModelSupplier | None = None
         self._budget: BudgetRequests | None = None
         self._tools: list[ToolChannel] = []
+        self._devices: list[Device] = []
         self._outputs: Publishers | None = None
         self._frames: Any = None  # publisher of the static transforms
         self._timers: list[Any] = []
@@ -105,6 +107,7 @@ class ContactNode(ManagedNode):
             passivity.warm_up()
         period = 1.0 / settings.rate
         self._tools = tool_channels(self.ports, settings)
+        self._devices = devices(self, settings, self._tools)
         self._outputs = Publishers(
             self.ports.publisher(
                 ContactState, "contact_state", qos.states(len(self._tools), period)
@@ -157,7 +160,11 @@ class ContactNode(ManagedNode):
         realtime.tune_interpreter()
         self._loop.record = TimingRecord(time.monotonic_ns())
         self._loop.start(granted.cpu)
-        reports = ContactReports(self, self._loop, self._tools, self._outputs, self.ports)
+        for device in self._devices:
+            device.begin()
+        reports = ContactReports(
+            self, self._loop, self._tools, self._devices, self._outputs, self.ports
+        )
         self._timers = [
             self.create_timer(_REPORT_PERIOD, reports.publish),
             self.create_timer(_COUNT_PERIOD, reports.count_publishers),
@@ -181,12 +188,13 @@ class ContactNode(ManagedNode):
             self._supplier = self._budget = None
             self._scene = ""
         self._loop = None
-        for tool in self._tools:
-            self.destroy_subscription(tool.subscription)
-            self.destroy_publisher(tool.publisher)
+        ends: list[Any] = [*self._tools, *self._devices]
+        for end in ends:
+            self.destroy_subscription(end.subscription)
+            self.destroy_publisher(end.publisher)
         for publisher in (*(vars(self._outputs).values() if self._outputs else ()), self._frames):
             self.destroy_publisher(publisher)
-        self._tools, self._outputs, self._frames = [], None, None
+        self._tools, self._devices, self._outputs, self._frames = [], [], None, None
 
     def _take_model(self, prepared: PreparedModel) -> None:
         """Put a model into use between two steps; called in the supplier's thread.

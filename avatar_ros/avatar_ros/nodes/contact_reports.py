@@ -12,6 +12,7 @@ from rclpy.node import Node
 from avatar_ros.framework.ports import Ports
 from avatar_ros.loop import diagnostics
 from avatar_ros.loop.contact_loop import ContactLoop, Publishers
+from avatar_ros.loop.device import Device
 from avatar_ros.loop.settings import THRESHOLDS
 from avatar_ros.loop.shown_modes import ShownModesReport
 from avatar_ros.loop.statistics import TimingRecord, statistics
@@ -24,6 +25,7 @@ _MINUTE = 60.0  # [s]
 class ContactReports:
     """Summarises the loop's last window, chooses the modes of the next, and publishes both.
 
+    devices : of the tools, whose operating states are heard; none if they are not asked
     ports : of the node, whose mismatches are reported
     """
 
@@ -32,11 +34,12 @@ class ContactReports:
         node: Node,
         loop: ContactLoop,
         tools: Sequence[ToolChannel],
+        devices: Sequence[Device],
         publishers: Publishers,
         ports: Ports,
     ) -> None:
         self._node, self._loop, self._tools = node, loop, tools
-        self._publishers, self._ports = publishers, ports
+        self._devices, self._publishers, self._ports = devices, publishers, ports
         self._faults = diagnostics.FaultCounter(tools)
         self._logged: dict[str, str] = {}  # last fault, by tool
         self._shown_modes_log = ShownModesLog(node)
@@ -93,12 +96,14 @@ class ContactReports:
             if text:
                 self._node.get_logger().warning(f"{tool}: {text}")
             else:
-                self._node.get_logger().info(f"{tool}: poses are sound again")
+                self._node.get_logger().info(f"{tool}: the fault is over")
 
     def count_publishers(self) -> None:
-        """Note how many nodes send poses of each tool."""
+        """Note how many nodes send poses of each tool, and which devices are still there."""
         for tool in self._tools:
             tool.publishers = tool.subscription.get_publisher_count()
+        for device in self._devices:
+            device.attend()
 
 
 class ShownModesLog:

@@ -43,6 +43,9 @@ _PLACED = frozenset(
         ContactState.STATUS_OUT_OF_RANGE,
         ContactState.STATUS_EXTRAPOLATED,
         ContactState.STATUS_ENGAGING,
+        ContactState.STATUS_NO_OPERATING_STATE,
+        ContactState.STATUS_NOT_ENABLED,
+        ContactState.STATUS_NOT_HOMED,
     )
 )
 # Deeper than the publisher's queue: a recording that lost a period cannot be replayed.

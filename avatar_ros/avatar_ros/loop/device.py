@@ -1,0 +1,106 @@
+"""The device of a tool as its driver describes it, by ``operating_state`` and ``state_command``.
+
+A device is ready, as CRTK has it, when it is enabled and homed. Drivers say so when it changes and
+keep the last word for late listeners: how old it is means nothing, that its publisher is gone does.
+All of this is the node's; the loop reads ``ToolChannel.device``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from crtk_msgs.msg import OperatingState, StringStamped
+from rclpy.node import Node
+
+from avatar_ros.framework import qos
+from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.tool_channel import OK, ToolChannel
+from avatar_ros.msg import ContactState
+
+NOTHING_SAID = int(ContactState.STATUS_NO_OPERATING_STATE)
+NOT_ENABLED = int(ContactState.STATUS_NOT_ENABLED)
+NOT_HOMED = int(ContactState.STATUS_NOT_HOMED)
+OF_DEVICE = (NOTHING_SAID, NOT_ENABLED, NOT_HOMED)
+
+_STATES = ("DISABLED", "ENABLED", "PAUSED", "FAULT")
+
+
+class Device:
+    """Hears one device, tells its tool's channel, and sends it the commands that were asked for.
+
+    A command is sent once after ``begin``, to a device that says it needs it: ``enable`` if it is
+    disabled, ``home`` if it is enabled, idle and not homed. One that was ready is sent nothing any
+    more, nor is one that is paused or in fault: somebody decided that.
+
+    subscription, publisher : of the two topics, made by :func:`devices`; None without commands
+    """
+
+    def __init__(
+        self, tool: ToolChannel, commands: tuple[str, ...], now: Callable[[], Time]
+    ) -> None:
+        self.subscription: Any = None
+        self.publisher: Any = None
+        self._tool = tool
+        self._commands, self._now = commands, now
+        self._to_send: tuple[str, ...] = ()
+        self._wanted = ""  # the command that the device needs
+        tool.device = NOTHING_SAID
+
+    def begin(self) -> None:
+        """Send commands from now on."""
+        self._to_send = self._commands
+
+    def hear(self, message: OperatingState) -> None:
+        """Take what the device says."""
+        state = message.state if message.state in _STATES else "an unknown state"
+        self._tool.operating_state = f"{state}, {'' if message.is_homed else 'not '}homed"
+        self._wanted = ""
+        if state != "ENABLED":
+            self._tell(NOT_ENABLED)
+            self._wanted = "enable" if state == "DISABLED" else ""
+        elif not message.is_homed:
+            self._tell(NOT_HOMED)
+            self._wanted = "" if message.is_busy else "home"
+        else:
+            self._tell(OK)
+            self._to_send = ()
+
+    def attend(self) -> str:
+        """Forget a device that is gone; returns the command that was sent, or an empty text."""
+        if self.subscription.get_publisher_count() == 0:
+            self._tool.operating_state = self._wanted = ""
+            self._tell(NOTHING_SAID)
+        command = self._wanted
+        if command not in self._to_send or self.publisher.get_subscription_count() == 0:
+            return ""
+        self._to_send = tuple(each for each in self._to_send if each != command)
+        message = StringStamped(string=command)
+        message.header.stamp = self._now()
+        self.publisher.publish(message)
+        return command
+
+    def _tell(self, status: int) -> None:
+        if status not in (OK, self._tool.device):
+            self._tool.faults[status] += 1
+        self._tool.device = status
+
+
+def devices(node: Node, settings: ContactSettings, tools: Sequence[ToolChannel]) -> list[Device]:
+    """The devices of all tools; none unless ``tool_operating_state`` asks for them."""
+    safety = settings.safety
+    if not safety.hears_state:
+        return []
+    made = []
+    for name, tool in zip(settings.tools, tools, strict=True):
+        device = Device(tool, safety.commands, lambda: node.get_clock().now().to_msg())
+        device.subscription = node.create_subscription(
+            OperatingState, f"{name}/operating_state", device.hear, qos.LATCHED
+        )
+        if safety.commands:
+            device.publisher = node.create_publisher(
+                StringStamped, f"{name}/state_command", qos.COMMAND
+            )
+        made.append(device)
+    return made
