@@ -15,6 +15,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
 from avatar_ros.framework.parameters import IDENTITY
 from avatar_ros.loop.safety import Safety
 from avatar_ros.nodes.contact_frames import static_transforms
@@ -24,6 +25,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
+from avatar_ros.msg import ContactState
 from tests.ros.refusals import refusal
 
 pytestmark = pytest.mark.ros
@@ -41,8 +43,11 @@ HASHES = {
 def contact(domain: dict[str, str], *values: str) -> Iterator[Module]:
     words = [word for value in values for word in ("-p", value)]
     process = Module("contact", ["--ros-args", *words] if words else [], domain)
-    yield process
-    assert process.finish() == 0
+    try:
+        yield process
+    finally:
+        code = process.finish()
+    assert code == 0
 
 
 def heard(probe: Any) -> dict[tuple[str, str], tuple[np.ndarray, Rotation]]:
@@ -60,8 +65,7 @@ def test_a_late_listener_learns_where_the_organ_lies(
     own_domain: dict[str, str], probe: Any
 ) -> None:
     with contact(own_domain):
-        probe.until(lambda: probe.node.count_publishers("/tf_static") > 0, 60.0)
-        probe.spin(0.5)  # late
+        probe.next(ContactState, "contact_state", qos.state(1))  # it is active
         found = heard(probe)
     assert found.keys() == {("world", "organ")}
     position, turn = found["world", "organ"]
