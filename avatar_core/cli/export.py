@@ -1,4 +1,5 @@
-"""``avatar export``: a vademecum as a mesh for ParaView, or as deformed surfaces for 3D Slicer."""
+"""``avatar export``: a vademecum as a mesh for ParaView, or as deformed surfaces for 3D Slicer; a
+recording as MCAP."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import require_output
 from avatar_core.cli.vademecum import require
 
@@ -16,14 +18,17 @@ if TYPE_CHECKING:
 
 
 def export(
-    file: Annotated[Path, typer.Argument(help="vademecum to export (.h5)")],
+    file: Annotated[
+        Path, typer.Argument(help="vademecum, or recording of the planning page (.h5)")
+    ],
     output: Annotated[
         Path,
         typer.Option(
             "-o",
             "--output",
             help="file to write: .vtu or .xdmf, the organ at rest with displacement and modes; "
-            ".stl or .obj, the deformed surface, and structures inside in files of their own",
+            ".stl or .obj, the deformed surface, and structures inside in files of their own; "
+            ".mcap, a recording as a bag of ROS 2",
         ),
     ],
     at: Annotated[
@@ -45,7 +50,9 @@ def export(
         str, typer.Option(help="of surfaces: LPS or RAS, which the header states")
     ] = "LPS",
 ) -> None:
-    """Export an organ under a load: a mesh for ParaView, or deformed surfaces for 3D Slicer."""
+    """Export an organ under a load: a mesh for ParaView, or deformed surfaces for 3D Slicer. Export
+    a recording as MCAP."""
+    from avatar_core.bags.files import MCAP
     from avatar_core.contact.tool_path import middle_of_access
     from avatar_core.geometry.surface import METRES
     from avatar_core.scene.export import DISPLACEMENT, FORMATS, organ_mesh, write_mesh
@@ -55,9 +62,12 @@ def export(
     require(modes >= 0, f"--modes is {modes}; ask for 0 or more")
     require(unit in METRES, f"--unit is {unit}; choose {', '.join(METRES)}")
     require(axes in AXES, f"--axes is {axes}; choose {' or '.join(AXES)}")
-    require_output(output, [*FORMATS, *SURFACE_FORMATS], [file])
-    newtons = _numbers("--force", force, (1, 3), "one number or three, as 0,-1,0.5")
-    given = None if at is None else _numbers("--at", at, (3,), "three numbers, as 0,0.07,0.005")
+    require_output(output, [*FORMATS, *SURFACE_FORMATS, MCAP], [file])
+    if output.suffix == MCAP:
+        _export_recording(file, output)
+        return
+    newtons = numbers("--force", force, (1, 3), "one number or three, as 0,-1,0.5")
+    given = None if at is None else numbers("--at", at, (3,), "three numbers, as 0,0.07,0.005")
     vademecum = load_vademecum(file)
     point = vademecum.surface.centers[middle_of_access(vademecum)] if given is None else given
     if output.suffix in FORMATS:
@@ -73,6 +83,17 @@ def export(
         ).items():
             print(f"{path}: {len(vertices)} vertices, deformed, in {unit} and {axes}")
     _say_load(vademecum, point, newtons, float((displacement**2).sum(axis=1).max() ** 0.5))
+
+
+def _export_recording(file: Path, output: Path) -> None:
+    from avatar_core.bags.write import write_mcap
+    from avatar_core.scene.recording import load_recording
+
+    recording = load_recording(file)
+    write_mcap(recording, output)
+    n_clouds = len(recording.clouds.period)
+    without = f", without {n_clouds} clouds" if n_clouds else ""
+    print(f"{output}: {len(recording.periods)} periods in {recording.seconds:.1f} s{without}")
 
 
 def _say_load(vademecum: Vademecum, point: Any, newtons: list[float], moved: float) -> None:
@@ -98,16 +119,3 @@ def _say_load(vademecum: Vademecum, point: Any, newtons: list[float], moved: flo
             "than small strains allow; press with less force",
             file=sys.stderr,
         )
-
-
-def _numbers(option: str, text: str, counts: tuple[int, ...], remedy: str) -> list[float]:
-    """The numbers of an option, separated by commas.
-
-    Raises AvatarError, with the remedy, unless there are as many as one of the counts.
-    """
-    try:
-        numbers = [float(number) for number in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    require(len(numbers) in counts, f"{option} is '{text}'; give {remedy}")
-    return numbers

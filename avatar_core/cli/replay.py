@@ -1,47 +1,209 @@
-"""``avatar replay``: compute a recording of the planning page again."""
+"""``avatar replay``: compute the forces along a recording or a bag again."""
 
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from avatar_core.errors import AvatarError
+from avatar_core.cli.numbers import numbers
+from avatar_core.cli.vademecum import require
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from avatar_core.bags.read import Bag
+    from avatar_core.contact.haptics.force_guard import ForceLimits
+    from avatar_core.scene.recording import Recording
+    from avatar_core.scene.replay import Replayed
+    from avatar_core.vademecum.model import Vademecum
+
+_BAR_FROM = 2.0  # [s]
 
 
 def replay(
-    file: Annotated[Path, typer.Argument(help="recording of the planning page (.h5)")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="recording of the planning page (.h5), or a bag of ROS 2: its folder, .mcap or "
+            ".db3"
+        ),
+    ],
     vademecum: Annotated[Path, typer.Option(help="vademecum with which it was recorded (.h5)")],
     tolerance: Annotated[
         float, typer.Option(help="largest permitted difference of a force [N]")
     ] = 1e-9,
+    tool: Annotated[
+        str | None,
+        typer.Option(help="of a bag of several tools: NAME of the topics NAME/measured_cp"),
+    ] = None,
+    scene: Annotated[
+        str | None,
+        typer.Option(
+            help="of a bag: scene that ran, a file or the name of one that comes with avatar; "
+            "default: a sphere of 5 mm and the natural effects of the vademecum"
+        ),
+    ] = None,
+    tool_transform: Annotated[
+        str | None,
+        typer.Option(
+            help="of a bag: pose of the poses' frame in the organ's, x,y,z [m] and quaternion "
+            "x,y,z,w, as the node's parameter tool_transform"
+        ),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="of a bag: of the contact loop [Hz]; default: as it shows")
+    ] = None,
+    device: Annotated[
+        str,
+        typer.Option(
+            help="of a bag without contact_state: safety.device of the contact node, whose limits "
+            "the forces kept: touch, omega or sigma"
+        ),
+    ] = "sigma",
 ) -> None:
     """Compute the forces along a recorded path again, and compare them with the recorded ones."""
+    from avatar_core.bags.files import is_bag
+    from avatar_core.contact.haptics.force_guard import DEVICES
+
+    require(rate is None or 100.0 <= rate <= 2000.0, f"--rate is {rate} Hz; give 100 to 2000")
+    require(device in DEVICES, f"--device is {device}; choose {', '.join(DEVICES)}")
+    transform = None
+    if tool_transform is not None:
+        remedy = "seven numbers, as 0,0,0.1,0,0,0,1"
+        transform = tuple(numbers("--tool-transform", tool_transform, (7,), remedy))
+    if is_bag(file):
+        how = _How(tool, scene, transform, rate, DEVICES[device])
+        _replay_bag(file, vademecum, how, tolerance)
+    else:
+        _replay_recording(file, vademecum, tolerance)
+
+
+def _replay_recording(file: Path, vademecum: Path, tolerance: float) -> None:
     from avatar_core.scene.recording import load_recording
-    from avatar_core.scene.replay import replay as replayed
-    from avatar_core.scene.replay import why_not
+    from avatar_core.scene.replay import replay, why_not
     from avatar_core.vademecum.storage import load_vademecum
 
     recording = load_recording(file)
-    found = replayed(recording, load_vademecum(vademecum))
-    periods = recording.periods
-    size = (periods.force**2).sum(axis=2) ** 0.5
+    organ = load_vademecum(vademecum)
+    with _bar("periods") as progress:
+        found = replay(recording, organ, progress)
+    _say(recording, recording.periods.force)
+    _compare(file, recording, found, why_not(recording), tolerance)
+
+
+class _How(NamedTuple):
+    """How a bag is read; see the options of the command."""
+
+    tool: str | None
+    scene: str | None
+    transform: tuple[float, ...] | None
+    rate: float | None
+    limits: ForceLimits
+
+
+def _replay_bag(file: Path, vademecum: Path, how: _How, tolerance: float) -> None:
+    from avatar_core.bags.compare import comparable, why_not
+    from avatar_core.bags.periods import path_of
+    from avatar_core.bags.read import read_bag
+    from avatar_core.scene.replay import replay
+    from avatar_core.vademecum.storage import load_vademecum
+
+    organ = load_vademecum(vademecum)
+    with _bar("messages") as progress:
+        bag = read_bag(file, how.tool, progress)
+    identity = _identity(bag, organ)
+    path = path_of(bag, _scene_of(bag, how.scene, organ), organ.id, how.transform, how.rate)
+    with _bar("periods") as progress:
+        replayed = replay(path.recording, organ, progress)
+    recorded = path.answers != "poses"
+    _say(path.recording, path.recording.periods.force if recorded else replayed.force)
+    for note in (_COMPARED[path.answers], *identity, *bag.notes, *path.notes):
+        print(f"  {note}")
+    if recorded:
+        found = comparable(path, replayed, how.limits)
+        _compare(file, path.recording, found, why_not(path), tolerance)
+
+
+_COMPARED = {
+    "states": "compared with the computed forces, from contact_state",
+    "wrenches": "no contact_state: compared with the wrenches where no limit or fault alters them",
+    "poses": "no forces in the bag: those above are computed, and compared with nothing",
+}
+
+
+def _identity(bag: Bag, organ: Vademecum) -> list[str]:
+    """Refuse another vademecum than the bag names; what the bag leaves open."""
+    ids = bag.vademecum_ids
+    if not ids:
+        return ["no vademecum_info in the bag: whether it was made with this vademecum is unknown"]
+    require(
+        organ.id in ids,
+        f"{bag.path} was made with the vademecum {', '.join(one[:12] for one in ids[:5])}, this is "
+        f"{organ.name!r} ({organ.id[:12]}); give the one it was made with",
+    )
+    others = len(ids) - 1
+    return [f"{others} more vademecums are named in the bag"] if others else []
+
+
+def _scene_of(bag: Bag, name: str | None, organ: Vademecum) -> str:
+    """The scene of one tool that is given, that the bag holds, or the default, as YAML."""
+    from avatar_core.contact.effects.selection import default_effects
+    from avatar_core.scene.file import read_scene, scene_path, write_scene
+    from avatar_core.scene.model import Scene
+
+    if name is None and bag.about is not None:
+        return bag.about.scene
+    if name is None:
+        return write_scene(Scene(effects=default_effects(organ, 1)))
+    scene = read_scene(scene_path(name))
+    require(
+        len(scene.tools) == 1,
+        f"{name} has {len(scene.tools)} tools, a bag is replayed for one; give a scene of one tool",
+    )
+    return write_scene(scene)
+
+
+def _say(recording: Recording, force: np.ndarray) -> None:
+    periods, size = recording.periods, (force**2).sum(axis=2) ** 0.5
+    n_clouds = len(recording.clouds.period)
     print(
         f"{recording.vademecum_name} ({recording.vademecum_id[:12]}): {len(periods)} periods, "
         f"{int(periods.lost.sum())} lost, in {recording.seconds:.1f} s (nominally "
-        f"{recording.rate:g} Hz), {len(recording.clouds.period)} clouds"
+        f"{recording.rate:g} Hz), {n_clouds} clouds"
     )
     print(f"  largest force {size.max():.3f} N, in contact {(size > 0).any(axis=1).mean():.0%}")
+
+
+def _compare(
+    file: Path, recording: Recording, found: Replayed, why_not: str, tolerance: float
+) -> None:
     difference = found.difference(recording)
-    if math.isnan(difference):
-        raise AvatarError(f"{file}: nothing can be compared: {why_not(recording)}")
+    require(not math.isnan(difference), f"{file}: nothing can be compared: {why_not}")
     print(
         f"  {int(found.known.sum())} periods can be compared: largest difference {difference:.2e} N"
     )
-    if difference > tolerance:
-        raise AvatarError(
-            f"{file}: forces differ by {difference:.2e} N, above {tolerance:g} N; replay with the "
-            "version of avatar, and on the kind of processor, that recorded"
-        )
+    require(
+        difference <= tolerance,
+        f"{file}: forces differ by {difference:.2e} N, above {tolerance:g} N; replay with the "
+        "version of avatar, and on the kind of processor, that recorded",
+    )
+
+
+@contextmanager
+def _bar(unit: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar that appears after ``_BAR_FROM`` seconds."""
+    from tqdm import tqdm
+
+    with tqdm(unit=f" {unit}", file=sys.stderr, disable=None, delay=_BAR_FROM, leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = max(total, done)
+            bar.update(done - bar.n)
+
+        yield show

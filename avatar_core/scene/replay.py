@@ -15,6 +15,7 @@ compared before the force guard, whose state (limits, ramps, engagement) is not 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +31,7 @@ from avatar_core.vademecum.model import Vademecum
 
 _REMEMBER_FOR_EVER = ("viscoelasticity", "inertia")
 _RECORDED_NOWHERE = {"respiration": "phase of the breath", "tilt": "direction of the tool's axis"}
+_STEP = 500  # periods from one call of ``progress`` to the next
 _MAY_BE_INSIDE = (int(Status.OUT_OF_RANGE), int(Status.INVALID_POSE))
 
 
@@ -52,8 +54,12 @@ class Replayed:
         return float(np.linalg.norm(gap, axis=2).max())
 
 
-def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
+def replay(
+    recording: Recording, vademecum: Vademecum, progress: Callable[[int, int], None] | None = None
+) -> Replayed:
     """Compute the forces along the path of a recording with a new model.
+
+    progress : called with the periods that are computed, and how many there are
 
     Raises
     ------
@@ -67,7 +73,7 @@ def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
             f"the recording is of {recording.vademecum_name!r} ({recording.vademecum_id[:12]}), "
             f"this is {vademecum.name!r} ({vademecum.id[:12]}); give the file it was made with"
         )
-    scene = _scene_of(recording)
+    scene = scene_of(recording)
     periods = recording.periods
     if len(scene.tools) != periods.tip.shape[1]:
         raise StorageError(
@@ -83,10 +89,14 @@ def replay(recording: Recording, vademecum: Vademecum) -> Replayed:
             friction.spin[:] = periods.turn[k]
         contact.solve(model, periods.tip[k])
         force[k] = model.out.force
+        if progress is not None and k % _STEP == 0:
+            progress(k, len(periods))
+    if progress is not None:
+        progress(len(periods), len(periods))
     return Replayed(force, known_periods(periods, scene, recording.from_rest))
 
 
-def _scene_of(recording: Recording) -> Scene:
+def scene_of(recording: Recording) -> Scene:
     """The scene in a recording, which nobody can correct: what is wrong with it, is recorded."""
     try:
         return parse_scene(recording.scene, "scene of the recording")

@@ -23,6 +23,7 @@ ORDER = {
         "vademecum",
         "contact",
         "scene",
+        "bags",
         "offline",
         "atlas",
         "__init__",  # the public API

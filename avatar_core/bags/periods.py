@@ -1,0 +1,302 @@
+"""From the tables of a bag to a recording: one period for each answer of the contact loop.
+
+Each ``contact_state``, or where there are none each wrench, was sent by one period of the loop, and
+its stamp is that of the pose that the period used. Where a bag has neither, each pose is taken for
+a period, and there is nothing to compare with.
+
+The loop does not number its messages. A period is taken to be lost where two answers were received
+more than ``_GAP`` periods apart; if it was only late, too little is compared, but nothing wrongly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar_core.bags.read import Bag
+from avatar_core.bags.table import Table
+from avatar_core.common.arrays import FloatArray
+from avatar_core.contact.model import FAR_AWAY, Status
+from avatar_core.errors import StorageError
+from avatar_core.scene.recording import Clouds, Periods, Recording
+
+ORGAN = "organ"  # the frame that the nodes call the organ's unless told otherwise
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+_ENGAGING = 13  # of avatar_ros/msg/ContactState
+# With these, the step used the pose of the stamp; with INVALID_POSE none; with others FAR_AWAY.
+PLACED = (
+    int(Status.OK),
+    int(Status.NOT_CONVERGED),
+    int(Status.TOO_MANY_CONTACTS),
+    int(Status.OUT_OF_RANGE),
+    int(Status.EXTRAPOLATED),
+    _ENGAGING,
+)
+_GAP = 1.5  # periods
+_HELD = 0.02  # for which a pose is held, by default; after it a zero is sent [s]
+_UNIT = 1e-3  # by which a quaternion may differ from length 1, as in the loop
+
+
+@dataclass(frozen=True, eq=False)
+class BagPath:
+    """A recording that was found in a bag.
+
+    recording : its forces are zero if ``answers`` is "poses"
+    answers : "states", "wrenches" or "poses", which of them the periods are
+    received : (n,) when each answer was received [ns]
+    sound : (n,) whether the pose was valid, as far as the bag shows
+    notes : what was left out, one line each
+    """
+
+    recording: Recording
+    answers: str
+    received: np.ndarray
+    sound: np.ndarray
+    notes: tuple[str, ...]
+
+
+def path_of(
+    bag: Bag,
+    scene: str,
+    vademecum_id: str,
+    transform: tuple[float, ...] | None = None,
+    rate: float | None = None,
+) -> BagPath:
+    """The recording of one tool.
+
+    Parameters
+    ----------
+    scene : YAML of the scene of one tool
+    vademecum_id : of the organ that the tool is to touch; states of others are left out
+    transform : pose of the poses' frame in the organ's, x y z [m] and quaternion x y z w; None if
+        they are in the organ's
+    rate : of the loop [Hz]; None for that of the answers
+
+    Raises
+    ------
+    StorageError
+        If poses are in another frame without a transform, or nothing is left.
+    """
+    poses, invalid, notes = _valid_poses(bag, transform)
+    origin, rotation = _parts(transform or IDENTITY)
+    answers, table = _answers(bag, poses)
+    rate = rate or (bag.about.rate if bag.about else _rate(table.received))
+    number = _numbers(table.received, rate)
+    row = _pose_of(poses, table.stamp, answers)
+    known = row >= 0
+    status, tip_kind = _placement(answers, table, known)
+    kept = (tip_kind != _MISSING) & _of_organ(answers, table, vademecum_id)
+    if not kept.any():
+        raise StorageError(f"{bag.path}: no {_ANSWER[answers]} answers a pose of the bag")
+    if lost := int((tip_kind == _MISSING).sum()):
+        notes.append(f"{lost:,} {_ANSWER[answers]} answer poses that the bag lacks: left out")
+    tip = np.full((len(table), 3), FAR_AWAY)
+    tip[tip_kind == _NONE] = np.nan
+    here = tip_kind == _AT_POSE
+    tip[here] = _moved(poses.values[row[here], :3], origin, rotation)
+    turn = _turns(poses, row, here) @ rotation.T
+    force = _forces(bag, answers, table, poses, row, rotation)
+    recording = Recording(
+        vademecum_id=vademecum_id,
+        vademecum_name=bag.about.vademecum_name if bag.about else bag.path.name,
+        scene=scene,
+        rate=rate,
+        from_rest=bag.about is not None and bag.about.from_rest and bool(kept.all()),
+        periods=Periods(
+            number=number[kept],
+            stamp=table.stamp[kept],
+            tip=tip[kept, None],
+            turn=turn[kept, None],
+            status=status[kept, None],
+            force=force[kept, None],
+            error=_column(answers, table, 4)[kept, None],
+            sent_fraction=_column(answers, table, 5)[kept, None],
+        ),
+        clouds=Clouds(np.zeros(0, np.int64), np.zeros((0, 0, 3), np.float32)),
+    )
+    sound = here & ~_spoilt(table.received, invalid)
+    return BagPath(recording, answers, table.received[kept], sound[kept], tuple(notes))
+
+
+_ANSWER = {"states": "contact_state", "wrenches": "wrenches", "poses": "poses"}
+_AT_POSE, _AWAY, _NONE, _MISSING = range(4)  # where the tip of a period was
+
+
+def _valid_poses(
+    bag: Bag, transform: tuple[float, ...] | None
+) -> tuple[Table, np.ndarray, list[str]]:
+    """The poses that the loop takes, times of receipt of those that it refuses, and notes."""
+    if not len(bag.poses):
+        raise StorageError(f"{bag.path}: {bag.tool}/measured_cp is empty; record it again")
+    frames, labels = bag.poses.label, bag.poses.labels
+    counts = np.bincount(frames, minlength=len(labels))
+    organ = labels.index(ORGAN) if transform is None and ORGAN in labels else -1
+    frame = organ if organ >= 0 else int(counts.argmax())
+    name = labels[frame]
+    if transform is None and name != ORGAN:
+        raise StorageError(
+            f"{bag.path}: poses are in the frame '{name}', not in '{ORGAN}'; give --tool-transform "
+            "(0,0,0,0,0,0,1 if they are the same)"
+        )
+    values = bag.poses.values
+    with np.errstate(over="ignore"):
+        norm = (values[:, 3:] ** 2).sum(axis=1)
+    whole = np.isfinite(values).all(axis=1) & (np.abs(norm - 1.0) < 2.0 * _UNIT)
+    valid = whole & (frames == frame)
+    notes = []
+    if others := int((frames != frame).sum()):
+        notes.append(f"{others:,} poses are in other frames than '{name}': refused, as by the loop")
+    if spoilt := int((~whole).sum()):
+        notes.append(f"{spoilt:,} poses are invalid: refused, as by the loop")
+    if not valid.any():
+        raise StorageError(f"{bag.path}: no pose of {bag.tool} is valid")
+    return bag.poses.where(valid), bag.poses.received[~valid], notes
+
+
+def _answers(bag: Bag, poses: Table) -> tuple[str, Table]:
+    if bag.states is not None and len(bag.states):
+        return "states", bag.states
+    if bag.wrenches is not None and len(bag.wrenches):
+        return "wrenches", bag.wrenches
+    return "poses", poses
+
+
+def _rate(received: np.ndarray) -> float:
+    """That of the answers, to three digits [Hz].
+
+    Raises
+    ------
+    StorageError
+        If it is out of any range.
+    """
+    if len(received) < 2:
+        return 1000.0
+    between = float(np.median(np.diff(received)))
+    rate = float(f"{1e9 / between:.3g}") if between > 0.0 else math.inf
+    if not 1.0 <= rate <= 10_000.0:
+        raise StorageError(f"the answers in the bag come at {rate:g} Hz; give --rate")
+    return rate
+
+
+def _numbers(received: np.ndarray, rate: float) -> np.ndarray:
+    """Numbers of the periods, with those that are lost, shape (n,)."""
+    periods = np.diff(received, prepend=received[:1]) * (rate * 1e-9)
+    steps = np.where(periods > _GAP, np.rint(periods), 1.0).astype(np.int64)
+    return np.cumsum(steps)
+
+
+def _pose_of(poses: Table, stamp: np.ndarray, answers: str) -> np.ndarray:
+    """The pose of each stamp, the last received if there are several; -1 without one."""
+    if answers == "poses":
+        return np.arange(len(poses))
+    order = np.argsort(poses.stamp, kind="stable")
+    sorted_stamp = poses.stamp[order]
+    at = np.searchsorted(sorted_stamp, stamp, side="right") - 1
+    found = (at >= 0) & (sorted_stamp[np.maximum(at, 0)] == stamp)
+    return np.where(found, order[np.maximum(at, 0)], -1)
+
+
+def _placement(answers: str, table: Table, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Status of each period, and where its tip was."""
+    n = len(table)
+    if answers == "states":
+        status = table.values[:, 0].astype(np.uint8)
+        placed = np.isin(status, PLACED)
+        where = np.where(placed, np.where(known, _AT_POSE, _MISSING), _AWAY)
+        where[status == int(Status.INVALID_POSE)] = _NONE
+        return status, where
+    status = np.zeros(n, np.uint8)
+    where = np.where(known, _AT_POSE, _MISSING)
+    if answers == "wrenches":
+        where[(table.stamp == 0) & ~known] = _AWAY  # before the first pose
+        where[_is_stale(table)] = _AWAY
+    return status, where
+
+
+def _is_stale(wrenches: Table) -> np.ndarray:
+    """Whether a wrench is zero because its pose is too old, shape (n,)."""
+    first = np.r_[True, np.diff(wrenches.stamp) != 0]
+    since = wrenches.received[first][np.cumsum(first) - 1]
+    old: np.ndarray = wrenches.received - since > _HELD * 1e9
+    return old & ~wrenches.values.any(axis=1)
+
+
+def _of_organ(answers: str, table: Table, vademecum_id: str) -> np.ndarray:
+    """Whether a period answered for that organ, shape (n,); true where the bag does not say."""
+    if answers != "states":
+        return np.ones(len(table), bool)
+    mine = [name == vademecum_id for name in table.labels]
+    return np.array(mine, bool)[table.label]
+
+
+def _spoilt(received: np.ndarray, invalid: np.ndarray) -> np.ndarray:
+    """Whether a refused pose came between an answer and the one before it, shape (n,)."""
+    came = np.searchsorted(np.sort(invalid), received, side="right")
+    return np.diff(came, prepend=0) > 0
+
+
+def _parts(transform: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Origin and rotation matrix of a pose.
+
+    Raises
+    ------
+    StorageError
+        If it is not seven finite numbers with a quaternion of length 1.
+    """
+    numbers = np.array(transform, float)
+    length = math.hypot(*numbers[3:]) if numbers.shape == (7,) else math.nan
+    if not (np.isfinite(numbers).all() and abs(length - 1.0) < _UNIT):
+        raise StorageError(
+            "a transform is x,y,z [m] and a quaternion x,y,z,w of length 1, as 0,0,0.1,0,0,0,1"
+        )
+    i, j, k, w = numbers[3:] / length
+    rotation = np.array([_rotated(axis, (i, j, k, w)) for axis in np.eye(3)]).T
+    return numbers[:3], rotation
+
+
+def _moved(points: FloatArray, origin: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Into the organ's frame; bit by bit the same if both frames are one."""
+    turned = points if np.array_equal(rotation, np.eye(3)) else points @ rotation.T
+    return turned + origin
+
+
+def _rotated(vector: FloatArray, quaternion: tuple[FloatArray, ...] | FloatArray) -> FloatArray:
+    """Vectors, shape (..., 3), in the frame that a quaternion x y z w is given in."""
+    i, j, k, w = quaternion
+    axis = np.stack([i, j, k], axis=-1)
+    twice = 2.0 * np.cross(axis, vector)
+    return vector + np.asarray(w)[..., None] * twice + np.cross(axis, twice)
+
+
+def _turns(poses: Table, row: np.ndarray, here: np.ndarray) -> FloatArray:
+    """Rotation vectors since the pose of the period before, shape (n, 3) [rad], as the loop takes
+    them: twice the vector part of q_now q_before*, zero after a period without a pose."""
+    q = poses.values[np.maximum(row, 0), 3:]
+    before = np.roll(q, 1, axis=0)
+    v, w, u, s = q[:, :3], q[:, 3:], before[:, :3], before[:, 3:]
+    sign = np.where((q * before).sum(axis=1, keepdims=True) >= 0.0, 2.0, -2.0)
+    turn = sign * (s * v - w * u - np.cross(v, u))
+    turned = here & np.r_[False, here[:-1]] & np.r_[False, row[1:] != row[:-1]]
+    return np.where(turned[:, None], turn, 0.0)
+
+
+def _forces(
+    bag: Bag, answers: str, table: Table, poses: Table, row: np.ndarray, rotation: FloatArray
+) -> FloatArray:
+    """Forces on the tool in the organ's frame, shape (n, 3) [N]; zero where the bag has none."""
+    if answers == "states":
+        return table.values[:, 1:4]
+    if answers == "poses":
+        return np.zeros((len(table), 3))
+    force = table.values
+    if bag.axes == "body":
+        force = _rotated(force, tuple(poses.values[np.maximum(row, 0), 3:].T))
+    return force if np.array_equal(rotation, np.eye(3)) else force @ rotation.T
+
+
+def _column(answers: str, table: Table, column: int) -> FloatArray:
+    """A column of the states; NaN, unknown, without them."""
+    return table.values[:, column] if answers == "states" else np.full(len(table), np.nan)

@@ -1,0 +1,99 @@
+"""The messages of a bag and their types, by the library rosbags (extra ``bags``)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from types import ModuleType
+from typing import Any
+
+from avatar_core.errors import StorageError
+
+POSE = "geometry_msgs/msg/PoseStamped"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+TEXT = "std_msgs/msg/String"
+STATE = "avatar_ros/msg/ContactState"
+CONTACT = "avatar_ros/msg/Contact"
+INFO = "avatar_ros/msg/VademecumInfo"
+
+# As in avatar_ros/msg, which the core does not have; those that a bag carries are not compiled.
+OWN = {
+    CONTACT: """
+geometry_msgs/Point position
+geometry_msgs/Vector3 normal
+geometry_msgs/Vector3 force
+float64 penetration
+""",
+    STATE: """
+std_msgs/Header header
+string tool
+uint8 status
+string vademecum_id
+avatar_ros/Contact[] contacts
+float64 force_error
+float64 force_share
+""",
+    INFO: """
+std_msgs/Header header
+string id
+string name
+string source
+string schema_version
+string axes
+uint32 n_vertices
+uint32 n_surface_vertices
+uint32 n_load_positions
+uint32 n_modes
+uint32 n_regions
+uint64 bytes
+float64 young_modulus
+float64 poisson_ratio
+float64 patch_radius
+float64 volume
+bool converged
+float64 l2_mean
+float64 l2_worst
+float64 contact_mean
+float64 contact_worst
+float64 force_mean
+float64 force_worst
+float64 build_cpu_seconds
+""",
+}
+
+
+def rosbag2() -> ModuleType:
+    """The module of the library that reads and writes bags.
+
+    Raises
+    ------
+    StorageError
+        If the extra ``bags`` is not installed.
+    """
+    try:
+        from rosbags import rosbag2
+    except ImportError as error:
+        raise StorageError("bags need rosbags; pip install 'avatar[bags]'") from error
+    module: ModuleType = rosbag2
+    return module
+
+
+@lru_cache(maxsize=1)
+def typestore() -> Any:
+    """The library's store of the types of Jazzy, and of ``OWN``."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(
+        {
+            name: definition
+            for name_of, text in OWN.items()
+            for name, definition in get_types_from_msg(text, name_of).items()
+        }
+    )
+    return store
+
+
+def full_name(name: str) -> str:
+    """A type's name with the ``/msg/`` that some writers leave out."""
+    package, slash, rest = name.partition("/")
+    return name if not slash or "/" in rest else f"{package}/msg/{rest}"

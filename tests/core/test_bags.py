@@ -1,0 +1,601 @@
+"""Bags that others wrote are replayed as our recordings; what we write, others read."""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.rosbag2 import Reader
+from scipy.spatial.transform import Rotation
+
+from avatar_core.bags import table, types
+from avatar_core.bags.compare import comparable
+from avatar_core.bags.periods import BagPath, path_of
+from avatar_core.bags.read import read_bag
+from avatar_core.bags.write import write_mcap as export
+from avatar_core.cli import main as cli
+from avatar_core.contact.effects import Friction, Viscoelasticity
+from avatar_core.contact.haptics.force_guard import DEVICES
+from avatar_core.errors import AvatarError, StorageError
+from avatar_core.scene.file import write_scene
+from avatar_core.scene.model import Scene
+from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
+from avatar_core.scene.replay import Replayed, replay
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.core import bag_files
+from tests.core.bag_files import (
+    PERIOD,
+    POSE,
+    Cell,
+    Message,
+    info,
+    only,
+    renamed,
+    write_mcap,
+    write_rosbag,
+)
+
+SAME = 1e-9  # [N]
+SCENE = write_scene(Scene())
+Writer = Callable[[Path, Iterable[Message]], Path]
+
+
+@pytest.fixture(scope="module")
+def organ(straight: Vademecum, tmp_path_factory: pytest.TempPathFactory) -> Vademecum:
+    file = tmp_path_factory.mktemp("bags") / "liver.h5"
+    save_vademecum(straight, file)
+    return load_vademecum(file)
+
+
+@pytest.fixture(scope="module")
+def cell(organ: Vademecum) -> Cell:
+    return bag_files.simulated_cell(organ)
+
+
+def replayed(path: Path, organ: Vademecum, **how: Any) -> tuple[BagPath, Replayed]:
+    """A bag's path and its replay, as the command makes them."""
+    bag = read_bag(path, how.pop("tool", None))
+    scene = how.pop("scene", SCENE)
+    found = path_of(bag, scene, organ.id, **how)
+    return found, comparable(found, replay(found.recording, organ), DEVICES["sigma"])
+
+
+def rosbag(plugin: str, version: int = 9, compression: str = "NONE") -> Writer:
+    return lambda folder, messages: write_rosbag(
+        folder / "bag", messages, plugin, version, compression
+    )
+
+
+def single(suffix: str, plugin: str) -> Writer:
+    def write(folder: Path, messages: Iterable[Message]) -> Path:
+        return next(write_rosbag(folder / "bag", messages, plugin).glob(f"*{suffix}"))
+
+    return write
+
+
+def by_mcap(compression: CompressionType) -> Writer:
+    return lambda folder, messages: write_mcap(folder / "bag.mcap", messages, compression)
+
+
+WRITERS = {
+    "sqlite3-v8": rosbag("SQLITE3", 8),
+    "sqlite3-v9": rosbag("SQLITE3"),
+    "sqlite3-messages": rosbag("SQLITE3", 9, "MESSAGE"),
+    "sqlite3-file": rosbag("SQLITE3", 9, "FILE"),
+    "db3": single(".db3", "SQLITE3"),
+    "mcap-v8": rosbag("MCAP", 8),
+    "mcap-v9": rosbag("MCAP"),
+    "mcap-chunks": rosbag("MCAP", 9, "STORAGE"),
+    "mcap": single(".mcap", "MCAP"),
+    "mcap-lz4": by_mcap(CompressionType.LZ4),
+    "mcap-zstd": by_mcap(CompressionType.ZSTD),
+    "mcap-none": by_mcap(CompressionType.NONE),
+}
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS.keys())
+def test_forces_of_a_cell_are_the_same(
+    write: Writer, organ: Vademecum, cell: Cell, tmp_path: Path
+) -> None:
+    path, found = replayed(write(tmp_path, cell.messages()), organ)
+    periods = path.recording.periods
+    np.testing.assert_array_equal(periods.tip[:, 0], cell.tip)
+    np.testing.assert_array_equal(periods.force[:, 0], cell.sent)
+    np.testing.assert_array_equal(periods.stamp, cell.stamp)
+    assert path.answers == "wrenches" and path.recording.rate == 1000.0
+    touching = np.linalg.norm(cell.force, axis=1) > 0.1
+    assert found.known[touching].mean() > 0.95
+    assert found.difference(path.recording) <= SAME
+
+
+def test_the_computed_forces_are_compared_where_states_are_recorded(
+    organ: Vademecum, cell: Cell, tmp_path: Path
+) -> None:
+    """Also those that the guard faded in, and limited."""
+    cut = slice(240, None)  # the force comes while it is faded in
+    kept = {k: v[cut] for k, v in vars(cell).items() if k not in ("vademecum_id", "orientation")}
+    weak = Cell(cell.vademecum_id, **kept)
+    weak.sent = 0.5 * weak.force
+    path, found = replayed(write_rosbag(tmp_path / "bag", weak.messages(states=True)), organ)
+    assert path.answers == "states" and found.known.all()
+    np.testing.assert_array_equal(path.recording.periods.force[:, 0], weak.force)
+    assert found.difference(path.recording) <= SAME
+    np.testing.assert_array_equal(path.recording.periods.sent_fraction[:, 0], weak.share)
+
+
+def test_a_difference_is_seen(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
+    other = replace(cell, sent=cell.sent * (1.0 + 1e-6))
+    path, found = replayed(write_rosbag(tmp_path / "bag", other.messages()), organ)
+    assert found.difference(path.recording) > 1e-7
+
+
+def test_poses_alone_give_forces(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
+    poses = only(cell.messages(), "measured_cp")
+    path, found = replayed(write_mcap(tmp_path / "poses.mcap", poses), organ)
+    assert path.answers == "poses" and not found.known.any()
+    np.testing.assert_allclose(found.force[:, 0], cell.force, atol=SAME)
+
+
+# --- recordings as bags -----------------------------------------------------------------------
+
+
+VISCOUS = Viscoelasticity(g=(0.3,), tau=(0.1,))
+
+
+def recorded(organ: Vademecum, effects: tuple[Any, ...], turning: bool = False) -> Recording:
+    """A recording as the planning page makes them, with a pose that failed and lost periods."""
+    cell = bag_files.simulated_cell(organ, effects)
+    n = len(cell.stamp)
+    turn = np.zeros((n, 1, 3))
+    turn[400:500] = [0.0, 2e-3, 1e-3] if turning else 0.0
+    tip = cell.tip[:, None].copy()
+    status = cell.status[:, None].astype(np.uint8)
+    stamp = cell.stamp.copy()
+    tip[700:], status[700:], stamp[700:] = 1e3, 3, stamp[699]  # STALE_POSE
+    made = Recording(
+        organ.id,
+        organ.name,
+        write_scene(Scene(effects=effects)),
+        1000.0,
+        True,
+        Periods(
+            number=np.arange(n) + 100,
+            stamp=stamp,
+            tip=tip,
+            turn=turn,
+            status=status,
+            force=np.zeros((n, 1, 3)),
+            error=np.full((n, 1), 0.02),
+            sent_fraction=cell.share[:, None].copy(),
+        ),
+        Clouds(np.array([100]), np.zeros((1, 7, 3), np.float32)),
+    )
+    made.periods.force[:] = replay(made, organ).force
+    kept = {key: np.delete(value, slice(720, 725), 0) for key, value in vars(made.periods).items()}
+    return replace(made, periods=Periods(**kept))
+
+
+@pytest.mark.parametrize(
+    ("effects", "turning"),
+    [
+        pytest.param((), False, id="elastic"),
+        pytest.param((VISCOUS,), False, id="viscous"),
+        pytest.param((Friction(),), True, id="friction", marks=pytest.mark.long),
+    ],
+)
+def test_a_recording_written_as_mcap_is_replayed_as_it_was(
+    effects: tuple[Any, ...], turning: bool, organ: Vademecum, tmp_path: Path
+) -> None:
+    made = recorded(organ, effects, turning)
+    export(made, tmp_path / "made.mcap")
+    bag = read_bag(tmp_path / "made.mcap")
+    assert bag.about is not None and bag.vademecum_ids == (organ.id,)
+    path = path_of(bag, bag.about.scene, organ.id)
+    read = path.recording
+    assert (read.scene, read.rate, read.from_rest) == (made.scene, made.rate, True)
+    before, after = vars(made.periods), vars(read.periods)
+    np.testing.assert_array_equal(np.diff(after["number"]), np.diff(before["number"]))
+    np.testing.assert_allclose(after["turn"], before["turn"], atol=1e-15)
+    for name in ("stamp", "tip", "status", "force", "error", "sent_fraction"):
+        np.testing.assert_array_equal(after[name], before[name], err_msg=name)
+    found, expected = replay(read, organ), replay(made, organ)
+    np.testing.assert_array_equal(found.known, expected.known)
+    assert found.known[:700].all() and found.difference(read) <= SAME
+
+
+def test_others_read_what_we_write(organ: Vademecum, tmp_path: Path) -> None:
+    made = recorded(organ, ())
+    export(made, tmp_path / "made.mcap")
+    p = made.periods
+    read: dict[str, list[Any]] = {}
+    with (tmp_path / "made.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        for _, channel, message, content in reader.iter_decoded_messages():
+            read.setdefault(channel.topic, []).append((message.log_time, content))
+        summary = reader.get_summary()
+    assert summary is not None and summary.statistics is not None
+    assert summary.statistics.message_count == sum(map(len, read.values()))
+    poses, wrenches = read["/tool/measured_cp"], read["/tool/servo_cf"]
+    assert len(poses) == 700 and len(wrenches) == len(read["/contact_state"]) == len(p)
+    for k, (_, pose) in enumerate(poses):
+        assert pose.header.frame_id == "organ" and stamp_of(pose) == p.stamp[k]
+        position = pose.pose.position
+        assert [position.x, position.y, position.z] == p.tip[k, 0].tolist()
+        assert pose.pose.orientation.w == 1.0
+    times = [time for time, _ in wrenches]
+    assert np.diff(times).min() == PERIOD and np.diff(times).max() == 6 * PERIOD
+    for k, (_, wrench) in enumerate(wrenches):
+        sent = p.force[k, 0] * p.sent_fraction[k, 0]
+        force = wrench.wrench.force
+        assert [force.x, force.y, force.z] == sent.tolist() and stamp_of(wrench) == p.stamp[k]
+    for k, (_, state) in enumerate(read["/contact_state"]):
+        assert (state.tool, state.vademecum_id) == ("tool", organ.id)
+        assert state.status == p.status[k, 0] and state.force_share == p.sent_fraction[k, 0]
+    ((_, about),) = read["/recording"]
+    assert json.loads(about.data)["scene"] == made.scene
+
+
+def stamp_of(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
+
+
+def test_nothing_is_written_over(organ: Vademecum, tmp_path: Path) -> None:
+    file = tmp_path / "made.mcap"
+    file.write_text("mine")
+    with pytest.raises(StorageError, match="exists; give another name"):
+        export(recorded(organ, ()), file)
+    assert file.read_text() == "mine" and list(tmp_path.iterdir()) == [file]
+
+
+# --- what bags are like -----------------------------------------------------------------------
+
+
+def test_messages_in_any_order_and_twice(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
+    messages = cell.messages()
+    shuffled = [messages[i] for i in np.random.default_rng(1).permutation(len(messages))]
+    twice = write_rosbag(tmp_path / "bag", [*shuffled, *messages[500:600]])
+    path, found = replayed(twice, organ)
+    np.testing.assert_array_equal(path.recording.periods.force[:, 0], cell.sent)
+    assert not path.recording.periods.lost.any()
+    assert found.difference(path.recording) <= SAME
+
+
+def test_gaps_are_lost_periods_and_lost_poses_are_left_out(
+    organ: Vademecum, cell: Cell, tmp_path: Path
+) -> None:
+    stamps = cell.stamp[[300, 301, 302, 500]].tolist()
+    messages = [
+        one
+        for one in cell.messages()
+        if not (one.topic.endswith("servo_cf") and stamp_of(one.content) in stamps[:3])
+        and not (one.topic.endswith("measured_cp") and stamp_of(one.content) == stamps[3])
+    ]
+    path, found = replayed(write_rosbag(tmp_path / "bag", messages), organ)
+    periods = path.recording.periods
+    assert len(periods) == len(cell.stamp) - 4 and periods.lost.sum() == 4
+    assert path.notes == ("1 wrenches answer poses that the bag lacks: left out",)
+    assert found.known[260:290].all() and found.difference(path.recording) <= SAME
+
+
+def test_poses_that_the_loop_refused(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
+    """A wrench that comes after one may be fading out."""
+    messages = cell.messages()
+    nan = bag_files.vector([np.nan] * 3, "Point")
+    turn = bag_files.vector([0.0, 0.0, 0.0, 1.0], "Quaternion")
+    pose = bag_files.make("geometry_msgs/msg/Pose", nan, turn)
+    at = int(cell.stamp[400]) + PERIOD // 10
+    content = bag_files.make(POSE, bag_files.header(at, "organ"), pose)
+    elsewhere = replace(messages[0].content, header=bag_files.header(at + 1, "world"))
+    spoilt = [
+        Message(at, "/tool/measured_cp", POSE, content),
+        Message(at + 1, "/tool/measured_cp", POSE, elsewhere),
+    ]
+    path, found = replayed(write_rosbag(tmp_path / "bag", [*messages, *spoilt]), organ)
+    assert "1 poses are invalid: refused, as by the loop" in path.notes
+    assert any("1 poses are in other frames than 'organ'" in note for note in path.notes)
+    assert found.known[370:389].all() and not found.known[395:530].any()
+    assert found.known[580:].any()
+
+
+@pytest.mark.parametrize("axes", ["servo_cf", "body/servo_cf", "spatial/servo_cf"])
+def test_frames_of_devices(axes: str, organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
+    """Poses and forces in a device's frame, which lies somewhere in the organ's."""
+    base = Rotation.from_rotvec([0.3, -1.1, 0.4])
+    origin = np.array([0.02, 0.3, -0.1])
+    gripper = Rotation.from_rotvec([1.0, 0.2, 0.1])
+    sent = base.inv().apply(cell.sent)
+    if axes.startswith("body"):
+        sent = gripper.inv().apply(sent)
+    moved = replace(
+        cell,
+        tip=base.inv().apply(cell.tip - origin),
+        sent=sent,
+        orientation=np.repeat(gripper.as_quat()[None], len(cell.stamp), 0),
+    )
+    messages = renamed(moved.messages("/MTML", "MTML_base"), "servo_cf", axes)
+    bag = write_rosbag(tmp_path / "bag", messages)
+    with pytest.raises(StorageError, match=r"in the frame 'MTML_base'.*give --tool-transform"):
+        replayed(bag, organ)
+    path, found = replayed(bag, organ, transform=(*origin, *base.as_quat()))
+    assert found.known.mean() > 0.5 and found.difference(path.recording) <= SAME
+    np.testing.assert_allclose(path.recording.periods.tip[:, 0], cell.tip, atol=1e-12)
+
+
+def test_one_tool_of_several(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
+    left, right = cell.messages("/cell/left", states=True), cell.messages("/cell/right")
+    messages = [*left, *right, info("1" * 64)]
+    bag = write_rosbag(tmp_path / "bag", renamed(messages, "/contact_state", "/cell/contact_state"))
+    with pytest.raises(StorageError, match=r"several tools.*--tool.*/cell/left/measured_cp"):
+        read_bag(bag)
+    with pytest.raises(StorageError, match=r"no tool 'middle'; choose.*/cell/right/servo_cf"):
+        read_bag(bag, "middle")
+    for name in ("left", "cell/left", "/cell/left"):
+        assert read_bag(bag, name).tool == "/cell/left"
+    assert read_bag(bag, "left").states is not None
+    assert read_bag(bag, "left").vademecum_ids == (organ.id,)  # the other is no topic of /cell
+
+
+def test_topics_that_do_not_fit(cell: Cell, tmp_path: Path) -> None:
+    messages = cell.messages()
+    wrong = [replace(m, kind=bag_files.WRENCH, content=messages[1].content) for m in messages[:2]]
+    with pytest.raises(StorageError, match=r"no NAME/measured_cp of.*PoseStamped; it has.*Wrench"):
+        read_bag(write_rosbag(tmp_path / "wrong", wrong))
+    with pytest.raises(StorageError, match="it has no topics"):
+        read_bag(write_rosbag(tmp_path / "empty", []))
+    other = [messages[0], replace(messages[0], topic="/tool/servo_cf")]
+    bag = read_bag(write_rosbag(tmp_path / "other", other))
+    assert bag.wrenches is None and "is of geometry_msgs/msg/PoseStamped" in bag.notes[0]
+    nothing = write_rosbag(tmp_path / "nothing", [replace(messages[0], received=5)])
+    with pytest.raises(StorageError, match="measured_cp is empty"):
+        bag = read_bag(nothing)
+        path_of(replace(bag, poses=bag.poses.where(np.zeros(1, bool))), SCENE, "")
+
+
+def test_bounded_memory(monkeypatch: pytest.MonkeyPatch, cell: Cell, tmp_path: Path) -> None:
+    monkeypatch.setattr(table, "MAX_MESSAGES", 100)
+    with pytest.raises(StorageError, match="more than 100 messages in a topic; cut the bag"):
+        read_bag(write_rosbag(tmp_path / "bag", cell.messages()))
+
+
+def test_our_types_are_those_of_the_nodes() -> None:
+    for name, definition in bag_files.own_types().items():
+        assert types.typestore().fielddefs[name][1] == definition[1], name
+
+
+# --- damage -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(cell: Cell, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An MCAP file of some chunks, by mcap-ros2-support."""
+    return write_mcap(tmp_path_factory.mktemp("whole") / "whole.mcap", cell.messages())
+
+
+@pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
+def test_a_file_that_was_not_closed(part: float, whole: Path, cell: Cell, tmp_path: Path) -> None:
+    content = whole.read_bytes()
+    file = tmp_path / "killed.mcap"
+    file.write_bytes(content[: int(part * len(content))])
+    bag = read_bag(file)
+    n = len(bag.poses)
+    assert (part - 0.25) * len(cell.stamp) < n <= len(cell.stamp)
+    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[:n])
+    assert bag.wrenches is not None
+    np.testing.assert_array_equal(bag.wrenches.values, cell.sent[: len(bag.wrenches)])
+    assert len(bag.notes) == 1 and "was not closed: read up to its last" in bag.notes[0]
+
+
+def test_a_file_that_ends_in_zeros(whole: Path, cell: Cell, tmp_path: Path) -> None:
+    """As a disk leaves one whose power failed; the last chunk is half zero."""
+    content = whole.read_bytes()
+    file = tmp_path / "zeros.mcap"
+    n = len(content) // 2
+    file.write_bytes(content[:n] + bytes(n))
+    bag = read_bag(file)
+    assert 0.2 * len(cell.stamp) < len(bag.poses) < 0.6 * len(cell.stamp)
+    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[: len(bag.poses)])
+
+
+def test_two_topics_out_of_order_in_a_file_that_was_not_closed(cell: Cell, tmp_path: Path) -> None:
+    messages = cell.messages()
+    swapped = [one for pair in zip(messages[1::2], messages[::2], strict=True) for one in pair]
+    file = write_mcap(tmp_path / "swapped.mcap", swapped)
+    file.write_bytes(file.read_bytes()[:-3000])
+    bag = read_bag(file)
+    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[: len(bag.poses)])
+    assert len(bag.poses) > 0.7 * len(cell.stamp)
+
+
+def test_a_damaged_chunk(whole: Path, cell: Cell, tmp_path: Path) -> None:
+    content = bytearray(whole.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 2000] = bytes(2000)
+    file = tmp_path / "spoilt.mcap"
+    file.write_bytes(content)
+    bag = read_bag(file)
+    n = len(bag.poses)
+    assert 0.2 * len(cell.stamp) < n < 0.7 * len(cell.stamp)
+    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[:n])
+    assert any("damaged after" in note for note in bag.notes)
+
+
+def test_a_folder_without_metadata(cell: Cell, tmp_path: Path) -> None:
+    messages = cell.messages()
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    for i in (2, 10):  # the files of one recording
+        part = messages[:800] if i == 2 else messages[800:]
+        write_mcap(folder / f"bag_{i}.mcap", part)
+    bag = read_bag(folder)
+    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip)
+    assert bag.notes == (f"{folder} has no metadata.yaml; its files are read one by one",)
+
+
+@pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
+def test_metadata_that_names_another_quality_of_service(
+    plugin: str, cell: Cell, tmp_path: Path
+) -> None:
+    """As in some bags of rosbag2 itself; the library alone reads nothing of them."""
+    bag = write_rosbag(tmp_path / "bag", cell.messages(), plugin, 8)
+    held = yaml.safe_load((bag / "metadata.yaml").read_text())
+    qos = "- {history: 3, depth: 0, reliability: 1, durability: 2, deadline: {sec: 1, nsec: 0}, "
+    qos += "lifespan: {sec: 1, nsec: 0}, liveliness: 1, liveliness_lease_duration: {sec: 1, nsec: "
+    qos += "0}, avoid_ros_namespace_conventions: false}"
+    for topic in held["rosbag2_bagfile_information"]["topics_with_message_count"]:
+        topic["topic_metadata"]["offered_qos_profiles"] = qos
+    (bag / "metadata.yaml").write_text(yaml.safe_dump(held))
+    with Reader(bag) as reader:
+        assert not list(reader.messages())
+    assert len(read_bag(bag).poses) == len(cell.stamp)
+
+
+def test_metadata_that_is_damaged(cell: Cell, tmp_path: Path) -> None:
+    bag = write_rosbag(tmp_path / "bag", cell.messages())
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: [")
+    assert len(read_bag(bag).poses) == len(cell.stamp)
+
+
+@pytest.mark.parametrize("garbage", ["text", "half", "short"])
+def test_sqlite_that_is_damaged_is_refused(garbage: str, cell: Cell, tmp_path: Path) -> None:
+    file = next(write_rosbag(tmp_path / "bag", cell.messages(), "SQLITE3").glob("*.db3"))
+    content = file.read_bytes()
+    spoilt = {"text": b"no database" * 99, "half": content[: len(content) // 2], "short": b""}
+    file.write_bytes(spoilt[garbage])
+    for path in (file, tmp_path / "bag"):
+        with pytest.raises(
+            StorageError, match=r"no readable bag.*sqlite3 FILE \.recover"
+        ) as caught:
+            read_bag(path)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_sizes_that_lie(closed: bool, whole: Path, cell: Cell, tmp_path: Path) -> None:
+    """A chunk, its content and the header that claim more than there is."""
+    content = bytearray(whole.read_bytes())
+    chunk = content.index(b"\x06", 8 + 9)
+    while struct.unpack_from("<Q", content, chunk + 1)[0] > len(content):
+        chunk = content.index(b"\x06", chunk + 1)
+    for offset, size in ((chunk + 1, 1 << 62), (chunk + 9 + 16, 1 << 60), (9, 1 << 40)):
+        lying = content.copy()
+        struct.pack_into("<Q", lying, offset, size)
+        file = tmp_path / "lying.mcap"
+        file.write_bytes(lying if closed else lying[:-100])
+        try:
+            bag = read_bag(file)
+        except StorageError as error:
+            assert "\n" not in str(error)
+        else:  # the index tells the truth
+            assert closed
+            np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[: len(bag.poses)])
+            assert len(bag.poses) == len(cell.stamp) or "damaged" in bag.notes[0]
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3"])
+def test_random_damage_never_ends_in_a_traceback(suffix: str, cell: Cell, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    plugin = "MCAP" if suffix == ".mcap" else "SQLITE3"
+    messages = cell.messages()[:300]
+    content = next(write_rosbag(tmp_path / "bag", messages, plugin).glob(f"*{suffix}")).read_bytes()
+    file, outcomes = tmp_path / f"spoilt{suffix}", set()
+    for _ in range(150):
+        spoilt = bytearray(content)
+        where = rng.integers(0, len(spoilt), 1 + rng.integers(0, 20))
+        spoilt[slice(None)] = bytes(spoilt)
+        for i in where:
+            spoilt[i] = rng.integers(0, 256)
+        file.write_bytes(spoilt[: rng.integers(len(spoilt) // 2, len(spoilt) + 1)])
+        try:
+            path_of(read_bag(file), SCENE, "")
+            outcomes.add("read")
+        except AvatarError as error:
+            assert "\n" not in str(error)
+            outcomes.add("refused")
+    assert outcomes == {"read", "refused"} or suffix == ".db3"
+
+
+def test_what_is_no_bag(tmp_path: Path) -> None:
+    for name, match in (
+        ("none", "there is no bag"),
+        ("old.bag", "a bag of ROS 1; convert it"),
+        ("half.db3.zstd", "give the bag's folder"),
+    ):
+        if "." in name:
+            (tmp_path / name).write_bytes(b"x")
+        with pytest.raises(StorageError, match=match):
+            read_bag(tmp_path / name)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(StorageError, match=r"holds no \.mcap or \.db3"):
+        read_bag(tmp_path / "folder")
+
+
+# --- the commands -----------------------------------------------------------------------------
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["avatar", *map(str, arguments)])
+    return cli.main()
+
+
+@pytest.fixture
+def file_of_organ(organ: Vademecum, tmp_path: Path) -> Path:
+    save_vademecum(organ, tmp_path / "liver.h5")
+    return tmp_path / "liver.h5"
+
+
+def test_the_commands(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    organ: Vademecum,
+    cell: Cell,
+    file_of_organ: Path,
+    tmp_path: Path,
+) -> None:
+    given = ("--vademecum", file_of_organ)
+    bag = write_rosbag(tmp_path / "bag", [info(organ.id), *cell.messages()])
+    assert run(monkeypatch, "replay", bag, *given) == 0
+    said = capsys.readouterr().out
+    assert "compared with the wrenches" in said and "largest difference 0.00e+00 N" in said
+    assert "is unknown" not in said
+    other = write_rosbag(tmp_path / "other", [info("f" * 64), *cell.messages()])
+    assert run(monkeypatch, "replay", other, *given) == 1
+    assert "made with the vademecum ffffffffffff" in capsys.readouterr().err
+    poses = write_mcap(tmp_path / "poses.mcap", only(cell.messages(), "measured_cp"))
+    assert run(monkeypatch, "replay", poses, *given) == 0
+    said = capsys.readouterr().out
+    assert "no forces in the bag" in said and "whether it was made with this" in said
+    assert run(monkeypatch, "replay", bag, *given, "--scene", "two_tools") == 1
+    assert "give a scene of one tool" in capsys.readouterr().err
+    assert run(monkeypatch, "replay", bag, *given, "--tool-transform", "1,2") == 1
+    assert "seven numbers" in capsys.readouterr().err
+    save_recording(recorded(organ, ()), tmp_path / "made.h5")
+    made = tmp_path / "made.mcap"
+    assert run(monkeypatch, "export", tmp_path / "made.h5", "-o", made) == 0
+    assert "without 1 clouds" in capsys.readouterr().out
+    assert run(monkeypatch, "replay", made, *given) == 0
+    assert "compared with the computed forces" in capsys.readouterr().out
+
+
+def test_without_the_extra(
+    monkeypatch: pytest.MonkeyPatch, organ: Vademecum, whole: Path, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    for needs in (
+        lambda: read_bag(whole),
+        lambda: export(recorded(organ, ()), tmp_path / "a.mcap"),
+    ):
+        with pytest.raises(StorageError, match=r"pip install 'avatar\[bags\]'"):
+            needs()
