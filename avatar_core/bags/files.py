@@ -5,7 +5,6 @@ What can be read is read, and a note says what could not.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -95,7 +94,7 @@ class OpenBag:
             raise StorageError(f"there is no bag {path}; give a folder, a .mcap or a .db3")
         if not path.is_dir():
             return [self._reader_of_file(path)]
-        files = sorted((f for f in path.iterdir() if f.suffix in SUFFIXES), key=_by_number)
+        files = sorted((f for f in path.iterdir() if f.suffix in SUFFIXES))
         if not (path / "metadata.yaml").exists():
             if not files:
                 raise StorageError(f"{path} holds no .mcap or .db3; give the folder of one bag")
@@ -165,10 +164,3 @@ class OpenBag:
 
     def _opened(self, path: Any) -> Any:
         return self._stack.enter_context(self._library.Reader(path))
-
-
-def _by_number(file: Path) -> list[tuple[int, str]]:
-    """Sorts bag_2 before bag_10."""
-    return [
-        (int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", file.name)
-    ]

@@ -4,8 +4,11 @@ Each ``contact_state``, or where there are none each wrench, was sent by one per
 its stamp is that of the pose that the period used. Where a bag has neither, each pose is taken for
 a period, and there is nothing to compare with.
 
-The loop does not number its messages. A period is taken to be lost where two answers were received
-more than ``_GAP`` periods apart; if it was only late, too little is compared, but nothing wrongly.
+The loop does not number its messages, so that an answer that a recorder lost cannot be told from
+one that was never sent because the loop was late. With effects that remember the path, periods are
+taken to be lost where two answers were received more than ``_GAP`` periods apart: too little may be
+compared, but nothing wrongly. Without, the force follows from the tip of the moment, and periods
+are lost where answers are missing for longer than a pose is held.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from avatar_core.bags.table import Table
 from avatar_core.common.arrays import FloatArray
 from avatar_core.contact.model import FAR_AWAY, Status
 from avatar_core.errors import StorageError
+from avatar_core.scene.file import parse_scene
 from avatar_core.scene.recording import Clouds, Periods, Recording
 
 ORGAN = "organ"  # the frame that the nodes call the organ's unless told otherwise
@@ -36,6 +40,7 @@ PLACED = (
     _ENGAGING,
 )
 _GAP = 1.5  # periods
+_REMEMBERING = {"friction", "viscoelasticity", "inertia", "respiration"}
 _HELD = 0.02  # for which a pose is held, by default; after it a zero is sent [s]
 _UNIT = 1e-3  # by which a quaternion may differ from length 1, as in the loop
 
@@ -84,7 +89,9 @@ def path_of(
     origin, rotation = _parts(transform or IDENTITY)
     answers, table = _answers(bag, poses)
     rate = rate or (bag.about.rate if bag.about else _rate(table.received))
-    number = _numbers(table.received, rate)
+    effects = {effect.name for effect in parse_scene(scene, "scene of the bag").effects}
+    gap = _GAP if effects & _REMEMBERING else max(_GAP, _HELD * rate)
+    number = _numbers(table.received, rate, gap)
     row = _pose_of(poses, table.stamp, answers)
     known = row >= 0
     status, tip_kind = _placement(answers, table, known)
@@ -181,10 +188,10 @@ def _rate(received: np.ndarray) -> float:
     return rate
 
 
-def _numbers(received: np.ndarray, rate: float) -> np.ndarray:
-    """Numbers of the periods, with those that are lost, shape (n,)."""
+def _numbers(received: np.ndarray, rate: float, gap: float) -> np.ndarray:
+    """Numbers of the periods, shape (n,); those in a longer ``gap`` [periods] are lost."""
     periods = np.diff(received, prepend=received[:1]) * (rate * 1e-9)
-    steps = np.where(periods > _GAP, np.rint(periods), 1.0).astype(np.int64)
+    steps = np.where(periods > gap, np.rint(periods), 1.0).astype(np.int64)
     return np.cumsum(steps)
 
 

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from avatar_core.contact import model as contact
 from avatar_core.contact.effects import Effect
-from avatar_core.contact.haptics.force_guard import DEVICES, ForceGuard
+from avatar_core.contact.haptics.force_guard import DEVICES, ForceGuard, ForceLimits
 from avatar_core.contact.model import prepare
 from avatar_core.contact.tool_path import push_and_slide
 from avatar_core.geometry.tip import Tip
@@ -110,15 +110,17 @@ class Cell:
         )
 
 
-def simulated_cell(vademecum: Vademecum, effects: Iterable[Effect] = ()) -> Cell:
-    """A push and a slide at 1 kHz, from 250 ms off the organ on, its forces guarded for a sigma."""
+def simulated_cell(
+    vademecum: Vademecum, effects: Iterable[Effect] = (), limits: ForceLimits = DEVICES["sigma"]
+) -> Cell:
+    """A push and a slide at 1 kHz, from 250 ms off the organ on; the forces are guarded."""
     path = push_and_slide(vademecum, RADIUS, 4e-3, 3e-3, 500, 40)
     off = path[0] + 0.05 * (path[0] - path[len(path) // 2]) / np.linalg.norm(path[0] - path[250])
     tips = np.concatenate([np.repeat(off[None], 250, 0), path, np.repeat(off[None], 30, 0)])
     model = prepare(
         vademecum, (Tip("sphere", RADIUS),), cloud="off", effects=tuple(effects), halves=True
     )
-    guard, n = ForceGuard(DEVICES["sigma"]), len(tips)
+    guard, n = ForceGuard(limits), len(tips)
     force, sent, share = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
     status = np.zeros(n, int)
     for k, tip in enumerate(tips):

@@ -26,7 +26,7 @@ from avatar_core.bags.read import read_bag
 from avatar_core.bags.write import write_mcap as export
 from avatar_core.cli import main as cli
 from avatar_core.contact.effects import Friction, Viscoelasticity
-from avatar_core.contact.haptics.force_guard import DEVICES
+from avatar_core.contact.haptics.force_guard import DEVICES, ForceLimits
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene
@@ -64,12 +64,14 @@ def cell(organ: Vademecum) -> Cell:
     return bag_files.simulated_cell(organ)
 
 
-def replayed(path: Path, organ: Vademecum, **how: Any) -> tuple[BagPath, Replayed]:
+def replayed(
+    path: Path, organ: Vademecum, limits: ForceLimits = DEVICES["sigma"], **how: Any
+) -> tuple[BagPath, Replayed]:
     """A bag's path and its replay, as the command makes them."""
     bag = read_bag(path, how.pop("tool", None))
     scene = how.pop("scene", SCENE)
     found = path_of(bag, scene, organ.id, **how)
-    return found, comparable(found, replay(found.recording, organ), DEVICES["sigma"])
+    return found, comparable(found, replay(found.recording, organ), limits)
 
 
 def rosbag(plugin: str, version: int = 9, compression: str = "NONE") -> Writer:
@@ -133,6 +135,35 @@ def test_the_computed_forces_are_compared_where_states_are_recorded(
     np.testing.assert_array_equal(path.recording.periods.force[:, 0], weak.force)
     assert found.difference(path.recording) <= SAME
     np.testing.assert_array_equal(path.recording.periods.sent_fraction[:, 0], weak.share)
+
+
+def test_forces_that_a_limit_altered_are_not_compared(organ: Vademecum, tmp_path: Path) -> None:
+    weak = ForceLimits(1.0, 40.0)
+    cell = bag_files.simulated_cell(organ, limits=weak)
+    altered = (cell.sent != cell.force).any(axis=1)
+    assert 100 < altered.sum() < 500
+    bag = write_rosbag(tmp_path / "bag", cell.messages())
+    path, found = replayed(bag, organ, weak)
+    assert not found.known[altered].any() and found.known[~altered].sum() > 200
+    assert found.difference(path.recording) <= SAME
+    path, found = replayed(bag, organ)
+    assert found.difference(path.recording) > 0.5
+
+
+def test_a_pose_that_is_too_old_is_no_pose(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
+    """The tool falls silent on the organ: its force is faded out, and stays zero."""
+    messages = cell.messages()[:680]  # until it presses
+    last = messages[-1]
+    zero = bag_files.vector(np.zeros(3))
+    nothing = bag_files.make("geometry_msgs/msg/Wrench", zero, zero)
+    for k in range(1, 200):
+        wrench = last.content if k < 20 else replace(last.content, wrench=nothing)
+        messages.append(replace(last, received=last.received + k * PERIOD, content=wrench))
+    path, found = replayed(write_rosbag(tmp_path / "bag", messages), organ)
+    assert np.linalg.norm(path.recording.periods.force[339, 0]) > 0.1
+    assert (path.recording.periods.tip[365:] == 1e3).all()
+    np.testing.assert_array_equal(path.recording.periods.tip[340:355, 0] - cell.tip[339], 0.0)
+    assert found.known[200:340].all() and found.difference(path.recording) <= SAME
 
 
 def test_a_difference_is_seen(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
@@ -269,25 +300,43 @@ def test_messages_in_any_order_and_twice(organ: Vademecum, cell: Cell, tmp_path:
     twice = write_rosbag(tmp_path / "bag", [*shuffled, *messages[500:600]])
     path, found = replayed(twice, organ)
     np.testing.assert_array_equal(path.recording.periods.force[:, 0], cell.sent)
-    assert not path.recording.periods.lost.any()
+    assert len(path.recording.periods) == len(cell.stamp)
     assert found.difference(path.recording) <= SAME
 
 
-def test_gaps_are_lost_periods_and_lost_poses_are_left_out(
-    organ: Vademecum, cell: Cell, tmp_path: Path
+@pytest.mark.parametrize(
+    ("effects", "n", "lost"), [((), 3, 0), ((), 30, 30), ((VISCOUS,), 3, 3), ((VISCOUS,), 1, 1)]
+)
+def test_gaps_are_lost_periods_if_they_matter(
+    effects: tuple[Any, ...], n: int, lost: int, organ: Vademecum, cell: Cell, tmp_path: Path
 ) -> None:
-    stamps = cell.stamp[[300, 301, 302, 500]].tolist()
+    """Elastic forces do not depend on what was between."""
+    stamps = cell.stamp[300 : 300 + n].tolist()
     messages = [
         one
         for one in cell.messages()
-        if not (one.topic.endswith("servo_cf") and stamp_of(one.content) in stamps[:3])
-        and not (one.topic.endswith("measured_cp") and stamp_of(one.content) == stamps[3])
+        if not (one.topic.endswith("servo_cf") and stamp_of(one.content) in stamps)
+    ]
+    bag = write_rosbag(tmp_path / "bag", messages)
+    path, found = replayed(bag, organ, scene=write_scene(Scene(effects=effects)))
+    assert len(path.recording.periods) == len(cell.stamp) - n
+    assert path.recording.periods.lost.sum() == lost
+    if not effects:
+        assert found.known[260:290].all() and found.known[350:450].all() == (lost == 0)
+        assert found.difference(path.recording) <= SAME
+
+
+def test_answers_to_lost_poses_are_left_out(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
+    lost = cell.stamp[500:503].tolist()
+    messages = [
+        one
+        for one in cell.messages()
+        if not (one.topic.endswith("measured_cp") and stamp_of(one.content) in lost)
     ]
     path, found = replayed(write_rosbag(tmp_path / "bag", messages), organ)
-    periods = path.recording.periods
-    assert len(periods) == len(cell.stamp) - 4 and periods.lost.sum() == 4
-    assert path.notes == ("1 wrenches answer poses that the bag lacks: left out",)
-    assert found.known[260:290].all() and found.difference(path.recording) <= SAME
+    assert path.notes == ("3 wrenches answer poses that the bag lacks: left out",)
+    assert path.recording.periods.lost.sum() == 3 and not found.known[503:600].any()
+    assert found.known[260:480].all() and found.difference(path.recording) <= SAME
 
 
 def test_poses_that_the_loop_refused(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
