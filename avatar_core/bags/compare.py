@@ -14,7 +14,7 @@ import numpy as np
 from avatar_core.bags.periods import BagPath
 from avatar_core.common.arrays import FloatArray
 from avatar_core.contact.haptics.force_guard import ForceGuard, ForceLimits
-from avatar_core.scene.replay import Replayed, known_periods, scene_of
+from avatar_core.scene.replay import REMEMBER_FOR_EVER, Replayed, known_periods, scene_of
 from avatar_core.scene.replay import why_not as why_not_recorded
 
 _MARGIN = 10  # periods around those that the guard alters
@@ -40,6 +40,13 @@ def comparable(path: BagPath, found: Replayed, limits: ForceLimits) -> Replayed:
 
 def why_not(path: BagPath) -> str:
     """Why no period of a bag can be compared, and the remedy."""
+    if not path.recording.from_rest:
+        effects = {effect.name for effect in scene_of(path.recording).effects}
+        if held := sorted(effects & set(REMEMBER_FOR_EVER)):
+            return (
+                f"a bag does not say how the organ was at its start, which {' and '.join(held)} "
+                "remembers; record on the planning page"
+            )
     if path.answers == "states":
         return why_not_recorded(path.recording)
     return (

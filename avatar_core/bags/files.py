@@ -94,7 +94,7 @@ class OpenBag:
             raise StorageError(f"there is no bag {path}; give a folder, a .mcap or a .db3")
         if not path.is_dir():
             return [self._reader_of_file(path)]
-        files = sorted((f for f in path.iterdir() if f.suffix in SUFFIXES))
+        files = sorted(f for f in path.iterdir() if f.suffix in SUFFIXES)
         if not (path / "metadata.yaml").exists():
             if not files:
                 raise StorageError(f"{path} holds no .mcap or .db3; give the folder of one bag")

@@ -25,6 +25,7 @@ from avatar_core.contact.model import FAR_AWAY, Status
 from avatar_core.errors import StorageError
 from avatar_core.scene.file import parse_scene
 from avatar_core.scene.recording import Clouds, Periods, Recording
+from avatar_core.scene.replay import REMEMBER_FOR_EVER
 
 ORGAN = "organ"  # the frame that the nodes call the organ's unless told otherwise
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -40,7 +41,7 @@ PLACED = (
     _ENGAGING,
 )
 _GAP = 1.5  # periods
-_REMEMBERING = {"friction", "viscoelasticity", "inertia", "respiration"}
+_REMEMBERING = {"friction", *REMEMBER_FOR_EVER}
 _HELD = 0.02  # for which a pose is held, by default; after it a zero is sent [s]
 _UNIT = 1e-3  # by which a quaternion may differ from length 1, as in the loop
 
@@ -90,7 +91,8 @@ def path_of(
     answers, table = _answers(bag, poses)
     rate = rate or (bag.about.rate if bag.about else _rate(table.received))
     effects = {effect.name for effect in parse_scene(scene, "scene of the bag").effects}
-    gap = _GAP if effects & _REMEMBERING else max(_GAP, _HELD * rate)
+    exact = bag.about is not None  # a recording, whose times of receipt count the periods
+    gap = _GAP if exact or effects & _REMEMBERING else max(_GAP, _HELD * rate)
     number = _numbers(table.received, rate, gap)
     row = _pose_of(poses, table.stamp, answers)
     known = row >= 0

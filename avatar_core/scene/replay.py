@@ -29,7 +29,7 @@ from avatar_core.scene.prepare import scene_spec
 from avatar_core.scene.recording import Periods, Recording
 from avatar_core.vademecum.model import Vademecum
 
-_REMEMBER_FOR_EVER = ("viscoelasticity", "inertia")
+REMEMBER_FOR_EVER = ("viscoelasticity", "inertia")
 _RECORDED_NOWHERE = {"respiration": "phase of the breath", "tilt": "direction of the tool's axis"}
 _STEP = 500  # periods from one call of ``progress`` to the next
 _MAY_BE_INSIDE = (int(Status.OUT_OF_RANGE), int(Status.INVALID_POSE))
@@ -113,7 +113,7 @@ def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray
     known = np.zeros(len(periods), bool)
     if names & set(_RECORDED_NOWHERE):
         return known
-    forgets = not names & set(_REMEMBER_FOR_EVER)
+    forgets = not names & set(REMEMBER_FOR_EVER)
     inside = periods.force.any(axis=2) | np.isin(periods.status, _MAY_BE_INSIDE)
     free, lost = np.logical_not(inside.any(axis=1)), periods.lost > 0
     sure = from_rest
@@ -129,6 +129,6 @@ def why_not(recording: Recording) -> str:
     for name, what in _RECORDED_NOWHERE.items():
         if name in names:
             return f"the {what} is not recorded; record without {name}"
-    if names & set(_REMEMBER_FOR_EVER):
+    if names & set(REMEMBER_FOR_EVER):
         return "the state of the organ at the start is not recorded; start with the tool off it"
     return "the tool was never off the organ; start with the tool off it"
