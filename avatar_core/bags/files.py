@@ -159,7 +159,7 @@ class OpenBag:
         if part is None:
             return None
         lost = file.stat().st_size - part.end
-        self.notes.append(f"{file} was not closed: read up to its last {lost:,} bytes")
+        self.notes.append(f"{file} was not closed: all but its last {lost:,} bytes are read")
         return self._opened(part)
 
     def _opened(self, path: Any) -> Any:

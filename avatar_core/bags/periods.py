@@ -8,7 +8,7 @@ The loop does not number its messages, so that an answer that a recorder lost ca
 one that was never sent because the loop was late. With effects that remember the path, periods are
 taken to be lost where two answers were received more than ``_GAP`` periods apart: too little may be
 compared, but nothing wrongly. Without, the force follows from the tip of the moment, and periods
-are lost where answers are missing for longer than a pose is held.
+are lost where answers are missing for longer than a pose is held, and the tip moved meanwhile.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ PLACED = (
 _GAP = 1.5  # periods
 _REMEMBERING = {"friction", *REMEMBER_FOR_EVER}
 _HELD = 0.02  # for which a pose is held, by default; after it a zero is sent [s]
+_FOLLOWED = 5e-3  # by which a tip may move and be still in contact, however deep it is [m]
 _UNIT = 1e-3  # by which a quaternion may differ from length 1, as in the loop
 
 
@@ -90,22 +91,24 @@ def path_of(
     origin, rotation = _parts(transform or IDENTITY)
     answers, table = _answers(bag, poses)
     rate = rate or (bag.about.rate if bag.about else _rate(table.received))
-    effects = {effect.name for effect in parse_scene(scene, "scene of the bag").effects}
-    exact = bag.about is not None  # a recording, whose times of receipt count the periods
-    gap = _GAP if exact or effects & _REMEMBERING else max(_GAP, _HELD * rate)
-    number = _numbers(table.received, rate, gap)
     row = _pose_of(poses, table.stamp, answers)
     known = row >= 0
     status, tip_kind = _placement(answers, table, known)
     kept = (tip_kind != _MISSING) & _of_organ(answers, table, vademecum_id)
     if not kept.any():
         raise StorageError(f"{bag.path}: no {_ANSWER[answers]} answers a pose of the bag")
-    if lost := int((tip_kind == _MISSING).sum()):
-        notes.append(f"{lost:,} {_ANSWER[answers]} answer poses that the bag lacks: left out")
+    if missing := int((tip_kind == _MISSING).sum()):
+        notes.append(f"{missing:,} {_ANSWER[answers]} answer poses that the bag lacks: left out")
     tip = np.full((len(table), 3), FAR_AWAY)
     tip[tip_kind == _NONE] = np.nan
     here = tip_kind == _AT_POSE
     tip[here] = _moved(poses.values[row[here], :3], origin, rotation)
+    late = np.diff(table.received, prepend=table.received[:1]) > _HELD * 1e9
+    lost = late & (_leaps(tip) | (answers == "wrenches"))  # whose status nobody knows
+    effects = {effect.name for effect in parse_scene(scene, "scene of the bag").effects}
+    if bag.about is not None or effects & _REMEMBERING:  # a recording's receipts count the periods
+        lost = np.ones(len(table), bool)
+    number = _numbers(table.received, rate, lost)
     turn = _turns(poses, row, here) @ rotation.T
     force = _forces(bag, answers, table, poses, row, rotation)
     recording = Recording(
@@ -126,7 +129,7 @@ def path_of(
         ),
         clouds=Clouds(np.zeros(0, np.int64), np.zeros((0, 0, 3), np.float32)),
     )
-    sound = here & ~_spoilt(table.received, invalid)
+    sound = here & ~late & ~_spoilt(table.received, invalid)
     return BagPath(recording, answers, table.received[kept], sound[kept], tuple(notes))
 
 
@@ -190,10 +193,17 @@ def _rate(received: np.ndarray) -> float:
     return rate
 
 
-def _numbers(received: np.ndarray, rate: float, gap: float) -> np.ndarray:
-    """Numbers of the periods, shape (n,); those in a longer ``gap`` [periods] are lost."""
+def _leaps(tip: FloatArray) -> np.ndarray:
+    """Whether the tip moved farther than a contact is followed, or was not known, shape (n,)."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        moved = np.linalg.norm(np.diff(tip, axis=0, prepend=tip[:1]), axis=1)
+        return np.asarray(~(moved <= _FOLLOWED))
+
+
+def _numbers(received: np.ndarray, rate: float, lost: np.ndarray) -> np.ndarray:
+    """Numbers of the periods, shape (n,); a gap counts where it ends in a ``lost`` one."""
     periods = np.diff(received, prepend=received[:1]) * (rate * 1e-9)
-    steps = np.where(periods > gap, np.rint(periods), 1.0).astype(np.int64)
+    steps = np.where((periods > _GAP) & lost, np.rint(periods), 1.0).astype(np.int64)
     return np.cumsum(steps)
 
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
 _BAR_FROM = 2.0  # [s]
+_SAME_CODE = "replay with the version of avatar, and on the kind of processor, that recorded"
+_SAME_CELL = f"give --scene, --tool-transform and --device of the cell, and {_SAME_CODE}"
 
 
 def replay(
@@ -94,7 +96,7 @@ def _replay_recording(file: Path, vademecum: Path, tolerance: float) -> None:
     with _bar("periods") as progress:
         found = replay(recording, organ, progress)
     _say(recording, recording.periods.force)
-    _compare(file, recording, found, why_not(recording), tolerance)
+    _compare(file, recording, found, why_not(recording), tolerance, _SAME_CODE)
 
 
 class _How(NamedTuple):
@@ -127,7 +129,7 @@ def _replay_bag(file: Path, vademecum: Path, how: _How, tolerance: float) -> Non
         print(f"  {note}")
     if recorded:
         found = comparable(path, replayed, how.limits)
-        _compare(file, path.recording, found, why_not(path), tolerance)
+        _compare(file, path.recording, found, why_not(path), tolerance, _SAME_CELL)
 
 
 _COMPARED = {
@@ -181,7 +183,7 @@ def _say(recording: Recording, force: np.ndarray) -> None:
 
 
 def _compare(
-    file: Path, recording: Recording, found: Replayed, why_not: str, tolerance: float
+    file: Path, recording: Recording, found: Replayed, why_not: str, tolerance: float, remedy: str
 ) -> None:
     difference = found.difference(recording)
     require(not math.isnan(difference), f"{file}: nothing can be compared: {why_not}")
@@ -190,8 +192,7 @@ def _compare(
     )
     require(
         difference <= tolerance,
-        f"{file}: forces differ by {difference:.2e} N, above {tolerance:g} N; replay with the "
-        "version of avatar, and on the kind of processor, that recorded",
+        f"{file}: forces differ by {difference:.2e} N, above {tolerance:g} N; {remedy}",
     )
 
 
