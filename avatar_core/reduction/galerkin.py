@@ -38,7 +38,7 @@ from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 _DEPENDENT = {False: 1e-10, True: 1e-6}
 _ORTHONORMAL = {False: 1e-6, True: 0.05}
 _TRIED = 2  # load positions on which single precision is tried
-WORST_OVER_MEAN = 2.25  # estimated, of the mean asked for; the true worst may be a third above
+WORST_OVER_MEAN = 2.0  # estimated, of the mean asked for; the true worst may be half as much again
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def reduce(
 ) -> ReducedResponse:
     """Galerkin response from the neighbours' load functions, enriched until the tolerance.
 
-    Stops at the tolerance (mean, and 2.25 times that for the worst load), or with ``converged``
+    Stops at the tolerance (mean, and twice that for the worst load), or with ``converged``
     False after ``max_solution_fraction`` of the fine solutions.
 
     Parameters
