@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.fem.elasticity import Elasticity
-from avatar_core.fem.norms import l2_norm
+from avatar_core.fem.norms import l2_by_position
 from avatar_core.fem.patch_loads import LoadSurface, scaled_gram, triples
 from avatar_core.offline.full_response import FullResponse, Solving, full_response
 from avatar_core.offline.rule import CompletionRule, Progress
@@ -92,7 +92,7 @@ def completed_response(
             progress("solve", (solved.sum() + done) / n, scale * float(left.mean()))
         if projections:
             exact = solving.columns[::_SAMPLED, triples(chosen)]
-            error = _by_position(guess - exact, mass) / _by_position(exact, mass)
+            error = l2_by_position(guess - exact, mass) / l2_by_position(exact, mass)
             scale = float(error.mean() / left[chosen].mean())
         solved[chosen] = True
         projections = projector.project(solving.compliance, solved)
@@ -194,11 +194,6 @@ def _columns(
         weights = projection.weights[:, here].astype(np.float32)
         found[:, place] = columns[:, projection.sources] @ weights
     return found
-
-
-def _by_position(columns: FloatArray, mass: FloatArray) -> FloatArray:
-    """L2 norm of the three columns of each position together, shape (n,)."""
-    return np.asarray(np.linalg.norm(l2_norm(columns, mass).reshape(-1, 3), axis=1))
 
 
 def _fill(solving: Solving, projections: Sequence[_Projection], solved: IntArray) -> None:

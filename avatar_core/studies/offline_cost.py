@@ -1,4 +1,4 @@
-"""Offline accuracy against time: mesh, grid, who writes a shape, and how a patient is made.
+"""Offline accuracy against time: mesh, loads, grid, who writes a shape, how a patient is made.
 
 Each row has an error, what it is of, and the CPU seconds that it took.
 """
@@ -19,11 +19,16 @@ from avatar_core.atlas.patient import Fidelity, PatientOptions, patient_vademecu
 from avatar_core.atlas.response import ResponseSolver
 from avatar_core.common.processes import repeatable
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.norms import l2_by_position
+from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.level_set import distance_grid, isosurface
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import mesh_error
+from avatar_core.offline.completion import completed_response
+from avatar_core.offline.full_response import full_response
 from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.offline.rule import CompletionRule, silent
 from avatar_core.shapes.registration import RegistrationRule
 from avatar_core.studies.grid import GridSettings, grid_row, reference_of
 from avatar_core.studies.leave_one_out import LeaveOneOutSettings, judged, methods, placed
@@ -57,6 +62,36 @@ def mesh_rows(surface: SurfaceMesh, sizes: tuple[int, ...]) -> list[dict[str, Va
                 "vademecum_error": built.certificate.l2_mean,
                 "modes": built.far.rank,
             }
+        )
+    return rows
+
+
+def load_rows(
+    elasticity: Elasticity, surface: LoadSurface, tolerances: tuple[float, ...]
+) -> list[dict[str, Value]]:
+    """The response to every load: all solved, and some solved and the others projected on them.
+
+    The error of projection is that from all solutions, that of these single precision's own, on
+    few loads; the time is without the factor.
+    """
+    loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
+    rounding = elasticity.single_error(loads[:, :6].tocsc())  # which makes the factor too
+    start = time.process_time()
+    exact = full_response(elasticity, loads, silent, single=True)
+    seconds = time.process_time() - start
+    rows = [_row("loads", "all solved", "all", rounding, seconds) | {"size": 0.0}]
+    mass = elasticity.mesh.lumped_mass
+    size = l2_by_position(exact.columns, mass)
+    for tolerance in follow(tolerances, "loads"):
+        rule = CompletionRule(tolerance, least=0)
+        start = time.process_time()
+        found = completed_response(elasticity, surface, loads, rule, silent)
+        seconds = time.process_time() - start
+        error = l2_by_position(found.columns - exact.columns, mass) / size
+        contact = np.abs(found.energy / exact.energy - 1.0)
+        rows.append(
+            _row("loads", "projected", f"asked for {tolerance:.2g}", error.mean(), seconds)
+            | {"size": tolerance, "worst": error.max(), "contact_error": contact.mean()}
         )
     return rows
 

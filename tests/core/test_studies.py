@@ -329,7 +329,7 @@ def test_json_has_no_nan(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_accuracy_time(tmp_path: Path) -> None:
     settings = accuracy_time.AccuracyTimeSettings(
-        400, 40, 40, 150, (300,), (20e-3, 10e-3), 6, 3, 250
+        400, 40, 40, 150, (300,), (20e-3, 10e-3), (5e-3,), 6, 3, 250
     )
     found = accuracy_time.study(None, settings, tmp_path)
     summary = checked_files(found, tmp_path)
@@ -339,7 +339,7 @@ def test_accuracy_time(tmp_path: Path) -> None:
     assert summary["front_points"] >= 5
     assert summary["budgets_as_enumerated"] == 1.0
     page = (tmp_path / "accuracy-time.html").read_text()
-    assert page.count("<figure>") == 7 and 'src="http' not in page  # it stands alone
+    assert page.count("<figure>") == 8 and 'src="http' not in page  # it stands alone
     rows = (tmp_path / "accuracy-time.csv").read_text().splitlines()
     assert len(rows) == len(found.rows) + 1
     methods = {row["method"] for row in found.rows}
