@@ -5,8 +5,9 @@ F_S of some positions solved, K X_S = F_S, another one is projected on their sol
 
     u_t ~ X_S w_t,    C_SS w_t = C_St,    C = F^T X,
 
-and no further equation is solved: the compliance C_St of every patch is read from X_S. S are the
-solved positions around t; farther ones change nothing that matters. What is left of the load,
+and no further equation is solved: the compliance C_St of every patch is read from X_S. (Of C this
+is the approximation of Nystroem, Williams & Seeger, NIPS 13, 2001.) S are the solved positions
+around t; farther ones change nothing that matters. What is left of the load,
 
     r_t = f_t - F_S w_t,    eta_t^2 = r_t . D^-1 r_t,    D = diag K,
 
