@@ -69,6 +69,11 @@ class HeldTool:
         self.wrench = WrenchTemplate("organ")
         self.status, self.stamp = OK, stamp_bytes(1)
 
+    @property
+    def fault(self) -> int:
+        """Its device takes every force."""
+        return self.status
+
     def take(self, now: int, timeout: int, tip: np.ndarray, turn: np.ndarray, leap: float) -> bool:
         tip[:], turn[:] = self.tip, self.turn
         return True
