@@ -1,20 +1,45 @@
 """A planning cell: `ros2 launch avatar_ros planning_cell.launch.py params:=FILE.yaml`.
 
-The file ``params`` holds the parameters of all nodes; the arguments ``library_dir``,
-``vademecum``, ``scene``, ``atlas`` and ``state_dir`` override those of the same name. The node
-patient_interpolation runs only if there is an atlas.
+The file ``params`` holds the parameters of all nodes; the other arguments override those of the
+same name. The node patient_interpolation runs only if there is an atlas, planning_ui only with
+``ui:=true``. The arguments are the options of `avatar cell`.
 """
+
+import sys
+from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+# As in avatar_ros.nodes.cell, which the Python of `ros2 launch` need not be able to import.
 OVERRIDES = {
     "vademecum_loader": ("library_dir", "vademecum", "state_dir"),
     "contact": ("scene", "state_dir"),
     "patient_interpolation": ("library_dir", "atlas"),
+    "planning_ui": ("library_dir", "host", "port"),
+}
+REQUIRED = {"patient_interpolation": "atlas", "planning_ui": "ui"}
+ARGUMENTS = {
+    "library_dir": "directory of the vademecums",
+    "vademecum": "file in library_dir to load",
+    "scene": "scene to simulate: name of a shipped one, or a path",
+    "atlas": "atlas; empty: no patient_interpolation",
+    "state_dir": "directory of saved state; empty: none",
+    "ui": "true: also serve the planning page",
+    "host": "network address to serve the page on",
+    "port": "port of the page",
+}
+# Arguments that launch itself takes.
+OF_LAUNCH = {
+    "launch-prefix",
+    "launch-prefix-filter",
+    "emulate_tty",
+    "sigterm_timeout",
+    "sigkill_timeout",
 }
 
 
@@ -24,18 +49,11 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument(
-                "params", default_value=default, description="parameters of all nodes"
+                "params", default_value=default, description="parameters of all nodes (YAML)"
             ),
-            DeclareLaunchArgument(
-                "library_dir", default_value="", description="directory of the vademecums"
-            ),
-            DeclareLaunchArgument("vademecum", default_value="", description="vademecum to load"),
-            DeclareLaunchArgument("scene", default_value="", description="scene to simulate"),
-            DeclareLaunchArgument(
-                "atlas", default_value="", description="atlas; empty: no patient_interpolation"
-            ),
-            DeclareLaunchArgument(
-                "state_dir", default_value="", description="directory of saved state; empty: none"
+            *(
+                DeclareLaunchArgument(name, default_value="", description=description)
+                for name, description in ARGUMENTS.items()
             ),
             OpaqueFunction(function=nodes),
         ]
@@ -43,15 +61,40 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def nodes(context: LaunchContext) -> list[Node]:
-    def given(name: str) -> str:
-        return LaunchConfiguration(name).perform(context)
-
+    refuse_unknown(context.argv)
+    values = {n: LaunchConfiguration(n).perform(context) for n in ("params", *ARGUMENTS)}
+    given = {name: value for name, value in values.items() if value}
+    if given.get("ui", "false").lower() not in ("true", "false"):
+        raise ValueError(f"ui is {given['ui']!r}; give true or false")
+    if given.get("ui", "").lower() == "false":
+        del given["ui"]
+    params = Path(given.get("params", "")).expanduser()
+    if not params.is_file():  # launch would warn, and start the nodes without it
+        raise FileNotFoundError(f"params is {str(params)!r}, which is not a file")
     return [
         Node(
             package="avatar_ros",
             executable=node,
-            parameters=[given("params"), {name: given(name) for name in names if given(name)}],
+            parameters=[str(params), {n: typed(n) for n in names if n in given}],
         )
         for node, names in OVERRIDES.items()
-        if node != "patient_interpolation" or given("atlas")
+        if REQUIRED.get(node, "params") in given
     ]
+
+
+def typed(name: str) -> ParameterValue:
+    """An argument as a parameter; launch by itself would take a folder called 2024 for a number."""
+    return ParameterValue(LaunchConfiguration(name), value_type=int if name == "port" else str)
+
+
+def refuse_unknown(words: list[str]) -> None:
+    """Raise ValueError for a mistyped argument, which launch ignores.
+
+    Only if the command line names this file: one that includes it may have arguments of its own.
+    """
+    if not any(Path(word).name.startswith("planning_cell.launch.") for word in sys.argv):
+        return
+    known = {"params", *ARGUMENTS}
+    names = {word.split(":=")[0] for word in words if ":=" in word}
+    for name in sorted(names - known - OF_LAUNCH):
+        raise ValueError(f"there is no argument {name}; there are {', '.join(sorted(known))}")
