@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
-from avatar_ros.framework import qos
+from avatar_ros.framework import promises, qos
 from avatar_ros.framework.realtime import wake_up_periods
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
@@ -21,6 +21,7 @@ from shape_msgs.msg import Mesh
 
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumInfo
 from avatar_ros.srv import LoadVademecum
+from tests.ros.answers import took
 from tests.ros.conftest import START_TIMEOUT
 from tests.slowness import Deadline
 
@@ -248,8 +249,11 @@ def test_a_bad_file_is_refused(cell: Any, probe: Any, name: str, reason: str) ->
 def test_a_good_file_is_loaded(cell: Any, probe: Any, organ: Any, library: Path) -> None:
     from avatar_core.vademecum.storage import load_vademecum
 
+    asked = time.monotonic()
     answer = probe.call(LoadVademecum, "load_vademecum", LoadVademecum.Request(name="liver.h5"))
-    assert (answer.success, answer.message) == (True, "")
+    assert answer.success, answer.message
+    promised = f"{promises.reading((library / 'liver.h5').stat().st_size):.1f} s"
+    assert 0.0 < took(answer.message, "announced", promised) < time.monotonic() - asked
     expected = load_vademecum(library / "liver.h5").info()
     assert answer.info.id == expected.id
     assert answer.info.n_modes == expected.n_modes

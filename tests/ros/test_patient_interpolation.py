@@ -34,6 +34,7 @@ from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.action import BuildPatient
 from avatar_ros.msg import ContactState
 from avatar_ros.srv import InterpolatePatient, LoadVademecum
+from tests.ros.answers import took
 from tests.ros.conftest import newcomer
 from tests.ros.pages import index, offered, parameter_rows, yaml_parameters
 from tests.ros.refusals import refusal
@@ -119,7 +120,8 @@ def test_the_service_writes_what_loader_and_contact_take(
     node: Module, own_domain: dict[str, str], probe: Any, folder: Path
 ) -> None:
     answer = _ask(probe, **PATIENT, name="first")
-    assert (answer.success, answer.message, answer.file) == (True, "", "first.h5")
+    assert (answer.success, answer.file) == (True, "first.h5"), answer.message
+    assert took(answer.message, "written", "30 s") == pytest.approx(answer.seconds, abs=0.01)
     assert set(answer.neighbours) == {"liver1", "liver2"}
     assert sum(answer.weights) == pytest.approx(1.0, abs=1e-9)
     assert answer.weight_abs_sum == pytest.approx(np.abs(answer.weights).sum())
@@ -162,7 +164,8 @@ def test_a_mesh_in_the_request_is_built_by_the_action(
     mesh = surface_mesh(livers[-1].vertices, livers[-1].faces)
     pursuit = Pursuit(probe, mesh=mesh, neighbors=2, fidelity="reduced", tolerance=0.2)
     status, result = pursuit.result()
-    assert (status, result.success, result.message) == (GoalStatus.STATUS_SUCCEEDED, True, "")
+    assert (status, result.success) == (GoalStatus.STATUS_SUCCEEDED, True), result.message
+    assert took(result.message, "written", "90 s") == pytest.approx(result.seconds, abs=0.01)
     assert result.file == "mesh-reduced.h5"
     assert len(result.neighbours) == 2
     assert load_vademecum(folder / result.file).id == result.vademecum_id

@@ -30,7 +30,7 @@ from avatar_core.contact.haptics import passivity
 from avatar_core.contact.layout import Layout
 from avatar_core.errors import AccuracyError, SceneError, one_line
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget
-from avatar_ros.framework import qos, realtime
+from avatar_ros.framework import promises, qos, realtime
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
@@ -231,12 +231,15 @@ class ContactNode(ManagedNode):
     async def _load_scene(
         self, request: LoadScene.Request, response: LoadScene.Response
     ) -> LoadScene.Response:
+        begin = time.monotonic()
         try:
             prepared = await self._in_use(scenes.change_of(request))
             if prepared.cloud_divisor is not None:
                 self._set_cloud_divisor(prepared.cloud_divisor)
             self._scene = self._supplier.scene if self._supplier is not None else ""
             self._save_state()
+            promised = f"{promises.SCENE:g} s, {promises.COMPILED_SCENE:g} s if it was compiled"
+            response.message = promises.kept("in use", time.monotonic() - begin, promised)
             response.success = True
         except Exception as error:  # a service always answers; the text decides what is raised
             response.message = one_line(error)

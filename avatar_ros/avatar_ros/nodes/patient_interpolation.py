@@ -16,7 +16,7 @@ from rclpy.task import Future
 
 from avatar_core.errors import one_line
 from avatar_ros.action import BuildPatient
-from avatar_ros.framework import conversions
+from avatar_ros.framework import conversions, promises
 from avatar_ros.framework.library import RefusedError, file_name, find_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
@@ -168,7 +168,7 @@ class PatientInterpolationNode(ManagedNode):
         self, request: InterpolatePatient.Request, response: InterpolatePatient.Response
     ) -> InterpolatePatient.Response:
         try:
-            _fill(response, await self._beside(lambda: self.build(request)))
+            _fill(response, await self._beside(lambda: self.build(request)), request.fidelity)
         except Exception as error:  # a service always answers; the surface decides what is raised
             self._refuse("interpolate_patient", response, error)
         return response
@@ -183,7 +183,7 @@ class PatientInterpolationNode(ManagedNode):
             return self.build(goal.request, tell, lambda: goal.is_cancel_requested)
 
         try:
-            _fill(result, await self._beside(work))
+            _fill(result, await self._beside(work), goal.request.fidelity)
             goal.succeed()
         except Exception as error:  # as above
             self._refuse("build_patient", result, error)
@@ -224,9 +224,11 @@ class PatientInterpolationNode(ManagedNode):
             self.get_logger().error(text)
 
 
-def _fill(answer: Any, built: Built) -> None:
+def _fill(answer: Any, built: Built, fidelity: str) -> None:
     for name, value in asdict(built).items():
         setattr(answer, name, value)
+    promised = f"{promises.PATIENT[fidelity or _DEFAULT_FIDELITY]:g} s"
+    answer.message = promises.kept("written", built.seconds, promised)
     answer.success = True
 
 

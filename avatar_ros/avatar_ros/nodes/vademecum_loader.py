@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from std_msgs.msg import Header
 
 from avatar_core.errors import AvatarError, StorageError, one_line
 from avatar_core.vademecum import storage
-from avatar_ros.framework import conversions, qos
+from avatar_ros.framework import conversions, promises, qos
 from avatar_ros.framework.library import read_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import (
@@ -114,8 +115,8 @@ class LoaderNode(ManagedNode):
         if name:
             self.load(name)
 
-    def load(self, name: str) -> VademecumInfo:
-        """Verify a file of the library and announce it.
+    def load(self, name: str) -> tuple[VademecumInfo, int]:
+        """Verify a file of the library and announce it; returns its size, too [bytes].
 
         Raises
         ------
@@ -135,16 +136,19 @@ class LoaderNode(ManagedNode):
         self.get_logger().info(
             f"announced {vademecum.name!r} ({vademecum.id[:12]}), {len(data) / 1e6:.1f} MB"
         )
-        return info
+        return info, len(data)
 
     def _answer(
         self, request: LoadVademecum.Request, response: LoadVademecum.Response
     ) -> LoadVademecum.Response:
+        begin = time.monotonic()
         try:
             if not self._is_active:
                 raise StorageError("the node is inactive; activate it first")
-            response.info = self.load(request.name)
+            response.info, n_bytes = self.load(request.name)
             self._state.save({"vademecum": request.name})
+            promised = f"{promises.reading(n_bytes):.1f} s"
+            response.message = promises.kept("announced", time.monotonic() - begin, promised)
             response.success = True
         except Exception as error:  # a service always answers; the file decides what is raised
             response.message = one_line(error)
