@@ -13,6 +13,7 @@ Run as ``python -m avatar_core.common.confined MAX_BYTES`` by ``Confined``, neve
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import pickle
 import resource
@@ -44,6 +45,24 @@ class ConfinedError(AvatarError):
     """A call ended its process, took too long or too much memory, or failed in its own way."""
 
 
+class Imported:
+    """A function by its name, which is imported where it is called and not where it is named."""
+
+    def __init__(self, module: str, name: str) -> None:
+        self._module, self._name = module, name
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return _imported(self._module, self._name)(*args, **kwargs)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _imported, (self._module, self._name)
+
+
+def _imported(module: str, name: str) -> Callable[..., Any]:
+    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return function
+
+
 class Confined:
     """A process that calls functions for this one.
 
@@ -70,6 +89,8 @@ class Confined:
         self, seconds: float, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """``function(*args, **kwargs)``; all of them can be pickled.
+
+        ``Imported`` in place of a function keeps this process free of what the function needs.
 
         Parameters
         ----------

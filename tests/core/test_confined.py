@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from avatar_core.common.confined import Confined, ConfinedError
+from avatar_core.common.confined import Confined, ConfinedError, Imported
 from avatar_core.errors import StorageError
 from avatar_core.vademecum.storage import load_vademecum
 from tests.slowness import within
@@ -29,6 +30,15 @@ def confined() -> Iterator[Confined]:
 def test_a_call_gives_what_the_function_gives(confined: Confined) -> None:
     made = confined.call(SECONDS, np.linspace, 0.0, 1.0, num=5)
     np.testing.assert_array_equal(made, [0.0, 0.25, 0.5, 0.75, 1.0])
+
+
+def test_a_function_by_its_name_is_imported_there_alone(
+    confined: Confined, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    named = Imported("colorsys", "rgb_to_yiq")
+    assert confined.call(SECONDS, named, 0.0, 0.0, 0.0) == (0.0, 0.0, 0.0)
+    assert "colorsys" not in sys.modules
 
 
 def test_an_error_of_ours_comes_back_as_it_is(confined: Confined) -> None:

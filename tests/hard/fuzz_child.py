@@ -15,7 +15,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -144,7 +144,7 @@ def _loader() -> Door:
 
     def check(vademecum: Any) -> None:
         _require_vademecum(vademecum)
-        conversions.vademecum_info(vademecum.info(), Header())
+        conversions.vademecum_info(asdict(vademecum.info()), Header())
         conversions.surface_mesh(vademecum.surface_vertices, vademecum.surface_faces)
 
     return Door(_vademecum_bytes, read, check, lambda: reader.pid)

@@ -15,10 +15,12 @@ class Footprint:
     """Resources of one process at one moment.
 
     memory_mb : that the system cannot reclaim: without code and pages of files
+    pss_mb : its share of all that it has in memory, code and pages of files too
     files : open descriptors, sockets among them
     """
 
     memory_mb: float
+    pss_mb: float
     files: int
     threads: int
 
@@ -30,9 +32,10 @@ class Footprint:
         if "RssAnon" not in status:
             raise ProcessLookupError(f"process {pid} has ended")
         held = sum(int(status[name][0]) for name in ("RssAnon", "RssShmem", "VmSwap"))
-        return Footprint(
-            1024e-6 * held, len(os.listdir(f"/proc/{pid}/fd")), int(status["Threads"][0])
-        )
+        shares = Path(f"/proc/{pid}/smaps_rollup").read_text()
+        pss = int(shares.partition("\nPss:")[2].split()[0])
+        files, threads = len(os.listdir(f"/proc/{pid}/fd")), int(status["Threads"][0])
+        return Footprint(1024e-6 * held, 1024e-6 * pss, files, threads)
 
 
 @dataclass(frozen=True)
@@ -63,11 +66,12 @@ class Growth:
         a, b = self.begin, self.end
         return (
             f"{self.process:34}{f'{a.memory_mb:.1f}':>10} {f'{self.memory_mb:+.1f}':>6}"
+            f"{f'{b.pss_mb:.1f}':>10}"
             f"{f'{a.files} {b.files}':>10}{f'{a.threads} {b.threads}':>10}"
         )
 
 
-HEADER = f"{'process':34}{'MB':>10} {'growth':>6}{'files':>10}{'threads':>10}"
+HEADER = f"{'process':34}{'MB':>10} {'growth':>6}{'PSS':>10}{'files':>10}{'threads':>10}"
 
 
 def footprints(pids: dict[str, int]) -> dict[str, Footprint]:

@@ -6,7 +6,6 @@ Those of the loop are in :mod:`avatar_ros.framework.templates`.
 from __future__ import annotations
 
 import array
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,9 @@ from std_msgs.msg import Header
 from avatar_ros.msg import VademecumFile, VademecumInfo
 
 
-def vademecum_info(info: Any, header: Header) -> VademecumInfo:
-    """The message of ``avatar_core.vademecum.model.VademecumInfo``, field by field."""
-    return VademecumInfo(header=header, **dataclasses.asdict(info))
+def vademecum_info(info: dict[str, Any], header: Header) -> VademecumInfo:
+    """The message of an ``avatar_core.vademecum.model.VademecumInfo``, given by its fields."""
+    return VademecumInfo(header=header, **info)
 
 
 def vademecum_file(identity: str, name: str, data: bytes) -> VademecumFile:

@@ -8,7 +8,7 @@ from __future__ import annotations
 SCENE = 2.0  # until another scene, compiled before, is in use [s]
 COMPILED_SCENE = 60.0  # with effects that were never combined on this machine [s]
 PATIENT = {"interpolated": 30.0, "reduced": 90.0, "solved": 240.0}  # from file to file [s]
-_READER = 1.5  # to start the process that reads [s]
+_READER = 3.0  # to start the process that reads [s]
 _READING = 40e6  # [byte/s]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
@@ -14,13 +15,19 @@ R = TypeVar("R")
 _OWN = 1 << 30  # address space of the process and its libraries [bytes]
 _SECONDS = 4.0  # for a file of any size, plus its size divided by
 _MIN_SPEED = 20e6  # [byte/s]
+_IDLE = 10.0  # after which the process, which holds four times the last file, is ended [s]
 
 
 class Reader:
-    """Reads files of at most ``max_bytes``, which may be in memory four times during that."""
+    """Reads files of at most ``max_bytes``, which may be in memory four times during that.
 
-    def __init__(self, max_bytes: int) -> None:
+    idle : after which the process is ended; the next file starts another, which takes a second [s]
+    """
+
+    def __init__(self, max_bytes: int, idle: float = _IDLE) -> None:
         self._confined = Confined(_OWN + 4 * max_bytes)
+        self._idle = idle
+        self._end = threading.Timer(0.0, self._confined.close)  # never started
 
     @property
     def pid(self) -> int | None:
@@ -40,11 +47,17 @@ class Reader:
             If it ends its process, or takes much longer or more memory than such a file needs.
         """
         seconds = _SECONDS + n_bytes / _MIN_SPEED
+        self._end.cancel()
         try:
             return self._confined.call(seconds, function, *args, **kwargs)
         except ConfinedError as error:
             raise RefusedError(f"{name}: damaged, {error}; make it again") from error
+        finally:
+            self._end = threading.Timer(self._idle, self._confined.close)
+            self._end.daemon = True
+            self._end.start()
 
     def close(self) -> None:
         """End the process."""
+        self._end.cancel()
         self._confined.close()

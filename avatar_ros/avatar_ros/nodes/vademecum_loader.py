@@ -11,8 +11,9 @@ from rclpy.node import Node
 from shape_msgs.msg import Mesh
 from std_msgs.msg import Header
 
+from avatar_core.common.confined import Imported
+from avatar_core.common.processes import return_memory
 from avatar_core.errors import AvatarError, StorageError, one_line
-from avatar_core.vademecum import storage
 from avatar_ros.framework import conversions, promises, qos
 from avatar_ros.framework.library import read_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
@@ -28,6 +29,8 @@ from avatar_ros.framework.reader import Reader
 from avatar_ros.framework.saved_state import STATE_DIR, SavedState
 from avatar_ros.msg import VademecumFile, VademecumInfo
 from avatar_ros.srv import LoadVademecum
+
+SUMMARY = Imported("avatar_ros.framework.summary", "summary")
 
 VADEMECUM_LOADER = (
     AUTOSTART,
@@ -90,6 +93,7 @@ class LoaderNode(ManagedNode):
     def activate(self) -> None:
         assert self._settings is not None
         self._load_first(self._settings.vademecum)
+        return_memory()
         self._is_active = True
 
     def deactivate(self) -> None:
@@ -124,17 +128,15 @@ class LoaderNode(ManagedNode):
         """
         assert self._settings is not None and self._reader is not None
         data = read_in_library(name, self._settings.library_dir, self._settings.max_bytes)
-        vademecum = self._reader.read(name, len(data), storage.parse_vademecum, data, name)
+        found, vertices, faces = self._reader.read(name, len(data), SUMMARY, data, name)
         header = Header(frame_id=self._settings.frame_id, stamp=self.get_clock().now().to_msg())
-        info = conversions.vademecum_info(vademecum.info(), header)
-        surface = conversions.surface_mesh(vademecum.surface_vertices, vademecum.surface_faces)
+        info = conversions.vademecum_info(found, header)
+        surface = conversions.surface_mesh(vertices, faces)
         self._outlets[VademecumInfo].publish(info)
         self._outlets[Mesh].publish(surface)
-        self._outlets[VademecumFile].publish(
-            conversions.vademecum_file(vademecum.id, vademecum.name, data)
-        )
+        self._outlets[VademecumFile].publish(conversions.vademecum_file(info.id, info.name, data))
         self.get_logger().info(
-            f"announced {vademecum.name!r} ({vademecum.id[:12]}), {len(data) / 1e6:.1f} MB"
+            f"announced {info.name!r} ({info.id[:12]}), {len(data) / 1e6:.1f} MB"
         )
         return info, len(data)
 
@@ -153,6 +155,7 @@ class LoaderNode(ManagedNode):
         except Exception as error:  # a service always answers; the file decides what is raised
             response.message = one_line(error)
             self.get_logger().error(f"load_vademecum: {response.message}")
+        return_memory()
         return response
 
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from avatar_core.common.processes import return_memory
 from avatar_core.errors import one_line
 from avatar_ros.framework import realtime
 from avatar_ros.framework.reader import Reader
@@ -90,6 +91,8 @@ class ModelPreparer:
                 return
             self._vademecum = vademecum
             self._time(sent)
+            del sent
+            return_memory()
 
     def listen(self) -> None:
         """Take changes of the request until the socket is closed."""
