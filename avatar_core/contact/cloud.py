@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from avatar_core.reduction.regional import RegionalField
 from avatar_core.vademecum.accuracy import Cloud, Precision
 
 if TYPE_CHECKING:
+    from avatar_core.reduction.regional import RegionalField
     from avatar_core.vademecum.model import Vademecum
 
 BLOCK = 256  # displacements that are summed together, within the first-level cache

@@ -37,7 +37,6 @@ from functools import cache
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from scipy.spatial import cKDTree
 
 from avatar_core.common.jit import fast
 from avatar_core.contact.effects.tip_law import PATCH, dent
@@ -127,6 +126,9 @@ def points_around(
 ) -> tuple[np.ndarray, ...]:
     """Points that a tip near each centre may move: start (n + 1,), and their numbers, nearest
     first."""
+    # Here, because the contact node needs none of it.
+    from scipy.spatial import cKDTree
+
     radius = (REACH + _ASIDE) * patch_radius
     if len(points) == 0:
         return np.zeros(len(centres) + 1, np.int64), np.zeros(0, np.int32)

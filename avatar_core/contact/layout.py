@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from avatar_core.contact import kernels
-from avatar_core.contact.ball_shift import shifts_of
 from avatar_core.contact.cloud import cloud_arrays
 from avatar_core.contact.dent import dent_arrays
 from avatar_core.contact.display import display_arrays
@@ -127,6 +126,9 @@ def lay_out_details(
         _check(vademecum, tips, detail)
     if effects is None:
         effects = default_effects(vademecum, len(tips))
+    # Here, because the contact node needs none of it.
+    from avatar_core.contact.ball_shift import shifts_of
+
     for effect in effects:
         effect.require(vademecum)
     if len(tips) > 1 and find(effects, SeveralTools) is None:

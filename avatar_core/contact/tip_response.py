@@ -19,14 +19,16 @@ a scaled Gram matrix, positive definite as C is, with the diagonal gamma.
 from __future__ import annotations
 
 from collections import namedtuple
+from typing import TYPE_CHECKING
 
-import igl
 import numpy as np
 
 from avatar_core.common.jit import compiled, fast
-from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.reduction.near_field import LocalBlocks, find_block, hash_rows
-from avatar_core.vademecum.tip_field import TipField, grid_normals, smoothed
+
+if TYPE_CHECKING:
+    from avatar_core.fem.patch_loads import LoadSurface
+    from avatar_core.vademecum.tip_field import TipField
 
 SMOOTHING = 0.1  # standard deviation of K, in patch radii
 MAX_STENCIL = 27 * 6  # load positions that carry one tip, at most: six at each grid point of a cell
@@ -57,6 +59,9 @@ def make_tip_response(
     near : LocalBlocks, its near part [m/N]
     depth, height : farthest tip centre below and above the surface [m]
     """
+    # Here, because the contact node needs none of it.
+    from avatar_core.vademecum.tip_field import grid_normals, smoothed
+
     spacing = float(field.spacing[0])
     margin = 3.0 * spacing  # half the splines' support, along its diagonal
     shell = (field.distance > -depth - margin) & (field.distance < height + margin)
@@ -92,6 +97,9 @@ def sampled_at_tip(
     -------
     ndarray float32, shape (n, nx, ny, nz)
     """
+    # Here, because the contact node needs none of it.
+    from avatar_core.vademecum.tip_field import smoothed
+
     shell = response.row >= 0
     deviation = SMOOTHING * surface.patch_radius / float(field.spacing[0])
     out = np.zeros((len(values), *shell.shape), np.float32)
@@ -104,6 +112,9 @@ def sampled_at_tip(
 
 def closest_weights(surface: LoadSurface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Load positions and their weights at the accessible points closest to some points (n, 3)."""
+    # Here, because the contact node needs none of it.
+    import igl
+
     _, face, closest = igl.point_mesh_squared_distance(points, surface.centers, surface.corners)
     corners = [np.ascontiguousarray(surface.centers[surface.corners[face, i]]) for i in range(3)]
     barycentric = igl.barycentric_coordinates(np.ascontiguousarray(closest), *corners)

@@ -16,11 +16,12 @@ the square of half the difference of the principal curvatures where the surface 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from avatar_core.geometry.offsets import Offsets
+if TYPE_CHECKING:
+    from avatar_core.geometry.offsets import Offsets
 
 RADII = 1e-3 * np.array([1.5, 3.0, 4.5, 6.0])  # of the circles [m]
 DIRECTIONS = 7  # odd: on a ridge, as good as twice as many

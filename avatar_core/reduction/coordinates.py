@@ -15,11 +15,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from avatar_core.errors import CoordinateError
-from avatar_core.fem.elasticity import Elasticity
+
+if TYPE_CHECKING:
+    from avatar_core.fem.elasticity import Elasticity
 
 # Between nodes no farther apart, in the scales above, interpolation adds nothing to the error that
 # can be measured (`avatar study coordinates`).

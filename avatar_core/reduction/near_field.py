@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from avatar_core.common.jit import compiled, inlined
 
@@ -105,6 +104,9 @@ class Pairs:
 
 def near_pairs(positions: np.ndarray, targets: np.ndarray, radius: float) -> Pairs:
     """All pairs closer than ``radius``; rows by position, targets ascending."""
+    # Here, because the contact node needs none of it.
+    from scipy.spatial import cKDTree
+
     hits = cKDTree(targets).query_ball_point(positions, radius, return_sorted=True)
     start = np.concatenate([[0], np.cumsum([len(hit) for hit in hits])]).astype(np.int64)
     target = np.concatenate([np.asarray(hit, np.int32) for hit in hits])

@@ -26,15 +26,17 @@ from tests.slowness import Deadline
 pytestmark = pytest.mark.ros
 
 MOST = 60.0  # of a loader without what it announces [MB]
-# Of finite elements and compilers, which only reading and preparing a vademecum need.
-LIBRARIES = ("scipy", "numba", "skfem", "igl", "rslab", "h5py")
+# Those that only reading and preparing a vademecum need.
+LIBRARIES = {"scipy.sparse", "scipy.spatial", "scipy.linalg", "skfem", "igl", "rslab", "h5py"}
 
 
-def test_the_loader_imports_no_library_that_only_reading_needs() -> None:
-    code = "import sys, avatar_ros.nodes.vademecum_loader; print(*sys.modules)"
+@pytest.mark.parametrize("node", ["vademecum_loader", "contact"])
+def test_a_node_imports_no_library_that_only_reading_and_preparing_need(node: str) -> None:
+    code = f"import sys, avatar_ros.nodes.{node}; print(*sys.modules)"
     command = [sys.executable, "-c", code]
     imported = subprocess.check_output(command, cwd="/", text=True).split()
-    assert {*LIBRARIES}.isdisjoint(imported)
+    assert LIBRARIES.isdisjoint(imported)
+    assert node == "contact" or "numba" not in imported
 
 
 def test_a_process_that_reads_ends_when_it_has_nothing_to_do() -> None:

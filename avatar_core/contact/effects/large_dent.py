@@ -21,7 +21,6 @@ on the tip is - Psi grad E* at constant F.
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from avatar_core.common.jit import fast
 from avatar_core.geometry.tip import Tip
@@ -57,6 +56,9 @@ def large_dent_of(tip: Tip, poisson_ratio: float, neo_hookean: bool) -> np.ndarr
 
 def interpolated(table: np.ndarray, poisson_ratio: float) -> np.ndarray:
     """c_0 ... c_3 and the largest s^3 between the rows of a table like ``COEFFICIENTS``, (5,)."""
+    # Here, because the contact node needs none of it.
+    from scipy.interpolate import CubicSpline
+
     return np.asarray(CubicSpline(table[:, 0], table[:, 1:])(poisson_ratio))
 
 

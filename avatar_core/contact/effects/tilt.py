@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections import namedtuple
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -34,7 +34,9 @@ from avatar_core.common.splines import in_cell
 from avatar_core.contact.effects.base import Effect, direction
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
-from avatar_core.vademecum.tip_field import TipField, grid_normals
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum.tip_field import TipField
 
 _UPRIGHT = 1e-9  # sine below which a punch does not lean
 
@@ -81,6 +83,9 @@ TiltState = namedtuple(
 
 def tilt_arrays(effect: Tilt, tips: Sequence[Tip], field: TipField) -> TiltArrays:
     """Constant arrays of the effect."""
+    # Here, because the contact node needs none of it.
+    from avatar_core.vademecum.tip_field import grid_normals
+
     normals = grid_normals(field.distance, float(field.spacing[0]))
     return TiltArrays(
         np.array(effect.axis),

@@ -42,6 +42,7 @@ from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -61,8 +62,10 @@ from avatar_core.contact.effects.tip_profile import (
 )
 from avatar_core.contact.effects.tip_surface import felt_shape
 from avatar_core.errors import ContactError
-from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.tip import Tip
+
+if TYPE_CHECKING:
+    from avatar_core.fem.elasticity import Material
 
 PATCH = 0.7665  # c E* R_p on a half-space,
 # and on the elements of a liver: at 38 places of five livers the same patch sank 0.03 to 0.12 of

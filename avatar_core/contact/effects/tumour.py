@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, ClassVar
 from avatar_core.common.quantities import quantity
 from avatar_core.contact.effects.base import Effect
 from avatar_core.errors import SceneError
-from avatar_core.vademecum.at_values import at_values
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
@@ -60,4 +59,7 @@ def at_contrast(vademecum: Vademecum, effect: Tumour | None) -> Vademecum:
         or not any(low <= contrast <= high for low, high in ranges)
     ):
         return vademecum
+    # Here, because the contact node needs none of it.
+    from avatar_core.vademecum.at_values import at_values
+
     return at_values(vademecum, {"contrast": contrast})
