@@ -1,6 +1,6 @@
 """The offline stage: from an organ's mesh to its vademecum.
 
-1. four patches in ten are solved, and the others projected on their solutions, see
+1. about half of the patches are solved, the others projected on their solutions, see
    :mod:`avatar_core.offline.completion`;
 2. PGD finds the modes that all loads share, and body functions join them; an orthogonal mixing
    sorts them by displacement norm. The first are the global modes of the displacement; the contact

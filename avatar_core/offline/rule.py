@@ -13,7 +13,7 @@ Progress = Callable[[str, float, float], None]  # stage, fraction of it, current
 NO_ERROR = float("nan")
 
 _GLOBAL_PART = 0.4  # of the modes that a place may have
-_COMPLETION_PART = 1.0 / 4.0  # of the tolerance, that loads which are not solved may take
+_COMPLETION_PART = 1.0 / 6.0  # of the tolerance, that loads which are not solved may take
 _REGION_POSITIONS = 30  # load positions of a region at least, in the mean
 
 
