@@ -28,7 +28,7 @@ from avatar_core.scene.model import Scene
 from avatar_core.scene.replay import replay
 from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.msg import ContactState, VademecumInfo
-from tests.core.bag_files import STORE
+from tests.core.bags.bag_files import STORE
 from tests.slowness import Deadline
 
 pytestmark = pytest.mark.ros

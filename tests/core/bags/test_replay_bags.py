@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -12,11 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.rosbag2 import Reader
 from scipy.spatial.transform import Rotation
 
 from avatar_core.bags import table, types
@@ -27,15 +24,15 @@ from avatar_core.bags.write import write_mcap as export
 from avatar_core.cli import main as cli
 from avatar_core.contact.effects import Friction, Viscoelasticity
 from avatar_core.contact.haptics.force_guard import DEVICES, ForceLimits
-from avatar_core.errors import AvatarError, StorageError
+from avatar_core.errors import StorageError
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
 from avatar_core.scene.replay import Replayed, replay
 from avatar_core.vademecum.model import Vademecum
-from avatar_core.vademecum.storage import load_vademecum, save_vademecum
-from tests.core import bag_files
-from tests.core.bag_files import (
+from avatar_core.vademecum.storage import save_vademecum
+from tests.core.bags import bag_files
+from tests.core.bags.bag_files import (
     PERIOD,
     POSE,
     Cell,
@@ -50,18 +47,6 @@ from tests.core.bag_files import (
 SAME = 1e-9  # [N]
 SCENE = write_scene(Scene())
 Writer = Callable[[Path, Iterable[Message]], Path]
-
-
-@pytest.fixture(scope="module")
-def organ(straight: Vademecum, tmp_path_factory: pytest.TempPathFactory) -> Vademecum:
-    file = tmp_path_factory.mktemp("bags") / "liver.h5"
-    save_vademecum(straight, file)
-    return load_vademecum(file)
-
-
-@pytest.fixture(scope="module")
-def cell(organ: Vademecum) -> Cell:
-    return bag_files.simulated_cell(organ)
 
 
 def replayed(
@@ -438,173 +423,6 @@ def test_bounded_memory(monkeypatch: pytest.MonkeyPatch, cell: Cell, tmp_path: P
 def test_our_types_are_those_of_the_nodes() -> None:
     for name, definition in bag_files.own_types().items():
         assert types.typestore().fielddefs[name][1] == definition[1], name
-
-
-# --- damage -----------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def whole(cell: Cell, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An MCAP file of some chunks, by mcap-ros2-support."""
-    return write_mcap(tmp_path_factory.mktemp("whole") / "whole.mcap", cell.messages())
-
-
-@pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
-def test_a_file_that_was_not_closed(part: float, whole: Path, cell: Cell, tmp_path: Path) -> None:
-    content = whole.read_bytes()
-    file = tmp_path / "killed.mcap"
-    file.write_bytes(content[: int(part * len(content))])
-    bag = read_bag(file)
-    n = len(bag.poses)
-    assert (part - 0.25) * len(cell.stamp) < n <= len(cell.stamp)
-    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[:n])
-    assert bag.wrenches is not None
-    np.testing.assert_array_equal(bag.wrenches.values, cell.sent[: len(bag.wrenches)])
-    assert len(bag.notes) == 1 and "was not closed: all but its last" in bag.notes[0]
-
-
-def test_a_file_that_ends_in_zeros(whole: Path, cell: Cell, tmp_path: Path) -> None:
-    """As a disk leaves one whose power failed; the last chunk is half zero."""
-    content = whole.read_bytes()
-    file = tmp_path / "zeros.mcap"
-    n = len(content) // 2
-    file.write_bytes(content[:n] + bytes(n))
-    bag = read_bag(file)
-    assert 0.2 * len(cell.stamp) < len(bag.poses) < 0.6 * len(cell.stamp)
-    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[: len(bag.poses)])
-
-
-def test_two_topics_out_of_order_in_a_file_that_was_not_closed(cell: Cell, tmp_path: Path) -> None:
-    messages = cell.messages()
-    swapped = [one for pair in zip(messages[1::2], messages[::2], strict=True) for one in pair]
-    file = write_mcap(tmp_path / "swapped.mcap", swapped)
-    file.write_bytes(file.read_bytes()[:-3000])
-    bag = read_bag(file)
-    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[: len(bag.poses)])
-    assert len(bag.poses) > 0.7 * len(cell.stamp)
-
-
-def test_a_damaged_chunk(whole: Path, cell: Cell, tmp_path: Path) -> None:
-    content = bytearray(whole.read_bytes())
-    middle = len(content) // 2
-    content[middle : middle + 2000] = bytes(2000)
-    file = tmp_path / "spoilt.mcap"
-    file.write_bytes(content)
-    bag = read_bag(file)
-    n = len(bag.poses)
-    assert 0.2 * len(cell.stamp) < n < 0.7 * len(cell.stamp)
-    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[:n])
-    assert any("damaged after" in note for note in bag.notes)
-
-
-def test_a_folder_without_metadata(cell: Cell, tmp_path: Path) -> None:
-    messages = cell.messages()
-    folder = tmp_path / "bag"
-    folder.mkdir()
-    for i in (2, 10):  # the files of one recording
-        part = messages[:800] if i == 2 else messages[800:]
-        write_mcap(folder / f"bag_{i}.mcap", part)
-    bag = read_bag(folder)
-    np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip)
-    assert bag.notes == (f"{folder} has no metadata.yaml; its files are read one by one",)
-
-
-@pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
-def test_metadata_that_names_another_quality_of_service(
-    plugin: str, cell: Cell, tmp_path: Path
-) -> None:
-    """As in some bags of rosbag2 itself; the library alone reads nothing of them."""
-    bag = write_rosbag(tmp_path / "bag", cell.messages(), plugin, 8)
-    held = yaml.safe_load((bag / "metadata.yaml").read_text())
-    qos = "- {history: 3, depth: 0, reliability: 1, durability: 2, deadline: {sec: 1, nsec: 0}, "
-    qos += "lifespan: {sec: 1, nsec: 0}, liveliness: 1, liveliness_lease_duration: {sec: 1, nsec: "
-    qos += "0}, avoid_ros_namespace_conventions: false}"
-    for topic in held["rosbag2_bagfile_information"]["topics_with_message_count"]:
-        topic["topic_metadata"]["offered_qos_profiles"] = qos
-    (bag / "metadata.yaml").write_text(yaml.safe_dump(held))
-    with Reader(bag) as reader:
-        assert not list(reader.messages())
-    assert len(read_bag(bag).poses) == len(cell.stamp)
-
-
-def test_metadata_that_is_damaged(cell: Cell, tmp_path: Path) -> None:
-    bag = write_rosbag(tmp_path / "bag", cell.messages())
-    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: [")
-    assert len(read_bag(bag).poses) == len(cell.stamp)
-
-
-@pytest.mark.parametrize("garbage", ["text", "half", "short"])
-def test_sqlite_that_is_damaged_is_refused(garbage: str, cell: Cell, tmp_path: Path) -> None:
-    file = next(write_rosbag(tmp_path / "bag", cell.messages(), "SQLITE3").glob("*.db3"))
-    content = file.read_bytes()
-    spoilt = {"text": b"no database" * 99, "half": content[: len(content) // 2], "short": b""}
-    file.write_bytes(spoilt[garbage])
-    for path in (file, tmp_path / "bag"):
-        with pytest.raises(
-            StorageError, match=r"no readable bag.*sqlite3 FILE \.recover"
-        ) as caught:
-            read_bag(path)
-        assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("closed", [True, False])
-def test_sizes_that_lie(closed: bool, whole: Path, cell: Cell, tmp_path: Path) -> None:
-    """A chunk, its content and the header that claim more than there is."""
-    content = bytearray(whole.read_bytes())
-    chunk = content.index(b"\x06", 8 + 9)
-    while struct.unpack_from("<Q", content, chunk + 1)[0] > len(content):
-        chunk = content.index(b"\x06", chunk + 1)
-    for offset, size in ((chunk + 1, 1 << 62), (chunk + 9 + 16, 1 << 60), (9, 1 << 40)):
-        lying = content.copy()
-        struct.pack_into("<Q", lying, offset, size)
-        file = tmp_path / "lying.mcap"
-        file.write_bytes(lying if closed else lying[:-100])
-        try:
-            bag = read_bag(file)
-        except StorageError as error:
-            assert "\n" not in str(error)
-        else:  # the index tells the truth
-            assert closed
-            np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip[: len(bag.poses)])
-            assert len(bag.poses) == len(cell.stamp) or "damaged" in bag.notes[0]
-
-
-@pytest.mark.parametrize("suffix", [".mcap", ".db3"])
-def test_random_damage_never_ends_in_a_traceback(suffix: str, cell: Cell, tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    plugin = "MCAP" if suffix == ".mcap" else "SQLITE3"
-    messages = cell.messages()[:300]
-    content = next(write_rosbag(tmp_path / "bag", messages, plugin).glob(f"*{suffix}")).read_bytes()
-    file, outcomes = tmp_path / f"spoilt{suffix}", set()
-    for _ in range(150):
-        spoilt = bytearray(content)
-        where = rng.integers(0, len(spoilt), 1 + rng.integers(0, 20))
-        spoilt[slice(None)] = bytes(spoilt)
-        for i in where:
-            spoilt[i] = rng.integers(0, 256)
-        file.write_bytes(spoilt[: rng.integers(len(spoilt) // 2, len(spoilt) + 1)])
-        try:
-            path_of(read_bag(file), SCENE, "")
-            outcomes.add("read")
-        except AvatarError as error:
-            assert "\n" not in str(error)
-            outcomes.add("refused")
-    assert outcomes == {"read", "refused"} or suffix == ".db3"
-
-
-def test_what_is_no_bag(tmp_path: Path) -> None:
-    for name, match in (
-        ("none", "there is no bag"),
-        ("old.bag", "a bag of ROS 1; convert it"),
-        ("half.db3.zstd", "give the bag's folder"),
-    ):
-        if "." in name:
-            (tmp_path / name).write_bytes(b"x")
-        with pytest.raises(StorageError, match=match):
-            read_bag(tmp_path / name)
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(StorageError, match=r"holds no \.mcap or \.db3"):
-        read_bag(tmp_path / "folder")
 
 
 # --- the commands -----------------------------------------------------------------------------
