@@ -137,7 +137,7 @@ class OpenBag:
             raise StorageError(f"{file} is no file; give a bag")
         try:
             return self._opened(file)
-        except Exception as error:
+        except Exception as error:  # whatever the library raises for what is no such file
             reader = self._recovered(file) if file.suffix == MCAP else None
             if reader is None:
                 raise StorageError(
@@ -152,7 +152,7 @@ class OpenBag:
             try:
                 with self._library.Reader(part):
                     return True
-            except Exception:
+            except Exception:  # likewise
                 return False
 
         part = longest_readable(file, opens)

@@ -17,6 +17,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from avatar_core.bags.read import Bag
 from avatar_core.bags.table import Table
@@ -271,23 +272,13 @@ def _parts(transform: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
         raise StorageError(
             "a transform is x,y,z [m] and a quaternion x,y,z,w of length 1, as 0,0,0.1,0,0,0,1"
         )
-    i, j, k, w = numbers[3:] / length
-    rotation = np.array([_rotated(axis, (i, j, k, w)) for axis in np.eye(3)]).T
-    return numbers[:3], rotation
+    return numbers[:3], Rotation.from_quat(numbers[3:]).as_matrix()
 
 
 def _moved(points: FloatArray, origin: FloatArray, rotation: FloatArray) -> FloatArray:
     """Into the organ's frame; bit by bit the same if both frames are one."""
     turned = points if np.array_equal(rotation, np.eye(3)) else points @ rotation.T
     return turned + origin
-
-
-def _rotated(vector: FloatArray, quaternion: tuple[FloatArray, ...] | FloatArray) -> FloatArray:
-    """Vectors, shape (..., 3), in the frame that a quaternion x y z w is given in."""
-    i, j, k, w = quaternion
-    axis = np.stack([i, j, k], axis=-1)
-    twice = 2.0 * np.cross(axis, vector)
-    return vector + np.asarray(w)[..., None] * twice + np.cross(axis, twice)
 
 
 def _turns(poses: Table, row: np.ndarray, here: np.ndarray) -> FloatArray:
@@ -312,7 +303,7 @@ def _forces(
         return np.zeros((len(table), 3))
     force = table.values
     if bag.axes == "body":
-        force = _rotated(force, tuple(poses.values[np.maximum(row, 0), 3:].T))
+        force = Rotation.from_quat(poses.values[np.maximum(row, 0), 3:]).apply(force)
     return force if np.array_equal(rotation, np.eye(3)) else force @ rotation.T
 
 

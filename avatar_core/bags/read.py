@@ -17,6 +17,7 @@ from avatar_core.scene.recording import FORMAT
 POSES = "measured_cp"
 WRENCHES = {"servo_cf": "absolute", "body/servo_cf": "body", "spatial/servo_cf": "spatial"}
 STATES, INFOS, ABOUT = "contact_state", "vademecum_info", "recording"
+_STEP = 4096  # messages from one call of ``progress`` to the next
 
 Progress = Callable[[int, int], None]
 
@@ -49,9 +50,6 @@ class About:
     def text(self) -> str:
         """As JSON."""
         return json.dumps({"format": FORMAT, **asdict(self)})
-
-
-_STEP = 4096  # messages from one call of ``progress`` to the next
 
 
 @dataclass(frozen=True, eq=False)
