@@ -1,4 +1,4 @@
-"""Types of arrays."""
+"""Types of arrays, and points that are chosen from many."""
 
 from __future__ import annotations
 
@@ -7,3 +7,23 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.integer]
+
+
+def farthest_points(points: FloatArray, n: int, first: int = 0) -> IntArray:
+    """Some points far from one another: each the farthest from all before it.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n_points, 3) [m]
+    n : how many, all of them at most; first : the one to begin with
+
+    Returns
+    -------
+    ndarray of int, shape (n,), in the order in which they are chosen
+    """
+    chosen, distance = [first], np.full(len(points), np.inf)
+    while len(chosen) < min(n, len(points)):
+        from_last = np.linalg.norm(points - points[chosen[-1]], axis=1)
+        distance = np.minimum(distance, from_last)
+        chosen.append(int(distance.argmax()))
+    return np.array(chosen)

@@ -82,6 +82,25 @@ class LoadSurface:
         """Centroids of the accessible faces, shape (n_triangles, 3) [m]."""
         return self.centers[self.corners].mean(axis=1)
 
+    def largest_apart(self, values: np.ndarray, n: int, distance: float) -> np.ndarray:
+        """Positions of the largest values above zero, not nearer to one another than a distance.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n_positions,)
+        n : number of positions at most; distance : [m]
+
+        Returns
+        -------
+        ndarray of int, the largest first
+        """
+        left = values.copy()
+        chosen: list[int] = []
+        while len(chosen) < n and left.max() > 0.0:
+            chosen.append(int(left.argmax()))
+            left[np.linalg.norm(self.centers - self.centers[chosen[-1]], axis=1) < distance] = 0.0
+        return np.array(chosen, np.int64)
+
     @property
     def area(self) -> float:
         """Area of the accessible faces [m^2]."""

@@ -29,7 +29,7 @@ import scipy.sparse as sp
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
 
-from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.arrays import FloatArray, IntArray, farthest_points
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_by_position
 from avatar_core.fem.patch_loads import LoadSurface, scaled_gram, triples
@@ -84,7 +84,10 @@ def completed_response(
     solving = Solving(elasticity, loads, single=True)
     projector = _Projector(elasticity, surface, loads, rule)
     mass = elasticity.mesh.lumped_mass[::_SAMPLED]
-    solved, chosen = np.zeros(n, bool), spread(surface.centers, round(rule.first * n))
+    solved, chosen = (
+        np.zeros(n, bool),
+        np.sort(farthest_points(surface.centers, round(rule.first * n))),
+    )
     projections: list[_Projection] = []
     scale, left = np.nan, np.full(n, np.nan)  # of the estimate, which is scale times what is left
     while chosen.size:
@@ -98,22 +101,13 @@ def completed_response(
         solved[chosen] = True
         projections = projector.project(solving.compliance, solved)
         left = _residual(projections, n)
-        chosen = _next(left, surface, max(1, round(rule.step * n)))
+        step, apart = max(1, round(rule.step * n)), _APART * surface.patch_radius
+        chosen = np.sort(surface.largest_apart(left, step, apart))
         if rule.is_met(scale * float(left.mean()), scale * float(left.max())):
             break
     _fill(solving, projections, solved)
     progress("solve", 1.0, scale * float(left.mean()))
     return solving.response()
-
-
-def spread(points: FloatArray, n: int) -> IntArray:
-    """Some points far from one another, each the farthest from those before it, ascending."""
-    distance, chosen = np.full(len(points), np.inf), [0]
-    while len(chosen) < min(n, len(points)):
-        from_last = np.linalg.norm(points - points[chosen[-1]], axis=1)
-        distance = np.minimum(distance, from_last)
-        chosen.append(int(distance.argmax()))
-    return np.sort(np.array(chosen))
 
 
 class _Projector:
@@ -161,17 +155,6 @@ class _Projector:
         square = self._size[targets] + np.einsum("st,st->t", weights, change)
         eta = np.maximum(square, 0.0).reshape(-1, 3).sum(axis=1)
         return _Projection(targets, sources, weights, np.sqrt(eta / np.maximum(given, 1e-300)))
-
-
-def _next(residual: FloatArray, surface: LoadSurface, n: int) -> IntArray:
-    """Positions of the largest residuals, not near one another, ascending."""
-    left = residual.copy()
-    chosen: list[int] = []
-    while len(chosen) < n and left.max() > 0.0:
-        chosen.append(int(left.argmax()))
-        distance = np.linalg.norm(surface.centers - surface.centers[chosen[-1]], axis=1)
-        left[distance < _APART * surface.patch_radius] = 0.0
-    return np.sort(np.array(chosen))
 
 
 def _residual(projections: Sequence[_Projection], n: int) -> FloatArray:

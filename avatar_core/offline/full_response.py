@@ -17,7 +17,6 @@ from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 from avatar_core.reduction.separated import SeparatedField
 
 _BATCH = 80  # load positions solved at once: fewer take longer each
-_TRIED = 2  # load positions on which single precision is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +60,7 @@ class Solving:
     def __init__(self, elasticity: Elasticity, loads: sp.csr_matrix, single: bool) -> None:
         self._elasticity, self._average = elasticity, loads.T.tocsr()
         self._by_column, n = loads.tocsc(), loads.shape[1]
-        self._single = single and elasticity.single_serves(self._by_column[:, : 3 * _TRIED])
+        self._single = single and elasticity.single_serves(self._by_column)
         self.columns = np.empty((3 * len(elasticity.mesh.vertices), n), np.float32, order="F")
         self.compliance = np.empty((n, n), np.float32, order="F")
 

@@ -37,7 +37,6 @@ from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 # what the Gram matrix of orthonormal functions may be off.
 _DEPENDENT = {False: 1e-10, True: 1e-6}
 _ORTHONORMAL = {False: 1e-6, True: 0.05}
-_TRIED = 2  # load positions on which single precision is tried
 WORST_OVER_MEAN = 2.0  # estimated, of the mean asked for; the true worst may be half as much again
 
 
@@ -217,7 +216,7 @@ def reduce(
     rule = rule or ReductionRule()
     limit = max(int(rule.max_solution_fraction * loads.shape[1]), 3 * (rule.n_probes + 1))
     n_probes = min(rule.n_probes, limit // 6, surface.n_positions)
-    single = elasticity.single_serves(loads[:, : 3 * _TRIED].tocsc())
+    single = elasticity.single_serves(loads)
     probes = solve_probes(elasticity, loads, n_probes, single)
     basis = GalerkinBasis(elasticity, loads, single)
     basis.solutions = 3 * n_probes
@@ -289,12 +288,7 @@ def worst_positions(
     """Load positions of the largest relative residuals, at least 1.5 patch radii apart."""
     left = relative_residual(basis, blocks)
     left[excluded] = 0.0  # a probe in the space would make the estimate too small
-    chosen: list[int] = []
-    while len(chosen) < n and left.max() > 0.0:
-        chosen.append(int(left.argmax()))
-        distance = np.linalg.norm(surface.centers - surface.centers[chosen[-1]], axis=1)
-        left[distance < 1.5 * surface.patch_radius] = 0.0
-    return np.array(chosen, np.int64)
+    return surface.largest_apart(left, n, 1.5 * surface.patch_radius)
 
 
 def residual_compliance(

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 
-from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.arrays import FloatArray, IntArray, farthest_points
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
@@ -109,18 +109,14 @@ def study(surface: SurfaceMesh, settings: PGDSettings) -> Study:
     )
 
 
-def spread(positions: LoadSurface, n: int) -> FloatArray:
-    """Numbers of load vertices that are far from one another (farthest point sampling)."""
+def spread(positions: LoadSurface, n: int) -> IntArray:
+    """Numbers of load vertices that are far from one another, the middle one first."""
     points = positions.centers[: len(positions.vertices)]
-    chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())]
-    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < min(n, len(points)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return np.array(chosen)
+    middle = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())
+    return farthest_points(points, n, middle)
 
 
-def make_case(elasticity: Elasticity, positions: LoadSurface, nodes: FloatArray, kind: str) -> Case:
+def make_case(elasticity: Elasticity, positions: LoadSurface, nodes: IntArray, kind: str) -> Case:
     """Unit loads in one direction, the mean inward normal, on patches or single nodes."""
     direction = -positions.normals[nodes].mean(axis=0)
     direction /= np.linalg.norm(direction)
