@@ -41,6 +41,9 @@ def study(
     quick: Annotated[
         bool, typer.Option("--quick", help="smaller version that takes minutes")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="go on with an interrupted meshes or transport study")
+    ] = False,
 ) -> None:
     """Repeat an experiment of the paper, and write its figures beside ours."""
     from avatar_core.studies.study import write_study
@@ -49,6 +52,8 @@ def study(
         print(f"avatar: no study '{name}'; choose one of {', '.join(STUDIES)}", file=sys.stderr)
         raise typer.Exit(USAGE)
     _require_folder(output)
+    if not resume:
+        (output / f"{name}.rows.jsonl").unlink(missing_ok=True)
     run = import_module(STUDIES[name]).run
     start = time.perf_counter()
     found = run(surfaces, quick, output)

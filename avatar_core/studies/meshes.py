@@ -19,6 +19,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import igl
@@ -60,16 +61,21 @@ QUICK = MeshesSettings(n_livers=6, n_built=0, n_refined=0, n_again=1)
 
 def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
     """The study on a folder of surfaces; None for the default one."""
-    file = RowFile(folder / "meshes.rows.jsonl")
-    return study(surfaces, QUICK if quick else FULL, file.add)
+    file = RowFile(folder / "meshes.rows.jsonl", "liver")
+    return study(surfaces, QUICK if quick else FULL, file.add, file.rows)
 
 
 def study(
     folder: Path | None,
     settings: MeshesSettings,
     row_done: Callable[[Mapping[str, Value]], None] | None = None,
+    known: Mapping[str, dict[str, Value]] = MappingProxyType({}),
 ) -> Study:
-    """One row for each surface; ``row_done`` is called with each when it is measured."""
+    """One row for each surface.
+
+    row_done : called with each when it is measured
+    known : rows of surfaces that are not measured again, by their names
+    """
     livers = read_livers(folder, settings.n_livers, settings.phantoms)
     n = len(livers.surfaces)
     built, refined, again = (
@@ -78,6 +84,9 @@ def study(
     )
     rows: list[dict[str, Value]] = []
     for i, surface in enumerate(follow(livers.surfaces, "livers")):
+        if surface.name in known:
+            rows.append(known[surface.name])
+            continue
         row, mesh = _meshed(surface, settings)
         if i in again:
             row["same_again"] = _same(mesh, tetrahedralize(surface, settings.n_vertices))

@@ -95,19 +95,36 @@ def machine() -> dict[str, Value]:
 class RowFile:
     """Rows of a study as they are measured, one JSON object a line in ``NAME.rows.jsonl``.
 
-    A study that is interrupted after an hour leaves what it had found.
+    A study that is interrupted after an hour leaves what it had found, and goes on from there.
 
-    path : of the file, which is begun anew
+    path : of the file, which is begun if it is not there
+    key : by which rows are told apart
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, key: str) -> None:
         self._path = path
-        path.write_text("")
+        lines = path.read_text().splitlines() if path.is_file() else []
+        found = [row for row in map(_parsed, lines) if row is not None]
+        self.rows: dict[str, dict[str, Value]] = {str(row[key]): row for row in found}
+        path.write_text("".join(_line(row) for row in found))
 
     def add(self, row: Mapping[str, Value]) -> None:
         """Append a row."""
         with self._path.open("a") as file:
-            file.write(json.dumps(_plain(dict(row)), allow_nan=False) + "\n")
+            file.write(_line(row))
+
+
+def _line(row: Mapping[str, Value]) -> str:
+    return json.dumps(_plain(dict(row)), allow_nan=False) + "\n"
+
+
+def _parsed(line: str) -> dict[str, Value] | None:
+    """A row; None for a line that was cut off."""
+    try:
+        row: dict[str, Value] = json.loads(line)
+    except ValueError:
+        return None
+    return row
 
 
 def follow(items: Iterable[Item], text: str) -> Iterator[Item]:

@@ -9,13 +9,15 @@ construction; its time is that of all solutions, without their separation.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import igl
 import numpy as np
@@ -141,8 +143,9 @@ def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
     skipped = tuple(
         f"{surface.name}: not in the atlas" for surface in livers.surfaces if surface not in members
     )
-    file = RowFile(folder / "transport.rows.jsonl")
-    found = transport(members, base, quick, row_done=lambda row: file.add(_flat(row)))
+    file = RowFile(folder / "transport.rows.jsonl", "name")
+    known = {name: _of_flat(row) for name, row in file.rows.items()}
+    found = transport(members, base, quick, row_done=lambda row: file.add(_flat(row)), known=known)
     summary = found.summary
     sentence = (
         f"{len(found.rows)} patients, each left out of {len(base.names)} livers: interpolated "
@@ -190,6 +193,7 @@ def transport(
     same_person: Collection[Collection[str]] = SAME_SUBJECT,
     options: PatientOptions | None = None,
     row_done: Callable[[TransportRow], None] | None = None,
+    known: Mapping[str, TransportRow] = MappingProxyType({}),
 ) -> Transport:
     """Leave-one-out over livers that are members of the base, one scan of each person.
 
@@ -198,6 +202,7 @@ def transport(
     surfaces : of the members, ``surface.name`` in ``base.names``
     quick : three patients on coarse meshes instead of twelve
     row_done : called with each row when it is measured
+    known : rows of patients that are not measured again, by their names
     """
     options = options or PatientOptions(n_vertices=700 if quick else 2850)
     further = {name for scans in same_person for name in sorted(scans)[1:]}
@@ -206,6 +211,9 @@ def transport(
     chosen = np.linspace(0, len(surfaces) - 1, count).astype(int)
     rows: list[TransportRow] = []
     for i in follow(chosen, "patients"):
+        if surfaces[i].name in known:
+            rows.append(known[surfaces[i].name])
+            continue
         rows.append(transport_row(surfaces[i], base, same_person, options))
         if row_done is not None:
             row_done(rows[-1])
@@ -361,6 +369,14 @@ def _flat(row: TransportRow) -> dict[str, Value]:
     by_weighting = record.pop("interpolated")
     names = [f"interpolated_{kind.replace('-', '_')}" for kind in WEIGHTINGS]
     return {**record, **dict(zip(names, by_weighting, strict=True)), "within_2x": row.within_2x}
+
+
+def _of_flat(flat: dict[str, Any]) -> TransportRow:
+    """The inverse of :func:`_flat`; what is not a number was written as null."""
+    found: dict[str, Any] = {k: math.nan if value is None else value for k, value in flat.items()}
+    del found["within_2x"]
+    by_weighting = (found.pop(f"interpolated_{kind.replace('-', '_')}") for kind in WEIGHTINGS)
+    return TransportRow(interpolated=tuple(by_weighting), **found)
 
 
 def _draw(figure: Figure, rows: Sequence[TransportRow]) -> None:

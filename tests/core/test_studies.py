@@ -90,11 +90,12 @@ def test_meshes(tmp_path: Path) -> None:
     assert summary["min_dihedral_deg"] > 5.0
 
 
-def test_an_interrupted_study_leaves_its_rows(
+def test_an_interrupted_study_leaves_its_rows_and_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = meshes.MeshesSettings(n_built=0, n_again=0, n_vertices=300, n_points=200)
-    rows = RowFile(tmp_path / "meshes.rows.jsonl")
+    path = tmp_path / "meshes.rows.jsonl"
+    rows = RowFile(path, "liver")
 
     def then_stop(row: Mapping[str, Value]) -> None:
         rows.add(row)
@@ -102,9 +103,19 @@ def test_an_interrupted_study_leaves_its_rows(
 
     with pytest.raises(KeyboardInterrupt):
         meshes.study(write_phantoms(tmp_path, 3), settings, then_stop)
-    (line,) = (tmp_path / "meshes.rows.jsonl").read_text().splitlines()
+    (line,) = path.read_text().splitlines()
     assert json.loads(line)["liver"] == "LiTS-5"
     assert json.loads(line)["n_vertices"] > 100
+    path.write_text(line + "\n" + line[:40])  # the process died as it wrote the second row
+    again = RowFile(path, "liver")
+    measured: list[str] = []
+    known = {"LiTS-5": {**again.rows["LiTS-5"], "n_vertices": 12345}}
+    found = meshes.study(
+        tmp_path, settings, lambda row: measured.append(str(row["liver"])), known=known
+    )
+    assert "LiTS-5" not in measured and len(measured) == 2
+    assert len(found.rows) == 3 and found.rows[0]["n_vertices"] == 12345
+    assert path.read_text() == line + "\n"
 
 
 @pytest.mark.usefixtures("no_folder")
