@@ -1,7 +1,9 @@
 """The displacement modes of a cloud of points, laid out for the compiled step.
 
-Their number and precision concern the display alone: the force comes from the contact compliance,
-which keeps all its modes in single precision.
+The points are put in compact blocks, and the field of each region is separated once more in each of
+them (:mod:`avatar_core.reduction.block_modes`): a step reads the few modes that move a block, and
+sums them in the first-level cache. Their number and precision concern the display alone: the force
+comes from the contact compliance, which keeps all its modes in single precision.
 """
 
 from __future__ import annotations
@@ -10,13 +12,18 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from avatar_core.reduction.block_modes import BlockModes, compact_order, load_sizes, separate_blocks
 from avatar_core.vademecum.accuracy import Cloud, Precision
 
 if TYPE_CHECKING:
     from avatar_core.reduction.regional import RegionalField
     from avatar_core.vademecum.model import Vademecum
 
-BLOCK = 256  # displacements that are summed together, within the first-level cache
+POINTS = 64  # of a block
+BLOCK = 3 * POINTS  # displacements that are summed together, within the first-level cache
+TOLERANCE = 2e-3  # root mean square of the relative error that blocks add to a load's displacement
+WHOLE = 1e-6  # the same of global modes that stand apart, whose amplitudes may be any
+LARGE_TOLERANCE = 1e-2  # the same of what large deformation adds, a fraction of that displacement
 
 _LARGEST = {"int16": 32767, "int8": 127}
 
@@ -24,12 +31,14 @@ _LARGEST = {"int16": 32767, "int8": 127}
 class CloudArrays(NamedTuple):
     """The arrays of the same names in :class:`avatar_core.contact.layout.Layout`, and their source.
 
-    points : vertices of the mesh that are shown
+    points : vertices of the mesh that are shown, in the order of the blocks
     large_start : as ``region_start``, of the modes of large deformation, which come last
     """
 
     space: np.ndarray
-    space_scale: np.ndarray
+    core: np.ndarray
+    level: np.ndarray
+    block_start: np.ndarray
     region_start: np.ndarray
     regional_load: np.ndarray
     points: np.ndarray
@@ -38,62 +47,113 @@ class CloudArrays(NamedTuple):
 
 def cloud_arrays(
     vademecum: Vademecum,
-    modes: int,
     cloud: Cloud,
     precision: Precision,
     large: RegionalField | None = None,
+    with_history: bool = False,
 ) -> CloudArrays:
-    """Global modes, those of all regions, and those of large deformation at the points of a cloud.
+    """The modes of all regions, and those of large deformation, in the blocks of a cloud.
 
-    modes : at a place, global ones first, then those of its region
+    with_history : the global modes have a history of their own, and stay apart; otherwise they are
+        part of every region's field
     """
-    points = shown_vertices(vademecum, cloud)
-    far = vademecum.far.space[:, :modes]
-    regional = vademecum.regional.truncated(modes - vademecum.far.rank)
-    parts = [far, regional.space] + ([large.space] if large else [])
-    space = np.concatenate([_at(part, points) for part in parts], axis=2)
-    start = far.shape[1] + regional.start
-    large_start = start[-1] + (large.start if large else np.zeros_like(start))
-    load = np.ascontiguousarray(regional.load)
-    return CloudArrays(*in_blocks(space, precision), start, load, points, large_start)
+    blocks, regional = _Blocks(vademecum, cloud), vademecum.regional
+    apart = vademecum.far.rank if with_history else 0
+    load = _loads(vademecum)
+    parts = _linear_modes(vademecum, blocks, load, apart)
+    counts = vademecum.far.rank - apart + np.diff(regional.start)
+    start = apart + np.concatenate([[0], np.cumsum(counts)])
+    large_start = np.full_like(start, start[-1])
+    if large is not None:
+        large_start = large_start + large.start
+        parts += [_large_modes(large, r, blocks) for r in range(large.n_regions)]
+    own_load = np.ascontiguousarray(load[:, :, apart:], np.float32)
+    return CloudArrays(*_joined(parts, precision), start, own_load, blocks.points, large_start)
 
 
-def _at(space: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Modes (3 n_vertices, n) at some vertices, shape (n_points, 3, n) float32."""
-    by_vertex = space.reshape(len(space) // 3, 3, space.shape[1])
-    return by_vertex[points].astype(np.float32)
+class _Blocks:
+    """The points of a cloud in compact blocks.
+
+    points : vertices of the mesh; mass : ndarray, shape (n_blocks, BLOCK), lumped
+    """
+
+    def __init__(self, vademecum: Vademecum, cloud: Cloud) -> None:
+        self.points = shown_vertices(vademecum, cloud)
+        volumes = np.repeat(vademecum.mesh.vertex_volumes, 3)
+        self.mass = self.of(volumes[:, None])[:, :, 0]
+
+    def of(self, field: np.ndarray) -> np.ndarray:
+        """Columns (3 n_vertices, n) as (n_blocks, BLOCK, n), the last block filled up by zeros."""
+        rows = field.reshape(len(field) // 3, 3, field.shape[1])[self.points]
+        n_blocks = -(-len(self.points) // POINTS)
+        found = np.zeros((n_blocks * POINTS, 3, field.shape[1]))
+        found[: len(rows)] = rows
+        return found.reshape(n_blocks, BLOCK, field.shape[1])
+
+
+def _loads(vademecum: Vademecum) -> np.ndarray:
+    """Of each position in the global modes and in those of its region, (n_positions, 3, n)."""
+    far, regional = vademecum.far, vademecum.regional
+    shared = far.load.reshape(vademecum.surface.n_positions, 3, far.rank)
+    return np.concatenate([shared, regional.load], axis=2)
+
+
+def _linear_modes(
+    vademecum: Vademecum, blocks: _Blocks, load: np.ndarray, apart: int
+) -> list[BlockModes]:
+    """Of the global modes that stand apart, and of every region with the others."""
+    far, regional = vademecum.far, vademecum.regional
+    shared, sizes, parts = blocks.of(far.space), np.empty(load.shape[:2]), []
+    for r in range(regional.n_regions):
+        here, own = regional.region == r, slice(*regional.start[r : r + 2])
+        fields = np.concatenate([shared, blocks.of(regional.space[:, own])], axis=2)
+        loads = load[here, :, : fields.shape[2]].reshape(-1, fields.shape[2]).astype(float)
+        size = load_sizes(fields, blocks.mass, loads)
+        sizes[here] = size.reshape(-1, 3)
+        rest = (fields[:, :, apart:], blocks.mass, loads[:, apart:])
+        parts.append(separate_blocks(*rest, size, TOLERANCE))
+    whole = (shared[:, :, :apart], blocks.mass, far.load[:, :apart])
+    return [separate_blocks(*whole, sizes.ravel(), WHOLE), *parts]
+
+
+def _large_modes(large: RegionalField, region: int, blocks: _Blocks) -> BlockModes:
+    """Of what large deformation adds to the loads of a region."""
+    fields = blocks.of(large.space[:, slice(*large.start[region : region + 2])])
+    loads = large.load[large.region == region, :, : fields.shape[2]]
+    loads = loads.reshape(-1, fields.shape[2]).astype(float)
+    sizes = load_sizes(fields, blocks.mass, loads)
+    return separate_blocks(fields, blocks.mass, loads, sizes, LARGE_TOLERANCE)
 
 
 def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
-    """Vertices of the mesh that a cloud shows, or that carry what it shows, ascending."""
+    """Vertices of the mesh that a cloud shows, or that carry what it shows, in compact blocks."""
     mesh, display = vademecum.mesh, vademecum.display
+    if cloud == "off":
+        return np.arange(0)
+    shown = np.arange(len(mesh.vertices))
     if cloud == "surface":
-        if display is None:
-            return mesh.surface_vertices
-        return np.union1d(mesh.surface_vertices, display.corners)
-    return np.arange(len(mesh.vertices) if cloud == "volume" else 0)
+        shown = mesh.surface_vertices
+        if display is not None:
+            shown = np.union1d(shown, display.corners)
+    return np.asarray(shown[compact_order(mesh.vertices[shown], POINTS)])
 
 
-def in_blocks(space: np.ndarray, precision: Precision = "int16") -> tuple[np.ndarray, np.ndarray]:
-    """Modes (n_points, 3, rank) as (n_blocks, rank, BLOCK), and the scale (rank,) of each.
+def _joined(
+    parts: list[BlockModes], precision: Precision
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """space, core, level and block_start of all parts.
 
     The time of the cloud is that of reading its modes; integers take a half or a quarter of single
-    precision. Rounding costs 1 / 65536 or 1 / 256 of each mode's peak.
+    precision. Rounding costs 1 / 65536 or 1 / 256 of each mode's peak, which is 1.
     """
-    flat = space.reshape(-1, space.shape[2])
-    kind, scale = np.dtype(precision), np.ones(flat.shape[1], np.float32)
+    space = np.concatenate([part.space for part in parts])
+    core = np.zeros((len(space), max(part.core.shape[1] for part in parts)), np.float32)
+    before = np.cumsum([0] + [len(part.space) for part in parts])
+    for first, part in zip(before, parts, strict=False):
+        core[first : first + len(part.core), : part.core.shape[1]] = part.core
     if precision in _LARGEST:
-        peak = np.abs(flat).max(axis=0, initial=1e-30)
-        scale = (peak / _LARGEST[precision]).astype(np.float32)
-    n_blocks = -(-len(flat) // BLOCK)
-    padded = np.zeros((n_blocks * BLOCK, len(scale)), kind)
-    padded[: len(flat)] = np.rint(flat / scale) if precision in _LARGEST else flat
-    blocks = padded.reshape(n_blocks, BLOCK, len(scale)).transpose(0, 2, 1)
-    return np.ascontiguousarray(blocks), scale
-
-
-def out_of_blocks(blocks: np.ndarray, scale: np.ndarray, n_points: int) -> np.ndarray:
-    """The inverse of :func:`in_blocks` up to rounding, shape (3 n_points, rank) float32."""
-    rank = len(scale)
-    flat = blocks.transpose(0, 2, 1).reshape(-1, rank)[: 3 * n_points]
-    return np.asarray(flat * scale, np.float32)
+        space = np.rint(space * _LARGEST[precision])
+        core /= np.float32(_LARGEST[precision])
+    level = np.concatenate([part.level for part in parts])
+    start = np.stack([first + part.start for first, part in zip(before, parts, strict=False)])
+    return np.ascontiguousarray(space.astype(precision)), core, level, start

@@ -1,10 +1,13 @@
-"""The compiled part of the contact step that deforms the cloud: global modes, and those of regions.
+"""The compiled part of the contact step that deforms the cloud.
 
-    u(x) = - sum_t lambda_t a_t [ sum_k X_k(x) Y_k . f_t  +  sum_j w_j sum_k Z_k(x) W_k(s_j) n_t ]
+    u(x) = sum_r sum_k Z_rbk(x) sum_m C_rbkm a_rm,    x in block b of the cloud,
+    a_rm = - sum_t lambda_t a_t sum_j w_j W_m(s_j) . n_t,
 
-with f_t = w(p_t) n_t as in :mod:`avatar_core.contact.kernels`, Z_k the modes of the region of load
-position j, and for large deformation the terms of :mod:`avatar_core.vademecum.large_deformation`.
-That is an organ under patches; near a tip, :mod:`avatar_core.contact.dent` shows the tip's dent.
+over the load positions j of region r that carry a tip, with the modes Z and the core C of
+:mod:`avatar_core.contact.cloud`, and for large deformation the terms of
+:mod:`avatar_core.vademecum.large_deformation`. Global modes that have a history stand apart, as a
+part of their own. That is an organ under patches; near a tip, :mod:`avatar_core.contact.dent` shows
+the tip's dent.
 
 A step reads the modes of the regions that are *touched*: those of the load positions that carry a
 tip or hold a history of loads.
@@ -14,14 +17,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from avatar_core.common.jit import fast, inlined
+from avatar_core.common.jit import entry, fast, inlined
 from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.display import write_cloud
 from avatar_core.contact.effects.large_deformation import add_nonlinear_load, powers_of_depth
 from avatar_core.contact.effects.respiration import shift_cloud
 from avatar_core.contact.effects.viscoelasticity import least_shown
 
-LEAST_WEIGHT = 0.04  # of the load positions of a region, below which its modes are left out
+ALL = 1 << 30  # a level that no mode has
+LEAST_WEIGHT = 0.02  # of the load positions of a region, below which its modes are left out
 MAX_PAST = 4  # regions whose history of loads is shown
 
 
@@ -63,17 +67,10 @@ def _displace(  # type: ignore[no-untyped-def]
 
 @fast
 def _global_amplitudes(model, state, superposition):  # type: ignore[no-untyped-def]
-    """- sum_t lambda_t a_t Y^T f_t, or what the effects superpose."""
-    amplitude, n_modes = state.amplitude, model.region_start[0]
-    for k in range(n_modes):
-        amplitude[k] = np.float32(0.0 if superposition is None else superposition.total[k])
+    """Of the global modes that stand apart: what the effects superpose."""
     if superposition is not None:
-        return
-    for t in range(state.passage.shape[0]):
-        if state.force[t] > 0.0:
-            force = np.float32(state.force[t] * state.scale[t])
-            for k in range(n_modes):
-                amplitude[k] -= force * state.mode[t, k]
+        for k in range(model.region_start[0]):
+            state.amplitude[k] = np.float32(superposition.total[k])
 
 
 @fast
@@ -143,11 +140,11 @@ def _load_regions(model, state, large_deformation, friction, viscoelasticity, t)
 def _kept_weight(model, state, t, i):  # type: ignore[no-untyped-def]
     """Weight of a load position, less what its region as a whole has faded."""
     whole = state.region_weight[model.region[state.nodes[t, i]]]
-    return state.weight[t, i, 0] * _soft_threshold(whole) / whole if whole != 0.0 else 0.0
+    return state.weight[t, i, 0] * soft_threshold(whole) / whole if whole != 0.0 else 0.0
 
 
 @inlined
-def _soft_threshold(w):  # type: ignore[no-untyped-def]
+def soft_threshold(w):  # type: ignore[no-untyped-def]
     """Soft thresholding, so that the modes of a region vanish continuously."""
     if w > 0.0:
         return max(w - LEAST_WEIGHT, 0.0)
@@ -177,7 +174,7 @@ def _fade_regions(model, state):  # type: ignore[no-untyped-def]
         r = state.touched[i]
         norm[r] = 0.0
         for k in range(model.region_start[r], model.region_start[r + 1]):
-            norm[r] += np.float64(state.amplitude[k] * model.space_scale[k]) ** 2
+            norm[r] += np.float64(state.amplitude[k]) ** 2  # of modes with a peak of 1
         norm[r] = np.sqrt(norm[r])
     bound = np.inf  # in the end the norm of the region after the last that is kept
     for _ in range(MAX_PAST + 1):
@@ -202,34 +199,55 @@ def _fade_regions(model, state):  # type: ignore[no-untyped-def]
 
 @fast
 def _sum_modes(model, space, state, large_deformation):  # type: ignore[no-untyped-def]
-    """sum_k X_k a_k over the global modes that are shown, then over those of touched regions."""
-    amplitude, scale, start = state.amplitude, model.space_scale, model.region_start
-    n_global = min(state.shown[0], start[0])
-    n_regional = max(state.shown[0] - start[0], 0)
-    for b in range(space.shape[0]):
-        u, x = state.field[b * BLOCK : (b + 1) * BLOCK], space[b]
+    """The displacement of every block: of global modes that stand apart, and of touched regions."""
+    amplitude, start, shown = state.amplitude, model.region_start, state.shown[0]
+    core, level, rows = model.core, model.level, model.block_start
+    n_global, n_regions = start[0], start.shape[0] - 1
+    for b in range(rows.shape[1] - 1):
+        u = state.field[b * BLOCK : (b + 1) * BLOCK]
         for i in range(BLOCK):
             u[i] = np.float32(0.0)
-        _add_modes(amplitude, scale, x, u, 0, n_global)
+        add_part(space, core, level, rows[0], amplitude[:n_global], ALL, b, u)
         for q in range(state.n_touched[0]):
             r = state.touched[q]
-            end = min(start[r] + n_regional, start[r + 1])
-            _add_modes(amplitude, scale, x, u, start[r], end)
+            own = amplitude[start[r] : start[r + 1]]
+            add_part(space, core, level, rows[1 + r], own, shown, b, u)
             if large_deformation is not None:
-                nonlinear = large_deformation.start
-                _add_modes(amplitude, scale, x, u, nonlinear[r], nonlinear[r + 1])
+                first, end = large_deformation.start[r], large_deformation.start[r + 1]
+                bent = rows[1 + n_regions + r]
+                add_part(space, core, level, bent, amplitude[first:end], ALL, b, u)
 
 
 @fast
-def _add_modes(amplitude, scale, x, u, first, end):  # type: ignore[no-untyped-def]
-    """The same sum over some modes, four at a time."""
+def add_part(space, core, level, rows, amplitude, shown, b, u):  # type: ignore[no-untyped-def]
+    """Add what a part of the modes, up to a level, moves in a block; four modes at a time."""
+    first, end = rows[b], rows[b + 1]
+    while end > first and level[end - 1] > shown:
+        end -= 1
     whole = end - (end - first) % 4
     for k in range(first, whole, 4):
-        a0, a1 = amplitude[k] * scale[k], amplitude[k + 1] * scale[k + 1]
-        a2, a3 = amplitude[k + 2] * scale[k + 2], amplitude[k + 3] * scale[k + 3]
+        a0 = a1 = a2 = a3 = np.float32(0.0)
+        for m in range(amplitude.shape[0]):
+            a = amplitude[m]
+            a0 += core[k, m] * a
+            a1 += core[k + 1, m] * a
+            a2 += core[k + 2, m] * a
+            a3 += core[k + 3, m] * a
+        z0, z1, z2, z3 = space[k], space[k + 1], space[k + 2], space[k + 3]
         for i in range(BLOCK):
-            u[i] += x[k, i] * a0 + x[k + 1, i] * a1 + x[k + 2, i] * a2 + x[k + 3, i] * a3
+            u[i] += z0[i] * a0 + z1[i] * a1 + z2[i] * a2 + z3[i] * a3
     for k in range(whole, end):
-        a = amplitude[k] * scale[k]
+        a0 = np.float32(0.0)
+        for m in range(amplitude.shape[0]):
+            a0 += core[k, m] * amplitude[m]
+        z0 = space[k]
         for i in range(BLOCK):
-            u[i] += x[k, i] * a
+            u[i] += z0[i] * a0
+
+
+@entry
+def add_to_field(space, core, level, rows, amplitude, shown, field):  # type: ignore[no-untyped-def]
+    """What a part of the modes moves in all blocks, for who measures the errors of a step."""
+    for b in range(rows.shape[0] - 1):
+        u = field[b * BLOCK : (b + 1) * BLOCK]
+        add_part(space, core, level, rows, amplitude, shown, b, u)

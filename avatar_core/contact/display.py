@@ -44,13 +44,13 @@ def display_arrays(
 ) -> DisplayArrays:
     """Of what is displayed.
 
-    points : vertices of the mesh that are summed from modes, ascending
+    points : vertices of the mesh that are summed from modes, in the order of the blocks
     vertices : ndarray, shape (n_vertices, 3), of the mesh [m]
     positions : ndarray, shape (n_positions, 3), of the patches [m]
     """
-    rest = vertices[points]
+    rest, order = vertices[points], np.argsort(points)
     return DisplayArrays(
-        np.searchsorted(points, display.corners).astype(np.int32),
+        order[np.searchsorted(points, display.corners, sorter=order)].astype(np.int32),
         display.weights,
         rest.astype(np.float32),
         *points_around(rest, positions, patch_radius),
@@ -61,24 +61,24 @@ def display_arrays(
 def write_cloud(model, state, cloud, law, dents, display):  # type: ignore[no-untyped-def]
     """The cloud, from what the modes displace in ``state.field``: with the dents of tips, at the
     displayed vertices if they are not the mesh's."""
+    flat = cloud.reshape(6 * cloud.shape[0])
     if display is None:
-        add_dents(model, state, law, dents, dents, model.rest, state.field, 3, 1.0, 1.0)
-        _write(model.rest, state.field, cloud)
+        _write(model.rest, model.place, state.field, cloud)
+        add_dents(model, state, law, dents, dents, model.rest, flat, 6, 1.0, 1.0)
         return
     add_dents(model, state, law, dents, display, display.rest, state.field, 3, 0.0, 1.0)
     _interpolate(display, model.rest, state.field, cloud)
-    flat = cloud.reshape(6 * cloud.shape[0])
     add_dents(model, state, law, dents, dents, model.rest, flat, 6, 1.0, 0.0)
 
 
 @fast
-def _write(rest, field, cloud):  # type: ignore[no-untyped-def]
+def _write(rest, place, field, cloud):  # type: ignore[no-untyped-def]
     """Deformed position and displacement of every point (n_points, 6)."""
-    n_points = cloud.shape[0]
-    flat_rest, flat_cloud = rest.reshape(6 * n_points), cloud.reshape(6 * n_points)
-    for v in range(n_points):
-        for d in range(6):
-            flat_cloud[6 * v + d] = flat_rest[6 * v + d] + field[3 * v + d % 3]
+    for v in range(place.shape[0]):
+        first = 3 * place[v]
+        x, y, z = field[first], field[first + 1], field[first + 2]
+        cloud[v, 0], cloud[v, 1], cloud[v, 2] = rest[v, 0] + x, rest[v, 1] + y, rest[v, 2] + z
+        cloud[v, 3], cloud[v, 4], cloud[v, 5] = x, y, z
 
 
 @fast

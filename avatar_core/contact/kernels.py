@@ -110,7 +110,11 @@ ModelArrays = namedtuple(
         "contact_block",
         "softness",
         "space",
-        "space_scale",
+        "core",
+        "level",
+        "block_start",
+        "shown",
+        "place",
         "region",
         "region_start",
         "regional_load",
@@ -145,8 +149,8 @@ State = namedtuple(
         "gram",  # (T, T) f_t . C f_t'
         "scale",  # (T,) a_t
         "compliance",  # (T, T)
-        "shown",  # (1,) number of modes in the cloud at a place, global ones first
-        "amplitude",  # (n_modes,) of the modes of the cloud
+        "shown",  # (1,) level of the modes that are shown
+        "amplitude",  # (n_amplitudes,) of global modes that stand apart, and of all regions
         "touched",  # (n_regions,) the regions whose modes move the cloud,
         "n_touched",  # (1,) their number,
         "is_touched",  # (n_regions,) and whether a region is one

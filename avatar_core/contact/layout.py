@@ -26,6 +26,7 @@ from avatar_core.contact.effects.selection import (
     adapted_vademecum,
     default_effects,
     find,
+    has_history,
     selected_arrays,
 )
 from avatar_core.contact.effects.several_tools import SeveralTools
@@ -60,11 +61,13 @@ class Layout:
         position (n_positions, 3) [m]; load (n_positions, 3, rank and zeros) and the contact_*
         blocks with their hash tables: compliance [m/N]; softness (1,), added where access fades
         [m/N];
-        space (n_blocks, n_modes, BLOCK) int16, displacement modes of the cloud in units of
-        space_scale (n_modes,): global ones, then those of each region from region_start
-        (n_regions + 1,) on, then those of large deformation; region (n_positions,) and
-        regional_load (n_positions, 3, most); rest (n_points, 6), the cloud without displacement
-        [m]; tip_offset (n_tools,), of a pose above the lowest point of the tip [m]
+        space (n_modes, BLOCK), core (n_modes, m) and level (n_modes,), the modes of the cloud's
+        blocks; block_start (n_parts, n_blocks + 1), those of each part: global modes with a
+        history, each region, and each region's large deformation; shown (1,), the level that is
+        shown; place (n_points,), of each point in the blocks; region (n_positions,) and
+        regional_load (n_positions, 3, most), whose amplitudes begin at region_start
+        (n_regions + 1,); rest (n_points, 6), the cloud without displacement [m]; tip_offset
+        (n_tools,), of a pose above the lowest point of the tip [m]
     effects : Constants, None for each effect that was not chosen
     """
 
@@ -158,11 +161,11 @@ def lay_out_details(
         large is not None and large.material == "neo-hookean",
     )
     for detail in details:
-        shown = cloud_arrays(
-            vademecum, detail.modes, detail.cloud, detail.precision, large.terms if large else None
-        )
+        terms = large.terms if large else None
+        history = has_history(effects)
+        shown = cloud_arrays(vademecum, detail.cloud, detail.precision, terms, history)
         display = vademecum.display if detail.cloud == "surface" else None
-        points = display.vertices if display else vademecum.mesh.vertices[shown.points]
+        points = display.vertices if display else vademecum.mesh.vertices[np.sort(shown.points)]
         arrays = ModelArrays(
             distance=field.distance,
             access=field.access,
@@ -183,7 +186,11 @@ def lay_out_details(
             contact_block=contact.block,
             softness=np.array([softness]),
             space=shown.space,
-            space_scale=shown.space_scale,
+            core=shown.core,
+            level=shown.level,
+            block_start=shown.block_start,
+            shown=np.array([detail.modes]),
+            place=np.argsort(shown.points).astype(np.int32),
             region=vademecum.regional.region,
             region_start=shown.region_start,
             regional_load=shown.regional_load,

@@ -133,17 +133,12 @@ class ContactModel:
 
     @property
     def n_modes(self) -> int:
-        """Modes that the cloud can show at a place."""
-        return _n_modes(self.layout)
-
-    @property
-    def n_global(self) -> int:
-        """Those of them that all places share."""
-        return int(self.arrays.region_start[0])
+        """Modes that the cloud can show; see :class:`avatar_core.vademecum.accuracy.Detail`."""
+        return int(self.arrays.shown[0])
 
     @property
     def n_shown(self) -> int:
-        """Modes that the cloud shows at a place: global ones first, then those of its region."""
+        """Modes that the cloud shows."""
         return int(self.state.shown[0])
 
     def show(self, modes: int) -> None:
@@ -202,7 +197,7 @@ def prepare(
     ----------
     vademecum : Vademecum
     tips : the tip of each tool
-    modes : of the *displacement* at a place, global ones first, then those of its region; None for
+    modes : of the *displacement*, as in :class:`avatar_core.vademecum.accuracy.Detail`; None for
         all. Fewer modes leave the force exact, since the contact compliance keeps all of its own.
     cloud : "surface" or "volume" vertices, or "off"
     effects : to simulate; by default those that the vademecum and the tools require
@@ -275,13 +270,13 @@ def _state(layout: Layout) -> State:
         gram=np.ones((n_tools, n_tools)),
         scale=np.ones(n_tools),
         compliance=np.zeros((n_tools, n_tools)),
-        shown=np.array([_n_modes(layout)], np.int64),
-        amplitude=np.zeros(len(arrays.space_scale), single),
+        shown=arrays.shown.astype(np.int64),
+        amplitude=np.zeros(_n_amplitudes(layout), single),
         touched=np.zeros(n_regions, np.int64),
         n_touched=np.zeros(1, np.int64),
         is_touched=np.zeros(n_regions, np.bool_),
         region_weight=np.zeros(n_regions),
-        field=np.zeros(arrays.space.shape[0] * BLOCK, single),
+        field=np.zeros((arrays.block_start.shape[1] - 1) * BLOCK, single),
     )
 
 
@@ -303,9 +298,10 @@ def _out(layout: Layout) -> Out:
     )
 
 
-def _n_modes(layout: Layout) -> int:
-    """Modes that the cloud can show at a place."""
-    return int(layout.arrays.region_start[0]) + layout.arrays.regional_load.shape[2]
+def _n_amplitudes(layout: Layout) -> int:
+    """Of global modes that stand apart, of all regions, and of large deformation."""
+    large = layout.effects.large_deformation
+    return int((layout.arrays.region_start if large is None else large.start)[-1])
 
 
 def _effects(layout: Layout) -> Selection:

@@ -82,7 +82,9 @@ class Scene:
     tools: tuple[Tool, ...] = (Tool(),)
     cloud: Cloud = "surface"
     cloud_divisor: int = quantity("-", 1, 1000, "the cloud is sent every so many steps", 1)
-    modes: int | None = quantity("-", 1, 100_000, "of the cloud at a place", None)
+    modes: int | None = quantity(
+        "-", 1, 100_000, "of the cloud that move a vertex, in the mean", None
+    )
     effects: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:

@@ -388,7 +388,7 @@ def _draw(figure: Figure, rows: Sequence[TransportRow]) -> None:
     left.plot(place, [row.reduced_worst for row in rows], "v", label="reduced, worst load")
     left.axhline(0.19, color="gray", linestyle="--", label="paper: below")
     left.set_yscale("log")
-    left.set_ylim(bottom=6e-3)  # room for the legend
+    left.set_ylim(bottom=4e-3)  # room for the legend
     left.set_ylabel("relative displacement error, L2 [-]")
     left.legend(fontsize=7, ncols=2, loc="lower left")
     width = 0.27

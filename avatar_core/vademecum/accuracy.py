@@ -20,6 +20,7 @@ Cloud = Literal["surface", "volume", "off"]
 Precision = Literal["float32", "int16", "int8"]
 
 CONTENT = 0.95  # part of the loads that a promised error holds for
+LEVELS = (1, 2, 3, 4, 5, 6, 8)  # numbers of modes that are measured, beside all of them
 _CONFIDENCE = 0.95  # that it does, over draws of the loads that were measured
 
 
@@ -27,7 +28,8 @@ _CONFIDENCE = 0.95  # that it does, over draws of the loads that were measured
 class Detail:
     """How finely a step shows the displacement.
 
-    modes : at a place, global ones first, then those of its region
+    modes : that move a point, in the mean over the points of the cloud, of those that the place's
+        region and its share of the global ones leave there; a vademecum's ``n_modes`` show all
     cloud : vertices that are shown
     precision : in which the modes are stored
     """
@@ -38,6 +40,11 @@ class Detail:
 
     def __str__(self) -> str:
         return f"{self.modes} modes in {self.precision}, cloud {self.cloud}"
+
+
+def mode_levels(n_modes: int) -> tuple[int, ...]:
+    """Numbers of modes of the details of a curve, ascending, all at the end."""
+    return (*(level for level in LEVELS if level < n_modes), n_modes)
 
 
 @dataclass(frozen=True)

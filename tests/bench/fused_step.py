@@ -12,7 +12,7 @@ from numba import njit
 
 OK, INVALID_POSE, OUT_OF_RANGE = 0, 4, 7
 OUTSIDE, ENTERED, BARRED = range(3)
-BLOCK, LEAST_WEIGHT = 256, 0.04
+BLOCK, LEAST_WEIGHT = 192, 0.02
 HASH = 2654435761
 
 
@@ -201,13 +201,10 @@ def fused_step(model, space, state, out, tips):  # type: ignore[no-untyped-def]
         out.contact_position[0, 1] = y - r * n1
         out.contact_position[0, 2] = z - r * n2
         # --- regions of the load positions -----------------------------------------------------
-        amplitude, scales, start = state.amplitude, model.space_scale, model.region_start
-        region_weight, n_global, n_touched, kept = state.region_weight, start[0], 0, 0.0
+        amplitude, start = state.amplitude, model.region_start
+        region_weight, n_touched, kept = state.region_weight, 0, 0.0
         for i in range(state.n_touched[0]):
             state.is_touched[state.touched[i]] = False
-        drive = np.float32(force * a)
-        for k in range(n_global):
-            amplitude[k] = -drive * mode[k]
         for i in range(count):
             region_weight[model.region[nodes[i]]] = 0.0
         for i in range(count):
@@ -236,34 +233,39 @@ def fused_step(model, space, state, out, tips):  # type: ignore[no-untyped-def]
                 amplitude[first + k] += load[0, k] * w0 + load[1, k] * w1 + load[2, k] * w2
         state.n_touched[0] = n_touched
         # --- modes -----------------------------------------------------------------------------
-        for block in range(space.shape[0]):
+        core, shown = model.core, state.shown[0]
+        for block in range(model.block_start.shape[1] - 1):
             u = field[block * BLOCK : (block + 1) * BLOCK]
-            shapes = space[block]
             for i in range(BLOCK):
                 u[i] = np.float32(0.0)
-            for q in range(n_touched + 1):
-                first, end = 0, n_global
-                if q > 0:
-                    first, end = start[state.touched[q - 1]], start[state.touched[q - 1] + 1]
+            for q in range(n_touched):
+                r = state.touched[q]
+                own = amplitude[start[r] : start[r + 1]]
+                first, end = model.block_start[1 + r, block], model.block_start[1 + r, block + 1]
+                while end > first and model.level[end - 1] > shown:
+                    end -= 1
                 whole_fours = end - (end - first) % 4
                 for k in range(first, whole_fours, 4):
-                    a0, a1 = amplitude[k] * scales[k], amplitude[k + 1] * scales[k + 1]
-                    a2, a3 = amplitude[k + 2] * scales[k + 2], amplitude[k + 3] * scales[k + 3]
+                    a0 = a1 = a2 = a3 = np.float32(0.0)
+                    for m in range(own.shape[0]):
+                        a0 += core[k, m] * own[m]
+                        a1 += core[k + 1, m] * own[m]
+                        a2 += core[k + 2, m] * own[m]
+                        a3 += core[k + 3, m] * own[m]
+                    s0, s1, s2, s3 = space[k], space[k + 1], space[k + 2], space[k + 3]
                     for i in range(BLOCK):
-                        u[i] += (
-                            shapes[k, i] * a0
-                            + shapes[k + 1, i] * a1
-                            + shapes[k + 2, i] * a2
-                            + shapes[k + 3, i] * a3
-                        )
+                        u[i] += s0[i] * a0 + s1[i] * a1 + s2[i] * a2 + s3[i] * a3
                 for k in range(whole_fours, end):
-                    a0 = amplitude[k] * scales[k]
+                    a0 = np.float32(0.0)
+                    for m in range(own.shape[0]):
+                        a0 += core[k, m] * own[m]
+                    s0 = space[k]
                     for i in range(BLOCK):
-                        u[i] += shapes[k, i] * a0
+                        u[i] += s0[i] * a0
     # --- cloud ---------------------------------------------------------------------------------
-    n_points = out.cloud.shape[0]
-    rest, cloud = model.rest.reshape(6 * n_points), out.cloud.reshape(6 * n_points)
-    for v in range(n_points):
-        for d in range(6):
-            cloud[6 * v + d] = rest[6 * v + d] + field[3 * v + d % 3]
+    rest, cloud, place = model.rest, out.cloud, model.place
+    for v in range(place.shape[0]):
+        ux, uy, uz = field[3 * place[v]], field[3 * place[v] + 1], field[3 * place[v] + 2]
+        cloud[v, 0], cloud[v, 1], cloud[v, 2] = rest[v, 0] + ux, rest[v, 1] + uy, rest[v, 2] + uz
+        cloud[v, 3], cloud[v, 4], cloud[v, 5] = ux, uy, uz
     return status

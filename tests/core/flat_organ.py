@@ -115,10 +115,14 @@ def _organ(
         contact_slot=slot,
         contact_block=blocks.block,
         softness=np.ones(1),
-        space=np.zeros((-(-3 * len(points) // BLOCK), LANES, BLOCK), np.int16),
-        space_scale=np.zeros(LANES, single),
+        space=np.zeros((0, BLOCK), np.int16),
+        core=np.zeros((0, 1), single),
+        level=np.zeros(0, np.int32),
+        block_start=np.zeros((3, 1 - (-3 * len(points) // BLOCK)), np.int64),
+        shown=np.array([1]),
+        place=np.arange(len(points), dtype=np.int32),
         region=np.zeros(1, np.int32),
-        region_start=np.full(2, LANES, np.int64),
+        region_start=np.zeros(2, np.int64),
         regional_load=np.zeros((1, 3, 0), single),
         rest=np.pad(points, ((0, 0), (0, 3))).astype(single),
         tip_offset=np.array([tip.offset]),
@@ -130,7 +134,7 @@ def _organ(
         soft = replace(MATERIAL, poisson_ratio=neo_hookean)
         law = tip_law_arrays((tip,), soft, local, neo_hookean=True)
         large = LargeDeformationArrays(
-            np.zeros((3, *shape), single), np.zeros((1, 2, 0), single), np.full(2, LANES, np.int64)
+            np.zeros((3, *shape), single), np.zeros((1, 2, 0), single), np.zeros(2, np.int64)
         )
     dent = dent_arrays((tip,), points, arrays.position, PATCH_RADIUS) if law else None
     field = TipField(arrays.distance, arrays.access, origin, arrays.spacing)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from avatar_core.common.hdf5 import replace_file
+from avatar_core.contact.cloud import TOLERANCE
 from avatar_core.contact.model import prepare
 from avatar_core.errors import StorageError, SurfaceError
 from avatar_core.geometry.phantom import phantom_liver
@@ -142,8 +143,9 @@ def test_a_structure_moves_with_the_organ() -> None:
     inside = np.unique(with_lesion.structures["lesion"])
     np.testing.assert_array_equal(inside, np.arange(n, len(cloud)))
     exact = np.einsum("vk,vkd->vd", display.weights[inside], whole[display.corners[inside]])
-    np.testing.assert_allclose(cloud[inside], exact, atol=2e-7)
-    np.testing.assert_allclose(cloud[:n], whole[cube.mesh.surface_vertices], atol=2e-7)
+    alike = 4.0 * TOLERANCE * DEPTH  # surface and volume have blocks of their own
+    np.testing.assert_allclose(cloud[inside], exact, atol=alike)
+    np.testing.assert_allclose(cloud[:n], whole[cube.mesh.surface_vertices], atol=alike)
     rest = np.einsum("vk,vkd->vd", display.weights, cube.mesh.vertices[display.corners])
     np.testing.assert_allclose(rest, display.vertices, atol=1e-6)
     moved = np.linalg.norm(cloud[inside], axis=1)

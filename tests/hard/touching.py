@@ -75,7 +75,7 @@ def stiffened(model: ContactModel, factor: float, several: bool) -> ContactModel
         for name in ("self_compliance", "contact_block", "regional_load")
     }
     root = single(np.sqrt(1.0 / factor))
-    scaled |= {name: getattr(arrays, name) * root for name in ("load", "space_scale")}
+    scaled["load"] = arrays.load * root
     scaled["softness"] = arrays.softness / factor
     chosen = Constants(several_tools=model.layout.effects.several_tools if several else None)
     return make_model(Layout(arrays._replace(**scaled), chosen))

@@ -135,6 +135,11 @@ def default_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
+def has_history(effects: Sequence[Effect]) -> bool:
+    """Whether modes move by more than the loads of the moment."""
+    return any(isinstance(one, (Viscoelasticity, Inertia, SelfWeight)) for one in effects)
+
+
 def adapted_vademecum(
     vademecum: Vademecum, effects: Sequence[Effect]
 ) -> tuple[Vademecum, np.ndarray | None]:

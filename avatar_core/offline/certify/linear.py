@@ -59,7 +59,8 @@ class UnseenErrors:
 
     l2 (n, 3); contact, force, tip_force (n,); smoothing (n,), relative change of the compliance
     under a tip by smoothing; shown (n_details, 3 n), of the displacement as it would be shown;
-    vertex_contact (m,), at load positions of the build
+    vertex_contact (m,), at load positions of the build; sizes (n_details,), of what shows them
+    [bytes]
     """
 
     l2: np.ndarray
@@ -69,6 +70,7 @@ class UnseenErrors:
     smoothing: np.ndarray
     shown: np.ndarray
     vertex_contact: np.ndarray
+    sizes: Sequence[int]
 
 
 def measured(
@@ -113,6 +115,7 @@ def measured(
         smoothing,
         np.concatenate(shown, axis=1),
         _vertex_contact(vademecum, elasticity, rng),
+        display.sizes,
     )
 
 
@@ -165,7 +168,7 @@ def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: in
         seed=seed,
         modes=vademecum.n_modes,
         force_error=calibrated(all_of("smoothing"), tip_force),
-        curve=curve_of(vademecum, all_of("shown"), tip_force),
+        curve=curve_of(vademecum, all_of("shown"), tip_force, parts[0].sizes),
     )
 
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from avatar_core.contact.haptics.shedding import Shedder
-from avatar_core.offline.certify.accuracy_curve import mode_levels
-from avatar_core.vademecum.accuracy import AccuracyCurve, CurvePoint
+from avatar_core.vademecum.accuracy import AccuracyCurve, CurvePoint, mode_levels
 from avatar_ros.msg import LoopStatistics
 
+LEAST_SHOWN = 3  # modes: with fewer, the organ under a tip no longer looks right
 _NAN = float("nan")
 
 
@@ -43,9 +43,7 @@ class ShownModes:
         if curve is not None:
             self._points = {p.detail.modes: p for p in curve.points}
         levels = list(self._points) or list(mode_levels(model.n_modes))
-        # no fewer than global ones and some of the region: under a tip the organ looks right
-        least = min(model.n_global, model.n_modes - 1)
-        fewer = (n for n in levels if least < n < model.n_modes)
+        fewer = (n for n in levels if LEAST_SHOWN <= n < model.n_modes)
         self._shedder = Shedder([*fewer, model.n_modes], deadline)
 
     @property
