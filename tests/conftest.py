@@ -28,7 +28,7 @@ from avatar_core.vademecum.model import Vademecum
 
 from . import examples, kept_fields, kept_meshes
 from .alone import Turns
-from .kept_responses import kept
+from .kept_responses import kept, of_cloud
 from .stored import stored
 
 # Compiling makes millions of objects that live on: looked through less often, it takes a seventh
@@ -69,9 +69,10 @@ def same_fields() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def same_responses() -> Iterator[None]:
-    """The response of one organ to a tip is computed once."""
+    """The response of one organ to a tip, and the modes of its cloud, are computed once."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(layout, "make_tip_response", kept(layout.make_tip_response))
+        patch.setattr(layout, "cloud_arrays", kept(layout.cloud_arrays, of_cloud))
         yield
 
 

@@ -29,7 +29,8 @@ _LARGEST = {"int16": 32767, "int8": 127}
 
 
 class CloudArrays(NamedTuple):
-    """The arrays of the same names in :class:`avatar_core.contact.layout.Layout`, and their source.
+    """The arrays of the same names in :class:`avatar_core.contact.layout.Layout`, and their source;
+    the modes in single precision.
 
     points : vertices of the mesh that are shown, in the order of the blocks
     large_start : as ``region_start``, of the modes of large deformation, which come last
@@ -48,7 +49,6 @@ class CloudArrays(NamedTuple):
 def cloud_arrays(
     vademecum: Vademecum,
     cloud: Cloud,
-    precision: Precision,
     large: RegionalField | None = None,
     with_history: bool = False,
 ) -> CloudArrays:
@@ -68,7 +68,7 @@ def cloud_arrays(
         large_start = large_start + large.start
         parts += [_large_modes(large, r, blocks) for r in range(large.n_regions)]
     own_load = np.ascontiguousarray(load[:, :, apart:], np.float32)
-    return CloudArrays(*_joined(parts, precision), start, own_load, blocks.points, large_start)
+    return CloudArrays(*_joined(parts), start, own_load, blocks.points, large_start)
 
 
 class _Blocks:
@@ -138,22 +138,26 @@ def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
     return np.asarray(shown[compact_order(mesh.vertices[shown], POINTS)])
 
 
-def _joined(
-    parts: list[BlockModes], precision: Precision
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """space, core, level and block_start of all parts.
+def rounded(arrays: CloudArrays, precision: Precision) -> CloudArrays:
+    """The same with modes in another precision.
 
     The time of the cloud is that of reading its modes; integers take a half or a quarter of single
     precision. Rounding costs 1 / 65536 or 1 / 256 of each mode's peak, which is 1.
     """
+    if precision not in _LARGEST:
+        return arrays
+    largest = np.float32(_LARGEST[precision])
+    space = np.rint(arrays.space * largest).astype(precision)
+    return arrays._replace(space=space, core=arrays.core / largest)
+
+
+def _joined(parts: list[BlockModes]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """space, core, level and block_start of all parts."""
     space = np.concatenate([part.space for part in parts])
     core = np.zeros((len(space), max(part.core.shape[1] for part in parts)), np.float32)
     before = np.cumsum([0] + [len(part.space) for part in parts])
     for first, part in zip(before, parts, strict=False):
         core[first : first + len(part.core), : part.core.shape[1]] = part.core
-    if precision in _LARGEST:
-        space = np.rint(space * _LARGEST[precision])
-        core /= np.float32(_LARGEST[precision])
     level = np.concatenate([part.level for part in parts])
     start = np.stack([first + part.start for first, part in zip(before, parts, strict=False)])
-    return np.ascontiguousarray(space.astype(precision)), core, level, start
+    return space, core, level, start

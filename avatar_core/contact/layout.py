@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from avatar_core.contact import kernels
-from avatar_core.contact.cloud import cloud_arrays
+from avatar_core.contact.cloud import CloudArrays, cloud_arrays, rounded
 from avatar_core.contact.dent import dent_arrays
 from avatar_core.contact.display import display_arrays
 from avatar_core.contact.effects.base import Effect
@@ -160,10 +160,14 @@ def lay_out_details(
         _error_factors(vademecum, tips),
         large is not None and large.material == "neo-hookean",
     )
+    clouds: dict[Cloud, CloudArrays] = {}
     for detail in details:
-        terms = large.terms if large else None
-        history = has_history(effects)
-        shown = cloud_arrays(vademecum, detail.cloud, detail.precision, terms, history)
+        if detail.cloud not in clouds:
+            terms = large.terms if large else None
+            clouds[detail.cloud] = cloud_arrays(
+                vademecum, detail.cloud, terms, has_history(effects)
+            )
+        shown = rounded(clouds[detail.cloud], detail.precision)
         display = vademecum.display if detail.cloud == "surface" else None
         points = display.vertices if display else vademecum.mesh.vertices[np.sort(shown.points)]
         arrays = ModelArrays(

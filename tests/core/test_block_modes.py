@@ -144,5 +144,5 @@ def test_a_step_shows_the_displacement_of_the_vademecum(
         errors.append(np.sqrt((mass * wrong**2).sum() / (mass * exact**2).sum()))
     assert 0.0 < max(errors) < 8e-3
     assert np.mean(errors) < 4e-3
-    counts = np.diff(cloud_arrays(v, "volume", "int16").block_start[1:], axis=1)
+    counts = np.diff(cloud_arrays(v, "volume").block_start[1:], axis=1)
     assert counts.mean() < 0.25 * v.n_modes

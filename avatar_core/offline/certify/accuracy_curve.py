@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from avatar_core.contact.cloud import BLOCK, CloudArrays, cloud_arrays
+from avatar_core.contact.cloud import BLOCK, CloudArrays, cloud_arrays, rounded
 from avatar_core.contact.cloud_kernels import add_to_field, soft_threshold
 from avatar_core.fem.norms import l2_norm
 from avatar_core.vademecum.accuracy import (
@@ -47,8 +47,8 @@ class DisplayErrors:
         self._vademecum = vademecum
         self._levels = mode_levels(vademecum.n_modes)
         self._shown = [
-            cloud_arrays(vademecum, cloud, precision)
-            for cloud in SHOWN
+            rounded(arrays, precision)
+            for arrays in (cloud_arrays(vademecum, cloud) for cloud in SHOWN)
             for precision in get_args(Precision)
         ]
         self.sizes = [_size(arrays, n) for arrays in self._shown for n in self._levels] + [0]
