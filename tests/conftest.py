@@ -29,6 +29,7 @@ from avatar_core.vademecum.model import Vademecum
 from . import examples, kept_fields, kept_meshes
 from .alone import Turns
 from .kept_responses import kept, of_cloud
+from .slowest import SlowestFiles
 from .stored import stored
 
 # Compiling makes millions of objects that live on: looked through less often, it takes a seventh
@@ -41,6 +42,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 def pytest_configure(config: pytest.Config) -> None:
     examples.choose(config)
     config.pluginmanager.register(Turns())
+    config.pluginmanager.register(SlowestFiles())
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest looks at markers

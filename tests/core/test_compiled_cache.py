@@ -54,6 +54,34 @@ def test_a_change_in_an_inlined_file_is_compiled_anew(tmp_path: Path) -> None:
     assert run(package, cache, 2.0) == ["2.0", "1"]  # the one before is kept
 
 
+def test_a_part_is_found_on_disk_and_has_no_machine_code(tmp_path: Path) -> None:
+    """Another function, in another process, takes in what the first left of their part."""
+    part = "from avatar_core.common.jit import inlined\n@inlined\ndef square(x): return x * x\n"
+    uses = """
+from avatar_core.common.jit import entry
+from part import square
+
+@entry
+def total(x):
+    return square(x) + {more}
+
+print(total(3.0), sum(square.stats.cache_hits.values()))
+[made] = square.overloads.values()
+print(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))
+"""
+    (tmp_path / "part.py").write_text(part)
+    paths = os.pathsep.join((str(tmp_path), str(PACKAGE.parent)))
+    environment = {**os.environ, "PYTHONPATH": paths, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    for more, hits in ((1.0, "0"), (2.0, "1")):
+        user = tmp_path / f"uses_{more}.py"
+        user.write_text(uses.format(more=more))
+        found = subprocess.run(
+            [sys.executable, user], env=environment, capture_output=True, text=True
+        )
+        assert not found.returncode, found.stderr
+        assert found.stdout.split() == [str(9.0 + more), hits, "0"]
+
+
 def test_folders_of_other_contents_do_not_pile_up(tmp_path: Path) -> None:
     for i in range(12):
         old = tmp_path / "avatar" / f"{i:016d}"

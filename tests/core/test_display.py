@@ -160,6 +160,7 @@ def test_a_structure_with_too_many_vertices_is_thinned() -> None:
     assert len(structure(lesion)[0]) == len(lesion.vertices)
 
 
+@pytest.mark.long
 def test_a_tumour_is_stored_with_its_organ_and_stays_there(tmp_path: Path) -> None:
     liver = phantom_liver(12e-3)
     lesion = lesion_at(liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0]), 0.02)

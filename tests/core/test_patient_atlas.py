@@ -149,9 +149,9 @@ def test_another_kind_of_organ_is_refused(atlas: Atlas) -> None:
 @pytest.mark.parametrize(
     "stage",
     [
-        *(pytest.param(early, marks=pytest.mark.long) for early in ("registration", "mesh")),
+        *(pytest.param(each, marks=pytest.mark.long) for each in ("registration", "mesh")),
         "response",
-        "certify",
+        pytest.param("certify", marks=pytest.mark.long),
     ],
 )
 def test_a_build_can_be_stopped_in_every_stage(

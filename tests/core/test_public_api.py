@@ -83,6 +83,7 @@ def built(n_vertices: int, n_certified: int) -> Vademecum:
     return pipeline.build(av.phantom_liver(), options)
 
 
+@pytest.mark.long
 def test_the_lines_of_the_readme_give_the_numbers_beside_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -106,7 +106,7 @@ def test_displacement_and_force_cross_borders_of_regions_without_a_jump(
 ) -> None:
     """A tenth of a millimetre moves the cloud as little at a border as within a region."""
     v, tip = phantom_vademecum, Tip("sphere", 8e-3)
-    model = prepare(v, (tip,), cloud="volume", precision="float32")
+    model = prepare(v, (tip,), cloud="volume")
     path = slide(v, tip.offset, 4e-3, 0.12)
     quarters = np.arange(0.0, len(path) - 1.0, 0.25)
     fine = np.column_stack([np.interp(quarters, np.arange(len(path)), x) for x in path.T])
@@ -130,7 +130,7 @@ def test_a_history_in_many_regions_is_shown_without_a_jump(phantom_vademecum: Va
     """Of soft tissue that was stroked across many regions, those that moved most stay shown."""
     v, tip = phantom_vademecum, Tip("sphere", 8e-3)
     slow = Viscoelasticity((0.95,), (2.0,))
-    model = prepare(v, (tip,), cloud="volume", precision="float32", effects=(slow,))
+    model = prepare(v, (tip,), cloud="volume", effects=(slow,))
     path = slide(v, tip.offset, 4e-3, 0.4)
     shown, change, turns, before = [], [], [], None
     for at in path:
@@ -150,7 +150,7 @@ def test_a_history_in_many_regions_is_shown_without_a_jump(phantom_vademecum: Va
 
 def test_regions_fade_before_they_are_left_out(phantom_vademecum: Vademecum) -> None:
     """Of seven, four stay, each less what the fifth moves: whichever it is, nothing jumps."""
-    model = prepare(phantom_vademecum, cloud="volume", precision="float32")
+    model = prepare(phantom_vademecum, cloud="volume")
     state, start = model.state, model.arrays.region_start
     moved = np.arange(7.0, 0.0, -1.0)
     state.n_touched[0], state.touched[:7] = 7, np.arange(7)

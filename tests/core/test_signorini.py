@@ -97,6 +97,7 @@ def test_a_ball_pushed_askew_finds_the_axis_without_moment() -> None:
     assert touch.force == pytest.approx(_sphere_force(SPHERE.radius, depth), rel=0.02)
 
 
+@pytest.mark.long
 def test_contacts_at_a_place_turn_the_axis_of_balls_alone() -> None:
     """The centre of the ball stays; a punch presses along the axis that it was given."""
     angle, depth = np.radians(12.0), 1e-3

@@ -114,6 +114,7 @@ def slopes(model: ContactModel, place: np.ndarray, axis: np.ndarray) -> tuple[np
     return out[0], out[1]
 
 
+@pytest.mark.long
 def test_torque_relaxes_and_friction_leaves_it() -> None:
     """In the end that of the relaxed modulus; on the face itself friction has no arm."""
     soft = Viscoelasticity((0.6,), (0.02,))
