@@ -81,7 +81,12 @@ CONTACT = (
         range=(1, 1000),
         read_only=False,
     ),
-    Parameter("modes", 0, "modes of the displacement that move a vertex, in the mean; 0: all", range=(0, 100_000)),
+    Parameter(
+        "modes",
+        0,
+        "modes of the displacement that move a vertex, in the mean; 0: all",
+        range=(0, 100_000),
+    ),
     Parameter(
         "pose_timeout",
         0.02,
