@@ -207,7 +207,8 @@ def main() -> int:
     from rclpy.signals import SignalHandlerOptions
 
     from avatar_ros.framework import qos
-    from avatar_ros.framework.managed_node import StopSignal, spin_until
+    from avatar_ros.framework.managed_node import spin_until
+    from avatar_ros.framework.stop_signal import StopSignal
     from avatar_ros.msg import VademecumFile
 
     stop = StopSignal()
