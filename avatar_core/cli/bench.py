@@ -1,4 +1,4 @@
-"""``avatar bench step | effects | cell | idle``: whether this machine holds 1 kHz, and rests."""
+"""``avatar bench step | effects | cell | start | idle``: whether this machine holds 1 kHz."""
 
 from __future__ import annotations
 
@@ -169,6 +169,19 @@ def bench_cell(
             file = Path(folder) / "bench.h5"
             save_vademecum(built, file)
         run_cell(file, seconds, output, changes)
+
+
+@bench.command("start")
+def bench_start(
+    vademecum: Annotated[
+        Path, typer.Argument(exists=True, dir_okay=False, help="vademecum to load (.h5)")
+    ],
+    output: Json = None,
+) -> None:
+    """Time a cell from `avatar cell` to the first force, stage by stage."""
+    require_ros()
+    _require_json(output, vademecum)
+    _run_module("start", [str(vademecum.resolve())], output)
 
 
 @bench.command("idle")

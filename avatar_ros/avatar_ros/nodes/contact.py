@@ -100,9 +100,6 @@ class ContactNode(ManagedNode):
         settings = self._settings()
         if settings.scene:
             self._set_cloud_divisor(settings.cloud_divisor)
-        load_compiler()
-        if settings.safety.passivity != "off":
-            passivity.warm_up()
         period = 1.0 / settings.rate
         self._tools = tool_channels(self.ports, settings)
         self._devices = devices(self, settings, self._tools)
@@ -134,6 +131,9 @@ class ContactNode(ManagedNode):
         self._budget = BudgetRequests(
             settings.budget, self._supplier.ask, self._grant_budget, self._refuse_budget
         )
+        load_compiler()  # while the worker starts
+        if settings.safety.passivity != "off":
+            passivity.warm_up()
         self._save_state()
 
     def _settings(self) -> ContactSettings:
