@@ -101,6 +101,6 @@ def test_an_organ_is_the_same_from_every_kind_of_file(tmp_path: Path) -> None:
         print(f"\n{name:14} {1e6 * surface.volume:.1f} ml, clamp at {x:.1f} {y:.1f} {z:.1f} mm")
     for name, surface in surfaces.items():
         assert surface.volume == pytest.approx(VOLUME, rel=0.01), name
-        # half a voxel of a cap of 13 % of the area; on the wrong side it lies 60 mm away
+        # half a voxel of a cap of 13 % of the area; on the wrong side it lies 45 mm away
         np.testing.assert_allclose(clamps[name], clamps["ras_obj"], atol=2.5e-3, err_msg=name)
     assert clamps["ras_obj"] @ [0.0, -1.0, 1.0] > 0.05  # behind and above
