@@ -227,7 +227,7 @@ def _cpu(pid: int) -> dict[str, float]:
 
 def _name(pid: int, parent: str) -> str:
     words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
-    module = words[words.index("-m") + 1] if "-m" in words else Path(words[1]).name
+    module = words[words.index("-m") + 1] if "-m" in words else Path(words[0]).name
     name = _NAMES.get(module, module.rpartition(".")[2])
     return f"{parent}'s reader".replace("'s worker's", "'s") if name == "reader" else name
 
