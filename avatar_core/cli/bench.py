@@ -1,4 +1,4 @@
-"""``avatar bench step | effects | cell``: whether this machine holds 1 kHz."""
+"""``avatar bench step | effects | cell | start | idle``: whether this machine holds 1 kHz."""
 
 from __future__ import annotations
 
@@ -171,6 +171,39 @@ def bench_cell(
         run_cell(file, seconds, output, changes)
 
 
+@bench.command("start")
+def bench_start(
+    vademecum: Annotated[
+        Path, typer.Argument(exists=True, dir_okay=False, help="vademecum to load (.h5)")
+    ],
+    output: Json = None,
+) -> None:
+    """Time a cell from `avatar cell` to the first force, stage by stage."""
+    require_ros()
+    _require_json(output, vademecum)
+    _run_module("start", [str(vademecum.resolve())], output)
+
+
+@bench.command("idle")
+def bench_idle(
+    seconds: Annotated[float, typer.Option(help="to measure [s]")] = 20.0,
+    atlas: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="atlas of the patients' service; without one it is started, not configured",
+        ),
+    ] = None,
+    output: Json = None,
+) -> None:
+    """Print what each thread of the nodes takes of a processor while there is nothing to do."""
+    require_ros()
+    _require_json(output, atlas)
+    options = ["--atlas", str(atlas.resolve())] if atlas is not None else []
+    _run_module("idle", [f"{seconds:g}", *options], output)
+
+
 def _require_json(output: Path | None, *inputs: str | Path | None) -> None:
     """Raise StorageError, before minutes of work, if the table cannot be written."""
     if output is not None:
@@ -191,8 +224,13 @@ def run_cell(
     vademecum: Path, seconds: float, output: Path | None = None, changes: float = 0.0
 ) -> None:
     """Measure the cell in a separate process, which prints the table or a one-line error."""
-    command = [sys.executable, "-m", "avatar_ros.bench.cell", str(vademecum), f"{seconds:g}"]
-    command += ["--changes", f"{changes:g}"]
+    arguments = [str(vademecum), f"{seconds:g}", "--changes", f"{changes:g}"]
+    _run_module("cell", arguments, output)
+
+
+def _run_module(name: str, arguments: list[str], output: Path | None) -> None:
+    """Run a benchmark of avatar_ros; its exit code is ours if it fails."""
+    command = [sys.executable, "-m", f"avatar_ros.bench.{name}", *arguments]
     command += ["--output", str(output)] if output is not None else []
     sys.stdout.flush()  # keeps the order of output in a file
     code = subprocess.run(command, check=False).returncode

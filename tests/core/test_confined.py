@@ -41,6 +41,16 @@ def test_a_function_by_its_name_is_imported_there_alone(
     assert "colorsys" not in sys.modules
 
 
+def test_what_was_loaded_is_there_before_the_first_call(confined: Confined) -> None:
+    confined.load(Imported("colorsys", "rgb_to_yiq"))
+    loaded = confined.pid
+    assert confined.call(SECONDS, eval, "'colorsys' in __import__('sys').modules")
+    assert confined.pid == loaded
+    with pytest.raises(ConfinedError):
+        confined.load(Imported("no_such_module", "f"))
+    assert confined.call(SECONDS, int, "1") == 1
+
+
 def test_an_error_of_ours_comes_back_as_it_is(confined: Confined) -> None:
     with pytest.raises(StorageError, match="no vademecum at /none"):
         confined.call(SECONDS, load_vademecum, "/none")

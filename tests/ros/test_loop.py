@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ import rclpy
 from avatar_ros.framework.templates import WrenchTemplate, rotation_between, stamp_bytes
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop
 from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.statistics import TimingRecord
 from avatar_ros.loop.tool_channel import OK
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
@@ -26,6 +28,7 @@ from avatar_core.contact.effects import Friction, Viscoelasticity
 from avatar_core.contact.model import prepare
 from avatar_core.geometry.tip import Tip
 from tests.ros.through import Through
+from tests.slowness import slowness
 
 pytestmark = pytest.mark.ros
 
@@ -68,6 +71,7 @@ class HeldTool:
         self.publisher = Outlet()
         self.wrench = WrenchTemplate("organ")
         self.status, self.stamp = OK, stamp_bytes(1)
+        self.connected = True
 
     @property
     def fault(self) -> int:
@@ -155,6 +159,31 @@ def test_without_a_model_the_loop_steps_seldom_but_sees_every_stream(
     loop._step()
     assert loop._due - loop._step_start < 1.5e6
     assert loop.record.nominal == 1e6 * (1 + periods)
+
+
+@pytest.mark.parametrize("reason", ["a model", "a tool", "the end"])
+def test_alone_it_sleeps_until_it_is_woken(bench: Bench, reason: str) -> None:
+    """However long that would be; the period that is cut short is neither late nor early."""
+    loop, tool = bench.loop, bench.tool
+    tool.connected = False
+    loop._step()
+    assert loop._due - loop._step_start >= 0.09e9
+    loop._step_start -= 10 * 10**9  # as if it had slept for that long
+    loop._due = loop._step_start + 3600 * 10**9
+    loop.record = TimingRecord(loop._step_start)
+    sleeper = threading.Thread(target=lambda: (loop._wait(), loop._step()), daemon=True)
+    sleeper.start()
+    if reason == "a model":
+        bench.use()
+    if reason == "the end":
+        loop.stop()
+    else:
+        tool.connected = reason == "a tool"
+        loop.wake()
+    sleeper.join(60.0 * slowness())
+    assert not sleeper.is_alive()
+    assert 10e9 <= loop.record.nominal <= loop.record.periods[0]
+    assert loop.record.n_missed == 0
 
 
 def test_the_force_moves_linearly_from_one_selection_of_effects_to_the_next(

@@ -18,6 +18,7 @@ from avatar_ros.bench.footprint import Footprint, children
 from avatar_ros.framework import qos
 from avatar_ros.framework.reader import Reader
 
+from avatar_core.common.confined import Imported
 from avatar_ros.msg import ContactState
 from avatar_ros.srv import LoadVademecum
 from tests.ros.conftest import START_TIMEOUT
@@ -48,6 +49,20 @@ def test_a_process_that_reads_ends_when_it_has_nothing_to_do() -> None:
             assert not passed
             time.sleep(0.01)
         assert reader.read("b", 0, os.getpid) not in (first, os.getpid())
+    finally:
+        reader.close()
+
+
+def test_a_process_that_was_loaded_for_nothing_ends_too() -> None:
+    reader = Reader(1 << 20, idle=0.2)
+    try:
+        reader.load(os.getpid)
+        passed = Deadline(30.0)
+        while reader.pid is not None:
+            assert not passed
+            time.sleep(0.01)
+        reader.load(Imported("no_such_module", "f"))  # the first file says it as well
+        assert reader.read("a", 0, os.getpid) != os.getpid()
     finally:
         reader.close()
 

@@ -24,6 +24,7 @@ from avatar_ros.framework.state_template import StateTemplate
 from avatar_ros.framework.templates import PoseReader, stamp_bytes, stamp_nanoseconds
 from avatar_ros.loop import contact_loop
 from avatar_ros.loop.contact_loop import ActiveModel, ContactLoop
+from avatar_ros.loop.diagnostics import FaultCounter
 from avatar_ros.loop.safety import Safety
 from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.loop.statistics import statistics
@@ -330,6 +331,26 @@ def test_one_gap_in_a_stream_makes_it_not_slow(bench: Any, touch: Any, hertz: in
     assert found[140:] == [OK] * 160
 
 
+@pytest.mark.parametrize("hertz", [100, 1000])
+def test_a_tool_that_joins_an_idle_loop_is_not_slow(bench: Any, touch: Any, hertz: int) -> None:
+    """Its first poses are taken before and after a long sleep, without a model and any tool."""
+    cell = bench(timeout=0.02)
+    loop, tool = cell.loop, cell.tools[0]
+    loop.active = loop._used = ActiveModel("", None, cell.settings)
+    sent, times = 0, []
+    for _ in range(100):
+        cell.now = max(cell.now, 1e-9 * loop._due)
+        times.append(cell.now)
+        if len(times) > 3 and cell.now * hertz >= sent + 1:
+            sent = math.floor(cell.now * hertz)
+            cell.poses[0].waiting = pose(touch[0])
+        loop._step()
+    np.testing.assert_allclose(np.diff(times)[:2], 0.1)
+    np.testing.assert_allclose(np.diff(times)[-9:], 0.005)
+    assert tool.status == OK
+    assert list(np.flatnonzero(tool.faults)) == [OK]
+
+
 @pytest.mark.parametrize("hertz", [1, 5, 20, 33, 100, 1000])
 @pytest.mark.parametrize("fault", ["frame", "stamp", "NaN", "quaternion"])
 def test_what_came_last_says_why_there_is_no_force(
@@ -354,6 +375,29 @@ def test_what_came_last_says_why_there_is_no_force(
     cell.step(spoilt)
     cell.tools[0].publishers = 0
     assert cell.step(None)[0] == LOST
+
+
+@pytest.mark.parametrize("hertz", [5, 20, 33, 100, 1000])
+@pytest.mark.parametrize("age", [0, 3600], ids=["valid", "old"])
+def test_a_stream_is_judged_by_when_it_comes(bench: Any, touch: Any, hertz: int, age: int) -> None:
+    """Stamps are not compared: another machine's clock may be an hour behind."""
+    cell = bench(timeout=0.02)
+    tip = cell.press(touch, 0.0)
+    counter = FaultCounter(cell.tools)
+    period, expected = 1000 // hertz, OK if hertz > 67 else SLOW
+    said = set()
+    for k in range(3 * period + 1200):
+        stamp = NOW - age * SECOND + k * 1_000_000
+        status, force = cell.step(pose(tip, stamp=stamp) if k % period == 0 else None)
+        if k == 3 * period:
+            counter.window()
+        if k >= 3 * period:
+            assert status == expected
+            assert force.any() == (expected == OK)
+        if k > 3 * period and k % 1000 == 0:
+            said |= {faults.text for faults in counter.window()}
+    what = "more slowly than pose_timeout allows" if expected == SLOW else ""
+    assert said and all(what in text and bool(text) == bool(what) for text in said)
 
 
 @pytest.mark.parametrize(("depth", "expected"), [(0.0, OK), (10e-3, BARRED)])

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,16 +71,34 @@ def test_the_executables_are_those_that_are_documented() -> None:
     assert {path.name for path in (PREFIX / "lib" / "avatar_ros").iterdir()} == EXECUTABLES
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+def executable(name: str) -> list[str]:
+    """What `ros2 run` starts."""
+    return [str(PREFIX / "lib" / "avatar_ros" / name)]
+
+
+def module(name: str) -> list[str]:
+    """What the README has in its place where there is no `ros2`."""
+    return [str(PREFIX / "bin" / "python"), "-m", f"avatar_ros.nodes.{name}"]
+
+
+@pytest.mark.parametrize(
+    ("command", "number"),
+    [(executable, signal.SIGINT), (executable, signal.SIGTERM), (module, signal.SIGINT)],
+    ids=["executable-SIGINT", "executable-SIGTERM", "module-SIGINT"],
+)
 @pytest.mark.parametrize("name", sorted(EXECUTABLES))
-def test_an_executable_starts_and_ends_cleanly(
-    shell: dict[str, str], lasting_probe: Any, name: str, number: signal.Signals
+def test_a_node_starts_without_ros2_and_ends_cleanly(
+    shell: dict[str, str],
+    lasting_probe: Any,
+    name: str,
+    command: Callable[[str], list[str]],
+    number: signal.Signals,
 ) -> None:
     if name == "planning_ui":
         pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
     begin = time.monotonic()
     process = subprocess.Popen(
-        [PREFIX / "lib" / "avatar_ros" / name, *ARGUMENTS.get(name, [])],
+        [*command(name), *ARGUMENTS.get(name, [])],
         env=shell,
         cwd="/",
         stderr=subprocess.PIPE,

@@ -18,7 +18,8 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
 from avatar_ros.framework import qos, realtime
-from avatar_ros.framework.managed_node import StopSignal, spin_until
+from avatar_ros.framework.managed_node import spin_until
+from avatar_ros.framework.stop_signal import StopSignal
 from avatar_ros.msg import LoopStatistics
 
 

@@ -21,7 +21,8 @@ from rclpy.task import Future
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.framework import realtime
-from avatar_ros.framework.managed_node import StopSignal, spin_until
+from avatar_ros.framework.managed_node import spin_until
+from avatar_ros.framework.stop_signal import StopSignal
 from avatar_ros.loop.settings import MATERIAL
 
 _YOUNG = (0.5, 2.0)  # times that of the vademecum

@@ -23,7 +23,7 @@ from avatar_core.contact import tool_path
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.framework import qos, realtime
-from avatar_ros.framework.managed_node import StopSignal
+from avatar_ros.framework.stop_signal import StopSignal
 from avatar_ros.framework.templates import PoseTemplate, WrenchReader, stamp_bytes
 from avatar_ros.msg import ContactState
 

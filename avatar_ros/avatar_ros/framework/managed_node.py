@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 import traceback
@@ -22,10 +21,11 @@ from avatar_ros.framework import discovery
 from avatar_ros.framework.ending import end_within
 from avatar_ros.framework.parameters import Parameter, ParameterError, declare
 from avatar_ros.framework.ports import Ports
+from avatar_ros.framework.stop_signal import StopSignal
 
-_SIGNAL_LATENCY = 0.1  # longest until a signal is noticed [s]
 _END = 1.0  # from the last answer to the end of the process [s]
 _LAST_ANSWERS = 1.0  # for requests that are pending when the node ends [s]
+_LOOK = 0.1  # at whether they are answered [s]
 
 
 class ManagedNode(LifecycleNode, ABC):
@@ -63,7 +63,7 @@ class ManagedNode(LifecycleNode, ABC):
 
     @property
     def failure(self) -> str:
-        """Why the node cannot continue; empty otherwise."""
+        """Why the node cannot continue; empty otherwise. Read after each callback."""
         return ""
 
     @property
@@ -111,28 +111,14 @@ class ManagedNode(LifecycleNode, ABC):
         return TransitionCallbackReturn.FAILURE
 
 
-class StopSignal:
-    """True once SIGINT or SIGTERM was received."""
-
-    def __init__(self) -> None:
-        self._came = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._note)
-
-    def _note(self, *_: object) -> None:
-        self._came = True
-
-    def __bool__(self) -> bool:
-        return self._came
-
-
 def spin_until(stop: StopSignal, node: Node) -> None:
     """Serve a plain node until the signal is received, then shut it and rclpy down."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        while not stop:
-            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+        with stop.wakes(executor):
+            while not stop:
+                executor.spin_once()
     finally:
         executor.shutdown()
         node.destroy_node()
@@ -172,8 +158,9 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
     try:
         if node.get_parameter("autostart").value and not node.bring_up():
             return 1  # the reason was logged
-        while not stop and not node.failure:
-            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+        with stop.wakes(executor):
+            while not stop and not node.failure:
+                executor.spin_once()
         if node.failure:
             node.get_logger().fatal(node.failure)
         return 1 if node.failure else 0
@@ -181,5 +168,5 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
         node.trigger_shutdown()
         end = time.monotonic() + _LAST_ANSWERS
         while node.has_pending_answers and time.monotonic() < end:
-            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+            executor.spin_once(timeout_sec=_LOOK)
         executor.shutdown(timeout_sec=_LAST_ANSWERS)  # else it waits forever for open requests

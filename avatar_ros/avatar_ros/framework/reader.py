@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, ParamSpec, TypeVar
 
 from avatar_core.common.confined import Confined, ConfinedError
 from avatar_ros.framework.library import RefusedError
@@ -47,12 +48,28 @@ class Reader:
             If it ends its process, or takes much longer or more memory than such a file needs.
         """
         seconds = _SECONDS + n_bytes / _MIN_SPEED
+        with self._kept():
+            try:
+                return self._confined.call(seconds, function, *args, **kwargs)
+            except ConfinedError as error:
+                raise RefusedError(f"{name}: damaged, {error}; make it again") from error
+
+    def load(self, function: Callable[..., Any]) -> None:
+        """Start the process, which imports what ``function`` needs; whoever reads soon waits less.
+
+        It ends like any other when it has nothing to do.
+        """
+        with self._kept(), suppress(ConfinedError):  # which the first file says as well
+            self._confined.load(function)
+
+    @contextmanager
+    def _kept(self) -> Iterator[None]:
+        """End the process only after a while without another use."""
         self._end.cancel()
         try:
-            return self._confined.call(seconds, function, *args, **kwargs)
-        except ConfinedError as error:
-            raise RefusedError(f"{name}: damaged, {error}; make it again") from error
+            yield
         finally:
+            self._end.cancel()  # of another thread, which used it meanwhile
             self._end = threading.Timer(self._idle, self._confined.close)
             self._end.daemon = True
             self._end.start()

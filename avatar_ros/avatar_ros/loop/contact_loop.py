@@ -1,8 +1,9 @@
 """The loop of the contact node: a thread that waits for a pose, steps and publishes.
 
 It waits for nothing but poses. Without a model it steps every fifth period, and no pose wakes it:
-there is no force to be late, and the wrench of zero keeps its deadline. An exception ends it, with
-a last wrench of zero. The node exchanges two references with it: the model in use and the record
+there is no force to be late, and the wrench of zero keeps its deadline. While no tool is connected
+either, it steps ten times a second, until the node wakes it. An exception ends it, with a last
+wrench of zero. The node exchanges two references with it: the model in use and the record
 of times.
 
 When a model replaces another, the loop steps both for ``BLEND`` seconds and publishes a mean of
@@ -44,6 +45,7 @@ BLEND = 0.1  # [s]
 _LONGEST_WAIT = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own
 _SHORTEST_PERIOD = 0.5  # periods between two answers to poses, however fast they come
 _IDLE = 5  # periods from step to step without a model; the wrench has a deadline of ten
+_ALONE = 100_000_000  # the same, while no tool is connected [ns]
 _NO_ERROR = float("nan")  # of a force that no model gave
 
 
@@ -89,7 +91,8 @@ class Publishers:
 class ContactLoop:
     """Answers every pose at once, and keeps its period when none comes.
 
-    active : the model in use; exchange it while ``is_changing`` is false, for a smooth change
+    active : the model in use; exchange it while ``is_changing`` is false, for a smooth change, and
+        ``wake`` the loop
     record : of the times; exchange it at any time
     failure : the exception that ended the loop; empty otherwise
     guards : of the force on each tool
@@ -123,6 +126,7 @@ class ContactLoop:
         self._period = round(1e9 / settings.rate)
         self._running = False
         self._stopping = False
+        self._awake = threading.Event()
         self._thread: threading.Thread | None = None
         self._step_start = 0  # of the last step [ns]
         self._due = 0  # the next step, if no pose comes before [ns]
@@ -146,10 +150,15 @@ class ContactLoop:
     def stop(self) -> None:
         """End the thread; returns when all forces have faded out, within 20 ms."""
         self._stopping = True
+        self.wake()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
         self._running = False
+
+    def wake(self) -> None:
+        """Step now, if the loop waits because there was no model and no tool."""
+        self._awake.set()
 
     def _run(self, cpu: int) -> None:
         try:
@@ -157,6 +166,7 @@ class ContactLoop:
                 for port in self._ports():
                     in_use.enter_context(port.handle)  # not destroyed under the loop
                 in_use.enter_context(self._wait_set)
+                realtime.name_thread("contact loop")
                 realtime.bind_thread(cpu)
                 self._step_start = self._due = time.monotonic_ns()
                 while not (self._stopping and all(guard.silent for guard in self.guards)):
@@ -174,7 +184,7 @@ class ContactLoop:
     def _wait(self) -> None:
         """Wait for a pose, at most until the step is due. Real-time safe."""
         if self._nominal > self._period:
-            realtime.sleep_until(self._due)
+            self._wait_idle()
             return
         realtime.sleep_until(self._answered + round(_SHORTEST_PERIOD * self._period))
         wait_set = self._wait_set
@@ -182,6 +192,12 @@ class ContactLoop:
         for tool in self._tools:
             wait_set.add_subscription(tool.subscription.handle)
         wait_set.wait(max(0, self._due - time.monotonic_ns()))
+
+    def _wait_idle(self) -> None:
+        """Wait until the step is due or the loop is woken, which shortens its period."""
+        if self._awake.wait(1e-9 * max(0, self._due - time.monotonic_ns())):
+            self._nominal = max(self._period, time.monotonic_ns() - self._step_start)
+        self._awake.clear()
 
     def _step(self) -> None:
         """Take poses, solve, and publish wrenches, states and the cloud. Real-time safe."""
@@ -254,6 +270,8 @@ class ContactLoop:
 
     def _idle_period(self, timeout: int) -> int:
         """From step to step without a model; short enough that no pose seems late [ns]."""
+        if not any(tool.connected for tool in self._tools):
+            return max(self._period, _ALONE)
         return self._period * max(1, min(_IDLE, timeout // (4 * self._period)))
 
     def _next_due(self, start: int, fresh: bool) -> int:
@@ -279,7 +297,8 @@ class ContactLoop:
             guard.update(now, tool.fault == OK and not self._stopping, wrench.force, wrench.torque)
             if energies is not None:
                 energies.held[i, -1] = wrench.force
-            tool.answer()
+            if model is not None or tool.connected:
+                tool.answer()
 
     def _send_zero(self) -> None:
         """Send a last wrench of zero to every tool, after a failure."""

@@ -51,6 +51,7 @@ class ToolChannel:
     status : OK with a usable pose, otherwise the reason why there is none
     stamp : of the last valid pose, eight bytes; zero before the first
     publishers : of its poses, as the node last counted them; one that was killed counts for a while
+    listeners : to its wrenches, likewise
     device : OK if its device takes forces or is not asked, otherwise why it does not; the node's
     operating_state : what its device said last, in words; empty before, the node's likewise
     faults : how often each status was entered since the node started, by its number
@@ -66,7 +67,8 @@ class ToolChannel:
         self.wrench = WrenchTemplate(frame)
         self.status = NO_POSE
         self.stamp = NO_STAMP
-        self.publishers = 1
+        self.publishers = 0
+        self.listeners = 0
         self.device = OK
         self.operating_state = ""
         self.faults = np.zeros(_N_STATUS, np.int64)
@@ -85,6 +87,11 @@ class ToolChannel:
         self._orientation: tuple[float, float, float, float] | None = None  # of the last valid pose
         self._kind = safety.wrench
         self._axes = (0.0, 0.0, 0.0, 1.0)  # of the last valid pose, as long as the channel exists
+
+    @property
+    def connected(self) -> bool:
+        """Whether somebody sends its poses or takes its wrenches. Real-time safe."""
+        return self.publishers > 0 or self.listeners > 0
 
     @property
     def fault(self) -> int:

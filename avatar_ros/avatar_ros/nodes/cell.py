@@ -17,7 +17,7 @@ from pathlib import Path
 
 from avatar_core.common.processes import ModuleProcess
 from avatar_ros.framework import realtime
-from avatar_ros.framework.managed_node import StopSignal
+from avatar_ros.framework.stop_signal import StopSignal
 
 _POLL = 0.1  # [s]
 _STOP_TIMEOUT = 5.0  # for a node to end by itself [s]

@@ -51,15 +51,13 @@ from avatar_ros.loop.tool_channel import ToolChannel, tool_channels
 from avatar_ros.msg import ContactState, LoopStatistics
 from avatar_ros.nodes import contact_frames
 from avatar_ros.nodes.contact_parameters import read_contact
-from avatar_ros.nodes.contact_reports import ContactReports
+from avatar_ros.nodes.contact_reports import REPORT_PERIOD, ContactReports
 from avatar_ros.prepare import scenes
 from avatar_ros.prepare.budget_requests import BudgetRequests
 from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedModel
 from avatar_ros.prepare.supplier import SUPERSEDED, ModelSupplier
 from avatar_ros.srv import LoadScene
 
-_REPORT_PERIOD = 1.0  # [s]
-_COUNT_PERIOD = 0.1  # between two counts of the tools' publishers [s]
 _BUDGET = ("accuracy.tolerance", "accuracy.quantity", "accuracy.deadline")
 _GRACE = 0.1  # for which a replaced model is kept after the last step that uses it [s]
 
@@ -75,7 +73,7 @@ class ContactNode(ManagedNode):
         self._devices: list[Device] = []
         self._outputs: Publishers | None = None
         self._frames: Any = None  # publisher of the static transforms
-        self._timers: list[Any] = []
+        self._reports: ContactReports | None = None  # while the node is active
         self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
         self._least_error: dict[str, float] = {}  # of any detail of it, by quantity
         self._n_awaited = 0
@@ -102,9 +100,6 @@ class ContactNode(ManagedNode):
         settings = self._settings()
         if settings.scene:
             self._set_cloud_divisor(settings.cloud_divisor)
-        load_compiler()
-        if settings.safety.passivity != "off":
-            passivity.warm_up()
         period = 1.0 / settings.rate
         self._tools = tool_channels(self.ports, settings)
         self._devices = devices(self, settings, self._tools)
@@ -113,8 +108,8 @@ class ContactNode(ManagedNode):
                 ContactState, "contact_state", qos.states(len(self._tools), period)
             ),
             self.ports.publisher(PointCloud2, "deformation", qos.clouds(period)),
-            self.ports.publisher(LoopStatistics, "statistics", qos.reports(_REPORT_PERIOD)),
-            self.ports.publisher(DiagnosticArray, "/diagnostics", qos.reports(_REPORT_PERIOD)),
+            self.ports.publisher(LoopStatistics, "statistics", qos.reports(REPORT_PERIOD)),
+            self.ports.publisher(DiagnosticArray, "/diagnostics", qos.reports(REPORT_PERIOD)),
         )
         self._frames = self.create_publisher(TFMessage, contact_frames.TOPIC, qos.LATCHED)
         self._loop = ContactLoop(settings, self._tools, self._outputs, self.context)
@@ -136,6 +131,9 @@ class ContactNode(ManagedNode):
         self._budget = BudgetRequests(
             settings.budget, self._supplier.ask, self._grant_budget, self._refuse_budget
         )
+        load_compiler()  # while the worker starts
+        if settings.safety.passivity != "off":
+            passivity.warm_up()
         self._save_state()
 
     def _settings(self) -> ContactSettings:
@@ -162,13 +160,10 @@ class ContactNode(ManagedNode):
         self._loop.start(granted.cpu)
         for device in self._devices:
             device.begin()
-        reports = ContactReports(
+        self._reports = ContactReports(
             self, self._loop, self._tools, self._devices, self._outputs, self.ports
         )
-        self._timers = [
-            self.create_timer(_REPORT_PERIOD, reports.publish),
-            self.create_timer(_COUNT_PERIOD, reports.count_publishers),
-        ]
+        self._reports.start()
         limits = settings.safety.limits
         self.get_logger().info(
             f"forces of at most {limits.force:g} N and {limits.slew:g} N/s "
@@ -176,9 +171,9 @@ class ContactNode(ManagedNode):
         )
 
     def deactivate(self) -> None:
-        for timer in self._timers:
-            self.destroy_timer(timer)
-        self._timers = []
+        if self._reports is not None:
+            self._reports.stop()
+            self._reports = None
         if self._loop is not None:
             self._loop.stop()
 
@@ -211,6 +206,7 @@ class ContactNode(ManagedNode):
         kept = self._budget.in_force if self._budget is not None else None
         shown_modes = ShownModes(model, curve, _deadline(kept))
         loop.active = ActiveModel(prepared.id, model, loop.settings, prepared.effects, shown_modes)
+        loop.wake()
         what = ", ".join(prepared.effects) or "no effects"
         self.get_logger().info(
             f"vademecum {prepared.name!r} ({prepared.id[:12]}) in use, with {what}; "
@@ -282,7 +278,7 @@ class ContactNode(ManagedNode):
         """
         executor, supplier = self.executor, self._supplier
         assert executor is not None  # which runs this
-        if supplier is None or not self._timers:
+        if supplier is None or self._reports is None:
             raise SceneError("the node is inactive; activate it first")
         done = Future(executor=executor)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
+from rclpy.timer import Timer
 
 from avatar_ros.framework.ports import Ports
 from avatar_ros.loop import diagnostics
@@ -19,6 +20,8 @@ from avatar_ros.loop.statistics import TimingRecord, statistics
 from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.msg import LoopStatistics
 
+REPORT_PERIOD = 1.0  # [s]
+_COUNT_PERIOD = 0.1  # between two counts of who is connected; with each report, if nobody was [s]
 _MINUTE = 60.0  # [s]
 
 
@@ -43,6 +46,36 @@ class ContactReports:
         self._faults = diagnostics.FaultCounter(tools)
         self._logged: dict[str, str] = {}  # last fault, by tool
         self._shown_modes_log = ShownModesLog(node)
+        self._timers: list[Timer] = []  # of the reports, and of the counts between them
+
+    def start(self) -> None:
+        """Report and count until :meth:`stop`."""
+        self._timers = [
+            self._node.create_timer(REPORT_PERIOD, self._report),
+            self._node.create_timer(_COUNT_PERIOD, self._count),
+        ]
+
+    def stop(self) -> None:
+        """End reports and counts."""
+        for timer in self._timers:
+            self._node.destroy_timer(timer)
+        self._timers = []
+
+    def _report(self) -> None:
+        self.publish()
+        self.count_ends()
+        if not self._is_alone():
+            self._timers[1].reset()
+
+    def _count(self) -> None:
+        self.count_ends()
+        if self._is_alone():
+            self._timers[1].cancel()
+
+    def _is_alone(self) -> bool:
+        """Whether there is no vademecum, and nobody whose coming or going would matter."""
+        connected = self._devices or any(tool.connected for tool in self._tools)
+        return self._loop.active.model is None and not connected
 
     def publish(self) -> None:
         """Publish statistics and diagnostics of the window that ends now."""
@@ -98,10 +131,14 @@ class ContactReports:
             else:
                 self._node.get_logger().info(f"{tool}: the fault is over")
 
-    def count_publishers(self) -> None:
-        """Note how many nodes send poses of each tool, and which devices are still there."""
+    def count_ends(self) -> None:
+        """Note who sends each tool's poses and takes its wrenches, and which devices are there."""
         for tool in self._tools:
+            was_connected = tool.connected
             tool.publishers = tool.subscription.get_publisher_count()
+            tool.listeners = tool.publisher.get_subscription_count()
+            if tool.connected and not was_connected:
+                self._loop.wake()
         for device in self._devices:
             device.attend()
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from avatar_core.common.confined import Imported
 from avatar_core.common.processes import return_memory
 from avatar_core.errors import one_line
 from avatar_ros.framework import realtime
@@ -35,6 +36,7 @@ from avatar_ros.prepare.shared_arrays import map_shared, write_shared
 
 _MAX_NAME = 80  # letters quoted of a name from elsewhere
 _MAX_BYTES = 1 << 30  # of a vademecum that can be received
+_PARSE = Imported("avatar_core.vademecum.storage", "parse_vademecum")
 
 
 class SentModel(NamedTuple):
@@ -77,11 +79,17 @@ class ModelPreparer:
             self._waiting.discard(threading.get_ident())
             yield
 
+    def expect(self) -> None:
+        """Have the process that verifies started before a vademecum comes; returns at once."""
+        loads = threading.Thread(target=self._reader.load, args=[_PARSE], daemon=True)
+        loads.start()
+
     def receive(self, message: Any) -> None:
         """Take a VademecumFile."""
         with self._exclusive():
             if self._vademecum is not None and message.id == self._vademecum.id:
                 return  # announced again by a restarted loader
+            threading.Thread(target=_import_libraries, name="imports", daemon=True).start()
             try:
                 vademecum = _verified(message.id, bytes(message.data), self._reader)
                 sent = self._prepare(vademecum, self._request, 0, {})
@@ -185,13 +193,20 @@ def _with_scene_text(change: Change) -> Change:
 
 
 def _verified(identity: str, data: bytes, reader: Reader) -> Any:
-    from avatar_core.vademecum import storage
-
     origin = "the received vademecum"
-    vademecum = reader.read(origin, len(data), storage.parse_vademecum, data, origin)
+    vademecum = reader.read(origin, len(data), _PARSE, data, origin)
     if vademecum.id != identity:
         raise ValueError("altered on the way, its checksum differs: load it again")
     return vademecum
+
+
+def _import_libraries() -> None:
+    """Import what preparing needs, while another process verifies; not before, for the memory."""
+    from avatar_core.common.jit import load_compiler
+    from avatar_core.contact import model  # noqa: F401
+    from avatar_ros.prepare import scenes  # noqa: F401
+
+    load_compiler()
 
 
 def _listen(preparer: ModelPreparer) -> None:
@@ -207,7 +222,8 @@ def main() -> int:
     from rclpy.signals import SignalHandlerOptions
 
     from avatar_ros.framework import qos
-    from avatar_ros.framework.managed_node import StopSignal, spin_until
+    from avatar_ros.framework.managed_node import spin_until
+    from avatar_ros.framework.stop_signal import StopSignal
     from avatar_ros.msg import VademecumFile
 
     stop = StopSignal()
@@ -218,6 +234,7 @@ def main() -> int:
     request, _ = received
     assert isinstance(request, PreparationRequest)
     preparer = ModelPreparer(request, channel, lambda: bool(stop))
+    preparer.expect()
     threading.Thread(target=_listen, args=[preparer], name="changes", daemon=True).start()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(

@@ -21,8 +21,8 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 
 from avatar_ros.framework import qos, realtime
-from avatar_ros.framework.managed_node import StopSignal
 from avatar_ros.framework.ports import PolledSubscriptions
+from avatar_ros.framework.stop_signal import StopSignal
 from avatar_ros.framework.templates import PoseTemplate, stamp_bytes
 from avatar_ros.loop.tool_channel import FAR_AWAY
 from avatar_ros.msg import ContactState

@@ -1,0 +1,199 @@
+"""What the nodes take of a processor while nobody asks anything of them.
+
+Contact node and loader run without a vademecum, the patients' service with an atlas if there is
+one, and beside them a node of rclpy with the contact node's topics alone, each in a domain of its
+own. ``avatar bench idle`` runs it as ``python -m avatar_ros.bench.idle SECONDS``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from avatar_core.errors import AvatarError
+from avatar_ros.bench.cell import CellError, Module, isolated_environment
+from avatar_ros.bench.footprint import children
+from avatar_ros.bench.thread_times import between, thread_times
+
+PROMISED = 0.03  # of a core, of the contact node with its worker
+_LEAST = 0.0005  # of a core, of a thread that has a row of its own
+_CALM = 0.15  # of a core, below which a process has started, even if it gets but a fifth of one
+_SETTLED = 5  # seconds in a row below that
+_START_TIMEOUT = 120.0  # [s]
+
+
+@dataclass(frozen=True)
+class IdleThread:
+    """One thread, or all of a process.
+
+    fraction : of a core
+    wake_ups : a second
+    """
+
+    process: str
+    thread: str
+    fraction: float
+    wake_ups: float
+
+    def row(self) -> str:
+        return f"{self.process:32}{self.thread:18}{self.fraction:>9.2%}{self.wake_ups:>12.1f}"
+
+
+HEADER = f"{'process':32}{'thread':18}{'of a core':>9}{'wake-ups/s':>12}"
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class IdleReport:
+    """What ``avatar bench idle`` prints."""
+
+    load_average: float
+    seconds: float
+    threads: tuple[IdleThread, ...]
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """The fraction of a core of each node, its helpers included."""
+        found: dict[str, float] = {}
+        for thread in self.threads:
+            if thread.thread == ALL:
+                name = thread.process.partition("'")[0]
+                found[name] = found.get(name, 0.0) + thread.fraction
+        return found
+
+    def table(self) -> str:
+        contact = self.summary["contact"]
+        kept = "kept" if contact <= PROMISED else "missed"
+        return "\n".join(
+            [
+                f"load average {self.load_average:.2f} before; {self.seconds:g} s",
+                HEADER,
+                *(thread.row() for thread in self.threads),
+                f"contact and its worker: {contact:.2%} of a core, promised {PROMISED:.0%}: {kept}",
+            ]
+        )
+
+    def save(self, path: Path) -> None:
+        """Write all figures as JSON."""
+        document = {"name": "idle", "summary": self.summary, **asdict(self)}
+        path.write_text(json.dumps(document, indent=2) + "\n")
+
+
+def run_idle(seconds: float, atlas: Path | None = None) -> IdleReport:
+    """Start the nodes, wait until they have nothing more to do, and measure.
+
+    Raises
+    ------
+    CellError : one of them ended, or does not come to rest
+    """
+    load = os.getloadavg()[0]
+    with _nodes(atlas) as nodes:
+        _settle(nodes)
+        pids = {name: node.pid for name, node in nodes.items()}
+        for name, pid in list(pids.items()):
+            helpers = sorted(children(pid))
+            pids |= {f"{name}'s helper {k}": helper for k, helper in enumerate(helpers, 1)}
+        begin, first = time.monotonic(), {name: thread_times(pid) for name, pid in pids.items()}
+        time.sleep(seconds)
+        took, last = time.monotonic() - begin, {n: thread_times(pid) for n, pid in pids.items()}
+        _require_alive(nodes)
+    rows: list[IdleThread] = []
+    for name, pid in pids.items():
+        taken = between(first[name], last[name])
+        whole = sum(thread.seconds for thread in taken.values()) / took
+        woken = sum(thread.wake_ups for thread in taken.values()) / took
+        rows.append(IdleThread(name, ALL, whole, woken))
+        rows += [
+            IdleThread(
+                name,
+                "main" if number == pid else thread.name,
+                thread.seconds / took,
+                thread.wake_ups / took,
+            )
+            for number, thread in taken.items()
+            if thread.seconds / took >= _LEAST
+        ]
+    return IdleReport(load, took, tuple(rows))
+
+
+@contextmanager
+def _nodes(atlas: Path | None) -> Iterator[dict[str, Module]]:
+    """The nodes, none of which hears another."""
+    of_patients = ["-p", "autostart:=false"]
+    if atlas is not None:
+        of_patients = ["-p", f"atlas:={atlas}", "-p", f"library_dir:={atlas.parent}"]
+    asked = {
+        "bare node": ("bench.bare_node", []),
+        "contact": ("contact", []),
+        "vademecum_loader": ("vademecum_loader", []),
+        "patient_interpolation": ("patient_interpolation", ["--ros-args", *of_patients]),
+    }
+    with ExitStack() as ended:
+        found = {}
+        for name, (module, arguments) in asked.items():
+            found[name] = Module(module, arguments, isolated_environment())
+            ended.callback(found[name].finish)
+        yield found
+
+
+def _settle(nodes: dict[str, Module]) -> None:
+    """Wait until all nodes have been calm for some seconds."""
+    end, calm, before = time.monotonic() + _START_TIMEOUT, 0, _used(nodes)
+    while calm < _SETTLED:
+        if time.monotonic() > end:
+            raise CellError(f"the nodes do not come to rest in {_START_TIMEOUT:g} s")
+        time.sleep(1.0)
+        _require_alive(nodes)
+        now = _used(nodes)
+        has_worker = any(children(nodes["contact"].pid))
+        at_rest = all(now[name] - before[name] < _CALM for name in now)
+        calm = calm + 1 if has_worker and at_rest else 0
+        before = now
+
+
+def _used(nodes: dict[str, Module]) -> dict[str, float]:
+    """Processor time of each node with its helpers so far [s]."""
+    return {
+        name: sum(
+            thread.seconds
+            for pid in (node.pid, *children(node.pid))
+            for thread in thread_times(pid).values()
+        )
+        for name, node in nodes.items()
+    }
+
+
+def _require_alive(nodes: dict[str, Module]) -> None:
+    for name, node in nodes.items():
+        if node.poll() is not None:
+            raise CellError(f"{name} ended by itself: {node.last_line()}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m avatar_ros.bench.idle")
+    parser.add_argument("seconds", type=float, help="to measure [s]")
+    parser.add_argument("--atlas", type=Path, help="of the patients' service")
+    parser.add_argument("--output", type=Path, help="write all figures as JSON")
+    chosen = parser.parse_args()
+    try:
+        report = run_idle(chosen.seconds, chosen.atlas)
+    except AvatarError as error:
+        print(f"avatar: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130  # by Ctrl-C, as shells count it
+    if chosen.output:
+        report.save(chosen.output)
+    print(report.table(), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,255 @@
+"""From launch to the first force: when each stage is reached, and what it takes of a processor.
+
+A cell is started as ``avatar cell`` does it, or by ``ros2 launch``, while a tool already holds its
+tip in the organ. ``avatar bench start`` runs it as ``python -m avatar_ros.bench.start VADEMECUM``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.executors import SingleThreadedExecutor
+
+from avatar_core.contact import tool_path
+from avatar_core.errors import AvatarError
+from avatar_core.vademecum.storage import load_vademecum
+from avatar_ros.bench.cell import CellError, isolated_environment
+from avatar_ros.bench.footprint import children
+from avatar_ros.bench.thread_times import thread_times
+from avatar_ros.framework import discovery, qos, realtime
+from avatar_ros.framework.templates import PoseTemplate, stamp_bytes
+from avatar_ros.msg import ContactState, VademecumInfo
+
+PROMISED = 6.0  # from launch to the first force, on a quiet machine with warm caches [s]
+STAGES = ("contact node answers", "vademecum announced", "first wrench with a model", "first force")
+_RADIUS = 5e-3  # of the tip, the node's default [m]
+_DEPTH = 3e-3  # [m]
+_PERIOD = 10e-3  # of the poses, below three quarters of the default pose_timeout [s]
+_TIMEOUT = 120.0  # [s]
+_STOP_TIMEOUT = 20.0  # [s]
+_NAMES = {
+    "avatar_ros.nodes.cell": "cell",
+    "avatar_ros.prepare.worker": "contact's worker",
+    "avatar_core.common.confined": "reader",
+}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a start.
+
+    seconds : since the launch [s]
+    cpu : processor time of each process until then [s]
+    """
+
+    name: str
+    seconds: float
+    cpu: dict[str, float]
+
+
+@dataclass(frozen=True)
+class StartReport:
+    """What ``avatar bench start`` prints."""
+
+    vademecum: str
+    load_average: float
+    stages: tuple[Stage, ...]
+
+    @property
+    def seconds(self) -> float:
+        """From launch to the first force [s]."""
+        return self.stages[-1].seconds
+
+    @property
+    def summary(self) -> dict[str, float]:
+        last = self.stages[-1]
+        return {"seconds": last.seconds, "cpu_seconds": sum(last.cpu.values())}
+
+    def table(self) -> str:
+        """One stage a line; columns: when, processor time of all, and of each process."""
+        names = list(self.stages[-1].cpu)
+        width = max(len(name) for name in names) + 2
+        lines = [
+            f"load average {self.load_average:.2f} before; processor times since launch [s]",
+            f"{'stage':28}{'at [s]':>8}{'all':>8}" + "".join(f"{n:>{width}}" for n in names),
+        ]
+        for stage in self.stages:
+            row = f"{stage.name:28}{stage.seconds:>8.2f}{sum(stage.cpu.values()):>8.2f}"
+            row += "".join(f"{stage.cpu.get(name, 0.0):>{width}.2f}" for name in names)
+            lines.append(row)
+        kept = "kept" if self.seconds <= PROMISED else "missed"
+        lines.append(f"{self.seconds:.2f} s, promised {PROMISED:g} s on a quiet machine: {kept}")
+        return "\n".join(lines)
+
+    def save(self, path: Path) -> None:
+        """Write all figures as JSON."""
+        document = {"name": "start", "summary": self.summary, **asdict(self)}
+        path.write_text(json.dumps(document, indent=2) + "\n")
+
+
+def run_start(vademecum: Path, command: list[str] | None = None) -> StartReport:
+    """Start a cell with a vademecum and wait for the first force on a tool.
+
+    command : that starts a cell; None: that of ``avatar cell``
+
+    Raises
+    ------
+    CellError : the cell ended, or gave no force in time
+    """
+    vademecum = vademecum.resolve()
+    tip = _tip(vademecum)
+    os.environ.update(isolated_environment())
+    discovery.stay_local()
+    load = os.getloadavg()[0]
+    words = command or [sys.executable, "-m", "avatar_core.cli.main", "cell"]
+    if command is None:
+        words += ["--library-dir", str(vademecum.parent), "--vademecum", vademecum.name]
+    context = rclpy.Context()
+    context.init()
+    watcher = _Watcher(context, tip)
+    begin = time.monotonic()
+    process = subprocess.Popen(
+        words,
+        cwd="/",
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+        preexec_fn=partial(realtime.die_with_parent, signal.SIGINT),
+    )
+    try:
+        stages = watcher.watch(process, begin)
+    finally:
+        watcher.close()
+        context.try_shutdown()
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(_STOP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            process.kill()
+    return StartReport(vademecum.name, load, tuple(stages))
+
+
+def _tip(vademecum: Path) -> Any:
+    """Centre of a tip that presses on the middle of the accessible surface, shape (3,) [m]."""
+    organ = load_vademecum(vademecum)
+    middle = tool_path.middle_of_access(organ)
+    surface = organ.surface
+    return surface.centers[middle] + (_RADIUS - _DEPTH) * surface.normals[middle]
+
+
+class _Watcher:
+    """A tool that holds still, and notes when the cell reaches each stage."""
+
+    def __init__(self, context: Any, tip: Any) -> None:
+        self._node = rclpy.create_node("start_watcher", context=context, enable_rosout=False)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self._node)
+        self._reached: dict[str, float] = {}
+        self._on_reached: Callable[[str], None] = lambda stage: None
+        node = self._node
+        node.create_subscription(ContactState, "contact_state", self._state, qos.state(1))
+        node.create_subscription(VademecumInfo, "vademecum_info", self._info, qos.LATCHED)
+        node.create_subscription(WrenchStamped, "tool/servo_cf", self._wrench, qos.COMMAND)
+        self._publisher = node.create_publisher(PoseStamped, "tool/measured_cp", qos.NEWEST)
+        self._pose = PoseTemplate("organ")
+        self._pose.position[:] = tip
+        node.create_timer(_PERIOD, self._send)
+
+    def watch(self, process: subprocess.Popen[bytes], begin: float) -> list[Stage]:
+        """Serve until the last stage is reached; the stages in the order in which they were."""
+        stages: list[Stage] = []
+
+        def note(name: str) -> None:
+            of_ended = stages[-1].cpu if stages else {}
+            stages.append(Stage(name, time.monotonic() - begin, of_ended | _cpu(process.pid)))
+
+        self._on_reached = note
+        while len(stages) < len(STAGES):
+            if process.poll() is not None:
+                raise CellError(f"the cell ended with code {process.returncode}; see above")
+            if time.monotonic() - begin > _TIMEOUT:
+                missing = [name for name in STAGES if name not in self._reached]
+                raise CellError(f"not reached in {_TIMEOUT:g} s: {', '.join(missing)}")
+            self._executor.spin_once(timeout_sec=0.1)
+        return stages
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+
+    def _send(self) -> None:
+        self._publisher.publish(self._pose.serialise(stamp_bytes(time.time_ns())))
+
+    def _state(self, state: Any) -> None:
+        self._reach(STAGES[0])
+        if state.vademecum_id:
+            self._reach(STAGES[2])
+
+    def _info(self, info: Any) -> None:
+        self._reach(STAGES[1])
+
+    def _wrench(self, wrench: Any) -> None:
+        force = wrench.wrench.force
+        if force.x or force.y or force.z:
+            self._reach(STAGES[3])
+
+    def _reach(self, stage: str) -> None:
+        if stage not in self._reached:
+            self._reached[stage] = time.monotonic()
+            self._on_reached(stage)
+
+
+def _cpu(pid: int) -> dict[str, float]:
+    """Processor time of a process and all below it, by name [s]."""
+    found = {}
+    waiting = [(pid, "")]
+    while waiting:
+        number, parent = waiting.pop(0)
+        with suppress(OSError):  # it ended meanwhile
+            name = _name(number, parent)
+            found[name] = sum(thread.seconds for thread in thread_times(number).values())
+            waiting += [(child, name) for child in sorted(children(number))]
+    return found
+
+
+def _name(pid: int, parent: str) -> str:
+    words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+    module = words[words.index("-m") + 1] if "-m" in words else Path(words[0]).name
+    name = _NAMES.get(module, module.rpartition(".")[2])
+    return f"{parent}'s reader".replace("'s worker's", "'s") if name == "reader" else name
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m avatar_ros.bench.start")
+    parser.add_argument("vademecum", type=Path)
+    parser.add_argument("--output", type=Path, help="write all figures as JSON")
+    parser.add_argument("command", nargs="*", help="that starts the cell; default: avatar cell")
+    chosen = parser.parse_args()
+    try:
+        report = run_start(chosen.vademecum, chosen.command or None)
+    except AvatarError as error:
+        print(f"avatar: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130  # by Ctrl-C, as shells count it
+    if chosen.output:
+        report.save(chosen.output)
+    print(report.table(), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,58 @@
+"""SIGINT and SIGTERM: a flag, and what wakes an executor that waits."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rclpy.executors import Executor
+
+
+class StopSignal:
+    """True once SIGINT or SIGTERM was received."""
+
+    def __init__(self) -> None:
+        self._came = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    def _note(self, *_: object) -> None:
+        self._came = True
+
+    def __bool__(self) -> bool:
+        return self._came
+
+    @contextmanager
+    def wakes(self, executor: Executor) -> Iterator[None]:
+        """A signal ends the executor's waiting, however long that would be; in the main thread.
+
+        Python calls its handlers between two instructions of the main thread, of which there are
+        none while that waits for the middleware. Looking ten times a second costs 1 % of a core.
+        """
+        ours, theirs = socket.socketpair()
+        theirs.setblocking(False)
+        with ours, theirs:
+            before = signal.set_wakeup_fd(theirs.fileno())
+            waker = threading.Thread(target=_pass_on, args=(ours, executor), name="signals")
+            waker.start()
+            try:
+                yield
+            finally:
+                signal.set_wakeup_fd(before)
+                theirs.close()
+                waker.join()
+
+
+def _pass_on(signals: socket.socket, executor: Executor) -> None:
+    """Give the executor a task for each signal; ``wake()`` alone does not end ``spin_once()``."""
+    while signals.recv(1):
+        executor.create_task(_nothing)
+
+
+def _nothing() -> None:
+    """Return."""

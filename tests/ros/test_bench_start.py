@@ -1,0 +1,45 @@
+"""The measured start: its stages come in order, its figures hang together, and nothing stays."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.bench.cell import CellError
+from avatar_ros.bench.footprint import children
+from avatar_ros.bench.start import STAGES, run_start
+
+pytestmark = [pytest.mark.ros, pytest.mark.long]
+
+
+def test_a_start_is_measured_stage_by_stage(library: Path, tmp_path: Path) -> None:
+    before = {*children(1)}
+    report = run_start(library / "liver.h5")
+    report.save(tmp_path / "start.json")
+    print("\n" + report.table())
+    assert {stage.name for stage in report.stages} == {*STAGES}
+    times = [stage.seconds for stage in report.stages]
+    assert times == sorted(times)
+    order = [stage.name for stage in report.stages]
+    assert order.index(STAGES[1]) < order.index(STAGES[2])
+    last = report.stages[-1].cpu
+    assert {"cell", "vademecum_loader", "contact", "contact's worker", "contact's reader"} <= {
+        *last
+    }
+    for stage, following in zip(report.stages, report.stages[1:], strict=False):
+        for name, seconds in stage.cpu.items():
+            assert seconds <= following.cpu.get(name, seconds)
+    data = json.loads((tmp_path / "start.json").read_text())
+    assert data["summary"] == report.summary
+    assert {*children(1)} <= before  # no orphan
+
+
+def test_a_cell_that_does_not_start_is_named(library: Path) -> None:
+    with pytest.raises(CellError, match="ended with code 3"):
+        run_start(library / "liver.h5", [sys.executable, "-c", "raise SystemExit(3)"])
