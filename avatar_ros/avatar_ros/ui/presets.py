@@ -1,0 +1,49 @@
+"""Materials to choose from on the planning page, each with where its stiffness was measured."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+# Label and unit of each coordinate of the material, and what one shown unit is in SI.
+SLIDERS = {
+    "young": ("Young's modulus E [kPa]", 1e3),
+    "poisson": ("Poisson's ratio nu [-]", 1.0),
+    "contrast": ("Tumour, E inside / outside [-]", 1.0),
+}
+
+
+class Preset(NamedTuple):
+    """young_modulus : [Pa]; source : of the number."""
+
+    young_modulus: float
+    source: str
+
+
+_CASTERA = (
+    "transient elastography at 50 Hz, least value of this stage (Castera et al., Gastroenterology "
+    "128, 2005)"
+)
+PRESETS = {
+    "as in the paper, 170 kPa": Preset(
+        170e3, "González, Cueto and Chinesta, Computational patient avatars for surgery planning"
+    ),
+    "healthy liver, 5.5 kPa": Preset(
+        5.5e3,
+        "transient elastography at 50 Hz, mean of 429 healthy adults (Roulot et al., Journal of "
+        "Hepatology 48, 2008)",
+    ),
+    "fibrosis F2, 7.1 kPa": Preset(7.1e3, _CASTERA),
+    "fibrosis F3, 9.5 kPa": Preset(9.5e3, _CASTERA),
+    "cirrhosis F4, 12.5 kPa": Preset(12.5e3, _CASTERA),
+}
+
+
+def source_of(name: str) -> str:
+    """Where the stiffness of a preset comes from, as Markdown."""
+    return f"E from {PRESETS[name].source}."
+
+
+def material_text(young: float, poisson: float, contrast: float | None) -> str:
+    """The material in force, in one line; young [Pa]."""
+    tumour = "" if contrast is None else f", tumour {contrast:.3g} E"
+    return f"E {young / 1e3:.4g} kPa, nu {poisson:.3g}{tumour}"
