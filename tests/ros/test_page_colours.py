@@ -30,12 +30,14 @@ def areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-@pytest.mark.parametrize("flat", [False, True], ids=["anywhere", "corners on the levels"])
-def test_no_triangle_crosses_the_edge_of_a_band_and_none_is_lost(flat: bool) -> None:
+@pytest.mark.parametrize("noise", [None, 0.0, 1e-18])
+def test_no_triangle_crosses_the_edge_of_a_band_and_none_is_lost(noise: float | None) -> None:
+    """Corners lie anywhere, on the levels, or beside them by as much as rounding."""
     points, faces = ball(1200, RADIUS)
     step, values = 5e-3 / N_BANDS, field(points)
-    if flat:
-        values = step * np.round(values / step)
+    if noise is not None:
+        near = step * np.round(values / step)
+        values = near + noise * np.random.default_rng(0).integers(-1, 2, len(near))
     data = np.column_stack([points, values])
     found = cut(data, values, faces, step, N_BANDS)
     inner = found.points[found.faces, 3] / step
@@ -46,7 +48,8 @@ def test_no_triangle_crosses_the_edge_of_a_band_and_none_is_lost(flat: bool) -> 
     together = np.zeros_like(given)
     np.add.at(together, found.parent, vectors)  # turned round or missing, they would not add up
     np.testing.assert_allclose(together, given, atol=1e-12)
-    assert ((vectors * given[found.parent]).sum(axis=1) > 0.0).all()
+    turned = (vectors * given[found.parent]).sum(axis=1)
+    assert (turned > -1e-20).all()  # but for slivers as thin as rounding
 
 
 def test_a_field_beyond_the_scale_is_in_the_last_band() -> None:

@@ -50,6 +50,7 @@ def view_and_page(shown: Organ) -> Iterator[tuple[OrganView, Any]]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     server = viser.ViserServer("127.0.0.1", port, verbose=False)
+    server.gui.main_panel.minimize()
     view = OrganView(server, lambda place, along_shaft: None)
     view.show(shown, Tip())
     with sync_playwright() as driver:

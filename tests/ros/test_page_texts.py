@@ -41,7 +41,7 @@ def row(status: int, force: float, stamp: int = 1) -> np.ndarray:
 def test_a_limited_force_is_no_measurement() -> None:
     """The organ pushes with 25 N; the device gets its 20 N, and the page says both."""
     now = shown(25.0, 2.7, 0.8, 0.0071)
-    text = frame_text(now, "E 170 kPa", None)
+    text = " ".join(frame_text(now, "E 170 kPa", None))
     assert "Force <b>25.00 N</b> ± 2.70 N, device 20.00 N" in text
     assert "<b>7.1 mm</b>" in text and "E 170 kPa" in text
     (alert,) = alerts(info(0.01), OK, now)
@@ -51,13 +51,13 @@ def test_a_limited_force_is_no_measurement() -> None:
 def test_a_force_that_the_device_gets_is_written_once() -> None:
     free = shown(0.0, 0.0, 0.0, 0.0)  # nothing is held back
     for now in (shown(3.3, 0.1, 1.0, 0.001), free):
-        assert "device" not in frame_text(now, "", None)
+        assert "device" not in " ".join(frame_text(now, "", None))
         assert alerts(info(0.01), OK, now) == []
 
 
 def test_no_displacement_is_not_none() -> None:
     """Without a surface from the contact node, 20 N stand beside no 0.0 mm."""
-    text = frame_text(shown(20.0, 1.0, 1.0, float("nan")), "", None)
+    text = " ".join(frame_text(shown(20.0, 1.0, 1.0, float("nan")), "", None))
     assert "20.00 N" in text and "mm" not in text and "sends no surface" in text
 
 
@@ -82,7 +82,7 @@ def test_beyond_the_range_the_last_valid_shape_stays() -> None:
         assert not chooser.take(row(OUT, 0.0))
         held = chooser.drawn(row(OUT, 0.0), float("nan"), TIP)
         assert held.is_held and held.force[1] == 20.0 and held.largest == 2e-3
-    text = frame_text(held, "", None)
+    text = " ".join(frame_text(held, "", None))
     assert "No force" in text and "20.00 N" in text and "2.0 mm" in text
     (alert,) = alerts(info(0.01), OUT, held)
     assert "No force" in alert and "beyond" in alert

@@ -18,6 +18,7 @@ try:
 except ImportError as error:
     raise SystemExit("planning_ui: viser is missing; pip install 'avatar[ui]'") from error
 
+from avatar_core.contact.error_map import force_error_at
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scenes
@@ -31,24 +32,28 @@ from avatar_ros.framework.templates import stamp_nanoseconds
 from avatar_ros.loop.settings import MATERIAL, TIP, chosen_tips
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
 from avatar_ros.prepare.scenes import scene_file
-from avatar_ros.ui.actions import Actions
+from avatar_ros.ui.actions import Actions, Wanted
 from avatar_ros.ui.alerts import alerts
+from avatar_ros.ui.bookmarks import Bookmark
+from avatar_ros.ui.camera import turn_camera
 from avatar_ros.ui.display import RATE, NewestCloud
 from avatar_ros.ui.guard import Guard, guarded
 from avatar_ros.ui.history import History
-from avatar_ros.ui.legend import legend
+from avatar_ros.ui.legend import EXPECTED_ERROR, legend
 from avatar_ros.ui.library import Library
 from avatar_ros.ui.measures import Measures, Now
 from avatar_ros.ui.measures_view import MeasuresView
 from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.orientation import Pose
 from avatar_ros.ui.panels import Panels
+from avatar_ros.ui.plan import Plan, PlanNow
 from avatar_ros.ui.presets import material_text
 from avatar_ros.ui.recorder import Recorder, scene_in_force
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
-from avatar_ros.ui.texts import frame_text, recorded_text, scene_texts, warnings
+from avatar_ros.ui.texts import frame_text, plain, recorded_text, scene_texts, warnings
 from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess
-from avatar_ros.ui.view import CLEARANCE, OrganView
+from avatar_ros.ui.view import CLEARANCE, GLASS, WHOLE, OrganView
 
 FRAME = "organ"
 _PLOT_FRAMES = 6  # between two points of the plots
@@ -78,6 +83,9 @@ class PlanningNode(ManagedNode):
         self._driver = ToolDriverProcess(self._state)
         self._recorder = Recorder(self._state)
         self._history = History()
+        self._look = (WHOLE, "A", 0.5)
+        self._lines: list[str] = []  # numbers that are shown
+        self._alerts: list[str] = []
         self._reader = Reader(1 << 30)
         self._organ: Organ | None = None
         self._cloud: NewestCloud | None = None
@@ -111,6 +119,13 @@ class PlanningNode(ManagedNode):
         self._view = OrganView(server, self._drag, self._show_cube)
         self._measures = Measures(MeasuresView(server))
         server.scene.on_click()(self._click)
+        self._plan = Plan(
+            self._library.folder,
+            self._plan_now,
+            self._return_to,
+            lambda labels: self._panels.plan.offer(labels),
+            self._say,
+        )
         self._panels = Panels(
             server,
             Actions(
@@ -123,10 +138,16 @@ class PlanningNode(ManagedNode):
                 lift=self._lift,
                 record=self._record,
                 turn=self._view.turn_to,
-                look=self._view.look,
+                look=self._choose_look,
+                errors=self._show_errors,
                 measure=self._measures.choose,
                 clear_measures=self._measures.clear,
                 undo=self._undo,
+                keep=self._plan.keep,
+                drop=self._plan.drop,
+                go_back=self._plan.go_back,
+                report=self._plan.report,
+                export=self._plan.export,
             ),
         )
         self._panels.scene.offer(scene_texts())
@@ -195,12 +216,14 @@ class PlanningNode(ManagedNode):
         tip = self._tip()
         self._state.live["target"][0] = organ.above(tip.offset + CLEARANCE)
         self._view.show(organ, tip)
+        self._look = (GLASS if organ.structures else WHOLE, "A", 0.5)
         self._measures.show_organ(organ, tip)
         self._periods.forget()
         self._panels.show_organ(organ)
         self._organ = organ
         self._listen_to_clouds()
         self._requests.parameters_of_contact(tuple(MATERIAL), self._note_material)
+        self._plan.show_organ(organ)
         self._say(f"{organ.name} is shown")
 
     def _take_statistics(self, window: LoopStatistics) -> None:
@@ -237,11 +260,15 @@ class PlanningNode(ManagedNode):
         values = self._values(organ)
         poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
         material = material_text(values["young"], poisson, values.get("contrast"))
-        self._panels.show_numbers(frame_text(shown, material, n_kept))
-        self._panels.show_alerts(alerts(organ.info, self._status(), shown))
+        numbers = frame_text(shown, material, n_kept)
+        self._panels.show_numbers("<br>".join(numbers))
+        self._alerts = alerts(organ.info, self._status(), shown)
+        self._panels.show_alerts(self._alerts)
         now = Now(self._view.points, shown.tip, values["young"])
-        self._panels.measure.show(self._measures.lines(now))
-        self._panels.show_scale(legend(self._view.top, opacity=self._view.opacity))
+        measured = self._measures.lines(now)
+        self._panels.measure.show(measured)
+        self._lines = [*map(plain, numbers), *measured]
+        self._panels.show_scale(self._legend())
         size = 0.0 if shown.is_held else float(np.linalg.norm(shown.force))
         self._panels.tool.show_force(time.monotonic() - self._began, size, shown.error)
 
@@ -273,6 +300,23 @@ class PlanningNode(ManagedNode):
         """Whether the contact node answered recently."""
         silence = time.monotonic_ns() - int(self._state.live["heard"][0])
         return silence < _SILENCE * 1e9
+
+    def _legend(self) -> str:
+        view = self._view
+        if view.shows_errors:
+            return legend(view.error_top, EXPECTED_ERROR, 1e-2, view.opacity)
+        return legend(view.top, opacity=view.opacity)
+
+    def _show_errors(self, wanted: bool) -> None:
+        """Colour by the expected error of the force, or by the displacement."""
+        organ = self._organ
+        if organ is None:
+            return
+        errors = force_error_at(organ.vademecum, organ.vertices) if wanted else None
+        if errors is not None and not np.isfinite(errors).any():
+            self._say("errors of this organ were never measured; build it with a certificate")
+            return
+        self._view.paint_errors(errors)
 
     def _status(self) -> int | None:
         """Of the last ContactState, if one came recently."""
@@ -414,7 +458,7 @@ class PlanningNode(ManagedNode):
 
         self._requests.load_scene(name, self._say, then=note)
 
-    def _build(self, surface: str, fidelity: str, tolerance: float) -> None:
+    def _build(self, wanted: Wanted) -> None:
         def load(file: str) -> None:
             if file:
                 self._panels.patient.show_progress("done", 1.0, float("nan"))
@@ -426,9 +470,73 @@ class PlanningNode(ManagedNode):
 
         self._say("")  # nothing of the last build stays
         self._panels.patient.show_progress("begins", 0.0, float("nan"))
-        self._requests.build_patient(
-            surface, fidelity, tolerance, self._panels.patient.show_progress, self._say, load
+        self._requests.build_patient(wanted, self._panels.patient.show_progress, self._say, load)
+
+    # --- The plan ----------------------------------------------------------------------------
+
+    def _choose_look(self, how: str, side: str, part: float) -> None:
+        before = self._look
+        self._history.note("look", "how the organ is shown", lambda: self._show_look(*before))
+        self._show_look(how, side, part)
+
+    def _show_look(self, how: str, side: str, part: float) -> None:
+        self._look = how, side, part
+        self._view.look(how, side, part)
+        self._panels.organ.show_look(how, side, part)
+
+    def _plan_now(self) -> PlanNow | None:
+        organ = self._organ
+        if organ is None:
+            return None
+        x, y, z = self._state.live["target"][0].tolist()
+        return PlanNow(
+            organ,
+            (x, y, z),
+            self._scene,
+            self._values(organ),
+            self._look,
+            tuple(self._lines),
+            tuple(self._alerts),
+            self._view.points,
         )
+
+    def _return_to(self, kept: Bookmark, client: Any) -> None:
+        """Scene, material, look, tool and view of a kept state; one step to undo."""
+        organ = self._organ
+        if organ is None:
+            return
+        target, look, values = self._state.live["target"][0].copy(), self._look, self._values(organ)
+        scene = self._scene
+
+        def back() -> None:
+            self._arrange(organ, scene, values, look, target)
+
+        self._history.note("return", "the return to a kept state", back)
+        self._arrange(organ, kept.scene, kept.material, kept.look, np.array(kept.target))
+        if client is not None and kept.camera:
+            turn_camera(client, Pose(*np.array(kept.camera).reshape(3, 3)))
+
+    def _arrange(
+        self,
+        organ: Organ,
+        scene: str,
+        material: dict[str, float],
+        look: tuple[str, str, float],
+        target: np.ndarray,
+    ) -> None:
+        if scene and scene != self._scene and scene in shipped_scenes():
+            self._switch(scene)
+        present = self._values(organ)
+        wanted = {
+            name: float(np.clip(material[name], low, high))
+            for name, (low, high, _) in organ.ranges.items()
+            if name in material
+        }
+        changed = {name: value for name, value in wanted.items() if value != present[name]}
+        if changed:
+            self._set(changed)
+        self._show_look(*look)
+        self._put(target)
 
     # --- Recordings --------------------------------------------------------------------------
 

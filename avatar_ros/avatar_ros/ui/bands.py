@@ -74,7 +74,8 @@ def _pieces(
     end = np.where(band == n_bands - 1, v[:, 2], np.minimum(band + 1.0, v[:, 2]))
 
     def on_side(i: int, k: int, level: np.ndarray) -> np.ndarray:
-        part = (level - v[:, i]) / np.maximum(v[:, k] - v[:, i], 1e-12)
+        length = v[:, k] - v[:, i]  # may be as small as rounding, and still counts
+        part = (level - v[:, i]) / np.where(length > 0.0, length, np.inf)
         return np.asarray(x[:, i] + np.clip(part, 0.0, 1.0)[:, None] * (x[:, k] - x[:, i]))
 
     def over_middle(level: np.ndarray) -> np.ndarray:

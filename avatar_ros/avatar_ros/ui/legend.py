@@ -5,6 +5,7 @@ from __future__ import annotations
 from avatar_ros.ui.colours import N_BANDS, band_colours
 
 DISPLACEMENT = "displacement [mm]"
+EXPECTED_ERROR = "expected error of the force [%]"
 
 
 def legend(top: float, what: str = DISPLACEMENT, unit: float = 1e-3, opacity: float = 1.0) -> str:

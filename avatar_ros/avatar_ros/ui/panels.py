@@ -9,18 +9,19 @@ from typing import Any
 import viser
 
 from avatar_ros.ui.actions import Actions
+from avatar_ros.ui.index_page import TITLE
 from avatar_ros.ui.legend import legend
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import NAMES
 from avatar_ros.ui.tabs.measure import MeasureTab
 from avatar_ros.ui.tabs.organ import OrganTab
 from avatar_ros.ui.tabs.patient import PatientTab
+from avatar_ros.ui.tabs.plan import PlanTab
 from avatar_ros.ui.tabs.scene import SceneTab
 from avatar_ros.ui.tabs.timing import TimingTab
 from avatar_ros.ui.tabs.tool import ToolTab
 
 PANEL_WIDTH = 350  # [px]; leaves 450 of 800 for the organ
-TITLE = "avatar planning page"
 BESIDE = "tool"
 VIEWS = {**{letter: letter for letter in NAMES}, BESIDE: BESIDE}  # by button
 _CUBE = "position:fixed;left:14px;bottom:10px;z-index:5;pointer-events:none;line-height:0"
@@ -54,6 +55,8 @@ class Panels:
             self.organ = OrganTab(gui, actions)
         with tabs.add_tab("Measure"):
             self.measure = MeasureTab(gui, actions)
+        with tabs.add_tab("Plan"):
+            self.plan = PlanTab(gui, actions)
         with tabs.add_tab("Patient"):
             self.patient = PatientTab(gui, actions)
         with tabs.add_tab("Scene"):

@@ -196,6 +196,11 @@ class SurfaceView:
         self._last = smooth, np.linalg.norm(smooth.displacements, axis=1), top
         self.redraw()
 
+    def paint(self, shown: FineSurface, values: np.ndarray, top: float) -> None:
+        """Draw another field, given at the cloud's points, over a surface as coarse as these."""
+        self._last = finer(self._shape, shown), self._shape.blend @ values, top
+        self.redraw()
+
     def redraw(self) -> None:
         """Draw the last field again."""
         if self._last is None:

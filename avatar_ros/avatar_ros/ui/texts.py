@@ -50,8 +50,8 @@ def _sentence(line: str) -> str:
     return f"{line[0].upper()}{line[1:].rstrip('.')}" + ("" if line.endswith("?") else ".")
 
 
-def frame_text(shown: ShownPeriod, material: str, n_kept: int | None) -> str:
-    """The numbers of a frame, as HTML.
+def frame_text(shown: ShownPeriod, material: str, n_kept: int | None) -> list[str]:
+    """The numbers of a frame, as lines of HTML.
 
     material : that is in force; n_kept : recorded periods, or None
     """
@@ -71,7 +71,12 @@ def frame_text(shown: ShownPeriod, material: str, n_kept: int | None) -> str:
     lines.append(material)
     if n_kept is not None:
         lines.append(f"Recording, {n_kept:,} periods")
-    return "<br>".join(lines)
+    return lines
+
+
+def plain(line: str) -> str:
+    """A line without its marks of HTML."""
+    return line.replace("<b>", "").replace("</b>", "")
 
 
 def recorded_text(recording: Recording) -> str:

@@ -21,14 +21,15 @@ from avatar_ros.ui.tip_body import turn_to
 from avatar_ros.ui.tool_view import LEAST_FORCE, ToolView
 
 CLEARANCE = 0.015  # of a new organ's tool over the surface [m]
-WHOLE, GLASS, CUT = "whole", "glass", "cut open"  # how the organ is shown
+ERROR_TOPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # possible ends of the scale of the error
+LOOKS = WHOLE, GLASS, CUT = "whole", "glass", "cut open"  # how the organ is shown
 _LEAST_MARKED = 0.1e-3  # displacement whose place is marked [m]
 
 
 class OrganView:
     """Draws into a viser server; everything in metres, in the organ's frame.
 
-    top : end of the colour scale [m]
+    top, error_top : ends of the colour scales, of the displacement [m] and the expected error
     """
 
     def __init__(
@@ -46,6 +47,8 @@ class OrganView:
         self._cameras = Cameras(server, on_cube)
         self._drawn: np.ndarray | None = None  # the cloud that is seen
         self._largest = 0.0
+        self._errors: np.ndarray | None = None  # at the cloud's points, if these are shown
+        self.error_top = ERROR_TOPS[0]
         self.top = top_for(0.0)
         server.scene.set_up_direction("+z")
         server.scene.world_axes.visible = False
@@ -56,7 +59,7 @@ class OrganView:
     def show(self, organ: Organ, tip: Tip) -> None:
         """Show another organ, at rest, with the structures of its own file and no others."""
         scene = self._server.scene
-        self._organ, self.top, self._drawn = organ, top_for(0.0), None
+        self._organ, self.top, self._drawn, self._errors = organ, top_for(0.0), None, None
         self._structures.show(organ.vertices, organ.structures)
         self._surface.show(organ.vertices, organ.faces, organ.clamped)
         self.look(GLASS if organ.structures else WHOLE)
@@ -98,6 +101,27 @@ class OrganView:
         if self._drawn is not None:
             self._surface.redraw()
 
+    @property
+    def shows_errors(self) -> bool:
+        """Whether the expected error is drawn in place of the displacement."""
+        return self._errors is not None
+
+    def paint_errors(self, errors: np.ndarray | None) -> None:
+        """Draw the expected error of the force at each point of the cloud, or the displacement.
+
+        errors : ndarray, shape (n,), relative; NaN where there is no access
+        """
+        organ, drawn = self._organ, self._drawn
+        if organ is None:
+            return
+        if errors is not None:
+            largest = float(np.nanmax(errors, initial=0.0))
+            self.error_top = next((x for x in ERROR_TOPS if x >= largest), ERROR_TOPS[-1])
+            errors = np.nan_to_num(errors)
+        self._errors, self._drawn = errors, None
+        rest = np.hstack([organ.vertices, np.zeros_like(organ.vertices)])
+        self.move(rest if drawn is None else drawn, np.zeros(3), np.zeros(3))
+
     def turn_to(self, side: str) -> None:
         """A standard view, as "A", or that beside the tool, in every browser."""
         if side in AXES:
@@ -129,11 +153,11 @@ class OrganView:
         if self._drawn is not None and np.array_equal(points, self._drawn):
             return self._largest
         self._drawn = points.copy()
+        plain = FineSurface(points[:, :3], points[:, 3:], organ.faces, np.arange(len(organ.faces)))
         if np.linalg.norm(force) > LEAST_FORCE:
             shown = fine_surface(organ.vademecum, points, self._tip, tip)
         else:
-            faces = organ.faces
-            shown = FineSurface(points[:, :3], points[:, 3:], faces, np.arange(len(faces)))
+            shown = plain
         size = np.linalg.norm(shown.displacements, axis=1)
         outer = np.zeros(len(size), bool)
         outer[shown.faces] = True
@@ -141,7 +165,10 @@ class OrganView:
         self._largest = float(size[place])
         self.top = top_for(self._largest, self.top)
         with self._server.atomic():
-            self._surface.move(shown, self.top)
+            if self._errors is None:
+                self._surface.move(shown, self.top)
+            else:
+                self._surface.paint(plain, self._errors, self.error_top)
             self._structures.move(points[:, :3])
             self._mark(shown.positions[place])
         return self._largest

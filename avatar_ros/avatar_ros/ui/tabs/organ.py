@@ -14,6 +14,7 @@ from avatar_ros.ui.presets import PRESETS, SLIDERS, source_of
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
 from avatar_ros.ui.view import CUT, GLASS, WHOLE
 
+DISPLACEMENT, ERROR = "displacement", "expected error"
 _AS_BUILT = "as built"
 _NO_PRESET = "as the sliders say"
 
@@ -33,6 +34,8 @@ class OrganTab:
         )
         for control in (self._look, self._side, self._depth):
             control.on_update(self._on_look)
+        self._colour = gui.add_dropdown("Colours show", (DISPLACEMENT, ERROR))
+        self._colour.on_update(self._on_colour)
         self._material = gui.add_folder("Material")
         self._sliders: dict[str, Any] = {}
         self._organ: Organ | None = None
@@ -55,6 +58,7 @@ class OrganTab:
         self._organ = organ
         self._about.content = organ.summary()
         self._look.value = GLASS if organ.structures else WHOLE
+        self._colour.value = DISPLACEMENT
         for slider in self._sliders.values():
             slider.remove()
         self._sliders = {}
@@ -69,6 +73,12 @@ class OrganTab:
                 slider = add(label, **bounds, step=step, initial_value=round(here / unit, 6))
                 slider.on_update(partial(self._on_slider, name, unit, (low, high)))
                 self._sliders[name] = slider
+
+    def show_look(self, how: str, side: str, part: float) -> None:
+        """Set the controls to how the organ is shown; as of ``Actions.look``."""
+        self._look.value, self._side.value = how, NAMES[side]
+        self._depth.value = round(100.0 * part)
+        self._side.visible = self._depth.visible = how == CUT
 
     def show_material(self, values: dict[str, float]) -> None:
         """Set the sliders to the values in force, by coordinate [SI]."""
@@ -96,6 +106,10 @@ class OrganTab:
         young = PRESETS[event.target.value].young_modulus
         self._source.content = source_of(event.target.value)
         self._actions.material({"young": young})
+
+    def _on_colour(self, event: Any) -> None:
+        if event.client is not None:
+            self._actions.errors(event.target.value == ERROR)
 
     def _on_look(self, event: Any) -> None:
         is_cut = self._look.value == CUT

@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from avatar_ros.ui.actions import Actions
+from avatar_ros.ui.actions import Actions, Wanted
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
 
+UNITS = ("mm", "cm", "m")
+STATED = "as the file states, else RAS"
+AXES = (STATED, "RAS", "LPS", "LAS", "RPS")
 FIDELITIES = ("interpolated", "reduced", "solved")
 
 
@@ -18,13 +21,21 @@ class PatientTab:
 
     def __init__(self, gui: Any, actions: Actions) -> None:
         self._surfaces = gui.add_dropdown("Surface", (NOTHING,))
+        self._unit = gui.add_dropdown("Unit of the file", UNITS)
+        self._axes = gui.add_dropdown("Axes of the file", AXES)
         self._fidelity = gui.add_dropdown("Fidelity", FIDELITIES, initial_value="reduced")
         self._tolerance = gui.add_slider(
             "Tolerance [%]", min=0.5, max=20.0, step=0.5, initial_value=3.0
         )
         gui.add_button("Build patient").on_click(
             lambda _: actions.build(
-                self._surfaces.value, self._fidelity.value, self._tolerance.value / 100.0
+                Wanted(
+                    self._surfaces.value,
+                    self._unit.value,
+                    "" if self._axes.value == STATED else self._axes.value,
+                    self._fidelity.value,
+                    self._tolerance.value / 100.0,
+                )
             )
         )
         self._stage = gui.add_markdown("")
