@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,6 +46,7 @@ class Cameras:
         self._centre, self._size = np.zeros(3), 0.2
         self._places: dict[str, np.ndarray] = {}
         self._nodes: dict[int, _Nodes] = {}
+        self._lock = Lock()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._left)
 
@@ -102,10 +104,14 @@ class Cameras:
         self._nodes.pop(client.client_id, None)
 
     def _moved(self, client: Any, camera: Any) -> None:
-        nodes, pose = self._nodes.get(client.client_id), pose_of(camera)
+        nodes = self._nodes.get(client.client_id)
         if nodes is None:
             return
-        length, ends = scale_bar(pose, camera.fov, self._size)
+        with self._lock:  # calls come in threads, and the last picture is to be of the last pose
+            self._draw(client, nodes, pose_of(camera), camera.fov)
+
+    def _draw(self, client: Any, nodes: _Nodes, pose: Pose, fov: float) -> None:
+        length, ends = scale_bar(pose, fov, self._size)
         towards = basis(pose)[2]
         with client.atomic():
             nodes.line.points = ends[None].astype(np.float32)

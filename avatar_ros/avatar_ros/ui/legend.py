@@ -23,7 +23,7 @@ def legend(top: float, what: str = DISPLACEMENT, unit: float = 1e-3, opacity: fl
     first = top / unit / N_BANDS
     return (
         f'<div id="colour-bar" role="img" aria-label="colour scale of {what}, 0 to '
-        f'{top / unit:g}" style="margin:0 1em;font-size:12px">{what}; tissue below {first:g}'
+        f'{top / unit:g}" style="margin:0 1em;font-size:12px">{what}; tissue: below {first:g}'
         f'<div style="height:12px;opacity:{opacity:g};'
         f'background:linear-gradient(to right, {stops})"></div>'
         f'<div style="display:flex;justify-content:space-between">{ticks}</div></div>'

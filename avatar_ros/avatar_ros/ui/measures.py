@@ -99,7 +99,7 @@ class Measures:
         error = float(force_error_at(organ.vademecum, near.point[None])[0])
         known = f"{error:.1%}" if np.isfinite(error) else "unknown"
         self._compliance = along
-        return f"expected error of the force {known} (90 % of touches)"
+        return f"expected error of force {known}"
 
     def lines(self, now: Now) -> list[str]:
         """Draw, and say in a line each, what is measured in a period."""
@@ -131,7 +131,7 @@ class Measures:
             lines.append(f"Probe: displacement {1e3 * moved:.2f} mm")
             if self._probed.startswith("expected"):
                 scaled = self._compliance * organ.vademecum.material.young_modulus / now.young
-                lines.append(f"Probe: compliance {1e3 * scaled:.3g} mm/N along the normal")
+                lines.append(f"Probe: compliance {1e3 * scaled:.3g} mm/N")
             lines.append(f"Probe: {self._probed}")
         ruler = self._places.get(RULER, [])
         if len(ruler) == 2:

@@ -12,6 +12,7 @@ from avatar_ros.ui.measuring import normal_of
 
 _BLUE, _BLACK, _GREEN = (0, 114, 178), (20, 20, 20), (0, 158, 115)
 _DOT = 0.0015  # radius [m]
+_UNSEEN = 1e-5  # change that nobody sees [m]
 _PLANE_OPACITY = 0.35
 _TWO = np.array([[0, 1, 2], [0, 2, 3]])
 _NOWHERE = np.zeros((1, 2, 3), np.float32)
@@ -42,7 +43,7 @@ class MeasuresView:
         }
         self._numbers = {
             name: scene.add_label(
-                f"/measures/{name}/number", "", anchor="bottom-center", font_screen_scale=0.9
+                f"/measures/{name}/number", "", anchor="center-right", font_screen_scale=0.9
             )
             for name in self._lines
         }
@@ -62,14 +63,14 @@ class MeasuresView:
         for i in range(n):
             dot = self._dots[first + i]
             _set(dot, "visible", i < len(places))
-            if i < len(places):
+            if i < len(places) and np.abs(places[i] - dot.position).max() > _UNSEEN:
                 dot.position = tuple(places[i])
 
     def line(self, name: str, ends: np.ndarray | None) -> None:
         """Show a line between two ends, shape (2, 3) [m], with its length."""
         line, number = self._lines[name], self._numbers[name]
         _set(line, "visible", ends is not None)
-        if ends is None:
+        if ends is None or np.abs(ends - line.points[0]).max() < _UNSEEN:
             return
         line.points = ends[None].astype(np.float32)
         number.position = tuple(ends.mean(axis=0))
@@ -88,7 +89,8 @@ class MeasuresView:
             middle + 0.5 * size * (s * along + t * across)
             for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))
         ]
-        self._plane.vertices = np.array(square, np.float32)
+        if np.abs(np.array(square) - self._plane.vertices).max() > _UNSEEN:
+            self._plane.vertices = np.array(square, np.float32)
 
 
 def _set(node: Any, name: str, value: Any) -> None:

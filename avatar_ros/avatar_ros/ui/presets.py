@@ -6,9 +6,15 @@ from typing import NamedTuple
 
 # Label and unit of each coordinate of the material, and what one shown unit is in SI.
 SLIDERS = {
-    "young": ("Young's modulus E [kPa]", 1e3),
-    "poisson": ("Poisson's ratio nu [-]", 1.0),
-    "contrast": ("Tumour, E inside / outside [-]", 1.0),
+    "young": ("E [kPa]", 1e3),
+    "poisson": ("nu [-]", 1.0),
+    "contrast": ("Tumour / E [-]", 1.0),
+}
+
+HINTS = {
+    "young": "Young's modulus",
+    "poisson": "Poisson's ratio",
+    "contrast": "Young's modulus in the tumour over that around it",
 }
 
 
@@ -45,5 +51,5 @@ def source_of(name: str) -> str:
 
 def material_text(young: float, poisson: float, contrast: float | None) -> str:
     """The material in force, in one line; young [Pa]."""
-    tumour = "" if contrast is None else f", tumour {contrast:.3g} E"
+    tumour = "" if contrast is None else f", tumour {contrast:.3g} x E"
     return f"E {young / 1e3:.4g} kPa, nu {poisson:.3g}{tumour}"

@@ -17,6 +17,7 @@ from avatar_ros.ui.tip_body import shaft_body, tip_body
 TOOL, SHAFT = (0, 114, 178), (150, 160, 170)
 ARROW = (213, 94, 0)
 LEAST_FORCE = 1e-3  # that is shown [N]
+_UNSEEN = 1e-5  # change of positions [m], turns and forces [N] that nobody sees
 _SCALE = 0.004  # length of the arrow per force [m/N]
 _LENGTHS = (0.012, 0.06)  # of the arrow, at least and at most [m]
 
@@ -32,9 +33,11 @@ class ToolView:
         self._tool: Any = None
         self._arrow: Any = None
         self._number: Any = None
+        self._placed: np.ndarray | None = None  # tip, turn and force that are seen
 
     def show(self, tip: Tip, position: np.ndarray, wxyz: np.ndarray) -> None:
         """Show a tool at a position [m]."""
+        self._placed = None
         scene = self._server.scene
         body, shaft = tip_body(tip), shaft_body(tip)
         self._tool = scene.add_glb(
@@ -70,7 +73,14 @@ class ToolView:
         self._on_drag(self.position + way, along_shaft)
 
     def place(self, tip: np.ndarray, wxyz: np.ndarray, force: np.ndarray) -> None:
-        """Show the tool at its tip [m], with the force on it [N]."""
+        """Show the tool at its tip [m], with the force on it [N].
+
+        Nothing is sent where nothing changes: a browser draws only then.
+        """
+        now = np.concatenate([tip, wxyz, force])
+        if self._placed is not None and np.abs(now - self._placed).max() < _UNSEEN:
+            return
+        self._placed = now
         self._tool.position, self._tool.wxyz = tuple(tip), wxyz
         size = float(np.linalg.norm(force))
         is_felt = size > LEAST_FORCE

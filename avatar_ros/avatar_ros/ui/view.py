@@ -64,7 +64,7 @@ class OrganView:
         self._surface.show(organ.vertices, organ.faces, organ.clamped)
         self.look(GLASS if organ.structures else WHOLE)
         self._marker = scene.add_label(
-            "/largest", "", visible=False, anchor="bottom-left", font_screen_scale=0.9
+            "/largest", "", visible=False, anchor="top-left", font_screen_scale=0.9
         )
         self._place = scene.add_icosphere(
             "/largest/place", 0.0012, color=(0, 0, 0), cast_shadow=False, visible=True

@@ -10,7 +10,7 @@ import numpy as np
 from avatar_ros.ui.actions import Actions
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import NAMES
-from avatar_ros.ui.presets import PRESETS, SLIDERS, source_of
+from avatar_ros.ui.presets import HINTS, PRESETS, SLIDERS, source_of
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
 from avatar_ros.ui.view import CUT, GLASS, WHOLE
 
@@ -70,7 +70,13 @@ class OrganTab:
                     add, step = self._gui.add_number, 0.1
                 else:
                     add, step = self._gui.add_slider, round((high - low) / unit / 200, 6)
-                slider = add(label, **bounds, step=step, initial_value=round(here / unit, 6))
+                slider = add(
+                    label,
+                    **bounds,
+                    step=step,
+                    initial_value=round(here / unit, 6),
+                    hint=HINTS[name],
+                )
                 slider.on_update(partial(self._on_slider, name, unit, (low, high)))
                 self._sliders[name] = slider
 
