@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import igl
 import numpy as np
 from scipy.ndimage import map_coordinates
 
@@ -10,6 +11,7 @@ from avatar_core.contact.locate import FULL_ACCESS
 from avatar_core.contact.tip_response import make_tip_response
 from avatar_core.vademecum.model import Vademecum
 
+_OFF = 5e-3  # of the accessible surface, up to which a point belongs to it [m]
 _SHELL = 5e-3  # below and above the surface, in which the compliance is sampled [m]
 
 
@@ -28,6 +30,10 @@ def force_error_at(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
     response = make_tip_response(surface, field, load, vademecum.contact_near, _SHELL, _SHELL)
     grid = ((np.asarray(points, float) - field.origin) / field.spacing[0]).T
     access = map_coordinates(field.access.astype(float), grid, order=1, mode="nearest")
+    square, _, _ = igl.point_mesh_squared_distance(
+        np.ascontiguousarray(points, float), surface.centers, surface.corners
+    )  # far from the accessible surface, nothing was sampled
+    is_known = (access >= FULL_ACCESS) & (square < _OFF**2)
     smoothing = map_coordinates(response.smoothing.astype(float), grid, order=1, mode="nearest")
     error = force_error_grid(vademecum.certificate, vademecum.large, smoothing)
-    return np.where(access >= FULL_ACCESS, error, np.nan)
+    return np.where(is_known, error, np.nan)
