@@ -65,6 +65,7 @@ def opened(port: int, shots: Path) -> Iterator[Any]:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
         context = browser.new_context(viewport={"width": WINDOW[0], "height": WINDOW[1]})
         page = context.new_page()
+        page.set_default_timeout(SLOW)  # screenshots too, of a busy machine
         foreign: list[str] = []
         page.on("request", lambda asked: foreign.append(asked.url))
         for _ in range(60):

@@ -25,7 +25,7 @@ from avatar_ros.ui.view import CUT, GLASS, WHOLE, OrganView
 
 from avatar_core.geometry.tip import Tip
 from tests.core.box_organ import organ
-from tests.ros.browser import CHROMIUM, OPTIONS, first_pose, screen_of, shots_in
+from tests.ros.browser import CHROMIUM, OPTIONS, SLOW, first_pose, screen_of, shots_in
 
 pytestmark = [
     pytest.mark.ros,
@@ -56,6 +56,7 @@ def view_and_page(shown: Organ) -> Iterator[tuple[OrganView, Any]]:
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
         page = browser.new_page(viewport={"width": 700, "height": 600})
+        page.set_default_timeout(SLOW)
         page.goto(f"http://127.0.0.1:{port}")
         page.locator("canvas").first.wait_for(timeout=120_000)
         page.wait_for_timeout(5000)
