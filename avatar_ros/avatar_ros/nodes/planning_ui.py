@@ -69,7 +69,7 @@ PLANNING_UI = (
         "port", 8080, "port to listen on; the next free one if it is in use", range=(1, 65535)
     ),
     Parameter("token", "", "at the end of the page's address; empty: a new one at each start"),
-    Parameter("library_dir", ".", "directory of the loader's files; recordings and plans are written there"),
+    Parameter("library_dir", ".", "directory of the loader's files; recordings are written there"),
     Parameter("tool", "tool", "name of the tool to move, one of those of contact"),
 )
 
