@@ -27,7 +27,7 @@ def export(
             "-o",
             "--output",
             help="file to write: .vtu or .xdmf, the organ at rest with displacement and modes; "
-            ".stl or .obj, the deformed surface, and structures inside in files of their own; "
+            ".stl, .obj or .vtp, the deformed surface, and structures in files of their own; "
             ".mcap, a recording as a bag of ROS 2",
         ),
     ],

@@ -41,11 +41,13 @@ class FineSurface(NamedTuple):
     positions : ndarray, shape (n, 3), deformed, those of the cloud first [m]
     displacements : ndarray, shape (n, 3) [m]
     faces : ndarray of int, shape (m, 3)
+    parents : ndarray of int, shape (m,), the face of the organ that each is a part of
     """
 
     positions: np.ndarray
     displacements: np.ndarray
     faces: np.ndarray
+    parents: np.ndarray
 
 
 class Touch(NamedTuple):
@@ -81,7 +83,7 @@ def fine_surface(
     touch = find_touch(vademecum, tip, np.asarray(pose, float) - breath)
     is_fine = len(faces) > len(vademecum.mesh.boundary_faces)
     if touch is None or is_fine:
-        return FineSurface(points[:, :3], moved, faces)
+        return FineSurface(points[:, :3], moved, faces, np.arange(len(faces)))
     patch_radius = vademecum.surface.patch_radius
     near = np.linalg.norm(rest - touch.point, axis=1) < REACH * patch_radius
     split = near[faces].any(axis=1)
@@ -92,7 +94,10 @@ def fine_surface(
     displacements[: len(rest)] = moved  # to the bit
     positions = places + breath + displacements
     positions[: len(rest)] = points[:, :3]
-    return FineSurface(positions, displacements, np.concatenate([faces[~split], finer]))
+    parents = [np.flatnonzero(~split), np.tile(np.flatnonzero(split), 4**_LEVELS)]
+    return FineSurface(
+        positions, displacements, np.concatenate([faces[~split], finer]), np.concatenate(parents)
+    )
 
 
 def find_touch(vademecum: Vademecum, tip: Tip, pose: np.ndarray) -> Touch | None:

@@ -149,7 +149,7 @@ def lay_out_details(
     field, offset = vademecum.tip_field, np.array([tip.offset for tip in tips])
     response = make_tip_response(surface, field, load, contact, MAX_DEPTH, max(offset))
     large = vademecum.large if find(effects, LargeDeformationEffect) is not None else None
-    error = _force_error(vademecum.certificate, large, response.smoothing)
+    error = force_error_grid(vademecum.certificate, large, response.smoothing)
     reach = _reach(contact, surface.centers)
     shift = shifts_of(field, tips)
     tilt = tilt_arrays(leaning, tips, field) if leaning is not None else None
@@ -252,10 +252,13 @@ def _error_factors(vademecum: Vademecum, tips: Sequence[Tip]) -> np.ndarray:
     return organ * np.where(shifted, 1.0, UNSHIFTED)
 
 
-def _force_error(
+def force_error_grid(
     certificate: Certificate | None, large: LargeDeformation | None, smoothing: np.ndarray
 ) -> np.ndarray:
-    """The relative error of the force on the grid of the tip field; NaN if it is not known."""
+    """The relative error of the force on the grid of the tip field; NaN if it is not known.
+
+    smoothing : of :class:`avatar_core.contact.tip_response.TipResponse`, or values of it
+    """
     nonlinear = 0.0
     if large is not None:
         nonlinear = large.certificate.contact_mean if large.certificate else float("nan")

@@ -1,4 +1,4 @@
-"""Deformed surfaces for 3D Slicer: STL and OBJ in millimetres, whose header states their axes.
+"""Deformed surfaces for 3D Slicer: STL, OBJ and VTP in millimetres, which state their axes.
 
 Slicer takes coordinates as LPS (left, posterior, superior) unless a file says ``SPACE=RAS``, and so
 does :func:`avatar_core.geometry.surface.read_surface`: what is written comes back to its place.
@@ -34,7 +34,7 @@ def export_surfaces(
 
     Parameters
     ----------
-    path : .stl or .obj, of the organ
+    path : .stl, .obj or .vtp, of the organ
     displacement : ndarray, shape (n_vertices, 3), of the mesh [m]
     unit, axes : of what is written
 
@@ -47,6 +47,13 @@ def export_surfaces(
     StorageError
         For another suffix, unit or axes, a missing folder or a full disk.
     """
+    return write_surfaces(vademecum, path, displaced(vademecum, displacement), unit, axes)
+
+
+def write_surfaces(
+    vademecum: Vademecum, path: str | Path, points: np.ndarray, unit: str = "mm", axes: str = "LPS"
+) -> dict[Path, tuple[np.ndarray, np.ndarray]]:
+    """The same for displayed vertices that are where a cloud has them, shape (n, 3) [m]."""
     path = Path(path)
     if path.suffix not in SURFACE_FORMATS:
         raise StorageError(f"{path} ends in '{path.suffix}'; choose {' or '.join(SURFACE_FORMATS)}")
@@ -54,7 +61,7 @@ def export_surfaces(
         raise StorageError(
             f"unit '{unit}', axes '{axes}'; choose {', '.join(METRES)} and {' or '.join(AXES)}"
         )
-    points = displaced(vademecum, displacement) / METRES[unit]
+    points = np.asarray(points, float) / METRES[unit]
     points = points * ([-1.0, -1.0, 1.0] if axes == "LPS" else [1.0, 1.0, 1.0])
     parts = {path: vademecum.organ_faces}
     for name, faces in vademecum.structures.items():
@@ -100,4 +107,26 @@ def _write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str) -
     path.write_text("\n".join(lines) + "\n")
 
 
-SURFACE_FORMATS: dict[str, Write] = {".stl": _write_stl, ".obj": _write_obj}
+def _write_vtp(path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str) -> None:
+    """VTK's XML as text, with the field in which 3D Slicer states the axes."""
+    places = "\n".join(f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices)
+    corners = "\n".join(f"{a} {b} {c}" for a, b, c in faces)
+    ends = " ".join(str(3 * k) for k in range(1, len(faces) + 1))
+    letters = " ".join(str(code) for code in (*axes.encode(), 0))
+    path.write_text(
+        '<?xml version="1.0"?>\n'
+        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32">\n'
+        "<PolyData>\n<FieldData>"
+        f'<Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">{letters}</Array>'
+        "</FieldData>\n"
+        f'<Piece NumberOfPoints="{len(vertices)}" NumberOfVerts="0" NumberOfLines="0" '
+        f'NumberOfStrips="0" NumberOfPolys="{len(faces)}">\n<Points>'
+        f'<DataArray type="Float64" NumberOfComponents="3" format="ascii">\n{places}\n'
+        "</DataArray></Points>\n<Polys>"
+        f'<DataArray type="Int64" Name="connectivity" format="ascii">\n{corners}\n</DataArray>\n'
+        f'<DataArray type="Int64" Name="offsets" format="ascii">\n{ends}\n</DataArray>'
+        "</Polys>\n</Piece>\n</PolyData>\n</VTKFile>\n"
+    )
+
+
+SURFACE_FORMATS: dict[str, Write] = {".stl": _write_stl, ".obj": _write_obj, ".vtp": _write_vtp}

@@ -154,10 +154,10 @@ def test_another_suffix_is_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], file: Path, tmp_path: Path
 ) -> None:
     assert run(monkeypatch, file, "-o", tmp_path / "out.ply") == 1
-    assert "choose .vtu or .xdmf or .stl or .obj" in capsys.readouterr().err
+    assert "choose .vtu or .xdmf or .stl or .obj or .vtp" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("suffix", [".stl", ".obj"])
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".vtp"])
 @pytest.mark.parametrize(("unit", "axes"), [("mm", "LPS"), ("m", "RAS")])
 def test_a_surface_comes_back_to_its_place(
     monkeypatch: pytest.MonkeyPatch,

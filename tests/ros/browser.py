@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from avatar_ros.bench.cell import Module
 from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.view import camera_of
+from avatar_ros.ui.orientation import FOV, Pose, basis, standard_view, view_beside
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 TOKEN = "a-token-for-tests"  # of the page
@@ -65,6 +65,7 @@ def opened(port: int, shots: Path) -> Iterator[Any]:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
         context = browser.new_context(viewport={"width": WINDOW[0], "height": WINDOW[1]})
         page = context.new_page()
+        page.set_default_timeout(SLOW)  # screenshots too, of a busy machine
         foreign: list[str] = []
         page.on("request", lambda asked: foreign.append(asked.url))
         for _ in range(60):
@@ -113,24 +114,33 @@ def until(page: Any, reached: Callable[[], bool], what: str, seconds: float = 12
     raise AssertionError(f"{what}: not within {seconds:g} s; {page.inner_text('body')[:400]}")
 
 
-def screen_of(page: Any, shown: Organ, point: np.ndarray) -> tuple[float, float]:
-    """Where a point [m] is on the page, before the view was turned [px]."""
-    position, look_at, fov = camera_of(shown)
-    ahead = (look_at - position) / np.linalg.norm(look_at - position)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    up = np.cross(right, ahead)
+def first_pose(shown: Organ) -> Pose:
+    """Of the camera, before the view was turned."""
+    return standard_view("A", shown.centre, shown.size)
+
+
+def beside_pose(shown: Organ) -> Pose:
+    """Of the camera beside the tool of a new organ."""
+    return view_beside(shown.normal, shown.centre, shown.size)
+
+
+def screen_of(page: Any, pose: Pose, point: np.ndarray) -> tuple[float, float]:
+    """Where a point [m] is on the page, seen by a camera [px]."""
+    right, up, towards = basis(pose)
     box = page.locator("canvas").first.bounding_box()
-    way = point - position
-    scale = 0.5 * box["height"] / np.tan(0.5 * fov) / (way @ ahead)
+    way = point - pose.position
+    scale = 0.5 * box["height"] / np.tan(0.5 * FOV) / -(way @ towards)
     x = box["x"] + 0.5 * box["width"] + scale * (way @ right)
     return float(x), float(box["y"] + 0.5 * box["height"] - scale * (way @ up))
 
 
 def drag(page: Any, shown: Organ, begin: float, end: float) -> None:
     """The tool from one height over the organ to another, with the mouse; the button stays down."""
-    x0, y0 = screen_of(page, shown, shown.above(begin))
-    x1, y1 = screen_of(page, shown, shown.above(end))
+    page.keyboard.press("7")  # the view beside the tool
+    page.wait_for_timeout(1500)
+    pose = beside_pose(shown)
+    x0, y0 = screen_of(page, pose, shown.above(begin))
+    x1, y1 = screen_of(page, pose, shown.above(end))
     page.mouse.move(x0, y0)
     page.wait_for_timeout(500)
     page.mouse.down()

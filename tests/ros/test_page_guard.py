@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Iterator
 from http.client import HTTPConnection, HTTPResponse
 
@@ -63,6 +64,15 @@ def test_the_printed_address_opens_the_page_and_the_browser_keeps_its_token(port
     assert "HttpOnly" in kept and "SameSite=Strict" in kept
     assert asked(port, "/", Cookie=cookie_of(port)).status == 200
     assert is_let_in(port, Cookie=cookie_of(port), Origin=f"http://127.0.0.1:{port}")
+
+
+@pytest.mark.parametrize("packing", ["gzip", "identity"])
+def test_the_tab_of_the_browser_says_what_the_page_is(port, packing):
+    page = asked(port, f"/?token={TOKEN}", **{"Accept-Encoding": packing})
+    body = page.read()
+    assert len(body) == int(page.headers["Content-Length"])
+    whole = gzip.decompress(body) if packing == "gzip" else body
+    assert b"<title>avatar planning page</title>" in whole and b"<title>Viser" not in whole
 
 
 @pytest.mark.parametrize("path", ["/", "/index.html", "/?token=", "/?token=another"])

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from typing import Any
+
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
+from avatar_ros.loop.statuses import EXPLANATIONS
+from avatar_ros.ui.alerts import alerts
 from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
 from avatar_ros.ui.texts import frame_text, recorded_text, warnings
 from avatar_ros.ui.tool_state import N_RECENT, ROW, SharedToolState
 
 from avatar_core.scene.recording import Clouds, Periods, Recording
+from avatar_core.vademecum.model import VademecumInfo
 from avatar_ros.msg import ContactState
 
 pytestmark = pytest.mark.ros
@@ -34,19 +40,24 @@ def row(status: int, force: float, stamp: int = 1) -> np.ndarray:
 
 def test_a_limited_force_is_no_measurement() -> None:
     """The organ pushes with 25 N; the device gets its 20 N, and the page says both."""
-    text = frame_text(shown(25.0, 2.7, 0.8, 0.0071), None)
-    assert "Force **25.00 N** ± 2.70 N, **limited: the device gets 20.00 N**" in text
-    assert "**7.1 mm**" in text
+    now = shown(25.0, 2.7, 0.8, 0.0071)
+    text = " ".join(frame_text(now, "E 170 kPa", None))
+    assert "Force <b>25.00 N</b> ± 2.70 N, device 20.00 N" in text
+    assert "<b>7.1 mm</b>" in text and "E 170 kPa" in text
+    (alert,) = alerts(info(0.01), OK, now)
+    assert alert == "Force limited: the device gets 20.00 N of 25.00 N"
 
 
 def test_a_force_that_the_device_gets_is_written_once() -> None:
-    assert "limited" not in frame_text(shown(3.3, 0.1, 1.0, 0.001), 12)
-    assert "limited" not in frame_text(shown(0.0, 0.0, 0.0, 0.0), None)  # nothing is held back
+    free = shown(0.0, 0.0, 0.0, 0.0)  # nothing is held back
+    for now in (shown(3.3, 0.1, 1.0, 0.001), free):
+        assert "device" not in " ".join(frame_text(now, "", None))
+        assert alerts(info(0.01), OK, now) == []
 
 
 def test_no_displacement_is_not_none() -> None:
     """Without a surface from the contact node, 20 N stand beside no 0.0 mm."""
-    text = frame_text(shown(20.0, 1.0, 1.0, float("nan")), None)
+    text = " ".join(frame_text(shown(20.0, 1.0, 1.0, float("nan")), "", None))
     assert "20.00 N" in text and "mm" not in text and "sends no surface" in text
 
 
@@ -71,8 +82,10 @@ def test_beyond_the_range_the_last_valid_shape_stays() -> None:
         assert not chooser.take(row(OUT, 0.0))
         held = chooser.drawn(row(OUT, 0.0), float("nan"), TIP)
         assert held.is_held and held.force[1] == 20.0 and held.largest == 2e-3
-    text = frame_text(held, None)
-    assert "No force" in text and "beyond" in text and "20.00 N" in text and "2.0 mm" in text
+    text = " ".join(frame_text(held, "", None))
+    assert "No force" in text and "20.00 N" in text and "2.0 mm" in text
+    (alert,) = alerts(info(0.01), OUT, held)
+    assert "No force" in alert and "beyond" in alert
     assert chooser.take(row(OK, 0.0))
     assert not chooser.drawn(row(OK, 0.0), 0.0, TIP).is_held
 
@@ -96,11 +109,39 @@ def test_a_tool_without_a_pose_is_drawn_where_it_was_sent() -> None:
 
 
 def test_missed_periods_are_said_beside_nodes_that_answer() -> None:
-    assert warnings((), True, OK, 0.001) == "**All nodes answer.**"
+    assert warnings((), True, OK, 0.001) == "All nodes answer."
     busy = warnings((), True, OK, 0.2)
-    assert busy.startswith("⚠ All nodes answer, but the machine is too busy for 1 kHz: 20% of")
+    assert busy.startswith("⚠ All nodes answer, but 20% of the periods come late")
     alone = warnings(("vademecum_loader",), True, OK, 0.2)
-    assert "nodes answer" not in alone and "The machine is too busy" in alone
+    assert "nodes answer" not in alone and "20% of the periods come late" in alone
+
+
+@pytest.mark.parametrize("status", [None, OK, *EXPLANATIONS])
+def test_each_line_ends_with_one_mark(status: int | None) -> None:
+    for line in warnings(("vademecum_loader",), False, status, 0.2).splitlines():
+        assert line[0] == "⚠" and not line[2].islower()
+        assert line[-1] in ".?" and line[-2].isalnum() | (line[-2] in "`')")
+
+
+def test_a_patient_of_large_expected_error_is_marked() -> None:
+    """Interpolated patients are 16 % wrong; what was never measured is no better."""
+    now = shown(0.0, 0.0, 1.0, 0.0)
+    (alert,) = alerts(info(0.16), OK, now)
+    assert "Large expected error" in alert and "16%" in alert
+    assert "never measured" in alerts(info(float("nan")), OK, now)[0]
+    assert alerts(info(0.02), OK, now) == []
+
+
+def test_an_extrapolated_force_is_marked_and_one_that_fades_in_is_not() -> None:
+    now = shown(3.0, 0.1, 0.5, 1e-3)
+    assert "Extrapolated" in alerts(info(0.01), ContactState.STATUS_EXTRAPOLATED, now)[0]
+    assert alerts(info(0.01), ContactState.STATUS_ENGAGING, now) == []
+
+
+def info(error: float) -> VademecumInfo:
+    """Of a vademecum with an expected error of its displacement."""
+    values: dict[str, Any] = {field.name: 0 for field in fields(VademecumInfo)}
+    return VademecumInfo(**values | {"l2_mean": error, "force_mean": 0.01})
 
 
 def test_a_recording_says_what_it_lacks() -> None:

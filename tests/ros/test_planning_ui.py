@@ -54,8 +54,8 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
 ]
 
-SIZES = (WINDOW, (800, 600))
-TABS = ("Tool", "Organ", "Patient", "Scene", "Timing")
+SIZES = (WINDOW, (900, 700), (1920, 1080))
+TABS = ("Tool", "Organ", "Measure", "Plan", "Patient", "Scene", "Timing")
 PROGRESS = re.compile(r"\n\w+: \d+%")
 # What is seen of a page's controls: name, left, top, right, bottom [px].
 CONTROLS = """() => [...document.querySelectorAll('button, input, [role=tab]')]

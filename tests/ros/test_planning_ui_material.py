@@ -134,16 +134,16 @@ def test_a_tumour_is_seen_in_the_organ(page: Any, shots: Path) -> None:
 
 def test_what_another_client_chose_is_shown(page: Any) -> None:
     open_tab(page, "Organ")
-    shown = slider(page, "Young's modulus E [kPa]")
+    shown = slider(page, "E [kPa]")
     until(page, lambda: shown.input_value() == f"{CHOSEN_BY_ANOTHER / 1e3:g}", "the value", 30.0)
 
 
 @pytest.mark.parametrize(
     ("label", "name", "value", "unit"),
     [
-        ("Young's modulus E [kPa]", "young_modulus", 300.0, 1e3),
-        ("Poisson's ratio nu [-]", "poisson_ratio", 0.42, 1.0),
-        ("Tumour, E inside / outside [-]", "contrast", 15.0, 1.0),
+        ("E [kPa]", "young_modulus", 300.0, 1e3),
+        ("nu [-]", "poisson_ratio", 0.42, 1.0),
+        ("Tumour / E [-]", "contrast", 15.0, 1.0),
     ],
 )
 def test_a_slider_is_felt(

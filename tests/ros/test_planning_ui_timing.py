@@ -28,6 +28,7 @@ from avatar_ros.msg import LoopStatistics
 from tests.ros.browser import (
     CHROMIUM,
     TOKEN,
+    beside_pose,
     drag,
     draw_in_idle_time,
     force_of,
@@ -148,7 +149,9 @@ def test_the_loop_keeps_its_figures_while_the_page_is_dragged(
 
 def dragged(page: Any, shown: Organ, probe: Probe) -> np.ndarray:
     """Figures while the mouse swings the tool about where it presses."""
-    x, y = screen_of(page, shown, shown.above(DEEP))
+    page.keyboard.press("7")  # the view beside the tool
+    page.wait_for_timeout(1500)
+    x, y = screen_of(page, beside_pose(shown), shown.above(DEEP))
     swing = iter(SWING * np.sin(np.arange(100_000) / 5.0))
     page.mouse.move(x, y)
     page.mouse.down()

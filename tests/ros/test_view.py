@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,10 @@ pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'
 pytest.importorskip("avatar_ros.ui.view", reason="avatar_ros is not installed")
 
 import viser
+from avatar_ros.ui import tone
+from avatar_ros.ui.colours import HELD, N_BANDS
 from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.view import HELD, OrganView
+from avatar_ros.ui.view import CUT, GLASS, WHOLE, OrganView
 
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.geometry.tip import Tip
@@ -34,7 +37,7 @@ def view() -> Iterator[OrganView]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     server = viser.ViserServer("127.0.0.1", port, verbose=False)
-    view = OrganView(server, lambda place: None)
+    view = OrganView(server, lambda place, along_shaft: None)
     view.show(Organ.of(organ("cube")), SPHERE)
     yield view
     server.stop()
@@ -48,20 +51,70 @@ def pressed() -> ContactModel:
     return model
 
 
-def n_faces(view: OrganView) -> int:
-    return sum(len(mesh.faces) for mesh in view._bands if len(mesh.faces) > 1)
+def meshes(view: OrganView, group: str) -> list[Any]:
+    """Those of a group that are not empty, which are the face 0, 0, 0 alone."""
+    nodes = view._surface._nodes.items()
+    return [mesh for (name, _), mesh in nodes if name == group and np.any(mesh.faces)]
+
+
+def area(found: list[Any]) -> float:
+    corners = [np.array(mesh.vertices)[np.array(mesh.faces)] for mesh in found]
+    a, b, c = np.concatenate(corners).transpose(1, 0, 2).astype(float)
+    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
 
 def test_under_a_tip_that_presses_the_page_draws_its_dent(
     view: OrganView, pressed: ContactModel
 ) -> None:
-    """Deeper than any point of the cloud; and the coarse organ again, when the tip lets go."""
+    """Deeper than any point of the cloud; and none of it when the tip lets go."""
     cloud, force = pressed.out.cloud, pressed.out.force[0]
     sizes = np.linalg.norm(cloud[:, 3:], axis=1)
     assert view.move(cloud, POSE, force) > 0.8 * DEPTH > 1.5 * sizes.max()
-    fine = n_faces(view)
-    assert view.move(cloud, POSE, 0.0 * force) == pytest.approx(sizes.max())
-    assert fine > 1.5 * n_faces(view)
+    assert len(meshes(view, "bands")) > 0.7 * N_BANDS * 0.8 * DEPTH / view.top
+    assert view.move(0.5 * cloud, POSE, 0.0 * force) == pytest.approx(0.5 * sizes.max())
+
+
+def test_at_rest_the_organ_is_tissue_whole_and_once(view: OrganView) -> None:
+    """Cut into shades, smoothed, and nothing over it."""
+    assert meshes(view, "bands") == []
+    cube = organ("cube")
+    corners = cube.surface_vertices[cube.organ_faces].astype(float)
+    a, b, c = corners.transpose(1, 0, 2)
+    exact = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert area(meshes(view, "tissue")) == pytest.approx(exact, rel=0.05)
+
+
+def test_bands_and_tissue_together_cover_the_organ(view: OrganView, pressed: ContactModel) -> None:
+    cloud = pressed.out.cloud.copy()
+    cloud[:, 3:] *= 0.05 * view.top / np.linalg.norm(cloud[:, 3:], axis=1).max() * 4.0
+    cloud[:, :3] = organ("cube").surface_vertices + cloud[:, 3:]
+    before = area(meshes(view, "tissue"))
+    view.move(cloud, POSE, np.zeros(3))
+    groups = [meshes(view, group) for group in ("tissue", "rim", "bands")]
+    assert all(groups)
+    assert sum(map(area, groups)) == pytest.approx(before, rel=5e-3)
+
+
+def test_the_same_cloud_is_not_sent_twice(view: OrganView, pressed: ContactModel) -> None:
+    """A tool at rest would cost the browser thirty pictures a second."""
+    cloud, force = pressed.out.cloud, pressed.out.force[0]
+    largest = view.move(cloud, POSE, force)
+    (first, *_) = meshes(view, "bands")
+    first.vertices = np.zeros_like(first.vertices)
+    assert view.move(cloud.copy(), POSE, force) == largest
+    assert not np.any(first.vertices)
+
+
+def test_cut_open_shows_half_and_the_far_wall(view: OrganView) -> None:
+    whole = area(meshes(view, "tissue"))
+    view.look(CUT, "A", 0.5)
+    assert area(meshes(view, "tissue")) < 0.75 * whole
+    assert len(meshes(view, "inside")) == 1
+    view.look(GLASS)
+    assert area(meshes(view, "tissue")) == pytest.approx(whole)
+    assert {mesh.opacity for mesh in meshes(view, "tissue")} == {view.opacity} != {1.0}
+    view.look(WHOLE)
+    assert view.opacity == 1.0 and meshes(view, "inside") == []
 
 
 def test_under_a_patch_the_page_draws_the_cloud(view: OrganView, pressed: ContactModel) -> None:
@@ -81,34 +134,24 @@ def with_lesion() -> Vademecum:
 def test_a_structure_belongs_to_its_organ_and_moves_with_it(view: OrganView) -> None:
     sick = with_lesion()
     view.show(Organ.of(sick), SPHERE)
-    (shown,) = view._structures
-    before = np.array(shown.vertices)
-    np.testing.assert_allclose(before, sick.surface_vertices[-4:], atol=1e-9)
+    parts = view._structures._parts
+    before = [np.array(part.mesh.vertices) for part in parts]
+    assert sum(len(part.mesh.faces) for part in parts) == 4
     model = prepare(sick, (SPHERE,), effects=())
     for height in np.linspace(DEPTH, 0.0, 9):
         step(model, (POSE + height * UP)[None])
     view.move(model.out.cloud, POSE, model.out.force[0])
-    np.testing.assert_array_equal(shown.vertices, model.out.cloud[-4:, :3])
-    assert np.abs(np.array(shown.vertices) - before).max() > 0.05 * DEPTH
+    for part, old in zip(parts, before, strict=True):
+        np.testing.assert_array_equal(part.mesh.vertices, model.out.cloud[part.used, :3])
+        assert np.abs(np.array(part.mesh.vertices) - old).max() > 0.05 * DEPTH
     view.show(Organ.of(organ("cube")), SPHERE)
-    assert view._structures == []
+    assert view._structures._parts == []
 
 
 def test_a_held_shape_is_grey_until_it_is_that_of_now(view: OrganView) -> None:
-    colours = [mesh.color for mesh in view._bands]
+    bands = [view._surface._nodes["bands", k] for k in range(N_BANDS)]
+    colours = [tuple(mesh.color) for mesh in bands]
     view.grey(True)
-    assert {tuple(mesh.color) for mesh in view._bands} == {HELD}
+    assert {tuple(mesh.color) for mesh in bands} == {tuple(tone.material(np.array(HELD)))}
     view.grey(False)
-    assert [mesh.color for mesh in view._bands] == colours
-
-
-def test_each_band_is_sent_its_own_vertices_alone(view: OrganView, pressed: ContactModel) -> None:
-    """All of them, ten times over, would be 70 MB/s for 20,000 vertices."""
-    cloud = pressed.out.cloud
-    view.move(cloud, POSE, 0.0 * pressed.out.force[0])
-    sent = sum(len(mesh.vertices) for mesh in view._bands)
-    assert len(cloud) <= sent < 2.0 * len(cloud) + len(view._bands)
-    filled = [mesh for mesh in view._bands if np.any(mesh.faces)]  # not the face 0, 0, 0 alone
-    shown = np.concatenate([np.array(m.vertices)[m.faces] for m in filled]).mean(axis=1)
-    exact = cloud[organ("cube").surface_faces, :3].mean(axis=1)
-    np.testing.assert_allclose(np.sort(shown, axis=0), np.sort(exact, axis=0), atol=1e-6)
+    assert [tuple(mesh.color) for mesh in bands] == colours

@@ -18,6 +18,7 @@ try:
 except ImportError as error:
     raise SystemExit("planning_ui: viser is missing; pip install 'avatar[ui]'") from error
 
+from avatar_core.contact.error_map import force_error_at
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scenes
@@ -31,17 +32,28 @@ from avatar_ros.framework.templates import stamp_nanoseconds
 from avatar_ros.loop.settings import MATERIAL, TIP, chosen_tips
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
 from avatar_ros.prepare.scenes import scene_file
+from avatar_ros.ui.actions import Actions, Wanted
+from avatar_ros.ui.alerts import alerts
+from avatar_ros.ui.bookmarks import Bookmark
+from avatar_ros.ui.camera import turn_camera
 from avatar_ros.ui.display import RATE, NewestCloud
 from avatar_ros.ui.guard import Guard, guarded
+from avatar_ros.ui.history import History
+from avatar_ros.ui.legend import EXPECTED_ERROR, legend
 from avatar_ros.ui.library import Library
+from avatar_ros.ui.measures import Measures, Now
+from avatar_ros.ui.measures_view import MeasuresView
 from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.panels import Actions, Panels
+from avatar_ros.ui.orientation import Pose
+from avatar_ros.ui.panels import Panels
+from avatar_ros.ui.plan import Plan, PlanNow
+from avatar_ros.ui.presets import material_text
 from avatar_ros.ui.recorder import Recorder, scene_in_force
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
-from avatar_ros.ui.texts import frame_text, recorded_text, scene_texts, warnings
+from avatar_ros.ui.texts import frame_text, plain, recorded_text, scene_texts, warnings
 from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess
-from avatar_ros.ui.view import CLEARANCE, OrganView
+from avatar_ros.ui.view import CLEARANCE, GLASS, WHOLE, OrganView
 
 FRAME = "organ"
 _PLOT_FRAMES = 6  # between two points of the plots
@@ -70,6 +82,10 @@ class PlanningNode(ManagedNode):
         self._state = SharedToolState.make()
         self._driver = ToolDriverProcess(self._state)
         self._recorder = Recorder(self._state)
+        self._history = History()
+        self._look = (WHOLE, "A", 0.5)
+        self._lines: list[str] = []  # numbers that are shown
+        self._alerts: list[str] = []
         self._reader = Reader(1 << 30)
         self._organ: Organ | None = None
         self._cloud: NewestCloud | None = None
@@ -100,7 +116,16 @@ class PlanningNode(ManagedNode):
             server = viser.ViserServer(value["host"], value["port"], verbose=False)
         self._server = server
         self._requests = Requests(self)
-        self._view = OrganView(server, self._drag)
+        self._view = OrganView(server, self._drag, self._show_cube)
+        self._measures = Measures(MeasuresView(server))
+        server.scene.on_click()(self._click)
+        self._plan = Plan(
+            self._library.folder,
+            self._plan_now,
+            self._return_to,
+            lambda labels: self._panels.plan.offer(labels),
+            self._say,
+        )
         self._panels = Panels(
             server,
             Actions(
@@ -112,9 +137,20 @@ class PlanningNode(ManagedNode):
                 nudge=self._nudge,
                 lift=self._lift,
                 record=self._record,
+                turn=self._view.turn_to,
+                look=self._choose_look,
+                errors=self._show_errors,
+                measure=self._measures.choose,
+                clear_measures=self._measures.clear,
+                undo=self._undo,
+                keep=self._plan.keep,
+                drop=self._plan.drop,
+                go_back=self._plan.go_back,
+                report=self._plan.report,
+                export=self._plan.export,
             ),
         )
-        self._panels.offer_scenes(scene_texts())
+        self._panels.scene.offer(scene_texts())
         self._own_subscriptions = [
             self.create_subscription(
                 VademecumInfo, "vademecum_info", self._take_frame, qos.LATCHED
@@ -176,20 +212,26 @@ class PlanningNode(ManagedNode):
             return
         self._stop_recording("the organ changed")
         self._material = {}
+        self._history.forget()
         tip = self._tip()
         self._state.live["target"][0] = organ.above(tip.offset + CLEARANCE)
         self._view.show(organ, tip)
+        self._look = (GLASS if organ.structures else WHOLE, "A", 0.5)
+        self._measures.show_organ(organ, tip)
         self._periods.forget()
         self._panels.show_organ(organ)
         self._organ = organ
         self._listen_to_clouds()
         self._requests.parameters_of_contact(tuple(MATERIAL), self._note_material)
+        self._plan.show_organ(organ)
         self._say(f"{organ.name} is shown")
 
     def _take_statistics(self, window: LoopStatistics) -> None:
         now = time.monotonic() - self._began
         self._missed = window.missed / max(window.periods, 1)
-        self._panels.show_loop(now, window.step_p99, window.missed / max(window.window, 1e-3))
+        self._panels.timing.show_loop(
+            now, window.step_p99, window.missed / max(window.window, 1e-3)
+        )
 
     def _tip(self) -> Tip:
         """The tip of the first tool."""
@@ -210,11 +252,25 @@ class PlanningNode(ManagedNode):
         shown = self._shown = self._period_to_show()
         self._view.place_tool(shown.tip, (0.0 if shown.is_held else shown.fraction) * shown.force)
         if self._frame % _PLOT_FRAMES == 0:
-            n_kept = self._recorder.n_periods if self._recorder.is_on else None
-            self._panels.readout.content = frame_text(shown, n_kept)
-            self._panels.show_scale(self._view.top)
-            size = 0.0 if shown.is_held else float(np.linalg.norm(shown.force))
-            self._panels.show_force(time.monotonic() - self._began, size, shown.error)
+            self._show_numbers(organ, shown)
+
+    def _show_numbers(self, organ: Organ, shown: ShownPeriod) -> None:
+        """Beside the picture, of the same period."""
+        n_kept = self._recorder.n_periods if self._recorder.is_on else None
+        values = self._values(organ)
+        poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
+        material = material_text(values["young"], poisson, values.get("contrast"))
+        numbers = frame_text(shown, material, n_kept)
+        self._panels.show_numbers("<br>".join(numbers))
+        self._alerts = alerts(organ.info, self._status(), shown)
+        self._panels.show_alerts(self._alerts)
+        now = Now(self._view.points, shown.tip, values["young"])
+        measured = self._measures.lines(now)
+        self._panels.measure.show(measured)
+        self._lines = [*map(plain, numbers), *measured]
+        self._panels.show_scale(self._legend())
+        size = 0.0 if shown.is_held else float(np.linalg.norm(shown.force))
+        self._panels.tool.show_force(time.monotonic() - self._began, size, shown.error)
 
     def _period_to_show(self) -> ShownPeriod:
         """Draw the newest cloud, and return what belongs to it."""
@@ -245,12 +301,32 @@ class PlanningNode(ManagedNode):
         silence = time.monotonic_ns() - int(self._state.live["heard"][0])
         return silence < _SILENCE * 1e9
 
+    def _legend(self) -> str:
+        view = self._view
+        if view.shows_errors:
+            return legend(view.error_top, EXPECTED_ERROR, 1e-2, view.opacity)
+        return legend(view.top, opacity=view.opacity)
+
+    def _show_errors(self, wanted: bool) -> None:
+        """Colour by the expected error of the force, or by the displacement."""
+        organ = self._organ
+        if organ is None:
+            return
+        errors = force_error_at(organ.vademecum, organ.vertices) if wanted else None
+        if errors is not None and not np.isfinite(errors).any():
+            self._say("errors of this organ were never measured; build it with a certificate")
+            return
+        self._view.paint_errors(errors)
+
+    def _status(self) -> int | None:
+        """Of the last ContactState, if one came recently."""
+        return int(self._state.live["status"][0]) if self._answers() else None
+
     def _poll_cell(self) -> None:
         """Check which nodes run, what the library holds, and that the tool driver runs."""
-        missing = self._requests.missing
-        status = int(self._state.live["status"][0]) if self._answers() else None
+        missing, status = self._requests.missing, self._status()
         has_organ = self._organ is not None
-        self._panels.warnings.content = warnings(missing, has_organ, status, self._missed)
+        self._panels.show_cell(warnings(missing, has_organ, status, self._missed))
         self._panels.offer(*self._library.offer())
         if self._organ is not None:
             self._driver.ensure_running(self._tool, self._frame_id)
@@ -269,13 +345,18 @@ class PlanningNode(ManagedNode):
     def _on_contact_started(self, values: dict[str, Any]) -> None:
         """The contact node runs, for the first time or again."""
         self._contact, self._is_to_restore = values, True
-        self._view.change_tip(self._tip())
-        self._panels.show_material(self._in_force())
+        self._change_tip()
+        self._panels.organ.show_material(self._in_force())
+
+    def _change_tip(self) -> None:
+        tip = self._tip()
+        self._view.change_tip(tip)
+        self._measures.change_tip(tip)
 
     def _note_material(self, values: dict[str, Any]) -> None:
         """Show the material in force, even if another client chose it."""
         self._contact |= values
-        self._panels.show_material(self._in_force())
+        self._panels.organ.show_material(self._in_force())
 
     def _in_force(self) -> dict[str, float]:
         """Values of the material that are not those of the file, by coordinate."""
@@ -284,11 +365,15 @@ class PlanningNode(ManagedNode):
             self._material
         )
 
+    def _values(self, organ: Organ) -> dict[str, float]:
+        """Of the material, by coordinate, as built where nothing was chosen."""
+        return {name: here for name, (_, _, here) in organ.ranges.items()} | self._in_force()
+
     def _restore(self) -> None:
         """Send what was chosen here to a restarted contact node, once it has an organ."""
         self._is_to_restore = False
         if self._scene:
-            self._choose_scene(self._scene)
+            self._switch(self._scene)
         if self._material:
             self._requests.set_material(dict(self._material), self._say)
 
@@ -296,54 +381,162 @@ class PlanningNode(ManagedNode):
 
     def _say(self, text: str) -> None:
         if self._server is not None:
-            self._panels.news.content = text
+            self._panels.say(text)
 
-    def _drag(self, target: np.ndarray) -> None:
-        if np.isfinite(target).all():
-            self._state.live["target"][0] = target
+    def _show_cube(self, client: Any, drawing: str) -> None:
+        self._panels.show_cube(client, drawing)
+
+    def _click(self, event: Any) -> None:
+        """A click on the organ: measure there."""
+        if self._organ is not None:
+            ray = np.array(event.ray_origin), np.array(event.ray_direction)
+            self._say(self._measures.click(*ray, self._view.points))
+
+    def _drag(self, target: np.ndarray, along_shaft: bool) -> None:
+        """Move the tool to where the mouse is, or as far along its shaft as the mouse moved up."""
+        organ = self._organ
+        if organ is None or not np.isfinite(target).all():
+            return
+        if along_shaft:
+            here = self._state.live["tip"][0].copy()
+            target = here + float((target - here)[2]) * organ.outward(here)
+        self._move(target, "drag")
+
+    def _move(self, target: np.ndarray, how: str) -> None:
+        before = self._state.live["target"][0].copy()
+        self._history.note(how, "the tool's place", lambda: self._put(before))
+        self._put(target)
+
+    def _put(self, target: np.ndarray) -> None:
+        self._state.live["target"][0] = target
+
+    def _undo(self) -> None:
+        what = self._history.undo()
+        self._say(f"undone: {what}" if what else "nothing to undo")
 
     def _nudge(self, axis: Any, way: float) -> None:
         target = self._state.live["target"][0].copy()
         if axis is None and self._organ is not None:
             axis = self._organ.outward(target)
         if axis is not None:
-            self._drag(target + way * np.asarray(axis))
+            self._move(target + way * np.asarray(axis), "nudge")
 
     def _lift(self) -> None:
         if self._organ is not None:
             target = self._state.live["target"][0].copy()
-            self._drag(target + 0.03 * self._organ.outward(target))
+            self._move(target + 0.03 * self._organ.outward(target), "lift")
 
-    def _choose_material(self, name: str, value: float) -> None:
+    def _choose_material(self, values: dict[str, float]) -> None:
+        organ = self._organ
+        if organ is None:
+            return
+        present = self._values(organ)
+        before = {name: present[name] for name in values if name in present}
+        name = ", ".join(values)
+        self._history.note(f"material {name}", f"the material ({name})", lambda: self._set(before))
+        self._set(values)
+
+    def _set(self, values: dict[str, float]) -> None:
         self._stop_recording("the material changed")
-        self._material[name] = value
-        self._requests.set_material({name: value}, self._say)
+        self._material |= values
+        self._requests.set_material(dict(values), self._say)
+        self._panels.organ.show_material(values)
 
     def _choose_scene(self, name: str) -> None:
+        before = self._scene
+        if before and before != name:
+            self._history.note("scene", "the scene", lambda: self._switch(before))
+        self._switch(name)
+
+    def _switch(self, name: str) -> None:
         self._stop_recording("the scene changed")
 
         def note(switched: bool) -> None:
             if switched:
                 self._scene = name
-                self._view.change_tip(self._tip())
+                self._change_tip()
 
         self._requests.load_scene(name, self._say, then=note)
 
-    def _build(self, surface: str, fidelity: str, tolerance: float) -> None:
+    def _build(self, wanted: Wanted) -> None:
         def load(file: str) -> None:
             if file:
-                self._panels.show_progress("done", 1.0, float("nan"))
+                self._panels.patient.show_progress("done", 1.0, float("nan"))
                 self._panels.offer(*self._library.offer())
-                self._panels.choose_file(file)
+                self._panels.organ.choose_file(file)
                 self._requests.load_vademecum(file, self._say)
             else:
-                self._panels.show_progress("not built", 0.0, float("nan"))
+                self._panels.patient.show_progress("not built", 0.0, float("nan"))
 
         self._say("")  # nothing of the last build stays
-        self._panels.show_progress("begins", 0.0, float("nan"))
-        self._requests.build_patient(
-            surface, fidelity, tolerance, self._panels.show_progress, self._say, load
+        self._panels.patient.show_progress("begins", 0.0, float("nan"))
+        self._requests.build_patient(wanted, self._panels.patient.show_progress, self._say, load)
+
+    # --- The plan ----------------------------------------------------------------------------
+
+    def _choose_look(self, how: str, side: str, part: float) -> None:
+        before = self._look
+        self._history.note("look", "how the organ is shown", lambda: self._show_look(*before))
+        self._show_look(how, side, part)
+
+    def _show_look(self, how: str, side: str, part: float) -> None:
+        self._look = how, side, part
+        self._view.look(how, side, part)
+        self._panels.organ.show_look(how, side, part)
+
+    def _plan_now(self) -> PlanNow | None:
+        organ = self._organ
+        if organ is None:
+            return None
+        x, y, z = self._state.live["target"][0].tolist()
+        return PlanNow(
+            organ,
+            (x, y, z),
+            self._scene,
+            self._values(organ),
+            self._look,
+            tuple(self._lines),
+            tuple(self._alerts),
+            self._view.points,
         )
+
+    def _return_to(self, kept: Bookmark, client: Any) -> None:
+        """Scene, material, look, tool and view of a kept state; one step to undo."""
+        organ = self._organ
+        if organ is None:
+            return
+        target, look, values = self._state.live["target"][0].copy(), self._look, self._values(organ)
+        scene = self._scene
+
+        def back() -> None:
+            self._arrange(organ, scene, values, look, target)
+
+        self._history.note("return", "the return to a kept state", back)
+        self._arrange(organ, kept.scene, kept.material, kept.look, np.array(kept.target))
+        if client is not None and kept.camera:
+            turn_camera(client, Pose(*np.array(kept.camera).reshape(3, 3)))
+
+    def _arrange(
+        self,
+        organ: Organ,
+        scene: str,
+        material: dict[str, float],
+        look: tuple[str, str, float],
+        target: np.ndarray,
+    ) -> None:
+        if scene and scene != self._scene and scene in shipped_scenes():
+            self._switch(scene)
+        present = self._values(organ)
+        wanted = {
+            name: float(np.clip(material[name], low, high))
+            for name, (low, high, _) in organ.ranges.items()
+            if name in material
+        }
+        changed = {name: value for name, value in wanted.items() if value != present[name]}
+        if changed:
+            self._set(changed)
+        self._show_look(*look)
+        self._put(target)
 
     # --- Recordings --------------------------------------------------------------------------
 
@@ -363,7 +556,7 @@ class PlanningNode(ManagedNode):
             return
         scene = self._scene_in_force(organ)
         text = self._recorder.open(organ.vademecum, scene, float(self._contact["rate"]))
-        self._panels.show_recording(True)
+        self._panels.tool.show_recording(True)
 
         def begin(switched: bool) -> None:
             touches = bool(self._state.live["touches"][0])  # half a minute after the click
@@ -371,7 +564,7 @@ class PlanningNode(ManagedNode):
                 self._recorder.begin()
                 return
             self._recorder.drop()
-            self._panels.show_recording(False)
+            self._panels.tool.show_recording(False)
             if touches:
                 self._say("not recorded: the tool touched the organ again; lift it, and record")
 
@@ -393,7 +586,7 @@ class PlanningNode(ManagedNode):
     def _stop_recording(self, why: str) -> None:
         if not self._recorder.is_on:
             return
-        self._panels.show_recording(False)
+        self._panels.tool.show_recording(False)
         try:
             saved = self._recorder.save(self._library.folder)
         except AvatarError as error:

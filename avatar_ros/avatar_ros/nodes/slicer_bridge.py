@@ -20,6 +20,7 @@ from avatar_ros.framework.parameters import AUTOSTART, Parameter
 from avatar_ros.framework.ports import PolledSubscriptions
 from avatar_ros.loop.statuses import explanation
 from avatar_ros.msg import ContactState, VademecumInfo
+from avatar_ros.ui.actions import Wanted
 from avatar_ros.ui.display import NewestCloud
 from avatar_ros.ui.requests import Requests
 
@@ -208,7 +209,7 @@ class SlicerBridge(ManagedNode):
             return
         assert self._requests is not None
         self._requests.build_patient(
-            file, fidelity, 0.0, self._say_stage, self._say, self._load_patient
+            Wanted(file, fidelity=fidelity), self._say_stage, self._say, self._load_patient
         )
 
     def _load_patient(self, file: str) -> None:

@@ -25,6 +25,8 @@ from urllib.parse import parse_qs, urlsplit
 import websockets.asyncio.server
 from websockets import Headers, Request, Response
 
+from avatar_ros.ui.index_page import retitle
+
 Check = Callable[[Any, Request], Response | None]
 
 _EVERYWHERE = ("0.0.0.0", "::", "")
@@ -108,6 +110,7 @@ def guarded(guard: Guard) -> Iterator[None]:
             response = process_request(connection, request)
             if response is not None:
                 guard.remember(request, response)
+                retitle(response)
             return response
 
         return serve(*arguments, process_request=check, **named)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from avatar_core.contact.tool_path import middle_of_access
-from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.model import Vademecum, VademecumInfo
 
-YOUNG_RANGE = (0.25, 4.0)  # of the slider, times that of the vademecum
+YOUNG_RANGE = (0.5e3, 1e6)  # that can be chosen [Pa]: the force is proportional to E
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,7 @@ class Organ:
     id: str
     name: str
     vademecum: Vademecum
+    info: VademecumInfo
     vertices: np.ndarray
     faces: np.ndarray
     structures: dict[str, np.ndarray]
@@ -44,7 +45,8 @@ class Organ:
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         j = middle_of_access(v)
         young = v.material.young_modulus
-        ranges = {"young": (YOUNG_RANGE[0] * young, YOUNG_RANGE[1] * young, young)}
+        low_young, high_young = YOUNG_RANGE
+        ranges = {"young": (min(low_young, young), max(high_young, young), young)}
         here = {"poisson": v.material.poisson_ratio, "contrast": v.contrast or 1.0}
         for c in v.parametric.coordinates if v.parametric else ():
             ranges[c.name] = (c.low, c.high, here[c.name])
@@ -52,6 +54,7 @@ class Organ:
             id=v.id,
             name=v.name,
             vademecum=v,
+            info=v.info(),
             vertices=vertices,
             faces=v.organ_faces,
             structures=v.structures,
@@ -75,7 +78,7 @@ class Organ:
 
     def summary(self) -> str:
         """Name, volume, material and certified errors, as Markdown."""
-        info = self.vademecum.info()
+        info = self.info
         errors = (
             f"Errors certified: displacement {info.l2_mean:.1%} (worst {info.l2_worst:.1%}), "
             f"force {info.force_mean:.1%} (worst {info.force_worst:.1%})."

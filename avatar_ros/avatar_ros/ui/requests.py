@@ -18,6 +18,7 @@ from rclpy.parameter import parameter_value_to_python
 from avatar_ros.action import BuildPatient
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.srv import LoadScene, LoadVademecum
+from avatar_ros.ui.actions import Wanted
 
 # How to start a node that does not run.
 START = {
@@ -129,20 +130,14 @@ class Requests:
         self._get.call_async(GetParameters.Request(names=list(names))).add_done_callback(answered)
 
     def build_patient(
-        self,
-        surface: str,
-        fidelity: str,
-        tolerance: float,
-        progress: Progress,
-        report: Report,
-        then: Callable[[str], None],
+        self, wanted: Wanted, progress: Progress, report: Report, then: Callable[[str], None]
     ) -> None:
         """Build a patient; calls ``then`` with the file's name, empty if there is none."""
         if not self._build.server_is_ready():
             report(START["patient_interpolation"])
             then("")
             return
-        goal = BuildPatient.Goal(surface=surface, fidelity=fidelity, tolerance=tolerance)
+        goal = BuildPatient.Goal(**wanted._asdict())
 
         def note(message: Any) -> None:
             stage = message.feedback

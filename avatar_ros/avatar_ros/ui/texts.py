@@ -14,14 +14,14 @@ from avatar_ros.ui.requests import START
 from avatar_ros.ui.shown_period import ShownPeriod
 
 _MANY_MISSED = 0.02  # part of the periods that may come late without a word
-_SHOWN_FORCE = 0.01  # smallest difference that is written [N]
+SHOWN_FORCE = 0.01  # smallest difference that is written [N]
 NO_ORGAN = "no organ yet: choose a vademecum under Organ"
 
 
 def warnings(
     missing: Sequence[str], has_organ: bool, status: int | None, missed: float = 0.0
 ) -> str:
-    """Everything that keeps the page from working, as Markdown; one line if nothing does.
+    """Everything that keeps the page from working, one line each; a single one if nothing does.
 
     status : of the last ContactState; None if none came lately
     missed : part of the loop's periods that came late, of the last second
@@ -36,31 +36,47 @@ def warnings(
     if "contact" not in missing and missed > _MANY_MISSED:
         whole = "" if lines else "all nodes answer, but "
         lines.append(
-            f"{whole}the machine is too busy for 1 kHz: {missed:.0%} of the periods come late; "
+            f"{whole}{missed:.0%} of the periods come late, since the machine has other work; "
             "close other programs"
         )
     if not lines:
         engaging = status == ContactState.STATUS_ENGAGING
-        return "**All nodes answer.**" + (" The force is being faded in." if engaging else "")
-    return "\n\n".join(f"⚠ {line[0].upper()}{line[1:]}." for line in lines)
+        return "All nodes answer." + (" The force is being faded in." if engaging else "")
+    return "\n".join(f"⚠ {_sentence(line)}" for line in lines)
 
 
-def frame_text(shown: ShownPeriod, n_kept: int | None) -> str:
-    """What a frame shows, as Markdown; n_kept : recorded periods, or None."""
-    recorded = "" if n_kept is None else f"; recording, {n_kept} periods"
+def _sentence(line: str) -> str:
+    """With a capital letter, and one mark at its end."""
+    return f"{line[0].upper()}{line[1:].rstrip('.')}" + ("" if line.endswith("?") else ".")
+
+
+def frame_text(shown: ShownPeriod, material: str, n_kept: int | None) -> list[str]:
+    """The numbers of a frame, as lines of HTML.
+
+    material : that is in force; n_kept : recorded periods, or None
+    """
     force = float(np.linalg.norm(shown.force))
-    numbers = f"**{force:.2f} N** ± {shown.error:.2f} N"
-    moved = f"**{1e3 * shown.largest:.1f} mm**"
+    numbers = f"<b>{force:.2f} N</b> ± {shown.error:.2f} N"
+    moved = f"<b>{1e3 * shown.largest:.1f} mm</b>"
     if shown.is_held:
-        return (
-            "**No force: the tool is beyond what the vademecum covers**, too deep or off the "
-            f"accessible surface. In grey, the last valid shape: {numbers}, {moved}{recorded}"
-        )
-    less = force * (1.0 - shown.fraction) >= _SHOWN_FORCE
-    device = f", **limited: the device gets {force * shown.fraction:.2f} N**" if less else ""
-    if np.isnan(shown.largest):
-        return f"Force {numbers}{device}; no displacement: the contact node sends no surface"
-    return f"Force {numbers}{device}, largest displacement {moved}{recorded}"
+        lines = [f"No force. In grey, the last valid shape: {numbers}, {moved}"]
+    else:
+        less = force * (1.0 - shown.fraction) >= SHOWN_FORCE
+        device = f", device {force * shown.fraction:.2f} N" if less else ""
+        lines = [f"Force {numbers}{device}"]
+        if np.isnan(shown.largest):
+            lines.append("No displacement: the contact node sends no surface")
+        else:
+            lines.append(f"Largest displacement {moved}")
+    lines.append(material)
+    if n_kept is not None:
+        lines.append(f"Recording, {n_kept:,} periods")
+    return lines
+
+
+def plain(line: str) -> str:
+    """A line without its marks of HTML."""
+    return line.replace("<b>", "").replace("</b>", "")
 
 
 def recorded_text(recording: Recording) -> str:

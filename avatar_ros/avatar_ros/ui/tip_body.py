@@ -9,6 +9,7 @@ from avatar_core.geometry.tip import Tip
 _N_RINGS = 24
 _N_SIDES = 32
 _SHAFT = 2.0  # length of the shaft over the tip, in radii
+_LENGTH, _WIDTH = 0.09, 0.5  # of the whole shaft: length [m], radius in radii of the tip
 
 
 def tip_body(tip: Tip) -> tuple[np.ndarray, np.ndarray]:
@@ -23,6 +24,12 @@ def tip_body(tip: Tip) -> tuple[np.ndarray, np.ndarray]:
     z = tip.height(r) - tip.offset
     top = z[-1] + _SHAFT * tip.radius
     return _revolved(np.append(r, [tip.radius, 0.0]), np.append(z, [top, top]))
+
+
+def shaft_body(tip: Tip) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) [m] and faces (m, 3) of the shaft, which is not felt, along z."""
+    r = _WIDTH * tip.radius * np.array([0.0, 1.0, 1.0, 0.0])
+    return _revolved(r, np.array([0.0, 0.0, _LENGTH, _LENGTH]))
 
 
 def _revolved(r: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

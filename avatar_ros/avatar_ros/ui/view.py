@@ -10,199 +10,187 @@ import viser
 
 from avatar_core.contact.fine_surface import FineSurface, fine_surface
 from avatar_core.geometry.tip import Tip
-from avatar_ros.ui.colours import table, top_for
+from avatar_ros.ui import tone
+from avatar_ros.ui.camera import Cameras
+from avatar_ros.ui.colours import top_for
 from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.tip_body import tip_body, turn_to
+from avatar_ros.ui.orientation import AXES
+from avatar_ros.ui.structures_view import StructuresView
+from avatar_ros.ui.surface_view import Plane, SurfaceView
+from avatar_ros.ui.tip_body import turn_to
+from avatar_ros.ui.tool_view import LEAST_FORCE, ToolView
 
-N_BANDS = 10  # of the colour scale; a mesh has a single colour
-CLAMP = (90, 90, 90)
-HELD = (170, 170, 170)  # of a shape that is not that of now
-STRUCTURE = (213, 94, 0)  # vermilion and blue of Okabe and Ito, distinguishable for all
-TOOL = (0, 114, 178)
-ARROW = (213, 94, 0)
-FORCE_SCALE = 0.004  # length of the arrow per force [m/N]
-MAX_ARROW = 0.06  # [m]
-LEAST_FORCE = 1e-3  # that is shown [N]
 CLEARANCE = 0.015  # of a new organ's tool over the surface [m]
-_NO_FACE = np.zeros((1, 3), np.uint32)  # of a band without faces; a mesh must not be empty
-_VIEW = 0.5  # part of the view along the normal; the rest is from the side
-_DISTANCE = 1.8  # of the camera, in lengths of the organ
-
-
-def band_shades() -> np.ndarray:
-    """Colours of the bands, shape (N_BANDS, 3), 0 to 255."""
-    middle = (np.arange(N_BANDS) + 0.5) / N_BANDS
-    return np.round(255 * table()[np.round(255 * middle).astype(int)]).astype(int)
-
-
-def camera_of(organ: Organ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Position and aim of the first view [m], and its vertical angle [rad].
-
-    From the side of the accessible surface, so that a drag on the screen can press.
-    """
-    side = np.cross([0.0, 0.0, 1.0], organ.normal)
-    side /= max(float(np.linalg.norm(side)), 1e-6)
-    view = _VIEW * organ.normal + np.sqrt(1.0 - _VIEW**2) * side
-    return organ.centre + _DISTANCE * organ.size * view, organ.centre, float(np.radians(50.0))
-
-
-def _draw(mesh: Any, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Change a mesh in an order in which no face ever names a vertex that is not there."""
-    if len(vertices) >= len(mesh.vertices):
-        mesh.vertices, mesh.faces = vertices, faces
-    else:
-        mesh.faces, mesh.vertices = faces, vertices
-
-
-def _own(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The points that some faces use, and the faces over these alone."""
-    is_used = np.zeros(int(faces.max()) + 1, bool)
-    is_used[faces] = True
-    place = np.cumsum(is_used, dtype=np.uint32) - np.uint32(1)
-    return np.flatnonzero(is_used), place[faces]
+ERROR_TOPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # possible ends of the scale of the error
+LOOKS = WHOLE, GLASS, CUT = "whole", "glass", "cut open"  # how the organ is shown
+_LEAST_MARKED = 0.1e-3  # displacement whose place is marked [m]
 
 
 class OrganView:
     """Draws into a viser server; everything in metres, in the organ's frame.
 
-    top : end of the colour scale [m]
+    top, error_top : ends of the colour scales, of the displacement [m] and the expected error
     """
 
-    def __init__(self, server: viser.ViserServer, on_drag: Callable[[np.ndarray], None]) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        on_drag: Callable[[np.ndarray, bool], None],
+        on_cube: Callable[[Any, str], None] = lambda client, drawing: None,
+    ) -> None:
         self._server = server
-        self._on_drag = on_drag
         self._organ: Organ | None = None
-        self._bands: list[Any] = []
-        self._structures: list[Any] = []
-        self._inside: list[np.ndarray] = []  # points of the cloud, of each structure
-        self._tool: Any = None
-        self._tip: Tip | None = None
-        self._arrow: Any = None
-        self._is_grey = False
+        self._surface = SurfaceView(server)
+        self._structures = StructuresView(server)
+        self._tip = Tip()
+        self._tool = ToolView(server, on_drag)
+        self._cameras = Cameras(server, on_cube)
+        self._drawn: np.ndarray | None = None  # the cloud that is seen
+        self._largest = 0.0
+        self._errors: np.ndarray | None = None  # at the cloud's points, if these are shown
+        self.error_top = ERROR_TOPS[0]
         self.top = top_for(0.0)
         server.scene.set_up_direction("+z")
         server.scene.world_axes.visible = False
-        server.scene.add_light_ambient("/light", intensity=1.2)  # the first colours are dark
+        server.scene.configure_default_lights(enabled=False)
+        server.scene.configure_environment_map(hdri=None)
+        server.scene.add_light_ambient("/light", intensity=tone.AMBIENT)
 
     def show(self, organ: Organ, tip: Tip) -> None:
         """Show another organ, at rest, with the structures of its own file and no others."""
-        scene, first = self._server.scene, self._organ is None
-        self._organ, self.top, self._is_grey = organ, top_for(0.0), False
-        clamp = organ.faces[organ.clamped]
-        # slightly outside the moving surface, so that it is visible
-        lifted = organ.centre + 1.003 * (organ.vertices - organ.centre)
-        scene.add_mesh_simple("/clamp", lifted, clamp, color=CLAMP, side="double")
-        self._bands = [
-            scene.add_mesh_simple(
-                f"/organ/{i}",
-                organ.vertices[:1] if i else organ.vertices,
-                _NO_FACE if i else organ.faces,
-                color=tuple(shade),
-                side="double",
-                opacity=0.55 if organ.structures else None,
-                cast_shadow=False,
-            )
-            for i, shade in enumerate(band_shades().tolist())
-        ]
-        for mesh in self._structures:
-            mesh.remove()
-        self._structures = [
-            scene.add_mesh_simple(
-                f"/structures/{i}", organ.vertices[used], local, color=STRUCTURE, side="double"
-            )
-            for i, (used, local) in enumerate(map(_own, organ.structures.values()))
-        ]
-        self._inside = [np.unique(faces) for faces in organ.structures.values()]
-        self._add_tool(tip, organ.above(tip.offset + CLEARANCE))
-        self._arrow = scene.add_arrows(
-            "/force",
-            np.zeros((1, 2, 3)),
-            ARROW,
-            shaft_radius=0.0015,
-            head_radius=0.004,
-            head_length=0.008,
-            visible=False,
+        scene = self._server.scene
+        self._organ, self.top, self._drawn, self._errors = organ, top_for(0.0), None, None
+        self._structures.show(organ.vertices, organ.structures)
+        self._surface.show(organ.vertices, organ.faces, organ.clamped)
+        self.look(GLASS if organ.structures else WHOLE)
+        self._marker = scene.add_label(
+            "/largest", "", visible=False, anchor="top-left", font_screen_scale=0.9
         )
-        self._aim(organ)
-        if not first:
-            for client in self._server.get_clients().values():
-                client.camera.look_at = tuple(organ.centre)
-
-    def _add_tool(self, tip: Tip, position: np.ndarray) -> None:
+        self._place = scene.add_icosphere(
+            "/largest/place", 0.0012, color=(0, 0, 0), cast_shadow=False, visible=True
+        )
         self._tip = tip
-        vertices, faces = tip_body(tip)
-        self._tool = self._server.scene.add_mesh_simple(
-            "/tool", vertices, faces, color=TOOL, wxyz=self._upright(position), position=position
-        )
-        self._tool.on_drag("left")(self._dragged)
+        position = organ.above(tip.offset + CLEARANCE)
+        self._tool.show(tip, position, self._upright(position))
+        self._cameras.show(organ.vertices)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Of the cloud that is drawn, or of the organ at rest, shape (n, 3) [m]."""
+        if self._drawn is None:
+            return np.zeros((0, 3)) if self._organ is None else self._organ.vertices
+        return self._drawn[:, :3]
+
+    @property
+    def opacity(self) -> float:
+        """Of the organ."""
+        return self._surface.opacity
+
+    def look(self, how: str, side: str = "A", part: float = 0.5) -> None:
+        """Show the organ whole, as of glass, or cut open from a side, by a part of its width."""
+        organ = self._organ
+        if organ is None:
+            return
+        plane = None
+        if how == CUT:
+            normal = np.array(AXES[side])
+            heights = organ.vertices @ normal
+            height = float(heights.max() - part * (heights.max() - heights.min()))
+            plane = Plane(height * normal, normal)
+        self._surface.look_inside(how == GLASS, plane)
+        if self._drawn is not None:
+            self._surface.redraw()
+
+    @property
+    def shows_errors(self) -> bool:
+        """Whether the expected error is drawn in place of the displacement."""
+        return self._errors is not None
+
+    def paint_errors(self, errors: np.ndarray | None) -> None:
+        """Draw the expected error of the force at each point of the cloud, or the displacement.
+
+        errors : ndarray, shape (n,), relative; NaN where there is no access
+        """
+        organ, drawn = self._organ, self._drawn
+        if organ is None:
+            return
+        if errors is not None:
+            largest = float(np.nanmax(errors, initial=0.0))
+            self.error_top = next((x for x in ERROR_TOPS if x >= largest), ERROR_TOPS[-1])
+            errors = np.nan_to_num(errors)
+        self._errors, self._drawn = errors, None
+        rest = np.hstack([organ.vertices, np.zeros_like(organ.vertices)])
+        self.move(rest if drawn is None else drawn, np.zeros(3), np.zeros(3))
+
+    def turn_to(self, side: str) -> None:
+        """A standard view, as "A", or that beside the tool, in every browser."""
+        if side in AXES:
+            self._cameras.turn_to(side)
+        elif self._organ is not None and self._tool.is_shown:
+            self._cameras.turn_beside(self._organ.outward(self._tool.position))
 
     def _upright(self, position: np.ndarray) -> np.ndarray:
         """Turns the shaft along the surface's normal, for which the force is computed."""
         assert self._organ is not None
         return turn_to(self._organ.outward(position))
 
-    def _aim(self, organ: Organ) -> None:
-        camera = self._server.initial_camera
-        camera.near = 0.001
-        camera.position, camera.look_at, camera.fov = camera_of(organ)
-
-    def _dragged(self, event: Any) -> None:
-        way = np.array(event.end_position) - np.array(event.start_position)
-        self._on_drag(np.array(self._tool.position) + way)
-
     def change_tip(self, tip: Tip) -> None:
         """Show another tip in the same place."""
-        if self._tool is not None:
-            self._add_tool(tip, np.array(self._tool.position))
+        self._tip = tip
+        if self._tool.is_shown:
+            position = self._tool.position
+            self._tool.show(tip, position, self._upright(position))
 
     def move(self, points: np.ndarray, tip: np.ndarray, force: np.ndarray) -> float:
         """Move the surface as in a cloud, (n, 6) [m]; returns the largest displacement [m].
 
-        Under a tip [m] that feels a force [N], smaller triangles show its dent.
+        Under a tip [m] that feels a force [N], smaller triangles show its dent. The same cloud is
+        not drawn twice.
         """
         organ = self._organ
         if organ is None or len(points) != len(organ.vertices):
             return 0.0
-        if self._tip is not None and np.linalg.norm(force) > LEAST_FORCE:
+        if self._drawn is not None and np.array_equal(points, self._drawn):
+            return self._largest
+        self._drawn = points.copy()
+        plain = FineSurface(points[:, :3], points[:, 3:], organ.faces, np.arange(len(organ.faces)))
+        if np.linalg.norm(force) > LEAST_FORCE:
             shown = fine_surface(organ.vademecum, points, self._tip, tip)
         else:
-            shown = FineSurface(points[:, :3], points[:, 3:], organ.faces)
+            shown = plain
         size = np.linalg.norm(shown.displacements, axis=1)
-        largest = float(size[shown.faces].max())
-        self.top = top_for(largest, self.top)
-        of_face = size[shown.faces].mean(axis=1)
-        band = np.minimum((of_face * (N_BANDS / self.top)).astype(int), N_BANDS - 1)
-        positions = np.ascontiguousarray(shown.positions, np.float32)
+        outer = np.zeros(len(size), bool)
+        outer[shown.faces] = True
+        place = int(np.argmax(np.where(outer, size, 0.0)))
+        self._largest = float(size[place])
+        self.top = top_for(self._largest, self.top)
         with self._server.atomic():
-            for i, mesh in enumerate(self._bands):
-                faces = shown.faces[band == i]
-                if len(faces) == 0 and len(mesh.faces) == 1:
-                    continue  # still empty
-                used, local = _own(faces if len(faces) else _NO_FACE)
-                _draw(mesh, positions[used], local)  # the vertices of all would be sent ten times
-            for mesh, points_inside in zip(self._structures, self._inside, strict=True):
-                mesh.vertices = positions[points_inside]
-        return largest
+            if self._errors is None:
+                self._surface.move(shown, self.top)
+            else:
+                self._surface.paint(plain, self._errors, self.error_top)
+            self._structures.move(points[:, :3])
+            self._mark(shown.positions[place])
+        return self._largest
+
+    def _mark(self, place: np.ndarray) -> None:
+        """The place of the largest displacement."""
+        is_seen = self._largest > _LEAST_MARKED
+        if is_seen:
+            self._marker.position = tuple(place)
+            text = f"max {1e3 * self._largest:.1f} mm"
+            if self._marker.text != text:
+                self._marker.text = text
+        if self._marker.visible != is_seen:
+            self._marker.visible = is_seen
 
     def grey(self, held: bool) -> None:
         """Draw the organ in grey while its shape is the last valid one, or in colours again."""
-        if held == self._is_grey:
-            return
-        self._is_grey = held
-        with self._server.atomic():
-            for mesh, shade in zip(self._bands, band_shades().tolist(), strict=True):
-                mesh.color = HELD if held else tuple(shade)
+        self._surface.grey(held)
 
     def place_tool(self, tip: np.ndarray, force: np.ndarray) -> None:
         """Show the tool at its tip [m], with the force on it [N]."""
-        if self._tool is None:
+        if not self._tool.is_shown:
             return
         with self._server.atomic():
-            self._tool.position = tuple(tip)
-            self._tool.wxyz = self._upright(tip)
-            size = float(np.linalg.norm(force))
-            if size > LEAST_FORCE:
-                length = min(FORCE_SCALE * size, MAX_ARROW)
-                self._arrow.points = np.stack([tip, tip + force * (length / size)])[None]
-            if self._arrow.visible != (size > LEAST_FORCE):
-                self._arrow.visible = size > LEAST_FORCE
+            self._tool.place(tip, self._upright(tip), force)

@@ -1,0 +1,39 @@
+"""How wrong the force on a tip is expected to be, place by place on the surface."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from avatar_core.contact.layout import force_error_grid
+from avatar_core.contact.locate import FULL_ACCESS
+from avatar_core.contact.tip_response import make_tip_response
+from avatar_core.vademecum.model import Vademecum
+
+_OFF = 5e-3  # of the accessible surface, up to which a point belongs to it [m]
+_SHELL = 5e-3  # below and above the surface, in which the compliance is sampled [m]
+
+
+def force_error_at(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
+    """Relative error of the force that one contact in ten exceeds, shape (n,).
+
+    As :class:`avatar_core.vademecum.force_error.ForceError` estimates it; NaN off the accessible
+    surface, and everywhere if the vademecum was not measured.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), of the surface at rest [m]
+    """
+    field, surface = vademecum.tip_field, vademecum.surface
+    load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
+    response = make_tip_response(surface, field, load, vademecum.contact_near, _SHELL, _SHELL)
+    grid = ((np.asarray(points, float) - field.origin) / field.spacing[0]).T
+    access = map_coordinates(field.access.astype(float), grid, order=1, mode="nearest")
+    square, _, _ = igl.point_mesh_squared_distance(
+        np.ascontiguousarray(points, float), surface.centers, surface.corners
+    )  # far from the accessible surface, nothing was sampled
+    is_known = (access >= FULL_ACCESS) & (square < _OFF**2)
+    smoothing = map_coordinates(response.smoothing.astype(float), grid, order=1, mode="nearest")
+    error = force_error_grid(vademecum.certificate, vademecum.large, smoothing)
+    return np.where(is_known, error, np.nan)

@@ -1,0 +1,53 @@
+"""What must not be missed on the planning page: numbers that are not what they seem."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avatar_core.vademecum.model import VademecumInfo
+from avatar_ros.msg import ContactState
+from avatar_ros.ui.shown_period import ShownPeriod
+from avatar_ros.ui.texts import SHOWN_FORCE
+
+LARGE_ERROR = 0.10  # expected of the displacement or the force, from which a patient is marked
+
+
+def alerts(info: VademecumInfo, status: int | None, shown: ShownPeriod | None) -> list[str]:
+    """One line each; none if the numbers are what they seem.
+
+    status : of the last ContactState, None if none came lately
+    """
+    return [*_of_patient(info), *_of_period(status, shown)]
+
+
+def _of_patient(info: VademecumInfo) -> list[str]:
+    errors = {"displacement": info.l2_mean, "force": info.force_mean}
+    if not np.isfinite(info.l2_mean):
+        return ["Errors of this organ were never measured: build it with a certificate"]
+    large = [
+        f"{what} {error:.0%}"
+        for what, error in errors.items()
+        if np.isfinite(error) and error >= LARGE_ERROR
+    ]
+    if not large:
+        return []
+    return [f"Large expected error: {', '.join(large)}. Build this patient as reduced or solved"]
+
+
+def _of_period(status: int | None, shown: ShownPeriod | None) -> list[str]:
+    if status is None or shown is None:
+        return []
+    lines = []
+    if shown.is_held:
+        lines.append(
+            "No force: the tool is beyond what the vademecum covers, too deep or off the "
+            "accessible surface"
+        )
+    if status == ContactState.STATUS_EXTRAPOLATED:
+        lines.append("Extrapolated: pressed beyond what was computed; the force is a guess")
+    force = float(np.linalg.norm(shown.force))
+    got = force * shown.fraction
+    is_engaging = status == ContactState.STATUS_ENGAGING
+    if not shown.is_held and not is_engaging and force - got >= SHOWN_FORCE:
+        lines.append(f"Force limited: the device gets {got:.2f} N of {force:.2f} N")
+    return lines

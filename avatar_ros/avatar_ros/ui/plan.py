@@ -1,0 +1,167 @@
+"""Keeps states of the planning page, returns to them, and writes reports and surfaces."""
+
+from __future__ import annotations
+
+import base64
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar_core.errors import AvatarError
+from avatar_core.scene.surface_export import write_surfaces
+from avatar_core.scene.written import replaced
+from avatar_ros.ui.bookmarks import Bookmark, Bookmarks
+from avatar_ros.ui.camera import pose_of
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.report import report
+
+_PICTURE = (420, 560)  # height and width [px]
+_PATIENCE = 20.0  # with a browser that draws a picture [s]
+
+
+@dataclass(frozen=True)
+class PlanNow:
+    """What is shown at the moment of a request; as in :class:`Bookmark`.
+
+    points : ndarray, shape (n, 3), of the cloud [m]
+    """
+
+    organ: Organ
+    target: tuple[float, float, float]
+    scene: str
+    material: dict[str, float]
+    look: tuple[str, str, float]
+    lines: tuple[str, ...]
+    alerts: tuple[str, ...]
+    points: np.ndarray
+
+
+class Plan:
+    """The kept states of the organ that is shown.
+
+    now : what is shown, None without an organ
+    restore : returns the page to a kept state, in one browser
+    offer : shows the labels of what is kept
+    say : reports the outcome in a line
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        now: Callable[[], PlanNow | None],
+        restore: Callable[[Bookmark, Any], None],
+        offer: Callable[[list[str]], None],
+        say: Callable[[str], None],
+    ) -> None:
+        self._folder, self._now, self._restore = folder, now, restore
+        self._offer, self._say = offer, say
+        self._bookmarks: Bookmarks | None = None
+
+    def show_organ(self, organ: Organ) -> None:
+        """The states of another organ; a file that is none is left alone and said."""
+        self._bookmarks = None
+        try:
+            self._bookmarks = Bookmarks(self._folder, organ.id, organ.name)
+        except AvatarError as error:
+            self._say(str(error))
+        self._show()
+
+    def _show(self) -> None:
+        kept = self._bookmarks.kept if self._bookmarks else []
+        self._offer([bookmark.label for bookmark in kept])
+
+    def keep(self, note: str, client: Any) -> None:
+        """Keep what is shown, as one browser sees it."""
+        now, bookmarks = self._now(), self._bookmarks
+        if now is None or bookmarks is None:
+            self._say("nothing to keep yet: choose an organ first")
+            return
+        camera: tuple[float, ...] = ()
+        if client is not None:
+            camera = tuple(float(x) for row in pose_of(client.camera) for x in row)
+        bookmark = Bookmark(
+            note=note.strip(),
+            made=time.strftime("%Y-%m-%dT%H:%M:%S"),
+            target=now.target,
+            scene=now.scene,
+            material=now.material,
+            camera=camera,
+            look=now.look,
+            lines=now.lines,
+            picture=_picture(client),
+        )
+        self._try(lambda: bookmarks.keep(bookmark), f"kept in {bookmarks.path.name}")
+        self._show()
+
+    def drop(self, label: str) -> None:
+        """Delete a kept state."""
+        bookmarks = self._bookmarks
+        if bookmarks is not None and bookmarks.find(label) is not None:
+            self._try(lambda: bookmarks.drop(label), "deleted")
+            self._show()
+
+    def go_back(self, label: str, client: Any) -> None:
+        """Return to a kept state."""
+        found = self._bookmarks.find(label) if self._bookmarks else None
+        if found is None:
+            self._say("no such state is kept of this organ")
+            return
+        self._restore(found, client)
+        self._say(f"back at {found.label}")
+
+    def report(self, client: Any) -> None:
+        """Write a report into the library, and offer it to one browser."""
+        now, bookmarks = self._now(), self._bookmarks
+        if now is None or bookmarks is None:
+            self._say("nothing to report yet: choose an organ first")
+            return
+        path = self._folder / time.strftime("report-%Y%m%d-%H%M%S.html")
+        text = report(now.organ, bookmarks.kept, now.alerts)
+
+        def write() -> None:
+            with replaced(path) as file:
+                file.write_text(text)
+            if client is not None:
+                client.send_file_download(path.name, text.encode())
+
+        self._try(write, f"{path.name}: {len(bookmarks.kept)} kept states")
+
+    def export(self, suffix: str) -> None:
+        """Write the organ and its structures as they are drawn, in mm and LPS."""
+        now = self._now()
+        if now is None:
+            self._say("nothing to export yet: choose an organ first")
+            return
+        path = self._folder / time.strftime(f"deformed-%Y%m%d-%H%M%S{suffix}")
+
+        def write() -> str:
+            written = write_surfaces(now.organ.vademecum, path, now.points)
+            return ", ".join(file.name for file in written)
+
+        self._try(write, "")
+
+    def _try(self, do: Callable[[], str | None], good: str) -> None:
+        try:
+            self._say(do() or good)
+        except AvatarError as error:
+            self._say(str(error))
+
+
+def _picture(client: Any) -> str:
+    """What a browser shows, as PNG in base64; empty if it gives none in time."""
+    if client is None:
+        return ""
+    from PIL import Image
+
+    try:
+        pixels = client.get_render(*_PICTURE, transport_format="jpeg", timeout=_PATIENCE)
+    except Exception:  # viser's own errors, of a browser that left or draws too slowly
+        return ""
+    file = BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return base64.b64encode(file.getvalue()).decode()

@@ -1,0 +1,70 @@
+"""The kept states of an organ on one page of HTML, with pictures and numbers, for the file."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Sequence
+from html import escape
+
+from avatar_ros.ui.bookmarks import Bookmark
+from avatar_ros.ui.organ import Organ
+
+_STYLE = (
+    "body{font:14px/1.45 sans-serif;max-width:60em;margin:1.5em auto;color:#111}"
+    "h1{font-size:1.4em}table{border-collapse:collapse;margin:.6em 0}"
+    "td,th{border:1px solid #bbb;padding:3px 9px;text-align:left}"
+    "section{display:flex;gap:1.2em;page-break-inside:avoid;margin:1em 0}"
+    "img{width:21em;border:1px solid #ccc}.alert{color:#b3261e;font-weight:600}"
+)
+
+
+def report(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> str:
+    """The page.
+
+    alerts : what must not be missed about the organ, as on the planning page
+    """
+    info = organ.info
+    rows = {
+        "organ": organ.name,
+        "vademecum": organ.id,
+        "surface": info.source,
+        "volume": f"{1e6 * info.volume:.0f} ml",
+        "material as built": f"E {info.young_modulus / 1e3:.4g} kPa, nu {info.poisson_ratio:.3g}",
+        "expected error of the displacement": _errors(info.l2_mean, info.l2_worst),
+        "expected error of the force": _errors(info.force_mean, info.force_worst),
+        "inside": ", ".join(organ.structures) or "nothing",
+    }
+    table = "".join(
+        f"<tr><th>{key}</th><td>{escape(value)}</td></tr>" for key, value in rows.items()
+    )
+    marked = "".join(f'<p class="alert">⚠ {escape(line)}</p>' for line in alerts)
+    states = "".join(map(_state, kept)) or "<p>No state was kept.</p>"
+    made = time.strftime("%Y-%m-%d %H:%M")
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Plan of '
+        f"{escape(organ.name)}</title><style>{_STYLE}</style></head><body>"
+        f"<h1>Plan of {escape(organ.name)}, {made}</h1>{marked}<table>{table}</table>{states}"
+        "<p>Axes RAS. The force is that of a rigid tip without friction. "
+        "avatar is not a medical device.</p></body></html>\n"
+    )
+
+
+def _errors(mean: float, worst: float) -> str:
+    return f"{mean:.1%} in the mean, {worst:.1%} at worst" if mean == mean else "never measured"
+
+
+def _state(kept: Bookmark) -> str:
+    picture = (
+        f'<img alt="the organ as it was seen" src="data:image/png;base64,{kept.picture}">'
+        if re.fullmatch(r"[A-Za-z0-9+/]+={0,2}", kept.picture)
+        else ""
+    )
+    x, y, z = (1e3 * value for value in kept.target)
+    scene = kept.scene or "natural effects"
+    lines = [*kept.lines, f"Tip at {x:.1f}, {y:.1f}, {z:.1f} mm; scene {scene}"]
+    numbers = "<br>".join(map(escape, lines))
+    return (
+        f"<section>{picture}<div><b>{escape(kept.note or 'without a note')}</b><br>"
+        f"{escape(kept.made.replace('T', ' '))}<br>{numbers}</div></section>"
+    )

@@ -1,0 +1,41 @@
+"""The plan: states that are kept, a report of them, and surfaces to take away."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from avatar_ros.ui.actions import Actions
+from avatar_ros.ui.tabs.choices import NOTHING, set_options
+
+FORMATS = (".stl", ".vtp", ".obj")
+
+
+class PlanTab:
+    """Controls of what is kept."""
+
+    def __init__(self, gui: Any, actions: Actions) -> None:
+        gui.add_button("Undo the last change", hint="Ctrl+Z").on_click(lambda _: actions.undo())
+        self._note = gui.add_text("Note", "")
+        gui.add_button("Keep this state").on_click(
+            lambda event: actions.keep(self._note.value, event.client)
+        )
+        self._kept = gui.add_dropdown("Kept", (NOTHING,))
+        group = gui.add_button_group("Kept state", ("return to it", "delete it"))
+        group.on_click(self._on_kept)
+        gui.add_button("Report of kept states").on_click(lambda event: actions.report(event.client))
+        self._format = gui.add_dropdown("Format", FORMATS)
+        gui.add_button("Export deformed surfaces").on_click(
+            lambda _: actions.export(self._format.value)
+        )
+        gui.add_markdown("Surfaces are in mm and LPS, as 3D Slicer takes them.")
+        self._actions = actions
+
+    def _on_kept(self, event: Any) -> None:
+        if event.target.value == "delete it":
+            self._actions.drop(self._kept.value)
+        else:
+            self._actions.go_back(self._kept.value, event.client)
+
+    def offer(self, labels: list[str]) -> None:
+        """Offer kept states, the newest first."""
+        set_options(self._kept, labels[::-1])

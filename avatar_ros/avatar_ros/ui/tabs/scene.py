@@ -1,0 +1,28 @@
+"""The scene: which effects are simulated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from avatar_ros.ui.actions import Actions
+from avatar_ros.ui.tabs.choices import NOTHING, set_options
+
+
+class SceneTab:
+    """Choice of a scene, with what it simulates."""
+
+    def __init__(self, gui: Any, actions: Actions) -> None:
+        self._scenes = gui.add_dropdown("Scene", (NOTHING,))
+        self._text = gui.add_markdown("")
+        self._scenes.on_update(lambda _: self._describe())
+        gui.add_button("Switch to scene").on_click(lambda _: actions.scene(self._scenes.value))
+        self._texts: dict[str, str] = {}
+
+    def offer(self, texts: dict[str, str]) -> None:
+        """Offer scenes by name, with their descriptions."""
+        self._texts = texts
+        set_options(self._scenes, list(texts))
+        self._describe()
+
+    def _describe(self) -> None:
+        self._text.content = self._texts.get(self._scenes.value, "")

@@ -1,0 +1,83 @@
+"""The tool: what it feels, how it is moved, and what is recorded of it."""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+from typing import Any
+
+import numpy as np
+from viser import uplot
+
+from avatar_ros.ui.actions import Actions
+from avatar_ros.ui.orientation import AXES
+from avatar_ros.ui.tabs.plots import plot
+
+STEP = 1e-3  # of a key [m]
+_HISTORY = 10.0  # of the plot [s]
+_LEAST_RANGE = 1.0  # of the plot [N]
+# Keys, what they do, and the side of the patient to which they move the tool; "": the normal.
+KEYS = {
+    "J": ("Tool to the patient's right", "R"),
+    "L": ("Tool to the patient's left", "L"),
+    "I": ("Tool up (superior)", "S"),
+    "K": ("Tool down (inferior)", "I"),
+    "U": ("Press the tool in", ""),
+    "O": ("Lift the tool", ""),
+}
+_SIDES = {"right": "R", "left": "L", "up": "S", "down": "I"}  # of the patient, by button
+
+
+class ToolTab:
+    """Plot of the force, buttons that move the tool, and its recording."""
+
+    def __init__(self, gui: Any, actions: Actions) -> None:
+        self._gui, self._actions = gui, actions
+        n = round(_HISTORY * 5)
+        self._times: deque[float] = deque(maxlen=n)
+        self._forces: deque[tuple[float, float, float]] = deque(maxlen=n)
+        self._plot = plot(
+            gui,
+            "Force on the tool [N]",
+            120,
+            _LEAST_RANGE,
+            uplot.Series(label="force [N]", stroke="#0072B2", width=2),
+            uplot.Series(label="at least [N]", stroke="#D55E0080", width=1),
+            uplot.Series(label="at most [N]", stroke="#D55E0080", width=1),
+            bands=(uplot.Band(series=(3, 2), fill="#D55E0030"),),
+        )
+        for name, labels in (("Tool", ("press 1 mm", "lift 1 mm")), ("1 mm", tuple(_SIDES))):
+            group = gui.add_button_group(name, labels)
+            group.on_click(lambda event: self._nudge(event.target.value))
+        gui.add_button("Lift off the organ").on_click(lambda _: actions.lift())
+        self._recording = gui.add_button("Record", hint="poses, forces and shapes, from rest")
+        self._recording.on_click(lambda _: actions.record(self._recording.label == "Record"))
+        gui.add_markdown(
+            "Drag the blue tip, with Shift along its shaft; or use the keys J L I K, "
+            "U to press, O to lift."
+        )
+        for key, (label, side) in KEYS.items():
+            way = -STEP if key == "U" else STEP
+            command = gui.add_command(f"{label}, 1 mm", hotkey=key)
+            command.on_trigger(partial(self._on_key, side, way))
+
+    def _nudge(self, label: str) -> None:
+        way = -STEP if label.startswith("press") else STEP
+        self._move(_SIDES.get(label, ""), way)
+
+    def _on_key(self, side: str, way: float, _: Any) -> None:
+        self._move(side, way)
+
+    def _move(self, side: str, way: float) -> None:
+        self._actions.nudge(AXES[side] if side else None, way)
+
+    def show_force(self, now: float, force: float, error: float) -> None:
+        """Add a point to the plot [s, N]; five per second are enough."""
+        self._times.append(now)
+        self._forces.append((force, max(force - error, 0.0), force + error))
+        values = np.array(self._forces).T
+        self._plot.data = (np.array(self._times), *(row.copy() for row in values))
+
+    def show_recording(self, is_on: bool) -> None:
+        """Label the button with what it does next."""
+        self._recording.label = "Stop and save" if is_on else "Record"
