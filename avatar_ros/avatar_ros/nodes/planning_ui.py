@@ -202,6 +202,7 @@ class PlanningNode(ManagedNode):
 
     def _take_organ(self, message: VademecumFile) -> None:
         if self._organ is not None and self._organ.id == message.id:
+            self._say(f"{self._organ.name} is shown")
             return
         try:
             data = bytes(message.data)

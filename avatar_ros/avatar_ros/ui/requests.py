@@ -63,13 +63,19 @@ class Requests:
         return tuple(name for name, is_ready in ready.items() if not is_ready)
 
     def load_vademecum(self, name: str, report: Report) -> None:
-        """Have the loader announce a file of its library."""
+        """Have the loader announce a file of its library; what is announced is shown in time."""
         if not self._load_vademecum.service_is_ready():
             report(START["vademecum_loader"])
             return
         report(f"loading {name} ...")
-        future = self._load_vademecum.call_async(LoadVademecum.Request(name=name))
-        future.add_done_callback(lambda done: report(_outcome(done, f"{name} loaded")))
+
+        def answered(done: Any) -> None:
+            # The organ may come before the answer, and says more than "loaded".
+            if failure := _outcome(done, ""):
+                report(failure)
+
+        request = LoadVademecum.Request(name=name)
+        self._load_vademecum.call_async(request).add_done_callback(answered)
 
     def load_scene(
         self,
