@@ -21,24 +21,21 @@ except ImportError as error:
 from avatar_core.contact.error_map import force_error_at
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
-from avatar_core.scene.file import read_scene, shipped_scenes
-from avatar_core.scene.model import Scene
 from avatar_core.vademecum.storage import parse_vademecum
 from avatar_ros.framework import qos
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import AUTOSTART, Parameter, ParameterError, values
 from avatar_ros.framework.reader import Reader
 from avatar_ros.framework.templates import stamp_nanoseconds
-from avatar_ros.loop.settings import MATERIAL, TIP, chosen_tips
+from avatar_ros.loop.settings import MATERIAL, TIP
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
-from avatar_ros.prepare.scenes import scene_file
 from avatar_ros.ui.actions import Actions, Wanted
 from avatar_ros.ui.alerts import alerts
 from avatar_ros.ui.bookmarks import Bookmark
 from avatar_ros.ui.camera import turn_camera
+from avatar_ros.ui.chosen import Chosen, Page
 from avatar_ros.ui.display import RATE, NewestCloud
 from avatar_ros.ui.guard import Guard, guarded
-from avatar_ros.ui.history import History
 from avatar_ros.ui.legend import EXPECTED_ERROR, legend
 from avatar_ros.ui.library import Library
 from avatar_ros.ui.measures import Measures, Now
@@ -48,7 +45,7 @@ from avatar_ros.ui.orientation import Pose
 from avatar_ros.ui.panels import Panels
 from avatar_ros.ui.plan import Plan, PlanNow
 from avatar_ros.ui.presets import material_text
-from avatar_ros.ui.recorder import Recorder, scene_in_force
+from avatar_ros.ui.recorder import Recorder
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
 from avatar_ros.ui.texts import frame_text, plain, recorded_text, scene_texts, warnings
@@ -82,16 +79,10 @@ class PlanningNode(ManagedNode):
         self._state = SharedToolState.make()
         self._driver = ToolDriverProcess(self._state)
         self._recorder = Recorder(self._state)
-        self._history = History()
-        self._look = (WHOLE, "A", 0.5)
         self._lines: list[str] = []  # numbers that are shown
         self._alerts: list[str] = []
         self._reader = Reader(1 << 30)
-        self._organ: Organ | None = None
         self._cloud: NewestCloud | None = None
-        self._material: dict[str, float] = {}  # chosen here, by coordinate
-        self._scene = ""  # chosen here, by name
-        self._contact: dict[str, Any] = {}  # parameters of the contact node
         self._was_missing, self._is_to_restore = True, False
         self._frame, self._frame_id = 0, FRAME
         self._began = time.monotonic()
@@ -116,7 +107,18 @@ class PlanningNode(ManagedNode):
             server = viser.ViserServer(value["host"], value["port"], verbose=False)
         self._server = server
         self._requests = Requests(self)
-        self._view = OrganView(server, self._drag, self._show_cube)
+        self._chosen = chosen = Chosen(
+            self._state.live,
+            self._requests,
+            Page(
+                say=self._say,
+                stop_recording=self._stop_recording,
+                change_tip=self._change_tip,
+                show_material=lambda values: self._panels.organ.show_material(values),
+                show_look=self._show_look,
+            ),
+        )
+        self._view = OrganView(server, chosen.drag, self._show_cube)
         self._measures = Measures(MeasuresView(server))
         server.scene.on_click()(self._click)
         self._plan = Plan(
@@ -130,19 +132,19 @@ class PlanningNode(ManagedNode):
             server,
             Actions(
                 vademecum=lambda name: self._requests.load_vademecum(name, self._say),
-                material=self._choose_material,
-                scene=self._choose_scene,
+                material=chosen.choose_material,
+                scene=chosen.choose_scene,
                 build=self._build,
                 cancel=self._requests.cancel_patient,
-                nudge=self._nudge,
-                lift=self._lift,
+                nudge=chosen.nudge,
+                lift=chosen.lift,
                 record=self._record,
                 turn=self._view.turn_to,
-                look=self._choose_look,
+                look=chosen.choose_look,
                 errors=self._show_errors,
                 measure=self._measures.choose,
                 clear_measures=self._measures.clear,
-                undo=self._undo,
+                undo=chosen.undo,
                 keep=self._plan.keep,
                 drop=self._plan.drop,
                 go_back=self._plan.go_back,
@@ -185,6 +187,11 @@ class PlanningNode(ManagedNode):
             self._server.stop()
             self._server = None
 
+    @property
+    def _organ(self) -> Organ | None:
+        """That is shown."""
+        return self._chosen.organ
+
     # --- From the cell -----------------------------------------------------------------------
 
     def _take_frame(self, info: VademecumInfo) -> None:
@@ -212,16 +219,14 @@ class PlanningNode(ManagedNode):
             self._say(str(error))
             return
         self._stop_recording("the organ changed")
-        self._material = {}
-        self._history.forget()
-        tip = self._tip()
-        self._state.live["target"][0] = organ.above(tip.offset + CLEARANCE)
+        self._chosen.forget(GLASS if organ.structures else WHOLE)
+        tip = self._chosen.tip
+        self._chosen.put(organ.above(tip.offset + CLEARANCE))
         self._view.show(organ, tip)
-        self._look = (GLASS if organ.structures else WHOLE, "A", 0.5)
         self._measures.show_organ(organ, tip)
         self._periods.forget()
         self._panels.show_organ(organ)
-        self._organ = organ
+        self._chosen.organ = organ
         self._listen_to_clouds()
         self._requests.parameters_of_contact(tuple(MATERIAL), self._note_material)
         self._plan.show_organ(organ)
@@ -233,14 +238,6 @@ class PlanningNode(ManagedNode):
         self._panels.timing.show_loop(
             now, window.step_p99, window.missed / max(window.window, 1e-3)
         )
-
-    def _tip(self) -> Tip:
-        """The tip of the first tool."""
-        if self._scene:
-            return read_scene(shipped_scenes()[self._scene]).tools[0].tip
-        if "tools" not in self._contact:  # the contact node was not asked yet
-            return Tip()
-        return chosen_tips(self._contact, len(self._contact["tools"]))[0]
 
     def _show(self) -> None:
         """Update the page; called for every frame."""
@@ -258,7 +255,7 @@ class PlanningNode(ManagedNode):
     def _show_numbers(self, organ: Organ, shown: ShownPeriod) -> None:
         """Beside the picture, of the same period."""
         n_kept = self._recorder.n_periods if self._recorder.is_on else None
-        values = self._values(organ)
+        values = self._chosen.values(organ)
         poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
         material = material_text(values["young"], poisson, values.get("contrast"))
         numbers = frame_text(shown, material, n_kept)
@@ -341,42 +338,23 @@ class PlanningNode(ManagedNode):
                 (*_OF_CONTACT, *MATERIAL), self._on_contact_started
             )
         elif self._is_to_restore and status not in (None, ContactState.STATUS_NO_MODEL):
-            self._restore()
+            self._is_to_restore = False
+            self._chosen.send_again()
 
     def _on_contact_started(self, values: dict[str, Any]) -> None:
         """The contact node runs, for the first time or again."""
-        self._contact, self._is_to_restore = values, True
-        self._change_tip()
-        self._panels.organ.show_material(self._in_force())
+        self._chosen.contact, self._is_to_restore = values, True
+        self._change_tip(self._chosen.tip)
+        self._panels.organ.show_material(self._chosen.in_force)
 
-    def _change_tip(self) -> None:
-        tip = self._tip()
+    def _change_tip(self, tip: Tip) -> None:
         self._view.change_tip(tip)
         self._measures.change_tip(tip)
 
     def _note_material(self, values: dict[str, Any]) -> None:
         """Show the material in force, even if another client chose it."""
-        self._contact |= values
-        self._panels.organ.show_material(self._in_force())
-
-    def _in_force(self) -> dict[str, float]:
-        """Values of the material that are not those of the file, by coordinate."""
-        contact = self._contact
-        return {MATERIAL[key]: contact[key] for key in MATERIAL if contact.get(key)} | (
-            self._material
-        )
-
-    def _values(self, organ: Organ) -> dict[str, float]:
-        """Of the material, by coordinate, as built where nothing was chosen."""
-        return {name: here for name, (_, _, here) in organ.ranges.items()} | self._in_force()
-
-    def _restore(self) -> None:
-        """Send what was chosen here to a restarted contact node, once it has an organ."""
-        self._is_to_restore = False
-        if self._scene:
-            self._switch(self._scene)
-        if self._material:
-            self._requests.set_material(dict(self._material), self._say)
+        self._chosen.contact |= values
+        self._panels.organ.show_material(self._chosen.in_force)
 
     # --- From the page -----------------------------------------------------------------------
 
@@ -392,72 +370,6 @@ class PlanningNode(ManagedNode):
         if self._organ is not None:
             ray = np.array(event.ray_origin), np.array(event.ray_direction)
             self._say(self._measures.click(*ray, self._view.points))
-
-    def _drag(self, target: np.ndarray, along_shaft: bool) -> None:
-        """Move the tool to where the mouse is, or as far along its shaft as the mouse moved up."""
-        organ = self._organ
-        if organ is None or not np.isfinite(target).all():
-            return
-        if along_shaft:
-            here = self._state.live["tip"][0].copy()
-            target = here + float((target - here)[2]) * organ.outward(here)
-        self._move(target, "drag")
-
-    def _move(self, target: np.ndarray, how: str) -> None:
-        before = self._state.live["target"][0].copy()
-        self._history.note(how, "the tool's place", lambda: self._put(before))
-        self._put(target)
-
-    def _put(self, target: np.ndarray) -> None:
-        self._state.live["target"][0] = target
-
-    def _undo(self) -> None:
-        what = self._history.undo()
-        self._say(f"undone: {what}" if what else "nothing to undo")
-
-    def _nudge(self, axis: Any, way: float) -> None:
-        target = self._state.live["target"][0].copy()
-        if axis is None and self._organ is not None:
-            axis = self._organ.outward(target)
-        if axis is not None:
-            self._move(target + way * np.asarray(axis), "nudge")
-
-    def _lift(self) -> None:
-        if self._organ is not None:
-            target = self._state.live["target"][0].copy()
-            self._move(target + 0.03 * self._organ.outward(target), "lift")
-
-    def _choose_material(self, values: dict[str, float]) -> None:
-        organ = self._organ
-        if organ is None:
-            return
-        present = self._values(organ)
-        before = {name: present[name] for name in values if name in present}
-        name = ", ".join(values)
-        self._history.note(f"material {name}", f"the material ({name})", lambda: self._set(before))
-        self._set(values)
-
-    def _set(self, values: dict[str, float]) -> None:
-        self._stop_recording("the material changed")
-        self._material |= values
-        self._requests.set_material(dict(values), self._say)
-        self._panels.organ.show_material(values)
-
-    def _choose_scene(self, name: str) -> None:
-        before = self._scene
-        if before and before != name:
-            self._history.note("scene", "the scene", lambda: self._switch(before))
-        self._switch(name)
-
-    def _switch(self, name: str) -> None:
-        self._stop_recording("the scene changed")
-
-        def note(switched: bool) -> None:
-            if switched:
-                self._scene = name
-                self._change_tip()
-
-        self._requests.load_scene(name, self._say, then=note)
 
     def _build(self, wanted: Wanted) -> None:
         def load(file: str) -> None:
@@ -475,69 +387,33 @@ class PlanningNode(ManagedNode):
 
     # --- The plan ----------------------------------------------------------------------------
 
-    def _choose_look(self, how: str, side: str, part: float) -> None:
-        before = self._look
-        self._history.note("look", "how the organ is shown", lambda: self._show_look(*before))
-        self._show_look(how, side, part)
-
     def _show_look(self, how: str, side: str, part: float) -> None:
-        self._look = how, side, part
         self._view.look(how, side, part)
         self._panels.organ.show_look(how, side, part)
 
     def _plan_now(self) -> PlanNow | None:
-        organ = self._organ
+        organ, chosen = self._organ, self._chosen
         if organ is None:
             return None
-        x, y, z = self._state.live["target"][0].tolist()
+        x, y, z = chosen.target.tolist()
         return PlanNow(
             organ,
             (x, y, z),
-            self._scene,
-            self._values(organ),
-            self._look,
+            chosen.scene,
+            chosen.values(organ),
+            chosen.look,
             tuple(self._lines),
             tuple(self._alerts),
             self._view.points,
         )
 
     def _return_to(self, kept: Bookmark, client: Any) -> None:
-        """Scene, material, look, tool and view of a kept state; one step to undo."""
-        organ = self._organ
-        if organ is None:
+        """Scene, material, look, tool and view of a kept state."""
+        if self._organ is None:
             return
-        target, look, values = self._state.live["target"][0].copy(), self._look, self._values(organ)
-        scene = self._scene
-
-        def back() -> None:
-            self._arrange(organ, scene, values, look, target)
-
-        self._history.note("return", "the return to a kept state", back)
-        self._arrange(organ, kept.scene, kept.material, kept.look, np.array(kept.target))
+        self._chosen.return_to(kept.scene, kept.material, kept.look, np.array(kept.target))
         if client is not None and kept.camera:
             turn_camera(client, Pose(*np.array(kept.camera).reshape(3, 3)))
-
-    def _arrange(
-        self,
-        organ: Organ,
-        scene: str,
-        material: dict[str, float],
-        look: tuple[str, str, float],
-        target: np.ndarray,
-    ) -> None:
-        if scene and scene != self._scene and scene in shipped_scenes():
-            self._switch(scene)
-        present = self._values(organ)
-        wanted = {
-            name: float(np.clip(material[name], low, high))
-            for name, (low, high, _) in organ.ranges.items()
-            if name in material
-        }
-        changed = {name: value for name, value in wanted.items() if value != present[name]}
-        if changed:
-            self._set(changed)
-        self._show_look(*look)
-        self._put(target)
 
     # --- Recordings --------------------------------------------------------------------------
 
@@ -549,14 +425,15 @@ class PlanningNode(ManagedNode):
         if organ is None or not self._answers():
             self._say("nothing to record: there is no organ, or the contact node does not answer")
             return
-        if len(self._contact.get("tools", ())) != 1:
+        if len(self._chosen.contact.get("tools", ())) != 1:
             self._say("a recording holds one tool; start the contact node with one")
             return
         if self._state.live["touches"][0]:
             self._say("lift the tool off the organ first: a recording starts at rest")
             return
-        scene = self._scene_in_force(organ)
-        text = self._recorder.open(organ.vademecum, scene, float(self._contact["rate"]))
+        scene = self._chosen.scene_in_force(organ)
+        rate = float(self._chosen.contact["rate"])
+        text = self._recorder.open(organ.vademecum, scene, rate)
         self._panels.tool.show_recording(True)
 
         def begin(switched: bool) -> None:
@@ -570,19 +447,6 @@ class PlanningNode(ManagedNode):
                 self._say("not recorded: the tool touched the organ again; lift it, and record")
 
         self._requests.load_scene(scene.name, self._say, yaml=text, then=begin)
-
-    def _scene_in_force(self, organ: Organ) -> Scene:
-        contact = self._contact
-        given = self._scene or contact["scene"]
-        chosen = read_scene(scene_file(given)) if given else None
-        return scene_in_force(
-            chosen,
-            organ.vademecum,
-            self._in_force(),
-            self._tip(),
-            contact["cloud"],
-            contact["cloud_divisor"],
-        )
 
     def _stop_recording(self, why: str) -> None:
         if not self._recorder.is_on:

@@ -1,0 +1,237 @@
+"""What a user chose on the planning page: scene, material, look and the tool's place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from avatar_core.geometry.tip import Tip
+from avatar_core.scene.file import read_scene, shipped_scenes
+from avatar_core.scene.model import Scene
+from avatar_ros.loop.settings import MATERIAL, chosen_tips
+from avatar_ros.prepare.scenes import scene_file
+from avatar_ros.ui.history import History
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.recorder import scene_in_force
+from avatar_ros.ui.requests import Requests
+from avatar_ros.ui.view import WHOLE
+
+_LIFT = 0.03  # off the organ [m]
+
+
+class Page(NamedTuple):
+    """What choices bring about on the page."""
+
+    say: Callable[[str], None]
+    stop_recording: Callable[[str], None]  # and why
+    change_tip: Callable[[Tip], None]
+    show_material: Callable[[dict[str, float]], None]  # values by coordinate [SI]
+    show_look: Callable[[str, str, float], None]  # how, from which side, which part
+
+
+class Chosen:
+    """The present choices, each of which can be undone.
+
+    Parameters
+    ----------
+    live : of :class:`avatar_ros.ui.tool_state.SharedToolState`, where the tool's place is
+    requests, page : what choices change in the cell and on the page
+
+    Attributes
+    ----------
+    organ : that is shown, None before the first
+    contact : parameters of the contact node, by name; empty until it was asked
+    scene : name of the one chosen here, empty for the contact node's own
+    look : how the organ is shown, from which side, and which part of it
+    """
+
+    def __init__(self, live: np.ndarray, requests: Requests, page: Page) -> None:
+        self._live, self._requests, self._page = live, requests, page
+        self._history = History()
+        self._material: dict[str, float] = {}  # by coordinate
+        self.organ: Organ | None = None
+        self.contact: dict[str, Any] = {}
+        self.scene = ""
+        self.look = (WHOLE, "A", 0.5)
+
+    def forget(self, look: str) -> None:
+        """Another organ comes, in its own material, and is shown as ``look``."""
+        self._material = {}
+        self._history.forget()
+        self.look = (look, "A", 0.5)
+
+    def undo(self) -> None:
+        """Take the last choice back."""
+        what = self._history.undo()
+        self._page.say(f"undone: {what}" if what else "nothing to undo")
+
+    # --- The tool ----------------------------------------------------------------------------
+
+    @property
+    def tip(self) -> Tip:
+        """Of the first tool."""
+        if self.scene:
+            return read_scene(shipped_scenes()[self.scene]).tools[0].tip
+        if "tools" not in self.contact:
+            return Tip()
+        return chosen_tips(self.contact, len(self.contact["tools"]))[0]
+
+    @property
+    def target(self) -> np.ndarray:
+        """Where the tool is to go, shape (3,) [m]."""
+        return np.array(self._live["target"][0])
+
+    def put(self, target: np.ndarray) -> None:
+        """Send the tool to a place, which cannot be undone, shape (3,) [m]."""
+        self._live["target"][0] = target
+
+    def drag(self, target: np.ndarray, along_shaft: bool) -> None:
+        """Move the tool to where the mouse is, or as far along its shaft as the mouse moved up."""
+        organ = self.organ
+        if organ is None or not np.isfinite(target).all():
+            return
+        if along_shaft:
+            here = self._live["tip"][0].copy()
+            target = here + float((target - here)[2]) * organ.outward(here)
+        self._move(target, "drag")
+
+    def nudge(self, axis: Any, way: float) -> None:
+        """Move the tool along an axis, None for the surface's normal, by a distance [m]."""
+        target = self.target
+        if axis is None and self.organ is not None:
+            axis = self.organ.outward(target)
+        if axis is not None:
+            self._move(target + way * np.asarray(axis), "nudge")
+
+    def lift(self) -> None:
+        """Move the tool off the organ."""
+        if self.organ is not None:
+            target = self.target
+            self._move(target + _LIFT * self.organ.outward(target), "lift")
+
+    def _move(self, target: np.ndarray, how: str) -> None:
+        before = self.target
+        self._history.note(how, "the tool's place", lambda: self.put(before))
+        self.put(target)
+
+    # --- Material and scene ------------------------------------------------------------------
+
+    @property
+    def in_force(self) -> dict[str, float]:
+        """Values of the material that are not those of the file, by coordinate [SI]."""
+        contact = self.contact
+        given = {MATERIAL[key]: contact[key] for key in MATERIAL if contact.get(key)}
+        return given | self._material
+
+    def values(self, organ: Organ) -> dict[str, float]:
+        """Of the material, by coordinate, as built where nothing was chosen [SI]."""
+        return {name: here for name, (_, _, here) in organ.ranges.items()} | self.in_force
+
+    def choose_material(self, values: dict[str, float]) -> None:
+        """Set some values, by coordinate [SI]."""
+        organ = self.organ
+        if organ is None:
+            return
+        present = self.values(organ)
+        before = {name: present[name] for name in values if name in present}
+        name = ", ".join(values)
+        self._history.note(f"material {name}", f"the material ({name})", lambda: self._set(before))
+        self._set(values)
+
+    def _set(self, values: dict[str, float]) -> None:
+        self._page.stop_recording("the material changed")
+        self._material |= values
+        self._requests.set_material(dict(values), self._page.say)
+        self._page.show_material(values)
+
+    def choose_scene(self, name: str) -> None:
+        """Switch to a shipped scene."""
+        before = self.scene
+        if before and before != name:
+            self._history.note("scene", "the scene", lambda: self._switch(before))
+        self._switch(name)
+
+    def _switch(self, name: str) -> None:
+        self._page.stop_recording("the scene changed")
+
+        def note(switched: bool) -> None:
+            if switched:
+                self.scene = name
+                self._page.change_tip(self.tip)
+
+        self._requests.load_scene(name, self._page.say, then=note)
+
+    def scene_in_force(self, organ: Organ) -> Scene:
+        """The scene that reproduces what runs now; ``contact`` must be known."""
+        given = self.scene or self.contact["scene"]
+        return scene_in_force(
+            read_scene(scene_file(given)) if given else None,
+            organ.vademecum,
+            self.in_force,
+            self.tip,
+            self.contact["cloud"],
+            self.contact["cloud_divisor"],
+        )
+
+    def send_again(self) -> None:
+        """Send what was chosen here to a contact node that was started again."""
+        if self.scene:
+            self._switch(self.scene)
+        if self._material:
+            self._requests.set_material(dict(self._material), self._page.say)
+
+    # --- The look, and all at once -----------------------------------------------------------
+
+    def choose_look(self, how: str, side: str, part: float) -> None:
+        """Show the organ whole, as glass or cut open, from a side, by a part."""
+        before = self.look
+        self._history.note("look", "how the organ is shown", lambda: self._show_look(*before))
+        self._show_look(how, side, part)
+
+    def _show_look(self, how: str, side: str, part: float) -> None:
+        self.look = how, side, part
+        self._page.show_look(how, side, part)
+
+    def return_to(
+        self,
+        scene: str,
+        material: dict[str, float],
+        look: tuple[str, str, float],
+        target: np.ndarray,
+    ) -> None:
+        """Choose all of a kept state; one step to undo.
+
+        material : values by coordinate [SI]; target : ndarray, shape (3,) [m]
+        """
+        organ = self.organ
+        if organ is None:
+            return
+        before = self.scene, self.values(organ), self.look, self.target
+        self._history.note(
+            "return", "the return to a kept state", lambda: self._arrange(organ, *before)
+        )
+        self._arrange(organ, scene, material, look, target)
+
+    def _arrange(
+        self,
+        organ: Organ,
+        scene: str,
+        material: dict[str, float],
+        look: tuple[str, str, float],
+        target: np.ndarray,
+    ) -> None:
+        if scene and scene != self.scene and scene in shipped_scenes():
+            self._switch(scene)
+        present = self.values(organ)
+        wanted = {
+            name: float(np.clip(material[name], low, high))
+            for name, (low, high, _) in organ.ranges.items()
+            if name in material
+        }
+        changed = {name: value for name, value in wanted.items() if value != present[name]}
+        if changed:
+            self._set(changed)
+        self._show_look(*look)
+        self.put(target)
