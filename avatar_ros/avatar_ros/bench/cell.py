@@ -28,6 +28,7 @@ import numpy as np
 from avatar_core.common.processes import ModuleProcess, thread_limits
 from avatar_core.errors import AvatarError
 from avatar_ros.bench import footprint
+from avatar_ros.bench.command import print_report
 from avatar_ros.bench.footprint import Growth, footprints
 from avatar_ros.bench.report import CellMeasurement, CellReport, Times
 from avatar_ros.bench.scripted_tool import READY, RoundTrips
@@ -270,15 +271,9 @@ def main() -> int:
     parser.add_argument("--changes", type=float, default=0.0, help="of the material [Hz]")
     parser.add_argument("--output", type=Path, help="write all figures as JSON")
     chosen = parser.parse_args()
-    try:
-        report = run_cell(chosen.vademecum, chosen.seconds, chosen.output, changes=chosen.changes)
-    except AvatarError as error:
-        print(f"avatar: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130  # by Ctrl-C, as shells count it
-    print(report.table(), flush=True)
-    return 0
+    return print_report(
+        lambda: run_cell(chosen.vademecum, chosen.seconds, chosen.output, changes=chosen.changes)
+    )
 
 
 if __name__ == "__main__":

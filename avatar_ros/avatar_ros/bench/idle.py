@@ -10,15 +10,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from avatar_core.errors import AvatarError
 from avatar_ros.bench.cell import CellError, Module, isolated_environment
+from avatar_ros.bench.command import print_report
 from avatar_ros.bench.footprint import children
 from avatar_ros.bench.thread_times import between, thread_times
 
@@ -182,17 +181,7 @@ def main() -> int:
     parser.add_argument("--atlas", type=Path, help="of the patients' service")
     parser.add_argument("--output", type=Path, help="write all figures as JSON")
     chosen = parser.parse_args()
-    try:
-        report = run_idle(chosen.seconds, chosen.atlas)
-    except AvatarError as error:
-        print(f"avatar: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130  # by Ctrl-C, as shells count it
-    if chosen.output:
-        report.save(chosen.output)
-    print(report.table(), flush=True)
-    return 0
+    return print_report(lambda: run_idle(chosen.seconds, chosen.atlas), chosen.output)
 
 
 if __name__ == "__main__":

@@ -25,9 +25,9 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 
 from avatar_core.contact import tool_path
-from avatar_core.errors import AvatarError
 from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.bench.cell import CellError, isolated_environment
+from avatar_ros.bench.command import print_report
 from avatar_ros.bench.footprint import children
 from avatar_ros.bench.thread_times import thread_times
 from avatar_ros.framework import discovery, qos, realtime
@@ -238,17 +238,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="write all figures as JSON")
     parser.add_argument("command", nargs="*", help="that starts the cell; default: avatar cell")
     chosen = parser.parse_args()
-    try:
-        report = run_start(chosen.vademecum, chosen.command or None)
-    except AvatarError as error:
-        print(f"avatar: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130  # by Ctrl-C, as shells count it
-    if chosen.output:
-        report.save(chosen.output)
-    print(report.table(), flush=True)
-    return 0
+    return print_report(lambda: run_start(chosen.vademecum, chosen.command or None), chosen.output)
 
 
 if __name__ == "__main__":
