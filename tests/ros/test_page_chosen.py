@@ -1,0 +1,114 @@
+"""Choices on the planning page: each reaches the cell once, and is taken back as a whole."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+pytest.importorskip("viser", reason="the extra ui is not installed")
+
+from avatar_ros.ui.chosen import Chosen, Page
+from avatar_ros.ui.view import GLASS, WHOLE
+
+pytestmark = pytest.mark.ros
+
+RANGES = {"young": (1e3, 1e6, 170e3), "poisson": (0.40, 0.49, 0.48)}  # least, most, as built
+
+
+class Cell:
+    """What the page and the nodes were asked for."""
+
+    def __init__(self) -> None:
+        self.material: list[dict[str, float]] = []
+        self.scenes: list[str] = []
+        self.looks: list[tuple[str, str, float]] = []
+        self.said: list[str] = []
+        self.stopped: list[str] = []
+        self.tips: list[Any] = []
+
+    def set_material(self, values: dict[str, float], report: Any) -> None:
+        self.material.append(values)
+
+    def load_scene(self, name: str, report: Any, then: Any) -> None:
+        self.scenes.append(name)
+        then(name != "refused")
+
+
+@pytest.fixture
+def cell() -> Cell:
+    return Cell()
+
+
+@pytest.fixture
+def chosen(cell: Cell) -> Chosen:
+    live = np.zeros(1, [("target", float, 3), ("tip", float, 3)])
+    page = Page(
+        say=cell.said.append,
+        stop_recording=cell.stopped.append,
+        change_tip=cell.tips.append,
+        show_material=lambda values: None,
+        show_look=lambda *look: cell.looks.append(look),
+    )
+    found = Chosen(live, cell, page)  # type: ignore[arg-type]
+    up = np.array([0.0, 0.0, 1.0])
+    found.organ = SimpleNamespace(ranges=RANGES, outward=lambda place: up)  # type: ignore[assignment]
+    return found
+
+
+def test_a_return_is_taken_back_as_a_whole(chosen: Chosen, cell: Cell) -> None:
+    chosen.put(np.array([0.01, 0.0, 0.0]))
+    chosen.choose_material({"young": 50e3})
+    kept = ("bare", {"young": 90e3, "poisson": 0.6}, (GLASS, "R", 0.3), np.array([0.0, 0.02, 0.0]))
+    chosen.return_to(*kept)
+    assert cell.material[-1] == {"young": 90e3, "poisson": 0.49}  # within the organ's range
+    assert chosen.look == (GLASS, "R", 0.3) and chosen.target.tolist() == [0.0, 0.02, 0.0]
+    chosen.undo()
+    assert cell.material[-1] == {"young": 50e3, "poisson": 0.48}
+    assert chosen.look == (WHOLE, "A", 0.5) and chosen.target.tolist() == [0.01, 0.0, 0.0]
+    chosen.undo()
+    assert cell.material[-1] == {"young": 170e3}
+    chosen.undo()
+    assert cell.said[-1] == "nothing to undo"
+
+
+def test_what_is_in_force_is_not_sent_again(chosen: Chosen, cell: Cell) -> None:
+    chosen.return_to("", {"young": 170e3, "poisson": 0.48}, (WHOLE, "A", 0.5), np.zeros(3))
+    assert cell.material == [] and cell.scenes == [] and cell.stopped == []
+
+
+def test_a_contact_node_that_starts_again_hears_what_was_chosen(chosen: Chosen, cell: Cell) -> None:
+    chosen.send_again()
+    assert cell.material == [] and cell.scenes == []
+    chosen.choose_material({"young": 50e3})
+    chosen.choose_material({"poisson": 0.45})
+    chosen.send_again()
+    assert cell.material[-1] == {"young": 50e3, "poisson": 0.45}
+
+
+def test_a_scene_that_is_refused_is_not_in_use(chosen: Chosen, cell: Cell) -> None:
+    chosen.choose_scene("refused")
+    assert chosen.scene == "" and cell.tips == []
+    assert cell.stopped == ["the scene changed"]
+
+
+def test_another_organ_comes_in_its_own_material(chosen: Chosen, cell: Cell) -> None:
+    chosen.choose_material({"young": 50e3})
+    chosen.forget(GLASS)
+    assert chosen.in_force == {} and chosen.look == (GLASS, "A", 0.5)
+    chosen.undo()
+    assert cell.said[-1] == "nothing to undo"
+
+
+def test_the_tool_is_lifted_along_the_normal_and_dragged_along_its_shaft(chosen: Chosen) -> None:
+    chosen.put(np.array([0.01, 0.02, 0.03]))
+    chosen.lift()
+    np.testing.assert_allclose(chosen.target, [0.01, 0.02, 0.06])
+    chosen.drag(np.array([0.5, 0.5, 0.004]), along_shaft=True)  # the tip is at the origin
+    np.testing.assert_allclose(chosen.target, [0.0, 0.0, 0.004])
+    chosen.drag(np.array([np.nan, 0.0, 0.0]), along_shaft=False)
+    np.testing.assert_allclose(chosen.target, [0.0, 0.0, 0.004])
