@@ -12,6 +12,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 pytest.importorskip("viser", reason="the extra ui is not installed")
 
+from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.ui.chosen import Chosen, Page
 from avatar_ros.ui.view import GLASS, WHOLE
 
@@ -88,6 +89,14 @@ def test_a_contact_node_that_starts_again_hears_what_was_chosen(chosen: Chosen, 
     chosen.choose_material({"poisson": 0.45})
     chosen.send_again()
     assert cell.material[-1] == {"young": 50e3, "poisson": 0.45}
+
+
+def test_values_are_those_of_coordinates_that_the_organ_has(chosen: Chosen) -> None:
+    """The contact node keeps the contrast of the last organ's tumour; this one has none."""
+    assert chosen.organ is not None
+    there = {"young": 300e3, "contrast": 15.0}
+    chosen.contact = {key: there.get(name, 0.0) for key, name in MATERIAL.items()}
+    assert chosen.values(chosen.organ) == {"young": 300e3, "poisson": 0.48}
 
 
 def test_a_scene_that_is_refused_is_not_in_use(chosen: Chosen, cell: Cell) -> None:

@@ -126,8 +126,9 @@ class Chosen:
         return given | self._material
 
     def values(self, organ: Organ) -> dict[str, float]:
-        """Of the material, by coordinate, as built where nothing was chosen [SI]."""
-        return {name: here for name, (_, _, here) in organ.ranges.items()} | self.in_force
+        """Of the organ's own coordinates, as built where nothing was chosen [SI]."""
+        in_force = self.in_force
+        return {name: in_force.get(name, built) for name, (_, _, built) in organ.ranges.items()}
 
     def choose_material(self, values: dict[str, float]) -> None:
         """Set some values, by coordinate [SI]."""
