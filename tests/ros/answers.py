@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+ROUNDING = 0.005  # [s] of what an answer names
+
 
 def took(message: str, done: str, promised: str) -> float:
     """Seconds that an answer names beside the promise."""

@@ -32,7 +32,7 @@ from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_core.scene.yaml_lines import MAX_BYTES
 from avatar_ros.msg import ContactState
 from avatar_ros.srv import LoadScene
-from tests.ros.answers import took
+from tests.ros.answers import ROUNDING, took
 from tests.ros.conftest import START_TIMEOUT, free_domain
 from tests.ros.test_cell import Hand, _force
 from tests.ros.test_material import _set
@@ -90,6 +90,10 @@ class Palpation:
             lambda: np.linalg.norm(self.hold(0.05)) == pytest.approx(size, rel=1e-3), START_TIMEOUT
         )
 
+    def feel(self, least: float) -> None:
+        """Stay until the organ pushes back: a busy machine may lose some poses on the way."""
+        self.probe.until(lambda: self.hold(0.05) @ self.normal > least, START_TIMEOUT)
+
     def load(self, yaml: str = "", name: str = "") -> LoadScene.Response:
         request = LoadScene.Request(yaml=yaml, name=name)
         return self.probe.call(LoadScene, "load_scene", request)
@@ -146,13 +150,13 @@ def test_a_shipped_scene_loads_or_says_why_not(
         assert answer.message == refusal
     else:  # faded in meanwhile
         seconds = took(answer.message, "in use", "2 s, 60 s if it was compiled")
-        assert 0.0 < seconds < time.monotonic() - asked
+        assert 0.0 < seconds <= time.monotonic() - asked + ROUNDING
     expected = [] if refusal else [effect.name for effect in read_scene(path).effects]
     assert answer.effects == expected
     if not refusal:  # press it by 2 mm with the scene's tip
         offset = read_scene(path).tools[0].tip.offset
-        pressed = palpation.go((offset - Tip().offset) * palpation.normal)
-        assert pressed @ palpation.normal > 0.1
+        palpation.go((offset - Tip().offset) * palpation.normal)
+        palpation.feel(0.1)
 
 
 def test_most_shipped_scenes_load_here(organ: Any) -> None:
