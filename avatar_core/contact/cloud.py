@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 POINTS = 64  # of a block
 BLOCK = 3 * POINTS  # displacements that are summed together, within the first-level cache
 TOLERANCE = 2e-3  # root mean square of the relative error that blocks add to a load's displacement
-WHOLE = 1e-6  # the same of global modes that stand apart, whose amplitudes may be any
-LARGE_TOLERANCE = 1e-2  # the same of what large deformation adds, a fraction of that displacement
+PART = 1e-2  # the same of what is but a part of a displacement: added by large deformation, or
+# moved by the organ's history and weight
 
 _LARGEST = {"int16": 32767, "int8": 127}
 
@@ -50,25 +50,25 @@ def cloud_arrays(
     vademecum: Vademecum,
     cloud: Cloud,
     large: RegionalField | None = None,
-    with_history: bool = False,
+    motion: np.ndarray | None = None,
 ) -> CloudArrays:
     """The modes of all regions, and those of large deformation, in the blocks of a cloud.
 
-    with_history : the global modes have a history of their own, and stay apart; otherwise they are
-        part of every region's field
+    motion : ndarray, shape (n, n_global), amplitudes that the global modes may have beside those of
+        the loads that are shown; see :func:`avatar_core.contact.effects.selection.own_motion`. None
+        if there are none
     """
     blocks, regional = _Blocks(vademecum, cloud), vademecum.regional
-    apart = vademecum.far.rank if with_history else 0
     load = _loads(vademecum)
-    parts = _linear_modes(vademecum, blocks, load, apart)
-    counts = vademecum.far.rank - apart + np.diff(regional.start)
-    start = apart + np.concatenate([[0], np.cumsum(counts)])
+    apart = 0 if motion is None else vademecum.far.rank
+    parts = [_moved_modes(vademecum, blocks, motion), *_linear_modes(vademecum, blocks, load)]
+    start = apart + np.concatenate([[0], np.cumsum(vademecum.far.rank + np.diff(regional.start))])
     large_start = np.full_like(start, start[-1])
     if large is not None:
         large_start = large_start + large.start
         parts += [_large_modes(large, r, blocks) for r in range(large.n_regions)]
-    own_load = np.ascontiguousarray(load[:, :, apart:], np.float32)
-    return CloudArrays(*_joined(parts), start, own_load, blocks.points, large_start)
+    load = np.ascontiguousarray(load, np.float32)
+    return CloudArrays(*_joined(parts), start, load, blocks.points, large_start)
 
 
 class _Blocks:
@@ -98,22 +98,25 @@ def _loads(vademecum: Vademecum) -> np.ndarray:
     return np.concatenate([shared, regional.load], axis=2)
 
 
-def _linear_modes(
-    vademecum: Vademecum, blocks: _Blocks, load: np.ndarray, apart: int
-) -> list[BlockModes]:
-    """Of the global modes that stand apart, and of every region with the others."""
-    far, regional = vademecum.far, vademecum.regional
-    shared, sizes, parts = blocks.of(far.space), np.empty(load.shape[:2]), []
+def _moved_modes(vademecum: Vademecum, blocks: _Blocks, motion: np.ndarray | None) -> BlockModes:
+    """Of the global modes, as far as they move by more than the loads that are shown."""
+    shared = blocks.of(vademecum.far.space)
+    if motion is None:
+        return BlockModes.none(len(shared), BLOCK, 0)
+    size = load_sizes(shared, blocks.mass, motion)
+    return separate_blocks(shared, blocks.mass, motion, size, PART)
+
+
+def _linear_modes(vademecum: Vademecum, blocks: _Blocks, load: np.ndarray) -> list[BlockModes]:
+    """Of every region with the global modes."""
+    regional, shared, parts = vademecum.regional, blocks.of(vademecum.far.space), []
     for r in range(regional.n_regions):
         here, own = regional.region == r, slice(*regional.start[r : r + 2])
         fields = np.concatenate([shared, blocks.of(regional.space[:, own])], axis=2)
         loads = load[here, :, : fields.shape[2]].reshape(-1, fields.shape[2]).astype(float)
         size = load_sizes(fields, blocks.mass, loads)
-        sizes[here] = size.reshape(-1, 3)
-        rest = (fields[:, :, apart:], blocks.mass, loads[:, apart:])
-        parts.append(separate_blocks(*rest, size, TOLERANCE))
-    whole = (shared[:, :, :apart], blocks.mass, far.load[:, :apart])
-    return [separate_blocks(*whole, sizes.ravel(), WHOLE), *parts]
+        parts.append(separate_blocks(fields, blocks.mass, loads, size, TOLERANCE))
+    return parts
 
 
 def _large_modes(large: RegionalField, region: int, blocks: _Blocks) -> BlockModes:
@@ -122,7 +125,7 @@ def _large_modes(large: RegionalField, region: int, blocks: _Blocks) -> BlockMod
     loads = large.load[large.region == region, :, : fields.shape[2]]
     loads = loads.reshape(-1, fields.shape[2]).astype(float)
     sizes = load_sizes(fields, blocks.mass, loads)
-    return separate_blocks(fields, blocks.mass, loads, sizes, LARGE_TOLERANCE)
+    return separate_blocks(fields, blocks.mass, loads, sizes, PART)
 
 
 def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:

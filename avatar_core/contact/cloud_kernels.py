@@ -5,9 +5,10 @@
 
 over the load positions j of region r that carry a tip, with the modes Z and the core C of
 :mod:`avatar_core.contact.cloud`, and for large deformation the terms of
-:mod:`avatar_core.vademecum.large_deformation`. Global modes that have a history stand apart, as a
-part of their own. That is an organ under patches; near a tip, :mod:`avatar_core.contact.dent` shows
-the tip's dent.
+:mod:`avatar_core.vademecum.large_deformation`. The global modes are part of every region's field;
+what they move by more than the loads that are shown (vibration, weight, faded history) stands
+apart, as a part of its own. That is an organ under patches; near a tip,
+:mod:`avatar_core.contact.dent` shows the tip's dent.
 
 A step reads the modes of the regions that are *touched*: those of the load positions that carry a
 tip or hold a history of loads.
@@ -55,22 +56,26 @@ def _displace(  # type: ignore[no-untyped-def]
     if superposition is None and out.n_contacts[0] == 0:
         state.field[:] = np.float32(0.0)
         return
-    _global_amplitudes(model, state, superposition)
     _release_regions(state)
     if viscoelasticity is not None:
         _load_past(model, state, large_deformation, viscoelasticity)
     for t in range(state.passage.shape[0]):
         if state.force[t] > 0.0:
             _load_regions(model, state, large_deformation, friction, viscoelasticity, t)
+    _move_globals(model, state, superposition)
     _sum_modes(model, space, state, large_deformation)
 
 
 @fast
-def _global_amplitudes(model, state, superposition):  # type: ignore[no-untyped-def]
-    """Of the global modes that stand apart: what the effects superpose."""
-    if superposition is not None:
-        for k in range(model.region_start[0]):
-            state.amplitude[k] = np.float32(superposition.total[k])
+def _move_globals(model, state, superposition):  # type: ignore[no-untyped-def]
+    """Amplitudes that the effects give to the global modes, less those of the touched regions."""
+    if superposition is None:
+        return
+    for k in range(model.region_start[0]):
+        moved = superposition.total[k]
+        for q in range(state.n_touched[0]):
+            moved -= state.amplitude[model.region_start[state.touched[q]] + k]
+        state.amplitude[k] = np.float32(moved)
 
 
 @fast
@@ -168,12 +173,12 @@ def _load_past(model, state, large_deformation, viscoelasticity):  # type: ignor
 
 @fast
 def _fade_regions(model, state):  # type: ignore[no-untyped-def]
-    """Keep the ``MAX_PAST`` regions that move most, less what the next one moves."""
-    norm, n = state.region_weight, state.n_touched[0]
+    """Keep the ``MAX_PAST`` regions whose own modes move most, less what the next one moves."""
+    norm, n, n_global = state.region_weight, state.n_touched[0], model.region_start[0]
     for i in range(n):
         r = state.touched[i]
         norm[r] = 0.0
-        for k in range(model.region_start[r], model.region_start[r + 1]):
+        for k in range(model.region_start[r] + n_global, model.region_start[r + 1]):
             norm[r] += np.float64(state.amplitude[k]) ** 2  # of modes with a peak of 1
         norm[r] = np.sqrt(norm[r])
     bound = np.inf  # in the end the norm of the region after the last that is kept

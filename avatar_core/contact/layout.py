@@ -26,7 +26,7 @@ from avatar_core.contact.effects.selection import (
     adapted_vademecum,
     default_effects,
     find,
-    has_history,
+    own_motion,
     selected_arrays,
 )
 from avatar_core.contact.effects.several_tools import SeveralTools
@@ -62,9 +62,9 @@ class Layout:
         blocks with their hash tables: compliance [m/N]; softness (1,), added where access fades
         [m/N];
         space (n_modes, BLOCK), core (n_modes, m) and level (n_modes,), the modes of the cloud's
-        blocks; block_start (n_parts, n_blocks + 1), those of each part: global modes with a
-        history, each region, and each region's large deformation; shown (1,), the level that is
-        shown; place (n_points,), of each point in the blocks; region (n_positions,) and
+        blocks; block_start (n_parts, n_blocks + 1), those of each part: global modes that move
+        beside the loads, each region, and each region's large deformation; shown (1,), the level
+        that is shown; place (n_points,), of each point in the blocks; region (n_positions,) and
         regional_load (n_positions, 3, most), whose amplitudes begin at region_start
         (n_regions + 1,); rest (n_points, 6), the cloud without displacement [m]; tip_offset
         (n_tools,), of a pose above the lowest point of the tip [m]
@@ -165,7 +165,7 @@ def lay_out_details(
         if detail.cloud not in clouds:
             terms = large.terms if large else None
             clouds[detail.cloud] = cloud_arrays(
-                vademecum, detail.cloud, terms, has_history(effects)
+                vademecum, detail.cloud, terms, own_motion(vademecum, effects)
             )
         shown = rounded(clouds[detail.cloud], detail.precision)
         display = vademecum.display if detail.cloud == "surface" else None

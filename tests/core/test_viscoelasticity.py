@@ -7,7 +7,8 @@ import pytest
 
 from avatar_core.contact.effects import Viscoelasticity
 from avatar_core.contact.model import prepare, step
-from avatar_core.contact.tool_path import middle_of_access
+from avatar_core.contact.tool_path import middle_of_access, slide
+from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
 from tests.core.effect_cases import SPHERE, push_and_drag
 from tests.core.flat_organ import COMPLIANCE, at_depth, flat_organ
@@ -113,6 +114,24 @@ def test_tissue_comes_back_slowly_where_a_tool_has_been(phantom_vademecum: Vadem
     assert 0.1 * deep < dents[0] < deep
     assert dents[1] < 0.5 * dents[0]
     assert dents[2] < 0.5 * dents[1]
+
+
+def test_a_history_moves_the_cloud_as_its_loads_do(phantom_vademecum: Vademecum) -> None:
+    """Of soft tissue that was stroked across more regions than are shown in full."""
+    v, tip = phantom_vademecum, Tip("patch", 8e-3)
+    model = prepare(v, (tip,), cloud="volume", effects=(Viscoelasticity((0.9,), (5.0,)),))
+    mass, errors = np.repeat(v.mesh.vertex_volumes, 3), []
+    for k, at in enumerate(slide(v, tip.offset, 4e-3, 0.15)):
+        step(model, at[None].copy())
+        if k % 100 == 99:
+            past = model.effects.viscoelasticity
+            exact = np.zeros(len(mass))
+            for m in range(past.count[0]):
+                at_one = v.displacement(past.position[m : m + 1], np.ones(1))
+                exact += at_one @ past.near_elastic[m]
+            wrong = model.out.cloud[:, 3:].ravel() - exact
+            errors.append(np.sqrt((mass * wrong**2).sum() / (mass * exact**2).sum()))
+    assert np.mean(errors) < 1e-2
 
 
 def test_fresh_tissue_is_stiffer_than_tissue_that_was_held(phantom_vademecum: Vademecum) -> None:

@@ -135,9 +135,19 @@ def default_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
-def has_history(effects: Sequence[Effect]) -> bool:
-    """Whether modes move by more than the loads of the moment."""
-    return any(isinstance(one, (Viscoelasticity, Inertia, SelfWeight)) for one in effects)
+def own_motion(vademecum: Vademecum, effects: Sequence[Effect]) -> np.ndarray | None:
+    """Amplitudes by which global modes may move beside the loads of the moment, (n, n_global).
+
+    A history may leave those of any load; the weight's count as much as all loads together. None
+    if the effects know neither.
+    """
+    inertia, weight = find(effects, Inertia), find(effects, SelfWeight)
+    remembers = inertia is not None or find(effects, Viscoelasticity) is not None
+    motion = [vademecum.far.load.astype(float)] if remembers else []
+    if weight is not None:
+        sag = self_weight_arrays(weight, vademecum, 1.0).amplitude
+        motion.append(np.repeat(sag[None], len(motion[0]) if motion else 1, axis=0))
+    return np.concatenate(motion) if motion else None
 
 
 def adapted_vademecum(

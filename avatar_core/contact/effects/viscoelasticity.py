@@ -29,6 +29,7 @@ from avatar_core.common.jit import fast, inlined
 from avatar_core.common.quantities import quantity
 from avatar_core.contact.effects.base import Effect
 from avatar_core.errors import SceneError
+from avatar_core.reduction.near_field import find_block
 
 
 @dataclass(frozen=True)
@@ -149,19 +150,14 @@ def near_free_displacement(model, state, viscoelasticity, t, near_free):  # type
     for i in range(state.n_nodes[t]):
         j = state.nodes[t, i]
         u0 = u1 = u2 = 0.0
-        if viscoelasticity.count[0] > 0:
-            for k in range(model.contact_start[j], model.contact_start[j + 1]):
-                target = model.contact_slot[k, 0]
-                if target < 0:
-                    continue
-                m = viscoelasticity.slot[target]
-                if m < 0:
-                    continue
-                b = model.contact_block[model.contact_slot[k, 1]]
-                f = viscoelasticity.near_held[m]
-                u0 -= b[0, 0] * f[0] + b[1, 0] * f[1] + b[2, 0] * f[2]
-                u1 -= b[0, 1] * f[0] + b[1, 1] * f[1] + b[2, 1] * f[2]
-                u2 -= b[0, 2] * f[0] + b[1, 2] * f[1] + b[2, 2] * f[2]
+        for m in range(viscoelasticity.count[0]):
+            e = find_block(model.contact_start, model.contact_slot, j, viscoelasticity.position[m])
+            if e < 0:
+                continue
+            b, f = model.contact_block[e], viscoelasticity.near_held[m]
+            u0 -= b[0, 0] * f[0] + b[1, 0] * f[1] + b[2, 0] * f[2]
+            u1 -= b[0, 1] * f[0] + b[1, 1] * f[1] + b[2, 1] * f[2]
+            u2 -= b[0, 2] * f[0] + b[1, 2] * f[1] + b[2, 2] * f[2]
         near_free[i, 0] = gain * u0
         near_free[i, 1] = gain * u1
         near_free[i, 2] = gain * u2
