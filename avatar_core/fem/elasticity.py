@@ -407,6 +407,8 @@ class Elasticity:
         three solutions in single precision instead of one in double, and no factor in double, which
         takes twice the time and memory. Where they do not converge, there is one after all.
         """
+        if self._refines:
+            return self
         other = copy(self)
         other._refines = True
         return other

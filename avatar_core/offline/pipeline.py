@@ -234,9 +234,11 @@ def _elasticity(mesh: TetMesh, regions: Regions, options: OrganOptions) -> Elast
     inclusion = None
     if options.tumour is not None:
         inclusion = Inclusion(volume_fraction_inside(mesh, options.tumour), options.contrast)
-    return Elasticity(
+    problem = Elasticity(
         mesh, options.material, regions.clamped, options.element or stiffest.element, inclusion
     )
+    # One factor then serves build and certificate; a range of materials has one for each value.
+    return problem if options.coordinates else problem.refining()
 
 
 def orientation_warning(surface: SurfaceMesh) -> str | None:
