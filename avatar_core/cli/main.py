@@ -18,6 +18,7 @@ from avatar_core.cli.patient import patient
 from avatar_core.cli.replay import replay
 from avatar_core.cli.scene import scene
 from avatar_core.cli.study import study
+from avatar_core.cli.uncertainty import uncertainty
 from avatar_core.cli.vademecum import Vertices, show, show_text, vademecum
 from avatar_core.errors import AvatarError
 
@@ -39,6 +40,7 @@ app.command()(show)
 app.command()(export)
 app.command()(patient)
 app.command()(replay)
+app.command()(uncertainty)
 app.command()(study)
 app.command()(cell)
 

@@ -22,6 +22,7 @@ ORDER = {
         "shapes",
         "vademecum",
         "contact",
+        "uncertainty",
         "scene",
         "bags",
         "offline",

@@ -1,0 +1,146 @@
+"""``avatar uncertainty``: bands of force and displacement when the data are not known exactly."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from avatar_core.cli.numbers import numbers
+from avatar_core.cli.output import require_output
+from avatar_core.cli.vademecum import require
+
+if TYPE_CHECKING:
+    from avatar_core.uncertainty.distributions import Distribution
+    from avatar_core.vademecum.model import Vademecum
+
+_FORMATS = (".json", ".png", ".pdf", ".svg")
+_DEPTHS = "1,2,4,6,8"
+
+
+def uncertainty(
+    file: Annotated[Path, typer.Argument(help="vademecum (.h5)")],
+    given: Annotated[
+        list[str],
+        typer.Option(
+            help="what is known of a parameter: NAME=lognormal:MEDIAN:FACTOR, uniform:LOW:HIGH or "
+            "fixed:VALUE, with NAME young [Pa] or a coordinate of the vademecum; or a file of them "
+            "(.yaml), as params/uncertainty/liver.yaml. Others keep the vademecum's value"
+        ),
+    ],
+    draws: Annotated[int, typer.Option(help="number of draws")] = 1000,
+    at: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="place that is pressed [m], as 0,0.07,0.005; default: three places apart"
+        ),
+    ] = None,
+    depths: Annotated[str, typer.Option(help="depths of the tip [mm]")] = _DEPTHS,
+    radius: Annotated[float, typer.Option(help="of the spherical tip [mm]")] = 5.0,
+    target: Annotated[
+        str | None,
+        typer.Option(
+            help="point whose displacement is asked for [m]; default: the tumour, or the middle of "
+            "the organ"
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="write numbers (.json) or a picture")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="of the draws")] = 0,
+) -> None:
+    """Show within which bands force and displacement lie, and which parameter makes them wide."""
+    from tqdm import tqdm
+
+    from avatar_core.geometry.tip import Tip
+    from avatar_core.uncertainty.bands import bands_of, known_of
+    from avatar_core.uncertainty.force_table import force_table
+    from avatar_core.uncertainty.report import picture, rows, say
+    from avatar_core.vademecum.storage import load_vademecum
+
+    require(20 <= draws <= 1_000_000, f"--draws is {draws}; give 20 to 1,000,000")
+    if output is not None:
+        require_output(output, _FORMATS, [file])
+    pressed = _depths(depths)
+    tip = Tip("sphere", 1e-3 * radius)
+    known = _given(given)
+    vademecum = load_vademecum(file)
+    known = known_of(vademecum, known)
+    places, vertex = _places(vademecum, at), _target(vademecum, target)
+    with tqdm(unit=" materials", file=sys.stderr, disable=None, delay=2.0, leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        table = force_table(vademecum, tip, places, pressed, vertex, show)
+    bands = bands_of(table, known, draws, seed)
+    centers = vademecum.surface.centers[places]
+    say(vademecum.name, draws, known, centers, pressed, bands)
+    if output is not None and output.suffix == ".json":
+        output.write_text(json.dumps(rows(centers, pressed, bands), indent=1) + "\n")
+    elif output is not None:
+        picture(output, vademecum.name, known, centers, pressed, bands)
+    if output is not None:
+        print(output)
+
+
+def _given(given: list[str]) -> dict[str, Distribution]:
+    from avatar_core.uncertainty.distributions import parse, read_distributions
+
+    found: dict[str, Distribution] = {}
+    for one in given:
+        if "=" in one:
+            found |= [parse(one)]
+        else:
+            found |= read_distributions(Path(one))
+    return found
+
+
+def _depths(text: str) -> list[float]:
+    import numpy as np
+
+    from avatar_core.contact.locate import MAX_DEPTH
+
+    counts, most = tuple(range(1, 101)), 1e3 * MAX_DEPTH
+    found = numbers("--depths", text, counts, f"rising numbers [mm], as {_DEPTHS}")
+    fits = found[0] > 0.0 and found[-1] <= most and (np.diff(found) > 0.0).all()
+    require(bool(fits), f"--depths is {text}; give rising numbers above 0, up to {most:g} mm")
+    return [1e-3 * depth for depth in found]
+
+
+def _places(vademecum: Vademecum, at: list[str] | None) -> list[int]:
+    """Load positions that are pressed."""
+    import numpy as np
+
+    from avatar_core.contact.tool_path import starts_apart
+
+    if not at:
+        return starts_apart(vademecum, 3)
+    centers, found = vademecum.surface.centers, []
+    for text in at:
+        point = numbers("--at", text, (3,), "three numbers, as 0,0.07,0.005")
+        vademecum.surface.nearest(point)  # refuses what lies off the surface
+        found.append(int(np.argmin(np.linalg.norm(centers - point, axis=1))))
+    return found
+
+
+def _target(vademecum: Vademecum, text: str | None) -> int:
+    """The vertex whose displacement is asked for."""
+    import numpy as np
+
+    vertices = vademecum.mesh.vertices
+    if text is not None:
+        point = np.array(numbers("--target", text, (3,), "three numbers, as 0,0.05,0"))
+        inside = (point >= vertices.min(axis=0)) & (point <= vertices.max(axis=0))
+        require(bool(inside.all()), f"--target is {text}, outside of the organ; give a point in it")
+    elif vademecum.structures:
+        assert vademecum.display is not None  # which holds them
+        (faces, *_) = vademecum.structures.values()
+        point = vademecum.display.vertices[np.unique(faces)].mean(axis=0)
+    else:
+        point = vertices.mean(axis=0)
+    return int(np.argmin(np.linalg.norm(vertices - point, axis=1)))

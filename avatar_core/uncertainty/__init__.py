@@ -1,0 +1,1 @@
+"""What a vademecum answers when its data are known as distributions only."""

@@ -1,0 +1,193 @@
+"""What is known of a parameter: a fixed value, a range, or a median with a factor.
+
+A vademecum is exact to some per cent about a problem whose data are not. A distribution says of
+each of its coordinates, and of Young's modulus, what is known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import yaml
+from scipy.special import ndtr, ndtri
+
+from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import CoordinateError
+
+LEAST_INSIDE = 0.9  # of a distribution's probability that a vademecum's range must hold
+
+
+class Distribution(Protocol):
+    """A parameter's distribution, by its quantile function."""
+
+    def ppf(self, probability: FloatArray) -> FloatArray:
+        """Values below which the parameter lies with some probabilities (0 to 1)."""
+
+    def cdf(self, value: float) -> float:
+        """Probability that the parameter lies below a value."""
+
+    def said(self, unit: str = "") -> str:
+        """What is known, in words, with a unit."""
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """A value that is known."""
+
+    value: float
+
+    def ppf(self, probability: FloatArray) -> FloatArray:
+        return np.full(np.shape(probability), self.value)
+
+    def cdf(self, value: float) -> float:
+        return float(value >= self.value)
+
+    def said(self, unit: str = "") -> str:
+        return f"{self.value:g}{unit}"
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Anywhere between two values, all alike."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise CoordinateError(f"uniform:{self.low:g}:{self.high:g} is empty; give LOW < HIGH")
+
+    def ppf(self, probability: FloatArray) -> FloatArray:
+        return self.low + (self.high - self.low) * np.asarray(probability)
+
+    def cdf(self, value: float) -> float:
+        return min(max((value - self.low) / (self.high - self.low), 0.0), 1.0)
+
+    def said(self, unit: str = "") -> str:
+        return f"{self.low:g} to {self.high:g}{unit}, all alike"
+
+
+@dataclass(frozen=True)
+class Lognormal:
+    """ln x is normal about ln median; two thirds lie within median / factor and median * factor."""
+
+    median: float
+    factor: float
+
+    def __post_init__(self) -> None:
+        if not (self.median > 0.0 and self.factor > 1.0 and math.isfinite(self.factor)):
+            raise CoordinateError(
+                f"lognormal:{self.median:g}:{self.factor:g}: give a positive median and a factor "
+                "above 1"
+            )
+
+    def ppf(self, probability: FloatArray) -> FloatArray:
+        return np.asarray(self.median * self.factor ** ndtri(probability))
+
+    def cdf(self, value: float) -> float:
+        if value <= 0.0:
+            return 0.0
+        return float(ndtr(math.log(value / self.median) / math.log(self.factor)))
+
+    def said(self, unit: str = "") -> str:
+        return f"{self.median:g}{unit}, give or take a factor of {self.factor:g}"
+
+
+@dataclass(frozen=True)
+class Within:
+    """A distribution that is cut off at the ends of a range, and fills it."""
+
+    whole: Distribution
+    low: float
+    high: float
+
+    @property
+    def inside(self) -> float:
+        """Part of the whole distribution within the range, ends included."""
+        below = self.whole.cdf(np.nextafter(self.low, -np.inf))
+        return self.whole.cdf(self.high) - below
+
+    def ppf(self, probability: FloatArray) -> FloatArray:
+        first, last = self.whole.cdf(self.low), self.whole.cdf(self.high)
+        drawn = self.whole.ppf(first + (last - first) * np.asarray(probability))
+        return np.clip(drawn, self.low, self.high)
+
+    def cdf(self, value: float) -> float:
+        first, last = self.whole.cdf(self.low), self.whole.cdf(self.high)
+        return min(max((self.whole.cdf(value) - first) / (last - first), 0.0), 1.0)
+
+    def said(self, unit: str = "") -> str:
+        return self.whole.said(unit)
+
+
+_KINDS = {"fixed": (Fixed, 1), "uniform": (Uniform, 2), "lognormal": (Lognormal, 2)}
+_EXAMPLE = "write young=lognormal:5e3:1.5, poisson=uniform:0.4:0.49 or contrast=fixed:4"
+
+
+def parse(text: str) -> tuple[str, Distribution]:
+    """``NAME=KIND:NUMBERS``, as on the command line."""
+    name, _, told = text.partition("=")
+    kind, *numbers = told.split(":")
+    make, count = _KINDS.get(kind, (None, 0))
+    try:
+        values = [float(number) for number in numbers]
+    except ValueError:
+        values = []
+    if make is None or len(values) != count or not np.isfinite(values).all():
+        raise CoordinateError(f"distribution '{text}' is not understood; {_EXAMPLE}")
+    return name.strip(), make(*values)
+
+
+def within(name: str, whole: Distribution, low: float, high: float) -> Distribution:
+    """A distribution over the range that a vademecum holds.
+
+    Raises
+    ------
+    CoordinateError
+        If less than ``LEAST_INSIDE`` of it lies in the range.
+    """
+    found = Within(whole, low, high)
+    if found.inside < LEAST_INSIDE:
+        raise CoordinateError(
+            f"{found.inside:.0%} of {name} ({whole.said()}) lies within {low:g} to {high:g}, "
+            f"which the vademecum holds; build it with a wider --coordinate {name}=LOW:HIGH"
+        )
+    return whole if isinstance(whole, Fixed) else found
+
+
+_FIELDS = {"fixed": ("value",), "uniform": ("low", "high"), "lognormal": ("median", "factor")}
+_WRITTEN = "write young: {lognormal: {median: 5.0e+3, factor: 1.5}}"
+
+
+def read_distributions(file: Path) -> dict[str, Distribution]:
+    """What a YAML file says of parameters, by name; see ``params/uncertainty``.
+
+    Raises
+    ------
+    CoordinateError
+        For a file that cannot be read or says something else.
+    """
+    try:
+        told = yaml.safe_load(file.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise CoordinateError(f"cannot read distributions from {file}: {reason}") from error
+    if not isinstance(told, dict) or not told:
+        raise CoordinateError(f"{file} names no parameter; {_WRITTEN}")
+    return {str(name): _of_mapping(file, name, one) for name, one in told.items()}
+
+
+def _of_mapping(file: Path, name: object, told: object) -> Distribution:
+    if isinstance(told, dict) and len(told) == 1:
+        ((kind, values),) = told.items()
+        names = _FIELDS.get(kind, ())
+        values = {"value": values} if kind == "fixed" else values
+        if isinstance(values, dict) and tuple(sorted(values)) == tuple(sorted(names)):
+            numbers = [values[field] for field in names]
+            if all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
+                return _KINDS[kind][0](*map(float, numbers))
+    raise CoordinateError(f"{file}: '{name}' is not understood; {_WRITTEN}")
