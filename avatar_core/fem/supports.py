@@ -25,10 +25,10 @@ import scipy.sparse as sp
 from skfem import BilinearForm, Element, FacetBasis, MeshTet
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.common.supports import LEAST_STIFFNESS, MOST_STIFFNESS
 from avatar_core.errors import MaterialError
 from avatar_core.geometry.mesh import IN_FACE, TetMesh
 
-LEAST_STIFFNESS, MOST_STIFFNESS = 1.0, 1e12  # [N/m^3]
 LEAST_HELD = 1e-6  # of q(r) L / E: below, 1 N moves a liver by metres
 
 
