@@ -109,10 +109,7 @@ def test_a_file_of_groups_may_clamp_beside_the_supports(
 ) -> None:
     usual = regions_by_rule(phantom_mesh)
     file = groups_file(
-        tmp_path / "g.npz",
-        phantom_mesh,
-        clamped=places["cava_groove"],
-        accessible=usual.accessible,
+        tmp_path / "g.npz", phantom_mesh, clamped=places["cava_groove"], accessible=usual.accessible
     )
     regions, _ = held_by(phantom_mesh, [SupportOption.parse("bare_area=1e6")], file)
     assert regions.clamped[places["cava_groove"]].all()
@@ -175,9 +172,7 @@ def test_a_support_is_fixed_free_to_choose_or_clamped() -> None:
         ("=1e5", MaterialError, "letters, digits and _"),
     ],
 )
-def test_a_bad_support_option_is_refused(
-    text: str, kind: type[AvatarError], reason: str
-) -> None:
+def test_a_bad_support_option_is_refused(text: str, kind: type[AvatarError], reason: str) -> None:
     with pytest.raises(kind, match=reason):
         SupportOption.parse(text)
 
