@@ -79,7 +79,7 @@ def supports_section(
             Panel("support-errors", _ERRORS, partial(_draw_errors, rows=rows)),
             Panel("support-limits", _LIMITS, partial(_draw_limits, rows=rows)),
         ),
-        notices=(f"{surface.name} on its {PLACE} at 1 N/m^3 and less: {refusal}",),
+        notices=(f"{surface.name} on its {PLACE}: {refusal}",),
     )
 
 
@@ -109,9 +109,9 @@ def _build(held: _Held, settings: CertaintySettings, progress: Progress) -> Vade
 def _unseen_rows(
     vademecum: Vademecum, held: _Held, settings: CertaintySettings
 ) -> list[dict[str, Value]]:
-    """Errors at the ends and at values drawn evenly in the coordinate's scale, one row each."""
-    rng = np.random.default_rng(1)
-    drawn = sorted(held.coordinate.value_at(rng.random()) for _ in range(settings.n_values))
+    """Errors at the ends and at one value drawn from each nth part of the range, one row each."""
+    rng, n = np.random.default_rng(1), settings.n_values
+    drawn = [held.coordinate.value_at((part + rng.random()) / n) for part in range(n)]
     rows: list[dict[str, Value]] = []
     for value in follow([LOW, *drawn, HIGH], "unseen values"):
         faces = rng.permutation(len(held.surface.corners))[: settings.n_loads]
@@ -190,7 +190,7 @@ def _free_rows(held: _Held) -> tuple[list[dict[str, Value]], str]:
         try:
             found = there.at_vertices(there.solve(loads))
         except MaterialError as error:
-            return rows, str(error)
+            return rows, f"at {stiffness:g} N/m^3, {error}"
         left = l2_norm(found - rigid_part(elasticity.mesh, found), mass) / l2_norm(found, mass)
         rows.append(
             {
@@ -245,8 +245,8 @@ def _sentence(summary: dict[str, float]) -> str:
         f"Over {LOW:g} to {HIGH:g} N/m^3 under the bare area the displacement misses full finite "
         f"elements by {summary['support_l2_mean']:.1%} in the mean and "
         f"{summary['support_l2_worst']:.1%} at worst; stiff springs are the clamp to "
-        f"{summary['support_clamp_limit_worst']:.1%}, and on weak ones all but "
-        f"{summary['support_free_limit_not_rigid']:.1%} of the motion is rigid."
+        f"{summary['support_clamp_limit_worst']:.2%}, and on weak ones all but "
+        f"{summary['support_free_limit_not_rigid']:.2%} of the motion is rigid."
     )
 
 

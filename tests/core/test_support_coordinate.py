@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
+from avatar_core.cli.vademecum import show
 from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import CoordinateError, SceneError, StorageError
 from avatar_core.fem.elasticity import Elasticity
@@ -147,6 +150,29 @@ def test_a_file_keeps_supports_and_their_coordinate(organ: Vademecum, tmp_path: 
         at_values(read, {BARE: 1e8}).compliance(*where),
         at_values(organ, {BARE: 1e8}).compliance(*where),
     )
+
+
+def test_show_names_supports_with_their_areas_and_range(
+    organ: Vademecum, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_vademecum(organ, tmp_path / "organ.h5")
+    area = organ.mesh.face_areas[organ.supports[0].faces].sum()
+    show(tmp_path / "organ.h5", as_json=False)
+    text = capsys.readouterr().out
+    assert f"support bare_area: 1e+06 N/m^3 on {1e4 * area:.0f} cm^2" in text
+    assert "coordinate support.bare_area: 100000 to 1e+09 (3 nodes)" in text
+    show(tmp_path / "organ.h5", as_json=True)
+    (said,) = json.loads(capsys.readouterr().out)["supports"]
+    assert said == {"name": "bare_area", "stiffness": 1e6, "area": pytest.approx(area)}
+
+
+def test_a_file_without_supports_says_nothing_of_them(organ: Vademecum, tmp_path: Path) -> None:
+    """So that earlier versions go on reading it, and this one reads theirs."""
+    save_vademecum(replace(organ, supports=(), parametric=None), tmp_path / "plain.h5")
+    with h5py.File(tmp_path / "plain.h5") as file:
+        assert "supports" not in file.attrs
+        assert "supports" not in file
+    assert load_vademecum(tmp_path / "plain.h5").supports == ()
 
 
 def test_a_file_whose_coordinate_has_no_support_is_refused(
