@@ -130,7 +130,10 @@ def write_scene(scene: Scene) -> str:
     document: dict[str, Any] = {"name": scene.name, "text": scene.text}
     for section, keys in SECTIONS.items():
         values = {key: getattr(scene, key) for key in keys}
-        document[section] = {key: _plain(v) for key, v in values.items() if v not in (None, ())}
+        chosen = {k: v for k, v in values.items() if v is not None and not isinstance(v, tuple)}
+        document[section] = {key: _plain(value) for key, value in chosen.items()}
+    if scene.supports:
+        document["material"]["supports"] = {s.name: float(s.stiffness) for s in scene.supports}
     document["tools"] = [
         {"name": tool.name, "tip": _plain_fields(tool.tip)} for tool in scene.tools
     ]
@@ -148,8 +151,6 @@ def _plain_fields(one: Any) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """Plain Python types: YAML does not know those of numpy."""
-    if isinstance(value, tuple) and value and isinstance(value[0], SupportStiffness):
-        return {one.name: float(one.stiffness) for one in value}
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
     return float(value) if isinstance(value, float) else value
