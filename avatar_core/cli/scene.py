@@ -90,6 +90,7 @@ def _material(one: Scene) -> str:
         for name, value, unit in (("E", one.young_modulus, " Pa"), ("nu", one.poisson_ratio, ""))
         if value is not None
     ]
+    chosen += [f"support {s.name} {s.stiffness:g} N/m^3" for s in one.supports]
     return ", ".join(chosen) or "its own material"
 
 

@@ -21,6 +21,7 @@ STUDIES = {
     "transport": "avatar_core.studies.transport",
     "pgd": "avatar_core.studies.pgd",
     "coordinates": "avatar_core.studies.coordinates",
+    "certainty": "avatar_core.studies.certainty",
     "accuracy-time": "avatar_core.studies.accuracy_time",
     "passivity": "avatar_core.studies.passivity",
     "contact": "avatar_core.studies.contact",

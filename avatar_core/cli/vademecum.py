@@ -17,6 +17,7 @@ from avatar_core.cli.timings import StageClock, Timings, require_timings, show_t
 from avatar_core.errors import AvatarError
 
 if TYPE_CHECKING:
+    from avatar_core.fem.supports import Support
     from avatar_core.geometry.surface import SurfaceMesh
     from avatar_core.offline.rule import Progress
     from avatar_core.vademecum.accuracy import AccuracyCurve, CurvePoint
@@ -73,7 +74,17 @@ def vademecum(
     groups: Annotated[
         Path | None,
         typer.Option(
-            help=".npz file with points 'clamped' and 'accessible' [m], instead of the rule"
+            help=".npz file with points 'clamped' and 'accessible' [m], instead of the rule, and "
+            "of supports by name"
+        ),
+    ] = None,
+    support: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="springs that hold the organ instead of the clamp, per area [N/m^3]: "
+            "bare_area=1e6, bare_area=1e5:1e9 to choose it later, bare_area=clamped, or bare_area "
+            "alone for a guess; also cava_groove, falciform, right_triangular, left_triangular "
+            "and groups of --groups; may be repeated"
         ),
     ] = None,
     element: Annotated[
@@ -146,6 +157,7 @@ def vademecum(
     from avatar_core.offline.large_deformation import LargeRule
     from avatar_core.offline.pipeline import OrganOptions, build, orientation_warning
     from avatar_core.offline.rule import BuildRule
+    from avatar_core.offline.supports import SupportOption
     from avatar_core.reduction.coordinates import Coordinate
     from avatar_core.vademecum.storage import is_vademecum, load_vademecum, save_vademecum
 
@@ -170,6 +182,7 @@ def vademecum(
     inputs = (None if surface == "phantom" else surface, tumour, groups)
     require_output(output, [".h5"], inputs, is_vademecum, overwrite)
     coordinates = tuple(Coordinate.parse(text) for text in coordinate or ())
+    supports = tuple(SupportOption.parse(text) for text in support or ())
     require_timings(timings)
     clock = StageClock()
     clock.begin("surface")
@@ -179,6 +192,7 @@ def vademecum(
         n_vertices=vertices,
         material=Material(young, poisson),
         coordinates=coordinates,
+        supports=supports,
         tumour=lesion,
         contrast=contrast,
         large=None if material == "linear" else material,  # type: ignore[arg-type]
@@ -252,6 +266,10 @@ def show(
                     **asdict(v.info()),
                     "element": v.element,
                     "contrast": v.contrast,
+                    "supports": [
+                        {"name": one.name, "stiffness": one.stiffness, "area": _area(v, one)}
+                        for one in v.supports
+                    ],
                     "coordinates": [
                         asdict(one) for one in (v.parametric.coordinates if v.parametric else ())
                     ],
@@ -265,6 +283,11 @@ def show(
             indent=2,
         )
     )
+
+
+def _area(v: Vademecum, support: Support) -> float:
+    """Of the surface that a support holds [m^2]."""
+    return float(v.mesh.face_areas[support.faces].sum())
 
 
 def _large_summary(v: Vademecum) -> dict[str, Any] | None:
@@ -335,6 +358,13 @@ def show_text(v: Vademecum) -> None:
     )
     if v.contrast is not None:
         print(f"  tumour: Young's modulus {v.contrast:g} times that of the organ")
+    for support in v.supports:
+        print(
+            f"  support {support.name}: {support.stiffness:.3g} N/m^3 on "
+            f"{1e4 * _area(v, support):.0f} cm^2"
+        )
+    if v.supports and v.regions.clamped.any():
+        print(f"  clamped: {1e4 * v.mesh.face_areas[v.regions.clamped].sum():.0f} cm^2")
     for one in v.parametric.coordinates if v.parametric else ():
         print(f"  coordinate {one.name}: {one.low:g} to {one.high:g} ({one.n_nodes} nodes)")
     if c is None:

@@ -11,11 +11,13 @@ are there for timing very large meshes, never as a default.
 
 With an inclusion, a tumour say, Young's modulus is (1 + (c - 1) chi) E, with the contrast c and the
 volume fraction chi of each tetrahedron inside. The stiffness is then affine in mu, lambda, c mu and
-c lambda, of which the coordinates of a vademecum make use.
+c lambda, and in the stiffness of every support (:mod:`avatar_core.fem.supports`), of which the
+coordinates of a vademecum make use.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,6 +32,7 @@ from skfem.helpers import div
 
 from avatar_core.errors import ConvergenceError, MaterialError, MeshError
 from avatar_core.fem.stiffness import unit_stiffness
+from avatar_core.fem.supports import Support, boundary_mass, require_held, with_stiffness
 from avatar_core.geometry.mesh import TetMesh, make_mesh
 
 Element = Literal["P1", "P2", "Taylor-Hood"]
@@ -37,7 +40,7 @@ Element = Literal["P1", "P2", "Taylor-Hood"]
 # P2 stays within 2 % of Taylor-Hood up to here and locks beyond.
 POISSON_RATIO_P2 = 0.49
 _TRIED = 6  # loads, of two positions, on which single precision is tried
-_BACKWARD = 1e-5  # imbalance in single precision, over the diagonal of K times the displacement
+_BACKWARD = 1e-5  # imbalance in single precision, over the largest diagonal times displacement
 _REFINED = 1e-4  # last relative change of a refined solution, whose own error is its square
 SINGLE_ERROR = 1e-3  # relative, up to which single precision serves: modes leave six times it
 
@@ -81,11 +84,13 @@ class Material:
         return "P2" if self.poisson_ratio <= POISSON_RATIO_P2 else "Taylor-Hood"
 
 
-def factors_at(material: Material, contrast: float | None) -> np.ndarray:
-    """theta_q of K = sum_q theta_q K_q: mu, lambda, and c mu, c lambda with an inclusion."""
+def factors_at(
+    material: Material, contrast: float | None, supports: Sequence[Support] = ()
+) -> np.ndarray:
+    """theta_q of K = sum_q theta_q K_q: mu, lambda; c mu, c lambda with an inclusion; each k."""
     lam, mu = material.lame
-    theta = np.array([mu, lam])
-    return theta if contrast is None else np.concatenate([theta, contrast * theta])
+    theta = [mu, lam] if contrast is None else [mu, lam, contrast * mu, contrast * lam]
+    return np.array([*theta, *(support.stiffness for support in supports)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +133,18 @@ class _Terms:
     """The constant matrices that a stiffness is made of, shared by all values of the material.
 
     volume_fraction : ndarray, shape (n_tets,), of an inclusion in each tetrahedron, or None
+    supported : vertices of the faces of each support, ndarrays of shape (n, 3)
     """
 
-    def __init__(self, mesh: MeshTet, element: Element, volume_fraction: np.ndarray | None) -> None:
+    def __init__(
+        self,
+        mesh: MeshTet,
+        element: Element,
+        volume_fraction: np.ndarray | None,
+        supported: Sequence[np.ndarray],
+    ) -> None:
         self._mesh, self._element, self._volume_fraction = mesh, element, volume_fraction
+        self._supported = supported
         self._shape = ElementTetP1() if element == "P1" else ElementTetP2()
         self._basis = Basis(mesh, self._shape, intorder=2)
         self.n_nodes = self._basis.N
@@ -144,6 +157,15 @@ class _Terms:
             return unit_stiffness(self._basis, node)
         outside = unit_stiffness(self._basis, node, 1.0 - self._volume_fraction)
         return outside + unit_stiffness(self._basis, node, self._volume_fraction)
+
+    @cached_property
+    def support_mass(self) -> tuple[sp.csr_matrix, ...]:
+        """int u.v da over each support, shape (3 n_nodes, 3 n_nodes) [m^2]."""
+        order = self.nodes_first(self._basis)
+        masses = (boundary_mass(self._mesh, self._shape, faces) for faces in self._supported)
+        return tuple(
+            sp.kron(mass[order][:, order], sp.identity(3), format="csr") for mass in masses
+        )
 
     @cached_property
     def mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
@@ -175,7 +197,7 @@ class _Terms:
 
 
 class Elasticity:
-    """The discrete elastic problem of one mesh, material and clamp.
+    """The discrete elastic problem of one mesh and material, held by a clamp or supports.
 
     Displacements are vectors of ``3 n_nodes`` values, ``3 node + component``; nodes are the mesh
     vertices in their order, then (P2, Taylor-Hood) the edge midpoints.
@@ -184,10 +206,11 @@ class Elasticity:
     ----------
     mesh : TetMesh
     material : Material
-    clamped : ndarray of bool, shape (n_faces,), over ``mesh.boundary_faces``; all False leaves
-        the organ free: then only :attr:`stiffness` can be used.
+    clamped : ndarray of bool, shape (n_faces,), over ``mesh.boundary_faces``; all False and no
+        supports leave the organ free: then only :attr:`stiffness` can be used.
     element : "P1", "P2", "Taylor-Hood" or None for ``material.element``
     inclusion : Inclusion or None; not with Taylor-Hood
+    supports : springs beside the clamp; where two overlap, both act
 
     Raises
     ------
@@ -202,8 +225,10 @@ class Elasticity:
         clamped: np.ndarray,
         element: Element | None = None,
         inclusion: Inclusion | None = None,
+        supports: Sequence[Support] = (),
     ) -> None:
         self.mesh, self.material, self.inclusion = mesh, material, inclusion
+        self.supports = tuple(supports)
         self._clamped_faces, self._refines = clamped, False
         self.element: Element = element or material.element
         if inclusion is not None and self.element == "Taylor-Hood":
@@ -215,7 +240,10 @@ class Elasticity:
             np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
         )
         self._terms = _Terms(
-            self._skfem_mesh, self.element, inclusion.volume_fraction if inclusion else None
+            self._skfem_mesh,
+            self.element,
+            inclusion.volume_fraction if inclusion else None,
+            [mesh.boundary_faces[support.faces] for support in self.supports],
         )
         self.n_nodes = self._terms.n_nodes
         self.clamped_nodes = np.unique(self.face_nodes[clamped])
@@ -244,12 +272,24 @@ class Elasticity:
             within = self._skfem_mesh.element_finder()
             parent_tet = within(*mesh.vertices[mesh.tets].mean(axis=1).T)
             inclusion = replace(inclusion, volume_fraction=inclusion.volume_fraction[parent_tet])
-        return Elasticity(mesh, self.material, self._clamped_faces[owner], self.element, inclusion)
+        supports = [replace(support, faces=support.faces[owner]) for support in self.supports]
+        return Elasticity(
+            mesh, self.material, self._clamped_faces[owner], self.element, inclusion, supports
+        )
 
-    def at(self, material: Material, contrast: float | None = None) -> Elasticity:
-        """The same problem and element at other values of the material; matrices are shared."""
+    def at(
+        self,
+        material: Material,
+        contrast: float | None = None,
+        stiffness: Mapping[str, float] | None = None,
+    ) -> Elasticity:
+        """The same problem and element at other values; matrices are shared.
+
+        stiffness : of supports, by name [N/m^3]; those not given keep theirs
+        """
         other = copy(self)
         other.material = material
+        other.supports = with_stiffness(self.supports, stiffness or {})
         if self.inclusion is not None and contrast is not None:
             other.inclusion = replace(self.inclusion, contrast=contrast)
         for name in ("stiffness", "_factor", "_single_factor"):
@@ -273,23 +313,34 @@ class Elasticity:
     @property
     def factors(self) -> np.ndarray:
         """theta_q at this problem's material, :func:`factors_at`."""
-        return factors_at(self.material, self.inclusion.contrast if self.inclusion else None)
+        contrast = self.inclusion.contrast if self.inclusion else None
+        return factors_at(self.material, contrast, self.supports)
 
     @cached_property
     def stiffness(self) -> sp.csr_matrix:
-        """K without boundary conditions, shape (3 n_nodes, 3 n_nodes) [N/m] (P1 and P2)."""
-        terms = zip(self.factors, self._terms.unit_stiffness, strict=True)
-        return sum(theta * matrix for theta, matrix in terms).tocsr()
+        """K with supports and without the clamp, shape (3 n_nodes,) * 2 [N/m] (P1 and P2)."""
+        matrices = self._terms.unit_stiffness + self._terms.support_mass
+        return sum(t * matrix for t, matrix in zip(self.factors, matrices, strict=True)).tocsr()
 
     @property
     def diagonal(self) -> np.ndarray:
-        """Diagonal of K, of its shear part with Taylor-Hood, shape (3 n_nodes,) [N/m]."""
+        """Diagonal of K, with Taylor-Hood without its volumetric part, (3 n_nodes,) [N/m]."""
         if self.element == "Taylor-Hood":
-            return np.asarray(self.material.lame[1] * self._terms.mixed[0].diagonal())
+            return np.asarray(self._shear_and_supports.diagonal())
         return np.asarray(self.stiffness.diagonal())
 
+    @property
+    def _shear_and_supports(self) -> sp.csr_matrix:
+        """What Taylor-Hood has of K without pressures."""
+        springs = zip(self.supports, self._terms.support_mass, strict=True)
+        shear = self.material.lame[1] * self._terms.mixed[0]
+        return sum((support.stiffness * mass for support, mass in springs), shear).tocsr()
+
     def apply_term(self, q: int, displacement: np.ndarray) -> np.ndarray:
-        """K_q u of one of :attr:`factors`, shape (3 n_nodes, n) [m^2]."""
+        """K_q u of one of :attr:`factors`, shape (3 n_nodes, n) [m^2], of a support [m^3]."""
+        n_material = len(self.factors) - len(self.supports)
+        if q >= n_material:
+            return np.asarray(self._terms.support_mass[q - n_material] @ displacement)
         if self.element != "Taylor-Hood":
             return np.asarray(self._terms.unit_stiffness[q] @ displacement)
         shear, coupling, _ = self._terms.mixed
@@ -315,33 +366,34 @@ class Elasticity:
     @property
     def _system(self) -> sp.csc_matrix:
         """The matrix over the free degrees of freedom, and the pressures of Taylor-Hood."""
-        if len(self.clamped_nodes) == 0:
-            raise MaterialError("an organ without a clamp has no equilibrium; clamp some faces")
+        if len(self.clamped_nodes) == 0 and not self.supports:
+            raise MaterialError(
+                "an organ without a clamp has no equilibrium; clamp some faces or give supports"
+            )
         self._require_all_held()
         free = self._free
         if self.element == "Taylor-Hood":
-            shear, coupling, mass = self._terms.mixed
+            _, coupling, mass = self._terms.mixed
             coupling = coupling[:, free]
-            lam, mu = self.material.lame
-            shear = mu * shear[free][:, free]
-            system = sp.bmat([[shear, -coupling.T], [-coupling, -mass / lam]])
+            shear = self._shear_and_supports[free][:, free]
+            system = sp.bmat([[shear, -coupling.T], [-coupling, -mass / self.material.lame[0]]])
         else:
             system = self.stiffness[free][:, free]
         return sp.csc_matrix(system)
 
     def _require_all_held(self) -> None:
-        """Raise MeshError if a part of the organ can move freely.
+        """Raise if a part of the organ can move freely.
 
         The factorization of such a system need not fail, and loads elsewhere do not reveal it.
         """
-        mesh, held = self.mesh, self.mesh.boundary_faces[self._clamped_faces]
-        n_pieces = int(mesh.pieces.max()) + 1
-        loose = [
-            k
-            for k in range(n_pieces if n_pieces > 1 else 0)
-            if not np.isin(held, mesh.tets[mesh.pieces == k]).all(axis=1).any()
-        ]
-        if loose:
+        mesh = self.mesh
+        piece = mesh.pieces[mesh.boundary_tets]
+        clamped, n_pieces = np.unique(piece[self._clamped_faces]), int(mesh.pieces.max()) + 1
+        loose = np.setdiff1d(np.arange(n_pieces), clamped)
+        if self.supports:
+            for k in loose:
+                require_held(mesh, self.supports, self.material.young_modulus, piece == k)
+        elif len(loose):
             raise MeshError(
                 f"{len(loose)} of {n_pieces} pieces connected by faces are not clamped; "
                 "clamp a face of each or remove them"
@@ -372,7 +424,7 @@ class Elasticity:
         Raises
         ------
         MaterialError, MeshError
-            For an organ, or a piece of it, without a clamp.
+            For an organ, or a piece of it, that neither clamp nor supports hold.
         ConvergenceError
             If the factorization failed and the solution does not balance the load.
         """
@@ -392,7 +444,7 @@ class Elasticity:
         imbalance = np.abs(balanced - right[: len(free), :1]).max()
         allowed = most * np.abs(right[:, :1]).max()
         if single:  # forces that nearly cancel drown in its rounding of what they are made of
-            allowed += _BACKWARD * self.diagonal.max() * np.abs(displacement[:, :1]).max()
+            allowed += _BACKWARD * np.abs(self.diagonal * displacement[:, 0]).max()
         if not imbalance <= allowed:
             raise ConvergenceError(
                 f"the linear solution leaves {imbalance:.1e} N out of balance; "

@@ -1,14 +1,14 @@
 """Tetrahedral meshes of an organ, and the regions where it is held and where a tool may touch it.
 
 ``surface -> tetrahedralize -> TetMesh``; the boundary of a ``TetMesh`` carries two regions, the
-clamp and the accessible surface, found by a geometric rule or read from a file of node groups.
+clamp and the accessible surface, found by a geometric rule here, or read from a file of node groups
+(:mod:`avatar_core.geometry.groups`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import igl
 import numpy as np
@@ -27,7 +27,7 @@ _LEAST_FINE = 0.05  # of the vertices wanted
 _TRIES = 3  # to meet their number
 _LOST_VOLUME = 0.03  # of the organ, that a mesh may lack; 64 livers at 2,850 vertices: below 0.8 %
 
-_IN_FACE = (np.ones((3, 3)) + 3.0 * np.eye(3)) / 6.0  # of three points, exact for parabolas
+IN_FACE = (np.ones((3, 3)) + 3.0 * np.eye(3)) / 6.0  # of three points, exact for parabolas
 POSTERIOR_SUPERIOR = np.array([0.0, -1.0, 1.0]) / np.sqrt(2.0)
 ANTERIOR = np.array([0.0, 1.0, 0.0])
 
@@ -52,11 +52,19 @@ class TetMesh:
     @cached_property
     def boundary_faces(self) -> np.ndarray:
         """Outward oriented boundary triangles, shape (n_faces, 3)."""
-        faces = self.tets[:, _TET_FACES].reshape(-1, 3)
-        _, first, count = np.unique(
-            np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-        )
-        return faces[np.sort(first[count == 1])]
+        return self.tets[:, _TET_FACES].reshape(-1, 3)[self._boundary]
+
+    @property
+    def boundary_tets(self) -> np.ndarray:
+        """The element that each boundary triangle is a face of, shape (n_faces,)."""
+        return self._boundary // 4
+
+    @cached_property
+    def _boundary(self) -> np.ndarray:
+        """4 element + face of those that no other element has, ascending."""
+        faces = np.sort(self.tets[:, _TET_FACES].reshape(-1, 3), axis=1)
+        _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
+        return np.sort(first[count == 1])
 
     @cached_property
     def face_area_normals(self) -> np.ndarray:
@@ -217,7 +225,7 @@ def _filled_out(mesh: TetMesh, surface: SurfaceMesh) -> TetMesh:
     Facets between points of a round surface cut corners: of a liver they lack half a per cent.
     """
     faces, area = mesh.boundary_faces, mesh.face_areas
-    points = np.einsum("qk,fkd->fqd", _IN_FACE, mesh.vertices[faces]).reshape(-1, 3)
+    points = np.einsum("qk,fkd->fqd", IN_FACE, mesh.vertices[faces]).reshape(-1, 3)
     closest = igl.point_mesh_squared_distance(points, *surface.skin.boundary)[2]
     gap = (closest - points).reshape(len(faces), -1, 3).mean(axis=1)
     outward = (gap * mesh.face_area_normals).sum() / area.sum()
@@ -286,35 +294,22 @@ def regions_by_rule(
     clamped[order[np.cumsum(area[order]) <= clamp_fraction * area.sum()]] = True
     if not clamped.any():
         clamped[order[0]] = True
-    touches_clamp = np.isin(faces, faces[clamped]).any(axis=1)
-    anterior = mesh.face_area_normals @ ANTERIOR > anterior_cosine * area
-    accessible = without_islands(faces, area, anterior & ~touches_clamp, least=0.05)
-    return _checked(mesh, Regions(clamped, accessible))
+    accessible = accessible_by_rule(mesh, touching(mesh, clamped), anterior_cosine)
+    return checked(Regions(clamped, accessible))
 
 
-def regions_from_groups(mesh: TetMesh, path: str | Path) -> Regions:
-    """Read the regions from a file of node groups.
+def accessible_by_rule(
+    mesh: TetMesh, covered: np.ndarray, anterior_cosine: float = 0.2
+) -> np.ndarray:
+    """Faces that look forward and are not covered, without islands, shape (n_faces,)."""
+    anterior = mesh.face_area_normals @ ANTERIOR > anterior_cosine * mesh.face_areas
+    return without_islands(mesh.boundary_faces, mesh.face_areas, anterior & ~covered, least=0.05)
 
-    The file is an ``.npz`` with two arrays of points [m], ``clamped`` and ``accessible``, shape
-    (n, 3): a boundary face belongs to the group if all three of its corners lie closer to a
-    point of that group than the mesh's mean surface edge.
-    """
-    from scipy.spatial import cKDTree
 
-    try:
-        with np.load(path, allow_pickle=False) as groups:
-            points = {name: np.asarray(groups[name], float) for name in ("clamped", "accessible")}
-    except (OSError, ValueError, KeyError) as error:
-        raise MeshError(
-            f"cannot read node groups from {path} ({error}); it must be an .npz with arrays "
-            "'clamped' and 'accessible' of shape (n, 3) in metres"
-        ) from error
-    inside = {}
-    for name, group in points.items():
-        near = cKDTree(group).query(mesh.vertices)[0] < mesh.mean_surface_edge
-        inside[name] = near[mesh.boundary_faces].all(axis=1)
-    touches = np.isin(mesh.boundary_faces, mesh.boundary_faces[inside["clamped"]]).any(axis=1)
-    return _checked(mesh, Regions(inside["clamped"], inside["accessible"] & ~touches))
+def touching(mesh: TetMesh, chosen: np.ndarray) -> np.ndarray:
+    """Boundary faces that share a vertex with chosen ones, these among them, shape (n_faces,)."""
+    faces = mesh.boundary_faces
+    return np.asarray(np.isin(faces, faces[chosen]).any(axis=1))
 
 
 def without_islands(
@@ -336,8 +331,15 @@ def without_islands(
     return kept
 
 
-def _checked(mesh: TetMesh, regions: Regions) -> Regions:
-    if not regions.clamped.any():
+def checked(regions: Regions, on_supports: bool = False) -> Regions:
+    """The regions of an organ that is held, by a clamp unless it is on supports.
+
+    Raises
+    ------
+    MeshError
+        If the organ is not held, or no tool reaches it.
+    """
+    if not (regions.clamped.any() or on_supports):
         raise MeshError("no face is clamped, so the organ could float away; widen the clamp")
     if not regions.accessible.any():
         raise MeshError("no face is accessible to the tool; check the axes (--axes) or the groups")

@@ -108,6 +108,7 @@ def build_vademecum(
             rule.is_met(last.mean, last.worst), rule.tolerance, modes.history, errors
         ),
         provenance=provenance,
+        supports=elasticity.supports,
     )
 
 

@@ -1,4 +1,4 @@
-"""Offline stage of a vademecum with coordinates of the material.
+"""Offline stage of a vademecum with coordinates of material and supports.
 
 1. at every node of the coordinates all patches are solved, as for an ordinary vademecum, and PGD
    finds the modes there;
@@ -23,6 +23,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
+from avatar_core.common.supports import SUPPORT
 from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
@@ -103,7 +104,7 @@ def build_parametric_vademecum(
     progress: Progress = silent,
     outline: SurfaceMesh | None = None,
 ) -> Vademecum:
-    """Compute the vademecum of one organ over a range of materials.
+    """Compute the vademecum of one organ over a range of materials and supports.
 
     Its own fields are those at the values of ``elasticity``, moved into the ranges.
 
@@ -284,6 +285,7 @@ def _assemble(
             contact_near=np.stack([blocks.block for blocks in contact]),
         ),
         contrast=first.inclusion.contrast if first.inclusion else None,
+        supports=first.supports,
         body=body,
     )
 
@@ -319,6 +321,7 @@ def _inside(coordinates: Sequence[Coordinate], elasticity: Elasticity) -> dict[s
     here = {
         "poisson": elasticity.material.poisson_ratio,
         "contrast": inclusion.contrast if inclusion else 1.0,
+        **{SUPPORT + support.name: support.stiffness for support in elasticity.supports},
     }
     return {c.name: float(np.clip(here[c.name], c.low, c.high)) for c in coordinates}
 

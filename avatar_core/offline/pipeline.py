@@ -10,14 +10,10 @@ from avatar_core.common.processes import cpu_seconds, repeatable
 from avatar_core.errors import ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import load_surface
+from avatar_core.fem.supports import Support
+from avatar_core.geometry.groups import regions_from_groups
 from avatar_core.geometry.level_set import orientation_offset
-from avatar_core.geometry.mesh import (
-    Regions,
-    TetMesh,
-    regions_by_rule,
-    regions_from_groups,
-    tetrahedralize,
-)
+from avatar_core.geometry.mesh import Regions, TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.resampling import require_displayable
 from avatar_core.geometry.surface import SurfaceMesh
@@ -34,6 +30,7 @@ from avatar_core.offline.large_deformation import (
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.parametric import build_parametric_vademecum, certify_range
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
+from avatar_core.offline.supports import SupportOption, held_by
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.display import Display, boundary, display_of, outline, structure
 from avatar_core.vademecum.large_deformation import LargeMaterial
@@ -52,7 +49,8 @@ class OrganOptions:
     material : Material
     element : None for the one that does not lock at the material's Poisson's ratio
     patch_radius : of the tool's traction [m]; None for max(12 mm, 1.2 x surface edge)
-    groups : file of node groups for clamp and accessible region; None for the anatomical rule
+    groups : file of node groups for clamp, accessible region and supports; None for the rules
+    supports : springs that hold the organ instead of the clamp
     rule : BuildRule
     coordinates : of the material, that stay free in the vademecum;
         :mod:`avatar_core.reduction.coordinates`
@@ -78,6 +76,7 @@ class OrganOptions:
     element: Element | None = None
     patch_radius: float | None = None
     groups: Path | None = None
+    supports: tuple[SupportOption, ...] = ()
     rule: BuildRule = field(default_factory=BuildRule)
     coordinates: tuple[Coordinate, ...] = ()
     tumour: SurfaceMesh | None = None
@@ -92,22 +91,31 @@ class OrganOptions:
     n_displayed: int | None = None
 
     def __post_init__(self) -> None:
-        names = [c.name for c in self.coordinates]
+        names = [c.name for c in self.all_coordinates]
         if len(set(names)) < len(names):
             raise CoordinateError(f"a coordinate is given twice: {', '.join(names)}")
+        if any(c.kind == "support" for c in self.coordinates):
+            raise CoordinateError(
+                "the stiffness of a support is chosen with --support NAME=LOW:HIGH"
+            )
+        held = [s.name for s in self.supports]
+        if len(set(held)) < len(held):
+            raise CoordinateError(f"a support is given twice: {', '.join(held)}")
         if "contrast" in names and self.tumour is None:
             raise CoordinateError(
                 "the contrast is that of a tumour; give its surface with --tumour"
             )
-        if self.large and (self.coordinates or self.tumour):
+        if self.large and (self.all_coordinates or self.tumour or self.supports):
             raise CoordinateError(
-                "large deformation is not combined with a tumour or coordinates of the material; "
-                "build two vademecums"
+                "large deformation is not combined with a tumour, supports or coordinates of the "
+                "material; build two vademecums"
             )
-        if self.n_contact_sites and (self.large or self.coordinates or self.tumour):
+        if self.n_contact_sites and (
+            self.large or self.all_coordinates or self.tumour or self.supports
+        ):
             raise CoordinateError(
                 "contact sites are resolved on one linear material; leave them out, or tumour, "
-                "coordinates and large deformation"
+                "supports, coordinates and large deformation"
             )
         if self.n_contact_sites != 0 and self.n_contact_sites < 3:
             raise ContactError(
@@ -129,6 +137,11 @@ class OrganOptions:
         if self.groups is not None and not self.groups.is_file():
             raise MeshError(f"cannot read node groups from {self.groups}: there is no such file")
 
+    @property
+    def all_coordinates(self) -> tuple[Coordinate, ...]:
+        """Of the material, then of the supports."""
+        return (*self.coordinates, *(s.coordinate for s in self.supports if s.coordinate))
+
 
 @repeatable
 def build(
@@ -147,8 +160,8 @@ def build(
     progress("mesh", 0.0, NO_ERROR)
     mesh = tetrahedralize(surface, options.n_vertices)
     progress("mesh", 1.0, NO_ERROR)
-    regions = regions_from_groups(mesh, options.groups) if options.groups else regions_by_rule(mesh)
-    elasticity = _elasticity(mesh, regions, options)
+    regions, supports = _held(mesh, options)
+    elasticity = _elasticity(mesh, regions, supports, options)
     loads = load_surface(mesh, regions, options.patch_radius)
     common = (surface.name, elasticity, regions, loads)
     provenance = _provenance(surface, options)
@@ -156,9 +169,9 @@ def build(
     def count(done: int) -> None:
         progress("certify", done / options.n_certified, NO_ERROR)
 
-    if options.coordinates:
+    if options.all_coordinates:
         vademecum = build_parametric_vademecum(
-            *common, options.coordinates, options.rule, provenance, progress, surface
+            *common, options.all_coordinates, options.rule, provenance, progress, surface
         )
         certificate = certify_range(vademecum, elasticity, options.n_certified, options.seed, count)
     else:
@@ -227,17 +240,27 @@ def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress)
     return vademecum.with_large_certificate(with_combinations(certificate, rows))
 
 
-def _elasticity(mesh: TetMesh, regions: Regions, options: OrganOptions) -> Elasticity:
+def _held(mesh: TetMesh, options: OrganOptions) -> tuple[Regions, tuple[Support, ...]]:
+    """Clamp, accessible region and supports."""
+    if options.supports:
+        return held_by(mesh, options.supports, options.groups)
+    if options.groups:
+        return regions_from_groups(mesh, options.groups), ()
+    return regions_by_rule(mesh), ()
+
+
+def _elasticity(
+    mesh: TetMesh, regions: Regions, supports: tuple[Support, ...], options: OrganOptions
+) -> Elasticity:
     """The elastic problem, on one element that serves the whole range of Poisson's ratio."""
     ratios = [c.high for c in options.coordinates if c.name == "poisson"]
     stiffest = replace(options.material, poisson_ratio=max(ratios)) if ratios else options.material
     inclusion = None
     if options.tumour is not None:
         inclusion = Inclusion(volume_fraction_inside(mesh, options.tumour), options.contrast)
-    problem = Elasticity(
-        mesh, options.material, regions.clamped, options.element or stiffest.element, inclusion
-    )
-    # One factor then serves build and certificate; a range of materials has one for each value.
+    element = options.element or stiffest.element
+    problem = Elasticity(mesh, options.material, regions.clamped, element, inclusion, supports)
+    # One factor then serves build and certificate; a range of values has one for each.
     return problem if options.coordinates else problem.refining()
 
 
@@ -252,6 +275,7 @@ def _provenance(surface: SurfaceMesh, options: OrganOptions) -> Provenance:
     for name in ("rule", "material", "large_rule"):
         del parameters[name]
     parameters["coordinates"] = " ".join(map(str, options.coordinates)) or None
+    parameters["supports"] = " ".join(map(str, options.supports)) or None
     parameters["tumour"] = options.tumour and options.tumour.name
     return Provenance(
         source=surface.name,

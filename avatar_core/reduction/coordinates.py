@@ -1,12 +1,13 @@
-"""The material coordinates of a vademecum u(x, s, p): ranges chosen at build time, values later.
+"""The coordinates of a vademecum u(x, s, p), of material and supports: ranges at build time.
 
-Both coordinates enter the stiffness through affine factors of constant matrices
+All coordinates enter the stiffness through affine factors of constant matrices
 (:attr:`avatar_core.fem.elasticity.Elasticity.factors`), so that everything that depends on them is
 a small problem. Responses are computed at a few nodes in each range; between them, weights are
 those of (multi)linear interpolation in
 
     poisson   -log(1 - 2 nu), in which the response varies evenly towards incompressibility
     contrast   log c
+    support.NAME    log k, of the stiffness per area of a support
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from avatar_core.common.supports import LEAST_STIFFNESS, MOST_STIFFNESS, SUPPORT
 from avatar_core.errors import CoordinateError
 
 if TYPE_CHECKING:
@@ -26,16 +28,20 @@ if TYPE_CHECKING:
 
 # Between nodes no farther apart, in the scales above, interpolation adds nothing to the error that
 # can be measured (`avatar study coordinates`).
-_SPACING = {"poisson": 2.4, "contrast": 1.9}
-_LIMITS = {"poisson": (0.0, 0.4999), "contrast": (0.01, 100.0)}
+_SPACING = {"poisson": 2.4, "contrast": 1.9, "support": 3.1}
+_LIMITS = {
+    "poisson": (0.0, 0.4999),
+    "contrast": (0.01, 100.0),
+    "support": (LEAST_STIFFNESS, MOST_STIFFNESS),
+}
 
 
 @dataclass(frozen=True)
 class Coordinate:
     """A parameter of the organ that may be chosen when the vademecum is used.
 
-    name : "poisson" (Poisson's ratio) or "contrast" (Young's modulus inside the tumour over that
-        outside)
+    name : "poisson" (Poisson's ratio), "contrast" (Young's modulus inside the tumour over that
+        outside) or "support.NAME" (stiffness per area of a support [N/m^3])
     low, high : its range
     n_nodes : at which the organ is solved, both ends included; 0: as many as the range needs
 
@@ -51,9 +57,11 @@ class Coordinate:
     n_nodes: int = 0
 
     def __post_init__(self) -> None:
-        if self.name not in _LIMITS:
-            raise CoordinateError(f"coordinate '{self.name}' is unknown; there are {_known()}")
-        least, most = _LIMITS[self.name]
+        if self.kind not in _LIMITS or self.name == "support":
+            raise CoordinateError(
+                f"coordinate '{self.name}' is unknown; there are poisson, contrast and support.NAME"
+            )
+        least, most = _LIMITS[self.kind]
         if not least <= self.low < self.high <= most:
             raise CoordinateError(
                 f"coordinate {self.name}={self.low:g}:{self.high:g}: give LOW:HIGH with "
@@ -66,9 +74,14 @@ class Coordinate:
                 "rounding; give a wider one"
             )
         if self.n_nodes == 0:
-            object.__setattr__(self, "n_nodes", 1 + math.ceil(span / _SPACING[self.name]))
+            object.__setattr__(self, "n_nodes", 1 + math.ceil(span / _SPACING[self.kind]))
         if self.n_nodes < 2:
             raise CoordinateError(f"coordinate {self.name}: give at least 2 nodes")
+
+    @property
+    def kind(self) -> str:
+        """What it is a coordinate of: "poisson", "contrast" or "support"."""
+        return "support" if self.name.startswith(SUPPORT) else self.name
 
     @classmethod
     def parse(cls, text: str) -> Coordinate:
@@ -146,16 +159,23 @@ def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]
         if name not in names:
             raise CoordinateError(
                 f"this vademecum has no coordinate '{name}' but {', '.join(names) or 'none'}; "
-                f"build it with --coordinate {name}=LOW:HIGH"
+                f"build it with {option_of(name)}=LOW:HIGH"
             )
 
 
-def _known() -> str:
-    return ", ".join(_LIMITS)
+def option_of(name: str) -> str:
+    """Of the command line, that makes a coordinate."""
+    is_support = name.startswith(SUPPORT)
+    return f"--support {name.removeprefix(SUPPORT)}" if is_support else f"--coordinate {name}"
+
+
+def stiffness_of(values: Mapping[str, float]) -> dict[str, float]:
+    """Of supports, by their own names, among values by name of a coordinate [N/m^3]."""
+    return {n.removeprefix(SUPPORT): k for n, k in values.items() if n.startswith(SUPPORT)}
 
 
 def problem_at(elasticity: Elasticity, values: Mapping[str, float]) -> Elasticity:
     """The elastic problem at values of the coordinates; others keep their values."""
     poisson = values.get("poisson", elasticity.material.poisson_ratio)
     material = replace(elasticity.material, poisson_ratio=poisson)
-    return elasticity.at(material, values.get("contrast"))
+    return elasticity.at(material, values.get("contrast"), stiffness_of(values))

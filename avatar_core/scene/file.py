@@ -19,7 +19,7 @@ from avatar_core.common.quantities import check_line, is_whole, lies_in
 from avatar_core.contact.effects import EFFECTS, Effect, Viscoelasticity
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
-from avatar_core.scene.model import Scene, Tool
+from avatar_core.scene.model import Scene, SupportStiffness, Tool
 from avatar_core.scene.prony import parse_prony
 from avatar_core.scene.yaml_lines import (
     Entries,
@@ -38,7 +38,7 @@ from avatar_core.scene.yaml_lines import (
 # Fields of a Scene by the key that groups them in YAML; the other keys have no group.
 SECTIONS = {
     "organ": ("vademecum",),
-    "material": ("young_modulus", "poisson_ratio"),
+    "material": ("young_modulus", "poisson_ratio", "supports"),
     "outputs": ("cloud", "cloud_divisor", "modes"),
 }
 SHIPPED = Path("params") / "scenes"  # in a checkout; installed below share/avatar_ros
@@ -130,7 +130,10 @@ def write_scene(scene: Scene) -> str:
     document: dict[str, Any] = {"name": scene.name, "text": scene.text}
     for section, keys in SECTIONS.items():
         values = {key: getattr(scene, key) for key in keys}
-        document[section] = {key: _plain(v) for key, v in values.items() if v is not None}
+        chosen = {k: v for k, v in values.items() if v is not None and not isinstance(v, tuple)}
+        document[section] = {key: _plain(value) for key, value in chosen.items()}
+    if scene.supports:
+        document["material"]["supports"] = {s.name: float(s.stiffness) for s in scene.supports}
     document["tools"] = [
         {"name": tool.name, "tip": _plain_fields(tool.tip)} for tool in scene.tools
     ]
@@ -165,6 +168,8 @@ def _fields(owner: type, entries: Entries, path: str) -> dict[str, Any]:
 def _value(node: Node, path: str, owner: type, key: str) -> Any:
     """The value of a node, of the type that the field has."""
     kind = get_type_hints(owner)[key]
+    if kind == tuple[SupportStiffness, ...]:
+        return _supports(node, path)
     if kind is str:
         return _line(node, path)
     if get_origin(kind) is not None and isinstance(get_args(kind)[0], str):
@@ -175,6 +180,18 @@ def _value(node: Node, path: str, owner: type, key: str) -> Any:
     if not isinstance(node, SequenceNode):
         raise refused(node, f"{path} is {shown(node)}; write a list of numbers in {allowed}")
     return tuple(_number(item, f"{path}[{i}]", allowed, False) for i, item in enumerate(node.value))
+
+
+def _supports(node: Node, path: str) -> tuple[SupportStiffness, ...]:
+    """A mapping of the supports' names to their stiffnesses."""
+    if not isinstance(node, MappingNode):
+        raise refused(node, f"{path} is {shown(node)}; write {{bare_area: 1e6}}, [N/m^3]")
+    (field,) = (f for f in fields(SupportStiffness) if f.name == "stiffness")
+    entries = checked(node.value, path, [str(key.value) for key, _ in node.value])
+    return tuple(
+        SupportStiffness(name, _number(value, below(path, name), field.metadata["quantity"], False))
+        for name, (_, value) in entries.items()
+    )
 
 
 def _number(node: Node, path: str, allowed: Any, whole: bool) -> float:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, get_args
 
 from avatar_core.common.quantities import check_line, check_numbers, quantity
+from avatar_core.common.supports import LEAST_STIFFNESS, MOST_STIFFNESS, SUPPORT
 from avatar_core.contact.effects import Effect, Tilt
 from avatar_core.contact.kernels import MAX_TOOLS
 from avatar_core.errors import CoordinateError, SceneError
@@ -60,11 +61,30 @@ class Tool:
 
 
 @dataclass(frozen=True)
+class SupportStiffness:
+    """How firmly a support holds the organ, if that is a coordinate of the vademecum.
+
+    Raises
+    ------
+    SceneError
+        For a stiffness that no support has.
+    """
+
+    name: str
+    stiffness: float = quantity("N/m^3", LEAST_STIFFNESS, MOST_STIFFNESS, "per area of the support")
+
+    def __post_init__(self) -> None:
+        check_line("material.supports", self.name)
+        check_numbers(self, f"material.supports.{self.name}.")
+
+
+@dataclass(frozen=True)
 class Scene:
     """What is simulated, in SI units.
 
     vademecum : file in the library's folder; "" for the one that is loaded
     young_modulus, poisson_ratio, modes : None for those of the vademecum
+    supports : stiffnesses per area that are not those of the vademecum
     cloud : vertices that are sent
     effects : each at most once, in any order
 
@@ -79,6 +99,7 @@ class Scene:
     vademecum: str = ""
     young_modulus: float | None = quantity("Pa", 1.0, 1e8, "of the organ", None)
     poisson_ratio: float | None = quantity("-", 0.0, 0.4999, "of the organ", None)
+    supports: tuple[SupportStiffness, ...] = ()
     tools: tuple[Tool, ...] = (Tool(),)
     cloud: Cloud = "surface"
     cloud_divisor: int = quantity("-", 1, 1000, "the cloud is sent every so many steps", 1)
@@ -108,6 +129,9 @@ class Scene:
         n_tools = len(self.tools)
         if not 1 <= n_tools <= MAX_TOOLS:
             raise SceneError(f"tools: there are {n_tools}; give 1 to {MAX_TOOLS}")
+        name = _first_twice([support.name for support in self.supports])
+        if name is not None:
+            raise SceneError(f"material.supports: {name} is named twice; name it once")
         name = _first_twice([tool.name for tool in self.tools])
         if name is not None:
             raise SceneError(f"tools: two are called '{name}'; give each its own name")
@@ -124,12 +148,13 @@ class Scene:
 
     @property
     def values(self) -> dict[str, float]:
-        """Material values that the scene chooses, for ``at_values``.
+        """Values of material and supports that the scene chooses, for ``at_values``.
 
         The contrast is that of the effect ``tumour``.
         """
         chosen = {"young": self.young_modulus, "poisson": self.poisson_ratio}
-        return {name: value for name, value in chosen.items() if value is not None}
+        given = {name: value for name, value in chosen.items() if value is not None}
+        return given | {SUPPORT + one.name: one.stiffness for one in self.supports}
 
     def require(self, vademecum: Vademecum) -> None:
         """Refuse a vademecum that lacks what the scene needs, or answers it too wrongly.
@@ -142,12 +167,16 @@ class Scene:
         for effect in self.effects:
             effect.require(vademecum)
         if self.poisson_ratio is not None:
-            _require_poisson(vademecum, self.poisson_ratio)
-        for one in combinations(self, vademecum):
-            if one.error is not None and one.error > REFUSED:
+            _require_coordinate(vademecum, "material.poisson_ratio", "poisson", self.poisson_ratio)
+        for one in self.supports:
+            _require_coordinate(
+                vademecum, f"material.supports.{one.name}", SUPPORT + one.name, one.stiffness
+            )
+        for pair in combinations(self, vademecum):
+            if pair.error is not None and pair.error > REFUSED:
                 raise SceneError(
-                    f"{' with '.join(one.effects)}: {one.how}, which is {one.error:.0%} wrong in "
-                    f"the mean for this organ, above {REFUSED:.0%}; leave one of the two out"
+                    f"{' with '.join(pair.effects)}: {pair.how}, which is {pair.error:.0%} wrong "
+                    f"in the mean for this organ, above {REFUSED:.0%}; leave one of the two out"
                 )
 
 
@@ -201,15 +230,19 @@ def _figure(certificate: Any, key: str | None) -> float | None:
     return None if value is None or math.isnan(value) else float(value)
 
 
-def _require_poisson(vademecum: Vademecum, value: float) -> None:
+def _require_coordinate(vademecum: Vademecum, key: str, name: str, value: float) -> None:
+    """Refuse a value of a coordinate that the vademecum has not, or out of its range.
+
+    The range of a support is that at Young's modulus of the vademecum: ``at_values`` knows others.
+    """
     coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
     try:
-        require_known(coordinates, {"poisson": value})
+        require_known(coordinates, {name: value})
         for coordinate in coordinates:
-            if coordinate.name == "poisson":
+            if coordinate.name == name and coordinate.kind != "support":
                 coordinate.weights(value)  # refuses a value out of range
     except CoordinateError as error:
-        raise SceneError(f"material.poisson_ratio: {error}") from error
+        raise SceneError(f"{key}: {error}") from error
 
 
 def _first_twice(names: Sequence[str]) -> str | None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from avatar_core.common.supports import SUPPORT
+from avatar_core.errors import CoordinateError
 from avatar_core.fem.elasticity import Material, factors_at
-from avatar_core.reduction.coordinates import node_weights, require_known
+from avatar_core.fem.supports import with_stiffness
+from avatar_core.reduction.coordinates import Coordinate, node_weights, require_known, stiffness_of
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.parametric import (
@@ -26,7 +30,8 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     ----------
     vademecum : Vademecum
     values : by name of a coordinate; what is not given keeps its value. "young" [Pa] is a
-        coordinate of every vademecum: displacements are proportional to 1 / E.
+        coordinate of every vademecum: displacements are proportional to 1 / E. On supports it is
+        their stiffness over E that they depend on, so that these must be coordinates too.
 
     Raises
     ------
@@ -38,23 +43,34 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
         vademecum.material, young_modulus=given.pop("young", vademecum.material.young_modulus)
     )
     parametric = vademecum.parametric
-    require_known(parametric.coordinates if parametric else (), given)
-    if parametric is None or not given:
+    coordinates = parametric.coordinates if parametric else ()
+    require_known(coordinates, given)
+    stiffens = material.young_modulus != vademecum.material.young_modulus
+    if stiffens:
+        _require_free(vademecum, coordinates)
+    if parametric is None or not (given or (stiffens and vademecum.supports)):
         return _with_young_modulus(vademecum, material)
+    supports = with_stiffness(vademecum.supports, stiffness_of(given))
+    softer = parametric.young_modulus / material.young_modulus
+    # u(E, k) = E0 / E u(E0, k E0 / E)
+    at_reference = with_stiffness(supports, {s.name: softer * s.stiffness for s in supports})
     here = {"poisson": material.poisson_ratio, "contrast": vademecum.contrast or 1.0, **given}
-    point = {c.name: float(here[c.name]) for c in parametric.coordinates}
-    weights = node_weights(parametric.coordinates, point)  # first, as it refuses
+    here |= {SUPPORT + support.name: support.stiffness for support in at_reference}
+    point = {c.name: float(here[c.name]) for c in coordinates}
+    _require_in_range(coordinates, point, softer)
+    weights = node_weights(coordinates, point)
     material = replace(material, poisson_ratio=point.get("poisson", material.poisson_ratio))
     contrast = point.get("contrast", vademecum.contrast)
     reference = replace(material, young_modulus=parametric.young_modulus)
-    root = stiffness_root(parametric, factors_at(reference, contrast))
+    root = stiffness_root(parametric, factors_at(reference, contrast, at_reference))
     far, trailing, body = galerkin_field(parametric, root)
     regional_load = regional_load_of_basis(parametric, root, trailing, vademecum.regional)
     regional_load += combined(parametric.regional_load, weights)
-    at_reference = replace(
+    found = replace(
         vademecum,
         material=reference,
         contrast=contrast,
+        supports=supports,
         far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
         trailing=trailing.astype(np.float32),
         body=body,
@@ -63,7 +79,53 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
             vademecum.contact_near, block=combined(parametric.contact_near, weights)
         ),
     )
-    return _with_young_modulus(at_reference, material)
+    return _with_young_modulus(found, material)
+
+
+def ranges(vademecum: Vademecum) -> dict[str, tuple[float, float]]:
+    """Lowest and highest value of each coordinate, by name, if no other is changed.
+
+    "young" is among them only where supports limit it.
+    """
+    parametric = vademecum.parametric
+    coordinates = parametric.coordinates if parametric else ()
+    out = {c.name: (c.low, c.high) for c in coordinates}
+    young, least, most = vademecum.material.young_modulus, 0.0, math.inf
+    for support in vademecum.supports:
+        name = SUPPORT + support.name
+        if parametric is None or name not in out:
+            least = most = young
+            continue
+        low, high = (young / parametric.young_modulus * end for end in out[name])
+        out[name] = low, high
+        least = max(least, young * support.stiffness / high)
+        most = min(most, young * support.stiffness / low)
+    return out | ({"young": (least, most)} if vademecum.supports else {})
+
+
+def _require_free(vademecum: Vademecum, coordinates: Sequence[Coordinate]) -> None:
+    """Raise CoordinateError if a fixed support forbids another Young's modulus."""
+    names = [c.name for c in coordinates]
+    for support in vademecum.supports:
+        if SUPPORT + support.name not in names:
+            raise CoordinateError(
+                f"support {support.name} is fixed, and with it Young's modulus at "
+                f"{vademecum.material.young_modulus:g} Pa; build with --support "
+                f"{support.name}=LOW:HIGH to choose both"
+            )
+
+
+def _require_in_range(
+    coordinates: Sequence[Coordinate], point: Mapping[str, float], softer: float
+) -> None:
+    """Raise CoordinateError for a support out of the range that it has at Young's modulus."""
+    for c in coordinates:
+        if softer != 1.0 and c.kind == "support" and not c.low <= point[c.name] <= c.high:
+            raise CoordinateError(
+                f"{c.name} is {point[c.name] / softer:g} N/m^3; at this Young's modulus the "
+                f"vademecum holds {c.low / softer:g} to {c.high / softer:g}; choose that, or build "
+                f"it near this modulus with --young"
+            )
 
 
 def _with_young_modulus(vademecum: Vademecum, material: Material) -> Vademecum:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from avatar_core.errors import ConvergenceError, LoadError
 from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.fem.supports import Support
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.reduction.pgd import EnrichmentReport
@@ -103,7 +104,7 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "3.1"
+SCHEMA_VERSION = "3.2"
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ class Vademecum:
     parametric : ParametricResponse or None, the coordinates of the material: all fields above
         are those of one choice of their values (:func:`avatar_core.vademecum.at_values.at_values`)
     contrast : Young's modulus inside the tumour over that outside; None without a tumour
+    supports : springs that hold the organ, beside the clamp of ``regions``
     large : LargeDeformation or None, the load's magnitude as a coordinate
     body : BodyResponse or None, mass and weight as the far modes see them
     display : Display or None, a finer surface, and structures inside; None for the boundary of the
@@ -143,6 +145,7 @@ class Vademecum:
     certificate: Certificate | None = None
     parametric: ParametricResponse | None = None
     contrast: float | None = None
+    supports: tuple[Support, ...] = ()
     large: LargeDeformation | None = None
     body: BodyResponse | None = None
     display: Display | None = None

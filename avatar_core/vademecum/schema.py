@@ -86,6 +86,7 @@ _DISPLAY: Shapes = {
     "display/weights": "f: displayed 4",
     "display/first_face": "i: parts",
 }
+_SUPPORTS: Shapes = {"supports/faces": "b: supports faces"}
 BODY_KEYS = tuple(_BODY)
 PARAMETRIC_KEYS = tuple(_PARAMETRIC)
 PARAMETRIC_BODY_KEYS = tuple(_PARAMETRIC_BODY)
@@ -94,9 +95,20 @@ PROFILE_KEYS = tuple(_PROFILE)
 TUMOUR_KEYS = tuple(_TUMOUR)
 SHIFT_KEYS = tuple(_SHIFT)
 DISPLAY_KEYS = tuple(_DISPLAY)
+SUPPORT_KEYS = tuple(_SUPPORTS)
 
 # Each is present or absent as a whole; its first key decides.
-_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE, _PROFILE, _TUMOUR, _SHIFT, _DISPLAY)
+_PARTS = (
+    _PARAMETRIC,
+    _BODY,
+    _PARAMETRIC_BODY,
+    _LARGE,
+    _PROFILE,
+    _TUMOUR,
+    _SHIFT,
+    _DISPLAY,
+    _SUPPORTS,
+)
 
 
 def shapes_of(held: Container[str]) -> dict[str, str]:

@@ -1,6 +1,6 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 3.1), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 3.2), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
 ``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve. Datasets:
@@ -35,6 +35,9 @@ to display
     display/corners (n, 4)               display/weights (n, 4), of the mesh's vertices
     display/first_face (n_parts + 1,), with the JSON attribute ``parts``, their names
 
+one on supports supports/faces (n_supports, n_faces) over the boundary faces, with the JSON
+attribute ``supports``, their names and stiffnesses [N/m^3];
+
 one with large deformation the JSON attribute
 ``large`` (material, certificate) and, for k = 2, 3,
 
@@ -48,6 +51,7 @@ import io
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -57,9 +61,11 @@ import numpy as np
 from avatar_core.common.dataclass_json import of_plain, parsed, require_name
 from avatar_core.common.files import FileError, opened
 from avatar_core.common.hdf5 import checksum, format_of, replace_file, require_schema, verified
+from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.fem.supports import Support
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.reduction.near_field import LocalBlocks, Mirror
@@ -84,6 +90,7 @@ from avatar_core.vademecum.schema import (
     PARAMETRIC_KEYS,
     PROFILE_KEYS,
     SHIFT_KEYS,
+    SUPPORT_KEYS,
     TUMOUR_KEYS,
     require_sound,
     shapes_of,
@@ -94,7 +101,7 @@ FORMAT = "avatar vademecum"
 MAX_FILE_BYTES = 4 << 30
 
 _JSON = ("material", "provenance", "convergence", "certificate")
-_JSON_LATER = ("coordinates", "contrast", "large", "accuracy", "parts")
+_JSON_LATER = ("coordinates", "contrast", "large", "accuracy", "parts", "supports")
 # What files call fields of the certificate.
 _STORED_AS = {"tip_force_mean": "felt_mean", "tip_force_worst": "felt_worst"}
 
@@ -199,6 +206,8 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
         for attribute in key.split("/"):
             value = getattr(value, attribute)
         arrays[key] = np.asarray(value)
+    if v.supports:
+        arrays[SUPPORT_KEYS[0]] = np.stack([support.faces for support in v.supports])
     return arrays | _upper_half(v)
 
 
@@ -222,7 +231,8 @@ def _attributes(v: Vademecum) -> dict[str, str]:
     for report in convergence["enrichments"]:
         report["status"] = report["status"].value
     coordinates = [asdict(c) for c in v.parametric.coordinates] if v.parametric else []
-    return {
+    supports = [{"name": s.name, "stiffness": s.stiffness} for s in v.supports]
+    attributes = {
         "format": FORMAT,
         "schema": SCHEMA_VERSION,
         "name": v.name,
@@ -237,6 +247,8 @@ def _attributes(v: Vademecum) -> dict[str, str]:
         "large": json.dumps(_large_attribute(v.large)),
         "parts": json.dumps(v.display.names if v.display else None),
     }
+    # only where there are some: earlier versions read all other files
+    return attributes | ({"supports": json.dumps(supports)} if supports else {})
 
 
 def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vademecum:
@@ -244,7 +256,7 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
     require_sound(arrays)
     mirror = Mirror.of(arrays["contact_near/start"], arrays["contact_near/target"])
     plain = {key: parsed(attributes.get(key, "null"), key) for key in (*_JSON, *_JSON_LATER)}
-
+    supports = _supports(arrays, plain["supports"])
     return Vademecum(
         name=require_name(attributes["name"], "name"),
         mesh=TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"]),
@@ -268,8 +280,9 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         convergence=of_plain(Convergence, plain["convergence"], "convergence"),
         provenance=of_plain(Provenance, plain["provenance"], "provenance"),
         certificate=_certificate(plain["certificate"], plain["accuracy"]),
-        parametric=_parametric(arrays, plain["coordinates"], mirror),
+        parametric=_parametric(arrays, plain["coordinates"], mirror, supports),
         contrast=_contrast(plain["contrast"]),
+        supports=supports,
         large=_large(arrays, plain["large"]),
         body=_body(arrays, BODY_KEYS),
         display=_display(arrays, plain["parts"]),
@@ -308,6 +321,26 @@ def _contrast(stored: Any) -> float | None:
     if contrast is not None and not (math.isfinite(contrast) and contrast > 0.0):
         raise StorageError(f"'contrast' is {contrast:g}, not above 0; build the file again")
     return contrast
+
+
+@dataclass(frozen=True)
+class _Support:
+    """What is stored of a support beside its faces."""
+
+    name: str
+    stiffness: float
+
+
+def _supports(arrays: dict[str, np.ndarray], stored: Any) -> tuple[Support, ...]:
+    if SUPPORT_KEYS[0] not in arrays:
+        return ()
+    said, faces = of_plain(tuple[_Support, ...], stored, "supports"), arrays[SUPPORT_KEYS[0]]
+    if len(said) != len(faces) or len({one.name for one in said}) < len(said):
+        raise StorageError("'supports' do not fit 'supports/faces'; build the file again")
+    return tuple(
+        Support(require_name(one.name, "supports"), some, one.stiffness)
+        for one, some in zip(said, faces, strict=True)
+    )
 
 
 def _certificate_attribute(certificate: Certificate | None) -> dict[str, Any] | None:
@@ -371,7 +404,7 @@ def _large(arrays: dict[str, np.ndarray], stored: Any) -> LargeDeformation | Non
 
 
 def _parametric(
-    arrays: dict[str, np.ndarray], stored: Any, mirror: Mirror
+    arrays: dict[str, np.ndarray], stored: Any, mirror: Mirror, supports: Sequence[Support]
 ) -> ParametricResponse | None:
     if PARAMETRIC_KEYS[0] not in arrays:
         return None
@@ -382,6 +415,9 @@ def _parametric(
         raise StorageError(
             "'coordinates' do not fit 'parametric/contact_near'; build the file again"
         )
+    held = {SUPPORT + support.name for support in supports}
+    if not {c.name for c in coordinates if c.kind == "support"} <= held:
+        raise StorageError("'coordinates' do not fit 'supports'; build the file again")
     return ParametricResponse(
         coordinates=coordinates,
         basis=SeparatedField(part["basis/space"], part["basis/load"]),

@@ -7,6 +7,7 @@ from array import array
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
+from avatar_core.common.supports import ATTACHMENTS, MOST_STIFFNESS, SUPPORT
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Shape, Tip
 from avatar_core.vademecum.accuracy import Budget, Cloud, Quantity
@@ -116,6 +117,17 @@ CONTACT = (
         range=(0.0, 100.0),
         read_only=False,
     ),
+    *(
+        Parameter(
+            f"support.{name}",
+            0.0,
+            f"stiffness per area of the support {name} [N/m^3], if it is a coordinate; 0: that of "
+            "the vademecum",
+            range=(0.0, MOST_STIFFNESS),
+            read_only=False,
+        )
+        for name in ATTACHMENTS
+    ),
     Parameter(
         "accuracy.tolerance",
         0.0,
@@ -156,6 +168,7 @@ MATERIAL = {
     "material.young_modulus": "young",
     "material.poisson_ratio": "poisson",
     "material.contrast": "contrast",
+    **{SUPPORT + name: SUPPORT + name for name in ATTACHMENTS},
 }
 
 

@@ -25,10 +25,12 @@ from sensor_msgs.msg import PointCloud2
 from tf2_msgs.msg import TFMessage
 
 from avatar_core.common.jit import load_compiler
+from avatar_core.common.supports import SUPPORT
 from avatar_core.contact import model as contact
 from avatar_core.contact.haptics import passivity
 from avatar_core.contact.layout import Layout
 from avatar_core.errors import AccuracyError, SceneError, one_line
+from avatar_core.reduction.coordinates import option_of
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget
 from avatar_ros.framework import promises, qos, realtime
 from avatar_ros.framework.managed_node import ManagedNode, run
@@ -323,7 +325,7 @@ class ContactNode(ManagedNode):
             name = MATERIAL.get(change.name)
             if name is None:
                 continue
-            refusal = self._refusal_of(name, change.value)
+            refusal = self._refusal_of(name, change.value, settings.material)
             if refusal:
                 return SetParametersResult(successful=False, reason=refusal)
             material.pop(name, None)
@@ -370,12 +372,21 @@ class ContactNode(ManagedNode):
             f"the most exact is within {least:.3g}"
         )
 
-    def _refusal_of(self, name: str, value: float) -> str:
-        """Why a value of the material lies outside the vademecum in use; empty if it does not."""
-        if value == 0.0 or name == "young" or self._ranges is None:
+    def _refusal_of(self, name: str, value: float, material: dict[str, float]) -> str:
+        """Why a value of the material lies outside the vademecum in use; empty if it does not.
+
+        On supports, the ranges of stiffness and Young's modulus depend on each other: where both
+        are changed, the worker process decides.
+        """
+        if value == 0.0 or self._ranges is None or (name == "young" and name not in self._ranges):
             return ""
         if name not in self._ranges:
-            return f"the vademecum has no coordinate {name}; build it with --coordinate {name}=..."
+            return f"the vademecum has no coordinate {name}; build it with {option_of(name)}=..."
+        others = {one for one in material if one != name}
+        if (name == "young" and any(one.startswith(SUPPORT) for one in others)) or (
+            name.startswith(SUPPORT) and "young" in others
+        ):
+            return ""
         low, high = self._ranges[name]
         return "" if low <= value <= high else f"the vademecum holds {low:g} to {high:g}"
 

@@ -139,6 +139,7 @@ class ModelPreparer:
         from avatar_core.contact.layout import Layout
         from avatar_core.contact.model import make_model
         from avatar_core.scene.file import parse_scene
+        from avatar_core.vademecum.at_values import ranges
         from avatar_ros.prepare.detail_chooser import least_error
         from avatar_ros.prepare.scenes import model_spec
 
@@ -146,7 +147,6 @@ class ModelPreparer:
         spec = model_spec(vademecum, request, scene)
         detail = self._chooser.detail(spec, request)
         handle, contents = write_shared(spec.layout(detail, request.period).flat())
-        coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
         try:
             # Compiles the step for these effects, if that was never done on this machine, from
             # arrays as the node will map them: it then finds the same types in numba's cache.
@@ -157,7 +157,7 @@ class ModelPreparer:
                 id=vademecum.id,
                 name=vademecum.name,
                 contents=contents,
-                ranges={c.name: (c.low, c.high) for c in coordinates},
+                ranges=ranges(vademecum),
                 effects=spec.effect_names,
                 cloud_divisor=scene.cloud_divisor if scene else None,
                 curve=self._chooser.curve(spec, detail),

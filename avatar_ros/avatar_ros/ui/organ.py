@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from avatar_core.common.supports import SUPPORT
 from avatar_core.contact.tool_path import middle_of_access
+from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum, VademecumInfo
+from avatar_ros.loop.settings import MATERIAL
 
 YOUNG_RANGE = (0.5e3, 1e6)  # that can be chosen [Pa]: the force is proportional to E
 
@@ -45,11 +49,13 @@ class Organ:
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         j = middle_of_access(v)
         young = v.material.young_modulus
-        low_young, high_young = YOUNG_RANGE
-        ranges = {"young": (min(low_young, young), max(high_young, young), young)}
-        here = {"poisson": v.material.poisson_ratio, "contrast": v.contrast or 1.0}
-        for c in v.parametric.coordinates if v.parametric else ():
-            ranges[c.name] = (c.low, c.high, here[c.name])
+        held = ranges(v)
+        here = {"young": young, "poisson": v.material.poisson_ratio, "contrast": v.contrast or 1.0}
+        here |= {SUPPORT + support.name: support.stiffness for support in v.supports}
+        least, most = held.pop("young", (0.0, math.inf))
+        low_young, high_young = (float(np.clip(end, least, most)) for end in YOUNG_RANGE)
+        held = {"young": (min(low_young, young), max(high_young, young)), **held}
+        settable = MATERIAL.values()  # other supports are chosen in a scene
         return Organ(
             id=v.id,
             name=v.name,
@@ -63,7 +69,7 @@ class Organ:
             size=float((high - low).max()),
             start=v.surface.centers[j],
             normal=v.surface.normals[j] / np.linalg.norm(v.surface.normals[j]),
-            ranges=ranges,
+            ranges={n: (*held[n], here[n]) for n in held if n in settable},
         )
 
     def above(self, height: float) -> np.ndarray:

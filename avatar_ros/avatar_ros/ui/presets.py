@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from avatar_core.common.supports import ATTACHMENTS, SUPPORT
+
 # Label and unit of each coordinate of the material, and what one shown unit is in SI.
 SLIDERS = {
     "young": ("E [kPa]", 1e3),
@@ -16,6 +18,10 @@ HINTS = {
     "poisson": "Poisson's ratio",
     "contrast": "Young's modulus in the tumour over that around it",
 }
+for _name in ATTACHMENTS:
+    _words = _name.replace("_", " ").capitalize()
+    SLIDERS[SUPPORT + _name] = (f"{_words} [kPa/mm]", 1e6)
+    HINTS[SUPPORT + _name] = "Stiffness per area of what holds the organ there"
 
 
 class Preset(NamedTuple):

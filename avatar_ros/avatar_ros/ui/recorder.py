@@ -11,8 +11,9 @@ import numpy as np
 from avatar_core.contact.effects import Tumour
 from avatar_core.contact.effects.selection import default_effects
 from avatar_core.geometry.tip import Tip
+from avatar_core.reduction.coordinates import stiffness_of
 from avatar_core.scene.file import write_scene
-from avatar_core.scene.model import Scene, Tool
+from avatar_core.scene.model import Scene, SupportStiffness, Tool
 from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
 from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.model import Vademecum
@@ -43,9 +44,13 @@ def scene_in_force(
     if "contrast" in material:
         others = (effect for effect in effects if not isinstance(effect, Tumour))
         effects = (*others, Tumour(material["contrast"]))
+    supports = {one.name: one for one in scene.supports} | {
+        name: SupportStiffness(name, k) for name, k in stiffness_of(material).items()
+    }
     return replace(
         scene,
         effects=effects,
+        supports=tuple(supports.values()),
         young_modulus=material.get("young", scene.young_modulus),
         poisson_ratio=material.get("poisson", scene.poisson_ratio),
     )

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from avatar_core.common.supports import SUPPORT
 from avatar_ros.ui.actions import Actions
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import NAMES
@@ -66,7 +67,7 @@ class OrganTab:
             for name, (low, high, here) in organ.ranges.items():
                 label, unit = SLIDERS[name]
                 bounds = {"min": round(low / unit, 6), "max": round(high / unit, 6)}
-                if name == "young":  # over three orders of magnitude
+                if name == "young" or name.startswith(SUPPORT):  # over orders of magnitude
                     add, step = self._gui.add_number, 0.1
                 else:
                     add, step = self._gui.add_slider, round((high - low) / unit / 200, 6)

@@ -1,0 +1,94 @@
+"""The study of certainty: its parts, without a build of an organ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from avatar_core.geometry.mesh import TetMesh
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.studies import certainty
+from avatar_core.studies.certainty_section import QUICK, CertaintySettings, Section
+from avatar_core.studies.certainty_supports import (
+    _clamp_rows,
+    _free_rows,
+    _Held,
+    _held,
+    _summary,
+    rigid_part,
+)
+from avatar_core.studies.report import Panel
+from avatar_core.studies.study import ProgressBar
+from tests.core.conftest import box_mesh
+
+
+@pytest.fixture(scope="module")
+def held() -> _Held:
+    return _held(phantom_liver(12e-3), CertaintySettings(n_vertices=450))
+
+
+def test_the_rigid_part_of_a_rigid_motion_is_the_motion() -> None:
+    mesh = box_mesh(2)
+    moved = np.array([1.0, -2.0, 0.5]) + np.cross([0.3, 0.1, -0.2], mesh.vertices)
+    motion = moved.reshape(-1, 1)
+    np.testing.assert_allclose(rigid_part(mesh, motion), motion, atol=1e-12)
+    away = mesh.vertices - mesh.vertices.mean(axis=0)
+    stretch = (away * [1.0, 0.0, 0.0]).reshape(-1, 1)
+    assert np.abs(rigid_part(mesh, stretch)).max() < 0.2 * np.abs(stretch).max()
+
+
+def test_stiff_springs_approach_the_clamp_of_a_liver(held: _Held) -> None:
+    miss = [float(str(row["l2_worst"])) for row in _clamp_rows(held)]
+    assert miss == sorted(miss, reverse=True)
+    assert miss[-1] < 0.01
+
+
+def test_a_liver_that_little_holds_moves_rigidly_and_then_is_refused(held: _Held) -> None:
+    rows, refusal = _free_rows(held)
+    left = [float(str(row["not_rigid_worst"])) for row in rows]
+    assert left == sorted(left, reverse=True)
+    assert left[-1] < 0.01
+    moved = [float(str(row["displacement_mean"])) for row in rows[-2:]]
+    assert moved[1] == pytest.approx(10.0 * moved[0], rel=0.01)
+    assert "N/m^3, nothing holds the organ against a rotation" in refusal
+
+
+def test_sections_share_one_page(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, phantom_mesh: TetMesh
+) -> None:
+    def one(surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar) -> Section:
+        bar.begin("one")
+        panel = Panel("one-plot", "a caption", lambda axes: axes.plot([0, 1]))
+        return Section("one", f"{surface.name}.", {"one_l2": 0.02}, ({"x": 1.0},), (panel,))
+
+    monkeypatch.setattr(certainty, "SECTIONS", (one, one))
+    found = certainty.study(phantom_liver(12e-3), QUICK, tmp_path)
+    assert found.rows == ({"section": "one", "x": 1.0},) * 2
+    assert found.summary == {"one_l2": 0.02}
+    assert "a caption" in (tmp_path / "certainty.html").read_text()
+    figure = Figure()
+    found.draw(figure)
+    assert len(figure.axes) == 2
+
+
+def test_the_summary_takes_means_of_unseen_values_and_the_last_of_the_limits() -> None:
+    unseen = [
+        {"kind": "unseen", "l2_mean": m, "l2_worst": w, "contact_mean": m, "contact_worst": w}
+        for m, w in ((0.01, 0.05), (0.03, 0.04))
+    ]
+    limits = [
+        {"kind": "clamp", "l2_worst": 0.5},
+        {"kind": "clamp", "l2_worst": 0.001},
+        {"kind": "free", "not_rigid_worst": 0.1, "displacement_mean": 1.0},
+        {"kind": "free", "not_rigid_worst": 0.01, "displacement_mean": 10.0},
+    ]
+    found = _summary([*unseen, *limits], Coordinate("support.bare_area", 1e5, 1e9), 60.0)
+    assert found["support_l2_mean"] == pytest.approx(0.02)
+    assert found["support_l2_worst"] == 0.05
+    assert found["support_clamp_limit_worst"] == 0.001
+    assert found["support_free_limit_growth"] == 10.0
