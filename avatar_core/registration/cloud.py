@@ -10,16 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from avatar_core.common import files
-from avatar_core.common.arrays import FloatArray
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import RegistrationError, one_line
+from avatar_core.geometry.point_location import closest_points
 from avatar_core.geometry.surface import METRES, axes_matrix
 from avatar_core.geometry.surface_files import stated_axes
 
 SUFFIXES = (".ply", ".obj", ".xyz", ".csv", ".txt", ".vtk", ".vtp", ".stl")
 LEAST_POINTS = 50
 MOST_POINTS = 4000  # that are used; of more a random part, always the same
-FARTHEST = 0.05  # of the middle point of a cloud from the organ's surface [m]
+FARTHEST = 0.03  # of the middle point of a cloud from the organ's surface [m]
 MOST_BYTES = 1 << 30
+_DOUBTED = 0.015  # distance of a cloud beyond which its axes are doubted [m]
+_TRIED = 300  # points of a cloud whose distances are looked at
 _MOST_EXTENT = 1.3  # of a cloud over that of the organ; a deformed organ is hardly larger
 _LEAST_EXTENT = 0.1  # the same, below which the unit is doubted
 
@@ -91,13 +94,10 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
     return Cloud(METRES[unit] * points, path.name, unit)
 
 
-def require_on_organ(cloud: Cloud, vertices: FloatArray, distance: FloatArray) -> None:
+def require_on_organ(cloud: Cloud, vertices: FloatArray, faces: IntArray) -> None:
     """Raise RegistrationError, naming unit or axes, unless a cloud may lie on an organ.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), of the organ at rest [m]
-    distance : ndarray, of the cloud's points from its surface [m]
+    vertices, faces : of the organ's surface at rest, shapes (n, 3) [m] and (m, 3)
     """
     ratio = cloud.extent / float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not _LEAST_EXTENT <= ratio <= _MOST_EXTENT:
@@ -105,11 +105,23 @@ def require_on_organ(cloud: Cloud, vertices: FloatArray, distance: FloatArray) -
             f"{cloud.name}: the cloud is {ratio:.2g} times as large as the organ; "
             f"{_unit_hint(ratio, cloud.unit)}"
         )
-    middle = float(np.median(distance))
-    if middle > FARTHEST:
+    few = cloud.points[:: max(1, len(cloud.points) // _TRIED)]
+
+    def off(points: FloatArray) -> float:
+        feet, _, _ = closest_points(vertices, faces, points)
+        return float(np.median(np.linalg.norm(points - feet, axis=1)))
+
+    given = off(few)
+    turned = off(few * [-1.0, -1.0, 1.0]) if given > _DOUBTED else given
+    if turned < 0.5 * given:
         raise RegistrationError(
-            f"{cloud.name}: half of the cloud is more than {1e3 * middle:.0f} mm off the organ; "
-            "give its axes (--axes LPS), or align it to about 10 mm and 10 degrees first"
+            f"{cloud.name}: half of the cloud is {1e3 * given:.0f} mm or more off the organ, but "
+            f"{1e3 * turned:.0f} mm with x and y reversed; give its axes (--axes LPS or RAS)"
+        )
+    if given > FARTHEST:
+        raise RegistrationError(
+            f"{cloud.name}: half of the cloud is {1e3 * given:.0f} mm or more off the organ; give "
+            "its axes (--axes), or align it to about 10 mm and 10 degrees first"
         )
 
 
@@ -163,7 +175,7 @@ def _read(path: Path) -> FloatArray:
 def _columns(path: Path) -> FloatArray:
     """The first three numbers of each line, after a line of titles at most."""
     text = path.read_text(encoding="utf-8", errors="replace").replace(",", " ").replace(";", " ")
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip()[0] == "#"]
+    lines = [line for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
     if lines and not _is_number(lines[0].split()[0]):
         lines = lines[1:]
     rows = [[float(word) for word in line.split()[:3]] for line in lines]

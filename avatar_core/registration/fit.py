@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import igl
 import numpy as np
+import scipy.sparse as sp
 
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import RegistrationError
@@ -74,6 +75,7 @@ class Fit:
     """The end of the iteration.
 
     loads : LoadBasis; motion : RigidMotion
+    columns : ndarray, shape (n_vertices, 3, n) [m], displacement by each coefficient of the loads
     coefficients : ndarray, shape (n,), of the loads
     covariance : ndarray, shape (n + 6, n + 6), of coefficients, turn and shift
     residuals : ndarray, signed distances of the points that were used [m]
@@ -84,6 +86,7 @@ class Fit:
 
     loads: LoadBasis
     motion: RigidMotion
+    columns: FloatArray
     coefficients: FloatArray
     covariance: FloatArray
     residuals: FloatArray
@@ -102,7 +105,7 @@ def fit(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
         If the cloud cannot be one of this organ, or the iteration leads away from it.
     """
     rule = rule or RegistrationRule()
-    problem = _Problem.of(vademecum, cloud, rule)
+    problem = _problem(vademecum, cloud, rule)
     state, n_rigid = _rigidly(problem)
     logarithms = problem.prior.middle
     for step in range(rule.most_steps):
@@ -120,6 +123,7 @@ def fit(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
     return Fit(
         problem.loads,
         problem.motion(mean),
+        problem.all_columns,
         mean[:n],
         covariance,
         residuals,
@@ -131,20 +135,34 @@ def fit(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
 
 
 _STRAY = 0.5  # weight of a point some four standard deviations off, below which it is a stray
-_TRIES = 70  # of scales, the first time; a half of it later
+_TRIES = 60  # of scales, the first time; a half of it later
+
+
+def rigid_motion(
+    vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
+) -> RigidMotion:
+    """What rigid steps alone make of a cloud; arguments and errors as of :func:`fit`."""
+    problem = _problem(vademecum, cloud, rule or RegistrationRule())
+    return problem.motion(_rigidly(problem)[0])
+
+
+def _problem(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule) -> _Problem:
+    """The problem, with the displacement of all vertices by each coefficient."""
+    loads = load_basis(vademecum)
+    every = np.arange(len(vademecum.mesh.vertices))
+    columns = loads.displacement(vademecum, every, np.eye(loads.size))
+    return _Problem.of(vademecum, cloud, rule, loads, columns)
 
 
 def _rigidly(problem: _Problem) -> tuple[FloatArray, int]:
     """Unknowns after the rigid steps, and their number."""
-    rule, state = problem.rule, np.zeros(problem.loads.size + 6)
-    for step in range(rule.rigid_steps):
+    rule, step, moved = problem.rule, 0, np.inf
+    state: FloatArray = np.zeros(problem.loads.size + 6)
+    while moved > 10.0 * rule.tolerance and step < rule.rigid_steps:
         found = problem.equations_at(state, np.exp(problem.prior.middle), first=True)
         mean = problem.solved_rigidly(found)
-        moved = problem.largest_move(state, mean)
-        state = mean
-        if moved < 10.0 * rule.tolerance:
-            break
-    return state, step + 1
+        moved, state, step = problem.largest_move(state, mean), mean, step + 1
+    return state, step
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,24 +175,29 @@ class _Problem:
     vertices: FloatArray
     faces: IntArray
     columns: FloatArray
+    all_columns: FloatArray
     points: FloatArray
     cell: float
 
     @classmethod
-    def of(cls, vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule) -> _Problem:
+    def of(
+        cls,
+        vademecum: Vademecum,
+        cloud: Cloud,
+        rule: RegistrationRule,
+        loads: LoadBasis,
+        columns: FloatArray,
+    ) -> _Problem:
         mesh = vademecum.mesh
         on_surface = mesh.surface_vertices
         vertices = np.ascontiguousarray(mesh.vertices[on_surface])
         faces = np.searchsorted(on_surface, mesh.boundary_faces).astype(np.int64)
         points = np.ascontiguousarray(cloud.thinned())
-        feet, _, _ = closest_points(vertices, faces, points)
-        require_on_organ(cloud, vertices, np.linalg.norm(points - feet, axis=1))
-        loads = load_basis(vademecum)
-        columns = loads.displacement(vademecum, on_surface, np.eye(loads.size))
+        require_on_organ(cloud, vertices, faces)
+        own = columns[on_surface].reshape(-1, loads.size)
         prior = rule.scales(vademecum.material.young_modulus)
-        return cls(
-            rule, prior, loads, vertices, faces, columns, points, mesh.mean_surface_edge
-        )
+        edge = mesh.mean_surface_edge
+        return cls(rule, prior, loads, vertices, faces, own, columns, points, edge)
 
     def motion(self, unknowns: FloatArray) -> RigidMotion:
         """The rigid part of the unknowns."""
@@ -183,8 +206,8 @@ class _Problem:
 
     def surface(self, unknowns: FloatArray) -> FloatArray:
         """The organ's surface, shape (n_vertices, 3) [m]."""
-        moved = self.vertices + self.columns @ unknowns[: self.loads.size]
-        return self.motion(unknowns)(moved)
+        moved = self.columns @ unknowns[: self.loads.size]
+        return self.motion(unknowns)(self.vertices + moved.reshape(-1, 3))
 
     def largest_move(self, before: FloatArray, after: FloatArray) -> float:
         """Of a point of the surface between two states [m]."""
@@ -223,10 +246,11 @@ class _Problem:
         normal = np.einsum("nk,nkd->nd", at, normals)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         own = normal @ motion.matrix  # in the axes of the organ
-        J = np.zeros((len(feet), self.loads.size))
-        for k in range(3):
-            for d in range(3):
-                J += (at[:, k] * own[:, d])[:, None] * self.columns[corners[:, k], d]
+        along = np.einsum("nk,nd->nkd", at, own).reshape(len(feet), 9)
+        column = (3 * corners[:, :, None] + np.arange(3)).reshape(len(feet), 9)
+        first = np.arange(0, 9 * len(feet) + 1, 9)
+        shape = (len(feet), 3 * len(self.vertices))
+        J = sp.csr_matrix((along.ravel(), column.ravel(), first), shape=shape) @ self.columns
         distance = ((self.points - feet) * normal).sum(axis=1)
         return np.hstack([J, motion.rows(feet, normal)]), distance
 

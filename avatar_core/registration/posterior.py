@@ -61,14 +61,16 @@ class Equations:
 
 
 def equations(J: FloatArray, d: FloatArray, W: FloatArray, cells: sp.csr_matrix) -> Equations:
-    """Sum up rows J (n_points, n), values d and weights W of points in cells (n_cells, n_points)."""
-    weighted = W[:, None] * J
+    """Sum up rows J (n_points, n), values d, weights W of points in cells (n_cells, n_points)."""
+    root = np.sqrt(W)
+    half, value = root[:, None] * J, root * d
+    sums = cells @ sp.diags(root)
     return Equations(
-        J.T @ weighted,
-        weighted.T @ d,
-        float(d @ (W * d)),
-        cells @ weighted,
-        cells @ (W * d),
+        half.T @ half,
+        half.T @ value,
+        float(value @ value),
+        sums @ half,
+        sums @ value,
         cells @ W,
         len(d),
         float(np.log(W).sum()),
@@ -111,7 +113,8 @@ def posterior(found: Equations, spread: FloatArray, noise: float, mismatch: floa
     """
     inverse = noise**-2
     taken = inverse**2 / (mismatch**-2 + inverse * found.cell_weight)  # Woodbury, cell by cell
-    hessian = inverse * found.gram - (taken[:, None] * found.cell_rows).T @ found.cell_rows
+    rows = np.sqrt(taken)[:, None] * found.cell_rows
+    hessian = inverse * found.gram - rows.T @ rows
     right = spread * (inverse * found.right - found.cell_rows.T @ (taken * found.cell_right))
     system = spread[:, None] * hessian * spread
     system.flat[:: len(spread) + 1] += 1.0

@@ -140,9 +140,8 @@ def register(
     found = fit(vademecum, cloud, rule)
     n = found.loads.size
     roots = UNDERSTATED * _roots(vademecum, found)
-    every = np.arange(len(vademecum.mesh.vertices))
-    columns = np.hstack([found.coefficients[:, None], roots[:n]])
-    fields = found.loads.displacement(vademecum, every, columns)
+    unknown = np.hstack([found.coefficients[:, None], roots[:n]])
+    fields = (found.columns.reshape(-1, n) @ unknown).reshape(*found.columns.shape[:2], -1)
     displacement, spread = fields[:, :, 0], fields[:, :, 1:]
     motion = found.motion
     place = motion(vademecum.mesh.vertices + displacement)
@@ -221,12 +220,10 @@ def strongest_forces(
 
 def _roots(vademecum: Vademecum, found: Fit) -> FloatArray:
     """R with R R^T ~ the covariance, shape (n + 6, k): what moves the surface alone."""
-    half = np.linalg.cholesky(
-        found.covariance + 1e-12 * np.diag(np.diagonal(found.covariance))
-    )
+    half = np.linalg.cholesky(found.covariance + 1e-12 * np.diag(np.diagonal(found.covariance)))
     some = vademecum.mesh.surface_vertices[::_EVERY]
     n = found.loads.size
-    moved = found.loads.displacement(vademecum, some, half[:n])
+    moved = found.columns[some] @ half[:n]
     arms = vademecum.mesh.vertices[some] - found.motion.centre
     moved += np.cross(half[n : n + 3].T[None], arms[:, None], axis=2).swapaxes(1, 2)
     moved += half[n + 3 :]
@@ -247,7 +244,9 @@ def _problems(found: Fit, rule: RegistrationRule) -> tuple[str, ...]:
             "expected (--noise)"
         )
     if mismatch > _MOST_MISMATCH * rule.noise:
-        problems.append(f"neighbouring points lie off the surface together, by {1e3 * mismatch:.1f} mm")
+        problems.append(
+            f"neighbouring points lie off the surface together, by {1e3 * mismatch:.1f} mm"
+        )
     if found.outlying > _MOST_OUTLYING:
         problems.append(f"{found.outlying:.0%} of the points are far off the surface")
     return tuple(problems)
