@@ -80,8 +80,9 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
     sentence = (
         f"A vademecum registered to {settings.seen:.0%} of the surface, {settings.n_points} points "
         f"of {1e3 * settings.noise:g} mm noise: {summary['registration_error']:.0%} of the mean "
-        f"displacement off ({summary['rigid_error']:.0%} rigidly, {summary['splines_error']:.0%} by "
-        f"splines), 90 % intervals hold {summary['registration_coverage']:.0%}, in "
+        f"displacement off ({summary['rigid_error']:.0%} rigidly, "
+        f"{summary['splines_error']:.0%} by splines), 90 % intervals hold "
+        f"{summary['registration_coverage']:.0%}, in "
         f"{summary['registration_seconds']:.2f} s"
     )
     return Study(
