@@ -41,7 +41,7 @@ class RegistrationRule:
     """Prior knowledge and stopping.
 
     noise : standard deviation of a point of the cloud along the normal, about [m]
-    turn, shift : prior standard deviations of the rigid motion, about each axis [rad, m]
+    turn, shift : prior root mean squares of the rigid motion, all axes together [rad, m]
     freedom : degrees of freedom of Student's distribution, from which points are weighed
     tolerance : step of a point of the surface that ends the iteration [m]
     rigid_steps, most_steps : iterations that move rigidly alone, and all, at most
@@ -52,7 +52,7 @@ class RegistrationRule:
     turn: float = float(np.radians(10.0))
     shift: float = 10e-3
     freedom: float = 10.0
-    tolerance: float = 5e-5
+    tolerance: float = 1e-4
     rigid_steps: int = 8
     most_steps: int = 40
     rescaled: tuple[int, ...] = (1, 3, 6)
@@ -114,7 +114,7 @@ def fit(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
             logarithms = problem.rescaled(found, logarithms, step == rule.rescaled[0])
         mean = problem.solved(found, np.exp(logarithms)).mean
         moved = problem.largest_move(state, mean)
-        state = mean
+        state = state + (1.0 if step < _UNDAMPED else 0.5) * (mean - state)
         if converged := moved < rule.tolerance and step > rule.rescaled[-1]:
             break
     found, residuals, weights = problem.linearised(state, np.exp(logarithms))
@@ -135,6 +135,7 @@ def fit(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
 
 
 _STRAY = 0.5  # weight of a point some four standard deviations off, below which it is a stray
+_UNDAMPED = 14  # steps; the closest points of some clouds swing to and fro after so many
 _TRIES = 60  # of scales, the first time; a half of it later
 
 
@@ -158,7 +159,7 @@ def _rigidly(problem: _Problem) -> tuple[FloatArray, int]:
     """Unknowns after the rigid steps, and their number."""
     rule, step, moved = problem.rule, 0, np.inf
     state: FloatArray = np.zeros(problem.loads.size + 6)
-    while moved > 10.0 * rule.tolerance and step < rule.rigid_steps:
+    while moved > 5.0 * rule.tolerance and step < rule.rigid_steps:
         found = problem.equations_at(state, np.exp(problem.prior.middle), first=True)
         mean = problem.solved_rigidly(found)
         moved, state, step = problem.largest_move(state, mean), mean, step + 1
@@ -217,7 +218,7 @@ class _Problem:
     def spread(self, scales: FloatArray) -> FloatArray:
         """Prior standard deviations of all unknowns at scales."""
         rule = self.rule
-        rigid = np.repeat([rule.turn, rule.shift], 3)
+        rigid = np.repeat([rule.turn, rule.shift], 3) / np.sqrt(3.0)
         return np.concatenate([self.loads.spread(scales[0], scales[1]), rigid])
 
     def equations_at(self, state: FloatArray, scales: FloatArray, first: bool) -> Equations:

@@ -23,7 +23,7 @@ _KEPT = 1e-4  # of the largest variance over the surface, below which directions
 _EVERY = 7  # vertices of the surface by which directions are judged
 _MOST_OUTLYING = 0.1
 _MOST_NOISE = 2.0  # noise that is found over that expected
-_MOST_MISMATCH = 1.0  # of the surface, over the noise expected
+_MOST_MISMATCH = 0.6  # of the surface, over the noise expected; meshes that differ have 0.1 to 0.4
 _INSIDE = 5e-3  # of a target from the organ at most [m]
 
 

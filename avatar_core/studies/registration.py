@@ -55,7 +55,7 @@ class RegistrationSettings:
 
     n_vertices: int = 2000
     n_true: int = 3200
-    n_cases: int = 6
+    n_cases: int = 4
     n_points: int = 2000
     noise: float = 1e-3
     seen: float = 0.3
@@ -99,13 +99,19 @@ def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
 def organ_rows(organ: SurfaceMesh, settings: RegistrationSettings) -> list[dict[str, Value]]:
     """All cases of one organ, a row each."""
     vademecum = build(organ, OrganOptions(n_vertices=settings.n_vertices, n_certified=20))
-    truth = Truth.of(organ, settings.n_true)
+    return case_rows(vademecum, Truth.of(organ, settings.n_true), settings)
+
+
+def case_rows(
+    vademecum: Vademecum, truth: Truth, settings: RegistrationSettings
+) -> list[dict[str, Value]]:
+    """All cases of one vademecum and the true mesh of its organ."""
     rows = []
     for kind in CLASSES:
         rng = np.random.default_rng(CLASSES.index(kind))
-        for _ in follow(range(settings.n_cases), f"{organ.name}, {kind}"):
+        for _ in follow(range(settings.n_cases), f"{vademecum.name}, {kind}"):
             case = truth.case(kind, settings, rng)
-            rows.append({"organ": organ.name, "class": kind, **measured(vademecum, case)})
+            rows.append({"organ": vademecum.name, "class": kind, **measured(vademecum, case)})
     return rows
 
 

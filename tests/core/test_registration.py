@@ -165,7 +165,7 @@ def test_strays_do_no_harm(phantom_vademecum: Vademecum, case: Case) -> None:
 
 def test_what_no_load_explains_is_said(phantom_vademecum: Vademecum, case: Case) -> None:
     x, y, z = case.cloud.points.T
-    ripple = 4e-3 * np.sin(2 * np.pi * x / 0.05) * np.sin(2 * np.pi * z / 0.05)
+    ripple = 4e-3 * np.sin(2 * np.pi * x / 0.03) * np.sin(2 * np.pi * z / 0.03)
     found = register(phantom_vademecum, Cloud(np.stack([x, y + ripple, z], axis=1)))
     assert found.problems and "off the surface together" in " ".join(found.problems)
     assert not register(phantom_vademecum, case.cloud).problems
