@@ -18,7 +18,7 @@ from avatar_core.geometry.surface_files import stated_axes
 
 SUFFIXES = (".ply", ".obj", ".xyz", ".csv", ".txt", ".vtk", ".vtp", ".stl")
 LEAST_POINTS = 50
-MOST_POINTS = 4000  # that are used; of more a random part, always the same
+MOST_POINTS = 3000  # that are used; of more a random part, always the same
 FARTHEST = 0.03  # of the middle point of a cloud from the organ's surface [m]
 MOST_BYTES = 1 << 30
 _DOUBTED = 0.015  # distance of a cloud beyond which its axes are doubted [m]
