@@ -13,7 +13,8 @@ All lengths are in metres, forces in newtons. What users can cause and cure rais
 :class:`AvatarError` with one line that names cause and remedy.
 
 The rooms, in the order in which data flows and imports may run: common, geometry, fem, reduction,
-shapes, vademecum, contact, scene, offline, atlas; then studies and cli, which use all of them.
+shapes, vademecum, registration, contact, scene, offline, atlas; then studies and cli, which use all
+of them.
 """
 
 from __future__ import annotations

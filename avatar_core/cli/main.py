@@ -15,6 +15,7 @@ from avatar_core.cli.cell import Host, Port, cell, require_ui, run_page
 from avatar_core.cli.export import export
 from avatar_core.cli.output import require_output
 from avatar_core.cli.patient import patient
+from avatar_core.cli.register import register
 from avatar_core.cli.replay import replay
 from avatar_core.cli.scene import scene
 from avatar_core.cli.study import study
@@ -39,6 +40,7 @@ app.command()(vademecum)
 app.command()(show)
 app.command()(export)
 app.command()(patient)
+app.command()(register)
 app.command()(replay)
 app.command()(uncertainty)
 app.command()(study)

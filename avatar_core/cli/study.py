@@ -26,6 +26,7 @@ STUDIES = {
     "passivity": "avatar_core.studies.passivity",
     "contact": "avatar_core.studies.contact",
     "indentation": "avatar_core.studies.indentation",
+    "registration": "avatar_core.studies.registration",
 }
 USAGE = 2
 

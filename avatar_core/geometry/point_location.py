@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import igl
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.geometry.mesh import TetMesh
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _SLACK = 1e-9  # barycentric coordinates down to minus this count as inside
 

@@ -6,7 +6,7 @@ does :func:`avatar_core.geometry.surface.read_surface`: what is written comes ba
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,8 @@ from avatar_core.vademecum.model import Vademecum
 
 AXES = ("LPS", "RAS")
 
-Write = Callable[[Path, np.ndarray, np.ndarray, str], None]
+Fields = Mapping[str, np.ndarray]
+Write = Callable[[Path, np.ndarray, np.ndarray, str, Fields], None]
 
 
 def export_surfaces(
@@ -51,9 +52,18 @@ def export_surfaces(
 
 
 def write_surfaces(
-    vademecum: Vademecum, path: str | Path, points: np.ndarray, unit: str = "mm", axes: str = "LPS"
+    vademecum: Vademecum,
+    path: str | Path,
+    points: np.ndarray,
+    unit: str = "mm",
+    axes: str = "LPS",
+    fields: Fields | None = None,
 ) -> dict[Path, tuple[np.ndarray, np.ndarray]]:
-    """The same for displayed vertices that are where a cloud has them, shape (n, 3) [m]."""
+    """The same for displayed vertices that are where a cloud has them, shape (n, 3) [m].
+
+    fields : values at displayed vertices, shape (n,), or vectors along RAS, (n, 3); .vtp alone
+        holds them, vectors along its own axes
+    """
     path = Path(path)
     if path.suffix not in SURFACE_FORMATS:
         raise StorageError(f"{path} ends in '{path.suffix}'; choose {' or '.join(SURFACE_FORMATS)}")
@@ -62,7 +72,9 @@ def write_surfaces(
             f"unit '{unit}', axes '{axes}'; choose {', '.join(METRES)} and {' or '.join(AXES)}"
         )
     points = np.asarray(points, float) / METRES[unit]
-    points = points * ([-1.0, -1.0, 1.0] if axes == "LPS" else [1.0, 1.0, 1.0])
+    signs = np.array([-1.0, -1.0, 1.0] if axes == "LPS" else [1.0, 1.0, 1.0])
+    points = points * signs
+    values = {k: v * signs if v.ndim == 2 else v for k, v in (fields or {}).items()}
     parts = {path: vademecum.organ_faces}
     for name, faces in vademecum.structures.items():
         parts[path.with_name(f"{path.stem}_{_plain(name)}{path.suffix}")] = faces
@@ -71,18 +83,22 @@ def write_surfaces(
         used, local = np.unique(faces, return_inverse=True)
         written[file] = points[used], local.reshape(faces.shape)
         with replaced(file) as whole:
-            SURFACE_FORMATS[path.suffix](whole, *written[file], axes)
+            own = {name: value[used] for name, value in values.items()}
+            SURFACE_FORMATS[path.suffix](whole, *written[file], axes, own)
     return written
 
 
 def displaced(vademecum: Vademecum, displacement: np.ndarray) -> np.ndarray:
     """Displayed vertices moved by a displacement of the mesh, shape (n, 3) [m]."""
+    return np.asarray(vademecum.surface_vertices + carried(vademecum, displacement), float)
+
+
+def carried(vademecum: Vademecum, values: np.ndarray) -> np.ndarray:
+    """Values at vertices of the mesh, (n_vertices, ...), taken to the displayed ones."""
     display = vademecum.display
     if display is None:
-        moved = displacement[vademecum.mesh.surface_vertices]
-    else:
-        moved = np.einsum("vk,vkd->vd", display.weights, displacement[display.corners])
-    return np.asarray(vademecum.surface_vertices + moved, float)
+        return np.asarray(values[vademecum.mesh.surface_vertices])
+    return np.einsum("vk,vk...->v...", display.weights, values[display.corners])
 
 
 def _plain(name: str) -> str:
@@ -90,7 +106,9 @@ def _plain(name: str) -> str:
     return "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)
 
 
-def _write_stl(path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str) -> None:
+def _write_stl(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str, _fields: Fields
+) -> None:
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
@@ -100,14 +118,18 @@ def _write_stl(path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str) -
     path.write_bytes(header + np.array(len(faces), "<u4").tobytes() + rows.tobytes())
 
 
-def _write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str) -> None:
+def _write_obj(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str, _fields: Fields
+) -> None:
     lines = [f"# avatar SPACE={axes}"]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     path.write_text("\n".join(lines) + "\n")
 
 
-def _write_vtp(path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str) -> None:
+def _write_vtp(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str, fields: Fields
+) -> None:
     """VTK's XML as text, with the field in which 3D Slicer states the axes."""
     places = "\n".join(f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices)
     corners = "\n".join(f"{a} {b} {c}" for a, b, c in faces)
@@ -120,13 +142,26 @@ def _write_vtp(path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str) -
         f'<Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">{letters}</Array>'
         "</FieldData>\n"
         f'<Piece NumberOfPoints="{len(vertices)}" NumberOfVerts="0" NumberOfLines="0" '
-        f'NumberOfStrips="0" NumberOfPolys="{len(faces)}">\n<Points>'
+        f'NumberOfStrips="0" NumberOfPolys="{len(faces)}">\n{_point_data(fields)}<Points>'
         f'<DataArray type="Float64" NumberOfComponents="3" format="ascii">\n{places}\n'
         "</DataArray></Points>\n<Polys>"
         f'<DataArray type="Int64" Name="connectivity" format="ascii">\n{corners}\n</DataArray>\n'
         f'<DataArray type="Int64" Name="offsets" format="ascii">\n{ends}\n</DataArray>'
         "</Polys>\n</Piece>\n</PolyData>\n</VTKFile>\n"
     )
+
+
+def _point_data(fields: Fields) -> str:
+    """Fields as VTK's point data; nothing where there are none."""
+    arrays = []
+    for name, value in fields.items():
+        rows = value.reshape(len(value), -1)
+        numbers = "\n".join(" ".join(f"{x:.6g}" for x in row) for row in rows)
+        arrays.append(
+            f'<DataArray type="Float64" Name="{name}" NumberOfComponents="{rows.shape[1]}" '
+            f'format="ascii">\n{numbers}\n</DataArray>'
+        )
+    return f"<PointData>{''.join(arrays)}</PointData>\n" if arrays else ""
 
 
 SURFACE_FORMATS: dict[str, Write] = {".stl": _write_stl, ".obj": _write_obj, ".vtp": _write_vtp}

@@ -21,6 +21,7 @@ ORDER = {
         "reduction",
         "shapes",
         "vademecum",
+        "registration",
         "contact",
         "uncertainty",
         "scene",

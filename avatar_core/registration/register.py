@@ -1,0 +1,252 @@
+"""The organ where a cloud shows it: displacement everywhere, with what is not known of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import RegistrationError
+from avatar_core.geometry.point_location import carriers
+from avatar_core.registration.cloud import Cloud
+from avatar_core.registration.fit import Fit, RegistrationRule, fit
+from avatar_core.registration.rigid import RigidMotion
+from avatar_core.vademecum.model import Vademecum
+
+# The true errors of synthetic clouds over the standard deviations that the posterior gives them:
+# loads are no Gaussian field, supports move, meshes differ. `avatar study registration` measures
+# what is covered.
+UNDERSTATED = 1.5
+INTERVAL_90 = 1.645  # half of a 90 % interval, in standard deviations
+_KEPT = 1e-4  # of the largest variance over the surface, below which directions are dropped
+_EVERY = 7  # vertices of the surface by which directions are judged
+_MOST_OUTLYING = 0.1
+_MOST_NOISE = 2.0  # noise that is found over that expected
+_MOST_MISMATCH = 0.6  # of the surface, over the noise expected; meshes that differ have 0.1 to 0.4
+_INSIDE = 5e-3  # of a target from the organ at most [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where a point of the organ, or the middle of some, has gone.
+
+    name : what it is
+    rest, place : ndarray, shape (3,) [m], before, and now in the cloud's frame
+    displacement : ndarray, shape (3,) [m], by deformation, along the axes at rest
+    displacement_deviation, place_deviation : standard deviations along the axes, (3,) [m]
+    model_error : standard deviation of each from the vademecum's own error [m], part of both
+    """
+
+    name: str
+    rest: FloatArray
+    place: FloatArray
+    displacement: FloatArray
+    displacement_deviation: FloatArray
+    place_deviation: FloatArray
+    model_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """A vademecum registered to a cloud.
+
+    fit : Fit, its loads, motion and residuals
+    displacement : ndarray, shape (n_vertices, 3) [m], by deformation, along the axes at rest
+    place : ndarray, shape (n_vertices, 3) [m], of the vertices in the cloud's frame
+    displacement_spread, place_spread : ndarray, shape (n_vertices, 3, k) [m], square roots of the
+        posterior covariance, S S^T of any vertices together
+    model_error : relative, of the vademecum's certificate; 0 without one
+    problems : why the model does not explain the cloud, one line each; empty if it does
+    """
+
+    fit: Fit
+    displacement: FloatArray
+    place: FloatArray
+    displacement_spread: FloatArray
+    place_spread: FloatArray
+    model_error: float
+    problems: tuple[str, ...]
+
+    @property
+    def motion(self) -> RigidMotion:
+        """The rigid motion from the organ's frame to the cloud's."""
+        return self.fit.motion
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance of the cloud from the surface [m]."""
+        return float(np.sqrt(np.mean(self.fit.residuals**2)))
+
+    @property
+    def displacement_deviation(self) -> FloatArray:
+        """Standard deviations along the axes, the model's error in them, (n_vertices, 3) [m]."""
+        return self._deviation(self.displacement_spread)
+
+    @property
+    def place_deviation(self) -> FloatArray:
+        """The same of the place in the cloud's frame."""
+        return self._deviation(self.place_spread)
+
+    @property
+    def model_deviation(self) -> FloatArray:
+        """Standard deviation along each axis by the vademecum's own error, (n_vertices,) [m]."""
+        size = np.linalg.norm(self.displacement, axis=1)
+        return np.asarray(self.model_error * size / np.sqrt(3.0))
+
+    def _deviation(self, spread: FloatArray) -> FloatArray:
+        square = (spread**2).sum(axis=2) + self.model_deviation[:, None] ** 2
+        return np.asarray(np.sqrt(square))
+
+    def estimate(self, name: str, vertices: FloatArray, weights: FloatArray) -> Estimate:
+        """Of a weighted mean of vertices, whose weights sum to one.
+
+        Parameters
+        ----------
+        vertices : ndarray of int, shape (n,); weights : ndarray, shape (n,)
+        """
+        own = float(weights @ self.model_deviation[vertices])
+
+        def deviation(spread: FloatArray) -> FloatArray:
+            mean = np.einsum("n,nak->ak", weights, spread[vertices])
+            return np.asarray(np.sqrt((mean**2).sum(axis=1) + own**2))
+
+        moved, place = weights @ self.displacement[vertices], weights @ self.place[vertices]
+        return Estimate(
+            name,
+            self.motion.back(place[None])[0] - moved,
+            place,
+            moved,
+            deviation(self.displacement_spread),
+            deviation(self.place_spread),
+            own,
+        )
+
+
+def register(
+    vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
+) -> Registered:
+    """Bring an organ to a cloud of points on its deformed surface.
+
+    The response is that of small strains, also where a vademecum has the load's magnitude as a
+    coordinate.
+
+    Raises
+    ------
+    RegistrationError
+        If the cloud cannot be one of this organ.
+    """
+    rule = rule or RegistrationRule()
+    found = fit(vademecum, cloud, rule)
+    n = found.loads.size
+    roots = UNDERSTATED * _roots(vademecum, found)
+    unknown = np.hstack([found.coefficients[:, None], roots[:n]])
+    fields = (found.columns.reshape(-1, n) @ unknown).reshape(*found.columns.shape[:2], -1)
+    displacement, spread = fields[:, :, 0], fields[:, :, 1:]
+    motion = found.motion
+    place = motion(vademecum.mesh.vertices + displacement)
+    turned = np.einsum("ab,nbk->nak", motion.matrix, spread)
+    arms = place - motion.centre - motion.shift
+    turned += np.cross(roots[n : n + 3].T[None], arms[:, None], axis=2).swapaxes(1, 2)
+    turned += roots[n + 3 :]
+    certificate = vademecum.certificate
+    error = certificate.l2_mean if certificate is not None else 0.0
+    return Registered(
+        found,
+        displacement,
+        place,
+        spread,
+        turned,
+        0.0 if np.isnan(error) else float(error),
+        _problems(found, rule),
+    )
+
+
+def targets(vademecum: Vademecum, registered: Registered) -> list[Estimate]:
+    """The middles of structures inside, such as tumours."""
+    display, found = vademecum.display, []
+    for name, faces in vademecum.structures.items():
+        assert display is not None
+        used = np.unique(faces)
+        weights = np.asarray(display.weights[used], float).ravel() / len(used)
+        found.append(registered.estimate(name, display.corners[used].ravel(), weights))
+    return found
+
+
+def target_at(vademecum: Vademecum, registered: Registered, point: FloatArray) -> Estimate:
+    """A point of the organ at rest [m].
+
+    Raises
+    ------
+    RegistrationError
+        If it lies more than 5 mm outside.
+    """
+    corners, weights = carriers(vademecum.mesh, np.asarray(point, float)[None])
+    found = registered.estimate("target", corners[0], weights[0])
+    off = float(np.linalg.norm(found.rest - point))
+    if off > _INSIDE:
+        raise RegistrationError(
+            f"the target lies {1e3 * off:.0f} mm outside the organ; give a point in it, in metres"
+        )
+    return found
+
+
+def largest(registered: Registered) -> Estimate:
+    """The vertex that the deformation displaces most."""
+    vertex = int((registered.displacement**2).sum(axis=1).argmax())
+    return registered.estimate("largest displacement", np.array([vertex]), np.ones(1))
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceForce:
+    """Force on a part of the surface: its middle (3,) [m] at rest, and a vector (3,) [N]."""
+
+    point: FloatArray
+    force: FloatArray
+
+
+def strongest_forces(
+    vademecum: Vademecum, registered: Registered, n: int = 3
+) -> tuple[PlaceForce, ...]:
+    """Forces within two patch radii of the places that are pressed or pulled hardest."""
+    surface, loads = vademecum.surface, registered.fit.loads
+    forces = loads.at_positions(registered.fit.coefficients[:, None])[:, :, 0]
+    reach = 2.0 * surface.patch_radius
+    apart = np.linalg.norm(surface.centers[:, None] - surface.centers[None], axis=2)
+    sums = (apart < reach) @ forces
+    chosen = surface.largest_apart(np.linalg.norm(sums, axis=1), n, 2.0 * reach)
+    return tuple(PlaceForce(surface.centers[k], sums[k]) for k in chosen)
+
+
+def _roots(vademecum: Vademecum, found: Fit) -> FloatArray:
+    """R with R R^T ~ the covariance, shape (n + 6, k): what moves the surface alone."""
+    half = np.linalg.cholesky(found.covariance + 1e-12 * np.diag(np.diagonal(found.covariance)))
+    some = vademecum.mesh.surface_vertices[::_EVERY]
+    n = found.loads.size
+    moved = found.columns[some] @ half[:n]
+    arms = vademecum.mesh.vertices[some] - found.motion.centre
+    moved += np.cross(half[n : n + 3].T[None], arms[:, None], axis=2).swapaxes(1, 2)
+    moved += half[n + 3 :]
+    flat = moved.reshape(-1, moved.shape[2])
+    value, vector = np.linalg.eigh(flat.T @ flat)
+    return np.asarray(half @ vector[:, value > _KEPT * value[-1]])
+
+
+def _problems(found: Fit, rule: RegistrationRule) -> tuple[str, ...]:
+    """Why loads, rigid motion and noise do not explain the cloud."""
+    noise, mismatch = found.scales[2], found.scales[3]
+    problems = []
+    if not found.converged:
+        problems.append(f"the iteration had not ended after {found.n_steps} steps")
+    if noise > _MOST_NOISE * rule.noise:
+        problems.append(
+            f"the points scatter by {1e3 * noise:.1f} mm, not the {1e3 * rule.noise:.1f} mm "
+            "expected (--noise)"
+        )
+    if mismatch > _MOST_MISMATCH * rule.noise:
+        problems.append(
+            f"neighbouring points lie off the surface together, by {1e3 * mismatch:.1f} mm"
+        )
+    if found.outlying > _MOST_OUTLYING:
+        problems.append(f"{found.outlying:.0%} of the points are far off the surface")
+    return tuple(problems)

@@ -1,0 +1,58 @@
+"""Small rigid motions about a fixed centre, x' = c + R (x - c) + t."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from avatar_core.common.arrays import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class RigidMotion:
+    """Rotation by a vector about a centre, then a translation.
+
+    centre : ndarray, shape (3,) [m]
+    turn : ndarray, shape (3,), rotation vector [rad]; shift : ndarray, shape (3,) [m]
+    """
+
+    centre: FloatArray
+    turn: FloatArray = field(default_factory=lambda: np.zeros(3))
+    shift: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def matrix(self) -> FloatArray:
+        """R, shape (3, 3)."""
+        return np.asarray(Rotation.from_rotvec(self.turn).as_matrix())
+
+    @property
+    def angle(self) -> float:
+        """Angle of the rotation [degrees]."""
+        return float(np.degrees(np.linalg.norm(self.turn)))
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Move points, shape (n, 3) [m]."""
+        moved = self.centre + (points - self.centre) @ self.matrix.T + self.shift
+        return np.asarray(moved)
+
+    def back(self, points: FloatArray) -> FloatArray:
+        """The inverse motion of points, shape (n, 3) [m]."""
+        return np.asarray(self.centre + (points - self.shift - self.centre) @ self.matrix)
+
+    def unknowns(self) -> FloatArray:
+        """Turn and shift, shape (6,)."""
+        return np.concatenate([self.turn, self.shift])
+
+    def with_unknowns(self, unknowns: FloatArray) -> RigidMotion:
+        """Another motion about the same centre."""
+        return RigidMotion(self.centre, unknowns[:3], unknowns[3:])
+
+    def rows(self, points: FloatArray, normals: FloatArray) -> FloatArray:
+        """Derivatives of moved points along normals by the unknowns, shape (n, 6).
+
+        To first order in the change of the turn, which is taken for one about the same axis.
+        """
+        arms = points - self.centre - self.shift
+        return np.hstack([np.cross(arms, normals), normals])

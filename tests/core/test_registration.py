@@ -1,0 +1,308 @@
+"""An organ registered to clouds whose truth is known, and clouds that are refused."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import meshio
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from avatar_core.cli import main as cli
+from avatar_core.errors import RegistrationError
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.geometry.mesh import regions_by_rule
+from avatar_core.geometry.point_location import carriers
+from avatar_core.registration.cloud import Cloud, read_cloud
+from avatar_core.registration.fit import RegistrationRule, rigid_motion
+from avatar_core.registration.posterior import Scales, averaged, cells_of, equations, posterior
+from avatar_core.registration.register import register, target_at, targets
+from avatar_core.registration.rigid import RigidMotion
+from avatar_core.registration.traction import load_basis
+from avatar_core.studies.registration import Case, RegistrationSettings, Truth, measured
+from avatar_core.vademecum.display import boundary, display_of
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import save_vademecum
+
+SETTINGS = RegistrationSettings(n_points=1500, peak=(0.012, 0.012))
+
+
+@pytest.fixture(scope="module")
+def truth(phantom_elasticity: Elasticity) -> Truth:
+    """On another mesh than the vademecum's, 700 vertices for 900."""
+    mesh = phantom_elasticity.mesh
+    return Truth(phantom_elasticity, regions_by_rule(mesh))
+
+
+@pytest.fixture(scope="module")
+def case(truth: Truth) -> Case:
+    return truth.case("pushes", SETTINGS, np.random.default_rng(1))
+
+
+def test_the_posterior_is_that_of_the_dense_gaussian() -> None:
+    rng = np.random.default_rng(0)
+    J, W = rng.standard_normal((60, 5)), rng.uniform(0.5, 2.0, 60)
+    d, spread = rng.standard_normal(60), rng.uniform(0.5, 2.0, 5)
+    cells = cells_of(rng.uniform(0.0, 3.0, (60, 3)), 1.0)
+    noise, mismatch = 0.7, 0.4
+    found = posterior(equations(J, d, W, cells), spread, noise, mismatch)
+    error = np.diag(noise**2 / W) + mismatch**2 * (cells.T @ cells).toarray()
+    data = error + (J * spread**2) @ J.T
+    gain = spread[:, None] ** 2 * J.T @ np.linalg.inv(data)
+    np.testing.assert_allclose(found.mean, gain @ d, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, np.diag(spread**2) - gain @ (J * spread**2))
+    cost = 0.5 * (d @ np.linalg.solve(data, d) + np.linalg.slogdet(data)[1])
+    assert found.cost == pytest.approx(cost, rel=1e-9)
+
+
+def test_unknown_scales_widen_the_posterior() -> None:
+    rng = np.random.default_rng(0)
+    J = rng.standard_normal((40, 3))
+    found = equations(J, J @ [1.0, -2.0, 0.5], np.ones(40), sp.identity(40, format="csr"))
+
+    def spread(scales: np.ndarray) -> np.ndarray:
+        return np.full(3, scales[0])
+
+    best = np.log([1.0, 1.0, 0.5, 0.1])
+    known, unknown = (
+        np.trace(averaged(found, spread, Scales(best, np.full(4, wide)), best)[1])
+        for wide in (1e-3, 0.5)
+    )
+    assert unknown > 1.02 * known
+
+
+def test_a_rigid_motion_and_its_derivatives() -> None:
+    rng = np.random.default_rng(0)
+    points, normals = rng.standard_normal((2, 7, 3))
+    motion = RigidMotion(np.array([0.1, -0.2, 0.3]), shift=np.array([0.3, 0.1, -0.2]))
+    motion = motion.with_unknowns(motion.unknowns())
+    np.testing.assert_allclose(motion.back(motion(points)), points, atol=1e-12)
+    rows = motion.rows(motion(points), normals)
+    for k, step in enumerate(1e-6 * np.eye(6)):
+        moved = motion.with_unknowns(motion.unknowns() + step)(points) - motion(points)
+        np.testing.assert_allclose(rows[:, k], (moved * normals).sum(axis=1) / 1e-6, atol=1e-5)
+
+
+def test_loads_displace_as_the_vademecum_does(phantom_vademecum: Vademecum) -> None:
+    v = phantom_vademecum
+    basis = load_basis(v)
+    coefficient = np.zeros((basis.size, 1))
+    coefficient[[1, 4]] = [[30.0], [-20.0]]  # along x
+    every = np.arange(len(v.mesh.vertices))
+    found = basis.displacement(v, every, coefficient)[:, :, 0]
+    force = basis.at_positions(coefficient)[:, 0, 0]
+    expected = v.displacement(np.arange(v.surface.n_positions), force)[:, 0].reshape(-1, 3)
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_a_weight_that_turned_sags_as_body_forces_do(
+    phantom_vademecum: Vademecum, truth: Truth
+) -> None:
+    v, problem = phantom_vademecum, truth.elasticity
+    basis = load_basis(v)
+    coefficient = np.zeros((basis.size, 1))
+    coefficient[-1] = 1e4
+    corners, weights = carriers(v.mesh, truth.mesh.vertices)
+    moved = basis.displacement(v, np.arange(len(v.mesh.vertices)), coefficient)[:, :, 0]
+    total = np.asarray(problem.mass.sum(axis=0)).ravel()
+    load = np.outer(total, [0.0, 0.0, 1e4]).reshape(-1, 1)
+    expected = problem.at_vertices(problem.solve(load)).reshape(-1, 3)
+    off = np.einsum("nk,nkd->nd", weights, moved[corners]) - expected
+    # the meshes differ, and with them the clamp
+    assert np.linalg.norm(off) < 0.15 * np.linalg.norm(expected)
+
+
+def test_traction_is_correlated_over_the_length_that_is_asked_for(
+    phantom_vademecum: Vademecum,
+) -> None:
+    surface, length = phantom_vademecum.surface, 0.04
+    basis = load_basis(phantom_vademecum, 120)
+    n = len(basis.eigenvalues)
+    field = basis.forces * basis.spread(2.0, length)[:n]
+    field /= np.linalg.norm(field, axis=1, keepdims=True)  # the area of a position cancels
+    apart = np.linalg.norm(surface.centers[:, None] - surface.centers[None], axis=2)
+    facing = surface.normals @ surface.normals.T > 0.8  # where the surface is nearly flat
+    correlation = field @ field.T
+    for distance in (0.5 * length, length):
+        pairs = facing & (np.abs(apart - distance) < 0.05 * distance)
+        expected = np.exp(-(distance**2) / (2.0 * length**2))
+        assert np.median(correlation[pairs]) == pytest.approx(expected, abs=0.06)
+
+
+def test_the_organ_is_found_from_a_part_of_its_surface(
+    phantom_vademecum: Vademecum, case: Case
+) -> None:
+    row = measured(phantom_vademecum, case)
+    assert row["vademecum_error"] < 0.3
+    assert row["vademecum_error"] < 0.5 * min(row["rigid_error"], row["splines_error"])
+    assert row["coverage"] > 0.7
+    assert row["explained"]
+
+
+def test_the_standard_deviation_grows_away_from_what_is_seen(
+    phantom_vademecum: Vademecum, case: Case
+) -> None:
+    found = register(phantom_vademecum, case.cloud)
+    seen = np.linalg.norm(found.place[:, None] - case.cloud.points[None, ::10], axis=2).min(axis=1)
+    deviation = np.linalg.norm(found.place_deviation, axis=1)
+    assert deviation[seen > 0.07].mean() > 1.5 * deviation[seen < 0.01].mean()
+
+
+def test_strays_do_no_harm(phantom_vademecum: Vademecum, case: Case) -> None:
+    points = case.cloud.points.copy()
+    rng = np.random.default_rng(3)
+    strays = rng.choice(len(points), len(points) // 25, replace=False)
+    points[strays] += [0.0, 0.03, 0.0] + 5e-3 * rng.standard_normal((len(strays), 3))
+    clean, dirty = (register(phantom_vademecum, c) for c in (case.cloud, Cloud(points)))
+    assert np.linalg.norm(dirty.place - clean.place, axis=1).mean() < 0.4e-3
+    assert dirty.fit.outlying == pytest.approx(0.04, abs=0.015)
+
+
+def test_what_no_load_explains_is_said(phantom_vademecum: Vademecum, case: Case) -> None:
+    x, y, z = case.cloud.points.T
+    ripple = 4e-3 * np.sin(2 * np.pi * x / 0.03) * np.sin(2 * np.pi * z / 0.03)
+    found = register(phantom_vademecum, Cloud(np.stack([x, y + ripple, z], axis=1)))
+    assert found.problems and "off the surface together" in " ".join(found.problems)
+    assert not register(phantom_vademecum, case.cloud).problems
+
+
+def test_a_cloud_at_rest_moves_nothing(phantom_vademecum: Vademecum, truth: Truth) -> None:
+    still = replace(SETTINGS, peak=(1e-9, 1e-9))
+    case = truth.case("pushes", still, np.random.default_rng(2))
+    found = register(phantom_vademecum, case.cloud)
+    corners, weights = carriers(phantom_vademecum.mesh, case.rest)
+    place = np.einsum("nk,nkd->nd", weights, found.place[corners])
+    assert case.volume @ np.linalg.norm(place - case.place, axis=1) < 0.5e-3
+    rigid = rigid_motion(phantom_vademecum, case.cloud)
+    assert np.linalg.norm(rigid(case.rest) - case.place, axis=1).mean() < 0.5e-3
+
+
+def test_targets_are_estimated_with_their_own_deviation(
+    phantom_vademecum: Vademecum, case: Case
+) -> None:
+    ball = display_ball(phantom_vademecum)
+    v = replace(phantom_vademecum, display=ball)
+    found = register(v, case.cloud)
+    (tumour,) = targets(v, found)
+    assert tumour.name == "lesion"
+    point = target_at(v, found, tumour.rest)
+    np.testing.assert_allclose(point.place, tumour.place, atol=1e-3)
+    np.testing.assert_allclose(point.place_deviation, tumour.place_deviation, rtol=0.3)
+    with pytest.raises(RegistrationError, match="outside the organ"):
+        target_at(v, found, np.array([0.0, 0.5, 0.0]))
+
+
+def display_ball(v: Vademecum) -> object:
+    """What is displayed with a small octahedron inside, named lesion."""
+    centre = v.mesh.vertices.mean(axis=0)
+    corner = centre + 8e-3 * np.vstack([np.eye(3), -np.eye(3)])
+    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+    return display_of(v.mesh, boundary(v.mesh), [("lesion", (corner, np.array(faces)))])
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((10, 3)), "too few"),
+        (np.full((100, 3), np.nan), "NaN"),
+        (np.zeros((100, 2)), "three coordinates"),
+    ],
+)
+def test_bad_clouds_are_refused(points: np.ndarray, message: str) -> None:
+    with pytest.raises(RegistrationError, match=message):
+        Cloud(points)
+
+
+def test_another_unit_or_other_axes_are_suspected(phantom_vademecum: Vademecum, case: Case) -> None:
+    points = case.cloud.points
+    for factor, unit in ((1e-3, "m instead of mm"), (1e3, "give the cloud of this organ|instead")):
+        with pytest.raises(RegistrationError, match=unit):
+            register(phantom_vademecum, Cloud(factor * points, unit="mm"))
+    with pytest.raises(RegistrationError, match="--axes LPS"):
+        register(phantom_vademecum, Cloud(points * [-1.0, -1.0, 1.0]))
+    with pytest.raises(RegistrationError, match="align it"):
+        register(phantom_vademecum, Cloud(points + np.array([0.0, 0.0, 0.3])))
+
+
+def test_every_format_gives_the_same_points(tmp_path: Path, case: Case) -> None:
+    points = 1e3 * case.cloud.points
+    meshio.write(tmp_path / "c.ply", meshio.Mesh(points, []))
+    (tmp_path / "c.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in points))
+    np.savetxt(tmp_path / "c.xyz", points)
+    rows = points * [-1.0, -1.0, 1.0]
+    np.savetxt(tmp_path / "c.csv", rows, delimiter=",", header="x,y,z", comments="")
+    for name in ("c.ply", "c.obj", "c.xyz"):
+        found = read_cloud(tmp_path / name)
+        np.testing.assert_allclose(found.points, case.cloud.points, atol=1e-9)
+    turned = read_cloud(tmp_path / "c.csv", axes="LPS")
+    np.testing.assert_allclose(turned.points, case.cloud.points, atol=1e-9)
+    np.testing.assert_allclose(read_cloud(tmp_path / "c.xyz", "m").points, points, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("missing.xyz", None, "check the path"),
+        ("words.xyz", "a b c\nd e f\n", "x, y, z in each line"),
+        ("short.csv", "1,2\n3,4\n", "x, y, z"),
+        ("empty.ply", "", "not a readable cloud"),
+        ("cloud.doc", "", "not a cloud"),
+    ],
+)
+def test_unreadable_files_are_refused(
+    tmp_path: Path, name: str, content: str | None, message: str
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(RegistrationError, match=message):
+        read_cloud(tmp_path / name)
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["avatar", "register", *map(str, arguments)])
+    return cli.main()
+
+
+def test_the_command_writes_the_surface_with_its_deviation(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    phantom_vademecum: Vademecum,
+    case: Case,
+) -> None:
+    v = replace(phantom_vademecum, display=display_ball(phantom_vademecum))
+    save_vademecum(v, tmp_path / "v.h5")
+    np.savetxt(tmp_path / "c.xyz", 1e3 * case.cloud.points)
+    given = (tmp_path / "v.h5", "--points", tmp_path / "c.xyz")
+    assert run(monkeypatch, *given, "-o", tmp_path / "out.vtp") == 0
+    line = capsys.readouterr().out
+    assert line.startswith("lesion: displaced by") and "the fit is good" in line
+    assert line.count("\n") == 1
+    piece = ElementTree.parse(tmp_path / "out.vtp").getroot().find("PolyData/Piece")
+    assert piece is not None
+    names = [array.get("Name") for array in piece.findall("PointData/DataArray")]
+    assert names == [
+        "displacement [m]",
+        "standard deviation of displacement [m]",
+        "standard deviation of place [m]",
+    ]
+    assert (tmp_path / "out_lesion.vtp").is_file()
+    assert run(monkeypatch, *given, "-o", tmp_path / "out.vtu", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    mesh = meshio.read(tmp_path / "out.vtu")
+    found = register(v, read_cloud(tmp_path / "c.xyz"))
+    np.testing.assert_allclose(mesh.points, found.place, atol=1e-9)
+    np.testing.assert_allclose(document["targets"][0]["place"], targets(v, found)[0].place)
+    assert document["explained"] and len(document["forces"]) >= 1
+    assert run(monkeypatch, *given, "-o", tmp_path / "out.vtu", "--noise", "1") == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_noise_is_a_length() -> None:
+    with pytest.raises(RegistrationError, match="in metres"):
+        RegistrationRule(noise=1.0)
