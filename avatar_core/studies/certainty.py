@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.studies.certainty_bands import bands_section
 from avatar_core.studies.certainty_section import FULL, QUICK, CertaintySettings, Section
 from avatar_core.studies.certainty_supports import supports_section
 from avatar_core.studies.report import Panel, write_report
@@ -23,8 +24,9 @@ if TYPE_CHECKING:
 
 SECTIONS: tuple[Callable[[SurfaceMesh, CertaintySettings, ProgressBar], Section], ...] = (
     supports_section,
+    bands_section,
 )
-N_STAGES = 2  # of the progress bar, over all sections
+N_STAGES = 4  # of the progress bar, over all sections
 
 
 def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:

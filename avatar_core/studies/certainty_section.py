@@ -17,16 +17,20 @@ class CertaintySettings:
     n_values : unseen values of a coordinate, beside the ends of its range
     n_loads : unseen load positions at each of them, three directions each
     max_modes : at a place
+    n_draws : of the material, each solved in full
+    n_places : that are pressed for them
     """
 
     n_vertices: int = 2850
     n_values: int = 8
     n_loads: int = 12
     max_modes: int = 100
+    n_draws: int = 1000
+    n_places: int = 3
 
 
 FULL = CertaintySettings()
-QUICK = CertaintySettings(n_vertices=700, n_values=4, n_loads=6)
+QUICK = CertaintySettings(n_vertices=700, n_values=4, n_loads=6, n_draws=40, n_places=2)
 
 
 @dataclass(frozen=True, eq=False)

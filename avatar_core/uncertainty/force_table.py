@@ -6,7 +6,9 @@ with l_n the Lagrange polynomials on Chebyshev's points (of the first kind) of t
 ranges, each in its own scale t, tensor-wise. The response is analytic in the coordinates, so that
 the error falls geometrically with the points (Trefethen, Approximation Theory, 2013); what the
 displacement elsewhere needs is interpolated alike. Young's modulus needs no point: forces at an
-imposed depth are proportional to it.
+imposed depth are proportional to it, with supports at the same stiffness over E,
+
+    F(E, k) = E / E0 F(E0, k E0 / E).
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ class ForceTable:
     """Forces and displacements at Chebyshev's points of the coordinates.
 
     coordinates : of the vademecum
-    young : Young's modulus of the forces [Pa]
+    young : Young's modulus of the forces, E0 [Pa]
     log_force : ndarray, shape (n_points, n_places, n_depths), ln of the force [N]
     log_moved : ndarray of that shape, ln of the displacement of the target [m]
     """
@@ -61,7 +63,10 @@ class ForceTable:
         """Of the points, shape (n, n_points)."""
         weights = np.ones((len(np.asarray(values["young"])), 1))
         for coordinate in self.coordinates:
-            own = _lagrange([coordinate.fraction(float(v)) for v in values[coordinate.name]])
+            at = np.asarray(values[coordinate.name])
+            if coordinate.kind == "support":  # far from all else it changes little: the ends do
+                at = np.clip(at * self.young / values["young"], coordinate.low, coordinate.high)
+            own = _lagrange([coordinate.fraction(float(v)) for v in at])
             weights = (weights[:, :, None] * own[:, None, :]).reshape(len(own), -1)
         return weights
 
@@ -92,13 +97,14 @@ def force_table(
     grids = product(*([c.value_at(t) for t in _points()] for c in coordinates))
     names, force, moved = [c.name for c in coordinates], [], []
     n_points = N_POINTS ** len(coordinates)
+    young = parametric.young_modulus if parametric else vademecum.material.young_modulus
+    reference = {"young": young} if parametric else {}
     for done, point in enumerate(grids):
-        here = at_values(vademecum, dict(zip(names, point, strict=True)))
+        here = at_values(vademecum, reference | dict(zip(names, point, strict=True)))
         found = _pressed(here, tip, places, depths)
         force.append(found)
         moved.append(found * _motion(here, places, target)[:, None])
         progress(done + 1, n_points)
-    young = vademecum.material.young_modulus
     return ForceTable(coordinates, young, np.log(force), np.log(moved))
 
 

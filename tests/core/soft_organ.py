@@ -1,4 +1,4 @@
-"""A coarse phantom over Poisson's ratio and the contrast of a tumour."""
+"""Coarse phantoms over Poisson's ratio and the contrast of a tumour, and over a support."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
+from avatar_core.offline.supports import SupportOption
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.model import Vademecum
 from tests.stored import stored
@@ -48,5 +49,17 @@ def soft_organ() -> Vademecum:
         coordinates=(POISSON, CONTRAST),
         tumour=soft_tumour(),
         n_certified=16,
+    )
+    return build(phantom_liver(12e-3), options)
+
+
+@stored
+def organ_on_springs() -> Vademecum:
+    """Over the stiffness of its bare area, which alone holds it."""
+    options = OrganOptions(
+        n_vertices=450,
+        rule=BuildRule(max_modes=60),
+        supports=(SupportOption.parse("bare_area=1e5:1e9:3"),),
+        n_certified=8,
     )
     return build(phantom_liver(12e-3), options)

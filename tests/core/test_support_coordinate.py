@@ -16,10 +16,6 @@ from avatar_core.errors import CoordinateError, SceneError, StorageError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.fem.supports import Support
-from avatar_core.geometry.phantom import phantom_liver
-from avatar_core.offline.pipeline import OrganOptions, build
-from avatar_core.offline.rule import BuildRule
-from avatar_core.offline.supports import SupportOption
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.scene.file import parse_scene, write_scene
 from avatar_core.scene.model import Scene, SupportStiffness
@@ -27,7 +23,7 @@ from avatar_core.scene.prepare import scene_spec
 from avatar_core.vademecum.at_values import at_values, ranges
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
-from tests.stored import stored
+from tests.core.soft_organ import organ_on_springs
 
 BARE = SUPPORT + "bare_area"
 YOUNG = 0.17e6
@@ -35,19 +31,7 @@ YOUNG = 0.17e6
 
 @pytest.fixture(scope="module")
 def organ() -> Vademecum:
-    """A coarse phantom over the stiffness of its bare area."""
-    return _organ_on_springs()
-
-
-@stored
-def _organ_on_springs() -> Vademecum:
-    options = OrganOptions(
-        n_vertices=450,
-        rule=BuildRule(max_modes=60),
-        supports=(SupportOption.parse("bare_area=1e5:1e9:3"),),
-        n_certified=8,
-    )
-    return build(phantom_liver(12e-3), options)
+    return organ_on_springs()
 
 
 @pytest.fixture(scope="module")

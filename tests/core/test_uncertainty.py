@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +29,11 @@ from avatar_core.uncertainty.distributions import (
     read_distributions,
     within,
 )
-from avatar_core.uncertainty.force_table import ForceTable, force_table
+from avatar_core.uncertainty.force_table import ForceTable, _pressed, force_table
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
-from tests.core.soft_organ import soft_organ, soft_tumour
+from tests.core.soft_organ import organ_on_springs, soft_organ, soft_tumour
 
 DEPTHS = [1e-3, 3e-3]
 PATCH = Tip("patch", 8e-3)
@@ -221,6 +222,26 @@ def test_bands_hold_what_full_finite_elements_find(
     drawn_bands = np.quantile(force, [0.05, 0.5, 0.95])
     ours = bands_of(table, known, 60, seed=5).force[:, 0, -1]
     np.testing.assert_allclose(ours / ours[1], drawn_bands / drawn_bands[1], rtol=0.03)
+
+
+def test_supports_count_over_young() -> None:
+    """At another E, the table is asked for the stiffness of supports that is the same over E."""
+    organ = organ_on_springs()
+    places = starts_apart(organ, 1)
+    table = force_table(organ, PATCH, places, DEPTHS, target=0)
+    values = {"young": 60e3, "support.bare_area": 5e5}
+    own = _pressed(at_values(organ, values), PATCH, places, DEPTHS)
+    found = table.force({name: np.array([value]) for name, value in values.items()})
+    np.testing.assert_allclose(found[0], own, rtol=4e-2)  # a vademecum has kinks at its nodes
+    twice = table.force({name: np.array([2.0 * value]) for name, value in values.items()})
+    np.testing.assert_allclose(twice, 2.0 * found, rtol=1e-9)
+    assert abs(table.force({"young": [60e3], "support.bare_area": [1.4e6]}) / own - 1).max() > 0.05
+
+
+def test_a_fixed_support_fixes_young() -> None:
+    held = replace(organ_on_springs(), parametric=None)
+    with pytest.raises(CoordinateError, match="support bare_area is fixed"):
+        known_of(held, {"young": Lognormal(60e3, 1.3)})
 
 
 def test_shares_add_up_and_name_the_parameter_that_matters(bands: Bands) -> None:
