@@ -6,6 +6,7 @@ clamp and the accessible surface, found by a geometric rule or read from a file 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from avatar_core.errors import MeshError
+from avatar_core.errors import MeshError, one_line
 from avatar_core.geometry.surface import SurfaceMesh, winding_number
 from avatar_core.geometry.tetwild import fill_box
 
@@ -299,16 +300,31 @@ def regions_from_groups(mesh: TetMesh, path: str | Path) -> Regions:
     (n, 3): a boundary face belongs to the group if all three of its corners lie closer to a
     point of that group than the mesh's mean surface edge.
     """
-    from scipy.spatial import cKDTree
+    return regions_of_groups(mesh, read_groups(path))
 
+
+def read_groups(path: str | Path) -> dict[str, np.ndarray]:
+    """The two groups of points of a file [m].
+
+    Raises MeshError for anything else.
+    """
     try:
         with np.load(path, allow_pickle=False) as groups:
             points = {name: np.asarray(groups[name], float) for name in ("clamped", "accessible")}
-    except (OSError, ValueError, KeyError) as error:
+        if any(p.shape[1:] != (3,) or not np.isfinite(p).all() for p in points.values()):
+            raise ValueError("points are rows of three finite numbers")
+    except Exception as error:  # whatever numpy and zipfile raise of a damaged file
         raise MeshError(
-            f"cannot read node groups from {path} ({error}); it must be an .npz with arrays "
-            "'clamped' and 'accessible' of shape (n, 3) in metres"
+            f"cannot read node groups from {path} ({one_line(error)}); it must be an .npz with "
+            "arrays 'clamped' and 'accessible' of shape (n, 3) in metres"
         ) from error
+    return points
+
+
+def regions_of_groups(mesh: TetMesh, points: Mapping[str, np.ndarray]) -> Regions:
+    """The regions of two groups of points [m], as :func:`regions_from_groups` reads them."""
+    from scipy.spatial import cKDTree
+
     inside = {}
     for name, group in points.items():
         near = cKDTree(group).query(mesh.vertices)[0] < mesh.mean_surface_edge
