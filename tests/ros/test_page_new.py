@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import socket
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,15 +18,22 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 pytest.importorskip("viser", reason="the extra ui is not installed")
 
+import viser
 from avatar_ros.framework.conversions import surface_mesh
 from avatar_ros.ui.actions import Wanted
+from avatar_ros.ui.cut_handle import CutHandle
 from avatar_ros.ui.new_patient import NewPatient
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.player import Player
-from avatar_ros.ui.preview_view import ACCESSIBLE, CLAMPED
+from avatar_ros.ui.preview_view import ACCESSIBLE, BRUSHES, CLAMPED
 from avatar_ros.ui.report_pdf import report_pdf
 from avatar_ros.ui.scan import read_scan, slice_of
+from avatar_ros.ui.scan_view import ScanView
+from avatar_ros.ui.structures_view import STRUCTURE
 from avatar_ros.ui.surface_view import section
+from avatar_ros.ui.tabs.inside import InsideTab
+from avatar_ros.ui.tabs.patient import PatientTab
+from avatar_ros.ui.tabs.scan import ScanTab
 
 from avatar_core.contact.effects.selection import default_effects
 from avatar_core.errors import SurfaceError
@@ -247,3 +256,90 @@ def test_a_pdf_has_a_page_for_the_organ_and_one_for_each_state() -> None:
     made = report_pdf(Organ.of(organ("cube")), [KEPT, KEPT], ["Large expected error: $x_1"])
     assert made.startswith(b"%PDF") and made.rstrip().endswith(b"%%EOF")
     assert made.count(b"/Type /Page ") == 3 or made.count(b"/Type /Page\n") == 3
+
+
+# --- controls ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = viser.ViserServer("127.0.0.1", port, verbose=False)
+    yield server
+    server.stop()
+
+
+class Asked:
+    """Actions that note what they were asked for."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Any, ...]] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *given: self.calls.append((name, *given))
+
+
+def test_labels_and_boxes_of_a_file_reach_the_build(server: viser.ViserServer) -> None:
+    asked: Any = Asked()
+    tab = PatientTab(server.gui, asked, tuple(BRUSHES))
+    tab.offer(["case.nii.gz", "liver.stl"])
+    tab.offer_labels(("liver", "lesion", "vein"))
+    assert list(tab._boxes) == ["lesion", "vein"]
+    tab._boxes["vein"].value = True
+    wanted = tab._wanted(preview=True)
+    assert (wanted.surface, wanted.label, wanted.inside) == ("case.nii.gz", "liver", ("vein",))
+    assert wanted.preview
+    tab._label.value = "lesion"
+    assert list(tab._boxes) == ["liver", "vein"]
+    tab.offer_labels(())
+    assert tab._wanted().label == "" and tab._wanted().inside == ()
+
+
+def test_structures_and_planes_have_their_controls(
+    server: viser.ViserServer, tmp_path: Path
+) -> None:
+    asked: Any = Asked()
+    inside = InsideTab(server.gui, asked)
+    inside.show(("lesion", "vein"))
+    inside._rows[2].value = 50
+    assert asked.calls[-1] == ("style", "lesion", True, STRUCTURE, 0.5)
+    inside.show(())
+    assert not inside._folder.visible
+    tab = ScanTab(server.gui, asked)
+    tab.offer(["mr.nii"])
+    values = np.arange(1000, dtype=np.int16).reshape(10, 10, 10)
+    nibabel.save(nibabel.Nifti1Image(values, np.eye(4)), tmp_path / "mr.nii")
+    said: list[str] = []
+    reader: Any = AtOnce()
+    planes = ScanView(server, tmp_path, reader, lambda: tab, said.append)
+    planes.choose("mr.nii")
+    assert said == [] and len(planes._planes) == 3
+    before = planes._planes[2].image.copy()
+    tab._sliders[2].value = 90
+    assert asked.calls[-1] == ("place_scan", 2, 0.9)
+    planes.place(2, 0.9)
+    assert (planes._planes[2].image != before).any()
+    np.testing.assert_allclose(planes._planes[2].position[2], 9e-3)
+    planes.forget()
+    assert planes._planes == [] and not tab._controls.visible
+
+
+def test_the_plane_of_a_cut_follows_its_handle(server: viser.ViserServer) -> None:
+    shown, parts = Organ.of(organ("cube")), []
+    handle = CutHandle(server, parts.append)
+    up = np.array([0.0, 1.0, 0.0])
+    plane = handle.show(shown, up, 0.25)
+    top, bottom = shown.vertices[:, 1].max(), shown.vertices[:, 1].min()
+    assert plane.point @ up == pytest.approx(top - 0.25 * (top - bottom), abs=1e-6)
+    assert handle._part() == pytest.approx(0.25, abs=1e-6)
+    node = handle._handle
+    node.position = tuple(np.array(node.position) - 0.25 * (top - bottom) * up)
+    handle._moved()
+    assert parts[-1] == pytest.approx(0.5, abs=1e-6)
+    handle.show(shown, up, 0.5)
+    assert handle._handle is node  # a handle that is held is not made anew
+    handle.show(shown, np.array([1.0, 0.0, 0.0]), 0.5)
+    assert handle._handle is not node
+    handle.hide()
