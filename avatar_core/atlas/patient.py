@@ -8,7 +8,7 @@ that they differ in the response only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
@@ -49,6 +49,7 @@ from avatar_core.reduction.separated import SeparatedField
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import load_map
 from avatar_core.shapes.registration import Registration, register
+from avatar_core.vademecum.display import Display, boundary, display_of, structure
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.tip_field import TipField, make_tip_field
 
@@ -74,6 +75,9 @@ class PatientOptions:
     max_modes : modes of the vademecum at a place; see :class:`BuildRule`
     n_certified : unseen loads of the certificate; None for 24, or 200 with ``solved``; 0 for none
     leave_out : numbers of anatomies that get no weight, such as other scans of the patient
+    groups : points that are clamped and accessible, in place of the template's; see
+        :func:`avatar_core.geometry.groups.regions_of_groups`
+    inside : what lies inside the organ and is displayed with it, as tumours; as stiff as the organ
     """
 
     n_vertices: int = 2850
@@ -83,6 +87,8 @@ class PatientOptions:
     max_modes: int = 100
     n_certified: int | None = None
     leave_out: tuple[int, ...] = ()
+    groups: Mapping[str, np.ndarray] | None = None
+    inside: tuple[SurfaceMesh, ...] = ()
     build: BuildRule = field(default_factory=BuildRule)
     reduction: ReductionRule = field(default_factory=ReductionRule)
 
@@ -157,10 +163,33 @@ def patient_vademecum(
     AvatarError
         Of the stage that failed, with the remedy.
     """
-    require_fidelity(fidelity)
     base = base_of(atlas) if isinstance(atlas, Atlas) else atlas
     options = options or PatientOptions()
     clock: dict[str, float] = {}
+    problem, weights = posed_patient(surface, base, fidelity, options, progress, clock)
+    return build_patient(problem, base, weights, fidelity, options, progress, clock)
+
+
+@repeatable
+def posed_patient(
+    surface: SurfaceMesh,
+    base: PatientBase,
+    fidelity: Fidelity,
+    options: PatientOptions,
+    progress: Progress = _silent,
+    clock: dict[str, float] | None = None,
+) -> tuple[PatientProblem, Barycenter]:
+    """A patient registered and meshed, with clamp and access, before anything is solved.
+
+    Parameters and errors as of :func:`patient_vademecum`.
+    """
+    require_fidelity(fidelity)
+    if options.groups is not None and fidelity == "interpolated":
+        raise PatientError(
+            "interpolated responses are those of organs clamped as the template; choose reduced or "
+            "solved for a clamp of your own"
+        )
+    clock = {} if clock is None else clock
     progress("registration", 0.0, np.nan)
     with _timed(clock, "registration"):
         known = base.registrations.get(surface.source_sha256)
@@ -174,8 +203,8 @@ def patient_vademecum(
             problem = member_problem(surface, base, weights.member, registration)
         else:
             mesh = tetrahedralize(surface, options.n_vertices)
-            problem = patient_problem(surface, base, registration, mesh)
-    return build_patient(problem, base, weights, fidelity, options, progress, clock)
+            problem = patient_problem(surface, base, registration, mesh, options.groups)
+    return problem, weights
 
 
 def build_patient(
@@ -202,6 +231,7 @@ def build_patient(
         else:
             vademecum = solved(problem, options, progress)
             solutions = 3 * problem.loads.n_positions
+    vademecum = replace(vademecum, display=_display(problem, options))
     count = _CERTIFIED[fidelity] if options.n_certified is None else options.n_certified
     with _timed(clock, "certificate"):
         if count:
@@ -320,6 +350,14 @@ def solved(
         lambda stage, fraction, error: progress(f"response: {stage}", fraction, error),
         problem.outline,
     )
+
+
+def _display(problem: PatientProblem, options: PatientOptions) -> Display | None:
+    """The mesh's own surface with what lies inside; None if nothing does."""
+    if not options.inside:
+        return None
+    inside = [(one.name, structure(one)) for one in options.inside]
+    return display_of(problem.mesh, boundary(problem.mesh), inside)
 
 
 # --- assembly ---------------------------------------------------------------------------------

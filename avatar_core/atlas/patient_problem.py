@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from avatar_core.atlas.base import PatientBase
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_normals
+from avatar_core.geometry.groups import regions_of_groups
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.correspondence import carry_regions, registered_positions
@@ -38,16 +40,25 @@ class PatientProblem:
 
 
 def patient_problem(
-    surface: SurfaceMesh, base: PatientBase, registration: Registration, mesh: TetMesh
+    surface: SurfaceMesh,
+    base: PatientBase,
+    registration: Registration,
+    mesh: TetMesh,
+    groups: Mapping[str, np.ndarray] | None = None,
 ) -> PatientProblem:
     """Transfer clamp, accessible region and patch radius of the base to a patient's mesh.
+
+    groups : points that are clamped and accessible, as of
+        :func:`avatar_core.geometry.groups.regions_of_groups`, in place of the template's
 
     Raises
     ------
     RegistrationError, MeshError
         If the mesh lies elsewhere, or is too coarse for the regions or the patch.
     """
-    regions = carry_regions(registration, mesh)
+    regions = (
+        carry_regions(registration, mesh) if groups is None else regions_of_groups(mesh, groups)
+    )
     loads = load_surface(mesh, regions, base.loads.patch_radius)
     elasticity = Elasticity(mesh, base.material, regions.clamped)
     return PatientProblem(surface, registration, mesh, regions, loads, elasticity)

@@ -26,12 +26,25 @@ _MAX_LABELS = 100  # more are an image
 _SLIMMEST = 100.0  # a voxel's length over its width
 
 
-def surface_of_label(path: Path, label: int | str | None) -> Soup:
+def labels_of(path: str | Path) -> tuple[str, ...]:
+    """What can be chosen of a label map: names of its segments, or its numbers; for the user.
+
+    Raises SurfaceError as :func:`surface_of_label` of a file that is none.
+    """
+    path = Path(path)
+    found = read_label_map(path)
+    if found.segments:
+        return tuple(one.name for one in found.segments)
+    return tuple(f"{value:g}" for value in _present(found.values[0], path.name))
+
+
+def surface_of_label(path: Path, label: int | str | None, inside: Sequence[str] = ()) -> Soup:
     """Surface of one label, in RAS [mm]; the only one if None.
 
     Parameters
     ----------
     label : number, or the name of a segment
+    inside : further labels that belong to it, as tumours of an organ that were cut out of it
 
     Raises
     ------
@@ -40,7 +53,10 @@ def surface_of_label(path: Path, label: int | str | None) -> Soup:
     """
     found = read_label_map(path)
     _require_voxels(path.name, found.affine)
-    return _surface_of_mask(_mask_of(found, path.name, label), found.affine)
+    mask = _mask_of(found, path.name, label)
+    for other in inside:
+        mask = mask | _mask_of(found, path.name, other)
+    return _surface_of_mask(mask, found.affine)
 
 
 def _require_voxels(name: str, affine: FloatArray) -> None:
@@ -79,11 +95,17 @@ def _chosen_segment(segments: Sequence[Segment], name: str, label: int | str | N
     return fitting[0]
 
 
-def _chosen_label(values: NDArray[Any], name: str, label: int | str | None) -> float:
+def _present(values: NDArray[Any], name: str) -> NDArray[Any]:
+    """The numbers of a map but zero, sorted; SurfaceError of an image."""
     present = np.unique(values)
     present = present[present != 0]
     if len(present) > _MAX_LABELS:
         raise SurfaceError(f"{name}: an image, not a label map; give the segmentation")
+    return present
+
+
+def _chosen_label(values: NDArray[Any], name: str, label: int | str | None) -> float:
+    present = _present(values, name)
     if label is None and len(present) == 1:
         return float(present[0])
     number = _number(label)

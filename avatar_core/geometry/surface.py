@@ -7,7 +7,7 @@ Cracked, doubled and locally flipped surfaces are accepted where the generalised
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -134,6 +134,7 @@ def read_surface(
     unit: str = "mm",
     axes: str | ArrayLike | None = None,
     label: int | str | None = None,
+    inside: Sequence[str] = (),
     *,
     check_size: bool = True,
     one_body: bool = True,
@@ -146,6 +147,7 @@ def read_surface(
         (``SPACE=LPS``, as 3D Slicer writes it), RAS if it states none. Axes that are given hold
         against the header, with a notice.
     label : number, or name in a ``.seg.nrrd``, of one in a label map; not needed for the only one
+    inside : further labels that belong to the organ, as tumours that were cut out of it
     one_body : small stray bodies are dropped, others refused; False for tumours
 
     Raises SurfaceError naming cause and remedy: file missing or unreadable, no triangles, points
@@ -156,7 +158,7 @@ def read_surface(
     stated = stated_axes(path)
     matrix = axes_matrix((stated or "RAS") if axes is None else axes)
     content = content_of(path)
-    vertices, faces = parse(path, label)
+    vertices, faces = parse(path, label, inside)
     _check_arrays(vertices, faces, path.name)
     vertices = scale * (vertices @ matrix[:3, :3].T + matrix[:3, 3])
     if np.linalg.det(matrix[:3, :3]) < 0:  # a mirror turns every face round

@@ -8,7 +8,7 @@ Nothing is checked here but that the file can be read; :mod:`avatar_core.geometr
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -104,8 +104,11 @@ _COMMENTS: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-def parse(path: Path, label: int | str | None) -> Soup:
-    """Vertices (n, 3) in the file's unit and axes, and triangles (m, 3)."""
+def parse(path: Path, label: int | str | None, inside: Sequence[str] = ()) -> Soup:
+    """Vertices (n, 3) in the file's unit and axes, and triangles (m, 3).
+
+    label, inside : as of :func:`avatar_core.geometry.label_maps.surface_of_label`
+    """
     kind = ".nii" if path.name.lower().endswith(".nii.gz") else path.suffix.lower()
     if kind not in _READERS and not is_label_map(path):
         raise SurfaceError(
@@ -113,7 +116,9 @@ def parse(path: Path, label: int | str | None) -> Soup:
             ".nrrd or .dcm"
         )
     try:
-        return surface_of_label(path, label) if is_label_map(path) else _READERS[kind](path)
+        if is_label_map(path):
+            return surface_of_label(path, label, inside)
+        return _READERS[kind](path)
     except SurfaceError:
         raise
     except Exception as error:  # parsers of eight formats, each with errors of its own

@@ -28,7 +28,7 @@ from avatar_core.common.supports import ATTACHMENTS, SUPPORT
 from avatar_core.errors import CoordinateError, MaterialError, MeshError
 from avatar_core.fem.supports import Support, require_stiffness
 from avatar_core.geometry.attachments import attachments_by_rule
-from avatar_core.geometry.groups import REGIONS, read_groups
+from avatar_core.geometry.groups import REGIONS, faces_of_groups, read_groups
 from avatar_core.geometry.mesh import Regions, TetMesh, accessible_by_rule, checked, touching
 from avatar_core.reduction.coordinates import Coordinate
 
@@ -111,7 +111,7 @@ def held_by(
     MaterialError, MeshError
         For a support that is nowhere, or without faces.
     """
-    given = {} if groups is None else read_groups(mesh, groups)
+    given = {} if groups is None else faces_of_groups(mesh, read_groups(groups))
     places = attachments_by_rule(mesh) | given
     clamped = given.get(CLAMPED, np.zeros(len(mesh.boundary_faces), bool)).copy()
     held = clamped.copy()

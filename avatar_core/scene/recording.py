@@ -12,7 +12,7 @@ Layout (schema 1.0), attributes at the root: ``format`` = "avatar recording", ``
     periods/force (n, t, 3) [N]  force of the organ on the tool, before the force guard
     periods/error (n, t) [N]     estimated error of the force, exceeded by one contact in ten
     periods/share (n, t)         fraction of the force that was sent; below 1 if the guard cut it
-    clouds/period (m,)           number of the last period before each cloud
+    clouds/period (m,)           number of the period of each cloud
     clouds/displacement (m, n_points, 3) [m], float32
 """
 

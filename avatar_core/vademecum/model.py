@@ -322,10 +322,19 @@ class Vademecum:
     @property
     def clamped_faces(self) -> np.ndarray:
         """Which of :attr:`organ_faces` are clamped, shape (m,) bool."""
+        return self._displayed(self.regions.clamped)
+
+    @property
+    def accessible_faces(self) -> np.ndarray:
+        """Which of :attr:`organ_faces` tools reach, shape (m,) bool."""
+        return self._displayed(self.regions.accessible)
+
+    def _displayed(self, region: np.ndarray) -> np.ndarray:
+        """A region of the mesh's boundary, on the faces of the displayed organ."""
         if self.display is None:
-            return self.regions.clamped
+            return region
         held = np.zeros(len(self.mesh.vertices))
-        held[self.mesh.boundary_faces[self.regions.clamped]] = 1.0
+        held[self.mesh.boundary_faces[region]] = 1.0
         part = (held[self.display.corners] * self.display.weights).sum(axis=1)
         return np.asarray((part[self.organ_faces] > 0.5).all(axis=1))
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry import label_files, surface_files
+from avatar_core.geometry.label_maps import labels_of
 from avatar_core.geometry.surface import read_surface
 from avatar_core.geometry.tumour import read_tumour
 
@@ -271,3 +272,24 @@ def test_other_dicom_files_are_refused(tmp_path, monkeypatch):
     refused(tmp_path / "image.dcm", "no segmentation")
     monkeypatch.setattr(label_files, "MAX_LABEL_BYTES", 1000)
     refused(path, "crop it", label="liver")
+
+
+def test_what_was_cut_out_of_the_organ_is_filled_by_its_labels(tmp_path):
+    """In one layer a lesion's voxels are no longer the liver's."""
+    path = segmentation(tmp_path / "a.seg.nrrd", {"Liver": 1, "lesion": 2})
+    assert labels_of(path) == ("Liver", "lesion")
+    whole = 4 / 3 * np.pi * 0.04 * 0.05 * 0.06
+    hollow, filled = (read_surface(path, label="Liver", inside=i) for i in ((), ("lesion",)))
+    assert hollow.volume == pytest.approx(whole - 4 / 3 * np.pi * 0.015**3, rel=0.01)
+    assert filled.volume == pytest.approx(whole, rel=0.01)
+    refused(path, "Liver (1), lesion (2)", label="Liver", inside=("vein",))
+
+
+def test_numbers_of_a_map_without_names_are_offered_and_an_image_has_none(tmp_path):
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = [-70, -100, -50]
+    assert labels_of(label_map(tmp_path / "organs.nii", affine, labels=(3, 7))) == ("3", "7")
+    grey = np.arange(1000, dtype=np.int16).reshape(10, 10, 10)
+    nibabel.save(nibabel.Nifti1Image(grey, affine), tmp_path / "ct.nii")
+    with pytest.raises(SurfaceError, match="an image, not a label map"):
+        labels_of(tmp_path / "ct.nii")

@@ -15,6 +15,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
+from avatar_ros.prepare.scenes import usable_material
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
@@ -25,6 +26,7 @@ from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_ros.srv import LoadVademecum
 from tests.ros.conftest import PATIENT
 from tests.ros.test_cell import Hand, felt
 from tests.slowness import Deadline
@@ -52,10 +54,14 @@ def _soft_organ() -> Any:
 
 @pytest.fixture(scope="module")
 def nodes(
-    own_domain: dict[str, str], soft_organ: Any, tmp_path_factory: pytest.TempPathFactory
+    own_domain: dict[str, str],
+    soft_organ: Any,
+    organ: Any,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[dict[str, Module]]:
     folder: Path = tmp_path_factory.mktemp("material")
     save_vademecum(soft_organ, folder / "soft.h5")
+    save_vademecum(organ, folder / "hard.h5")
     options = ["--ros-args", "-p", f"library_dir:={folder}", "-p", "vademecum:=soft.h5"]
     processes = {
         "vademecum_loader": Module("vademecum_loader", options, own_domain),
@@ -142,6 +148,48 @@ def test_a_value_that_the_vademecum_does_not_have_is_refused(
     assert not answer.successful
     assert reason in answer.reason
     np.testing.assert_allclose(_settled(probe, hand), before, rtol=1e-3)
+
+
+def test_a_value_stays_for_the_next_organ_that_has_it_and_stops_no_other(
+    probe: Any, hand: Hand
+) -> None:
+    """An organ of one material comes while Poisson's ratio is set, and then the first one again."""
+    before = np.linalg.norm(_settled(probe, hand))
+    assert _set(probe, poisson_ratio=0.31).successful
+
+    def is_other(force: np.ndarray) -> bool:
+        return bool(force.any()) and abs(np.linalg.norm(force) / before - 1) > 0.02
+
+    _until(probe, hand, is_other)
+    _use(probe, hand, "hard.h5")
+    _use(probe, hand, "soft.h5")
+    _until(probe, hand, is_other)
+    _set_back(probe, hand, before, "poisson_ratio")
+
+
+def _use(probe: Any, hand: Hand, name: str) -> None:
+    """Load a file, and wait until the contact node has it in use."""
+    loaded = probe.call(LoadVademecum, "/load_vademecum", LoadVademecum.Request(name=name))
+    assert loaded.success
+    probe.next(
+        ContactState,
+        "contact_state",
+        qos.state(1),
+        lambda state: state.vademecum_id == loaded.info.id,
+        meanwhile=hand,
+    )
+
+
+def test_what_an_organ_has_no_place_for_is_said(organ: Any, soft_organ: Any) -> None:
+    material = {"young": 2e5, "poisson": 0.31, "contrast": 3.0}
+    used, notices = usable_material(organ, material)
+    assert used == {"young": 2e5}
+    assert len(notices) == 2
+    assert "poisson" in notices[0] and "no such coordinate" in notices[0]
+    used, notices = usable_material(soft_organ, material | {"poisson": 0.2})
+    assert used == {"young": 2e5}
+    assert "holds 0.3 to 0.49" in notices[0]
+    assert usable_material(soft_organ, {"poisson": 0.31}) == ({"poisson": 0.31}, ())
 
 
 def test_the_loop_goes_on_while_the_material_changes(probe: Any, hand: Hand) -> None:

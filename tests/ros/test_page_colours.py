@@ -13,7 +13,7 @@ from avatar_ros.ui.bands import cut
 from avatar_ros.ui.colours import N_BANDS, band_colours, tissue_colours
 from avatar_ros.ui.refined import finer, refined
 
-from avatar_core.contact.fine_surface import FineSurface
+from avatar_core.contact.fine_surface import _LEVELS, FineSurface, _split
 from tests.hard.small_files import ball
 
 pytestmark = pytest.mark.ros
@@ -96,9 +96,41 @@ def test_what_is_finer_under_a_tip_stays_and_no_gap_opens_beside_it() -> None:
         np.concatenate([np.arange(1, len(faces)), np.zeros(4, int)]),
     )
     smooth = finer(refined(n, faces), shown)
-    edges = smooth.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, times = np.unique(_ends(smooth.positions[edges]), axis=0, return_counts=True)
-    assert (times == 2).all()  # every edge of a closed surface has two sides
+    require_closed(smooth)
+
+
+def require_closed(shown: FineSurface) -> None:
+    """Every edge has two sides, which use the same two points."""
+    edges = shown.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, times = np.unique(_ends(shown.positions[edges]), axis=0, return_counts=True)
+    assert (times == 2).all()
+
+
+@pytest.mark.parametrize("size", [1, 2, 6, 40])
+def test_no_point_of_a_finer_part_lies_on_a_side_that_does_not_have_it(size: int) -> None:
+    """Single pixels would stay open there: neighbours of a part are split as it is."""
+    points, faces = ball(400, RADIUS)
+    middle = points[faces].mean(axis=1)
+    chosen = np.argsort(np.linalg.norm(middle - middle[0], axis=1))[:size]
+    is_split = np.isin(np.arange(len(faces)), chosen)
+    blend, finest = _split(faces[is_split], len(points))
+    positions = blend @ points
+    shown = FineSurface(
+        positions,
+        np.zeros_like(positions),
+        np.concatenate([faces[~is_split], finest]),
+        np.concatenate([np.flatnonzero(~is_split), np.tile(np.flatnonzero(is_split), 4**_LEVELS)]),
+    )
+    shape = refined(len(points), faces)
+    smooth = finer(shape, shown)
+    require_closed(smooth)
+    vectors = areas(smooth.positions, smooth.faces)
+    together = np.zeros((len(faces), 3))
+    np.add.at(together, smooth.parents // 4, vectors)
+    beside = ~is_split & (np.linalg.norm(together, axis=1) > 0.0)
+    assert beside.sum() == len(faces) - size
+    outward = (vectors * smooth.positions[smooth.faces].mean(axis=1)).sum(axis=1)
+    assert (outward > 0.0).all()  # none is turned round
 
 
 def _ends(places: np.ndarray) -> np.ndarray:

@@ -119,7 +119,7 @@ def test_a_report_holds_numbers_errors_and_notes(
     made, said, labels, _ = plan
     made.keep("over <the> tumour", None)
     assert len(labels) == 1 and labels[0].endswith("over <the> tumour")
-    made.report(None)
+    made.report(".html", None)
     (path,) = tmp_path.glob("report-*.html")
     text = path.read_text()
     assert path.name in said[-1]

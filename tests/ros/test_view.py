@@ -15,8 +15,9 @@ pytest.importorskip("avatar_ros.ui.view", reason="avatar_ros is not installed")
 
 import viser
 from avatar_ros.ui import tone
-from avatar_ros.ui.colours import HELD, N_BANDS
+from avatar_ros.ui.colours import HELD, N_BANDS, N_SHADES, TISSUE
 from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.patterns import GAP
 from avatar_ros.ui.view import CUT, GLASS, WHOLE, OrganView
 
 from avatar_core.contact.model import ContactModel, prepare, step
@@ -111,10 +112,56 @@ def test_cut_open_shows_half_and_the_far_wall(view: OrganView) -> None:
     assert area(meshes(view, "tissue")) < 0.75 * whole
     assert len(meshes(view, "inside")) == 1
     view.look(GLASS)
+    assert meshes(view, "inside") == []
     assert area(meshes(view, "tissue")) == pytest.approx(whole)
     assert {mesh.opacity for mesh in meshes(view, "tissue")} == {view.opacity} != {1.0}
     view.look(WHOLE)
-    assert view.opacity == 1.0 and meshes(view, "inside") == []
+    assert view.opacity == 1.0 and len(meshes(view, "inside")) == 1  # behind cracks
+
+
+def shades(view: OrganView, first: int) -> list[Any]:
+    """Meshes of tissue that are no shades, from one beyond these on, and not empty."""
+    nodes = view._surface._nodes
+    beyond = [nodes["tissue", k] for k in range(N_SHADES + first, N_SHADES + 3)]
+    return [mesh for mesh in beyond if np.any(mesh.faces)]
+
+
+def test_the_clamp_has_checks_and_access_has_stripes(view: OrganView) -> None:
+    """Both kinds of checks together are the clamp; stripes lie where tools reach, if asked for."""
+    shown = Organ.of(organ("cube"))
+    whole = area(meshes(view, "tissue"))
+    corners = shown.vertices[shown.faces[shown.clamped]].astype(float)
+    a, b, c = corners.transpose(1, 0, 2)
+    clamp = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    dark, light = shades(view, 0)
+    assert area([dark, light]) == pytest.approx(clamp, rel=0.05)
+    assert 0.4 < area([dark]) / clamp < 0.6
+    view.mark_reach(True)
+    *_, reached = shades(view, 0)
+    corners = shown.vertices[shown.faces[shown.accessible]].astype(float)
+    a, b, c = corners.transpose(1, 0, 2)
+    reach = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert area([reached]) == pytest.approx(reach / GAP, rel=0.2)
+    assert area(meshes(view, "tissue")) == pytest.approx(whole, rel=1e-6)
+    view.mark_reach(False)
+    assert len(shades(view, 0)) == 2
+
+
+def test_little_error_looks_unlike_no_access(view: OrganView) -> None:
+    """A face with an error is in a band, the first one too; one without stays tissue."""
+    shown = Organ.of(organ("cube"))
+    errors = np.full(len(shown.vertices), np.nan)
+    reached = shown.faces[shown.accessible]
+    errors[np.unique(reached)] = 0.5e-3  # half a band of a scale to 2 %
+    is_known = np.isfinite(errors)[shown.faces].all(axis=1)
+    view.paint_errors(errors)
+    (first,) = meshes(view, "bands")
+    assert first is view._surface._nodes["bands", 0]
+    corners = shown.vertices[shown.faces[is_known]].astype(float)
+    a, b, c = corners.transpose(1, 0, 2)
+    known = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert area([first]) == pytest.approx(known, rel=0.05)
+    assert tuple(first.color) != tuple(tone.material(np.array(TISSUE)))
 
 
 def test_under_a_patch_the_page_draws_the_cloud(view: OrganView, pressed: ContactModel) -> None:

@@ -78,6 +78,7 @@ class ContactNode(ManagedNode):
         self._reports: ContactReports | None = None  # while the node is active
         self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
         self._least_error: dict[str, float] = {}  # of any detail of it, by quantity
+        self._told: tuple[str, ...] = ()  # of the material that it has no place for
         self._n_awaited = 0
         self._changing = threading.RLock()
         super().__init__("contact", CONTACT)
@@ -214,10 +215,18 @@ class ContactNode(ManagedNode):
             f"vademecum {prepared.name!r} ({prepared.id[:12]}) in use, with {what}; "
             f"{shown_modes.promise}"
         )
+        self._tell(prepared.notices)
         while loop.is_changing:
             time.sleep(BLEND / 4)
         time.sleep(_GRACE)
         del replaced  # frees its memory here, not in the loop
+
+    def _tell(self, notices: tuple[str, ...]) -> None:
+        """Say once which values of the material the vademecum in use has no place for."""
+        for notice in notices:
+            if notice not in self._told:
+                self.get_logger().warning(f"{notice}; it stays as built")
+        self._told = notices
 
     def _take_times(self, curve: dict[str, Any]) -> None:
         """Promise the measured times of the model in use; called in the supplier's thread."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import threading
+from array import array
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -15,13 +16,21 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 
 from avatar_core.errors import one_line
+from avatar_core.geometry.label_files import is_label_map
 from avatar_ros.action import BuildPatient
 from avatar_ros.framework import conversions, promises
 from avatar_ros.framework.library import RefusedError, file_name, find_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.patients.builder import PatientBuilder
-from avatar_ros.patients.protocol import Built, BusyError, CancelledError, PatientRequest, Stage
+from avatar_ros.patients.protocol import (
+    Built,
+    BusyError,
+    CancelledError,
+    PatientRequest,
+    Previewed,
+    Stage,
+)
 from avatar_ros.patients.settings import (
     PATIENT_INTERPOLATION,
     InterpolationSettings,
@@ -55,6 +64,13 @@ def patient_request(request: Any, settings: InterpolationSettings) -> PatientReq
         )
     fidelity = request.fidelity or _DEFAULT_FIDELITY
     stem = "mesh" if inline else Path(request.surface).name.split(".")[0] or "surface"
+    if inline and (request.label or request.inside):
+        raise RefusedError("label and inside are those of a file that holds a label map")
+    if request.inside and not is_label_map(Path(request.surface)):
+        raise RefusedError(f"{request.surface} is no label map, so nothing can be named inside")
+    groups = ""
+    if request.groups:
+        groups = str(find_in_library(request.groups, settings.library_dir, settings.max_bytes))
     output = file_name(request.name or f"{stem}-{fidelity}")
     surface, vertices, faces = "", None, None
     if inline:
@@ -68,6 +84,10 @@ def patient_request(request: Any, settings: InterpolationSettings) -> PatientReq
         faces=faces,
         unit=request.unit or "mm",
         axes=request.axes or None,
+        label=request.label or None,
+        inside=tuple(request.inside),
+        groups=groups,
+        preview=getattr(request, "preview", False),
         leave_out=tuple(request.leave_out),
         neighbors=request.neighbors,
         fidelity=fidelity,
@@ -146,7 +166,7 @@ class PatientInterpolationNode(ManagedNode):
         request: Any,
         on_stage: Callable[[Stage], None] = lambda stage: None,
         cancelled: Callable[[], bool] = lambda: False,
-    ) -> Built:
+    ) -> Built | Previewed:
         """Build what a request or a goal asks for.
 
         Raises
@@ -158,6 +178,8 @@ class PatientInterpolationNode(ManagedNode):
         self._builder.require_idle()  # before a large mesh is converted
         patient = patient_request(request, self._settings)
         built = self._builder.build(patient, on_stage, cancelled)
+        if isinstance(built, Previewed):
+            return built
         self.get_logger().info(
             f"wrote {built.file} ({built.vademecum_id[:12]}), {patient.fidelity}, in "
             f"{built.seconds:.1f} s"
@@ -179,7 +201,7 @@ class PatientInterpolationNode(ManagedNode):
         def tell(stage: Stage) -> None:
             goal.publish_feedback(BuildPatient.Feedback(**asdict(stage)))
 
-        def work() -> Built:
+        def work() -> Built | Previewed:
             return self.build(goal.request, tell, lambda: goal.is_cancel_requested)
 
         try:
@@ -193,7 +215,7 @@ class PatientInterpolationNode(ManagedNode):
                 goal.abort()
         return result
 
-    async def _beside(self, work: Callable[[], Built]) -> Built:
+    async def _beside(self, work: Callable[[], Built | Previewed]) -> Built | Previewed:
         """Wait for work in a separate thread while the executor keeps running."""
         executor = self.executor
         assert executor is not None  # which runs this
@@ -224,7 +246,15 @@ class PatientInterpolationNode(ManagedNode):
             self.get_logger().error(text)
 
 
-def _fill(answer: Any, built: Built, fidelity: str) -> None:
+def _fill(answer: Any, built: Built | Previewed, fidelity: str) -> None:
+    if isinstance(built, Previewed):
+        answer.boundary = conversions.surface_mesh(built.vertices, built.faces)
+        answer.regions = array("B", built.regions.tobytes())
+        answer.notices, answer.seconds = built.notices, built.seconds
+        answer.displacement_error = math.nan
+        answer.message = "previewed; no file was written"
+        answer.success = True
+        return
     for name, value in asdict(built).items():
         setattr(answer, name, value)
     promised = f"{promises.PATIENT[fidelity or _DEFAULT_FIDELITY]:g} s"

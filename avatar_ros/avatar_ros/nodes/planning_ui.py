@@ -29,7 +29,7 @@ from avatar_ros.framework.reader import Reader
 from avatar_ros.framework.templates import stamp_nanoseconds
 from avatar_ros.loop.settings import MATERIAL, TIP
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
-from avatar_ros.ui.actions import Actions, Wanted
+from avatar_ros.ui.actions import Actions
 from avatar_ros.ui.alerts import alerts
 from avatar_ros.ui.bookmarks import Bookmark
 from avatar_ros.ui.camera import turn_camera
@@ -40,13 +40,17 @@ from avatar_ros.ui.legend import EXPECTED_ERROR, legend
 from avatar_ros.ui.library import Library
 from avatar_ros.ui.measures import Measures, Now
 from avatar_ros.ui.measures_view import MeasuresView
+from avatar_ros.ui.new_patient import NewPatient
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import Pose
 from avatar_ros.ui.panels import Panels
 from avatar_ros.ui.plan import Plan, PlanNow
+from avatar_ros.ui.player import Player
 from avatar_ros.ui.presets import material_text
+from avatar_ros.ui.preview_view import PreviewView
 from avatar_ros.ui.recorder import Recorder
 from avatar_ros.ui.requests import Requests
+from avatar_ros.ui.scan_view import ScanView
 from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
 from avatar_ros.ui.texts import frame_text, plain, recorded_text, scene_texts, warnings
 from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess
@@ -54,6 +58,7 @@ from avatar_ros.ui.view import CLEARANCE, GLASS, WHOLE, OrganView
 
 FRAME = "organ"
 _PLOT_FRAMES = 6  # between two points of the plots
+_CUT_FRAMES = 3  # between two places of a cut that is dragged
 _POLL_FRAMES = 30  # between two checks of library and nodes
 _SILENCE = 1.0  # after which the contact node counts as not answering [s]
 _TIP = tuple(parameter.name for parameter in TIP)
@@ -118,7 +123,7 @@ class PlanningNode(ManagedNode):
                 show_look=self._show_look,
             ),
         )
-        self._view = OrganView(server, chosen.drag, self._show_cube)
+        self._view = OrganView(server, chosen.drag, self._show_cube, chosen.drag_cut)
         self._measures = Measures(MeasuresView(server))
         server.scene.on_click()(self._click)
         self._plan = Plan(
@@ -128,20 +133,45 @@ class PlanningNode(ManagedNode):
             lambda labels: self._panels.plan.offer(labels),
             self._say,
         )
+        self._player = Player(self._library.folder, self._reader)
+        self._scan = ScanView(
+            server, self._library.folder, self._reader, lambda: self._panels.scan, self._say
+        )
+        self._new_patient = new = NewPatient(
+            self._library.folder,
+            self._reader,
+            self._requests,
+            lambda: self._panels.patient,
+            PreviewView(server, self._view.set_aside),
+            self._use_built,
+            self._say,
+        )
         self._panels = Panels(
             server,
             Actions(
                 vademecum=lambda name: self._requests.load_vademecum(name, self._say),
                 material=chosen.choose_material,
                 scene=chosen.choose_scene,
-                build=self._build,
+                choose_surface=new.choose_surface,
+                build=new.build,
+                end_preview=new.end_preview,
+                brush=new.brush,
                 cancel=self._requests.cancel_patient,
                 nudge=chosen.nudge,
                 lift=chosen.lift,
                 record=self._record,
+                play=self._play,
+                pause=lambda: self._player.pause(True),
+                seek=self._player.seek,
+                stop_playing=self._player.close,
                 turn=self._view.turn_to,
                 look=chosen.choose_look,
+                mark_reach=self._view.mark_reach,
                 errors=self._show_errors,
+                style=self._view.style,
+                scan=self._scan.choose,
+                place_scan=self._scan.place,
+                grey=self._scan.grey,
                 measure=self._measures.choose,
                 clear_measures=self._measures.clear,
                 undo=chosen.undo,
@@ -222,6 +252,9 @@ class PlanningNode(ManagedNode):
         self._chosen.forget(GLASS if organ.structures else WHOLE)
         tip = self._chosen.tip
         self._chosen.put(organ.above(tip.offset + CLEARANCE))
+        self._player.close()
+        self._new_patient.end_preview()
+        self._scan.forget()
         self._view.show(organ, tip)
         self._measures.show_organ(organ, tip)
         self._periods.forget()
@@ -247,22 +280,43 @@ class PlanningNode(ManagedNode):
             self._poll_cell()
         if organ is None or self._cloud is None:
             return
+        if self._frame % _CUT_FRAMES == 0:
+            self._chosen.settle()
+        recorded = self._player.state(organ)
+        if recorded is not None:
+            self._show_recorded(organ, *recorded)
+            return
         shown = self._shown = self._period_to_show()
         self._view.place_tool(shown.tip, (0.0 if shown.is_held else shown.fraction) * shown.force)
         if self._frame % _PLOT_FRAMES == 0:
-            self._show_numbers(organ, shown)
+            values = self._chosen.values(organ)
+            poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
+            material = material_text(values["young"], poisson, values.get("contrast"))
+            self._show_numbers(organ, shown, material)
 
-    def _show_numbers(self, organ: Organ, shown: ShownPeriod) -> None:
+    def _show_recorded(
+        self, organ: Organ, cloud: np.ndarray, shown: ShownPeriod, material: str
+    ) -> None:
+        """Update the page from a recording that plays."""
+        self._shown = None  # of now, nothing is drawn
+        largest = self._view.move(cloud, shown.tip, shown.force)
+        self._view.grey(False)
+        self._view.place_tool(shown.tip, shown.fraction * shown.force)
+        if self._frame % _PLOT_FRAMES == 0:
+            self._panels.recordings.show(self._player.part)
+            self._show_numbers(organ, shown._replace(largest=largest), material)
+
+    def _show_numbers(self, organ: Organ, shown: ShownPeriod, material: str) -> None:
         """Beside the picture, of the same period."""
         n_kept = self._recorder.n_periods if self._recorder.is_on else None
-        values = self._chosen.values(organ)
-        poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
-        material = material_text(values["young"], poisson, values.get("contrast"))
         numbers = frame_text(shown, material, n_kept)
         self._panels.show_numbers("<br>".join(numbers))
-        self._alerts = alerts(organ.info, self._status(), shown)
-        self._panels.show_alerts(self._alerts)
-        now = Now(self._view.points, shown.tip, values["young"])
+        status = None if self._player.is_on else self._status()  # that is of now
+        self._alerts = alerts(organ.info, status, shown)
+        over = [*self._new_patient.alerts(organ.name), *self._player.alerts]
+        self._panels.show_alerts([*over, *self._alerts])
+        young = self._chosen.values(organ)["young"]
+        now = Now(self._view.points, shown.tip, young)
         measured = self._measures.lines(now)
         self._panels.measure.show(measured)
         self._lines = [*map(plain, numbers), *measured]
@@ -291,7 +345,7 @@ class PlanningNode(ManagedNode):
             largest = self._view.move(taken[1], row["tip"], row["force"])
         self._view.grey(self._periods.is_held)
         if taken is not None and self._recorder.is_on:
-            self._recorder.note_cloud(taken[1][:, 3:])
+            self._recorder.note_cloud(taken[1][:, 3:], int(row["number"]))
         return self._periods.drawn(row, largest, sent)
 
     def _answers(self) -> bool:
@@ -366,24 +420,17 @@ class PlanningNode(ManagedNode):
         self._panels.show_cube(client, drawing)
 
     def _click(self, event: Any) -> None:
-        """A click on the organ: measure there."""
-        if self._organ is not None:
-            ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        """A click on the organ: measure there; on a preview: paint."""
+        ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        if self._new_patient.is_previewing:
+            self._new_patient.paint(*ray)
+        elif self._organ is not None:
             self._say(self._measures.click(*ray, self._view.points))
 
-    def _build(self, wanted: Wanted) -> None:
-        def load(file: str) -> None:
-            if file:
-                self._panels.patient.show_progress("done", 1.0, float("nan"))
-                self._panels.offer(*self._library.offer())
-                self._panels.organ.choose_file(file)
-                self._requests.load_vademecum(file, self._say)
-            else:
-                self._panels.patient.show_progress("not built", 0.0, float("nan"))
-
-        self._say("")  # nothing of the last build stays
-        self._panels.patient.show_progress("begins", 0.0, float("nan"))
-        self._requests.build_patient(wanted, self._panels.patient.show_progress, self._say, load)
+    def _use_built(self, file: str) -> None:
+        self._panels.offer(*self._library.offer())
+        self._panels.organ.choose_file(file)
+        self._requests.load_vademecum(file, self._say)
 
     # --- The plan ----------------------------------------------------------------------------
 
@@ -416,6 +463,16 @@ class PlanningNode(ManagedNode):
             turn_camera(client, Pose(*np.array(kept.camera).reshape(3, 3)))
 
     # --- Recordings --------------------------------------------------------------------------
+
+    def _play(self, name: str) -> None:
+        """Play a recording from its begin, or go on with the one that was paused."""
+        organ = self._organ
+        if organ is None:
+            self._say("nothing to play: choose the organ of a recording first")
+        elif self._player.is_playing(name):
+            self._player.pause(False)
+        else:
+            self._say(self._player.open(name, organ))
 
     def _record(self, on: bool) -> None:
         if not on:

@@ -26,6 +26,7 @@ from avatar_ros.patients.protocol import (
     BusyError,
     CancelledError,
     PatientRequest,
+    Previewed,
     Ready,
     Refused,
     Stage,
@@ -58,8 +59,8 @@ class PatientBuilder:
         request: PatientRequest,
         on_stage: Callable[[Stage], None],
         cancelled: Callable[[], bool] = lambda: False,
-    ) -> Built:
-        """Build and write one patient; returns when that is done.
+    ) -> Built | Previewed:
+        """Build and write one patient, or preview it; returns when that is done.
 
         on_stage : called in the caller's thread at each step of progress, at least twice a second
         cancelled : called many times a second
@@ -110,7 +111,7 @@ class PatientBuilder:
         request: PatientRequest,
         on_stage: Callable[[Stage], None],
         cancelled: Callable[[], bool],
-    ) -> Built:
+    ) -> Built | Previewed:
         ending = False
         stage, reported = Stage("loading", 0.0, float("nan")), time.monotonic()
         try:
@@ -130,7 +131,7 @@ class PatientBuilder:
                 if isinstance(note, Stage):
                     stage, reported = note, time.monotonic()
                     on_stage(stage)
-                elif isinstance(note, Built):
+                elif isinstance(note, Built | Previewed):
                     return note
                 elif isinstance(note, Refused):
                     raise BuildError(note.reason)

@@ -44,6 +44,9 @@ class PatientRequest:
 
     surface : file, or empty if there are vertices, shape (n, 3) [m], and faces, shape (m, 3)
     unit, axes : of the file; axes None for those that it states, else RAS
+    label, inside : of a label map, the organ and what lies inside; label None for the only one
+    groups : file of clamped and accessible points; empty for the template's
+    preview : only register, mesh and clamp
     neighbors : 0 for all
     tolerance : 0 for the default
     output : file to write
@@ -54,6 +57,10 @@ class PatientRequest:
     faces: np.ndarray | None
     unit: str
     axes: str | None
+    label: str | None
+    inside: tuple[str, ...]
+    groups: str
+    preview: bool
     leave_out: tuple[str, ...]
     neighbors: int
     fidelity: str
@@ -83,6 +90,21 @@ class Refused:
     """Nothing was written, for this reason."""
 
     reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Previewed:
+    """The surface of a patient's mesh and its regions; nothing was written.
+
+    vertices : ndarray, shape (n, 3) [m]; faces : (m, 3)
+    regions : ndarray of uint8, shape (m,): 0 free, 1 clamped, 2 accessible
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    regions: np.ndarray
+    notices: list[str]
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 from avatar_core.geometry.label_files import MAX_LABEL_BYTES
 from avatar_core.geometry.surface import (
@@ -13,6 +14,7 @@ from avatar_core.geometry.surface import (
     require_closed,
     require_plausible_size,
 )
+from avatar_core.geometry.tumour import read_tumour
 from avatar_ros.framework.reader import Reader
 from avatar_ros.patients.protocol import PatientRequest
 
@@ -32,13 +34,29 @@ def read_confined(request: PatientRequest, reader: Reader) -> SurfaceMesh:
     return reader.read(os.path.basename(request.surface), n_bytes, surface_of, request)
 
 
+def read_inside(request: PatientRequest, reader: Reader) -> tuple[SurfaceMesh, ...]:
+    """What lies inside the organ of a label map, by its labels, read in the process of a reader."""
+    name = os.path.basename(request.surface)
+    return tuple(
+        reader.read(name, MAX_LABEL_BYTES, structure_of, request, label) for label in request.inside
+    )
+
+
+def structure_of(request: PatientRequest, label: str) -> SurfaceMesh:
+    """The surface of one label, by that name."""
+    found = read_tumour(request.surface, request.unit, request.axes, label)
+    return replace(found, name=f"label {label}" if label.isdecimal() else label)
+
+
 def surface_of(request: PatientRequest) -> SurfaceMesh:
     """The surface of the request's file or arrays.
 
     Raises SurfaceError as ``read_surface`` does.
     """
     if request.vertices is None or request.faces is None:
-        return read_surface(request.surface, request.unit, request.axes)
+        return read_surface(
+            request.surface, request.unit, request.axes, request.label, request.inside
+        )
     surface = SurfaceMesh(request.vertices, request.faces, request.name)
     surface = orient_outward(require_closed(keep_organ(surface)))
     require_plausible_size(surface)

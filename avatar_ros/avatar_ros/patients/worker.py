@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -24,12 +24,16 @@ from avatar_core.atlas.patient import (
     Patient,
     PatientOptions,
     patient_vademecum,
+    posed_patient,
     require_fidelity,
 )
+from avatar_core.atlas.patient_problem import PatientProblem
 from avatar_core.atlas.storage import load_atlas
 from avatar_core.errors import one_line
+from avatar_core.geometry.groups import read_groups
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.vademecum import storage
+from avatar_core.vademecum.display import boundary
 from avatar_ros.framework import realtime
 from avatar_ros.framework.library import RefusedError
 from avatar_ros.framework.reader import Reader
@@ -38,11 +42,12 @@ from avatar_ros.patients.protocol import (
     BuildSettings,
     Built,
     PatientRequest,
+    Previewed,
     Ready,
     Refused,
     Stage,
 )
-from avatar_ros.patients.surface import read_confined
+from avatar_ros.patients.surface import read_confined, read_inside
 
 _MAX_BYTES = 1 << 30  # of a surface, unpacked
 _NICENESS = 10  # a contact loop on the same machine has precedence
@@ -68,8 +73,8 @@ def build(
     settings: BuildSettings,
     reader: Reader,
     connection: Connection,
-) -> Built:
-    """Build one patient and write it.
+) -> Built | Previewed:
+    """Build one patient and write it, or show what would be clamped.
 
     Raises
     ------
@@ -81,10 +86,18 @@ def build(
 
     require_fidelity(request.fidelity)
     options = _options(request, atlas.base, settings)
-    require_replaceable(Path(request.output), reader)
+    if not request.preview:
+        require_replaceable(Path(request.output), reader)
     report("surface", 0.0, math.nan)
     surface = read_confined(request, reader)
+    options = replace(options, groups=_groups(request, reader))
     fidelity: Fidelity = request.fidelity  # type: ignore[assignment]
+    if request.preview:
+        problem, _ = posed_patient(surface, atlas.base, fidelity, options, report)
+        previewed = preview_of(problem)
+        connection.send(previewed)
+        return previewed
+    options = replace(options, inside=read_inside(request, reader))
     patient = patient_vademecum(surface, atlas.base, fidelity, options, report)
     report("save", 0.0, math.nan)
     with _uninterrupted():
@@ -93,6 +106,22 @@ def build(
         built = _result_of(patient, identity, surface, atlas, request)
         connection.send(built)
     return built
+
+
+def preview_of(problem: PatientProblem) -> Previewed:
+    """The boundary of a patient's mesh with its regions."""
+    vertices, faces = boundary(problem.mesh)
+    regions = np.where(problem.regions.accessible, 2, 0)
+    regions[problem.regions.clamped] = 1
+    notices = [*problem.surface.notices, *problem.registration.notices]
+    return Previewed(vertices, faces, regions.astype(np.uint8), notices)
+
+
+def _groups(request: PatientRequest, reader: Reader) -> dict[str, np.ndarray] | None:
+    if not request.groups:
+        return None
+    size = os.path.getsize(request.groups)
+    return reader.read(os.path.basename(request.groups), size, read_groups, request.groups)
 
 
 def require_replaceable(path: Path, reader: Reader) -> None:

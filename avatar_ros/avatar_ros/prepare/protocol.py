@@ -48,6 +48,7 @@ class ModelReady:
     cloud_divisor: int | None
     curve: dict[str, Any] | None
     least_error: dict[str, float]
+    notices: tuple[str, ...] = ()
 
     def map(self, handle: int) -> PreparedModel:
         """The model, with its arrays mapped into this process; closes the descriptor."""
@@ -60,6 +61,7 @@ class ModelReady:
             self.cloud_divisor,
             self.curve,
             self.least_error,
+            tuple(self.notices),
         )
 
 

@@ -52,6 +52,7 @@ class PreparedModel:
     curve : plain form of the AccuracyCurve for the modes in use and fewer; times that were not
         measured yet are NaN; None if no errors were measured
     least_error : of any detail of the cloud, by quantity; empty if no errors were measured
+    notices : values of the material that this vademecum has no place for, one line each
     """
 
     id: str
@@ -62,3 +63,4 @@ class PreparedModel:
     cloud_divisor: int | None = None
     curve: dict[str, Any] | None = None
     least_error: dict[str, float] = field(default_factory=dict)
+    notices: tuple[str, ...] = ()

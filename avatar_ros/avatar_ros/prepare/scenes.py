@@ -45,6 +45,34 @@ def change_of(request: Any) -> dict[str, Any]:
     return {"scene": request.yaml}
 
 
+def usable_material(
+    vademecum: Vademecum, material: dict[str, float]
+) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Values that a vademecum has a coordinate for, and what is said of each of the others.
+
+    The node keeps its parameters from one organ to the next, and the next may be of another range.
+
+    material : values by name of the coordinate [SI]
+    """
+    ranges = {c.name: (c.low, c.high) for c in _coordinates(vademecum)}
+    used, notices = {}, []
+    for name, value in material.items():
+        low, high = ranges.get(name, (value, value) if name == "young" else (1.0, 0.0))
+        if low <= value <= high:
+            used[name] = value
+        elif name in ranges:
+            notices.append(
+                f"{name} {value:g} is not used: {vademecum.name} holds {low:g} to {high:g}"
+            )
+        else:
+            notices.append(f"{name} {value:g} is not used: {vademecum.name} has no such coordinate")
+    return used, tuple(notices)
+
+
+def _coordinates(vademecum: Vademecum) -> tuple[Any, ...]:
+    return tuple(vademecum.parametric.coordinates) if vademecum.parametric else ()
+
+
 def model_spec(vademecum: Vademecum, request: PreparationRequest, scene: Scene | None) -> ModelSpec:
     """What a request and a scene make of a vademecum; the request's material overrides the scene's.
 

@@ -141,10 +141,11 @@ class ModelPreparer:
         from avatar_core.scene.file import parse_scene
         from avatar_core.vademecum.at_values import ranges
         from avatar_ros.prepare.detail_chooser import least_error
-        from avatar_ros.prepare.scenes import model_spec
+        from avatar_ros.prepare.scenes import model_spec, usable_material
 
         scene = parse_scene(request.scene, "scene") if request.scene else None
-        spec = model_spec(vademecum, request, scene)
+        material, notices = usable_material(vademecum, request.material)
+        spec = model_spec(vademecum, replace(request, material=material), scene)
         detail = self._chooser.detail(spec, request)
         handle, contents = write_shared(spec.layout(detail, request.period).flat())
         try:
@@ -162,6 +163,7 @@ class ModelPreparer:
                 cloud_divisor=scene.cloud_divisor if scene else None,
                 curve=self._chooser.curve(spec, detail),
                 least_error=least_error(spec),
+                notices=notices,
             )
             self._send(ready, handle)
         finally:

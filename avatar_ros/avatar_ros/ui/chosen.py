@@ -16,7 +16,7 @@ from avatar_ros.ui.history import History
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.recorder import scene_in_force
 from avatar_ros.ui.requests import Requests
-from avatar_ros.ui.view import WHOLE
+from avatar_ros.ui.view import CUT, WHOLE
 
 _LIFT = 0.03  # off the organ [m]
 
@@ -55,6 +55,7 @@ class Chosen:
         self.contact: dict[str, Any] = {}
         self.scene = ""
         self.look = (WHOLE, "A", 0.5)
+        self._dragged: float | None = None  # part that the handle of the cut is dragged to
 
     def forget(self, look: str) -> None:
         """Another organ comes, in its own material, and is shown as ``look``."""
@@ -190,6 +191,17 @@ class Chosen:
         before = self.look
         self._history.note("look", "how the organ is shown", lambda: self._show_look(*before))
         self._show_look(how, side, part)
+
+    def drag_cut(self, part: float) -> None:
+        """The plane's handle is dragged; what it leaves is drawn by :meth:`settle`."""
+        self._dragged = part
+
+    def settle(self) -> None:
+        """Cut where the handle was dragged to: not for each of its steps, as a cut takes time."""
+        part, self._dragged = self._dragged, None
+        how, side, before = self.look
+        if part is not None and how == CUT and part != before:
+            self.choose_look(how, side, part)
 
     def _show_look(self, how: str, side: str, part: float) -> None:
         self.look = how, side, part

@@ -17,6 +17,8 @@ TOPS = (1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3)  # possible ends of the scale [m]
 N_BANDS = 20  # of the scale, the first of which is tissue
 N_SHADES = 20  # of tissue, from its dark to its light side
 TISSUE = (196, 112, 99)
+CLAMP = ((70, 70, 70), (165, 165, 165))  # checks where the organ is held
+ACCESS = (38, 84, 124)  # stripes where tools reach
 HELD = (170, 170, 170)  # of a shape that is not that of now
 _DARKEST, _LIGHTEST = 0.42, 1.15  # over the colour of tissue
 _LIGHT = np.array([0.35, 0.75, 0.55])  # towards the lamp: from the front, above, a bit right
@@ -55,6 +57,14 @@ def band_colours() -> np.ndarray:
     wanted = 255.0 * table()[np.round(255 * middle).astype(int)]
     wanted[0] = TISSUE
     return np.round(tone.shown(tone.material(wanted))).astype(int)
+
+
+@cache
+def scale_colours() -> np.ndarray:
+    """The same, the first band too in the colour of the scale: tissue means something else."""
+    wanted = 255.0 * table()[round(255 * 0.5 / N_BANDS)]
+    first = np.round(tone.shown(tone.material(wanted))).astype(int)
+    return np.vstack([first, band_colours()[1:]])
 
 
 @cache

@@ -2,29 +2,46 @@
 
 from __future__ import annotations
 
-from avatar_ros.ui.colours import N_BANDS, band_colours
+from avatar_ros.ui.colours import ACCESS, CLAMP, N_BANDS, TISSUE, band_colours, scale_colours
 
 DISPLACEMENT = "displacement [mm]"
-EXPECTED_ERROR = "expected error of the force [%]"
+EXPECTED_ERROR = "error of the force [%]"
+_KEY = "display:inline-block;width:15px;height:11px;vertical-align:-1px;margin:0 3px 0 9px"
 
 
 def legend(top: float, what: str = DISPLACEMENT, unit: float = 1e-3, opacity: float = 1.0) -> str:
-    """The bands with the values at their edges, as HTML.
+    """The bands with the values at their edges, and what patterns mean, as HTML.
 
     top : end of the scale; unit : one shown unit, both in SI
     opacity : of the organ, so that both look alike before the same ground
     """
-    shades = [f"rgb({r},{g},{b})" for r, g, b in band_colours().tolist()]
+    is_error = what == EXPECTED_ERROR
+    colours = scale_colours() if is_error else band_colours()
+    shades = [f"rgb({r},{g},{b})" for r, g, b in colours.tolist()]
     stops = ", ".join(
         f"{shade} {100 * i / N_BANDS:g}% {100 * (i + 1) / N_BANDS:g}%"
         for i, shade in enumerate(shades)
     )
     ticks = "".join(f"<span>{top / unit * i / 5:g}</span>" for i in range(6))
-    first = top / unit / N_BANDS
+    tissue = "tissue: no access" if is_error else f"tissue: below {top / unit / N_BANDS:g}"
     return (
         f'<div id="colour-bar" role="img" aria-label="colour scale of {what}, 0 to '
-        f'{top / unit:g}" style="margin:0 1em;font-size:12px">{what}; tissue: below {first:g}'
+        f'{top / unit:g}" style="margin:0 1em;font-size:12px">{what}; {tissue}'
+        f"{key_of_clamp()}"
         f'<div style="height:12px;opacity:{opacity:g};'
         f'background:linear-gradient(to right, {stops})"></div>'
         f'<div style="display:flex;justify-content:space-between">{ticks}</div></div>'
     )
+
+
+def key_of_clamp() -> str:
+    """The pattern of the clamp, and its name."""
+    dark, light = (f"rgb{colour}" for colour in CLAMP)
+    checks = f"repeating-conic-gradient({dark} 0 25%, {light} 0 50%) 0 0/7px 7px"
+    return f'<span style="{_KEY};background:{checks}"></span>clamp'
+
+
+def key_of_access() -> str:
+    """The pattern of what tools reach, and its name."""
+    stripes = f"repeating-linear-gradient(135deg, rgb{ACCESS} 0 2px, rgb{TISSUE} 2px 6px)"
+    return f'<span style="{_KEY};background:{stripes}"></span>access'

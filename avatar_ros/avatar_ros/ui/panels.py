@@ -13,10 +13,14 @@ from avatar_ros.ui.index_page import TITLE
 from avatar_ros.ui.legend import legend
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import NAMES
+from avatar_ros.ui.preview_view import BRUSHES
+from avatar_ros.ui.tabs.inside import InsideTab
 from avatar_ros.ui.tabs.measure import MeasureTab
 from avatar_ros.ui.tabs.organ import OrganTab
 from avatar_ros.ui.tabs.patient import PatientTab
 from avatar_ros.ui.tabs.plan import PlanTab
+from avatar_ros.ui.tabs.recordings import RecordingsTab
+from avatar_ros.ui.tabs.scan import ScanTab
 from avatar_ros.ui.tabs.scene import SceneTab
 from avatar_ros.ui.tabs.timing import TimingTab
 from avatar_ros.ui.tabs.tool import ToolTab
@@ -51,14 +55,17 @@ class Panels:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Tool"):
             self.tool = ToolTab(gui, actions)
+            self.recordings = RecordingsTab(gui, actions)
         with tabs.add_tab("Organ"):
             self.organ = OrganTab(gui, actions)
+            self.inside = InsideTab(gui, actions)
+            self.scan = ScanTab(gui, actions)
         with tabs.add_tab("Measure"):
             self.measure = MeasureTab(gui, actions)
         with tabs.add_tab("Plan"):
             self.plan = PlanTab(gui, actions)
         with tabs.add_tab("Patient"):
-            self.patient = PatientTab(gui, actions)
+            self.patient = PatientTab(gui, actions, tuple(BRUSHES))
         with tabs.add_tab("Scene"):
             self.scene = SceneTab(gui, actions)
         with tabs.add_tab("Timing"):
@@ -82,14 +89,19 @@ class Panels:
         else:
             self._cubes[client.client_id].content = content
 
-    def offer(self, files: list[str], surfaces: list[str]) -> None:
+    def offer(
+        self, files: list[str], surfaces: list[str], images: list[str], recordings: list[str]
+    ) -> None:
         """Offer the files of the library."""
+        self.recordings.offer(recordings)
         self.organ.offer(files)
+        self.scan.offer(images)
         self.patient.offer(surfaces)
 
     def show_organ(self, organ: Organ) -> None:
         """Show name, certificate and material of another organ."""
         self.organ.show_organ(organ)
+        self.inside.show(tuple(organ.structures))
 
     def show_cell(self, text: str) -> None:
         """Show the state of the cell, one line each."""

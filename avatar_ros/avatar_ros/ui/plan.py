@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -20,6 +20,18 @@ from avatar_ros.ui.camera import pose_of
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.report import report
 
+
+def _html(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> bytes:
+    return report(organ, kept, alerts).encode()
+
+
+def _pdf(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> bytes:
+    from avatar_ros.ui.report_pdf import report_pdf  # matplotlib takes half a second
+
+    return report_pdf(organ, kept, alerts)
+
+
+REPORTS = {".html": _html, ".pdf": _pdf}
 _PICTURE = (420, 560)  # height and width [px]
 _PATIENCE = 20.0  # with a browser that draws a picture [s]
 
@@ -114,20 +126,20 @@ class Plan:
         self._restore(found, client)
         self._say(f"back at {found.label}")
 
-    def report(self, client: Any) -> None:
-        """Write a report into the library, and offer it to one browser."""
+    def report(self, suffix: str, client: Any) -> None:
+        """Write a report, .html or .pdf, into the library, and offer it to one browser."""
         now, bookmarks = self._now(), self._bookmarks
         if now is None or bookmarks is None:
             self._say("nothing to report yet: choose an organ first")
             return
-        path = self._folder / time.strftime("report-%Y%m%d-%H%M%S.html")
-        text = report(now.organ, bookmarks.kept, now.alerts)
+        path = self._folder / time.strftime(f"report-%Y%m%d-%H%M%S{suffix}")
+        made = REPORTS[suffix](now.organ, bookmarks.kept, now.alerts)
 
         def write() -> None:
             with replaced(path) as file:
-                file.write_text(text)
+                file.write_bytes(made)
             if client is not None:
-                client.send_file_download(path.name, text.encode())
+                client.send_file_download(path.name, made)
 
         self._try(write, f"{path.name}: {len(bookmarks.kept)} kept states")
 

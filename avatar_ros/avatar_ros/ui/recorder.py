@@ -91,12 +91,14 @@ class Recorder:
         """The new model is in use: discard what was recorded before."""
         self._begin = int(self._state.live["n_rows"][0])
 
-    def note_cloud(self, displacement: np.ndarray) -> None:
-        """Record a cloud that was shown, (n_points, 3) [m]."""
+    def note_cloud(self, displacement: np.ndarray, period: int) -> None:
+        """Record a cloud that was shown, (n_points, 3) [m], of the period of a number."""
         n = int(self._state.live["n_rows"][0])
         if self._begin >= 0 and n > self._begin:
-            self._clouds.append(displacement.astype(np.float32))
-            self._after.append(int(self._state.rows["number"][n - 1]))
+            first = int(self._state.rows["number"][self._begin])
+            if period >= first:
+                self._clouds.append(displacement.astype(np.float32))
+                self._after.append(period)
 
     def drop(self) -> None:
         """Stop and discard the recording."""

@@ -113,9 +113,76 @@ def finer(shape: Refined, shown: FineSurface) -> FineSurface:
     four = (4 * left[:, None] + np.arange(4)).reshape(-1)
     extra = np.hstack([shown.positions[n:], shown.displacements[n:]])
     points = np.concatenate([points, extra])
+    between = _between(shape, _borders(under, n_all))
+    points, beside, of_beside = _joined(points, shape.faces[four], four, between)
     return FineSurface(
         points[:, :3],
         points[:, 3:],
-        np.concatenate([shape.faces[four], under]),
-        np.concatenate([four, 4 * shown.parents[of_tip]]),
+        np.concatenate([beside, under]),
+        np.concatenate([of_beside, 4 * shown.parents[of_tip]]),
+    )
+
+
+def _borders(under: np.ndarray, n_all: int) -> list[list[int]]:
+    """Chains of points along the border of the finest faces, from one of the others to the next.
+
+    under : ndarray of int, shape (m, 3); points from ``n_all`` on are of these faces alone
+    """
+    if len(under) == 0:
+        return []
+    edges = under[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    base = int(under.max()) + 1
+    key = edges[:, 0] * base + edges[:, 1]
+    outer = edges[~np.isin(key, edges[:, 1] * base + edges[:, 0])]
+    follows = {int(a): int(b) for a, b in outer if a >= n_all}
+    chains = []
+    for a, b in outer[outer[:, 0] < n_all].tolist():
+        chain = [a, b]
+        while chain[-1] >= n_all:
+            chain.append(follows[chain[-1]])
+        chains.append(chain)
+    return chains
+
+
+def _between(shape: Refined, chains: list[list[int]]) -> dict[tuple[int, int], list[int]]:
+    """Points of chains between both ends of a side of the refined faces, as these go round."""
+    n = shape.blend.shape[1]
+    key = shape.ends[:, 0] * n + shape.ends[:, 1]  # ascending
+    found = {}
+    for first, *inner, last in chains:
+        low, high = min(first, last), max(first, last)
+        middle = n + int(np.searchsorted(key, low * n + high))
+        half = len(inner) // 2  # the point there is the middle, too
+        found[middle, first] = inner[:half][::-1]
+        found[last, middle] = inner[half + 1 :][::-1]
+    return found
+
+
+def _joined(
+    points: np.ndarray,
+    faces: np.ndarray,
+    parents: np.ndarray,
+    between: dict[tuple[int, int], list[int]],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, faces and their parents, with the faces beside a finer border split from the middle.
+
+    A browser leaves pixels open where a point lies on the side of a triangle that does not have it.
+    """
+    ends = list({end for side in between for end in side})
+    beside = np.flatnonzero(np.isin(faces, ends).sum(axis=1) >= 2)
+    split: list[int] = []
+    fans: list[tuple[int, int, int, int]] = []
+    for k in beside.tolist():
+        a, b, c = faces[k].tolist()
+        ring = [p for side in ((a, b), (b, c), (c, a)) for p in (side[0], *between.get(side, ()))]
+        if len(ring) > 3:
+            middle = len(points) + len(split)
+            fans += [(p, q, middle, k) for p, q in zip(ring, ring[1:] + ring[:1], strict=True)]
+            split.append(k)
+    new = np.array(fans, int).reshape(-1, 4)
+    kept = np.setdiff1d(np.arange(len(faces)), split)
+    return (
+        np.concatenate([points, points[faces[split]].mean(axis=1)]) if split else points,
+        np.concatenate([faces[kept], new[:, :3]]),
+        np.concatenate([parents[kept], parents[new[:, 3]]]),
     )

@@ -17,6 +17,9 @@ _STYLE = (
     "section{display:flex;gap:1.2em;page-break-inside:avoid;margin:1em 0}"
     "img{width:21em;border:1px solid #ccc}.alert{color:#b3261e;font-weight:600}"
 )
+DISCLAIMER = (
+    "Axes RAS. The force is that of a rigid tip without friction. avatar is not a medical device."
+)
 
 
 def report(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> str:
@@ -24,8 +27,24 @@ def report(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> str
 
     alerts : what must not be missed about the organ, as on the planning page
     """
+    table = "".join(
+        f"<tr><th>{key}</th><td>{escape(value)}</td></tr>" for key, value in rows_of(organ).items()
+    )
+    marked = "".join(f'<p class="alert">⚠ {escape(line)}</p>' for line in alerts)
+    states = "".join(map(_state, kept)) or "<p>No state was kept.</p>"
+    made = time.strftime("%Y-%m-%d %H:%M")
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Plan of '
+        f"{escape(organ.name)}</title><style>{_STYLE}</style></head><body>"
+        f"<h1>Plan of {escape(organ.name)}, {made}</h1>{marked}<table>{table}</table>{states}"
+        f"<p>{DISCLAIMER}</p></body></html>\n"
+    )
+
+
+def rows_of(organ: Organ) -> dict[str, str]:
+    """What a report says of the organ itself."""
     info = organ.info
-    rows = {
+    return {
         "organ": organ.name,
         "vademecum": organ.id,
         "surface": info.source,
@@ -35,23 +54,17 @@ def report(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> str
         "expected error of the force": _errors(info.force_mean, info.force_worst),
         "inside": ", ".join(organ.structures) or "nothing",
     }
-    table = "".join(
-        f"<tr><th>{key}</th><td>{escape(value)}</td></tr>" for key, value in rows.items()
-    )
-    marked = "".join(f'<p class="alert">⚠ {escape(line)}</p>' for line in alerts)
-    states = "".join(map(_state, kept)) or "<p>No state was kept.</p>"
-    made = time.strftime("%Y-%m-%d %H:%M")
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Plan of '
-        f"{escape(organ.name)}</title><style>{_STYLE}</style></head><body>"
-        f"<h1>Plan of {escape(organ.name)}, {made}</h1>{marked}<table>{table}</table>{states}"
-        "<p>Axes RAS. The force is that of a rigid tip without friction. "
-        "avatar is not a medical device.</p></body></html>\n"
-    )
 
 
 def _errors(mean: float, worst: float) -> str:
     return f"{mean:.1%} in the mean, {worst:.1%} at worst" if mean == mean else "never measured"
+
+
+def lines_of(kept: Bookmark) -> list[str]:
+    """What a report says of a kept state."""
+    x, y, z = (1e3 * value for value in kept.target)
+    scene = kept.scene or "natural effects"
+    return [*kept.lines, f"Tip at {x:.1f}, {y:.1f}, {z:.1f} mm; scene {scene}"]
 
 
 def _state(kept: Bookmark) -> str:
@@ -60,10 +73,7 @@ def _state(kept: Bookmark) -> str:
         if re.fullmatch(r"[A-Za-z0-9+/]+={0,2}", kept.picture)
         else ""
     )
-    x, y, z = (1e3 * value for value in kept.target)
-    scene = kept.scene or "natural effects"
-    lines = [*kept.lines, f"Tip at {x:.1f}, {y:.1f}, {z:.1f} mm; scene {scene}"]
-    numbers = "<br>".join(map(escape, lines))
+    numbers = "<br>".join(map(escape, lines_of(kept)))
     return (
         f"<section>{picture}<div><b>{escape(kept.note or 'without a note')}</b><br>"
         f"{escape(kept.made.replace('T', ' '))}<br>{numbers}</div></section>"

@@ -136,12 +136,12 @@ class Requests:
         self._get.call_async(GetParameters.Request(names=list(names))).add_done_callback(answered)
 
     def build_patient(
-        self, wanted: Wanted, progress: Progress, report: Report, then: Callable[[str], None]
+        self, wanted: Wanted, progress: Progress, report: Report, then: Callable[[Any], None]
     ) -> None:
-        """Build a patient; calls ``then`` with the file's name, empty if there is none."""
+        """Build or preview a patient; calls ``then`` with the result, None if there is none."""
         if not self._build.server_is_ready():
             report(START["patient_interpolation"])
-            then("")
+            then(None)
             return
         goal = BuildPatient.Goal(**wanted._asdict())
 
@@ -152,9 +152,9 @@ class Requests:
         def finished(done: Any) -> None:
             self._goal = None
             result = done.result().result
-            for_all = f"{result.file} built in {result.seconds:.0f} s"
-            report(for_all if result.success else result.message)
-            then(result.file if result.success else "")
+            what = "previewed" if wanted.preview else f"{result.file} built"
+            report(f"{what} in {result.seconds:.0f} s" if result.success else result.message)
+            then(result if result.success else None)
 
         def accepted(done: Any) -> None:
             self._goal = done.result()

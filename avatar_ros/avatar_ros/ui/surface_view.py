@@ -15,14 +15,28 @@ import viser
 from avatar_core.contact.fine_surface import FineSurface
 from avatar_ros.ui import tone
 from avatar_ros.ui.bands import cut
-from avatar_ros.ui.colours import HELD, N_BANDS, N_SHADES, band_colours, lightness, tissue_colours
+from avatar_ros.ui.colours import (
+    ACCESS,
+    CLAMP,
+    HELD,
+    N_BANDS,
+    N_SHADES,
+    TISSUE,
+    lightness,
+    scale_colours,
+    shaded,
+    tissue_colours,
+)
+from avatar_ros.ui.patterns import Patterned, checkered, striped
 from avatar_ros.ui.refined import finer, refined
 
 GLASS = 0.45  # opacity of an organ that is seen through
-CLAMP = (105, 105, 105)
+OUTLINE = (30, 16, 14)  # of a section
 INSIDE = (120, 52, 45)  # of the far wall of an organ that is cut open
+_HELD_DARK, _HELD_LIGHT, _REACHED = range(N_SHADES, N_SHADES + 3)  # colours beside the shades
 _MOVED = 0.1e-3  # of tissue, that is seen [m]
 _NO_FACE = np.zeros((1, 3), np.uint32)  # of a mesh without faces, which must not be empty
+_NO_LINE = np.zeros((1, 2, 3), np.float32)
 _NO_POINT = np.zeros((1, 3), np.float32)
 
 
@@ -38,7 +52,7 @@ class Plane(NamedTuple):
 
 
 class Tissue(NamedTuple):
-    """Triangles of tissue at rest, by shade.
+    """Triangles of tissue at rest, by shade; those of patterns have further numbers.
 
     corners : ndarray of int, shape (n, 3), points of the cloud that each point hangs on
     weights : ndarray, shape (n, 3), of these
@@ -57,22 +71,45 @@ class Tissue(NamedTuple):
 
 
 def tissue_of(
-    vertices: np.ndarray, faces: np.ndarray, light: np.ndarray, plane: Plane | None
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    light: np.ndarray,
+    plane: Plane | None,
+    clamped: np.ndarray,
+    accessible: np.ndarray,
 ) -> Tissue:
-    """The organ's surface at rest, cut by shade, without what lies beyond a plane."""
+    """The organ's surface at rest, cut by shade and patterns, without what lies beyond a plane.
+
+    clamped, accessible : ndarray of bool, shape (m,), faces with a pattern
+    """
     data = np.column_stack([vertices, light])
     kept, parents = faces, np.arange(len(faces))
     if plane is not None:
         data, kept, parents = _below(data, plane.above(vertices), faces)
-    shaded = cut(data, data[:, 3], kept, 1.0 / N_SHADES, N_SHADES)
-    parent = parents[shaded.parent]
-    used, local = np.unique(shaded.faces, return_inverse=True)
+    by_shade = cut(data, data[:, 3], kept, 1.0 / N_SHADES, N_SHADES)
+    points, pieces = by_shade.points, by_shade.faces
+    shade, parent = by_shade.band, parents[by_shade.parent]
+    for chosen, pattern in ((clamped, checkered), (accessible, striped)):
+        there = chosen[parent]
+        if not there.any():
+            continue
+        found: Patterned = pattern(points, pieces[there])
+        marks = shade[there][found.parent]
+        if pattern is checkered:
+            marks = np.where(found.is_marked, _HELD_DARK, _HELD_LIGHT)
+        else:
+            marks = np.where(found.is_marked, _REACHED, marks)
+        points = found.points
+        pieces = np.concatenate([pieces[~there], found.faces])
+        shade = np.concatenate([shade[~there], marks])
+        parent = np.concatenate([parent[~there], parent[there][found.parent]])
+    used, local = np.unique(pieces, return_inverse=True)
     local = local.reshape(-1, 3)
     of_point = np.zeros(len(used), int)
     of_point[local] = parent[:, None]
     corners = faces[of_point]
-    weights = _barycentric(shaded.points[used, :3], vertices[corners].astype(float))
-    return Tissue(corners, weights, local, shaded.band, parent)
+    weights = _barycentric(points[used, :3], vertices[corners].astype(float))
+    return Tissue(corners, weights, local, shade, parent)
 
 
 def _below(
@@ -96,11 +133,31 @@ def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return np.column_stack([1.0 - second - third, second, third])
 
 
-class SurfaceView:
-    """Draws the surface into a viser server, more smoothly than it is given."""
+def section(points: np.ndarray, height: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Lines on which a surface has a height of zero, shape (k, 2, 3) float32 [m].
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
+    points : ndarray, shape (n, 3) [m]; height : (n,), linear on each of the faces (m, 3)
+    """
+    is_below = height[faces] < 0.0
+    crossed = faces[is_below.any(axis=1) & ~is_below.all(axis=1)]
+    begin, end = crossed, np.roll(crossed, -1, axis=1)
+    low, high = height[begin], height[end]
+    part = low / np.where(low != high, low - high, 1.0)
+    places = points[begin] + part[..., None] * (points[end] - points[begin])
+    two = (low < 0.0) != (high < 0.0)  # of the three sides
+    return np.asarray(places[two].reshape(-1, 2, 3), np.float32)
+
+
+class SurfaceView:
+    """Draws the surface into a viser server, more smoothly than it is given.
+
+    root : name of the node above all of its meshes
+    """
+
+    def __init__(self, server: viser.ViserServer, root: str = "/organ") -> None:
+        self._server, self._root = server, root
+        self._is_reach_marked = False
+        self._known: np.ndarray | None = None  # faces on which another field is known
         self._nodes: dict[tuple[str, int], Any] = {}
         self._faces = np.empty((0, 3), int)
         self._vertices = _NO_POINT
@@ -117,14 +174,31 @@ class SurfaceView:
         """Of the organ."""
         return 1.0 if self._opacity is None else self._opacity
 
-    def show(self, vertices: np.ndarray, faces: np.ndarray, clamped: np.ndarray) -> None:
-        """Show another organ, at rest; ``clamped`` faces are marked, shape (m,) bool."""
+    def show(
+        self, vertices: np.ndarray, faces: np.ndarray, clamped: np.ndarray, accessible: np.ndarray
+    ) -> None:
+        """Show another organ, at rest.
+
+        clamped, accessible : ndarray of bool, shape (m,), faces of these regions
+        """
         self._shape = refined(len(vertices), faces)
         self._vertices, self._faces = self._shape.blend @ vertices, self._shape.faces
+        self._coarse = np.asarray(faces, np.uint32)
         self._plane, self._is_grey, self._last = None, False, None
         self._light = lightness(self._vertices, self._faces)
-        self._clamped = np.repeat(clamped, 4) if self._shape.is_finer else clamped
+        self._clamped, self._accessible = self._of_parts(clamped), self._of_parts(accessible)
         self._make()
+
+    def _of_parts(self, of_face: np.ndarray) -> np.ndarray:
+        """What is given for each face of the organ, for each that is drawn."""
+        return np.repeat(of_face, 4) if self._shape.is_finer else of_face
+
+    def mark_reach(self, wanted: bool) -> None:
+        """Draw a pattern where tools reach, or none."""
+        if wanted != self._is_reach_marked:
+            self._is_reach_marked = wanted
+            if len(self._faces):
+                self._make()
 
     def look_inside(self, glass: bool, plane: Plane | None) -> None:
         """See through the organ, or cut it open; the next cloud is drawn so."""
@@ -134,15 +208,31 @@ class SurfaceView:
 
     def _make(self) -> None:
         """All meshes, with the tissue at rest; those of bands still empty."""
-        self._tissue = tissue_of(self._vertices, self._faces, self._light, self._plane)
-        tissue = np.vstack([tissue_colours(), CLAMP])  # the last shade
-        groups = {"tissue": tissue, "rim": tissue, "bands": band_colours()}
+        self._tissue = tissue_of(
+            self._vertices,
+            self._faces,
+            self._light,
+            self._plane,
+            self._clamped,
+            self._accessible & self._is_reach_marked,
+        )
+        tissue = np.vstack([tissue_colours(), *CLAMP, ACCESS])  # as the numbers of shades
+        groups = {"tissue": tissue, "rim": tissue, "bands": scale_colours()}
+        inside = np.array(INSIDE) if self._plane is not None else shaded(TISSUE, np.array([0.6]))[0]
         with self._server.atomic():
             for group, colours in groups.items():
                 for k, colour in enumerate(tone.material(colours).tolist()):
-                    self._nodes[group, k] = self._add(f"/organ/{group}/{k}", colour, "front")
+                    self._nodes[group, k] = self._add(f"{self._root}/{group}/{k}", colour, "front")
             self._nodes["inside", 0] = self._add(
-                "/organ/inside", tone.material(np.array(INSIDE)).tolist(), "back"
+                f"{self._root}/inside", tone.material(inside).tolist(), "back"
+            )
+            self._outline = self._server.scene.add_line_segments(
+                f"{self._root}/outline",
+                _NO_LINE,
+                OUTLINE,
+                thickness=3.0,
+                thickness_units="screen",
+                visible=self._plane is not None,
             )
             self._draw_tissue(self._vertices)
             self._choose_tissue(np.zeros(len(self._faces), bool))
@@ -165,10 +255,9 @@ class SurfaceView:
         assert tissue is not None
         self._sent, self._shown_faces = points, {}
         moved = tissue.moved(points.astype(float)).astype(np.float32)
-        shade = np.where(self._clamped[tissue.parent], N_SHADES, tissue.shade)
         self._of_shade = []
-        for k in range(N_SHADES + 1):
-            chosen = np.flatnonzero(shade == k)
+        for k in range(N_SHADES + 3):
+            chosen = np.flatnonzero(tissue.shade == k)
             used, local = own(tissue.faces[chosen]) if len(chosen) else ([0], _NO_FACE[:0])
             self._of_shade.append((moved[used], local, tissue.parent[chosen]))
 
@@ -184,21 +273,39 @@ class SurfaceView:
             draw(self._nodes["tissue", k], points, chosen if len(chosen) else _NO_FACE)
 
     def _draw_inside(self, points: np.ndarray) -> None:
-        if self._plane is None:
+        """The far wall: seen where the organ is cut open, and behind every crack between meshes.
+
+        Meshes of different cuts meet in points that lie beside each other's edges by rounding; a
+        browser leaves single pixels open there, which would show the ground.
+        """
+        if self._opacity is not None:  # of glass, it would be seen
+            return
+        if self._plane is None:  # where nobody looks: the surface as coarse as it is given
+            coarse = points[: self._shape.blend.shape[1]]
+            draw(self._nodes["inside", 0], coarse, self._coarse)
             return
         data, faces, _ = _below(points, self._plane.above(self._vertices), self._faces)
         used, local = own(faces) if len(faces) else ([0], _NO_FACE)
         draw(self._nodes["inside", 0], data[used], local)
+        lines = section(points, self._plane.above(self._vertices), self._faces)
+        self._outline.points = lines if len(lines) else _NO_LINE
 
     def move(self, shown: FineSurface, top: float) -> None:
         """Draw the displacement over the moved surface; ``top`` ends its scale [m]."""
-        smooth = finer(self._shape, shown)
+        smooth, self._known = finer(self._shape, shown), None
         self._last = smooth, np.linalg.norm(smooth.displacements, axis=1), top
         self.redraw()
 
     def paint(self, shown: FineSurface, values: np.ndarray, top: float) -> None:
-        """Draw another field, given at the cloud's points, over a surface as coarse as these."""
-        self._last = finer(self._shape, shown), self._shape.blend @ values, top
+        """Draw another field, given at the cloud's points, over a surface as coarse as these.
+
+        values : ndarray, shape (n,); a face at whose corners one is NaN stays tissue
+        """
+        is_known = np.isfinite(values)
+        self._known = self._of_parts(is_known[shown.faces].all(axis=1))
+        values = np.where(is_known, values, 0.0)
+        middles = values[self._shape.ends].mean(axis=1)
+        self._last = finer(self._shape, shown), np.concatenate([values, middles]), top
         self.redraw()
 
     def redraw(self) -> None:
@@ -208,7 +315,10 @@ class SurfaceView:
         shown, values, top = self._last
         faces, parent = shown.faces, shown.parents
         is_band = np.zeros(len(self._faces), bool)
-        is_band[parent[(values[faces] > top / N_BANDS).any(axis=1)]] = True
+        if self._known is not None:
+            is_band = self._known.copy()
+        else:
+            is_band[parent[(values[faces] > top / N_BANDS).any(axis=1)]] = True
         if self._shape.is_finer:  # under a tip, a triangle stands for all four of its parent
             under = np.unique(parent[faces[:, 0] >= len(self._vertices)] // 4)
             is_band[(4 * under[:, None] + np.arange(4)).reshape(-1)] = True
@@ -226,17 +336,20 @@ class SurfaceView:
             if np.abs(points - self._sent).max() > _MOVED:
                 self._draw_tissue(points)
             self._choose_tissue(is_band)
-            for k in range(1, N_BANDS):
-                self._replace(("bands", k), positions, banded.faces[banded.band == k])
+            is_tissue = (banded.band == 0) & (self._known is None)
+            for k in range(N_BANDS):
+                of_band = (banded.band == k) & ~is_tissue
+                self._replace(("bands", k), positions, banded.faces[of_band])
             for k in range(N_SHADES + 1):
-                rim = (banded.band == 0) & (shade == k)
+                rim = is_tissue & (shade == k)
                 self._replace(("rim", k), positions, banded.faces[rim])
-            self._draw_inside(points)
+            if self._plane is not None or self._sent is points:
+                self._draw_inside(points)
 
     def _shade_of_faces(self) -> np.ndarray:
         light = self._light[self._faces].mean(axis=1)
         shade = np.minimum((N_SHADES * light).astype(int), N_SHADES - 1)
-        return np.where(self._clamped, N_SHADES, shade)
+        return np.where(self._clamped, _HELD_DARK, shade)
 
     def _replace(self, node: tuple[str, int], points: np.ndarray, faces: np.ndarray) -> None:
         mesh = self._nodes[node]
@@ -250,7 +363,7 @@ class SurfaceView:
         if held == self._is_grey or not self._nodes:
             return
         self._is_grey = held
-        colours = np.tile(HELD, (N_BANDS, 1)) if held else band_colours()
+        colours = np.tile(HELD, (N_BANDS, 1)) if held else scale_colours()
         with self._server.atomic():
             for k, colour in enumerate(tone.material(colours).tolist()):
                 self._nodes["bands", k].color = tuple(colour)

@@ -41,13 +41,13 @@ class ToolView:
         scene = self._server.scene
         body, shaft = tip_body(tip), shaft_body(tip)
         self._tool = scene.add_glb(
-            "/tool", _shaded_glb(body, TOOL), position=position, wxyz=wxyz, cast_shadow=False
+            "/tools/tool", _shaded_glb(body, TOOL), position=position, wxyz=wxyz, cast_shadow=False
         )
-        scene.add_glb("/tool/shaft", _shaded_glb(shaft, SHAFT), cast_shadow=False)
+        scene.add_glb("/tools/tool/shaft", _shaded_glb(shaft, SHAFT), cast_shadow=False)
         self._tool.on_drag("left")(lambda event: self._dragged(event, False))
         self._tool.on_drag("left", modifier="shift")(lambda event: self._dragged(event, True))
         self._arrow = scene.add_arrows(
-            "/force",
+            "/tools/force",
             np.zeros((1, 2, 3)),
             tuple(tone.instance(np.array(ARROW)).tolist()),
             shaft_radius=0.0015,
@@ -56,7 +56,7 @@ class ToolView:
             visible=False,
         )
         self._number = scene.add_label(
-            "/force_number", "", visible=False, anchor="bottom-center", font_screen_scale=1.1
+            "/tools/force_number", "", visible=False, anchor="bottom-center", font_screen_scale=1.1
         )
 
     @property

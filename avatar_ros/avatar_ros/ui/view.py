@@ -13,22 +13,26 @@ from avatar_core.geometry.tip import Tip
 from avatar_ros.ui import tone
 from avatar_ros.ui.camera import Cameras
 from avatar_ros.ui.colours import top_for
+from avatar_ros.ui.cut_handle import CutHandle
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import AXES
 from avatar_ros.ui.structures_view import StructuresView
-from avatar_ros.ui.surface_view import Plane, SurfaceView
+from avatar_ros.ui.surface_view import SurfaceView
 from avatar_ros.ui.tip_body import turn_to
 from avatar_ros.ui.tool_view import LEAST_FORCE, ToolView
 
 CLEARANCE = 0.015  # of a new organ's tool over the surface [m]
 ERROR_TOPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # possible ends of the scale of the error
 LOOKS = WHOLE, GLASS, CUT = "whole", "glass", "cut open"  # how the organ is shown
+_ROOTS = ("/organ", "/structures", "/tools", "/measures")  # nodes above what is of an organ
 _LEAST_MARKED = 0.1e-3  # displacement whose place is marked [m]
 
 
 class OrganView:
     """Draws into a viser server; everything in metres, in the organ's frame.
 
+    on_drag : gets where a user drags the tip, and whether along its shaft; on_cube : a browser and
+    its cube; on_cut : the part that a user cuts away with the plane's handle
     top, error_top : ends of the colour scales, of the displacement [m] and the expected error
     """
 
@@ -37,9 +41,12 @@ class OrganView:
         server: viser.ViserServer,
         on_drag: Callable[[np.ndarray, bool], None],
         on_cube: Callable[[Any, str], None] = lambda client, drawing: None,
+        on_cut: Callable[[float], None] = lambda part: None,
     ) -> None:
         self._server = server
         self._organ: Organ | None = None
+        self._handle = CutHandle(server, on_cut)
+        self._roots: dict[str, Any] = {}
         self._surface = SurfaceView(server)
         self._structures = StructuresView(server)
         self._tip = Tip()
@@ -59,15 +66,17 @@ class OrganView:
     def show(self, organ: Organ, tip: Tip) -> None:
         """Show another organ, at rest, with the structures of its own file and no others."""
         scene = self._server.scene
+        for name in _ROOTS:
+            self._roots[name] = scene.add_frame(name, show_axes=False)
         self._organ, self.top, self._drawn, self._errors = organ, top_for(0.0), None, None
         self._structures.show(organ.vertices, organ.structures)
-        self._surface.show(organ.vertices, organ.faces, organ.clamped)
+        self._surface.show(organ.vertices, organ.faces, organ.clamped, organ.accessible)
         self.look(GLASS if organ.structures else WHOLE)
         self._marker = scene.add_label(
-            "/largest", "", visible=False, anchor="top-left", font_screen_scale=0.9
+            "/organ/largest", "", visible=False, anchor="top-left", font_screen_scale=0.9
         )
         self._place = scene.add_icosphere(
-            "/largest/place", 0.0012, color=(0, 0, 0), cast_shadow=False, visible=True
+            "/organ/largest/place", 0.0012, color=(0, 0, 0), cast_shadow=False, visible=True
         )
         self._tip = tip
         position = organ.above(tip.offset + CLEARANCE)
@@ -93,10 +102,9 @@ class OrganView:
             return
         plane = None
         if how == CUT:
-            normal = np.array(AXES[side])
-            heights = organ.vertices @ normal
-            height = float(heights.max() - part * (heights.max() - heights.min()))
-            plane = Plane(height * normal, normal)
+            plane = self._handle.show(organ, np.array(AXES[side]), part)
+        else:
+            self._handle.hide()
         self._surface.look_inside(how == GLASS, plane)
         if self._drawn is not None:
             self._surface.redraw()
@@ -117,10 +125,24 @@ class OrganView:
         if errors is not None:
             largest = float(np.nanmax(errors, initial=0.0))
             self.error_top = next((x for x in ERROR_TOPS if x >= largest), ERROR_TOPS[-1])
-            errors = np.nan_to_num(errors)
         self._errors, self._drawn = errors, None
         rest = np.hstack([organ.vertices, np.zeros_like(organ.vertices)])
         self.move(rest if drawn is None else drawn, np.zeros(3), np.zeros(3))
+
+    def mark_reach(self, wanted: bool) -> None:
+        """Draw a pattern where tools reach, or none."""
+        self._surface.mark_reach(wanted)
+        if self._drawn is not None:
+            self._surface.redraw()
+
+    def style(self, name: str, is_seen: bool, colour: tuple[int, int, int], opacity: float) -> None:
+        """Show a structure in a colour, 0 to 255, or hide it."""
+        self._structures.style(name, is_seen, colour, opacity)
+
+    def set_aside(self, aside: bool) -> None:
+        """Hide all of the organ in use while something else is shown, or show it again."""
+        for root in self._roots.values():
+            root.visible = not aside
 
     def turn_to(self, side: str) -> None:
         """A standard view, as "A", or that beside the tool, in every browser."""

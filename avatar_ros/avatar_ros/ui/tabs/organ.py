@@ -35,6 +35,8 @@ class OrganTab:
         )
         for control in (self._look, self._side, self._depth):
             control.on_update(self._on_look)
+        reach = gui.add_checkbox("Mark where tools reach", False)
+        reach.on_update(lambda _: actions.mark_reach(reach.value))
         self._colour = gui.add_dropdown("Colours show", (DISPLACEMENT, ERROR))
         self._colour.on_update(self._on_colour)
         self._material = gui.add_folder("Material")

@@ -7,6 +7,7 @@ from typing import Any
 from avatar_ros.ui.actions import Actions
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
 
+REPORTS = {"HTML": ".html", "PDF": ".pdf"}
 FORMATS = (".stl", ".vtp", ".obj")
 
 
@@ -22,7 +23,8 @@ class PlanTab:
         self._kept = gui.add_dropdown("Kept", (NOTHING,))
         group = gui.add_button_group("Kept state", ("return to it", "delete it"))
         group.on_click(self._on_kept)
-        gui.add_button("Report of kept states").on_click(lambda event: actions.report(event.client))
+        reports = gui.add_button_group("Report", tuple(REPORTS))
+        reports.on_click(lambda event: actions.report(REPORTS[event.target.value], event.client))
         self._format = gui.add_dropdown("Format", FORMATS)
         gui.add_button("Export deformed surfaces").on_click(
             lambda _: actions.export(self._format.value)

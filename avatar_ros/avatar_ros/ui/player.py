@@ -1,0 +1,132 @@
+"""Recordings of the library, played and scrubbed: what was drawn then, with its numbers."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from avatar_core.errors import AvatarError
+from avatar_core.scene.file import parse_scene
+from avatar_core.scene.recording import Recording, load_recording
+from avatar_ros.framework.reader import Reader
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.presets import material_text
+from avatar_ros.ui.shown_period import ShownPeriod
+
+_REPEATED = 1.0  # s: the last state stays so long before it begins again
+
+
+class Player:
+    """One recording at a time, of the organ that is shown and of no other.
+
+    seconds : of the recording; is_on : its states are drawn in place of those of now
+    """
+
+    def __init__(self, folder: Path, reader: Reader) -> None:
+        self._folder, self._reader = folder, reader
+        self._recording: Recording | None = None
+        self._name = ""
+        self._rows = np.zeros(0, int)  # period of each cloud
+        self._times = np.zeros(0)  # of each cloud, from the first [s]
+        self._place, self._began = 0.0, 0.0  # [s], and when it was there
+        self._runs = False
+
+    @property
+    def is_on(self) -> bool:
+        return self._recording is not None
+
+    @property
+    def seconds(self) -> float:
+        """Of the clouds of the recording [s]."""
+        return float(self._times[-1]) if len(self._times) else 0.0
+
+    @property
+    def part(self) -> float:
+        """How far it is, 0 to 1."""
+        return self.place / self.seconds if self.seconds > 0.0 else 0.0
+
+    @property
+    def place(self) -> float:
+        """Time that is shown, from the first cloud on [s]."""
+        if not self._runs:
+            return self._place
+        since = self._place + time.monotonic() - self._began
+        return min(since % (self.seconds + _REPEATED), self.seconds)
+
+    def open(self, name: str, organ: Organ) -> str:
+        """Play a recording of an organ; returns why not, empty if it plays."""
+        self.close()
+        path = self._folder / name
+        try:
+            size = path.stat().st_size
+            found = self._reader.read(name, size, load_recording, path)
+        except (OSError, AvatarError) as error:
+            return str(error)
+        if found.vademecum_id != organ.id:
+            return f"{name} is of {found.vademecum_name}, another organ; load that one first"
+        n_points = len(organ.vertices)
+        if found.clouds.displacement.shape[1:] != (n_points, 3) or found.periods.tip.shape[1] != 1:
+            return f"{name} holds no surface that was shown, or several tools; record again"
+        number = found.periods.number
+        rows = np.clip(np.searchsorted(number, found.clouds.period), 0, len(number) - 1)
+        stamps = found.periods.stamp[rows]
+        self._rows, self._times = rows, (stamps - stamps[0]) * 1e-9
+        self._material = _material_of(found, organ)
+        self._name, self._recording = name, found
+        self._place, self._began, self._runs = 0.0, time.monotonic(), True
+        return ""
+
+    def is_playing(self, name: str) -> bool:
+        """Whether that recording is shown, moving or not."""
+        return self.is_on and self._name == name
+
+    def close(self) -> None:
+        """Show what is now again."""
+        self._recording, self._runs = None, False
+
+    def pause(self, paused: bool) -> None:
+        """Stay where it is, or go on."""
+        self._place, self._began, self._runs = self.place, time.monotonic(), not paused
+
+    def seek(self, part: float) -> None:
+        """Stay at a part of the time, 0 to 1."""
+        self._place, self._runs = part * self.seconds, False
+
+    def state(self, organ: Organ) -> tuple[np.ndarray, ShownPeriod, str] | None:
+        """Cloud (n, 6) [m] and numbers of the state to show, and its material; None of now."""
+        recording = self._recording
+        if recording is None:
+            return None
+        k = int(np.searchsorted(self._times, self.place, side="right")) - 1
+        moved = recording.clouds.displacement[max(k, 0)]
+        row, periods = int(self._rows[max(k, 0)]), recording.periods
+        error = float(periods.error[row, 0])
+        shown = ShownPeriod(
+            periods.tip[row, 0],
+            periods.force[row, 0],
+            error if np.isfinite(error) else 0.0,
+            float(periods.sent_fraction[row, 0]),
+            float(np.linalg.norm(moved, axis=1).max()),
+            is_held=False,
+        )
+        return np.hstack([organ.vertices + moved, moved]), shown, self._material
+
+    @property
+    def alerts(self) -> list[str]:
+        """What must not be missed while it plays."""
+        if self._recording is None:
+            return []
+        return [
+            f"Recording {self._name}, {self.place:.1f} of {self.seconds:.1f} s: "
+            "not what the tool feels now"
+        ]
+
+
+def _material_of(recording: Recording, organ: Organ) -> str:
+    """The material that was in force, in a line."""
+    given = parse_scene(recording.scene, recording.vademecum_name).values
+    values = {name: given.get(name, built) for name, (_, _, built) in organ.ranges.items()}
+    poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
+    return material_text(values["young"], poisson, values.get("contrast"))

@@ -1,0 +1,99 @@
+"""An image in three planes: which file, where the planes lie, and how they are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+from scipy.spatial.transform import Rotation
+
+from avatar_core.errors import AvatarError
+from avatar_core.geometry.label_files import MAX_LABEL_BYTES
+from avatar_ros.framework.reader import Reader
+from avatar_ros.ui.scan import Scan, read_scan, slice_of
+from avatar_ros.ui.tabs.scan import ScanTab
+
+_MIDDLE = 0.5
+
+
+class ScanView:
+    """Draws three planes into a viser server.
+
+    folder : of the library; tab : controls of the planes; say : reports in a line
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        folder: Path,
+        reader: Reader,
+        tab: Callable[[], ScanTab],
+        say: Callable[[str], None],
+    ) -> None:
+        self._server, self._folder, self._reader = server, folder, reader
+        self._tab, self._say = tab, say
+        self._scan: Scan | None = None
+        self._parts = [_MIDDLE] * 3
+        self._grey = (0.0, 1.0)
+        self._planes: list[Any] = []
+
+    def choose(self, file: str) -> None:
+        """Show the image of a file; an empty name shows none."""
+        self.forget()
+        if not file:
+            return
+        try:
+            scan = self._reader.read(file, MAX_LABEL_BYTES, read_scan, self._folder / file)
+        except AvatarError as error:
+            self._say(str(error))
+            return
+        self._scan, self._parts = scan, [_MIDDLE] * 3
+        self._grey = (scan.level, scan.window)
+        self._tab().show_scan(scan)
+        self._draw(range(3))
+
+    def forget(self) -> None:
+        """Another organ is shown, or none of the planes is wanted."""
+        self._scan = None
+        for plane in self._planes:
+            plane.remove()
+        self._planes = []
+        self._tab().show_scan(None)
+
+    def place(self, axis: int, part: float) -> None:
+        """Move a plane along its axis of the voxels, to a part of the way."""
+        self._parts[axis] = part
+        self._draw([axis])
+
+    def grey(self, level: float, window: float) -> None:
+        """Choose middle and width of the grey scale."""
+        self._grey = (level, window)
+        self._draw(range(3))
+
+    def _draw(self, axes: Any) -> None:
+        scan = self._scan
+        if scan is None:
+            return
+        with self._server.atomic():
+            for axis in axes:
+                found = slice_of(scan, axis, self._parts[axis], *self._grey)
+                image = np.repeat(found.grey[:, :, None], 3, axis=2)
+                x, y, z, w = Rotation.from_matrix(found.turn).as_quat()
+                if len(self._planes) < 3:
+                    plane = self._server.scene.add_image(
+                        f"/scan/{axis}",
+                        image,
+                        found.width,
+                        found.height,
+                        cast_shadow=False,
+                        receive_shadow=False,
+                        wxyz=(w, x, y, z),
+                        position=tuple(found.middle),
+                    )
+                    self._planes.append(plane)
+                    continue
+                self._planes[axis].image = image
+                self._planes[axis].position = tuple(found.middle)

@@ -1,0 +1,345 @@
+"""Parts of the planning page that need no browser: preview, recordings, images, sections, PDF."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import nibabel
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+pytest.importorskip("viser", reason="the extra ui is not installed")
+
+import viser
+from avatar_ros.framework.conversions import surface_mesh
+from avatar_ros.ui.actions import Wanted
+from avatar_ros.ui.cut_handle import CutHandle
+from avatar_ros.ui.new_patient import NewPatient
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.player import Player
+from avatar_ros.ui.preview_view import ACCESSIBLE, BRUSHES, CLAMPED
+from avatar_ros.ui.report_pdf import report_pdf
+from avatar_ros.ui.scan import read_scan, slice_of
+from avatar_ros.ui.scan_view import ScanView
+from avatar_ros.ui.structures_view import STRUCTURE
+from avatar_ros.ui.surface_view import section
+from avatar_ros.ui.tabs.inside import InsideTab
+from avatar_ros.ui.tabs.patient import PatientTab
+from avatar_ros.ui.tabs.scan import ScanTab
+
+from avatar_core.contact.effects.selection import default_effects
+from avatar_core.errors import SurfaceError
+from avatar_core.geometry.groups import read_groups, regions_of_groups
+from avatar_core.scene.file import write_scene
+from avatar_core.scene.model import Scene, Tool
+from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
+from tests.core.box_organ import organ
+from tests.hard.small_files import ball
+from tests.ros.test_page_plan import KEPT
+
+pytestmark = pytest.mark.ros
+
+
+class AtOnce:
+    """A reader that needs no process."""
+
+    def read(self, name: str, n_bytes: int, function: Any, *given: Any) -> Any:
+        return function(*given)
+
+
+# --- a new patient ----------------------------------------------------------------------------
+
+
+class Cell:
+    """What is asked of the cell, and what the tab shows."""
+
+    def __init__(self, result: Any) -> None:
+        self.result, self.asked = result, []
+        self.labels: list[tuple[str, ...]] = []
+        self.previews: list[bool] = []
+        self.drawn: list[np.ndarray] = []
+        self.hidden = self.used = 0
+
+    def build_patient(self, wanted: Wanted, progress: Any, report: Any, then: Any) -> None:
+        self.asked.append(wanted)
+        then(self.result)
+
+    def show_progress(self, stage: str, fraction: float, error: float) -> None:
+        pass
+
+    def offer_labels(self, labels: tuple[str, ...]) -> None:
+        self.labels.append(labels)
+
+    def show_preview(self, is_shown: bool) -> None:
+        self.previews.append(is_shown)
+
+    def show(self, points: np.ndarray, faces: np.ndarray, regions: np.ndarray) -> None:
+        self.drawn.append(regions)
+
+    def hide(self) -> None:
+        self.hidden += 1
+
+    def use(self, file: str) -> None:
+        self.used += 1
+
+
+@pytest.fixture
+def previewed(tmp_path: Path) -> tuple[NewPatient, Cell]:
+    """The surface of a cube's mesh, clamped and reached as its vademecum."""
+    cube = organ("cube")
+    points, faces = Organ.of(cube).vertices, Organ.of(cube).faces
+    regions = np.where(cube.regions.accessible, ACCESSIBLE, 0)
+    regions[cube.regions.clamped] = CLAMPED
+    result = SimpleNamespace(boundary=surface_mesh(points, faces), regions=regions, file="x.h5")
+    cell = Cell(result)
+    reader: Any = AtOnce()
+    parts: Any = (cell, lambda: cell, cell, cell.use, lambda text: None)
+    return NewPatient(tmp_path, reader, *parts), cell
+
+
+def test_painted_regions_reach_the_next_build_of_that_organ_alone(
+    previewed: tuple[NewPatient, Cell], tmp_path: Path
+) -> None:
+    new, cell = previewed
+    wanted = Wanted("cube.stl", fidelity="reduced", preview=True)
+    new.build(wanted)
+    assert new.is_previewing and cell.previews == [True]
+    assert "hidden" in new.alerts("liver")[0]
+    free = int(np.flatnonzero(cell.drawn[-1] == 0)[0])
+    cube = Organ.of(organ("cube"))
+    place = cube.vertices[cube.faces[free]].mean(axis=0).astype(float)
+    corners = cube.vertices[cube.faces[free]].astype(float)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    normal /= np.linalg.norm(normal)
+    ray = place + 0.05 * normal, -normal
+    new.paint(*ray)  # without a brush
+    assert len(cell.drawn) == 1
+    new.brush("clamp", 2e-3)
+    new.paint(*ray)
+    assert cell.drawn[-1][free] == CLAMPED
+    assert (cell.drawn[-1] == CLAMPED).sum() > (cell.drawn[0] == CLAMPED).sum()
+    new.build(Wanted("other.stl", fidelity="reduced"))
+    assert cell.asked[-1].groups == ""
+    new.build(wanted._replace(preview=False))
+    assert cell.asked[-1].groups == "cube-groups.npz"
+    painted = regions_of_groups(organ("cube").mesh, read_groups(tmp_path / "cube-groups.npz"))
+    np.testing.assert_array_equal(painted.clamped, cell.drawn[-1] == CLAMPED)
+    new.end_preview()
+    assert not new.is_previewing and cell.hidden == 1
+    new.build(wanted._replace(preview=False))
+    assert cell.asked[-1].groups == ""
+
+
+def test_labels_are_offered_of_a_label_map_alone(
+    previewed: tuple[NewPatient, Cell], tmp_path: Path
+) -> None:
+    new, cell = previewed
+    labels = np.zeros((6, 6, 6), np.uint8)
+    labels[1:4, 1:4, 1:4], labels[4, 4, 4] = 1, 7
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "case.nii.gz")
+    for file, offered in (("case.nii.gz", ("1", "7")), ("liver.stl", ())):
+        before = len(cell.labels)
+        new.choose_surface(file)
+        end = time.monotonic() + 60.0
+        while len(cell.labels) == before and time.monotonic() < end:
+            time.sleep(0.01)
+        assert cell.labels[-1] == offered
+
+
+# --- recordings -------------------------------------------------------------------------------
+
+
+def recording_of(shown: Organ, n: int = 200) -> Recording:
+    """A force that grows by 0.01 N a period, with a cloud every twenty."""
+    number = np.arange(1000, 1000 + n)
+    force = np.zeros((n, 1, 3))
+    force[:, 0, 1] = 0.01 * np.arange(n)
+    periods = Periods(
+        number=number,
+        stamp=number * 1_000_000,
+        tip=np.tile(shown.start, (n, 1, 1)),
+        turn=np.zeros((n, 1, 3)),
+        status=np.zeros((n, 1), np.uint8),
+        force=force,
+        error=np.full((n, 1), 0.1),
+        sent_fraction=np.ones((n, 1)),
+    )
+    chosen = number[::20]
+    moved = np.zeros((len(chosen), *shown.vertices.shape), np.float32)
+    moved[:, :, 1] = -1e-5 * (chosen - 1000)[:, None]
+    effects = default_effects(shown.vademecum, 1)
+    scene = Scene(name="then", tools=(Tool(),), effects=effects, young_modulus=50e3)
+    return Recording(
+        shown.id, shown.name, write_scene(scene), 1000.0, True, periods, Clouds(chosen, moved)
+    )
+
+
+def test_a_recording_is_scrubbed_and_each_state_is_one_period(tmp_path: Path) -> None:
+    shown = replace(Organ.of(organ("cube")), id="a" * 64)
+    save_recording(recording_of(shown), tmp_path / "recording-1.h5")
+    reader: Any = AtOnce()
+    player = Player(tmp_path, reader)
+    assert player.state(shown) is None
+    assert player.open("recording-1.h5", shown) == ""
+    assert player.seconds == pytest.approx(0.18)
+    for part, k in ((0.0, 0), (0.5, 4), (1.0, 9)):
+        player.seek(part)
+        found = player.state(shown)
+        assert found is not None
+        cloud, period, material = found
+        assert np.linalg.norm(period.force) == pytest.approx(0.2 * k)
+        assert np.abs(cloud[:, 4] + 2e-4 * k).max() < 1e-8
+        np.testing.assert_allclose(cloud[:, :3] - cloud[:, 3:], shown.vertices, atol=1e-8)
+        assert material.startswith("E 50 kPa")
+        assert player.part == pytest.approx(part)
+    assert "not what the tool feels now" in player.alerts[0]
+    player.close()
+    assert player.state(shown) is None and player.alerts == []
+    assert "another organ" in player.open("recording-1.h5", replace(shown, id="b" * 64))
+    assert not player.is_on
+
+
+# --- images, sections, PDF --------------------------------------------------------------------
+
+
+def test_planes_of_an_image_lie_where_its_voxels_do(tmp_path: Path) -> None:
+    """One bright voxel, in an image whose first axis runs from right to left."""
+    values = np.zeros((10, 12, 14), np.int16)
+    values[7, 3, 5] = 100
+    affine = np.array([[-2.0, 0, 0, 30], [0, 3, 0, -10], [0, 0, 4, 5], [0, 0, 0, 1]])
+    nibabel.save(nibabel.Nifti1Image(values, affine), tmp_path / "mr.nii.gz")
+    scan = read_scan(tmp_path / "mr.nii.gz")
+    assert scan.planes == ("sagittal", "coronal", "axial")
+    place = 1e-3 * (affine @ [7, 3, 5, 1])[:3]
+    for axis, k in enumerate((7, 3, 5)):
+        n = values.shape[axis]
+        found = slice_of(scan, axis, (k + 0.5) / n, 50.0, 100.0)
+        (bright,) = np.argwhere(found.grey == 255)
+        rows, columns = found.grey.shape
+        right = (bright[1] + 0.5 - 0.5 * columns) * found.width / columns
+        down = (bright[0] + 0.5 - 0.5 * rows) * found.height / rows
+        seen = found.middle + right * found.turn[:, 0] + down * found.turn[:, 1]
+        np.testing.assert_allclose(seen, place, atol=1e-9)
+        assert np.linalg.det(found.turn) == pytest.approx(1.0)
+        beside = slice_of(scan, axis, (k + 1.5) / n, 50.0, 100.0)
+        assert beside.grey.max() == 0
+    assert slice_of(scan, 0, 0.75, 500.0, 100.0).grey.max() == 0  # level and window
+
+
+def test_sheared_or_several_images_are_refused(tmp_path: Path) -> None:
+    affine = np.eye(4)
+    affine[0, 1] = 0.5
+    nibabel.save(nibabel.Nifti1Image(np.ones((3, 3, 3), np.int16), affine), tmp_path / "a.nii")
+    with pytest.raises(SurfaceError, match="not square"):
+        read_scan(tmp_path / "a.nii")
+
+
+def test_the_outline_of_a_cut_ball_is_its_circle() -> None:
+    points, faces = ball(1200, 0.05)
+    lines = section(points, points[:, 2] - 0.03, faces)
+    np.testing.assert_allclose(lines[..., 2], 0.03, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(lines[..., :2], axis=2), 0.04, rtol=0.03)
+    length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum()
+    assert length == pytest.approx(2 * np.pi * 0.04, rel=0.02)
+    assert len(section(points, points[:, 2] - 1.0, faces)) == 0
+
+
+def test_a_pdf_has_a_page_for_the_organ_and_one_for_each_state() -> None:
+    made = report_pdf(Organ.of(organ("cube")), [KEPT, KEPT], ["Large expected error: $x_1"])
+    assert made.startswith(b"%PDF") and made.rstrip().endswith(b"%%EOF")
+    assert made.count(b"/Type /Page ") == 3 or made.count(b"/Type /Page\n") == 3
+
+
+# --- controls ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = viser.ViserServer("127.0.0.1", port, verbose=False)
+    yield server
+    server.stop()
+
+
+class Asked:
+    """Actions that note what they were asked for."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Any, ...]] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *given: self.calls.append((name, *given))
+
+
+def test_labels_and_boxes_of_a_file_reach_the_build(server: viser.ViserServer) -> None:
+    asked: Any = Asked()
+    tab = PatientTab(server.gui, asked, tuple(BRUSHES))
+    tab.offer(["case.nii.gz", "liver.stl"])
+    tab.offer_labels(("liver", "lesion", "vein"))
+    assert list(tab._boxes) == ["lesion", "vein"]
+    tab._boxes["vein"].value = True
+    wanted = tab._wanted(preview=True)
+    assert (wanted.surface, wanted.label, wanted.inside) == ("case.nii.gz", "liver", ("vein",))
+    assert wanted.preview
+    tab._label.value = "lesion"
+    assert list(tab._boxes) == ["liver", "vein"]
+    tab.offer_labels(())
+    assert tab._wanted().label == "" and tab._wanted().inside == ()
+
+
+def test_structures_and_planes_have_their_controls(
+    server: viser.ViserServer, tmp_path: Path
+) -> None:
+    asked: Any = Asked()
+    inside = InsideTab(server.gui, asked)
+    inside.show(("lesion", "vein"))
+    inside._rows[2].value = 50
+    assert asked.calls[-1] == ("style", "lesion", True, STRUCTURE, 0.5)
+    inside.show(())
+    assert not inside._folder.visible
+    tab = ScanTab(server.gui, asked)
+    tab.offer(["mr.nii"])
+    values = np.arange(1000, dtype=np.int16).reshape(10, 10, 10)
+    nibabel.save(nibabel.Nifti1Image(values, np.eye(4)), tmp_path / "mr.nii")
+    said: list[str] = []
+    reader: Any = AtOnce()
+    planes = ScanView(server, tmp_path, reader, lambda: tab, said.append)
+    planes.choose("mr.nii")
+    assert said == [] and len(planes._planes) == 3
+    before = planes._planes[2].image.copy()
+    tab._sliders[2].value = 90
+    assert asked.calls[-1] == ("place_scan", 2, 0.9)
+    planes.place(2, 0.9)
+    assert (planes._planes[2].image != before).any()
+    np.testing.assert_allclose(planes._planes[2].position[2], 9e-3)
+    planes.forget()
+    assert planes._planes == [] and not tab._controls.visible
+
+
+def test_the_plane_of_a_cut_follows_its_handle(server: viser.ViserServer) -> None:
+    shown, parts = Organ.of(organ("cube")), []
+    handle = CutHandle(server, parts.append)
+    up = np.array([0.0, 1.0, 0.0])
+    plane = handle.show(shown, up, 0.25)
+    top, bottom = shown.vertices[:, 1].max(), shown.vertices[:, 1].min()
+    assert plane.point @ up == pytest.approx(top - 0.25 * (top - bottom), abs=1e-6)
+    assert handle._part() == pytest.approx(0.25, abs=1e-6)
+    node = handle._handle
+    node.position = tuple(np.array(node.position) - 0.25 * (top - bottom) * up)
+    handle._moved()
+    assert parts[-1] == pytest.approx(0.5, abs=1e-6)
+    handle.show(shown, up, 0.5)
+    assert handle._handle is node  # a handle that is held is not made anew
+    handle.show(shown, np.array([1.0, 0.0, 0.0]), 0.5)
+    assert handle._handle is not node
+    handle.hide()
