@@ -32,14 +32,14 @@ POSTERIOR = np.array([0.0, -1.0, 0.0])
 def attachments_by_rule(mesh: TetMesh) -> dict[str, np.ndarray]:
     """Faces of each of ``ATTACHMENTS``, ndarrays of bool, shape (n_faces,); no face has two.
 
-    Strips are as wide as in anatomy, or as a triangle of the mesh.
+    Strips are as wide as in anatomy, or so that triangles of the mesh fill them without a gap.
     """
     centre, normal = mesh.vertices[mesh.boundary_faces].mean(axis=1), _normals(mesh)
     x, left = centre[:, 0], mesh.vertices[:, 0].min()
     width = float(np.ptp(mesh.vertices[:, 0]))
     middle = float((mesh.vertices[:, 0] * mesh.vertex_volumes).sum() / mesh.volume)
     cava, falciform = middle + CAVA * width, middle + FALCIFORM * width
-    least = 0.5 * mesh.mean_surface_edge
+    least = 0.75 * mesh.mean_surface_edge
     behind_above, end = normal @ POSTERIOR_SUPERIOR > 0.3, TIP_FRACTION * width
     found = {
         "cava_groove": (np.abs(x - cava) < max(CAVA_HALF_WIDTH, least))

@@ -105,7 +105,8 @@ def force_table(
         force.append(found)
         moved.append(found * _motion(here, places, target)[:, None])
         progress(done + 1, n_points)
-    return ForceTable(coordinates, young, np.log(force), np.log(moved))
+    least = np.finfo(float).tiny  # where the target is clamped
+    return ForceTable(coordinates, young, np.log(force), np.log(np.maximum(moved, least)))
 
 
 def _pressed(

@@ -145,6 +145,14 @@ def test_a_band_of_young_is_that_of_the_force(phantom_vademecum: Vademecum) -> N
     np.testing.assert_allclose(bands.shares["young"], 1.0, atol=1e-2)
 
 
+def test_a_clamped_target_does_not_move(phantom_vademecum: Vademecum) -> None:
+    v, tip = phantom_vademecum, Tip("sphere", 5e-3)
+    held = int(v.mesh.boundary_faces[v.regions.clamped][0, 0])
+    table = force_table(v, tip, starts_apart(v, 1), DEPTHS, target=held)
+    moved = bands_of(table, known_of(v, {"young": Lognormal(5e3, 1.4)})).moved
+    assert (moved >= 0.0).all() and (moved < 1e-9).all()
+
+
 def test_what_a_vademecum_does_not_have_is_refused(phantom_vademecum: Vademecum) -> None:
     with pytest.raises(CoordinateError, match="no 'poisson' but young; build it with --coord"):
         known_of(phantom_vademecum, {"poisson": Uniform(0.4, 0.45)})

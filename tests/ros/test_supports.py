@@ -23,14 +23,15 @@ from avatar_core.scene.model import SupportStiffness
 from avatar_core.scene.prepare import scene_spec
 from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum
-from tests.core.test_support_coordinate import BARE, YOUNG, _organ_on_springs
+from tests.core.soft_organ import organ_on_springs
+from tests.core.test_support_coordinate import BARE, YOUNG
 
 pytestmark = pytest.mark.ros
 
 
 @pytest.fixture(scope="module")
 def organ() -> Vademecum:
-    return _organ_on_springs()
+    return organ_on_springs()
 
 
 def test_every_attachment_has_a_parameter_and_a_place_on_the_page() -> None:
