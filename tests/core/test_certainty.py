@@ -13,6 +13,7 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.studies import certainty
+from avatar_core.studies.certainty_bands import band_errors
 from avatar_core.studies.certainty_section import QUICK, CertaintySettings, Section
 from avatar_core.studies.certainty_supports import (
     _clamp_rows,
@@ -74,6 +75,17 @@ def test_sections_share_one_page(
     figure = Figure()
     found.draw(figure)
     assert len(figure.axes) == 2
+
+
+def test_the_error_of_a_force_is_told_apart_from_that_of_its_band() -> None:
+    """A force that is wrong by a fifth at one place may have a band of the right width."""
+    rows = [
+        {"low_error": -0.21, "median_error": -0.20, "high_error": -0.20},
+        {"low_error": 0.0, "median_error": 0.01, "high_error": 0.02},
+    ]
+    worst, shape = band_errors(rows)
+    assert worst == pytest.approx(0.21)
+    assert shape == pytest.approx(0.01 / 0.8)
 
 
 def test_the_summary_takes_means_of_unseen_values_and_the_last_of_the_limits() -> None:
