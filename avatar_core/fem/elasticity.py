@@ -27,12 +27,11 @@ import numpy as np
 import rslab
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
-from skfem import Basis, BilinearForm, ElementTetP1, ElementTetP2, ElementVector, MeshTet
-from skfem.helpers import div
+from skfem import MeshTet
 
 from avatar_core.errors import ConvergenceError, MaterialError, MeshError
-from avatar_core.fem.stiffness import unit_stiffness
-from avatar_core.fem.supports import Support, boundary_mass, require_held, with_stiffness
+from avatar_core.fem.stiffness_terms import StiffnessTerms
+from avatar_core.fem.supports import Support, require_held, with_stiffness
 from avatar_core.geometry.mesh import TetMesh, make_mesh
 
 Element = Literal["P1", "P2", "Taylor-Hood"]
@@ -111,91 +110,6 @@ class Inclusion:
             )
 
 
-@BilinearForm
-def divergence(u, q, w):  # type: ignore[no-untyped-def]
-    """q div(u), the coupling of displacement and pressure."""
-    return q * div(u)
-
-
-@BilinearForm
-def pressure_mass(p, q, w):  # type: ignore[no-untyped-def]
-    """p q."""
-    return p * q
-
-
-@BilinearForm
-def scalar_mass(u, v, w):  # type: ignore[no-untyped-def]
-    """u v, one component."""
-    return u * v
-
-
-class _Terms:
-    """The constant matrices that a stiffness is made of, shared by all values of the material.
-
-    volume_fraction : ndarray, shape (n_tets,), of an inclusion in each tetrahedron, or None
-    supported : vertices of the faces of each support, ndarrays of shape (n, 3)
-    """
-
-    def __init__(
-        self,
-        mesh: MeshTet,
-        element: Element,
-        volume_fraction: np.ndarray | None,
-        supported: Sequence[np.ndarray],
-    ) -> None:
-        self._mesh, self._element, self._volume_fraction = mesh, element, volume_fraction
-        self._supported = supported
-        self._shape = ElementTetP1() if element == "P1" else ElementTetP2()
-        self._basis = Basis(mesh, self._shape, intorder=2)
-        self.n_nodes = self._basis.N
-
-    @cached_property
-    def unit_stiffness(self) -> tuple[sp.csr_matrix, ...]:
-        """K_q of :attr:`Elasticity.factors` (P1 and P2; the first for Taylor-Hood too)."""
-        node = np.argsort(self.nodes_first(self._basis))[self._basis.element_dofs.T]
-        if self._volume_fraction is None:
-            return unit_stiffness(self._basis, node)
-        outside = unit_stiffness(self._basis, node, 1.0 - self._volume_fraction)
-        return outside + unit_stiffness(self._basis, node, self._volume_fraction)
-
-    @cached_property
-    def support_mass(self) -> tuple[sp.csr_matrix, ...]:
-        """int u.v da over each support, shape (3 n_nodes, 3 n_nodes) [m^2]."""
-        order = self.nodes_first(self._basis)
-        masses = (boundary_mass(self._mesh, self._shape, faces) for faces in self._supported)
-        return tuple(
-            sp.kron(mass[order][:, order], sp.identity(3), format="csr") for mass in masses
-        )
-
-    @cached_property
-    def mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
-        """Shear stiffness for mu = 1, divergence and pressure mass of the Taylor-Hood pair."""
-        pressure = Basis(self._mesh, ElementTetP1(), intorder=2)
-        displacement = Basis(self._mesh, ElementVector(self._shape), intorder=2)
-        coupling = divergence.assemble(displacement, pressure).tocsr()
-        coupling = coupling[:, self.nodes_first(displacement)]
-        return self.unit_stiffness[0], coupling, pressure_mass.assemble(pressure).tocsr()
-
-    @cached_property
-    def mass(self) -> sp.csr_matrix:
-        """int N_a N_b dx, shape (n_nodes, n_nodes)."""
-        matrix = scalar_mass.assemble(Basis(self._mesh, self._shape, intorder=4)).tocsr()
-        order = self.nodes_first(self._basis)
-        return matrix[order][:, order]
-
-    @cached_property
-    def pressure_factor(self) -> rslab.Ldlt:
-        """The factorized pressure mass."""
-        return rslab.ldlt(sp.csc_matrix(self.mixed[2]), threads=1)
-
-    def nodes_first(self, basis: Basis) -> np.ndarray:
-        """scikit-fem's number of each degree of freedom, in our order."""
-        dofs = basis.nodal_dofs.T
-        if self._element != "P1":
-            dofs = np.concatenate([dofs, basis.edge_dofs.T])
-        return np.ascontiguousarray(dofs).ravel()
-
-
 class Elasticity:
     """The discrete elastic problem of one mesh and material, held by a clamp or supports.
 
@@ -239,9 +153,9 @@ class Elasticity:
         self._skfem_mesh = MeshTet(
             np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
         )
-        self._terms = _Terms(
+        self._terms = StiffnessTerms(
             self._skfem_mesh,
-            self.element,
+            self.element != "P1",
             inclusion.volume_fraction if inclusion else None,
             [mesh.boundary_faces[support.faces] for support in self.supports],
         )

@@ -1,0 +1,111 @@
+"""The matrices of which the stiffness is a sum, with factors that are the material's.
+
+K = sum_q theta_q K_q,    theta = mu, lambda; c mu, c lambda of an inclusion; k of each support
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+import rslab
+import scipy.sparse as sp
+from skfem import Basis, BilinearForm, ElementTetP1, ElementTetP2, ElementVector, MeshTet
+from skfem.helpers import div
+
+from avatar_core.fem.stiffness import unit_stiffness
+from avatar_core.fem.supports import boundary_mass
+
+
+@BilinearForm
+def divergence(u, q, w):  # type: ignore[no-untyped-def]
+    """q div(u), the coupling of displacement and pressure."""
+    return q * div(u)
+
+
+@BilinearForm
+def pressure_mass(p, q, w):  # type: ignore[no-untyped-def]
+    """p q."""
+    return p * q
+
+
+@BilinearForm
+def scalar_mass(u, v, w):  # type: ignore[no-untyped-def]
+    """u v, one component."""
+    return u * v
+
+
+class StiffnessTerms:
+    """The constant matrices that a stiffness is made of, shared by all values of the material.
+
+    mesh : scikit-fem's
+    quadratic : whether displacements are (P2, Taylor-Hood), or linear (P1)
+    volume_fraction : ndarray, shape (n_tets,), of an inclusion in each tetrahedron, or None
+    supported : vertices of the faces of each support, ndarrays of shape (n, 3)
+    """
+
+    def __init__(
+        self,
+        mesh: MeshTet,
+        quadratic: bool,
+        volume_fraction: np.ndarray | None,
+        supported: Sequence[np.ndarray],
+    ) -> None:
+        self._mesh, self._quadratic, self._volume_fraction = mesh, quadratic, volume_fraction
+        self._supported = supported
+        self._shape = ElementTetP2() if quadratic else ElementTetP1()
+        self._basis = Basis(mesh, self._shape, intorder=2)
+        self.n_nodes = self._basis.N
+
+    @cached_property
+    def unit_stiffness(self) -> tuple[sp.csr_matrix, ...]:
+        """K_q of mu, lambda and those of an inclusion, (3 n_nodes, 3 n_nodes) [m].
+
+        Of P1 and P2; Taylor-Hood has the first as well.
+        """
+        node = np.argsort(self.nodes_first(self._basis))[self._basis.element_dofs.T]
+        if self._volume_fraction is None:
+            return unit_stiffness(self._basis, node)
+        outside = unit_stiffness(self._basis, node, 1.0 - self._volume_fraction)
+        return outside + unit_stiffness(self._basis, node, self._volume_fraction)
+
+    @cached_property
+    def support_mass(self) -> tuple[sp.csr_matrix, ...]:
+        """int u.v da over each support, shape (3 n_nodes, 3 n_nodes) [m^2]."""
+        order = self.nodes_first(self._basis)
+        masses = (boundary_mass(self._mesh, self._shape, faces) for faces in self._supported)
+        return tuple(
+            sp.kron(mass[order][:, order], sp.identity(3), format="csr") for mass in masses
+        )
+
+    @cached_property
+    def mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:
+        """Shear stiffness for mu = 1 [m], divergence [m^2] and pressure mass [m^3] of Taylor-Hood.
+
+        Shapes (3 n_nodes, 3 n_nodes), (n_pressures, 3 n_nodes) and (n_pressures, n_pressures).
+        """
+        pressure = Basis(self._mesh, ElementTetP1(), intorder=2)
+        displacement = Basis(self._mesh, ElementVector(self._shape), intorder=2)
+        coupling = divergence.assemble(displacement, pressure).tocsr()
+        coupling = coupling[:, self.nodes_first(displacement)]
+        return self.unit_stiffness[0], coupling, pressure_mass.assemble(pressure).tocsr()
+
+    @cached_property
+    def mass(self) -> sp.csr_matrix:
+        """int N_a N_b dx, shape (n_nodes, n_nodes) [m^3]."""
+        matrix = scalar_mass.assemble(Basis(self._mesh, self._shape, intorder=4)).tocsr()
+        order = self.nodes_first(self._basis)
+        return matrix[order][:, order]
+
+    @cached_property
+    def pressure_factor(self) -> rslab.Ldlt:
+        """The factorized pressure mass."""
+        return rslab.ldlt(sp.csc_matrix(self.mixed[2]), threads=1)
+
+    def nodes_first(self, basis: Basis) -> np.ndarray:
+        """scikit-fem's number of each degree of freedom, in our order."""
+        dofs = basis.nodal_dofs.T
+        if self._quadratic:
+            dofs = np.concatenate([dofs, basis.edge_dofs.T])
+        return np.ascontiguousarray(dofs).ravel()
