@@ -15,6 +15,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from avatar_core.atlas.assembly import assembled, provenance, surroundings
 from avatar_core.atlas.base import PatientBase, PatientError, base_of
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.patient_problem import PatientProblem, member_problem, patient_problem
@@ -28,11 +29,10 @@ from avatar_core.atlas.transfer import (
 )
 from avatar_core.common.processes import cpu_seconds, repeatable
 from avatar_core.contact.ball_shift import make_felt_field
-from avatar_core.fem.patch_loads import LoadSurface, patch_loads
-from avatar_core.geometry.mesh import Regions, TetMesh, tetrahedralize
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import certify
-from avatar_core.offline.full_response import remainder
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.compact_response import CompactResponse
@@ -41,17 +41,13 @@ from avatar_core.reduction.galerkin import (
     ReducedResponse,
     ReductionRule,
     reduce,
-    residual_compliance_blocks,
 )
-from avatar_core.reduction.near_field import LocalBlocks, taper
-from avatar_core.reduction.regional import RegionalField, separate_regions
-from avatar_core.reduction.separated import SeparatedField
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import load_map
 from avatar_core.shapes.registration import Registration, register
 from avatar_core.vademecum.display import Display, boundary, display_of, structure
-from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
-from avatar_core.vademecum.tip_field import TipField, make_tip_field
+from avatar_core.vademecum.model import Convergence, RankError, Vademecum
+from avatar_core.vademecum.tip_field import make_tip_field
 
 Fidelity = Literal["interpolated", "reduced", "solved"]
 Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
@@ -95,6 +91,11 @@ class PatientOptions:
     def __post_init__(self) -> None:
         if not 0.0 < self.tolerance < 1.0:
             raise PatientError(f"tolerance {self.tolerance:g}; choose between 0 and 1")
+
+    @property
+    def rule(self) -> BuildRule:
+        """``build`` with as many modes as are wanted."""
+        return replace(self.build, max_modes=self.max_modes)
 
 
 @dataclass(frozen=True)
@@ -269,8 +270,8 @@ def interpolated(
     response = interpolated_response(problem, base, weights, options)
     support = RESIDUAL_SUPPORT * problem.loads.patch_radius
     convergence = Convergence(converged=False, tolerance=float("nan"))
-    field_ = make_tip_field(*_surroundings(problem))
-    return _assembled(problem, response, support, convergence, options, field_)
+    field_ = make_tip_field(*surroundings(problem))
+    return assembled(problem, response, support, convergence, options.rule, field_)
 
 
 def interpolated_response(
@@ -332,8 +333,8 @@ def vademecum_of_reduced(
         options.tolerance,
         rank_errors=tuple(RankError(e.rank, e.mean, e.worst) for e in found.history),
     )
-    field_ = make_felt_field(*_surroundings(problem))
-    return _assembled(problem, found.response, found.support, convergence, options, field_)
+    field_ = make_felt_field(*surroundings(problem))
+    return assembled(problem, found.response, found.support, convergence, options.rule, field_)
 
 
 def solved(
@@ -345,8 +346,8 @@ def solved(
         problem.elasticity,
         problem.regions,
         problem.loads,
-        replace(options.build, max_modes=options.max_modes),
-        _provenance(problem),
+        options.rule,
+        provenance(problem),
         lambda stage, fraction, error: progress(f"response: {stage}", fraction, error),
         problem.outline,
     )
@@ -374,89 +375,6 @@ def certified(
             n_loads,
             progress=lambda done: progress("certify", done / n_loads, np.nan),
         )
-    )
-
-
-def _surroundings(problem: PatientProblem) -> tuple[TetMesh, Regions, float, SurfaceMesh | None]:
-    """What a tip field is made of."""
-    return problem.mesh, problem.regions, problem.loads.patch_radius, problem.outline
-
-
-def _assembled(
-    problem: PatientProblem,
-    response: CompactResponse,
-    support: float,
-    convergence: Convergence,
-    options: PatientOptions,
-    tip_field: TipField,
-) -> Vademecum:
-    """The vademecum of a compact response: leading modes as global ones, the rest by regions."""
-    rule, loads = replace(options.build, max_modes=options.max_modes), problem.loads
-    modes = _sorted_by_norm(response, problem.mesh)
-    n_global, rank = min(rule.n_global, modes.rank), min(rule.contact_modes, modes.rank)
-    reach = rule.contact_support * loads.patch_radius
-    residual = residual_compliance_blocks(response.residual_compliance, support, loads, reach)
-    return Vademecum(
-        name=problem.surface.name,
-        mesh=problem.mesh,
-        regions=problem.regions,
-        material=problem.elasticity.material,
-        element=problem.elasticity.element,
-        surface=loads,
-        far=modes.truncate(n_global),
-        regional=_regional(modes, n_global, problem, rule),
-        trailing=modes.load[:, n_global:rank],
-        contact_near=_with_gram_of(modes.load[:, rank:], residual, loads, reach),
-        tip_field=tip_field,
-        convergence=convergence,
-        provenance=_provenance(problem),
-    )
-
-
-def _regional(
-    modes: SeparatedField, n_global: int, problem: PatientProblem, rule: BuildRule
-) -> RegionalField:
-    """The modes beyond the global ones, separated by regions of the load surface."""
-    mass = problem.mesh.lumped_mass
-    root = np.asarray(np.linalg.qr(np.sqrt(mass)[:, None] * modes.space, mode="r"))
-    size = np.linalg.norm(modes.load @ root.T, axis=1).reshape(-1, 3)
-    space, load = modes.space[:, n_global:], modes.load[:, n_global:].reshape(len(size), 3, -1)
-    return separate_regions(
-        rule.regions(problem.loads),
-        lambda positions: np.tensordot(space, load[positions], ([1], [2])),
-        np.maximum(size, 1e-300),
-        mass,
-        rule.regional,
-    )[0]
-
-
-def _with_gram_of(
-    load: np.ndarray, near: LocalBlocks, surface: LoadSurface, reach: float
-) -> LocalBlocks:
-    """Blocks and the tapered compliance of modes that are left out, Y Y^T."""
-    distance = near.distances(surface.centers)
-    zero = replace(near, block=np.zeros_like(near.block))
-    left = remainder(zero, load, taper(distance / reach))
-    return replace(near, block=near.block - left.block)
-
-
-def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
-    """Modes rotated so that the first hold most of the displacement; Y Y^T does not change."""
-    field_ = SeparatedField(np.asarray(response.space, float), np.asarray(response.load, float))
-    size = np.maximum((field_.load**2).sum(axis=1), 1e-300)
-    sorted_ = field_.sorted_by_norm(mesh.lumped_mass, 1.0 / size)
-    return SeparatedField(sorted_.space.astype(np.float32), sorted_.load.astype(np.float32))
-
-
-def _provenance(problem: PatientProblem) -> Provenance:
-    surface = problem.surface
-    return Provenance(
-        source=surface.name,
-        source_sha256=surface.source_sha256,
-        unit=surface.unit,
-        axes=surface.axes_name,
-        parameters=(f"template={problem.registration.template.name}",),
-        notices=surface.notices,
     )
 
 

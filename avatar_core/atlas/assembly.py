@@ -1,0 +1,108 @@
+"""From a patient's response to a vademecum: sorted modes, regions and what is left near a load."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from avatar_core.atlas.patient_problem import PatientProblem
+from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.offline.full_response import remainder
+from avatar_core.offline.rule import BuildRule
+from avatar_core.reduction.compact_response import CompactResponse
+from avatar_core.reduction.galerkin import residual_compliance_blocks
+from avatar_core.reduction.near_field import LocalBlocks, taper
+from avatar_core.reduction.regional import RegionalField, separate_regions
+from avatar_core.reduction.separated import SeparatedField
+from avatar_core.vademecum.model import Convergence, Provenance, Vademecum
+from avatar_core.vademecum.tip_field import TipField
+
+
+def surroundings(problem: PatientProblem) -> tuple[TetMesh, Regions, float, SurfaceMesh | None]:
+    """What a tip field is made of."""
+    return problem.mesh, problem.regions, problem.loads.patch_radius, problem.outline
+
+
+def assembled(
+    problem: PatientProblem,
+    response: CompactResponse,
+    support: float,
+    convergence: Convergence,
+    rule: BuildRule,
+    tip_field: TipField,
+) -> Vademecum:
+    """The vademecum of a compact response: leading modes as global ones, the rest by regions.
+
+    support : of the residual compliance [m]
+    rule : of modes and regions
+    """
+    loads, modes = problem.loads, _sorted_by_norm(response, problem.mesh)
+    n_global, rank = min(rule.n_global, modes.rank), min(rule.contact_modes, modes.rank)
+    reach = rule.contact_support * loads.patch_radius
+    residual = residual_compliance_blocks(response.residual_compliance, support, loads, reach)
+    return Vademecum(
+        name=problem.surface.name,
+        mesh=problem.mesh,
+        regions=problem.regions,
+        material=problem.elasticity.material,
+        element=problem.elasticity.element,
+        surface=loads,
+        far=modes.truncate(n_global),
+        regional=_regional(modes, n_global, problem, rule),
+        trailing=modes.load[:, n_global:rank],
+        contact_near=_with_gram_of(modes.load[:, rank:], residual, loads, reach),
+        tip_field=tip_field,
+        convergence=convergence,
+        provenance=provenance(problem),
+    )
+
+
+def _regional(
+    modes: SeparatedField, n_global: int, problem: PatientProblem, rule: BuildRule
+) -> RegionalField:
+    """The modes beyond the global ones, separated by regions of the load surface."""
+    mass = problem.mesh.lumped_mass
+    root = np.asarray(np.linalg.qr(np.sqrt(mass)[:, None] * modes.space, mode="r"))
+    size = np.linalg.norm(modes.load @ root.T, axis=1).reshape(-1, 3)
+    space, load = modes.space[:, n_global:], modes.load[:, n_global:].reshape(len(size), 3, -1)
+    return separate_regions(
+        rule.regions(problem.loads),
+        lambda positions: np.tensordot(space, load[positions], ([1], [2])),
+        np.maximum(size, 1e-300),
+        mass,
+        rule.regional,
+    )[0]
+
+
+def _with_gram_of(
+    load: np.ndarray, near: LocalBlocks, surface: LoadSurface, reach: float
+) -> LocalBlocks:
+    """Blocks and the tapered compliance of modes that are left out, Y Y^T."""
+    distance = near.distances(surface.centers)
+    zero = replace(near, block=np.zeros_like(near.block))
+    left = remainder(zero, load, taper(distance / reach))
+    return replace(near, block=near.block - left.block)
+
+
+def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
+    """Modes rotated so that the first hold most of the displacement; Y Y^T does not change."""
+    field_ = SeparatedField(np.asarray(response.space, float), np.asarray(response.load, float))
+    size = np.maximum((field_.load**2).sum(axis=1), 1e-300)
+    sorted_ = field_.sorted_by_norm(mesh.lumped_mass, 1.0 / size)
+    return SeparatedField(sorted_.space.astype(np.float32), sorted_.load.astype(np.float32))
+
+
+def provenance(problem: PatientProblem) -> Provenance:
+    """The patient's surface, and the template from which clamp and access are."""
+    surface = problem.surface
+    return Provenance(
+        source=surface.name,
+        source_sha256=surface.source_sha256,
+        unit=surface.unit,
+        axes=surface.axes_name,
+        parameters=(f"template={problem.registration.template.name}",),
+        notices=surface.notices,
+    )
