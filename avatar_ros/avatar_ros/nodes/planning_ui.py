@@ -49,10 +49,12 @@ from avatar_ros.ui.player import Player
 from avatar_ros.ui.presets import material_text
 from avatar_ros.ui.preview_view import PreviewView
 from avatar_ros.ui.recorder import Recorder
+from avatar_ros.ui.recordings import Page as RecordingsPage
+from avatar_ros.ui.recordings import Recordings
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.scan_view import ScanView
 from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
-from avatar_ros.ui.texts import frame_text, plain, recorded_text, scene_texts, warnings
+from avatar_ros.ui.texts import frame_text, plain, scene_texts, warnings
 from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess
 from avatar_ros.ui.view import CLEARANCE, GLASS, WHOLE, OrganView
 
@@ -117,7 +119,7 @@ class PlanningNode(ManagedNode):
             self._requests,
             Page(
                 say=self._say,
-                stop_recording=self._stop_recording,
+                stop_recording=lambda why: self._recordings.stop(why),
                 change_tip=self._change_tip,
                 show_material=lambda values: self._panels.organ.show_material(values),
                 show_look=self._show_look,
@@ -134,6 +136,19 @@ class PlanningNode(ManagedNode):
             self._say,
         )
         self._player = Player(self._library.folder, self._reader)
+        self._recordings = Recordings(
+            self._library.folder,
+            self._recorder,
+            self._player,
+            self._requests,
+            chosen,
+            self._state.live,
+            RecordingsPage(
+                say=self._say,
+                show_recording=lambda on: self._panels.tool.show_recording(on),
+                answers=self._answers,
+            ),
+        )
         self._scan = ScanView(
             server, self._library.folder, self._reader, lambda: self._panels.scan, self._say
         )
@@ -159,8 +174,8 @@ class PlanningNode(ManagedNode):
                 cancel=self._requests.cancel_patient,
                 nudge=chosen.nudge,
                 lift=chosen.lift,
-                record=self._record,
-                play=self._play,
+                record=self._recordings.record,
+                play=self._recordings.play,
                 pause=lambda: self._player.pause(True),
                 seek=self._player.seek,
                 stop_playing=self._player.close,
@@ -248,7 +263,7 @@ class PlanningNode(ManagedNode):
         except AvatarError as error:
             self._say(str(error))
             return
-        self._stop_recording("the organ changed")
+        self._recordings.stop("the organ changed")
         self._chosen.forget(GLASS if organ.structures else WHOLE)
         tip = self._chosen.tip
         self._chosen.put(organ.above(tip.offset + CLEARANCE))
@@ -384,7 +399,7 @@ class PlanningNode(ManagedNode):
             self._driver.ensure_running(self._tool, self._frame_id)
         if "contact" in missing:
             if not self._was_missing:
-                self._stop_recording("the contact node ended")
+                self._recordings.stop("the contact node ended")
             self._was_missing = True
         elif self._was_missing:
             self._was_missing = False
@@ -461,65 +476,6 @@ class PlanningNode(ManagedNode):
         self._chosen.return_to(kept.scene, kept.material, kept.look, np.array(kept.target))
         if client is not None and kept.camera:
             turn_camera(client, Pose(*np.array(kept.camera).reshape(3, 3)))
-
-    # --- Recordings --------------------------------------------------------------------------
-
-    def _play(self, name: str) -> None:
-        """Play a recording from its begin, or go on with the one that was paused."""
-        organ = self._organ
-        if organ is None:
-            self._say("nothing to play: choose the organ of a recording first")
-        elif self._player.is_playing(name):
-            self._player.pause(False)
-        else:
-            self._say(self._player.open(name, organ))
-
-    def _record(self, on: bool) -> None:
-        if not on:
-            self._stop_recording("")
-            return
-        organ = self._organ
-        if organ is None or not self._answers():
-            self._say("nothing to record: there is no organ, or the contact node does not answer")
-            return
-        if len(self._chosen.contact.get("tools", ())) != 1:
-            self._say("a recording holds one tool; start the contact node with one")
-            return
-        if self._state.live["touches"][0]:
-            self._say("lift the tool off the organ first: a recording starts at rest")
-            return
-        scene = self._chosen.scene_in_force(organ)
-        rate = float(self._chosen.contact["rate"])
-        text = self._recorder.open(organ.vademecum, scene, rate)
-        self._panels.tool.show_recording(True)
-
-        def begin(switched: bool) -> None:
-            touches = bool(self._state.live["touches"][0])  # half a minute after the click
-            if switched and not touches:
-                self._recorder.begin()
-                return
-            self._recorder.drop()
-            self._panels.tool.show_recording(False)
-            if touches:
-                self._say("not recorded: the tool touched the organ again; lift it, and record")
-
-        self._requests.load_scene(scene.name, self._say, yaml=text, then=begin)
-
-    def _stop_recording(self, why: str) -> None:
-        if not self._recorder.is_on:
-            return
-        self._panels.tool.show_recording(False)
-        try:
-            saved = self._recorder.save(self._library.folder)
-        except AvatarError as error:
-            self._say(str(error))
-            return
-        because = f", since {why}" if why else ""
-        if saved is None:
-            self._say(f"nothing was recorded{because}")
-            return
-        path, recording = saved
-        self._say(f"{recorded_text(recording)}{because}: {path.name}")
 
 
 def main() -> int:
