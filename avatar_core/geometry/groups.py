@@ -41,25 +41,23 @@ def faces_of_groups(mesh: TetMesh, points: Mapping[str, np.ndarray]) -> dict[str
     return {name: _near(mesh, group) for name, group in points.items()}
 
 
-def regions_of_groups(mesh: TetMesh, points: Mapping[str, np.ndarray]) -> Regions:
-    """Clamp and accessible surface from the groups ``clamped`` and ``accessible``.
+def regions_of_groups(
+    mesh: TetMesh, points: Mapping[str, np.ndarray], source: str | Path = "points"
+) -> Regions:
+    """Clamp and accessible surface from the groups ``clamped`` and ``accessible`` [m].
 
-    Raises MeshError if one is missing.
+    Raises MeshError, which names their source, if one is missing.
     """
     for name in REGIONS:
         if name not in points:
-            raise _unreadable(f"what has no '{name}'")
+            raise _unreadable(f"{source} ('{name}' is not in it)")
     clamped, accessible = (_near(mesh, points[name]) for name in REGIONS)
     return checked(Regions(clamped, accessible & ~touching(mesh, clamped)))
 
 
 def regions_from_groups(mesh: TetMesh, path: str | Path) -> Regions:
     """:func:`regions_of_groups` of a file."""
-    points = read_groups(path)
-    for name in REGIONS:
-        if name not in points:
-            raise _unreadable(f"{path} ('{name}' is not in it)")
-    return regions_of_groups(mesh, points)
+    return regions_of_groups(mesh, read_groups(path), path)
 
 
 def _near(mesh: TetMesh, points: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ each of its coordinates, and of Young's modulus, what is known.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Protocol
 
@@ -124,7 +124,12 @@ class Within:
         return self.whole.said(unit)
 
 
-_KINDS = {"fixed": (Fixed, 1), "uniform": (Uniform, 2), "lognormal": (Lognormal, 2)}
+_KINDS: dict[str, type[Fixed | Uniform | Lognormal]] = {
+    "fixed": Fixed,
+    "uniform": Uniform,
+    "lognormal": Lognormal,
+}
+_NUMBERS = {kind: tuple(one.name for one in fields(made)) for kind, made in _KINDS.items()}
 _EXAMPLE = "write young=lognormal:5e3:1.5, poisson=uniform:0.4:0.49 or contrast=fixed:4"
 
 
@@ -132,14 +137,13 @@ def parse(text: str) -> tuple[str, Distribution]:
     """``NAME=KIND:NUMBERS``, as on the command line."""
     name, _, told = text.partition("=")
     kind, *numbers = told.split(":")
-    make, count = _KINDS.get(kind, (None, 0))
     try:
         values = [float(number) for number in numbers]
     except ValueError:
         values = []
-    if make is None or len(values) != count or not np.isfinite(values).all():
+    if kind not in _KINDS or len(values) != len(_NUMBERS[kind]) or not np.isfinite(values).all():
         raise CoordinateError(f"distribution '{text}' is not understood; {_EXAMPLE}")
-    return name.strip(), make(*values)
+    return name.strip(), _KINDS[kind](*values)
 
 
 def within(name: str, whole: Distribution, low: float, high: float) -> Distribution:
@@ -159,7 +163,6 @@ def within(name: str, whole: Distribution, low: float, high: float) -> Distribut
     return whole if isinstance(whole, Fixed) else found
 
 
-_FIELDS = {"fixed": ("value",), "uniform": ("low", "high"), "lognormal": ("median", "factor")}
 _WRITTEN = "write young: {lognormal: {median: 5.0e+3, factor: 1.5}}"
 
 
@@ -184,10 +187,10 @@ def read_distributions(file: Path) -> dict[str, Distribution]:
 def _of_mapping(file: Path, name: object, told: object) -> Distribution:
     if isinstance(told, dict) and len(told) == 1:
         ((kind, values),) = told.items()
-        names = _FIELDS.get(kind, ())
+        names = _NUMBERS.get(kind, ())
         values = {"value": values} if kind == "fixed" else values
         if isinstance(values, dict) and tuple(sorted(values)) == tuple(sorted(names)):
             numbers = [values[field] for field in names]
             if all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
-                return _KINDS[kind][0](*map(float, numbers))
+                return _KINDS[kind](*map(float, numbers))
     raise CoordinateError(f"{file}: '{name}' is not understood; {_WRITTEN}")
