@@ -121,6 +121,16 @@ def test_a_file_of_groups_may_clamp_beside_the_supports(
     ).any()
 
 
+def test_a_tool_does_not_reach_what_touches_the_clamp_of_a_file(
+    phantom_mesh: TetMesh, places: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    everywhere = np.ones(len(phantom_mesh.boundary_faces), bool)
+    clamped = places["bare_area"]
+    file = groups_file(tmp_path / "g.npz", phantom_mesh, clamped=clamped, accessible=everywhere)
+    regions = regions_from_groups(phantom_mesh, file)
+    np.testing.assert_array_equal(regions.accessible, ~touching(phantom_mesh, regions.clamped))
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
