@@ -12,6 +12,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.loop.settings import CONTACT, MATERIAL, chosen_material
 from avatar_ros.nodes.contact import ContactNode
+from avatar_ros.prepare.scenes import usable_material
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.presets import HINTS, SLIDERS
 from avatar_ros.ui.recorder import scene_in_force
@@ -76,6 +77,32 @@ def test_a_support_of_another_name_is_left_to_scenes(organ: Vademecum) -> None:
         ),
     )
     assert list(Organ.of(renamed).ranges) == ["young"]
+
+
+@pytest.mark.parametrize(
+    ("material", "used", "reason"),
+    [
+        ({"young": 17e3, BARE: 5e4}, {"young": 17e3, BARE: 5e4}, ""),  # as 5e5 at that of the build
+        ({"young": 17e3, BARE: 5e8}, {"young": 17e3}, "holds 10000 to 1e+08"),
+        ({"young": 100.0, BARE: 2e6}, {BARE: 2e6}, "young 100 is not used: the supports"),
+        ({"young": 100.0, BARE: 1e5}, {"young": 100.0, BARE: 1e5}, ""),
+        ({"young": 17e3, "poisson": 0.4}, {"young": 17e3}, "has no such coordinate"),
+    ],
+)
+def test_another_organ_uses_what_its_supports_allow(
+    organ: Vademecum, material: dict[str, float], used: dict[str, float], reason: str
+) -> None:
+    found, notices = usable_material(organ, material)
+    assert found == used
+    assert (not notices) if reason == "" else reason in notices[0]
+    scene_spec(organ, parse_scene("name: bare", "scene"), found)  # which does not refuse it
+
+
+def test_a_fixed_support_keeps_the_modulus_as_built(organ: Vademecum) -> None:
+    fixed = replace(organ, parametric=None)
+    found, notices = usable_material(fixed, {"young": 17e3})
+    assert found == {} and "young 17000 is not used" in notices[0]
+    assert usable_material(fixed, {"young": YOUNG}) == ({"young": YOUNG}, ())
 
 
 def test_a_recording_keeps_the_stiffness_in_its_scene(organ: Vademecum) -> None:

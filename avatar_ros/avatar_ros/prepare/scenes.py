@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import shipped_scene
@@ -51,26 +52,64 @@ def usable_material(
     """Values that a vademecum has a coordinate for, and what is said of each of the others.
 
     The node keeps its parameters from one organ to the next, and the next may be of another range.
+    On supports, Young's modulus is left out where their stiffness over it would be out of range.
 
     material : values by name of the coordinate [SI]
     """
-    ranges = {c.name: (c.low, c.high) for c in _coordinates(vademecum)}
-    used, notices = {}, []
-    for name, value in material.items():
-        low, high = ranges.get(name, (value, value) if name == "young" else (1.0, 0.0))
-        if low <= value <= high:
-            used[name] = value
-        elif name in ranges:
-            notices.append(
-                f"{name} {value:g} is not used: {vademecum.name} holds {low:g} to {high:g}"
-            )
-        else:
-            notices.append(f"{name} {value:g} is not used: {vademecum.name} has no such coordinate")
+    own = vademecum.material.young_modulus
+    others = {name: value for name, value in material.items() if name != "young"}
+    for young in (material.get("young", own), own):
+        ranges = _ranges_at(vademecum, young)
+        used, notices = _within(vademecum.name, others, ranges)
+        if young == own or _holds(vademecum, used, ranges):
+            break
+    if material.get("young", young) == young:
+        used |= {"young": young} if "young" in material else {}
+    else:
+        told = f"the supports of {vademecum.name} do not allow it"
+        notices.append(f"young {material['young']:g} is not used: {told}")
     return used, tuple(notices)
 
 
-def _coordinates(vademecum: Vademecum) -> tuple[Any, ...]:
-    return tuple(vademecum.parametric.coordinates) if vademecum.parametric else ()
+def _ranges_at(vademecum: Vademecum, young: float) -> dict[str, tuple[float, float]]:
+    """Of each coordinate at a Young's modulus [Pa], over which the stiffness of supports counts."""
+    parametric = vademecum.parametric
+    if parametric is None:
+        return {}
+    scale = young / parametric.young_modulus
+    return {
+        c.name: (scale * c.low, scale * c.high) if c.kind == "support" else (c.low, c.high)
+        for c in parametric.coordinates
+    }
+
+
+def _within(
+    organ: str, material: dict[str, float], ranges: dict[str, tuple[float, float]]
+) -> tuple[dict[str, float], list[str]]:
+    """Values within ranges, and a line for each of the others."""
+    used, notices = {}, []
+    for name, value in material.items():
+        if name not in ranges:
+            notices.append(f"{name} {value:g} is not used: {organ} has no such coordinate")
+            continue
+        low, high = ranges[name]
+        if low <= value <= high:
+            used[name] = value
+        else:
+            notices.append(f"{name} {value:g} is not used: {organ} holds {low:g} to {high:g}")
+    return used, notices
+
+
+def _holds(
+    vademecum: Vademecum, material: dict[str, float], ranges: dict[str, tuple[float, float]]
+) -> bool:
+    """Whether all supports, those that are not chosen too, are coordinates within their ranges."""
+    for support in vademecum.supports:
+        name = SUPPORT + support.name
+        low, high = ranges.get(name, (1.0, 0.0))
+        if not low <= material.get(name, support.stiffness) <= high:
+            return False
+    return True
 
 
 def model_spec(vademecum: Vademecum, request: PreparationRequest, scene: Scene | None) -> ModelSpec:
