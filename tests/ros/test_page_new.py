@@ -234,6 +234,14 @@ def test_planes_of_an_image_lie_where_its_voxels_do(tmp_path: Path) -> None:
     assert slice_of(scan, 0, 0.75, 500.0, 100.0).grey.max() == 0  # level and window
 
 
+def test_large_values_of_an_image_stay_what_they_are(tmp_path: Path) -> None:
+    values = np.zeros((4, 4, 4), np.uint16)
+    values[1] = 60_000
+    nibabel.save(nibabel.Nifti1Image(values, np.eye(4)), tmp_path / "mr.nii")
+    scan = read_scan(tmp_path / "mr.nii")
+    assert (scan.low, scan.high) == (0.0, 60_000.0)
+
+
 def test_sheared_or_several_images_are_refused(tmp_path: Path) -> None:
     affine = np.eye(4)
     affine[0, 1] = 0.5

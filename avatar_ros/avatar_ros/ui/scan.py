@@ -70,7 +70,7 @@ def read_scan(path: str | Path) -> Scan:
     values, affine = found.values[0], found.affine.copy()
     step = np.maximum(-(-np.array(values.shape) // MOST), 1)
     values = values[:: step[0], :: step[1], :: step[2]]
-    kind = np.int16 if values.dtype.kind in "iub" and values.dtype.itemsize < 4 else np.float32
+    kind = np.int16 if np.can_cast(values.dtype, np.int16) else np.float32
     values = np.ascontiguousarray(values, kind)
     affine[:3, :3] *= step
     affine[:3] *= 1e-3
