@@ -134,6 +134,18 @@ def path_of(
     return BagPath(recording, answers, table.received[kept], sound[kept], tuple(notes))
 
 
+def valid_tips(
+    bag: Bag, transform: tuple[float, ...] | None = None
+) -> tuple[np.ndarray, FloatArray, list[str]]:
+    """When each valid pose was received (n,) [ns], its tip in the organ's frame (n, 3) [m], notes.
+
+    transform, errors : as of :func:`path_of`
+    """
+    poses, _, notes = _valid_poses(bag, transform)
+    tip = _moved(poses.values[:, :3], *_parts(transform or IDENTITY))
+    return poses.received, tip, notes
+
+
 _ANSWER = {"states": "contact_state", "wrenches": "wrenches", "poses": "poses"}
 _AT_POSE, _AWAY, _NONE, _MISSING = range(4)  # where the tip of a period was
 

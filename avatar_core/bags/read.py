@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -59,6 +59,7 @@ class Bag:
     tool : the part of its topics' names before ``/measured_cp``
     poses : label: frame; values: position [m], unit quaternion x y z w
     wrenches : label: frame; values: force [N]; None if the bag has none
+    wrench : name of their topic, after the tool's; "" without any
     axes : of the wrenches: "absolute", "body" or "spatial"
     states : label: id of the vademecum; values: status, force of the contacts [N], its estimated
         error [N], fraction that was sent; None if the bag has none
@@ -71,6 +72,7 @@ class Bag:
     tool: str
     poses: Table
     wrenches: Table | None
+    wrench: str
     axes: str
     states: Table | None
     vademecum_ids: tuple[str, ...]
@@ -78,7 +80,12 @@ class Bag:
     notes: tuple[str, ...]
 
 
-def read_bag(path: str | Path, tool: str | None = None, progress: Progress | None = None) -> Bag:
+def read_bag(
+    path: str | Path,
+    tool: str | None = None,
+    progress: Progress | None = None,
+    wrenches: Mapping[str, str] = WRENCHES,
+) -> Bag:
     """Read one tool's messages from a bag.
 
     Parameters
@@ -86,6 +93,7 @@ def read_bag(path: str | Path, tool: str | None = None, progress: Progress | Non
     path : folder with metadata.yaml, .mcap or .db3
     tool : beginning of its topics' names, with or without namespace; None if there is only one
     progress : called with the messages that were read, and how many there are
+    wrenches : topics of a tool that are read, and their axes; the first that has messages is taken
 
     Raises
     ------
@@ -95,7 +103,7 @@ def read_bag(path: str | Path, tool: str | None = None, progress: Progress | Non
     path = Path(path)
     with OpenBag(path) as bag:
         chosen = _chosen_tool(bag, tool)
-        topics = _Topics(bag.connections, chosen)
+        topics = _Topics(bag.connections, chosen, wrenches)
         total = sum(one.msgcount for one in topics.connections)
         for n, (connection, received, content) in enumerate(bag.messages(topics.connections)):
             topics.take(connection, received, content)
@@ -132,11 +140,11 @@ def _chosen_tool(bag: OpenBag, tool: str | None) -> str:
 class _Topics:
     """The topics of a tool and those that all tools share, message by message."""
 
-    def __init__(self, connections: Sequence[Any], tool: str) -> None:
-        self._tool, self._store = tool, types.typestore()
+    def __init__(self, connections: Sequence[Any], tool: str, wrenches: Mapping[str, str]) -> None:
+        self._tool, self._axes, self._store = tool, wrenches, types.typestore()
         namespace = tool.rpartition("/")[0]
         self._poses = TableWriter(7)
-        self._wrenches = {f"{tool}/{name}": TableWriter(3) for name in WRENCHES}
+        self._wrenches = {f"{tool}/{name}": TableWriter(3) for name in wrenches}
         self._states: dict[str, TableWriter] = {}  # by the tool that they name
         self._ids: dict[str, None] = {}
         self._about: About | None = None
@@ -175,7 +183,7 @@ class _Topics:
     def bag(self, path: Path, notes: Sequence[str]) -> Bag:
         wrenches = {
             name: self._wrenches[f"{self._tool}/{name}"]
-            for name in WRENCHES
+            for name in self._axes
             if len(self._wrenches[f"{self._tool}/{name}"])
         }
         chosen = next(iter(wrenches), None)
@@ -187,7 +195,8 @@ class _Topics:
             self._tool,
             self._poses.table(),
             None if chosen is None else wrenches[chosen].table(),
-            WRENCHES[chosen or "servo_cf"],
+            chosen or "",
+            self._axes[chosen] if chosen else "absolute",
             None if states is None else states.table(),
             tuple(self._ids),
             self._about,

@@ -11,6 +11,7 @@ import typer
 from avatar_core.cli.atlas import atlas
 from avatar_core.cli.bench import bench, require_ros, run_cell
 from avatar_core.cli.build_bar import BuildBar
+from avatar_core.cli.calibrate import calibrate
 from avatar_core.cli.cell import Host, Port, cell, require_ui, run_page
 from avatar_core.cli.export import export
 from avatar_core.cli.output import require_output
@@ -43,6 +44,7 @@ app.command()(patient)
 app.command()(register)
 app.command()(replay)
 app.command()(uncertainty)
+app.command()(calibrate)
 app.command()(study)
 app.command()(cell)
 

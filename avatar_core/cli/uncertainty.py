@@ -66,7 +66,7 @@ def uncertainty(
         require_output(output, _FORMATS, [file])
     pressed = _depths(depths)
     tip = Tip("sphere", 1e-3 * radius)
-    known = _given(given)
+    known = given_of(given)
     vademecum = load_vademecum(file)
     known = known_of(vademecum, known)
     places, vertex = _places(vademecum, at), _target(vademecum, target)
@@ -88,7 +88,8 @@ def uncertainty(
         print(output)
 
 
-def _given(given: list[str]) -> dict[str, Distribution]:
+def given_of(given: list[str]) -> dict[str, Distribution]:
+    """The distributions that options ``--given`` say."""
     from avatar_core.uncertainty.distributions import parse, read_distributions
 
     found: dict[str, Distribution] = {}

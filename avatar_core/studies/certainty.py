@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.studies.certainty_bands import bands_section
+from avatar_core.studies.certainty_calibration import calibration_section
 from avatar_core.studies.certainty_section import FULL, QUICK, CertaintySettings, Section
 from avatar_core.studies.certainty_supports import supports_section
 from avatar_core.studies.report import Panel, write_report
@@ -25,8 +26,9 @@ if TYPE_CHECKING:
 SECTIONS: tuple[Callable[[SurfaceMesh, CertaintySettings, ProgressBar], Section], ...] = (
     supports_section,
     bands_section,
+    calibration_section,
 )
-N_STAGES = 4  # of the progress bar, over all sections
+N_STAGES = 6  # of the progress bar, over all sections
 
 
 def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:

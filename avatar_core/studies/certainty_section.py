@@ -19,6 +19,7 @@ class CertaintySettings:
     max_modes : at a place
     n_draws : of the material, each solved in full
     n_places : that are pressed for them
+    n_trials : of a calibration, each solved in full
     """
 
     n_vertices: int = 2850
@@ -27,10 +28,13 @@ class CertaintySettings:
     max_modes: int = 100
     n_draws: int = 1000
     n_places: int = 3
+    n_trials: int = 100
 
 
 FULL = CertaintySettings()
-QUICK = CertaintySettings(n_vertices=700, n_values=4, n_loads=6, n_draws=40, n_places=2)
+QUICK = CertaintySettings(
+    n_vertices=700, n_values=4, n_loads=6, n_draws=40, n_places=2, n_trials=12
+)
 
 
 @dataclass(frozen=True, eq=False)

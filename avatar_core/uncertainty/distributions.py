@@ -72,6 +72,31 @@ class Uniform:
 
 
 @dataclass(frozen=True)
+class LogUniform:
+    """Anywhere between two positive values, every factor alike."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.low < self.high < math.inf:
+            raise CoordinateError(
+                f"loguniform:{self.low:g}:{self.high:g} is empty; give 0 < LOW < HIGH"
+            )
+
+    def ppf(self, probability: FloatArray) -> FloatArray:
+        return np.asarray(self.low * (self.high / self.low) ** np.asarray(probability))
+
+    def cdf(self, value: float) -> float:
+        if value <= self.low:
+            return 0.0
+        return min(math.log(value / self.low) / math.log(self.high / self.low), 1.0)
+
+    def said(self, unit: str = "") -> str:
+        return f"{self.low:g} to {self.high:g}{unit}, every factor alike"
+
+
+@dataclass(frozen=True)
 class Lognormal:
     """ln x is normal about ln median; two thirds lie within median / factor and median * factor."""
 
@@ -124,9 +149,10 @@ class Within:
         return self.whole.said(unit)
 
 
-_KINDS: dict[str, type[Fixed | Uniform | Lognormal]] = {
+_KINDS: dict[str, type[Fixed | Uniform | LogUniform | Lognormal]] = {
     "fixed": Fixed,
     "uniform": Uniform,
+    "loguniform": LogUniform,
     "lognormal": Lognormal,
 }
 _NUMBERS = {kind: tuple(one.name for one in fields(made)) for kind, made in _KINDS.items()}

@@ -1,21 +1,15 @@
 """The force at some places and depths as a function of the material, from a few vademecums.
 
-    ln F(p) ~ sum_n l_n(t(p)) ln F(p_n),    F ~ E,
+    ln F(p) ~ sum_n l_n(p) ln F(p_n)
 
-with l_n the Lagrange polynomials on Chebyshev's points (of the first kind) of the coordinates'
-ranges, each in its own scale t, tensor-wise. The response is analytic in the coordinates, so that
-the error falls geometrically with the points (Trefethen, Approximation Theory, 2013); what the
-displacement elsewhere needs is interpolated alike. Young's modulus needs no point: forces at an
-imposed depth are proportional to it, with supports at the same stiffness over E,
-
-    F(E, k) = E / E0 F(E0, k E0 / E).
+over the points of :mod:`avatar_core.uncertainty.material_grid`; what the displacement elsewhere
+needs is interpolated alike.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -24,51 +18,35 @@ from avatar_core.contact.layout import lay_out
 from avatar_core.contact.model import Status, make_model, step
 from avatar_core.errors import ContactError
 from avatar_core.geometry.tip import Tip
-from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.uncertainty.material_grid import MaterialGrid
 from avatar_core.vademecum.accuracy import Detail
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 
-N_POINTS = 5  # of Chebyshev, for each coordinate
 _ABOVE = 2e-3  # over the surface, where a tip starts [m]
 _STEP = 2e-3  # in which it comes down, at most: it must not be taken for one that jumped [m]
 
 
 @dataclass(frozen=True, eq=False)
 class ForceTable:
-    """Forces and displacements at Chebyshev's points of the coordinates.
+    """Forces and displacements at the points of a grid of materials.
 
-    coordinates : of the vademecum
-    young : Young's modulus of the forces, E0 [Pa]
     log_force : ndarray, shape (n_points, n_places, n_depths), ln of the force [N]
     log_moved : ndarray of that shape, ln of the displacement of the target [m]
     """
 
-    coordinates: tuple[Coordinate, ...]
-    young: float
+    grid: MaterialGrid
     log_force: FloatArray
     log_moved: FloatArray
 
     def force(self, values: Mapping[str, FloatArray]) -> FloatArray:
         """At values of all coordinates and "young", each (n,): (n, n_places, n_depths) [N]."""
-        softer = np.log(np.asarray(values["young"]) / self.young)
-        found = np.tensordot(self._weights(values), self.log_force, 1)
+        softer = np.log(self.grid.softer(values))
+        found = np.tensordot(self.grid.weights(values), self.log_force, 1)
         return np.asarray(np.exp(found + softer[:, None, None]))
 
     def moved(self, values: Mapping[str, FloatArray]) -> FloatArray:
         """Displacement of the target at these values, of that shape [m]; it knows no E."""
-        return np.asarray(np.exp(np.tensordot(self._weights(values), self.log_moved, 1)))
-
-    def _weights(self, values: Mapping[str, FloatArray]) -> FloatArray:
-        """Of the points, shape (n, n_points)."""
-        weights = np.ones((len(np.asarray(values["young"])), 1))
-        for coordinate in self.coordinates:
-            at = np.asarray(values[coordinate.name])
-            if coordinate.kind == "support":  # far from all else it changes little: the ends do
-                at = np.clip(at * self.young / values["young"], coordinate.low, coordinate.high)
-            own = _lagrange([coordinate.fraction(float(v)) for v in at])
-            weights = (weights[:, :, None] * own[:, None, :]).reshape(len(own), -1)
-        return weights
+        return np.asarray(np.exp(np.tensordot(self.grid.weights(values), self.log_moved, 1)))
 
 
 def force_table(
@@ -92,21 +70,14 @@ def force_table(
     ContactError
         If a tip finds no surface at a place, or is not felt there.
     """
-    parametric = vademecum.parametric
-    coordinates = parametric.coordinates if parametric else ()
-    grids = product(*([c.value_at(t) for t in _points()] for c in coordinates))
-    names, force, moved = [c.name for c in coordinates], [], []
-    n_points = N_POINTS ** len(coordinates)
-    young = parametric.young_modulus if parametric else vademecum.material.young_modulus
-    reference = {"young": young} if parametric else {}
-    for done, point in enumerate(grids):
-        here = at_values(vademecum, reference | dict(zip(names, point, strict=True)))
+    grid, force, moved = MaterialGrid.of(vademecum), [], []
+    for done, here in enumerate(grid.materials(vademecum)):
         found = _pressed(here, tip, places, depths)
         force.append(found)
         moved.append(found * _motion(here, places, target)[:, None])
-        progress(done + 1, n_points)
+        progress(done + 1, grid.n_points)
     least = np.finfo(float).tiny  # where the target is clamped
-    return ForceTable(coordinates, young, np.log(force), np.log(np.maximum(moved, least)))
+    return ForceTable(grid, np.log(force), np.log(np.maximum(moved, least)))
 
 
 def _pressed(
@@ -141,19 +112,3 @@ def _motion(vademecum: Vademecum, places: Sequence[int], target: int) -> FloatAr
         by_axis = vademecum.displacement(np.array([j]), np.ones(1))[three]
         found.append(np.linalg.norm(by_axis @ normals[j]))
     return np.array(found)
-
-
-def _points() -> FloatArray:
-    """Chebyshev's points of the first kind on 0 to 1, ascending."""
-    angles = np.pi * (np.arange(N_POINTS) + 0.5) / N_POINTS
-    return np.asarray(0.5 - 0.5 * np.cos(angles))
-
-
-def _lagrange(fractions: Sequence[float]) -> FloatArray:
-    """Weights of Chebyshev's points at some places of the range, shape (n, N_POINTS)."""
-    nodes, at = _points(), np.asarray(fractions)[:, None]
-    columns = []
-    for n in range(N_POINTS):
-        others = np.delete(nodes, n)
-        columns.append(np.prod((at - others) / (nodes[n] - others), axis=1))
-    return np.stack(columns, axis=1)

@@ -1,0 +1,203 @@
+"""``avatar calibrate``: the material of an organ from the forces of some touches."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from avatar_core.cli.bench import require_ros
+from avatar_core.cli.numbers import numbers
+from avatar_core.cli.output import require_output
+from avatar_core.cli.uncertainty import given_of
+from avatar_core.cli.vademecum import finite, require
+
+if TYPE_CHECKING:
+    from avatar_core.common.arrays import FloatArray
+    from avatar_core.geometry.tip import Tip
+    from avatar_core.uncertainty.calibration import Calibration
+
+EXIT_NOT_EXPLAINED = 3
+_FORMATS = (".yaml", ".json", ".png", ".pdf", ".svg")
+
+
+def calibrate(
+    file: Annotated[Path, typer.Argument(help="vademecum (.h5)")],
+    recording: Annotated[
+        Path,
+        typer.Option(
+            help="touches with measured forces: a recording of the planning page (.h5), or a bag "
+            "of ROS 2 with measured_cp and measured_cf of a tool"
+        ),
+    ],
+    given: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="what is known before, as of 'avatar uncertainty'; default: anything within the "
+            "ranges of the vademecum, and a Young's modulus of 500 to 350,000 Pa"
+        ),
+    ] = None,
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            help="of a bag of several tools: NAME of the topics NAME/measured_cp; of a recording: "
+            "number of the tool, from 1"
+        ),
+    ] = None,
+    tool_transform: Annotated[
+        str | None,
+        typer.Option(
+            help="of a bag: pose of the poses' frame in the organ's, x,y,z [m] and quaternion "
+            "x,y,z,w, as the node's parameter tool_transform"
+        ),
+    ] = None,
+    radius: Annotated[float, typer.Option(help="of a bag: radius of the spherical tip [mm]")] = 5.0,
+    sensor: Annotated[
+        float, typer.Option(help="standard deviation of a measured force, a part of it")
+    ] = 0.02,
+    least: Annotated[
+        float, typer.Option(help="smallest standard deviation of a measured force [N]")
+    ] = 0.02,
+    depth: Annotated[
+        float,
+        typer.Option(
+            help="standard deviation of the place of the surface at a touch [mm]: of the mesh and "
+            "of the registration of tool and organ"
+        ),
+    ] = 0.3,
+    output: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "-o",
+            "--output",
+            help="write distributions for 'avatar uncertainty' (.yaml), all numbers (.json) or a "
+            "picture (.png, .pdf, .svg); may be repeated",
+        ),
+    ] = None,
+    set_them: Annotated[
+        bool, typer.Option("--set", help="set the values in the contact node that runs")
+    ] = False,
+) -> None:
+    """Find Young's modulus and the coordinates of a vademecum from touches with measured forces."""
+    from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
+    from avatar_core.uncertainty.calibration_report import say
+    from avatar_core.uncertainty.palpation import palpation_of
+    from avatar_core.uncertainty.priors import priors_of
+    from avatar_core.vademecum.storage import load_vademecum
+
+    for one in output or []:
+        require_output(one, _FORMATS, [file, recording])
+    require(0.0 < sensor < 1.0, f"--sensor is {sensor}; give a part of the force, such as 0.02")
+    require(least > 0.0, f"--least is {least} N; give a positive force")
+    require(0.0 <= depth <= 20.0, f"--depth is {depth} mm; give 0 to 20")
+    if set_them:
+        require_ros()
+    known = given_of(given or [])
+    touched = _touched(recording, tool, tool_transform, radius)
+    palpation = palpation_of(touched.position, touched.force)
+    vademecum = load_vademecum(file)
+    priors = priors_of(vademecum, known)
+    with _bar("materials") as progress:
+        table = touch_table(vademecum, touched.tip, palpation, progress)
+    found = calibrated(table, priors, Errors(sensor, least, 1e-3 * depth))
+    for note in touched.notes:
+        print(f"notice: {note}", file=sys.stderr)
+    say(vademecum.name, table, found)
+    for one in output or []:
+        _write(one, vademecum.name, table, found)
+    if not found.explained:
+        raise typer.Exit(EXIT_NOT_EXPLAINED)
+    if set_them:
+        _set(found)
+
+
+class _Touched(NamedTuple):
+    """What a file says of a tool: its tip, where it was (n, 3) [m], the forces (n,) [N]."""
+
+    tip: Tip
+    position: FloatArray
+    force: FloatArray
+    notes: tuple[str, ...]
+
+
+def _touched(recording: Path, tool: str | None, transform: str | None, radius: float) -> _Touched:
+    from avatar_core.bags.files import is_bag
+
+    if not is_bag(recording):
+        return _of_recording(recording, tool)
+    from avatar_core.bags.palpation import measured_path
+    from avatar_core.geometry.tip import Tip
+
+    given = None
+    if transform is not None:
+        remedy = "seven numbers, as 0,0,0.1,0,0,0,1"
+        given = tuple(numbers("--tool-transform", transform, (7,), remedy))
+    tip = Tip("sphere", 1e-3 * radius)
+    with _bar("messages") as progress:
+        path = measured_path(recording, tool, given, progress)
+    return _Touched(tip, path.tip, path.force, path.notes)
+
+
+def _of_recording(file: Path, tool: str | None) -> _Touched:
+    import numpy as np
+
+    from avatar_core.scene.recording import load_recording
+    from avatar_core.scene.replay import scene_of
+
+    found = load_recording(file)
+    tips = [one.tip for one in scene_of(found).tools]
+    number = int(tool) if tool is not None and tool.isdecimal() else 1
+    right = tool is None or tool == str(number)
+    require(
+        right and 1 <= number <= len(tips), f"--tool is '{tool}'; {file} has tools 1 to {len(tips)}"
+    )
+    periods, k = found.periods, number - 1
+    return _Touched(
+        tips[k],
+        periods.tip[:, k],
+        np.linalg.norm(periods.force[:, k], axis=1),
+        ("forces of a recording are those that the cell computed, unless a sensor's were put in",),
+    )
+
+
+def _write(output: Path, name: str, table: object, found: Calibration) -> None:
+    from avatar_core.uncertainty import calibration_report as report
+    from avatar_core.uncertainty.calibration import TouchTable
+
+    assert isinstance(table, TouchTable)
+    if output.suffix == ".yaml":
+        output.write_text(report.distributions_text(name, found))
+    elif output.suffix == ".json":
+        output.write_text(json.dumps(finite(report.numbers(table, found)), indent=1) + "\n")
+    else:
+        report.picture(output, name, table, found)
+    print(output)
+
+
+def _set(found: Calibration) -> None:
+    """Set the values in the running contact node; its answer is printed by the module."""
+    values = [f"{name}={found.value(name):.6g}" for name in found.names]
+    sys.stdout.flush()
+    command = [sys.executable, "-m", "avatar_ros.nodes.set_material", *values]
+    done = subprocess.run(command, cwd="/", check=False)
+    if done.returncode != 0:
+        raise typer.Exit(done.returncode)
+
+
+@contextmanager
+def _bar(unit: str) -> Iterator[Callable[[int, int], None]]:
+    from tqdm import tqdm
+
+    with tqdm(unit=f" {unit}", file=sys.stderr, disable=None, delay=2.0, leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = max(total, done)
+            bar.update(done - bar.n)
+
+        yield show

@@ -1,0 +1,292 @@
+"""What the measured forces of some touches tell about the material: the posterior of its values.
+
+Each parameter p_k is a function of a standard normal number z_k by what was known before,
+
+    p_k = Q_k(Phi(z_k)),
+
+Q_k its quantile function. With y the logarithms of the measured forces and f those of the computed
+ones, the most probable values minimize
+
+    (y - f(z))^T C^-1 (y - f(z)) + z^T z,
+
+and the inverse of J^T C^-1 J + 1 there, J = df/dz, is the covariance of z (Tarantola, Inverse
+Problem Theory, SIAM 2005, section 3.2). If model and errors are as stated, the least value itself
+is chi-square distributed with as many degrees of freedom as there are samples: a model that lacks
+something is found out by it.
+
+C holds what is off about a force, each with its own reach:
+
+    a sample   the sensor: a part of the force, and a smallest force
+    a touch    the vademecum's own error at that place, and by how much the surface lies deeper or
+               higher than in the model, times d ln F / d depth
+    all        the mesh that all forces share
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares
+from scipy.special import ndtr
+from scipy.stats import chi2
+
+from avatar_core.common.arrays import FloatArray
+from avatar_core.contact.layout import lay_out
+from avatar_core.contact.model import Status, estimate_error, make_model, step
+from avatar_core.errors import ContactError
+from avatar_core.geometry.tip import Tip
+from avatar_core.uncertainty.distributions import Distribution, Fixed, Lognormal
+from avatar_core.uncertainty.material_grid import MaterialGrid
+from avatar_core.uncertainty.palpation import Palpation
+from avatar_core.vademecum.accuracy import Detail
+from avatar_core.vademecum.model import Vademecum
+
+LEAST_PROBABILITY = 0.01  # of so bad a fit, below which the model is called wrong
+NINETY = 1.6449  # deviations from the middle that hold 90 % of a normal distribution
+_N_WEIGHTINGS = 4  # by the forces that the last one expects
+_FARTHEST = 4.0  # deviations from what was known, of the values that are tried
+_UNKNOWN = 0.1  # error of a force whose place was never certified
+_LEAST_TOUCHES = 3
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Standard deviations of what is off about a force.
+
+    sensor : part of the force, of each sample
+    least : of each sample [N]
+    depth : of the surface's place at a touch [m]
+    mesh : part of the force, of all samples alike
+    """
+
+    sensor: float = 0.02
+    least: float = 0.02
+    depth: float = 0.3e-3
+    mesh: float = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class TouchTable:
+    """Forces at the samples of a palpation, at the points of a grid of materials.
+
+    palpation : of which the touches are that the vademecum feels
+    left_out : number of touches that it does not feel
+    log_force : ndarray, shape (n_points, n_samples), ln of the force [N]
+    steepness : ndarray, shape (n_samples,), d ln F / d depth [1/m]
+    error : ndarray, shape (n_samples,), standard deviation of the vademecum's own error, a part of
+        the force
+    """
+
+    grid: MaterialGrid
+    palpation: Palpation
+    left_out: int
+    log_force: FloatArray
+    steepness: FloatArray
+    error: FloatArray
+
+    def at(self, values: Mapping[str, FloatArray]) -> FloatArray:
+        """ln of the forces at values of all coordinates and "young", each (n,): (n, n_samples)."""
+        softer = np.log(self.grid.softer(values))
+        return np.asarray(self.grid.weights(values) @ self.log_force + softer[:, None])
+
+    @property
+    def measured(self) -> FloatArray:
+        """ln of the measured forces, shape (n_samples,)."""
+        return np.asarray(np.log(self.palpation.force[self.palpation.sampled]))
+
+    @property
+    def touch(self) -> np.ndarray:
+        """The touch of each sample, shape (n_samples,)."""
+        return np.asarray(self.palpation.touch[self.palpation.sampled])
+
+    def covariance(self, errors: Errors, log_force: FloatArray) -> FloatArray:
+        """C at forces that are expected, shape (n_samples, n_samples)."""
+        same = (self.touch[:, None] == self.touch).astype(float)
+        moved, own = errors.depth * self.steepness, self.error
+        sensor = np.hypot(errors.sensor, errors.least * np.exp(-log_force))
+        touches = same * (np.outer(moved, moved) + np.outer(own, own))
+        return np.asarray(np.diag(sensor**2) + touches + errors.mesh**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What is known after a palpation.
+
+    known : before it, by parameter
+    names : of the parameters that were not fixed
+    mean, covariance : of their standard normal numbers, shapes (n,) and (n, n)
+    misfit : ndarray, shape (n_samples,), of ln F, measured less computed
+    deviations : ndarray, shape (n_touches,), the same of each touch over what is expected of it
+    probability : that so bad a fit comes by chance
+    """
+
+    known: Mapping[str, Distribution]
+    names: tuple[str, ...]
+    mean: FloatArray
+    covariance: FloatArray
+    misfit: FloatArray
+    deviations: FloatArray
+    probability: float
+
+    @property
+    def explained(self) -> bool:
+        """Whether the model can have made these forces."""
+        return self.probability >= LEAST_PROBABILITY
+
+    def value(self, name: str, deviations: float = 0.0) -> float:
+        """The most probable value of a parameter, or one some deviations above it."""
+        if name not in self.names:
+            return float(self.known[name].ppf(np.array(0.5)))
+        k = self.names.index(name)
+        z = self.mean[k] + deviations * np.sqrt(self.covariance[k, k])
+        return float(self.known[name].ppf(ndtr(z)))
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """The values between which a parameter lies with 90 %."""
+        return self.value(name, -NINETY), self.value(name, NINETY)
+
+    def posterior(self, name: str) -> Distribution:
+        """A distribution about the most probable value, as wide as two thirds of the posterior.
+
+        It knows nothing of the other parameters; see :attr:`covariance`.
+        """
+        factor = np.sqrt(self.value(name, 1.0) / self.value(name, -1.0))
+        middle = self.value(name)
+        return Lognormal(middle, float(factor)) if factor > 1.0 else Fixed(middle)
+
+
+def touch_table(
+    vademecum: Vademecum,
+    tip: Tip,
+    palpation: Palpation,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TouchTable:
+    """Follow the touches at every material of the grid.
+
+    Raises
+    ------
+    ContactError
+        If the vademecum feels too few of the touches.
+    """
+    grid, force = MaterialGrid.of(vademecum), []
+    error = np.zeros(len(palpation.tip))
+    for done, here in enumerate(grid.materials(vademecum)):
+        found, expected = _followed(here, tip, palpation)
+        force.append(found)
+        error = np.maximum(error, expected)
+        progress(done + 1, grid.n_points)
+    return _of_felt(grid, palpation, np.array(force), error)
+
+
+def _of_felt(
+    grid: MaterialGrid, palpation: Palpation, force: FloatArray, error: FloatArray
+) -> TouchTable:
+    """The table of the touches whose samples are all felt."""
+    silent = palpation.sampled & ~(force > 0.0).all(axis=0)
+    felt = np.bincount(palpation.touch, silent, palpation.n_touches) == 0
+    if felt.sum() < _LEAST_TOUCHES:
+        raise ContactError(
+            f"{felt.sum()} of {len(felt)} touches meet the organ where it was computed, and "
+            f"{_LEAST_TOUCHES} are needed; check the frame of the poses (--tool-transform) and the "
+            "tip (--radius)"
+        )
+    chosen = felt[palpation.touch]
+    kept = palpation.where(felt)
+    with np.errstate(divide="ignore"):
+        log_force = np.log(force[:, chosen])
+    steepness = _steepness(kept, log_force[len(log_force) // 2])
+    sampled = kept.sampled
+    return TouchTable(
+        grid,
+        kept,
+        int((~felt).sum()),
+        log_force[:, sampled],
+        steepness[sampled],
+        error[chosen][sampled],
+    )
+
+
+def _followed(
+    vademecum: Vademecum, tip: Tip, palpation: Palpation
+) -> tuple[FloatArray, FloatArray]:
+    """Force along the paths [N], and its error as a part of it, each (n,)."""
+    model = make_model(lay_out(vademecum, (tip,), Detail(1, "off")))
+    force, error = np.zeros((2, len(palpation.tip)))
+    before = -1
+    for k, (touch, at) in enumerate(zip(palpation.touch, palpation.tip, strict=True)):
+        if touch != before:
+            model.reset()
+        before, status = touch, step(model, at[None])
+        size = float(np.linalg.norm(model.out.force[0]))
+        if status in (Status.OK, Status.EXTRAPOLATED) and size > 0.0:
+            estimate_error(model)
+            expected = float(model.out.force_error[0]) / size / NINETY
+            force[k], error[k] = size, expected if np.isfinite(expected) else _UNKNOWN
+    return force, error
+
+
+def _steepness(palpation: Palpation, log_force: FloatArray) -> FloatArray:
+    """d ln F / d depth along the paths, shape (n,) [1/m]; zero where there is no force."""
+    found = np.zeros(len(log_force))
+    for touch in range(palpation.n_touches):
+        here = np.flatnonzero((palpation.touch == touch) & np.isfinite(log_force))
+        if len(here) == 0:
+            continue
+        first = here[0] - 1 if here[0] and palpation.touch[here[0] - 1] == touch else here[0]
+        way = np.linalg.norm(palpation.tip[here] - palpation.tip[first], axis=1)
+        way = np.maximum.accumulate(np.maximum(way, 1e-4))
+        # F ~ d^a: d ln F / d d = a / d, with a from the touch itself.
+        power = np.polyfit(np.log(way), log_force[here], 1)[0] if np.ptp(way) > 0.0 else 1.0
+        found[here] = np.clip(power, 0.5, 2.0) / way
+    return found
+
+
+def calibrated(
+    table: TouchTable, known: Mapping[str, Distribution], errors: Errors | None = None
+) -> Calibration:
+    """The posterior of all parameters that are not fixed.
+
+    known : of every coordinate and "young", as :func:`avatar_core.uncertainty.bands.known_of` gives
+    """
+    names = tuple(name for name, one in known.items() if not isinstance(one, Fixed))
+    errors = errors or Errors()
+
+    def computed(z: FloatArray) -> FloatArray:
+        probability = dict(zip(names, ndtr(z), strict=True))
+        values = {
+            name: np.atleast_1d(one.ppf(np.array(probability.get(name, 0.5))))
+            for name, one in known.items()
+        }
+        return np.asarray(table.at(values)[0])
+
+    def whitened(z: FloatArray) -> FloatArray:
+        misfit = table.measured - computed(z)
+        return np.r_[solve_triangular(root, misfit, lower=True), z]
+
+    # By the measured forces, those that noise made small would count less than those it made large.
+    expected, at = table.measured, np.zeros(len(names))
+    for _ in range(_N_WEIGHTINGS):
+        covariance = table.covariance(errors, expected)
+        root = np.linalg.cholesky(covariance)
+        best = least_squares(whitened, at, bounds=(-_FARTHEST, _FARTHEST), jac="3-point")
+        at, expected = best.x, computed(best.x)
+    left = table.measured - expected
+    return Calibration(
+        known,
+        names,
+        np.asarray(at),
+        np.linalg.inv(best.jac.T @ best.jac),
+        left,
+        _deviations(table.touch, left, covariance),
+        float(chi2.sf(2.0 * best.cost, len(left))),
+    )
+
+
+def _deviations(touch: np.ndarray, misfit: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Sum of the misfits of each touch over its standard deviation, shape (n_touches,)."""
+    member = (np.arange(touch[-1] + 1)[:, None] == touch).astype(float)
+    variance = np.einsum("ti,ij,tj->t", member, covariance, member)
+    return np.asarray(member @ misfit / np.sqrt(variance))

@@ -1,0 +1,96 @@
+"""What is a function of the material, from a few vademecums.
+
+    f(p) ~ sum_n l_n(t(p)) f(p_n)
+
+with l_n the Lagrange polynomials on Chebyshev's points (of the first kind) of the coordinates'
+ranges, each in its own scale t, tensor-wise. The response is analytic in the coordinates, so that
+the error falls geometrically with the points (Trefethen, Approximation Theory, 2013). Young's
+modulus needs no point: forces at an imposed depth are proportional to it, with supports at the
+same stiffness over E,
+
+    F(E, k) = E / E0 F(E0, k E0 / E).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from avatar_core.common.arrays import FloatArray
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.model import Vademecum
+
+_N_POINTS = {1: 5, 2: 5, 3: 4}  # for each of so many coordinates
+_N_OF_MANY = 3
+
+
+@dataclass(frozen=True)
+class MaterialGrid:
+    """Chebyshev's points of the coordinates of a vademecum.
+
+    coordinates : of the vademecum
+    young : Young's modulus at the points, E0 [Pa]
+    n_each : points for each coordinate
+    """
+
+    coordinates: tuple[Coordinate, ...]
+    young: float
+    n_each: int
+
+    @classmethod
+    def of(cls, vademecum: Vademecum) -> MaterialGrid:
+        """The grid of a vademecum; its fineness follows from the number of coordinates."""
+        parametric = vademecum.parametric
+        if parametric is None:
+            return cls((), vademecum.material.young_modulus, 1)
+        coordinates = parametric.coordinates
+        n_each = _N_POINTS.get(len(coordinates), _N_OF_MANY)
+        return cls(coordinates, parametric.young_modulus, n_each)
+
+    @property
+    def n_points(self) -> int:
+        """Number of points."""
+        return self.n_each ** len(self.coordinates)
+
+    def materials(self, vademecum: Vademecum) -> Iterator[Vademecum]:
+        """The vademecum at every point, some tenths of a second each."""
+        names = [c.name for c in self.coordinates]
+        reference = {"young": self.young} if self.coordinates else {}
+        fractions = chebyshev_points(self.n_each)
+        for point in product(*([c.value_at(t) for t in fractions] for c in self.coordinates)):
+            yield at_values(vademecum, reference | dict(zip(names, point, strict=True)))
+
+    def softer(self, values: Mapping[str, FloatArray]) -> FloatArray:
+        """E / E0 at values of "young", shape (n,)."""
+        return np.asarray(values["young"]) / self.young
+
+    def weights(self, values: Mapping[str, FloatArray]) -> FloatArray:
+        """Of the points, at values of all coordinates and "young", each (n,): (n, n_points)."""
+        weights = np.ones((len(np.asarray(values["young"])), 1))
+        for coordinate in self.coordinates:
+            at = np.asarray(values[coordinate.name])
+            if coordinate.kind == "support":  # far from all else it changes little: the ends do
+                at = np.clip(at / self.softer(values), coordinate.low, coordinate.high)
+            own = lagrange([coordinate.fraction(float(v)) for v in at], self.n_each)
+            weights = (weights[:, :, None] * own[:, None, :]).reshape(len(own), -1)
+        return weights
+
+
+def chebyshev_points(n: int) -> FloatArray:
+    """Chebyshev's points of the first kind on 0 to 1, ascending, shape (n,)."""
+    angles = np.pi * (np.arange(n) + 0.5) / n
+    return np.asarray(0.5 - 0.5 * np.cos(angles))
+
+
+def lagrange(fractions: Sequence[float], n: int) -> FloatArray:
+    """Weights of n of Chebyshev's points at some places of the range, shape (n_places, n)."""
+    nodes, at = chebyshev_points(n), np.asarray(fractions)[:, None]
+    columns = []
+    for k in range(n):
+        others = np.delete(nodes, k)
+        columns.append(np.prod((at - others) / (nodes[k] - others), axis=1))
+    return np.stack(columns, axis=1)

@@ -1,0 +1,329 @@
+"""Calibration: a posterior in closed form, truths found again, and a wrong model that shows."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar_core.cli.main import main
+from avatar_core.contact.model import FAR_AWAY, prepare, step
+from avatar_core.contact.tool_path import palpation as push
+from avatar_core.contact.tool_path import starts_apart
+from avatar_core.errors import ContactError, CoordinateError, StorageError
+from avatar_core.geometry.tip import Tip
+from avatar_core.scene.file import write_scene
+from avatar_core.scene.model import Scene
+from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
+from avatar_core.uncertainty.calibration import Errors, TouchTable, calibrated, touch_table
+from avatar_core.uncertainty.distributions import (
+    Fixed,
+    Lognormal,
+    LogUniform,
+    Uniform,
+    read_distributions,
+)
+from avatar_core.uncertainty.palpation import N_SAMPLES, Palpation, palpation_of
+from avatar_core.uncertainty.priors import YOUNG, priors_of
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import save_vademecum
+from tests.core.soft_organ import organ_on_springs, soft_organ
+
+RADIUS = 5e-3
+SPHERE = Tip("sphere", RADIUS)
+N_TOUCHES = 8
+DEPTH = 5e-3
+TRUE = {"young": 6e3, "poisson": 0.45, "contrast": 5.0}
+SENSOR_ALONE = Errors(sensor=0.02, least=1e-9, depth=0.0, mesh=1e-9)
+
+
+def path_over(organ: Vademecum, n: int) -> np.ndarray:
+    """Pushes at n places, the tool far away between them, shape (periods, 3)."""
+    parts = [push(organ, RADIUS, DEPTH, 120, j) for j in starts_apart(organ, n)]
+    away = np.full((5, 3), FAR_AWAY)
+    return np.concatenate([row for part in parts for row in (away, part)] + [away])
+
+
+def felt(organ: Vademecum, tips: np.ndarray) -> np.ndarray:
+    """Force on the tip, shape (n, 3)."""
+    model = prepare(organ, (SPHERE,), cloud="off")
+    force = np.empty(tips.shape)
+    for k, tip in enumerate(tips):
+        step(model, tip[None])
+        force[k] = model.out.force[0]
+    return force
+
+
+@pytest.fixture(scope="module")
+def organ() -> Vademecum:
+    return soft_organ()
+
+
+@pytest.fixture(scope="module")
+def tips(organ: Vademecum) -> np.ndarray:
+    return path_over(organ, N_TOUCHES)
+
+
+@pytest.fixture(scope="module")
+def forces(organ: Vademecum, tips: np.ndarray) -> np.ndarray:
+    return felt(at_values(organ, TRUE), tips)
+
+
+@pytest.fixture(scope="module")
+def table(organ: Vademecum, tips: np.ndarray, forces: np.ndarray) -> TouchTable:
+    return touch_table(organ, SPHERE, palpation_of(tips, np.linalg.norm(forces, axis=1)))
+
+
+def with_forces(table: TouchTable, log_force: np.ndarray) -> TouchTable:
+    """As if these had been measured."""
+    force = table.palpation.force.copy()
+    force[table.palpation.sampled] = np.exp(log_force)
+    return replace(table, palpation=replace(table.palpation, force=force))
+
+
+def without_error(table: TouchTable) -> TouchTable:
+    """As if the vademecum's forces were exact."""
+    return replace(table, error=np.zeros(len(table.error)))
+
+
+def at(table: TouchTable, **values: float) -> np.ndarray:
+    """ln of the forces at values."""
+    return table.at({name: np.array([value]) for name, value in (TRUE | values).items()})[0]
+
+
+# --- touches -----------------------------------------------------------------------------------
+
+
+def test_touches_begin_outside_and_hold_samples_of_rising_force(
+    tips: np.ndarray, forces: np.ndarray
+) -> None:
+    size = np.linalg.norm(forces, axis=1)
+    found = palpation_of(tips, size)
+    assert found.n_touches == N_TOUCHES
+    for touch in range(N_TOUCHES):
+        force = found.force[found.touch == touch]
+        assert np.isnan(force[0])  # before it touches
+        samples = force[np.isfinite(force)]
+        assert 3 <= len(samples) <= N_SAMPLES
+        assert (np.diff(samples) > 0.0).all()
+    assert np.nanmax(found.force) == size.max()
+
+
+def test_the_way_back_and_what_is_not_known_are_left_out(
+    tips: np.ndarray, forces: np.ndarray
+) -> None:
+    size = np.linalg.norm(forces, axis=1)
+    spoilt, doubled = tips.copy(), size.copy()
+    spoilt[2] = np.nan
+    first = slice(5, 125)  # of the first push
+    peak = 5 + int(np.argmax(size[first]))
+    doubled[peak + 1 : 125] *= 0.5
+    before, after = palpation_of(tips, size), palpation_of(spoilt, doubled)
+    np.testing.assert_array_equal(before.force, after.force)
+
+
+def test_a_path_that_touches_nothing_is_refused(tips: np.ndarray) -> None:
+    with pytest.raises(StorageError, match="nothing was touched: the largest"):
+        palpation_of(tips, np.full(len(tips), 0.01))
+
+
+def test_touches_off_the_organ_are_counted_or_refused(
+    organ: Vademecum, tips: np.ndarray, forces: np.ndarray
+) -> None:
+    size = np.linalg.norm(forces, axis=1)
+    found = palpation_of(tips, size)
+    moved = found.tip.copy()
+    moved[found.touch == 2] += 0.5
+    assert touch_table(organ, SPHERE, replace(found, tip=moved)).left_out == 1
+    with pytest.raises(ContactError, match="0 of 8 touches meet the organ"):
+        touch_table(organ, SPHERE, replace(found, tip=found.tip + 0.5))
+
+
+# --- the posterior -----------------------------------------------------------------------------
+
+
+def test_young_alone_has_a_posterior_in_closed_form(table: TouchTable) -> None:
+    """ln E is normal before, and so is ln F: the mean of two normal distributions."""
+    factor, n = 1.5, len(table.measured)
+    prior = Lognormal(4e3, factor)
+    known = {"young": prior, "poisson": Fixed(0.45), "contrast": Fixed(5.0)}
+    rng = np.random.default_rng(1)
+    noisy = with_forces(without_error(table), at(table) + 0.02 * rng.standard_normal(n))
+    found = calibrated(noisy, known, SENSOR_ALONE)
+    told = noisy.measured - at(table, young=1.0)  # ln E by each sample
+    weight, own = n / 0.02**2, 1.0 / np.log(factor) ** 2
+    mean = (weight * told.mean() + own * np.log(4e3)) / (weight + own)
+    assert np.log(found.value("young")) == pytest.approx(mean, abs=1e-5)
+    low, high = found.interval("young")
+    assert np.log(high / low) == pytest.approx(2 * 1.6449 / np.sqrt(weight + own), rel=1e-3)
+
+
+def test_all_values_are_found_again(organ: Vademecum, table: TouchTable) -> None:
+    """The forces of the vademecum itself, at values between the points of the table."""
+    found = calibrated(table, priors_of(organ), SENSOR_ALONE)
+    for name, value in TRUE.items():
+        low, high = found.interval(name)
+        assert low < value < high
+    assert found.value("young") == pytest.approx(TRUE["young"], rel=0.03)
+    assert found.explained
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say(table: TouchTable) -> None:
+    """Errors drawn from C itself; the least value is chi-square distributed."""
+    known = {"young": Lognormal(5e3, 1.5), "poisson": Fixed(0.45), "contrast": LogUniform(1, 9.9)}
+    errors, rng = Errors(), np.random.default_rng(2)
+    held, chances = [], []
+    for _ in range(60):
+        true = {name: float(one.ppf(rng.random())) for name, one in known.items()}
+        exact = with_forces(table, at(table, **true))
+        root = np.linalg.cholesky(exact.covariance(errors, exact.measured))
+        noisy = with_forces(exact, exact.measured + root @ rng.standard_normal(len(root)))
+        found = calibrated(noisy, known, errors)
+        chances.append(found.probability)
+        for name in found.names:
+            low, high = found.interval(name)
+            held.append(low <= true[name] <= high)
+    assert 0.82 <= np.mean(held) <= 0.97
+    assert 0.35 <= np.mean(chances) <= 0.65
+
+
+def test_larger_errors_widen_the_interval_of_young(organ: Vademecum, table: TouchTable) -> None:
+    def width(errors: Errors) -> float:
+        low, high = calibrated(table, priors_of(organ), errors).interval("young")
+        return np.log(high / low)
+
+    usual = width(Errors())
+    for worse in (Errors(sensor=0.2), Errors(depth=1e-3), Errors(mesh=0.1)):
+        assert width(worse) > 1.05 * usual
+
+
+def test_a_model_without_the_tumour_is_found_out(organ: Vademecum, table: TouchTable) -> None:
+    """Not by what all forces share, but by the difference of places."""
+    hard = with_forces(without_error(table), at(table, contrast=10.0))
+    known = priors_of(organ, {"contrast": Fixed(0.5)})
+    found = calibrated(hard, known, SENSOR_ALONE)
+    assert not found.explained
+    assert calibrated(hard, priors_of(organ), SENSOR_ALONE).explained
+
+
+def test_what_nobody_said_is_as_wide_as_the_vademecum(organ: Vademecum) -> None:
+    known = priors_of(organ, {"poisson": Uniform(0.4, 0.48)})
+    assert known["young"] == YOUNG
+    assert known["contrast"].ppf(np.array([0.0, 1.0])) == pytest.approx([0.5, 10.0])
+    assert known["poisson"].ppf(np.array([0.0, 1.0])) == pytest.approx([0.4, 0.48])
+    held = replace(organ_on_springs(), parametric=None)
+    assert isinstance(priors_of(held)["young"], Fixed)
+    with pytest.raises(CoordinateError, match="no 'nonsense'"):
+        priors_of(organ, {"nonsense": Fixed(1.0)})
+
+
+def test_a_posterior_becomes_what_is_known(organ: Vademecum, table: TouchTable) -> None:
+    """The median and two thirds of it, as for `avatar uncertainty`."""
+    found = calibrated(table, priors_of(organ))
+    one = found.posterior("young")
+    assert one.ppf(np.array(0.5)) == pytest.approx(found.value("young"))
+    assert one.ppf(np.array(0.8413)) == pytest.approx(found.value("young", 1.0), rel=0.02)
+
+
+# --- the command -------------------------------------------------------------------------------
+
+
+def recording_of(organ: Vademecum, tips: np.ndarray, forces: np.ndarray) -> Recording:
+    n = len(tips)
+    periods = Periods(
+        number=np.arange(n),
+        stamp=np.arange(n) * 1_000_000,
+        tip=tips[:, None],
+        turn=np.zeros((n, 1, 3)),
+        status=np.zeros((n, 1), np.uint8),
+        force=forces[:, None],
+        error=np.zeros((n, 1)),
+        sent_fraction=np.ones((n, 1)),
+    )
+    clouds = Clouds(np.zeros(0, np.int64), np.zeros((0, 0, 3), np.float32))
+    return Recording("", organ.name, write_scene(Scene()), 1e3, True, periods, clouds)
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    organ: Vademecum,
+    tips: np.ndarray,
+    forces: np.ndarray,
+) -> Callable[..., tuple[int, str]]:
+    """Runs ``avatar calibrate liver.h5 --recording push.h5 ...``: exit code and what was said."""
+    save_vademecum(organ, tmp_path / "liver.h5")
+    save_recording(recording_of(organ, tips, forces), tmp_path / "push.h5")
+
+    def call(*arguments: str, recording: str = "push.h5") -> tuple[int, str]:
+        monkeypatch.chdir(tmp_path)
+        words = ["avatar", "calibrate", "liver.h5", "--recording", recording, *arguments]
+        monkeypatch.setattr(sys, "argv", words)
+        code = main()
+        said = capsys.readouterr()
+        return code, said.out + said.err
+
+    return call
+
+
+def test_the_command_says_and_writes_what_was_found(
+    run: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    code, said = run("-o", "found.yaml", "-o", "found.json", "-o", "found.png")
+    assert code == 0
+    assert "8 touches" in said and "the fit is good" in said
+    assert "which the cell computed" in said or "that the cell computed" in said
+    found = read_distributions(tmp_path / "found.yaml")
+    assert set(found) == set(TRUE)
+    told = json.loads((tmp_path / "found.json").read_text())
+    assert told["explained"] is True
+    for name, value in TRUE.items():
+        assert told["values"][name]["low"] < value < told["values"][name]["high"]
+        assert f"{told['values'][name]['value']:.4g}" in said
+    assert (tmp_path / "found.png").stat().st_size > 10_000
+
+
+def test_the_command_calls_a_wrong_model_wrong(
+    run: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    exact = ("--sensor", "0.001", "--least", "1e-6", "--depth", "0", "-o", "found.json")
+    code, said = run("--given", "contrast=fixed:0.5", "--given", "poisson=fixed:0.3", *exact)
+    assert code == 3
+    assert "NOT EXPLAINED" in said and "do not use these values" in said
+    assert json.loads((tmp_path / "found.json").read_text())["explained"] is False
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("-o", "found.txt"), "choose .yaml or .json"),
+        (("-o", "push.json", "--sensor", "0"), "--sensor is 0"),
+        (("--least", "0"), "--least is 0"),
+        (("--depth", "-1"), "--depth is -1"),
+        (("--tool", "2"), "--tool is '2'; push.h5 has tools 1 to 1"),
+        (("--given", "stiffness=fixed:1"), "no 'stiffness'"),
+    ],
+)
+def test_the_command_refuses_in_a_line(
+    run: Callable[..., tuple[int, str]], arguments: tuple[str, ...], reason: str
+) -> None:
+    code, said = run(*arguments)
+    assert code == 1
+    assert reason in said and said.count("\n") == 1
+
+
+def test_a_palpation_keeps_whole_touches(tips: np.ndarray, forces: np.ndarray) -> None:
+    found = palpation_of(tips, np.linalg.norm(forces, axis=1))
+    kept = np.ones(N_TOUCHES, bool)
+    kept[[0, 3]] = False
+    some: Palpation = found.where(kept)
+    assert some.n_touches == N_TOUCHES - 2
+    np.testing.assert_array_equal(some.tip[some.touch == 0], found.tip[found.touch == 1])
