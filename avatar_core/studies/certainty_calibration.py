@@ -46,14 +46,14 @@ CONTRAST = Coordinate("contrast", 0.7, 30.0)
 STIFFNESS = (5e5, 2e8)  # of the support at the vademecum's Young's modulus [N/m^3]
 TRUE_YOUNG, TRUE_CONTRAST, TRUE_STIFFNESS = (3e3, 12e3), (2.0, 12.0), (2e6, 2e7)
 N_TOUCHES = 20
-N_AT_TUMOUR = 8  # of them
+N_AT_TUMOUR, APART = 8, 8e-3  # of them, and how far apart these are at least [m]
 WELL_KNOWN = 0.08  # error of a force that nine in ten keep, where a touch is worth it
 NOISE = 0.02  # of a measured force
 DEPTHS = (2e-3, 4e-3, 6e-3)  # [m]
 TIP = Tip("patch", 8e-3)
 ERRORS = Errors(sensor=NOISE, least=1e-6)
 _ABOVE, _STEP = 2e-3, 1e-3  # where a touch begins, and between its points [m]
-_SHRUNK, _BELOW = 0.25, 22e-3  # the tumour: of the organ's size, its middle below the surface [m]
+_SHRUNK, _BELOW = 0.35, 28e-3  # the tumour: of the organ's size, its middle below the surface [m]
 _N_VERTICES, _N_TRUE_VERTICES = 1500, 5000
 
 
@@ -137,11 +137,17 @@ def _build(outline: SurfaceMesh, tumour: SurfaceMesh, bar: ProgressBar) -> Vadem
 def _places(vademecum: Vademecum, tumour: SurfaceMesh) -> IntArray:
     """Load positions: some over the tumour, the others far apart."""
     centers, inner = vademecum.surface.centers, _well_known(vademecum)
-    away = np.linalg.norm(centers[inner] - tumour.vertices.mean(axis=0), axis=1)
-    near = inner[np.argsort(away)[: 4 * N_AT_TUMOUR]]
-    over = near[farthest_points(centers[near], N_AT_TUMOUR)]
-    others = np.setdiff1d(inner, near)
-    return np.r_[over, others[farthest_points(centers[others], N_TOUCHES - N_AT_TUMOUR)]]
+    over = vademecum.surface.largest_apart(_nearness(vademecum, tumour, inner), N_AT_TUMOUR, APART)
+    others = np.setdiff1d(inner, over)
+    return np.r_[over, others[farthest_points(centers[others], N_TOUCHES - len(over))]]
+
+
+def _nearness(vademecum: Vademecum, tumour: SurfaceMesh, among: IntArray) -> FloatArray:
+    """One over the distance from the tumour's middle; zero at positions that are not asked for."""
+    centers = vademecum.surface.centers
+    found = np.zeros(len(centers))
+    found[among] = 1.0 / np.linalg.norm(centers[among] - tumour.vertices.mean(axis=0), axis=1)
+    return found
 
 
 def _well_known(vademecum: Vademecum) -> IntArray:

@@ -10,9 +10,7 @@ ones, the most probable values minimize
     (y - f(z))^T C^-1 (y - f(z)) + z^T z,
 
 and the inverse of J^T C^-1 J + 1 there, J = df/dz, is the covariance of z (Tarantola, Inverse
-Problem Theory, SIAM 2005, section 3.2). If model and errors are as stated, the least value itself
-is chi-square distributed with as many degrees of freedom as there are samples: a model that lacks
-something is found out by it.
+Problem Theory, SIAM 2005, section 3.2).
 
 C holds what is off about a force, each with its own reach:
 
@@ -20,6 +18,13 @@ C holds what is off about a force, each with its own reach:
     a touch    the vademecum's own error at that place, and by how much the surface lies deeper or
                higher than in the model, times d ln F / d depth
     all        the mesh that all forces share
+
+The vademecum's error has long tails: at few places it is many times what it is elsewhere. It is
+taken for Student's t with nu degrees of freedom, as a touch that is d deviations off having an
+error whose variance is (nu + d^2) / (nu + 1) times the stated one (Lange, Little & Taylor, J. Am.
+Stat. Assoc. 84:881, 1989). If model and errors are as stated, the normal scores of all d are
+chi-square distributed together, and neighbours deviate no more alike than others: a model that
+lacks something is found out by the one or the other.
 """
 
 from __future__ import annotations
@@ -30,8 +35,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 from scipy.stats import chi2
+from scipy.stats import t as student_t
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.contact.layout import lay_out
@@ -50,6 +56,8 @@ _N_WEIGHTINGS = 4  # by the forces that the last one expects
 _FARTHEST = 4.0  # deviations from what was known, of the values that are tried
 _UNKNOWN = 0.1  # error of a force whose place was never certified
 _LEAST_TOUCHES = 3
+_AROUND, _N_PERMUTED = 30e-3, 1999  # neighbours of a touch [m]; permutations of all touches
+_TAIL = 4.0  # degrees of freedom of a vademecum's error over what it states
 
 
 @dataclass(frozen=True)
@@ -102,10 +110,17 @@ class TouchTable:
         """The touch of each sample, shape (n_samples,)."""
         return np.asarray(self.palpation.touch[self.palpation.sampled])
 
-    def covariance(self, errors: Errors, log_force: FloatArray) -> FloatArray:
-        """C at forces that are expected, shape (n_samples, n_samples)."""
+    def covariance(
+        self, errors: Errors, log_force: FloatArray, inflated: FloatArray | None = None
+    ) -> FloatArray:
+        """C at forces that are expected, shape (n_samples, n_samples).
+
+        inflated : (n_touches,) factor on the variance of the vademecum's own error at each touch
+        """
         same = (self.touch[:, None] == self.touch).astype(float)
         moved, own = errors.depth * self.steepness, self.error
+        if inflated is not None:
+            own = own * np.sqrt(inflated[self.touch])
         sensor = np.hypot(errors.sensor, errors.least * np.exp(-log_force))
         touches = same * (np.outer(moved, moved) + np.outer(own, own))
         return np.asarray(np.diag(sensor**2) + touches + errors.mesh**2)
@@ -267,22 +282,53 @@ def calibrated(
         return np.r_[solve_triangular(root, misfit, lower=True), z]
 
     # By the measured forces, those that noise made small would count less than those it made large.
-    expected, at = table.measured, np.zeros(len(names))
+    expected, at, inflated = table.measured, np.zeros(len(names)), None
     for _ in range(_N_WEIGHTINGS):
-        covariance = table.covariance(errors, expected)
-        root = np.linalg.cholesky(covariance)
+        root = np.linalg.cholesky(table.covariance(errors, expected, inflated))
         best = least_squares(whitened, at, bounds=(-_FARTHEST, _FARTHEST), jac="3-point")
         at, expected = best.x, computed(best.x)
-    left = table.measured - expected
+        left = table.measured - expected
+        deviations = _deviations(table.touch, left, table.covariance(errors, expected))
+        inflated = (_TAIL + deviations**2) / (_TAIL + 1.0)
     return Calibration(
         known,
         names,
         np.asarray(at),
         np.linalg.inv(best.jac.T @ best.jac),
         left,
-        _deviations(table.touch, left, covariance),
-        float(chi2.sf(2.0 * best.cost, len(left))),
+        deviations,
+        _chance(deviations, _places(table.palpation), len(names)),
     )
+
+
+def _chance(deviations: FloatArray, tips: FloatArray, n_parameters: int) -> float:
+    """Probability of deviations as large, or as alike between neighbours, as these."""
+    scores = ndtri(student_t.cdf(-np.abs(deviations), _TAIL))  # parameters fit some away
+    large = float(chi2.sf((scores**2).sum(), max(len(deviations) - n_parameters, 1)))
+    return min(1.0, 2.0 * min(large, _alike(deviations, tips)))
+
+
+def _alike(deviations: FloatArray, tips: FloatArray) -> float:
+    """Probability, over permutations, that neighbours deviate as alike as they do.
+
+    By Moran's I with weights exp(-r^2 / r0^2) (Moran, Biometrika 37:17, 1950). The vademecum's own
+    error differs from place to place; what the model lacks makes all touches around it deviate to
+    one side.
+    """
+    square = ((tips[:, None] - tips) ** 2).sum(axis=-1)
+    near = np.exp(-square / _AROUND**2)
+    np.fill_diagonal(near, 0.0)
+    centred = ndtri(student_t.cdf(deviations - np.median(deviations), _TAIL))
+    rng = np.random.default_rng(0)
+    drawn = np.array([rng.permutation(centred) for _ in range(_N_PERMUTED)])
+    chance = np.einsum("pi,ij,pj->p", drawn, near, drawn)
+    return float((1 + (chance >= centred @ near @ centred).sum()) / (1 + _N_PERMUTED))
+
+
+def _places(palpation: Palpation) -> FloatArray:
+    """Where each touch was deepest, shape (n_touches, 3) [m]."""
+    last = np.searchsorted(palpation.touch, np.arange(palpation.n_touches), side="right") - 1
+    return palpation.tip[last]
 
 
 def _deviations(touch: np.ndarray, misfit: FloatArray, covariance: FloatArray) -> FloatArray:
