@@ -52,23 +52,42 @@ class ForceTable:
     def force(self, values: Mapping[str, FloatArray]) -> FloatArray:
         """At values of all coordinates and "young", each (n,): (n, n_places, n_depths) [N]."""
         softer = np.log(np.asarray(values["young"]) / self.young)
-        found = np.tensordot(self._weights(values), self.log_force, 1)
+        found = np.tensordot(weights_at(self.coordinates, self.young, values), self.log_force, 1)
         return np.asarray(np.exp(found + softer[:, None, None]))
 
     def moved(self, values: Mapping[str, FloatArray]) -> FloatArray:
         """Displacement of the target at these values, of that shape [m]; it knows no E."""
-        return np.asarray(np.exp(np.tensordot(self._weights(values), self.log_moved, 1)))
+        weights = weights_at(self.coordinates, self.young, values)
+        return np.asarray(np.exp(np.tensordot(weights, self.log_moved, 1)))
 
-    def _weights(self, values: Mapping[str, FloatArray]) -> FloatArray:
-        """Of the points, shape (n, n_points)."""
-        weights = np.ones((len(np.asarray(values["young"])), 1))
-        for coordinate in self.coordinates:
-            at = np.asarray(values[coordinate.name])
-            if coordinate.kind == "support":  # far from all else it changes little: the ends do
-                at = np.clip(at * self.young / values["young"], coordinate.low, coordinate.high)
-            own = _lagrange([coordinate.fraction(float(v)) for v in at])
-            weights = (weights[:, :, None] * own[:, None, :]).reshape(len(own), -1)
-        return weights
+
+def grid_points(
+    coordinates: Sequence[Coordinate], n_points: int = N_POINTS
+) -> list[dict[str, float]]:
+    """Values of coordinates, by name, at Chebyshev's points, ``n_points`` for each."""
+    grids = product(*([c.value_at(t) for t in _points(n_points)] for c in coordinates))
+    return [dict(zip([c.name for c in coordinates], point, strict=True)) for point in grids]
+
+
+def weights_at(
+    coordinates: Sequence[Coordinate],
+    young: float,
+    values: Mapping[str, FloatArray],
+    n_points: int = N_POINTS,
+) -> FloatArray:
+    """Weights of :func:`grid_points` at some values, shape (n, n_points ** n_coordinates).
+
+    young : Young's modulus of the points [Pa]
+    values : of these coordinates and "young", each (n,)
+    """
+    weights = np.ones((len(np.asarray(values["young"])), 1))
+    for coordinate in coordinates:
+        at = np.asarray(values[coordinate.name])
+        if coordinate.kind == "support":  # far from all else it changes little: the ends do
+            at = np.clip(at * young / values["young"], coordinate.low, coordinate.high)
+        own = _lagrange([coordinate.fraction(float(v)) for v in at], n_points)
+        weights = (weights[:, :, None] * own[:, None, :]).reshape(len(own), -1)
+    return weights
 
 
 def force_table(
@@ -94,17 +113,16 @@ def force_table(
     """
     parametric = vademecum.parametric
     coordinates = parametric.coordinates if parametric else ()
-    grids = product(*([c.value_at(t) for t in _points()] for c in coordinates))
-    names, force, moved = [c.name for c in coordinates], [], []
-    n_points = N_POINTS ** len(coordinates)
+    points = grid_points(coordinates)
+    force, moved = [], []
     young = parametric.young_modulus if parametric else vademecum.material.young_modulus
     reference = {"young": young} if parametric else {}
-    for done, point in enumerate(grids):
-        here = at_values(vademecum, reference | dict(zip(names, point, strict=True)))
+    for done, point in enumerate(points):
+        here = at_values(vademecum, reference | point)
         found = _pressed(here, tip, places, depths)
         force.append(found)
         moved.append(found * _motion(here, places, target)[:, None])
-        progress(done + 1, n_points)
+        progress(done + 1, len(points))
     least = np.finfo(float).tiny  # where the target is clamped
     return ForceTable(coordinates, young, np.log(force), np.log(np.maximum(moved, least)))
 
@@ -143,17 +161,17 @@ def _motion(vademecum: Vademecum, places: Sequence[int], target: int) -> FloatAr
     return np.array(found)
 
 
-def _points() -> FloatArray:
+def _points(n: int) -> FloatArray:
     """Chebyshev's points of the first kind on 0 to 1, ascending."""
-    angles = np.pi * (np.arange(N_POINTS) + 0.5) / N_POINTS
+    angles = np.pi * (np.arange(n) + 0.5) / n
     return np.asarray(0.5 - 0.5 * np.cos(angles))
 
 
-def _lagrange(fractions: Sequence[float]) -> FloatArray:
-    """Weights of Chebyshev's points at some places of the range, shape (n, N_POINTS)."""
-    nodes, at = _points(), np.asarray(fractions)[:, None]
+def _lagrange(fractions: Sequence[float], n: int) -> FloatArray:
+    """Weights of n Chebyshev points at some places of the range, shape (n_places, n)."""
+    nodes, at = _points(n), np.asarray(fractions)[:, None]
     columns = []
-    for n in range(N_POINTS):
-        others = np.delete(nodes, n)
-        columns.append(np.prod((at - others) / (nodes[n] - others), axis=1))
+    for k in range(n):
+        others = np.delete(nodes, k)
+        columns.append(np.prod((at - others) / (nodes[k] - others), axis=1))
     return np.stack(columns, axis=1)
