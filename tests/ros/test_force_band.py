@@ -1,13 +1,15 @@
 """Bands of the force: what the loop sends, what is prepared for it, and what the page makes of it.
 
-The loop is stepped by hand; the node itself is in test_uncertainty.
+The loop is stepped by hand; how a running node takes the parameter is in test_uncertainty.
 """
 
 from __future__ import annotations
 
+import json
 import tracemalloc
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel
 from avatar_ros.loop.safety import Safety, band_topics
+from avatar_ros.loop.settings import CHANGEABLE, CONTACT
 from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.prepare.bands import BandPreparer, usable_known
 from geometry_msgs.msg import WrenchStamped
@@ -34,6 +37,7 @@ from avatar_core.uncertainty.force_ratios import DEPTHS
 from avatar_core.uncertainty.known import Held
 from avatar_core.vademecum.at_values import at_values
 from tests.core.soft_organ import soft_organ
+from tests.ros.refusals import refusal
 from tests.ros.test_poses import OK, Bench, Queue, bench, pose
 
 pytestmark = pytest.mark.ros
@@ -267,3 +271,19 @@ def test_a_known_value_counts_as_any_other(organ: Any) -> None:
     young = {"young": Fixed(3.0 * organ.material.young_modulus)}
     _, arrays, _ = BandPreparer().prepare(default_spec(organ, (TIP,)), mappings(young))
     np.testing.assert_allclose(arrays[RATIO], np.log(3.0), atol=1e-5)
+
+
+# --- the node ----------------------------------------------------------------------------------
+
+
+def test_a_node_does_not_start_with_a_file_that_is_not_there() -> None:
+    assert "parameter uncertainty: cannot read" in refusal("contact", "uncertainty:=/no/such.yaml")
+    assert "come with avatar" in refusal("contact", "uncertainty:=spleen")
+
+
+def test_it_starts_though_a_file_of_the_last_run_is_gone(tmp_path: Path) -> None:
+    started = {p.name: p.default for p in CONTACT if p.name in CHANGEABLE} | {"scene": ""}
+    changed = {"uncertainty": str(tmp_path / "gone.yaml")}
+    saved = json.dumps({"started": started, "changed": changed})
+    (tmp_path / "contact.json").write_text(saved)
+    assert refusal("contact", f"state_dir:={tmp_path}") == ""

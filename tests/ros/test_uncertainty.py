@@ -17,7 +17,6 @@ from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.msg import Log, Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 
-from tests.ros.refusals import refusal
 from tests.ros.test_cell import Hand, _force, _stamp
 from tests.ros.test_material import _set, _set_back, _settled, _until, _use, hand, nodes, soft_organ
 from tests.slowness import Deadline
@@ -179,8 +178,3 @@ def test_what_the_next_organ_lacks_is_said_and_the_rest_used(
     ears.heard["force_low"].clear()
     ears.band(lambda _, band: np.allclose(band, soft, rtol=0.01))
     probe.node.destroy_subscription(log)
-
-
-def test_a_node_does_not_start_with_a_file_that_is_not_there() -> None:
-    assert "parameter uncertainty: cannot read" in refusal("contact", "uncertainty:=/no/such.yaml")
-    assert "come with avatar" in refusal("contact", "uncertainty:=spleen")
