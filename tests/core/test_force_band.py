@@ -115,6 +115,24 @@ def test_edges_are_those_of_tips_pressed_anywhere(organ: Vademecum, tip: Tip) ->
     np.testing.assert_allclose(found, truth, rtol=0.03)
 
 
+def test_a_tip_over_a_tumour_feels_its_modulus(organ: Vademecum) -> None:
+    """Half of the energy under each tip is the tumour's, six times as stiff as the organ; or none
+    of it: what that makes of the force, in a step and as it is prepared."""
+    field, soft = organ.tip_field, at_values(organ, {"contrast": 6.0})
+    points, normals = organ.surface.centers, organ.surface.normals
+    places, found, prepared = inner_positions(organ)[::60], [], []
+    for part in (0.5, 0.0):
+        under = np.full(field.distance.shape, part, np.float32)
+        v = replace(soft, tip_field=field._replace(tumour=under))
+        model = model_of(v, SPHERE)
+        found.append([press(model, SPHERE, points[j], normals[j], DEPTHS[1]) for j in places])
+        prepared.append(np.exp(log_forces(v, [SPHERE])[0, places, 1]))
+    stiffer = np.divide(*found)
+    assert (stiffer > 1.05).all()
+    # a step's depth is that below the smooth surface
+    np.testing.assert_allclose(np.divide(*prepared), stiffer, rtol=0.04)
+
+
 @pytest.mark.parametrize("tip", [SPHERE, PATCH, Tip("flat", 4e-3), Tip("cone", 4e-3, 30.0)])
 def test_young_alone_scales_every_force(phantom_vademecum: Vademecum, tip: Tip) -> None:
     v, factor = phantom_vademecum, 1.4
