@@ -56,8 +56,9 @@ def uncertainty(
     from tqdm import tqdm
 
     from avatar_core.geometry.tip import Tip
-    from avatar_core.uncertainty.bands import bands_of, known_of
+    from avatar_core.uncertainty.bands import bands_of
     from avatar_core.uncertainty.force_table import force_table
+    from avatar_core.uncertainty.known import known_of
     from avatar_core.uncertainty.report import picture, rows, say
     from avatar_core.vademecum.storage import load_vademecum
 

@@ -1,4 +1,4 @@
-"""Opening files of unknown origin: regular files only, of limited size.
+"""Opening files of unknown origin, regular files only, of limited size; and finding our own.
 
 A path may name something else between the check and the opening, so the open descriptor is checked
 again; opening never blocks.
@@ -41,7 +41,7 @@ def opened(path: Path, max_bytes: int) -> Iterator[BinaryIO]:
         if not stat.S_ISREG(status.st_mode):
             raise FileError("not a file")
         if status.st_size > max_bytes:
-            raise FileError(f"{status.st_size / 1e6:.0f} MB, more than {max_bytes / 1e6:.0f}")
+            raise FileError(f"{status.st_size / 1e6:.6g} MB, more than {max_bytes / 1e6:.6g}")
         yield source
 
 
@@ -55,6 +55,20 @@ def content_of(source: BinaryIO) -> bytes:
     if len(content) > size:
         raise FileError("it grows while it is read")
     return content
+
+
+def shipped(folder: str) -> dict[str, Path]:
+    """The YAML files in a folder of ``params``, by name without suffix; sorted.
+
+    They lie in ``params`` of a checkout, or below the prefix that pip or colcon installed this
+    package into.
+    """
+    here, own = Path(__file__).resolve(), Path("params", folder)
+    installed = [prefix / "share" / "avatar_ros" / own for prefix in here.parents]
+    for found in (here.parents[2] / own, *installed):
+        if found.is_dir():
+            return {path.stem: path for path in sorted(found.glob("*.yaml"))}
+    return {}
 
 
 def _reason(error: OSError | ValueError) -> str:

@@ -169,6 +169,14 @@ def option_of(name: str) -> str:
     return f"--support {name.removeprefix(SUPPORT)}" if is_support else f"--coordinate {name}"
 
 
+def fixed_support(name: str, young: float) -> CoordinateError:
+    """That a support is no coordinate, and with it Young's modulus [Pa] cannot be chosen."""
+    return CoordinateError(
+        f"support {name} is fixed, and with it Young's modulus at {young:g} Pa; build with "
+        f"--support {name}=LOW:HIGH to choose both"
+    )
+
+
 def stiffness_of(values: Mapping[str, float]) -> dict[str, float]:
     """Of supports, by their own names, among values by name of a coordinate [N/m^3]."""
     return {n.removeprefix(SUPPORT): k for n, k in values.items() if n.startswith(SUPPORT)}

@@ -15,6 +15,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import yaml
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
+from avatar_core.common.files import shipped
 from avatar_core.common.quantities import check_line, is_whole, lies_in
 from avatar_core.contact.effects import EFFECTS, Effect, Viscoelasticity
 from avatar_core.errors import SceneError
@@ -41,23 +42,14 @@ SECTIONS = {
     "material": ("young_modulus", "poisson_ratio", "supports"),
     "outputs": ("cloud", "cloud_divisor", "modes"),
 }
-SHIPPED = Path("params") / "scenes"  # in a checkout; installed below share/avatar_ros
+SHIPPED = "scenes"  # folder of those that come with the project
 _OLD_TIP = "tip_radius"  # a key of earlier versions
 _KEYS = ("name", "text", "organ", "material", "tools", "outputs", "effects")
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Files of the scenes that come with the project, by name without suffix; sorted.
-
-    They lie in ``params/scenes`` of a checkout, or below the prefix that pip or colcon installed
-    this package into.
-    """
-    here = Path(__file__).resolve()
-    installed = [prefix / "share" / "avatar_ros" / SHIPPED for prefix in here.parents]
-    for folder in (here.parents[2] / SHIPPED, *installed):
-        if folder.is_dir():
-            return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-    return {}
+    """Files of the scenes that come with the project, by name without suffix; sorted."""
+    return shipped(SHIPPED)
 
 
 def shipped_scene(name: str) -> Path:
@@ -68,13 +60,13 @@ def shipped_scene(name: str) -> Path:
     SceneError
         If there is no such scene, or the name is a path; lists the scenes there are.
     """
-    shipped = shipped_scenes()
-    if (stem := name.removesuffix(".yaml")) not in shipped:
+    known = shipped_scenes()
+    if (stem := name.removesuffix(".yaml")) not in known:
         raise SceneError(
             f"there is no scene {name!r}; choose one of those that come with avatar: "
-            f"{', '.join(shipped) or 'none is installed'}"
+            f"{', '.join(known) or 'none is installed'}"
         )
-    return shipped[stem]
+    return known[stem]
 
 
 def scene_path(name: str) -> Path:

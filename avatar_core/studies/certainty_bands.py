@@ -27,9 +27,10 @@ from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.report import Panel
 from avatar_core.studies.study import ProgressBar, Value, follow
-from avatar_core.uncertainty.bands import HIGH, LOW, bands_of, drawn, known_of
+from avatar_core.uncertainty.bands import HIGH, LOW, bands_of, drawn
 from avatar_core.uncertainty.distributions import Distribution, Lognormal, Uniform
 from avatar_core.uncertainty.force_table import force_table
+from avatar_core.uncertainty.known import known_of
 from avatar_core.vademecum.model import Vademecum
 
 if TYPE_CHECKING:

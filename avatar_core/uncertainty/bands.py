@@ -14,12 +14,8 @@ import numpy as np
 from scipy.stats import qmc, sobol_indices
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.common.supports import SUPPORT
-from avatar_core.errors import CoordinateError
-from avatar_core.uncertainty.distributions import Distribution, Fixed, within
+from avatar_core.uncertainty.distributions import Distribution, Fixed
 from avatar_core.uncertainty.force_table import ForceTable
-from avatar_core.vademecum.at_values import at_values
-from avatar_core.vademecum.model import Vademecum
 
 LOW, HIGH = 0.05, 0.95  # the probabilities of a band's edges
 _INDEX_DRAWS = 1024  # for each parameter, a power of two
@@ -36,57 +32,6 @@ class Bands:
     force: FloatArray
     moved: FloatArray
     shares: Mapping[str, FloatArray]
-
-
-def known_of(vademecum: Vademecum, given: Mapping[str, Distribution]) -> dict[str, Distribution]:
-    """A distribution of every coordinate and of "young", within what the vademecum holds.
-
-    What is not given has the vademecum's own value.
-
-    Raises
-    ------
-    CoordinateError
-        For a parameter that the vademecum does not have, or a distribution beyond its range.
-    """
-    coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
-    names = ["young", *(c.name for c in coordinates)]
-    for name in given:
-        if name not in names:
-            raise CoordinateError(
-                f"this vademecum has no '{name}' but {', '.join(names)}; build it with "
-                f"--coordinate {name}=LOW:HIGH"
-            )
-    own, found = _own_values(vademecum), {}
-    found["young"] = given.get("young", Fixed(own["young"]))
-    if found["young"].cdf(0.0) > 0.0:
-        raise CoordinateError(
-            f"young ({found['young'].said()}) may be negative; give positive values"
-        )
-    median = float(found["young"].ppf(np.array(0.5)))
-    if any(SUPPORT + support.name not in names for support in vademecum.supports):
-        at_values(vademecum, {"young": median})  # which a fixed support may forbid
-    for c in coordinates:
-        # The stiffness of supports counts over Young's modulus.
-        scale = median / _reference(vademecum) if c.kind == "support" else 1.0
-        whole = given.get(c.name, Fixed(own[c.name]))
-        found[c.name] = within(c.name, whole, scale * c.low, scale * c.high)
-    return found
-
-
-def _own_values(vademecum: Vademecum) -> dict[str, float]:
-    material = vademecum.material
-    return {
-        "young": material.young_modulus,
-        "poisson": material.poisson_ratio,
-        "contrast": vademecum.contrast or 1.0,
-        **{SUPPORT + support.name: support.stiffness for support in vademecum.supports},
-    }
-
-
-def _reference(vademecum: Vademecum) -> float:
-    """Young's modulus for which the ranges of supports are stated [Pa]."""
-    parametric = vademecum.parametric
-    return parametric.young_modulus if parametric else vademecum.material.young_modulus
 
 
 def drawn(known: Mapping[str, Distribution], n: int, seed: int) -> dict[str, FloatArray]:

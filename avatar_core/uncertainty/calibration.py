@@ -264,7 +264,7 @@ def calibrated(
 ) -> Calibration:
     """The posterior of all parameters that are not fixed.
 
-    known : of every coordinate and "young", as :func:`avatar_core.uncertainty.bands.known_of` gives
+    known : of every coordinate and "young", as :func:`avatar_core.uncertainty.known.known_of` gives
     """
     names = tuple(name for name, one in known.items() if not isinstance(one, Fixed))
     errors = errors or Errors()

@@ -7,18 +7,22 @@ each of its coordinates, and of Young's modulus, what is known.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import yaml
-from scipy.special import ndtr, ndtri
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.common.files import FileError, content_of, opened, shipped
 from avatar_core.errors import CoordinateError
 
 LEAST_INSIDE = 0.9  # of a distribution's probability that a vademecum's range must hold
+MAX_BYTES = 16_000  # of a file of distributions
+SHIPPED = "uncertainty"  # folder of those that come with the project
 
 
 class Distribution(Protocol):
@@ -111,12 +115,16 @@ class Lognormal:
             )
 
     def ppf(self, probability: FloatArray) -> FloatArray:
+        # Here, because the contact node needs none of it.
+        from scipy.special import ndtri
+
         return np.asarray(self.median * self.factor ** ndtri(probability))
 
     def cdf(self, value: float) -> float:
         if value <= 0.0:
             return 0.0
-        return float(ndtr(math.log(value / self.median) / math.log(self.factor)))
+        deviations = math.log(value / self.median) / math.log(self.factor)
+        return 0.5 * math.erfc(-deviations / math.sqrt(2.0))
 
     def said(self, unit: str = "") -> str:
         return f"{self.median:g}{unit}, give or take a factor of {self.factor:g}"
@@ -192,31 +200,74 @@ def within(name: str, whole: Distribution, low: float, high: float) -> Distribut
 _WRITTEN = "write young: {lognormal: {median: 5.0e+3, factor: 1.5}}"
 
 
+def distribution_file(value: str) -> Path:
+    """The file that a text names: a path if it has a /, else one that comes with the project.
+
+    Raises
+    ------
+    CoordinateError
+        If none of that name comes with it; lists those that do.
+    """
+    if "/" in value:
+        return Path(value).expanduser().absolute()
+    known = shipped(SHIPPED)
+    if (stem := value.removesuffix(".yaml")) not in known:
+        raise CoordinateError(
+            f"no distributions {value!r} come with avatar; give a path with a /, or one of "
+            f"{', '.join(known) or 'none: none is installed'}"
+        )
+    return known[stem]
+
+
 def read_distributions(file: Path) -> dict[str, Distribution]:
     """What a YAML file says of parameters, by name; see ``params/uncertainty``.
 
     Raises
     ------
     CoordinateError
-        For a file that cannot be read or says something else.
+        For a file that cannot be read, has more than ``MAX_BYTES`` or says something else.
     """
     try:
-        told = yaml.safe_load(file.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        with opened(file, MAX_BYTES) as source:
+            told = yaml.safe_load(content_of(source).decode())
+    except (FileError, yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise CoordinateError(f"cannot read distributions from {file}: {reason}") from error
     if not isinstance(told, dict) or not told:
         raise CoordinateError(f"{file} names no parameter; {_WRITTEN}")
-    return {str(name): _of_mapping(file, name, one) for name, one in told.items()}
+    return of_mappings(told, str(file))
 
 
-def _of_mapping(file: Path, name: object, told: object) -> Distribution:
+def of_mappings(told: Mapping[Any, Any], origin: str) -> dict[str, Distribution]:
+    """Distributions by name of the parameter, of what a file of them consists of.
+
+    Raises
+    ------
+    CoordinateError
+        For what is no distribution, naming ``origin`` and the parameter.
+    """
+    return {str(name): _of_mapping(origin, name, one) for name, one in told.items()}
+
+
+def mappings(known: Mapping[str, Distribution]) -> dict[str, dict[str, Any]]:
+    """The inverse of :func:`of_mappings`, of distributions that are not cut off."""
+    found = {}
+    for name, one in known.items():
+        kind = next(kind for kind, made in _KINDS.items() if isinstance(one, made))
+        found[name] = {kind: one.value if isinstance(one, Fixed) else asdict(one)}  # type: ignore[call-overload]
+    return found
+
+
+def _of_mapping(origin: str, name: object, told: object) -> Distribution:
     if isinstance(told, dict) and len(told) == 1:
         ((kind, values),) = told.items()
         names = _NUMBERS.get(kind, ())
         values = {"value": values} if kind == "fixed" else values
-        if isinstance(values, dict) and tuple(sorted(values)) == tuple(sorted(names)):
-            numbers = [values[field] for field in names]
-            if all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
-                return _KINDS[kind](*map(float, numbers))
-    raise CoordinateError(f"{file}: '{name}' is not understood; {_WRITTEN}")
+        if isinstance(values, dict) and set(values) == set(names) and _are_finite(values):
+            return _KINDS[kind](*(float(values[field]) for field in names))
+    raise CoordinateError(f"{origin}: '{name}' is not understood; {_WRITTEN}")
+
+
+def _are_finite(values: Mapping[Any, Any]) -> bool:
+    largest = sys.float_info.max  # whole numbers may be larger than any other
+    return all(type(v) in (int, float) and abs(v) <= largest for v in values.values())

@@ -24,15 +24,15 @@ from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 
-_N_POINTS = {1: 5, 2: 5, 3: 4}  # for each of so many coordinates
-_N_OF_MANY = 3
+N_POINTS = 5  # for each coordinate
+_FEWER, _LEAST = {3: 4}, 3  # for each of three, of more
 
 
 @dataclass(frozen=True)
 class MaterialGrid:
-    """Chebyshev's points of the coordinates of a vademecum.
+    """Chebyshev's points of coordinates of a vademecum.
 
-    coordinates : of the vademecum
+    coordinates : all of the vademecum, or some
     young : Young's modulus at the points, E0 [Pa]
     n_each : points for each coordinate
     """
@@ -48,7 +48,8 @@ class MaterialGrid:
         if parametric is None:
             return cls((), vademecum.material.young_modulus, 1)
         coordinates = parametric.coordinates
-        n_each = _N_POINTS.get(len(coordinates), _N_OF_MANY)
+        n = len(coordinates)
+        n_each = N_POINTS if n < 3 else _FEWER.get(n, _LEAST)
         return cls(coordinates, parametric.young_modulus, n_each)
 
     @property
@@ -56,13 +57,18 @@ class MaterialGrid:
         """Number of points."""
         return self.n_each ** len(self.coordinates)
 
+    def points(self) -> list[dict[str, float]]:
+        """Values of the coordinates, by name, at every point."""
+        fractions = chebyshev_points(self.n_each)
+        grids = product(*([c.value_at(t) for t in fractions] for c in self.coordinates))
+        names = [c.name for c in self.coordinates]
+        return [dict(zip(names, point, strict=True)) for point in grids]
+
     def materials(self, vademecum: Vademecum) -> Iterator[Vademecum]:
         """The vademecum at every point, some tenths of a second each."""
-        names = [c.name for c in self.coordinates]
         reference = {"young": self.young} if self.coordinates else {}
-        fractions = chebyshev_points(self.n_each)
-        for point in product(*([c.value_at(t) for t in fractions] for c in self.coordinates)):
-            yield at_values(vademecum, reference | dict(zip(names, point, strict=True)))
+        for point in self.points():
+            yield at_values(vademecum, reference | point)
 
     def softer(self, values: Mapping[str, FloatArray]) -> FloatArray:
         """E / E0 at values of "young", shape (n,)."""

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from avatar_core.common.supports import SUPPORT
-from avatar_core.uncertainty.bands import known_of
 from avatar_core.uncertainty.distributions import Distribution, Fixed, LogUniform, Uniform
+from avatar_core.uncertainty.known import Held
 from avatar_core.vademecum.model import Vademecum
 
 # From the softest livers of elastography to twice the 170 kPa of the paper.
@@ -26,20 +25,16 @@ def priors_of(
     Raises
     ------
     CoordinateError
-        As :func:`avatar_core.uncertainty.bands.known_of`.
+        As :meth:`avatar_core.uncertainty.known.Held.known`.
     """
-    given = given or {}
-    parametric = vademecum.parametric
-    coordinates = parametric.coordinates if parametric else ()
-    reference = parametric.young_modulus if parametric else vademecum.material.young_modulus
-    names = {c.name for c in coordinates}
-    held = any(SUPPORT + support.name not in names for support in vademecum.supports)
-    wide: dict[str, Distribution] = {"young": Fixed(reference) if held else YOUNG}
+    given, held = given or {}, Held.by(vademecum)
+    own = Fixed(held.own["young"])
+    wide: dict[str, Distribution] = {"young": own if held.fixed else YOUNG}
     young = given.get("young", wide["young"])
-    for c in coordinates:
+    for c in held.coordinates:
         if c.kind == "poisson":
             wide[c.name] = Uniform(c.low, c.high)
             continue
-        scale = float(young.ppf(np.array(0.5))) / reference if c.kind == "support" else 1.0
+        scale = float(young.ppf(np.array(0.5))) / held.reference if c.kind == "support" else 1.0
         wide[c.name] = LogUniform(scale * c.low, scale * c.high)
-    return known_of(vademecum, wide | dict(given))
+    return held.known(wide | dict(given))

@@ -12,12 +12,19 @@ from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import CoordinateError
 from avatar_core.fem.elasticity import Material, factors_at
 from avatar_core.fem.supports import with_stiffness
-from avatar_core.reduction.coordinates import Coordinate, node_weights, require_known, stiffness_of
+from avatar_core.reduction.coordinates import (
+    Coordinate,
+    fixed_support,
+    node_weights,
+    require_known,
+    stiffness_of,
+)
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.parametric import (
     combined,
     galerkin_field,
+    galerkin_load,
     regional_load_of_basis,
     stiffness_root,
 )
@@ -82,6 +89,43 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     return _with_young_modulus(found, material)
 
 
+def own_compliance_at(vademecum: Vademecum, values: Mapping[str, float]) -> np.ndarray:
+    """Contact compliance at each load position of a load there, (n_positions, 3, 3) [m/N].
+
+    As of :func:`at_values` at the Young's modulus for which the coordinates are computed, without
+    what does not belong to it: a small part of the time.
+
+    Parameters
+    ----------
+    values : of all coordinates, by name; within their ranges
+    """
+    parametric, near = vademecum.parametric, vademecum.contact_near
+    own = np.flatnonzero(near.position == near.target)
+    if parametric is None:
+        return own_compliance(vademecum)
+    poisson = values.get("poisson", vademecum.material.poisson_ratio)
+    material = replace(
+        vademecum.material, young_modulus=parametric.young_modulus, poisson_ratio=poisson
+    )
+    supports = with_stiffness(vademecum.supports, stiffness_of(values))
+    factors = factors_at(material, values.get("contrast", vademecum.contrast), supports)
+    load = galerkin_load(parametric, stiffness_root(parametric, factors))
+    weights = node_weights(parametric.coordinates, values)
+    return _own_compliance(load, combined(parametric.contact_near[:, own], weights))
+
+
+def own_compliance(vademecum: Vademecum) -> np.ndarray:
+    """The same of a vademecum at the values that it has, (n_positions, 3, 3) [m/N]."""
+    near = vademecum.contact_near
+    return _own_compliance(vademecum.contact_load, near.block[near.position == near.target])
+
+
+def _own_compliance(load: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """Y_j Y_j^T + the near block of j with itself."""
+    rows = load.reshape(len(block), 3, -1)
+    return np.asarray(rows @ rows.swapaxes(1, 2) + block)
+
+
 def ranges(vademecum: Vademecum) -> dict[str, tuple[float, float]]:
     """Lowest and highest value of each coordinate, by name, if no other is changed.
 
@@ -108,11 +152,7 @@ def _require_free(vademecum: Vademecum, coordinates: Sequence[Coordinate]) -> No
     names = [c.name for c in coordinates]
     for support in vademecum.supports:
         if SUPPORT + support.name not in names:
-            raise CoordinateError(
-                f"support {support.name} is fixed, and with it Young's modulus at "
-                f"{vademecum.material.young_modulus:g} Pa; build with --support "
-                f"{support.name}=LOW:HIGH to choose both"
-            )
+            raise fixed_support(support.name, vademecum.material.young_modulus)
 
 
 def _require_in_range(

@@ -83,13 +83,19 @@ def galerkin_field(
     body : of the global modes; None for modes of surface loads alone
     """
     basis, body, n = parametric.basis, parametric.body, parametric.n_global
-    load = scipy.linalg.solve_triangular(root, basis.load.T, lower=True)[: parametric.rank].T
+    load = galerkin_load(parametric, root)
     first = root[:n, :n]
     space = scipy.linalg.solve_triangular(first, basis.space[:, :n].T, lower=True).T
     if body is not None:
         inverse = scipy.linalg.solve_triangular(first, np.eye(n), lower=True).T
         body = BodyResponse(body.mass[:n, :n], body.weight[:n]).mixed(inverse)
     return SeparatedField(space, load[:, :n]), load[:, n:], body
+
+
+def galerkin_load(parametric: ParametricResponse, root: np.ndarray) -> np.ndarray:
+    """Y(s) of the contact compliance, shape (3 n_positions, rank); ``root`` as above."""
+    load = scipy.linalg.solve_triangular(root, parametric.basis.load.T, lower=True)
+    return np.asarray(load[: parametric.rank].T)
 
 
 def regional_load_of_basis(

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from avatar_core.cli import main as cli
+from avatar_core.common import files
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.effects import Respiration
 from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import middle_of_access, push_and_slide
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
-from avatar_core.scene import file as scene_file
 from avatar_core.scene.file import read_scene, scene_path, shipped_scene, shipped_scenes
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.studies.bench import scene as bench_scene
@@ -64,7 +64,7 @@ def test_shipped_scenes_are_found_where_they_are_installed(
 ) -> None:
     package = tmp_path / "lib" / "python3" / "site-packages" / "avatar_core"
     package.mkdir(parents=True)
-    monkeypatch.setattr(scene_file, "__file__", str(package / "scene" / "file.py"))
+    monkeypatch.setattr(files, "__file__", str(package / "common" / "files.py"))
     assert shipped_scenes() == {}
     folder = tmp_path / "share" / "avatar_ros" / "params" / "scenes"
     folder.mkdir(parents=True)

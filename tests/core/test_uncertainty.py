@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,17 +20,21 @@ from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.tip import Tip
 from avatar_core.geometry.tumour import volume_fraction_inside
 from avatar_core.reduction.coordinates import problem_at
-from avatar_core.uncertainty.bands import Bands, bands_of, drawn, known_of
+from avatar_core.uncertainty.bands import Bands, bands_of, drawn
 from avatar_core.uncertainty.distributions import (
     Distribution,
     Fixed,
     Lognormal,
     Uniform,
+    distribution_file,
+    mappings,
+    of_mappings,
     parse,
     read_distributions,
     within,
 )
 from avatar_core.uncertainty.force_table import ForceTable, _pressed, force_table
+from avatar_core.uncertainty.known import known_of
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
@@ -110,7 +115,11 @@ def test_what_is_no_distribution_is_refused(text: str) -> None:
         "young: {lognormal: {median: 5.0e+3}}",
         "young: {lognormal: {median: soft, factor: 2}}",
         "young: {fixed: true}",
+        "young: {fixed: 1" + 400 * "0" + "}",
+        "young: 2001-13-45",
         "young: [",
+        "young: " + 3000 * "[",
+        "young: {fixed: 5} # " + 16_000 * ".",
     ],
 )
 def test_a_file_that_says_something_else_is_refused(text: str, tmp_path: Path) -> None:
@@ -119,6 +128,26 @@ def test_a_file_that_says_something_else_is_refused(text: str, tmp_path: Path) -
     with pytest.raises(CoordinateError, match=r"known\.yaml") as refused:
         read_distributions(file)
     assert "\n" not in str(refused.value)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "known.yaml")
+    with pytest.raises(CoordinateError, match="not a file"):
+        read_distributions(tmp_path / "known.yaml")
+
+
+def test_what_is_written_reads_back() -> None:
+    known = {**KNOWN, "support.dome": Fixed(1e6)}
+    assert of_mappings(json.loads(json.dumps(mappings(known))), "message") == known
+
+
+def test_a_bare_name_is_that_of_a_shipped_file() -> None:
+    shipped = Path(__file__).parents[2] / "params" / "uncertainty" / "liver.yaml"
+    for name in ("liver", "liver.yaml"):
+        assert distribution_file(name).read_text() == shipped.read_text()
+    assert distribution_file("./liver.yaml") == Path.cwd() / "liver.yaml"
+    with pytest.raises(CoordinateError, match=r"no distributions 'spleen' come .*liver"):
+        distribution_file("spleen")
 
 
 def test_shipped_files_are_understood(phantom_vademecum: Vademecum) -> None:

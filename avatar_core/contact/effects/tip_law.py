@@ -392,12 +392,29 @@ def depths_under_loads(law, curvature, growth, anisotropy, load, depth):  # type
     """delta of the first tip, on surfaces of these shapes, for F / E* [m^2]; all (n,), the last
     is written."""
     for i in range(len(load)):
-        law.value[0, KAPPA], law.value[0, TAU] = curvature[i], growth[i]
-        law.value[0, ANISOTROPY] = anisotropy[i]
-        felt_shape(law, 0)
-        law.place[0] = 0.0
+        _stand_on(law, curvature[i], growth[i], anisotropy[i])
         _find_place(None, law, None, 0, 0.0, 1.0, load[i])
         depth[i] = dent(law, 0)[0]
+
+
+@entry
+def loads_at_depths(law, curvature, growth, anisotropy, softness, depth, load):  # type: ignore[no-untyped-def]
+    """F / E* [m^2] of the first tip at depths [m] below surfaces of these shapes, over an organ
+    that gives way by ``softness`` F / E* beside the dent, E* (gamma - c) [1/m]; all (n,), the last
+    is written."""
+    for i in range(len(load)):
+        _stand_on(law, curvature[i], growth[i], anisotropy[i])
+        _find_place(None, law, None, 0, 1.0, softness[i], depth[i])
+        load[i] = dent(law, 0)[2]
+
+
+@fast
+def _stand_on(law, curvature, growth, anisotropy):  # type: ignore[no-untyped-def]
+    """The first tip over a surface of a shape, not in contact yet."""
+    law.value[0, KAPPA], law.value[0, TAU] = curvature, growth
+    law.value[0, ANISOTROPY] = anisotropy
+    felt_shape(law, 0)
+    law.place[0] = 0.0
 
 
 @inlined

@@ -19,7 +19,8 @@ def main() -> int:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("bare")
     node.create_subscription(PoseStamped, "tool/measured_cp", lambda _: None, qos.NEWEST)
-    node.create_publisher(WrenchStamped, "tool/servo_cf", qos.COMMAND)
+    for topic in ("servo_cf", "force_low", "force_high"):
+        node.create_publisher(WrenchStamped, f"tool/{topic}", qos.COMMAND)
     node.create_publisher(ContactState, "contact_state", qos.state(1))
     node.create_publisher(PointCloud2, "deformation", qos.NEWEST)
     node.create_publisher(LoopStatistics, "statistics", qos.STATISTICS)

@@ -96,6 +96,11 @@ def wrenches(period: float) -> Quality:
     return Quality(COMMAND, period, has_deadline=True)
 
 
+def bands(period: float) -> Quality:
+    """As wrenches, but no deadline is offered."""
+    return Quality(COMMAND, period)
+
+
 def states(n_tools: int, period: float) -> Quality:
     return Quality(state(n_tools), period, (n_tools, 1000))
 

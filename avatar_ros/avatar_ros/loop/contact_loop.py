@@ -9,6 +9,8 @@ of times.
 When a model replaces another, the loop steps both for ``BLEND`` seconds and publishes a mean of
 both whose weight moves linearly from the old model to the new one.
 
+The band of a force is that of the organ's, whatever of it is sent: it is neither limited nor faded.
+
 Before the organ's force is sent to a tool, a guard
 (:mod:`avatar_core.contact.haptics.force_guard`) limits it, fades it out on a fault and lets it come
 back gradually. Stopping the loop counts as a fault.
@@ -26,6 +28,7 @@ import numpy as np
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 from avatar_core.contact import model as contact
+from avatar_core.contact.force_band import ForceBand
 from avatar_core.contact.haptics import passivity
 from avatar_core.contact.haptics.force_guard import ForceGuard
 from avatar_ros.framework import realtime
@@ -54,6 +57,7 @@ class ActiveModel:
 
     effects : names of the effects that it simulates
     shown_modes : which of its modes are shown, and the accuracy promised with them
+    band : of its forces; None without distributions of the material
     """
 
     def __init__(
@@ -63,11 +67,13 @@ class ActiveModel:
         settings: ContactSettings,
         effects: tuple[str, ...] = (),
         shown_modes: ShownModes | None = None,
+        band: ForceBand | None = None,
     ) -> None:
         self.id = vademecum_id
         self.model = model
         self.effects = effects
         self.shown_modes = shown_modes
+        self.band = band
         self.cloud: CloudTemplate | None = None
         if model is not None and len(model.out.cloud) > 0:
             self.cloud = CloudTemplate(settings.frame_id, len(model.out.cloud))
@@ -119,7 +125,8 @@ class ContactLoop:
         self._tips = np.full((len(tools), 3), FAR_AWAY)
         self._rotations = np.zeros((len(tools), 3))
         self._used = self.active  # of the last step
-        self._outgoing: Any = None  # the model that it replaces, while both are stepped
+        self._outgoing: Any = None  # the model that it replaces, while both are stepped,
+        self._outgoing_band: ForceBand | None = None  # and its band
         self._blend = 1.0  # of the model in use, in what is published
         self._part_per_step = 1.0 / max(1, round(BLEND * settings.rate))
         self._wait_set = _rclpy.WaitSet(len(tools), 0, 0, 0, 0, 0, context.handle)
@@ -143,7 +150,7 @@ class ContactLoop:
     def start(self, cpu: int = -1) -> None:
         """Start the thread, bound to a core; -1: any."""
         self._running, self._stopping = True, False
-        self._used, self._outgoing = self.active, None
+        self._used, self._outgoing, self._outgoing_band = self.active, None, None
         self._thread = threading.Thread(target=self._run, args=(cpu,), name="contact loop")
         self._thread.start()
 
@@ -178,7 +185,7 @@ class ContactLoop:
                 self._send_zero()
 
     def _ports(self) -> list[Any]:
-        of_tools = [port for tool in self._tools for port in (tool.subscription, tool.publisher)]
+        of_tools = [port for tool in self._tools for port in tool.ports]
         return [*of_tools, self._publishers.state, self._publishers.deformation]
 
     def _wait(self) -> None:
@@ -225,10 +232,13 @@ class ContactLoop:
         if outgoing is not None:
             self._solve(outgoing)
             self._blend = min(1.0, self._blend + self._part_per_step)
+            self._blend_bands(active.band, self._outgoing_band)
             _fade_in(model.out.force, outgoing.out.force, self._blend)
             _fade_in(model.out.torque, outgoing.out.torque, self._blend)
         self._publish_wrenches(start * 1e-9, model)
         record.note_step(time.monotonic_ns() - start)
+        if active.band is not None:
+            self._publish_bands(active.band)
         if model is not None:
             contact.estimate_error(model)
         for i, tool in enumerate(self._tools):
@@ -245,7 +255,8 @@ class ContactLoop:
             stamp = self._tools[0].stamp
             self._publishers.deformation.handle.publish_raw(active.cloud.serialise(stamp))
         if self._blend == 1.0:
-            self._outgoing = None  # freed outside the loop, by the thread that exchanged the model
+            # Freed outside the loop, by the thread that exchanged the model.
+            self._outgoing = self._outgoing_band = None
 
     def _begin_change(self, active: ActiveModel) -> None:
         """Begin to fade in another model, from the same contacts if the organ is the same.
@@ -257,6 +268,7 @@ class ContactLoop:
             self._blend = 0.0
             if active.id == self._used.id:
                 active.model.resume(outgoing)
+        self._outgoing_band = self._used.band
         self._outgoing, self._used = outgoing, active
 
     def _solve(self, model: Any) -> None:
@@ -267,6 +279,20 @@ class ContactLoop:
             for tool, axis in zip(self._tools, model.axes, strict=True):
                 tool.point(model.shaft, axis)
         contact.solve(model, self._tips)
+
+    def _blend_bands(self, band: ForceBand | None, outgoing: ForceBand | None) -> None:
+        """Fade in the band of a model, of forces that are not faded in yet. Real-time safe."""
+        if band is not None and outgoing is not None:
+            band.update()
+            outgoing.update()
+            _fade_in(band.edges, outgoing.edges, self._blend)
+
+    def _publish_bands(self, band: ForceBand) -> None:
+        """Send both edges of each tool's force, after the force itself. Real-time safe."""
+        if self._outgoing_band is None:
+            band.update()
+        for i, tool in enumerate(self._tools):
+            tool.send_band(band.edges[:, i])
 
     def _idle_period(self, timeout: int) -> int:
         """From step to step without a model; short enough that no pose seems late [ns]."""

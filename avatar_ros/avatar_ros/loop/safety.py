@@ -12,6 +12,7 @@ from avatar_ros.framework.parameters import IDENTITY, Parameter, ParameterError,
 PASSIVITY = ("off", "observe", "control")
 # How a wrench is given, and the topic below that of the tool, as CRTK calls them.
 WRENCHES = {"absolute": "servo_cf", "body": "body/servo_cf", "spatial": "spatial/servo_cf"}
+BAND = ("force_low", "force_high")  # topics of a band's edges, beside that of the wrench
 # What tool_state_command may ask for, and the commands of CRTK that it takes.
 COMMANDS: dict[str, tuple[str, ...]] = {"": (), "enable": ("enable",), "home": ("enable", "home")}
 _DEVICE = "sigma"
@@ -118,6 +119,11 @@ class Safety:
         if self.passivity == "off":
             return None
         return make_passivity(n_tools, self.delay, self.resolution, period)
+
+
+def band_topics(wrench: str) -> tuple[str, ...]:
+    """Topics of the edges of a force's band, for one of ``WRENCHES``; the low edge first."""
+    return tuple(WRENCHES[wrench].replace("servo_cf", edge) for edge in BAND)
 
 
 def chosen_safety(value: dict[str, Any]) -> Safety:

@@ -8,8 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any, get_args
 
 from avatar_core.common.supports import ATTACHMENTS, MOST_STIFFNESS, SUPPORT
-from avatar_core.errors import SceneError
+from avatar_core.errors import CoordinateError, SceneError, one_line
 from avatar_core.geometry.tip import Shape, Tip
+from avatar_core.uncertainty.distributions import (
+    Distribution,
+    distribution_file,
+    read_distributions,
+)
 from avatar_core.vademecum.accuracy import Budget, Cloud, Quantity
 from avatar_ros.framework.parameters import AUTOSTART, FRAME_ID, IDENTITY, Parameter, ParameterError
 from avatar_ros.framework.saved_state import STATE_DIR
@@ -129,6 +134,13 @@ CONTACT = (
         for name in ATTACHMENTS
     ),
     Parameter(
+        "uncertainty",
+        "",
+        "what is known of the material, for NAME/force_low and force_high: a file in "
+        "params/uncertainty, or a path (with a /); empty: no bands",
+        read_only=False,
+    ),
+    Parameter(
         "accuracy.tolerance",
         0.0,
         "relative error that 95 % of touches must not exceed; 0: as exact as the vademecum",
@@ -180,6 +192,7 @@ class ContactSettings:
     parent_frame, parent_transform : for tf2; the pose of the organ's frame there, or an empty name
     material : values chosen, by name of the coordinate; the others are those of the vademecum
     budget : of error and time; None for none
+    known : what is known of the material, by name of the coordinate; empty for no bands
     """
 
     tools: tuple[str, ...]
@@ -199,6 +212,7 @@ class ContactSettings:
     safety: Safety = field(default_factory=Safety)
     parent_frame: str = ""
     parent_transform: tuple[float, ...] = IDENTITY
+    known: dict[str, Distribution] = field(default_factory=dict)
 
 
 def chosen_tips(value: dict[str, Any], n_tools: int) -> tuple[Tip, ...]:
@@ -234,6 +248,19 @@ def _tip(shape: Any, radius: Any, half_angle: Any, rounding: Any) -> Tip:
 def chosen_material(value: dict[str, Any]) -> dict[str, float]:
     """The values of the material that differ from the vademecum's, by coordinate."""
     return {name: value[key] for key, name in MATERIAL.items() if value[key] != 0.0}
+
+
+def chosen_known(value: str) -> dict[str, Distribution]:
+    """What the file that the parameter ``uncertainty`` names says; empty if it names none.
+
+    Raises
+    ------
+    ParameterError : the file is not there, or says something else
+    """
+    try:
+        return read_distributions(distribution_file(value)) if value else {}
+    except CoordinateError as error:
+        raise ParameterError(f"parameter uncertainty: {one_line(error)}") from error
 
 
 def chosen_budget(value: dict[str, Any]) -> Budget | None:

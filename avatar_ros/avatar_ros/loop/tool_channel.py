@@ -17,7 +17,7 @@ from avatar_ros.framework.templates import (
     rotated,
     rotation_between,
 )
-from avatar_ros.loop.safety import WRENCHES, Safety
+from avatar_ros.loop.safety import WRENCHES, Safety, band_topics
 from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.msg import ContactState
 
@@ -44,21 +44,27 @@ _N_STATUS = 32
 
 
 class ToolChannel:
-    """One tool's subscription, publisher and last pose.
+    """One tool's subscription, publishers and last pose.
 
     Poses come in the tool's frame; ``tip`` and ``turn`` of the step are in the organ's.
 
+    band_publishers : of the low and the high edge of the band of its force; may be none
     status : OK with a usable pose, otherwise the reason why there is none
     stamp : of the last valid pose, eight bytes; zero before the first
     publishers : of its poses, as the node last counted them; one that was killed counts for a while
-    listeners : to its wrenches, likewise
+    listeners : to its wrenches, likewise; band_listeners : to their bands
     device : OK if its device takes forces or is not asked, otherwise why it does not; the node's
     operating_state : what its device said last, in words; empty before, the node's likewise
     faults : how often each status was entered since the node started, by its number
     """
 
     def __init__(
-        self, subscription: Any, publisher: Any, frame_id: str, safety: Safety | None = None
+        self,
+        subscription: Any,
+        publisher: Any,
+        frame_id: str,
+        safety: Safety | None = None,
+        band: tuple[Any, ...] = (),
     ) -> None:
         safety = safety or Safety()
         frame = safety.frame or frame_id
@@ -69,9 +75,12 @@ class ToolChannel:
         self.stamp = NO_STAMP
         self.publishers = 0
         self.listeners = 0
+        self.band_listeners = 0
+        self.band_publishers = band
         self.device = OK
         self.operating_state = ""
         self.faults = np.zeros(_N_STATUS, np.int64)
+        self._edges = [WrenchTemplate(frame) for _ in band]
         self._reader = PoseReader(frame)
         self._rotation = _rotation(safety.transform[3:])  # of the tool's frame in the organ's
         self._is_turned = not np.array_equal(self._rotation, np.eye(3))
@@ -87,6 +96,11 @@ class ToolChannel:
         self._orientation: tuple[float, float, float, float] | None = None  # of the last valid pose
         self._kind = safety.wrench
         self._axes = (0.0, 0.0, 0.0, 1.0)  # of the last valid pose, as long as the channel exists
+
+    @property
+    def ports(self) -> tuple[Any, ...]:
+        """Its subscription and publishers."""
+        return (self.subscription, self.publisher, *self.band_publishers)
 
     @property
     def connected(self) -> bool:
@@ -139,7 +153,20 @@ class ToolChannel:
 
     def answer(self) -> None:
         """Send ``wrench``, given in the organ's frame, as the tool takes it. Real-time safe."""
-        force, torque = self.wrench.force, self.wrench.torque
+        self._send(self.publisher, self.wrench)
+
+    def send_band(self, edges: np.ndarray) -> None:
+        """Send both edges of its band, force and torque (2, 6) in the organ's frame, if anybody
+        hears them. Real-time safe."""
+        if self.band_listeners == 0:
+            return
+        for publisher, wrench, edge in zip(self.band_publishers, self._edges, edges, strict=False):
+            wrench.force[:], wrench.torque[:] = edge[:3], edge[3:]
+            self._send(publisher, wrench)
+
+    def _send(self, publisher: Any, wrench: WrenchTemplate) -> None:
+        """Send a wrench in the organ's frame as the tool takes it. Real-time safe."""
+        force, torque = wrench.force, wrench.torque
         if self._is_turned:
             for part in (force, torque):
                 np.dot(part, self._rotation, out=self._turned)  # R^T v
@@ -153,7 +180,7 @@ class ToolChannel:
             torque[0] += y * force[2] - z * force[1]
             torque[1] += z * force[0] - x * force[2]
             torque[2] += x * force[1] - y * force[0]
-        self.publisher.handle.publish_raw(self.wrench.serialise(self.stamp))
+        publisher.handle.publish_raw(wrench.serialise(self.stamp))
 
     def _judge(self, taken: Any, now: int, timeout: int, leap: float) -> int:
         """The status after a message, or after none came. Real-time safe."""
@@ -236,6 +263,10 @@ def tool_channels(ports: Ports, settings: ContactSettings) -> list[ToolChannel]:
             ),
             settings.frame_id,
             settings.safety,
+            tuple(
+                ports.publisher(WrenchStamped, f"{name}/{edge}", qos.bands(period))
+                for edge in band_topics(settings.safety.wrench)
+            ),
         )
         for name in settings.tools
     ]

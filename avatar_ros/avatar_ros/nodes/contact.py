@@ -5,7 +5,7 @@ Three threads of control:
 - the loop (:mod:`avatar_ros.loop.contact_loop`, a thread) waits for a pose, steps, publishes.
 - the node (``ContactNode``, the main thread) handles parameters, transitions and statistics.
 - the supplier (:mod:`avatar_ros.prepare.supplier`, a thread with a worker process) prepares the
-  model of a vademecum, and prepares it again for another scene, material or budget.
+  model of a vademecum, and prepares it again for another scene, material, budget or uncertainty.
 """
 
 from __future__ import annotations
@@ -27,10 +27,13 @@ from tf2_msgs.msg import TFMessage
 from avatar_core.common.jit import load_compiler
 from avatar_core.common.supports import SUPPORT
 from avatar_core.contact import model as contact
+from avatar_core.contact.force_band import ForceBand
 from avatar_core.contact.haptics import passivity
 from avatar_core.contact.layout import Layout
-from avatar_core.errors import AccuracyError, SceneError, one_line
+from avatar_core.errors import AccuracyError, CoordinateError, SceneError, one_line
 from avatar_core.reduction.coordinates import option_of
+from avatar_core.uncertainty.distributions import Distribution, mappings
+from avatar_core.uncertainty.known import Held
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget
 from avatar_ros.framework import promises, qos, realtime
 from avatar_ros.framework.managed_node import ManagedNode, run
@@ -45,6 +48,7 @@ from avatar_ros.loop.settings import (
     MATERIAL,
     ContactSettings,
     chosen_budget,
+    chosen_known,
     of_budget,
 )
 from avatar_ros.loop.shown_modes import ShownModes
@@ -78,6 +82,7 @@ class ContactNode(ManagedNode):
         self._reports: ContactReports | None = None  # while the node is active
         self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
         self._least_error: dict[str, float] = {}  # of any detail of it, by quantity
+        self._held: Held | None = None  # parameters of it, of which distributions may be given
         self._told: tuple[str, ...] = ()  # of the material that it has no place for
         self._n_awaited = 0
         self._changing = threading.RLock()
@@ -127,6 +132,7 @@ class ContactNode(ManagedNode):
             material=settings.material,
             scene=settings.scene,
             budget=asdict(settings.budget) if settings.budget else {},
+            uncertainty=mappings(settings.known),
         )
         self._supplier = ModelSupplier(
             request, self._take_model, self._take_times, self.get_logger().error
@@ -190,6 +196,8 @@ class ContactNode(ManagedNode):
         for end in ends:
             self.destroy_subscription(end.subscription)
             self.destroy_publisher(end.publisher)
+        for publisher in (p for tool in self._tools for p in tool.band_publishers):
+            self.destroy_publisher(publisher)
         for publisher in (*(vars(self._outputs).values() if self._outputs else ()), self._frames):
             self.destroy_publisher(publisher)
         self._tools, self._devices, self._outputs, self._frames = [], [], None, None
@@ -205,10 +213,14 @@ class ContactNode(ManagedNode):
         model = contact.make_model(Layout.of(prepared.arrays), halves=True)
         replaced = loop.active
         self._ranges, self._least_error = prepared.ranges, prepared.least_error
+        self._held = Held.of_plain(prepared.held)
         curve = AccuracyCurve.of_plain(prepared.curve) if prepared.curve else None
         kept = self._budget.in_force if self._budget is not None else None
         shown_modes = ShownModes(model, curve, _deadline(kept))
-        loop.active = ActiveModel(prepared.id, model, loop.settings, prepared.effects, shown_modes)
+        band = ForceBand.of(model, prepared.arrays)
+        loop.active = ActiveModel(
+            prepared.id, model, loop.settings, prepared.effects, shown_modes, band
+        )
         loop.wake()
         what = ", ".join(prepared.effects) or "no effects"
         self.get_logger().info(
@@ -258,6 +270,11 @@ class ContactNode(ManagedNode):
     def _restore(self, kept: dict[str, Any]) -> str:
         """Set the saved parameters; returns the saved scene, or an empty string."""
         scene = str(kept.pop("scene", ""))
+        try:
+            chosen_known(str(kept.get("uncertainty", "")))
+        except ParameterError as error:  # its file may be gone
+            self.get_logger().error(f"a saved value is not used: {error}")
+            del kept["uncertainty"]
         for result in self.set_parameters([Parameter(n, value=v) for n, v in kept.items()]):
             if not result.successful:
                 self.get_logger().error(f"a saved value is not used: {result.reason}")
@@ -324,9 +341,13 @@ class ContactNode(ManagedNode):
         try:
             budget = chosen_budget(self._values(_BUDGET, changes))
             safety = chosen_safety(self._values(tuple(p.name for p in SAFETY), changes))
+            known = settings.known
+            for change in changes:
+                if change.name == "uncertainty":  # its file may say something else by now
+                    known = chosen_known(change.value)
         except (AccuracyError, ParameterError) as error:
             return SetParametersResult(successful=False, reason=str(error))
-        refusal = self._refusal_of_budget(budget)
+        refusal = self._refusal_of_budget(budget) or self._refusal_of_known(known, settings.known)
         if refusal:
             return SetParametersResult(successful=False, reason=refusal)
         material = dict(settings.material)
@@ -343,9 +364,11 @@ class ContactNode(ManagedNode):
         changed = {p.name: p.value for p in changes if hasattr(loop.settings, p.name)}
         if material != settings.material and self._supplier is not None:
             self._supplier.ask({"material": material}, self._log_refused_material)
+        if known != settings.known and self._supplier is not None:
+            self._supplier.ask({"uncertainty": mappings(known)}, self._log_refused_known)
         if self._budget is not None:
             self._budget.ask(budget)
-        loop.settings = replace(settings, **changed, material=material, safety=safety)
+        loop.settings = replace(settings, **changed, material=material, known=known, safety=safety)
         return SetParametersResult(successful=True)
 
     def _values(self, names: tuple[str, ...], changes: list[Parameter]) -> dict[str, Any]:
@@ -367,6 +390,23 @@ class ContactNode(ManagedNode):
     def _log_refused_material(self, prepared: PreparedModel | None, refusal: str) -> None:
         if refusal and refusal != SUPERSEDED:
             self.get_logger().error(f"material refused: {refusal}")
+
+    def _log_refused_known(self, prepared: PreparedModel | None, refusal: str) -> None:
+        if refusal and refusal != SUPERSEDED:
+            self.get_logger().error(f"uncertainty refused: {refusal}")
+
+    def _refusal_of_known(
+        self, known: dict[str, Distribution], before: dict[str, Distribution]
+    ) -> str:
+        """Why the vademecum in use has no place for distributions; empty if it has, or if they are
+        those of before: these may be of another organ's."""
+        if self._held is None or known == before:
+            return ""
+        try:
+            self._held.known(known)
+        except CoordinateError as error:
+            return one_line(error)
+        return ""
 
     def _refusal_of_budget(self, budget: Budget | None) -> str:
         """Why no detail of the vademecum in use is so exact; empty if one is, or if none is known.

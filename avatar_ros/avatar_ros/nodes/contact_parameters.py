@@ -18,6 +18,7 @@ from avatar_ros.loop.settings import (
     CONTACT,
     ContactSettings,
     chosen_budget,
+    chosen_known,
     chosen_material,
     chosen_tips,
 )
@@ -66,6 +67,7 @@ def read_contact(node: Node, saved_scene: str = "") -> ContactSettings:
         safety=chosen_safety(value),
         parent_frame=value["parent_frame"],
         parent_transform=pose("parent_transform", value["parent_transform"]),
+        known=chosen_known(value["uncertainty"]),
     )
     if saved_scene:
         kept = _with_scene(settings, lambda: parse_scene(saved_scene, "kept"))

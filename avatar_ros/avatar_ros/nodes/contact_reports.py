@@ -137,6 +137,7 @@ class ContactReports:
             was_connected = tool.connected
             tool.publishers = tool.subscription.get_publisher_count()
             tool.listeners = tool.publisher.get_subscription_count()
+            tool.band_listeners = sum(p.get_subscription_count() for p in tool.band_publishers)
             if tool.connected and not was_connected:
                 self._loop.wake()
         for device in self._devices:

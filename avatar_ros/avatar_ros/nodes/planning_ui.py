@@ -35,6 +35,7 @@ from avatar_ros.ui.bookmarks import Bookmark
 from avatar_ros.ui.camera import turn_camera
 from avatar_ros.ui.chosen import Chosen, Page
 from avatar_ros.ui.display import RATE, NewestCloud
+from avatar_ros.ui.force_band import NewestBand
 from avatar_ros.ui.guard import Guard, guarded
 from avatar_ros.ui.legend import EXPECTED_ERROR, legend
 from avatar_ros.ui.library import Library
@@ -90,6 +91,7 @@ class PlanningNode(ManagedNode):
         self._alerts: list[str] = []
         self._reader = Reader(1 << 30)
         self._cloud: NewestCloud | None = None
+        self._band: NewestBand | None = None
         self._was_missing, self._is_to_restore = True, False
         self._frame, self._frame_id = 0, FRAME
         self._began = time.monotonic()
@@ -207,6 +209,7 @@ class PlanningNode(ManagedNode):
                 LoopStatistics, "statistics", self._take_statistics, qos.STATISTICS
             ),
         ]
+        self._band = NewestBand(self, self._tool, self._state.force_of)
         self.get_logger().info(f"planning page at {guard.address(server.get_port())}")
 
     def activate(self) -> None:
@@ -226,6 +229,9 @@ class PlanningNode(ManagedNode):
         if self._cloud is not None:
             self._cloud.close()
             self._cloud = None
+        if self._band is not None:
+            self._band.close()
+            self._band = None
         if self._server is not None:
             self._requests.close()
             self._reader.close()
@@ -273,6 +279,8 @@ class PlanningNode(ManagedNode):
         self._view.show(organ, tip)
         self._measures.show_organ(organ, tip)
         self._periods.forget()
+        if self._band is not None:
+            self._band.forget()
         self._panels.show_organ(organ)
         self._chosen.organ = organ
         self._listen_to_clouds()
@@ -297,6 +305,8 @@ class PlanningNode(ManagedNode):
             return
         if self._frame % _CUT_FRAMES == 0:
             self._chosen.settle()
+        if self._band is not None:
+            self._band.take()
         recorded = self._player.state(organ)
         if recorded is not None:
             self._show_recorded(organ, *recorded)
@@ -307,7 +317,13 @@ class PlanningNode(ManagedNode):
             values = self._chosen.values(organ)
             poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
             material = material_text(values["young"], poisson, values.get("contrast"))
-            self._show_numbers(organ, shown, material)
+            self._show_numbers(organ, self._with_band(shown), material)
+
+    def _with_band(self, shown: ShownPeriod) -> ShownPeriod:
+        """With the band of its force, where the contact node sends one."""
+        if self._band is None or shown.is_held:
+            return shown
+        return shown._replace(band=self._band.of(float(np.linalg.norm(shown.force))))
 
     def _show_recorded(
         self, organ: Organ, cloud: np.ndarray, shown: ShownPeriod, material: str
@@ -337,7 +353,7 @@ class PlanningNode(ManagedNode):
         self._lines = [*map(plain, numbers), *measured]
         self._panels.show_scale(self._legend())
         size = 0.0 if shown.is_held else float(np.linalg.norm(shown.force))
-        self._panels.tool.show_force(time.monotonic() - self._began, size, shown.error)
+        self._panels.tool.show_force(time.monotonic() - self._began, size, shown.error, shown.band)
 
     def _period_to_show(self) -> ShownPeriod:
         """Draw the newest cloud, and return what belongs to it."""

@@ -3,5 +3,5 @@ material and budget, compiles the step and puts the model's arrays into shared m
 process only maps them, so the loop never waits.
 
 Read in this order: requests, protocol, supplier (in the node), worker (the process), and what the
-worker uses: model_spec, detail_chooser, shared_arrays.
+worker uses: model_spec, detail_chooser, bands, shared_arrays.
 """

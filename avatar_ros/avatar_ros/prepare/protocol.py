@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 import socket
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedModel
@@ -49,6 +49,7 @@ class ModelReady:
     curve: dict[str, Any] | None
     least_error: dict[str, float]
     notices: tuple[str, ...] = ()
+    held: dict[str, Any] = field(default_factory=dict)
 
     def map(self, handle: int) -> PreparedModel:
         """The model, with its arrays mapped into this process; closes the descriptor."""
@@ -62,6 +63,7 @@ class ModelReady:
             self.curve,
             self.least_error,
             tuple(self.notices),
+            self.held,
         )
 
 

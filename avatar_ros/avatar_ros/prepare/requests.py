@@ -24,6 +24,8 @@ class PreparationRequest:
     scene : YAML; empty for the natural effects of the vademecum
     budget : fields of an avatar_core.vademecum.accuracy.Budget; empty for all modes in ordinary
         precision
+    uncertainty : what is known of the material, as of
+        :func:`avatar_core.uncertainty.distributions.mappings`; empty for no bands
     """
 
     topic: str
@@ -36,6 +38,7 @@ class PreparationRequest:
     material: dict[str, float] = field(default_factory=dict)
     scene: str = ""
     budget: dict[str, Any] = field(default_factory=dict)
+    uncertainty: dict[str, Any] = field(default_factory=dict)
 
 
 # Fields of a PreparationRequest; or scene_file, a path, in place of scene.
@@ -46,6 +49,8 @@ Change = dict[str, Any]
 class PreparedModel:
     """The contact model of a verified vademecum, as arrays in shared memory.
 
+    arrays : of the layout, and with bands those of
+        :class:`avatar_core.contact.force_band.ForceBand`
     ranges : lowest and highest value of each coordinate of the vademecum
     effects : names of the simulated effects
     cloud_divisor : that of the scene; None without a scene
@@ -53,6 +58,7 @@ class PreparedModel:
         measured yet are NaN; None if no errors were measured
     least_error : of any detail of the cloud, by quantity; empty if no errors were measured
     notices : values of the material that this vademecum has no place for, one line each
+    held : plain form of the avatar_core.uncertainty.known.Held at the values in use
     """
 
     id: str
@@ -64,3 +70,4 @@ class PreparedModel:
     curve: dict[str, Any] | None = None
     least_error: dict[str, float] = field(default_factory=dict)
     notices: tuple[str, ...] = ()
+    held: dict[str, Any] = field(default_factory=dict)

@@ -27,6 +27,7 @@ from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedMode
 _WORKER = "avatar_ros.prepare.worker"
 _RESTART_DELAY = 1.0  # [s]
 _STOP_TIMEOUT = 1.0  # [s]
+_KINDS = ("material", "budget", "uncertainty")  # of changes, besides scenes
 
 # Called with the model now in use and "", or with None and the reason of a refusal. None and "":
 # there is no vademecum yet, and the change applies to the next one.
@@ -40,7 +41,7 @@ class ModelSupplier:
 
     Callbacks run in a thread of this object, one at a time. Changes are sent one by one, each
     after the last one was answered. Of the changes that wait, only the newest of each kind (scene,
-    material, budget) is kept, so dragging a slider fills neither time nor memory.
+    material, budget, uncertainty) is kept, so dragging a slider fills neither time nor memory.
 
     on_model : called with each model that was verified and prepared; puts it into use
     on_times : called with the curve of the model in use once its times are measured
@@ -78,7 +79,7 @@ class ModelSupplier:
 
         A waiting change of the same kind is refused as ``SUPERSEDED``, in the caller's thread.
         """
-        kind = next((kind for kind in ("material", "budget") if kind in change), "scene")
+        kind = next((kind for kind in _KINDS if kind in change), "scene")
         with self._lock:
             _, superseded = self._waiting.pop(kind, (None, None))
             self._waiting[kind] = (change, answer)

@@ -21,6 +21,7 @@ from avatar_core.common.processes import return_memory
 from avatar_core.errors import one_line
 from avatar_ros.framework import realtime
 from avatar_ros.framework.reader import Reader
+from avatar_ros.prepare.bands import BandPreparer
 from avatar_ros.prepare.detail_chooser import DetailChooser, SupersededError
 from avatar_ros.prepare.protocol import (
     Accepted,
@@ -67,6 +68,7 @@ class ModelPreparer:
         self._vademecum: Any = None
         self._reader = Reader(_MAX_BYTES)
         self._chooser = DetailChooser()
+        self._bands = BandPreparer()
         self._lock = threading.Lock()
         self._stop = stop
         self._waiting: set[int] = set()  # threads that interrupt the timing
@@ -136,6 +138,7 @@ class ModelPreparer:
         self, vademecum: Any, request: PreparationRequest, number: int, change: Change
     ) -> SentModel:
         """Prepare the model of a vademecum that a request asks for, and send it."""
+        from avatar_core.contact.force_band import ForceBand
         from avatar_core.contact.layout import Layout
         from avatar_core.contact.model import make_model
         from avatar_core.scene.file import parse_scene
@@ -147,11 +150,14 @@ class ModelPreparer:
         material, notices = usable_material(vademecum, request.material)
         spec = model_spec(vademecum, replace(request, material=material), scene)
         detail = self._chooser.detail(spec, request)
-        handle, contents = write_shared(spec.layout(detail, request.period).flat())
+        held, bands, unused = self._bands.prepare(spec, request.uncertainty)
+        handle, contents = write_shared(spec.layout(detail, request.period).flat() | bands)
         try:
             # Compiles the step for these effects, if that was never done on this machine, from
             # arrays as the node will map them: it then finds the same types in numba's cache.
-            model = make_model(Layout.of(map_shared(os.dup(handle), contents)), halves=True)
+            arrays = map_shared(os.dup(handle), contents)
+            model = make_model(Layout.of(arrays), halves=True)
+            ForceBand.of(model, arrays)
             ready = ModelReady(
                 number,
                 change,
@@ -163,7 +169,8 @@ class ModelPreparer:
                 cloud_divisor=scene.cloud_divisor if scene else None,
                 curve=self._chooser.curve(spec, detail),
                 least_error=least_error(spec),
-                notices=notices,
+                notices=notices + unused,
+                held=held,
             )
             self._send(ready, handle)
         finally:

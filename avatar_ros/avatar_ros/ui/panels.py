@@ -134,7 +134,7 @@ class Panels:
 
 
 _STATE = "height:4.4em;overflow:auto;margin:0 1em;font-size:13px;line-height:1.45"
-_NUMBERS = "height:6.2em;overflow:hidden;margin:0 1em;font-size:14px;line-height:1.5"
+_NUMBERS = "height:7.7em;overflow:hidden;margin:0 1em;font-size:14px;line-height:1.5"
 
 
 def _set(handle: Any, content: str) -> None:

@@ -24,6 +24,7 @@ class ShownPeriod(NamedTuple):
     force : of the organ [N]; error : of it [N]; fraction : of it, that the device gets
     largest : displacement [m]; NaN where no cloud comes
     is_held : beyond the range; force and displacement are those of the last valid period
+    band : that holds 90 % of what is known of the material, of the force [N]; None if not asked for
     """
 
     tip: np.ndarray
@@ -32,6 +33,7 @@ class ShownPeriod(NamedTuple):
     fraction: float
     largest: float
     is_held: bool
+    band: tuple[float, float] | None = None
 
 
 class PeriodChooser:

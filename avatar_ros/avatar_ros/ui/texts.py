@@ -15,6 +15,7 @@ from avatar_ros.ui.shown_period import ShownPeriod
 
 _MANY_MISSED = 0.02  # part of the periods that may come late without a word
 SHOWN_FORCE = 0.01  # smallest difference that is written [N]
+BAND = "90 % of what is known of the material"
 NO_ORGAN = "no organ yet: choose a vademecum under Organ"
 
 
@@ -64,6 +65,9 @@ def frame_text(shown: ShownPeriod, material: str, n_kept: int | None) -> list[st
         less = force * (1.0 - shown.fraction) >= SHOWN_FORCE
         device = f", device {force * shown.fraction:.2f} N" if less else ""
         lines = [f"Force {numbers}{device}"]
+        if shown.band is not None:
+            low, high = shown.band
+            lines.append(f"{low:.2f} to {high:.2f} N: {BAND}")
         if np.isnan(shown.largest):
             lines.append("No displacement: the contact node sends no surface")
         else:

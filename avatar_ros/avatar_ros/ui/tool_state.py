@@ -83,6 +83,11 @@ class SharedToolState:
         found = np.flatnonzero(self.recent["stamp"] == stamp)
         return self.recent[found[0] if len(found) else (n - 1) % N_RECENT].copy()
 
+    def force_of(self, stamp: int) -> float:
+        """Size of the organ's force in the recent period of a stamp [ns]; NaN if it is not kept."""
+        found = self.recent[self.recent["stamp"] == stamp]
+        return float(np.linalg.norm(found["force"][0])) if len(found) else float("nan")
+
     def recorded(self, begin: int = 0) -> np.ndarray:
         """A copy of the recorded rows from ``begin`` on."""
         return self.rows[begin : int(self.live["n_rows"][0])].copy()

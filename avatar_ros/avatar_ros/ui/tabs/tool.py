@@ -12,6 +12,7 @@ from viser import uplot
 from avatar_ros.ui.actions import Actions
 from avatar_ros.ui.orientation import AXES
 from avatar_ros.ui.tabs.plots import plot
+from avatar_ros.ui.texts import BAND
 
 STEP = 1e-3  # of a key [m]
 _HISTORY = 10.0  # of the plot [s]
@@ -28,6 +29,23 @@ KEYS = {
 _SIDES = {"right": "R", "left": "L", "up": "S", "down": "I"}  # of the patient, by button
 
 
+def _plot_of_force(gui: Any, has_band: bool) -> Any:
+    """The force with its error, and with the band of what is known of the material or without."""
+    curves = [
+        uplot.Series(label="force [N]", stroke="#0072B2", width=2),
+        uplot.Series(label="at least [N]", stroke="#D55E0080", width=1),
+        uplot.Series(label="at most [N]", stroke="#D55E0080", width=1),
+    ]
+    bands = [uplot.Band(series=(3, 2), fill="#D55E0030")]
+    if has_band:
+        curves += [
+            uplot.Series(label=f"{BAND}, {end} [N]", stroke="#009E73", width=1, dash=(4.0, 4.0))
+            for end in ("from", "to")
+        ]
+        bands.append(uplot.Band(series=(5, 4), fill="#009E7320"))
+    return plot(gui, "Force on the tool [N]", 120, _LEAST_RANGE, *curves, bands=tuple(bands))
+
+
 class ToolTab:
     """Plot of the force, buttons that move the tool, and its recording."""
 
@@ -36,16 +54,9 @@ class ToolTab:
         n = round(_HISTORY * 5)
         self._times: deque[float] = deque(maxlen=n)
         self._forces: deque[tuple[float, float, float]] = deque(maxlen=n)
-        self._plot = plot(
-            gui,
-            "Force on the tool [N]",
-            120,
-            _LEAST_RANGE,
-            uplot.Series(label="force [N]", stroke="#0072B2", width=2),
-            uplot.Series(label="at least [N]", stroke="#D55E0080", width=1),
-            uplot.Series(label="at most [N]", stroke="#D55E0080", width=1),
-            bands=(uplot.Band(series=(3, 2), fill="#D55E0030"),),
-        )
+        self._bands: deque[tuple[float, float]] = deque(maxlen=n)  # the force, where it has none
+        self._plot, self._plot_of_band = _plot_of_force(gui, False), _plot_of_force(gui, True)
+        self._plot_of_band.visible = False
         for name, labels in (("Tool", ("press 1 mm", "lift 1 mm")), ("1 mm", tuple(_SIDES))):
             group = gui.add_button_group(name, labels)
             group.on_click(lambda event: self._nudge(event.target.value))
@@ -71,12 +82,26 @@ class ToolTab:
     def _move(self, side: str, way: float) -> None:
         self._actions.nudge(AXES[side] if side else None, way)
 
-    def show_force(self, now: float, force: float, error: float) -> None:
-        """Add a point to the plot [s, N]; five per second are enough."""
+    def show_force(
+        self, now: float, force: float, error: float, band: tuple[float, float] | None = None
+    ) -> None:
+        """Add a point to the plot [s, N]; five per second are enough.
+
+        band : low and high edge of what is known of the force [N]; the plot shows it for as long as
+            one of its points has one
+        """
         self._times.append(now)
         self._forces.append((force, max(force - error, 0.0), force + error))
-        values = np.array(self._forces).T
-        self._plot.data = (np.array(self._times), *(row.copy() for row in values))
+        self._bands.append(band or (force, force))
+        has_band = any(low < high for low, high in self._bands)
+        values = np.array(self._forces)
+        shown, hidden = self._plot, self._plot_of_band
+        if has_band:
+            shown, hidden = hidden, shown
+            values = np.hstack([values, np.array(self._bands)])
+        shown.data = (np.array(self._times), *(row.copy() for row in values.T))
+        if not shown.visible:
+            shown.visible, hidden.visible = True, False
 
     def show_recording(self, is_on: bool) -> None:
         """Label the button with what it does next."""

@@ -1,0 +1,85 @@
+"""The band of the force on a tip: the forces that it exceeds with 95 and 5 % probability.
+
+How far both lie from the force at the values in use is prepared for every load position and some
+depths (:mod:`avatar_core.uncertainty.force_ratios`). A step looks it up with the weights w_j of the
+load positions that carry the tip, and between two depths by their logarithm,
+
+    F_edge(p) = F(p) exp( sum_j w_j(p) rho_j(ln d) ),        rho = ln (edge / F).
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+
+from avatar_core.common.array_table import ArrayTable
+from avatar_core.common.jit import entry
+from avatar_core.contact.model import ContactModel, compiled_for
+
+RATIO, DEPTH = "force_band.ratio", "force_band.depth"  # names of the arrays beside a layout's
+
+# ratio (T, n_positions, n_depths, 2) float32: rho of the low and the high edge; depth (n_depths,)
+# rising by a factor [m], at least two; edges (2, T, 6): forces [N] and torques [N m]
+BandArrays = namedtuple("BandArrays", ["ratio", "depth", "edges"])
+
+
+@entry
+def force_band(state, out, band):  # type: ignore[no-untyped-def]
+    """Both edges of the wrench of each tip, of the last solution. Real-time safe.
+
+    Beyond the prepared depths the ratios are those of the nearest.
+    """
+    first, last = band.depth[0], band.depth.shape[0] - 2
+    scale = 1.0 / np.log(band.depth[1] / first)
+    for t in range(out.force.shape[0]):
+        low = high = whole = 0.0
+        if state.force[t] > 0.0:
+            place = scale * np.log(max(-state.gap[t], first) / first)
+            k = min(int(min(place, 1e3)), last)
+            part = min(place - k, 1.0)
+            for i in range(state.n_nodes[t]):
+                w, at = state.weight[t, i, 0], band.ratio[t, state.nodes[t, i]]
+                low += w * ((1.0 - part) * at[k, 0] + part * at[k + 1, 0])
+                high += w * ((1.0 - part) * at[k, 1] + part * at[k + 1, 1])
+                whole += w
+        whole = max(whole, 1e-6)
+        low, high = np.exp(low / whole), np.exp(high / whole)
+        for d in range(3):
+            band.edges[0, t, d], band.edges[1, t, d] = low * out.force[t, d], high * out.force[t, d]
+            band.edges[0, t, 3 + d] = low * out.torque[t, d]
+            band.edges[1, t, 3 + d] = high * out.torque[t, d]
+
+
+class ForceBand:
+    """The band of one model's forces.
+
+    Parameters
+    ----------
+    model : ContactModel
+    ratio : ndarray float32, shape (n_tools, n_positions, n_depths, 2), ln of the low and the high
+        edge over the force
+    depth : ndarray, shape (n_depths,), n_depths >= 2, rising by a constant factor [m]
+
+    edges : ndarray, shape (2, n_tools, 6), force [N] and torque [N m] of both edges, low first
+    """
+
+    def __init__(self, model: ContactModel, ratio: np.ndarray, depth: np.ndarray) -> None:
+        self.edges = np.zeros((2, model.n_tools, 6))
+        self._table = ArrayTable(BandArrays(ratio, depth, self.edges))
+        arguments = model.tables.state, model.tables.out, self._table
+        self._update = partial(compiled_for(force_band, *arguments), *arguments)
+
+    @staticmethod
+    def of(model: ContactModel, arrays: Mapping[str, np.ndarray]) -> ForceBand | None:
+        """The band of a model, if its arrays were prepared."""
+        return ForceBand(model, arrays[RATIO], arrays[DEPTH]) if RATIO in arrays else None
+
+    def update(self) -> None:
+        """Write the edges of the forces of the last solution.
+
+        Real-time safe, as :func:`avatar_core.contact.model.step`.
+        """
+        self._update()

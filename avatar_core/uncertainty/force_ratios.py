@@ -1,0 +1,167 @@
+"""How far the edges of a force's band lie from the force, for every load position and some depths.
+
+A tip d deep that feels the force F on tissue of the modulus E* sinks, with L = F / E*, by
+
+    d = delta(L) + L s,      s = E* (gamma - c)
+
+(:mod:`avatar_core.contact.effects.tip_law`); a patch by gamma F. delta knows the surface's shape
+alone: the material comes in by E* and gamma, the compliance of a load position with itself. For
+both, no vademecum has to be made at every point of the coordinates. So F is found at Chebyshev's
+points of those that are not known, interpolated as in :mod:`avatar_core.uncertainty.material_grid`,
+drawn, and its quantiles are taken.
+
+It takes tissue to be linear and at rest without the tool: forces are then proportional to Young's
+modulus. Beside self-weight and other tools, whose own depths stay as they are, that is nearly so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from avatar_core.common.arrays import FloatArray
+from avatar_core.contact.effects.tip_law import (
+    PATCH_ON_MESH,
+    TipLawState,
+    loads_at_depths,
+    tip_law_arrays,
+    tip_law_state,
+)
+from avatar_core.fem.elasticity import Material
+from avatar_core.geometry.tip import Tip
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.uncertainty.bands import HIGH, LOW, drawn
+from avatar_core.uncertainty.distributions import Distribution, Fixed
+from avatar_core.uncertainty.material_grid import N_POINTS, MaterialGrid
+from avatar_core.vademecum.at_values import own_compliance, own_compliance_at
+from avatar_core.vademecum.model import Vademecum
+
+DEPTHS = 0.5e-3 * 3.0 ** np.arange(4)  # for which forces are found [m]
+DRAWS = 1000
+MAX_POINTS = 625  # of all coordinates together; where there are many, each has fewer
+
+
+def log_edges(
+    vademecum: Vademecum,
+    tips: Sequence[Tip],
+    known: Mapping[str, Distribution],
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> FloatArray:
+    """ln of the forces that 5 and 95 % of the draws stay below.
+
+    Parameters
+    ----------
+    vademecum : Vademecum, at whatever values
+    known : of all its parameters, by :func:`avatar_core.uncertainty.known.known_of`
+
+    Returns
+    -------
+    ndarray, shape (n_tips, n_positions, n_depths, 2)
+    """
+    parametric = vademecum.parametric
+    young = parametric.young_modulus if parametric else vademecum.material.young_modulus
+    coordinates = parametric.coordinates if parametric else ()
+    constant = {c.name: _constant(c, known, young) for c in coordinates}
+    free = [c for c in coordinates if constant[c.name] is None]
+    grid = MaterialGrid(tuple(free), young, _n_points(len(free)))
+    held = {name: value for name, value in constant.items() if value is not None}
+    found = np.stack([_at(vademecum, tips, held | point, young) for point in grid.points()])
+    values = drawn(known, draws, seed)
+    weights, stiffer = grid.weights(values), np.log(grid.softer(values))[:, None]
+    edges = np.empty((*found.shape[1:], 2))
+    for t, k in np.ndindex(found.shape[1], found.shape[3]):
+        of_draws = np.exp(weights @ found[:, t, :, k] + stiffer)
+        edges[t, :, k] = np.log(np.quantile(of_draws, (LOW, HIGH), axis=0)).T
+    return edges
+
+
+def log_forces(vademecum: Vademecum, tips: Sequence[Tip]) -> FloatArray:
+    """ln of the forces at the values that a vademecum has, (n_tips, n_positions, n_depths)."""
+    compliance = own_compliance(vademecum)
+    return _log_forces(vademecum, tips, compliance, vademecum.material, vademecum.contrast)
+
+
+def _at(
+    vademecum: Vademecum, tips: Sequence[Tip], values: Mapping[str, float], young: float
+) -> FloatArray:
+    """The same at values of all coordinates, and a Young's modulus [Pa]."""
+    poisson = values.get("poisson", vademecum.material.poisson_ratio)
+    compliance = own_compliance_at(vademecum, values)
+    material = Material(young_modulus=young, poisson_ratio=poisson)
+    contrast = values.get("contrast", vademecum.contrast)
+    return _log_forces(vademecum, tips, compliance, material, contrast)
+
+
+def _constant(
+    coordinate: Coordinate, known: Mapping[str, Distribution], young: float
+) -> float | None:
+    """The value of a coordinate that is known, at the Young's modulus of the points [Pa]; None if
+    it varies. The stiffness of a support varies with Young's modulus, over which it counts."""
+    one, modulus = known[coordinate.name], known["young"]
+    if not isinstance(one, Fixed):
+        return None
+    if coordinate.kind != "support":
+        return one.value
+    if not isinstance(modulus, Fixed):
+        return None
+    return float(np.clip(one.value * young / modulus.value, coordinate.low, coordinate.high))
+
+
+def _n_points(n_coordinates: int) -> int:
+    """Of Chebyshev for each coordinate."""
+    return min(N_POINTS, max(3, int(MAX_POINTS ** (1.0 / max(n_coordinates, 1)) + 1e-9)))
+
+
+def _log_forces(
+    vademecum: Vademecum,
+    tips: Sequence[Tip],
+    compliance: FloatArray,
+    material: Material,
+    contrast: float | None,
+) -> FloatArray:
+    surface = vademecum.surface
+    normals = surface.normals / np.linalg.norm(surface.normals, axis=1, keepdims=True)
+    gamma = np.einsum("ia,iab,ib->i", normals, compliance, normals)
+    return np.log([_pressed(vademecum, tip, gamma, material, contrast) for tip in tips])
+
+
+def _pressed(
+    vademecum: Vademecum, tip: Tip, gamma: FloatArray, material: Material, contrast: float | None
+) -> FloatArray:
+    """Forces on a tip at ``DEPTHS``, (n_positions, n_depths) [N]; gamma is that of E too."""
+    law = _law(tip)
+    if law is None:
+        return np.asarray(DEPTHS / gamma[:, None])
+    curvature, growth, anisotropy, tumour = _under(vademecum, tip)
+    stiffness = np.full(len(gamma), material.plane_strain_modulus)
+    if contrast is not None:
+        stiffness /= 1.0 - tumour + tumour / contrast
+    taken = np.minimum(PATCH_ON_MESH / (stiffness * vademecum.surface.patch_radius), gamma)
+    softness, load = stiffness * (gamma - taken), np.empty((len(DEPTHS), len(gamma)))
+    for depth, found in zip(DEPTHS, load, strict=True):
+        at = np.full(len(gamma), depth)
+        loads_at_depths(law, curvature, growth, anisotropy, softness, at, found)
+    return np.asarray((stiffness * load).T)
+
+
+def _law(tip: Tip) -> TipLawState | None:
+    """The law of an upright tip; None of a patch."""
+    arrays = tip_law_arrays((tip,), Material(), np.zeros((5, 0, 0, 0)))
+    return None if arrays is None else tip_law_state(arrays, 0)
+
+
+def _under(vademecum: Vademecum, tip: Tip) -> FloatArray:
+    """kappa, tau, D and f where a tip touches each load position, (4, n_positions)."""
+    field, surface = vademecum.tip_field, vademecum.surface
+    at = surface.centers + tip.offset * surface.normals
+    grid = ((at - field.origin) / field.spacing[0]).T
+    found = np.zeros((4, len(at)))
+    for row, values in zip(
+        found, (field.curvature, field.growth, field.anisotropy, field.tumour), strict=True
+    ):
+        if values is not None:
+            row[:] = map_coordinates(values, grid, order=2, prefilter=False, mode="nearest")
+    return found
