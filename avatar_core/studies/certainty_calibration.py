@@ -252,8 +252,8 @@ def _sentence(summary: Mapping[str, float], n: int) -> str:
         f"within {summary['contrast_error']:.0%}, the support's stiffness within a factor of "
         f"{summary['support_factor']:.2f}; intervals of 90 % hold the truth in "
         f"{summary['calibration_coverage']:.0%}. That the tumour is harder is seen in "
-        f"{summary['calibration_tumour_seen']:.0%}; by a model without it, its absence is noticed in "
-        f"{summary['calibration_wrong_noticed']:.0%}."
+        f"{summary['calibration_tumour_seen']:.0%}; of a model without it, the check of the fit "
+        f"notices that in {summary['calibration_wrong_noticed']:.0%}."
     )
 
 

@@ -24,6 +24,7 @@ from avatar_core.uncertainty.calibration import (
     LEAST_PROBABILITY,
     Errors,
     TouchTable,
+    _alike,
     calibrated,
     touch_table,
 )
@@ -314,15 +315,16 @@ def test_the_command_calls_a_wrong_model_wrong(
     assert json.loads((tmp_path / "found.json").read_text())["explained"] is False
 
 
-def test_touches_that_deviate_alike_beside_one_another_are_found_out(table: TouchTable) -> None:
-    """Half as much force at all touches of one side, each of which alone may be an error."""
-    known = {"young": Lognormal(5e3, 1.5), "poisson": Fixed(0.45), "contrast": Fixed(5.0)}
-    rough = replace(table, error=np.full(len(table.error), 0.15))
-    x = table.palpation.tip[table.palpation.sampled][:, 0]
-    by_side = np.where(x > np.median(x), 0.25, -0.25)
-    assert calibrated(with_forces(rough, at(rough)), known, SENSOR_ALONE).explained
-    found = calibrated(with_forces(rough, at(rough) + by_side), known, SENSOR_ALONE)
-    assert found.probability < 0.05
+def test_touches_that_deviate_alike_beside_one_another_are_found_out() -> None:
+    """As over something hard that the model lacks; the same deviations elsewhere are chance."""
+    across = 20e-3 * np.arange(5)
+    tips = np.stack([*np.meshgrid(across, across)], axis=-1).reshape(-1, 2)
+    tips = np.c_[tips, np.zeros(25)]
+    over = np.linalg.norm(tips - tips[12], axis=1) < 25e-3
+    deviations = np.where(over, 1.2, -0.3)
+    assert _alike(deviations, tips) < LEAST_PROBABILITY / 2.0
+    anywhere = [_alike(np.random.default_rng(k).permutation(deviations), tips) for k in range(20)]
+    assert 0.25 < np.mean(anywhere) < 0.75
 
 
 @pytest.mark.parametrize(
