@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +20,7 @@ from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.prepare.scenes import usable_material
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
 
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.geometry.phantom import phantom_liver
@@ -218,3 +221,35 @@ def test_of_a_slider_that_is_dragged_the_last_value_counts_soon(probe: Any, hand
     # the one in work, then the last; all forty would take forty times one
     assert time.monotonic() - begin < 10.0 * alone
     _set_back(probe, hand, before)
+
+
+# --- values that a calibration found --------------------------------------------------------
+
+
+def set_by_command(domain: dict[str, str], *values: str) -> tuple[int, str]:
+    """What ``avatar calibrate --set`` runs: exit code and what was said."""
+    command = [sys.executable, "-m", "avatar_ros.nodes.set_material", *values]
+    environment = {**os.environ, **domain}
+    done = subprocess.run(
+        command, env=environment, cwd="/", capture_output=True, text=True, timeout=120, check=False
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_calibrated_values_are_set_all_or_none(
+    hand: Hand, own_domain: dict[str, str], probe: Any
+) -> None:
+    code, said = set_by_command(own_domain, "young=5300", "poisson=0.41")
+    assert (code, said) == (0, "set in the contact node: young=5300, poisson=0.41\n")
+    assert parameters(probe) == [5300.0, 0.41]
+    code, said = set_by_command(own_domain, "young=9900", "poisson=0.495")
+    assert code == 1 and "poisson" in said and said.count("\n") == 1
+    assert parameters(probe) == [5300.0, 0.41]
+
+
+def parameters(probe: Any) -> list[float]:
+    names = ["material.young_modulus", "material.poisson_ratio"]
+    answer = probe.call(
+        GetParameters, "/contact/get_parameters", GetParameters.Request(names=names)
+    )
+    return [value.double_value for value in answer.values]

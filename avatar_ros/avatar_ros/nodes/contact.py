@@ -437,7 +437,9 @@ class ContactNode(ManagedNode):
         ):
             return ""
         low, high = self._ranges[name]
-        return "" if low <= value <= high else f"the vademecum holds {low:g} to {high:g}"
+        if low <= value <= high:
+            return ""
+        return f"{name} is {value:g}; the vademecum holds {low:g} to {high:g}"
 
 
 def _deadline(budget: Budget | None) -> float:
