@@ -270,5 +270,7 @@ def _draw(axes: Axes, rows: Sequence[dict[str, Value]]) -> None:
     axes.axhline(1.0, color="grey", linewidth=1.0)
     axes.set(yscale="log", ylabel="found over true value")
     axes.set_xticks(range(len(_NAMES)), ["Young's modulus", "contrast", "support"])
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
     axes.set_xlabel("each parameter's trials, by their true values")
     axes.grid(axis="y", alpha=0.3)
