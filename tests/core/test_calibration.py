@@ -147,7 +147,9 @@ def test_touches_off_the_organ_are_counted_or_refused(
     found = palpation_of(tips, size)
     moved = found.tip.copy()
     moved[found.touch == 2] += 0.5
-    assert touch_table(organ, SPHERE, replace(found, tip=moved)).left_out == 1
+    left = touch_table(organ, SPHERE, replace(found, tip=moved))
+    assert (left.left_out, left.palpation.n_touches) == (1, N_TOUCHES - 1)
+    assert np.isfinite(left.log_force).all()
     with pytest.raises(ContactError, match="0 of 8 touches meet the organ"):
         touch_table(organ, SPHERE, replace(found, tip=found.tip + 0.5))
 
