@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
 from avatar_core.cli.bench import require_ros
-from avatar_core.cli.numbers import numbers
+from avatar_core.cli.numbers import pose
 from avatar_core.cli.output import require_output
+from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.uncertainty import given_of
 from avatar_core.cli.vademecum import finite, require
 
@@ -103,7 +102,7 @@ def calibrate(
     palpation = palpation_of(touched.position, touched.force)
     vademecum = load_vademecum(file)
     priors = priors_of(vademecum, known)
-    with _bar("materials") as progress:
+    with progress_bar("materials") as progress:
         table = touch_table(vademecum, touched.tip, palpation, progress)
     found = calibrated(table, priors, Errors(sensor, least, 1e-3 * depth))
     for note in touched.notes:
@@ -136,10 +135,9 @@ def _touched(recording: Path, tool: str | None, transform: str | None, radius: f
 
     given = None
     if transform is not None:
-        remedy = "seven numbers, as 0,0,0.1,0,0,0,1"
-        given = tuple(numbers("--tool-transform", transform, (7,), remedy))
+        given = pose("--tool-transform", transform)
     tip = Tip("sphere", 1e-3 * radius)
-    with _bar("messages") as progress:
+    with progress_bar("messages") as progress:
         path = measured_path(recording, tool, given, progress)
     return _Touched(tip, path.tip, path.force, path.notes)
 
@@ -188,16 +186,3 @@ def _set(found: Calibration) -> None:
     done = subprocess.run(command, cwd="/", check=False)
     if done.returncode != 0:
         raise typer.Exit(done.returncode)
-
-
-@contextmanager
-def _bar(unit: str) -> Iterator[Callable[[int, int], None]]:
-    from tqdm import tqdm
-
-    with tqdm(unit=f" {unit}", file=sys.stderr, disable=None, delay=2.0, leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = max(total, done)
-            bar.update(done - bar.n)
-
-        yield show

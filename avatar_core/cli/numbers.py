@@ -17,3 +17,8 @@ def numbers(option: str, text: str, counts: tuple[int, ...], remedy: str) -> lis
     if len(found) not in counts:
         raise AvatarError(f"{option} is '{text}'; give {remedy}")
     return found
+
+
+def pose(option: str, text: str) -> tuple[float, ...]:
+    """Position [m] and quaternion of an option, x,y,z,x,y,z,w."""
+    return tuple(numbers(option, text, (7,), "seven numbers, as 0,0,0.1,0,0,0,1"))

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from avatar_core.cli.numbers import numbers
+from avatar_core.cli.numbers import pose
+from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.vademecum import require
 
 if TYPE_CHECKING:
@@ -23,7 +21,6 @@ if TYPE_CHECKING:
     from avatar_core.scene.replay import Replayed
     from avatar_core.vademecum.model import Vademecum
 
-_BAR_FROM = 2.0  # [s]
 _SAME_CODE = "replay with the version of avatar, and on the kind of processor, that recorded"
 _SAME_CELL = f"give --scene, --tool-transform and --device of the cell, and {_SAME_CODE}"
 
@@ -77,8 +74,7 @@ def replay(
     require(device in DEVICES, f"--device is {device}; choose {', '.join(DEVICES)}")
     transform = None
     if tool_transform is not None:
-        remedy = "seven numbers, as 0,0,0.1,0,0,0,1"
-        transform = tuple(numbers("--tool-transform", tool_transform, (7,), remedy))
+        transform = pose("--tool-transform", tool_transform)
     if is_bag(file):
         how = _How(tool, scene, transform, rate, DEVICES[device])
         _replay_bag(file, vademecum, how, tolerance)
@@ -93,7 +89,7 @@ def _replay_recording(file: Path, vademecum: Path, tolerance: float) -> None:
 
     recording = load_recording(file)
     organ = load_vademecum(vademecum)
-    with _bar("periods") as progress:
+    with progress_bar("periods") as progress:
         found = replay(recording, organ, progress)
     _say(recording, recording.periods.force)
     _compare(file, recording, found, why_not(recording), tolerance, _SAME_CODE)
@@ -117,11 +113,11 @@ def _replay_bag(file: Path, vademecum: Path, how: _How, tolerance: float) -> Non
     from avatar_core.vademecum.storage import load_vademecum
 
     organ = load_vademecum(vademecum)
-    with _bar("messages") as progress:
+    with progress_bar("messages") as progress:
         bag = read_bag(file, how.tool, progress)
     identity = _identity(bag, organ)
     path = path_of(bag, _scene_of(bag, how.scene, organ), organ.id, how.transform, how.rate)
-    with _bar("periods") as progress:
+    with progress_bar("periods") as progress:
         replayed = replay(path.recording, organ, progress)
     recorded = path.answers != "poses"
     _say(path.recording, path.recording.periods.force if recorded else replayed.force)
@@ -194,17 +190,3 @@ def _compare(
         difference <= tolerance,
         f"{file}: forces differ by {difference:.2e} N, above {tolerance:g} N; {remedy}",
     )
-
-
-@contextmanager
-def _bar(unit: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar that appears after ``_BAR_FROM`` seconds."""
-    from tqdm import tqdm
-
-    with tqdm(unit=f" {unit}", file=sys.stderr, disable=None, delay=_BAR_FROM, leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = max(total, done)
-            bar.update(done - bar.n)
-
-        yield show

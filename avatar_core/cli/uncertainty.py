@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +10,7 @@ import typer
 
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import require_output
+from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.vademecum import require
 
 if TYPE_CHECKING:
@@ -53,8 +53,6 @@ def uncertainty(
     seed: Annotated[int, typer.Option(help="of the draws")] = 0,
 ) -> None:
     """Show within which bands force and displacement lie, and which parameter makes them wide."""
-    from tqdm import tqdm
-
     from avatar_core.geometry.tip import Tip
     from avatar_core.uncertainty.bands import bands_of
     from avatar_core.uncertainty.force_table import force_table
@@ -71,12 +69,7 @@ def uncertainty(
     vademecum = load_vademecum(file)
     known = known_of(vademecum, known)
     places, vertex = _places(vademecum, at), _target(vademecum, target)
-    with tqdm(unit=" materials", file=sys.stderr, disable=None, delay=2.0, leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with progress_bar("materials") as show:
         table = force_table(vademecum, tip, places, pressed, vertex, show)
     bands = bands_of(table, known, draws, seed)
     centers = vademecum.surface.centers[places]

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from avatar_core.bags import table, types
 from avatar_core.bags.compare import comparable
-from avatar_core.bags.palpation import measured_path
 from avatar_core.bags.periods import BagPath, path_of
 from avatar_core.bags.read import read_bag
 from avatar_core.bags.write import write_mcap as export
@@ -39,10 +38,8 @@ from tests.core.bags.bag_files import (
     Cell,
     Message,
     info,
-    make,
     only,
     renamed,
-    vector,
     write_mcap,
     write_rosbag,
 )
@@ -489,39 +486,3 @@ def test_without_the_extra(
     ):
         with pytest.raises(StorageError, match=r"pip install 'avatar\[bags\]'"):
             needs()
-
-
-# --- palpations ----------------------------------------------------------------------------------
-
-
-def test_a_sensor_is_read_rather_than_what_the_cell_computed(
-    organ: Vademecum, cell: Cell, tmp_path: Path
-) -> None:
-    """measured_cf at its own times, its force between two messages; servo_cf where it is alone."""
-    computed = cell.messages()
-    path = measured_path(write_mcap(tmp_path / "computed.mcap", computed))
-    assert "servo_cf, which the cell computed" in path.notes[-1]
-    measured = make("geometry_msgs/msg/Wrench", vector([0.0, 0.0, 2.0]), vector(np.zeros(3)))
-    sensed = [
-        Message(
-            message.received + PERIOD // 3,
-            "/tool/measured_cf",
-            message.kind,
-            make(message.kind, message.content.header, measured),
-        )
-        for message in only(computed, "servo_cf")
-    ]
-    path = measured_path(write_mcap(tmp_path / "sensed.mcap", [*computed, *sensed]))
-    assert path.notes == ()
-    np.testing.assert_allclose(path.force[1:], 2.0)
-    np.testing.assert_allclose(path.tip, cell.tip, atol=1e-12)
-
-
-def test_a_bag_without_forces_or_with_gaps(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
-    poses = [*only(cell.messages(), "measured_cp")]
-    with pytest.raises(StorageError, match="no /tool/measured_cf and no /tool/servo_cf"):
-        measured_path(write_mcap(tmp_path / "poses.mcap", poses))
-    wrenches = [*only(cell.messages(), "servo_cf")]
-    gap = [*poses, *wrenches[:100], *wrenches[300:]]
-    path = measured_path(write_mcap(tmp_path / "gap.mcap", gap))
-    assert np.isnan(path.force[110:290]).all() and np.isfinite(path.force[310:600]).all()
