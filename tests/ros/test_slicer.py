@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 import time
+from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
@@ -94,6 +95,11 @@ def heard(client: Any, probe: Any, device: str, wanted: Any = lambda message: Tr
     raise AssertionError(f"nothing wanted came for {device}")
 
 
+def points_of(cloud: PointCloud2) -> np.ndarray:
+    """Positions of a cloud, shape (n, 3) [mm]."""
+    return 1e3 * np.frombuffer(cloud.data, np.float32).reshape(-1, 6)[:, :3]
+
+
 def test_the_organ_comes_in_millimetres(cell: Any, probe: Any, slicer: Any, organ: Any) -> None:
     _wait_for_model(cell, probe)
     for device in (messages.ORGAN, messages.DEFORMED):
@@ -115,6 +121,8 @@ def test_a_tool_that_is_moved_there_presses_here(
         slicer.send_message(messages.pose(messages.TARGET, tip + way * normal, UPRIGHT))
         probe.spin(0.03)
     probe.spin(1.0)  # it arrives a pose late
+    at = 1e3 * tip
+    heard(slicer, probe, messages.TOOL, lambda m: np.abs(m.matrix[:3, 3] - at).max() < 0.1)
     state = probe.next(
         ContactState,
         "contact_state",
@@ -126,14 +134,21 @@ def test_a_tool_that_is_moved_there_presses_here(
         np.sum([(c.force.x, c.force.y, c.force.z) for c in state.contacts], axis=0)
     )
     assert force > 0.1
-    moved = heard(slicer, probe, messages.DEFORMED, lambda m: np.abs(m.points - rest).max() > 1.0)
-    cloud = probe.next(PointCloud2, "deformation", qos.NEWEST)
-    points = np.frombuffer(cloud.data, np.float32).reshape(-1, 6)[:, :3]
-    np.testing.assert_allclose(moved.points, 1e3 * points, atol=0.02)
+    # A busy machine shows fewer modes from one period to the next: one of the last clouds is it.
+    clouds: deque[np.ndarray] = deque(maxlen=500)
+    listener = probe.node.create_subscription(
+        PointCloud2, "deformation", lambda cloud: clouds.append(points_of(cloud)), qos.NEWEST
+    )
+    moved = heard(
+        slicer,
+        probe,
+        messages.DEFORMED,
+        lambda m: any(np.allclose(m.points, points, rtol=0.0, atol=0.02) for points in clouds),
+    )
+    probe.node.destroy_subscription(listener)
+    assert np.abs(moved.points - rest).max() > 1.0
     said = heard(slicer, probe, messages.CONTACT, lambda m: " N" in m.string)
     assert float(said.string.split()[0]) == pytest.approx(force, abs=0.01)
-    tool = heard(slicer, probe, messages.TOOL)
-    np.testing.assert_allclose(tool.matrix[:3, 3], 1e3 * tip, atol=0.1)
     slicer.stop()
     left = lambda s: s.status != ContactState.STATUS_OK  # noqa: E731
     probe.next(ContactState, "contact_state", qos.state(1), left, SECONDS)
