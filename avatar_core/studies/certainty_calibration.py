@@ -45,16 +45,17 @@ SUPPORTED = "support.bare_area"
 CONTRAST = Coordinate("contrast", 0.7, 30.0)
 STIFFNESS = (5e5, 2e8)  # of the support at the vademecum's Young's modulus [N/m^3]
 TRUE_YOUNG, TRUE_CONTRAST, TRUE_STIFFNESS = (3e3, 12e3), (2.0, 12.0), (2e6, 2e7)
-N_TOUCHES = 20
-N_AT_TUMOUR, APART = 8, 8e-3  # of them, and how far apart these are at least [m]
-WELL_KNOWN = 0.08  # error of a force that nine in ten keep, where a touch is worth it
+N_TOUCHES, N_AT_TUMOUR = 20, 8  # of a trial, and of them over the tumour
+POOL, POOL_AT_TUMOUR = 60, 20  # places that trials draw from, away from the tumour and over it
+APART = 4e-3  # places over the tumour, at least [m]
+WELL_KNOWN = 0.05  # error of a force that nine in ten keep, where a touch is worth it
 NOISE = 0.02  # of a measured force
 DEPTHS = (2e-3, 4e-3, 6e-3)  # [m]
 TIP = Tip("patch", 8e-3)
-ERRORS = Errors(sensor=NOISE, least=1e-6)
+ERRORS = Errors(sensor=NOISE, least=1e-6, depth=0.1e-3)  # poses and surface are exact here
 _ABOVE, _STEP = 2e-3, 1e-3  # where a touch begins, and between its points [m]
 _SHRUNK, _BELOW = 0.35, 28e-3  # the tumour: of the organ's size, its middle below the surface [m]
-_N_VERTICES, _N_TRUE_VERTICES = 1500, 5000
+_N_TRUE_VERTICES = 5000
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +85,16 @@ def calibration_section(
     surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar
 ) -> Section:
     """Calibration of a small organ, whatever the liver of the study: each trial is a solution."""
-    outline = phantom_liver(12e-3)
+    outline = phantom_liver()
     tumour = _tumour(outline)
-    vademecum = _build(outline, tumour, bar)
+    vademecum = _build(outline, tumour, settings.n_vertices, bar)
     positions = _places(vademecum, tumour)
     truth = _truth(outline, tumour, vademecum, positions)
     path = _path(vademecum, positions)
     bar.begin("calibrations")
     table = touch_table(vademecum, TIP, path)
-    rows = _trials(table, priors_of(vademecum), truth, settings.n_trials)
+    depth = _depths(outline, table)
+    rows = _trials(table, priors_of(vademecum), truth, depth, settings.n_trials)
     summary = _summary(rows)
     return Section(
         name="calibration",
@@ -101,8 +103,8 @@ def calibration_section(
         rows=tuple(rows),
         panels=(Panel("calibration", _FOUND, partial(_draw, rows=rows)),),
         notices=(
-            f"calibration: of the phantom at {_N_VERTICES} vertices with a tumour, by forces of a "
-            f"mesh of {len(truth.problem.mesh.vertices)}",
+            f"calibration: of the phantom with a tumour, {len(vademecum.mesh.vertices)} vertices, "
+            f"by forces of a mesh of {len(truth.problem.mesh.vertices)}",
         ),
     )
 
@@ -122,24 +124,25 @@ def _tumour(outline: SurfaceMesh) -> SurfaceMesh:
     return SurfaceMesh(place + _SHRUNK * off, outline.faces, "tumour in the phantom")
 
 
-def _build(outline: SurfaceMesh, tumour: SurfaceMesh, bar: ProgressBar) -> Vademecum:
+def _build(outline: SurfaceMesh, tumour: SurfaceMesh, n: int, bar: ProgressBar) -> Vademecum:
     low, high = STIFFNESS
     options = OrganOptions(
-        n_vertices=_N_VERTICES,
+        n_vertices=n,
         coordinates=(CONTRAST,),
         tumour=tumour,
         supports=(SupportOption.parse(f"bare_area={low:g}:{high:g}"),),
-        n_certified=16,
+        n_certified=48,
     )
     return build(outline, options, bar.begin("calibration"))
 
 
 def _places(vademecum: Vademecum, tumour: SurfaceMesh) -> IntArray:
-    """Load positions: some over the tumour, the others far apart."""
+    """Load positions: ``POOL_AT_TUMOUR`` over the tumour, then ``POOL`` far apart."""
     centers, inner = vademecum.surface.centers, _well_known(vademecum)
-    over = vademecum.surface.largest_apart(_nearness(vademecum, tumour, inner), N_AT_TUMOUR, APART)
+    near = _nearness(vademecum, tumour, inner)
+    over = vademecum.surface.largest_apart(near, POOL_AT_TUMOUR, APART)
     others = np.setdiff1d(inner, over)
-    return np.r_[over, others[farthest_points(centers[others], N_TOUCHES - len(over))]]
+    return np.r_[over, others[farthest_points(centers[others], POOL)]]
 
 
 def _nearness(vademecum: Vademecum, tumour: SurfaceMesh, among: IntArray) -> FloatArray:
@@ -186,8 +189,15 @@ def _path(vademecum: Vademecum, positions: IntArray) -> Palpation:
     return Palpation(tip.reshape(-1, 3), np.repeat(np.arange(n), len(depth)), np.tile(force, n))
 
 
+def _depths(outline: SurfaceMesh, table: TouchTable) -> FloatArray:
+    """How deep the patch lies below the surface, whose exact place no mesh decides, (n, 3) [m]."""
+    path = table.palpation
+    off = outline.skin.signed_distance(path.tip[path.sampled])
+    return np.asarray(TIP.offset - off).reshape(-1, len(DEPTHS))
+
+
 def _trials(
-    table: TouchTable, known: Mapping[str, Distribution], truth: Truth, n: int
+    table: TouchTable, known: Mapping[str, Distribution], truth: Truth, depth: FloatArray, n: int
 ) -> list[dict[str, Value]]:
     rng, rows = np.random.default_rng(4), []
     without = {**known, "contrast": Fixed(1.0)}
@@ -198,7 +208,9 @@ def _trials(
             for ends in (TRUE_YOUNG, TRUE_CONTRAST, TRUE_STIFFNESS)
         )
         values = {"young": young, "contrast": contrast, SUPPORTED: stiffness * young / reference}
-        measured = _measured(table, truth.stiffness(values), rng)
+        chosen = _touches(rng)
+        force = truth.stiffness(values)[chosen, None] * depth[chosen]
+        measured = _measured(table.where(chosen), force, rng)
         found = calibrated(measured, known, ERRORS)
         row: dict[str, Value] = {"explained": found.explained, "probability": found.probability}
         for name, value in values.items():
@@ -210,12 +222,19 @@ def _trials(
     return rows
 
 
-def _measured(table: TouchTable, stiffness: FloatArray, rng: np.random.Generator) -> TouchTable:
-    """The table with the forces of a truth and the noise of a sensor."""
+def _touches(rng: np.random.Generator) -> np.ndarray:
+    """Those of a trial, a mask of all places: errors of places are other ones in each trial."""
+    chosen = np.zeros(POOL_AT_TUMOUR + POOL, bool)
+    chosen[rng.permutation(POOL_AT_TUMOUR)[:N_AT_TUMOUR]] = True
+    chosen[POOL_AT_TUMOUR + rng.permutation(POOL)[: N_TOUCHES - N_AT_TUMOUR]] = True
+    return chosen
+
+
+def _measured(table: TouchTable, force: FloatArray, rng: np.random.Generator) -> TouchTable:
+    """The table with the forces of a truth, (n_touches, n_depths), and the noise of a sensor."""
     path = table.palpation
-    force = np.outer(stiffness, DEPTHS).ravel()[: path.sampled.sum()]
     noisy = path.force.copy()
-    noisy[path.sampled] = force * (1.0 + NOISE * rng.standard_normal(len(force)))
+    noisy[path.sampled] = force.ravel() * (1.0 + NOISE * rng.standard_normal(force.size))
     return replace(table, palpation=replace(path, force=noisy))
 
 

@@ -22,22 +22,19 @@ C holds what is off about a force, each with its own reach:
 The vademecum's error has long tails: at few places it is many times what it is elsewhere. It is
 taken for Student's t with nu degrees of freedom, as a touch that is d deviations off having an
 error whose variance is (nu + d^2) / (nu + 1) times the stated one (Lange, Little & Taylor, J. Am.
-Stat. Assoc. 84:881, 1989). If model and errors are as stated, the normal scores of all d are
-chi-square distributed together, and neighbours deviate no more alike than others: a model that
-lacks something is found out by the one or the other.
+Stat. Assoc. 84:881, 1989). Whether the model can have made the forces at all is judged by these d;
+see :mod:`avatar_core.uncertainty.fit_check`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
-from scipy.special import ndtr, ndtri
-from scipy.stats import chi2
-from scipy.stats import t as student_t
+from scipy.special import ndtr
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.contact.layout import lay_out
@@ -45,6 +42,7 @@ from avatar_core.contact.model import Status, estimate_error, make_model, step
 from avatar_core.errors import ContactError
 from avatar_core.geometry.tip import Tip
 from avatar_core.uncertainty.distributions import Distribution, Fixed, Lognormal
+from avatar_core.uncertainty.fit_check import chance
 from avatar_core.uncertainty.material_grid import MaterialGrid
 from avatar_core.uncertainty.palpation import Palpation
 from avatar_core.vademecum.accuracy import Detail
@@ -56,7 +54,6 @@ _N_WEIGHTINGS = 4  # by the forces that the last one expects
 _FARTHEST = 4.0  # deviations from what was known, of the values that are tried
 _UNKNOWN = 0.1  # error of a force whose place was never certified
 _LEAST_TOUCHES = 3
-_AROUND, _N_PERMUTED = 30e-3, 1999  # neighbours of a touch [m]; permutations of all touches
 _TAIL = 4.0  # degrees of freedom of a vademecum's error over what it states
 
 
@@ -110,6 +107,17 @@ class TouchTable:
         """The touch of each sample, shape (n_samples,)."""
         return np.asarray(self.palpation.touch[self.palpation.sampled])
 
+    def where(self, kept: np.ndarray) -> TouchTable:
+        """Of some touches only, (n_touches,) of bool."""
+        samples = kept[self.touch]
+        return replace(
+            self,
+            palpation=self.palpation.where(kept),
+            log_force=self.log_force[:, samples],
+            steepness=self.steepness[samples],
+            error=self.error[samples],
+        )
+
     def covariance(
         self, errors: Errors, log_force: FloatArray, inflated: FloatArray | None = None
     ) -> FloatArray:
@@ -134,7 +142,7 @@ class Calibration:
     names : of the parameters that were not fixed
     mean, covariance : of their standard normal numbers, shapes (n,) and (n, n)
     misfit : ndarray, shape (n_samples,), of ln F, measured less computed
-    deviations : ndarray, shape (n_touches,), the same of each touch over what is expected of it
+    deviations : ndarray, shape (n_touches,), the same of each touch over its standard deviation
     probability : that so bad a fit comes by chance
     """
 
@@ -288,8 +296,10 @@ def calibrated(
         best = least_squares(whitened, at, bounds=(-_FARTHEST, _FARTHEST), jac="3-point")
         at, expected = best.x, computed(best.x)
         left = table.measured - expected
-        deviations = _deviations(table.touch, left, table.covariance(errors, expected))
+        together = _together(table.touch, table.covariance(errors, expected))
+        deviations = together @ left
         inflated = (_TAIL + deviations**2) / (_TAIL + 1.0)
+    derivatives = together @ root @ best.jac[: len(left)]
     return Calibration(
         known,
         names,
@@ -297,32 +307,8 @@ def calibrated(
         np.linalg.inv(best.jac.T @ best.jac),
         left,
         deviations,
-        _chance(deviations, _places(table.palpation), len(names)),
+        chance(deviations, _places(table.palpation), derivatives, _TAIL),
     )
-
-
-def _chance(deviations: FloatArray, tips: FloatArray, n_parameters: int) -> float:
-    """Probability of deviations as large, or as alike between neighbours, as these."""
-    scores = ndtri(student_t.cdf(-np.abs(deviations), _TAIL))  # parameters fit some away
-    large = float(chi2.sf((scores**2).sum(), max(len(deviations) - n_parameters, 1)))
-    return min(1.0, 2.0 * min(large, _alike(deviations, tips)))
-
-
-def _alike(deviations: FloatArray, tips: FloatArray) -> float:
-    """Probability, over permutations, that neighbours deviate as alike as they do.
-
-    By Moran's I with weights exp(-r^2 / r0^2) (Moran, Biometrika 37:17, 1950). The vademecum's own
-    error differs from place to place; what the model lacks makes all touches around it deviate to
-    one side.
-    """
-    square = ((tips[:, None] - tips) ** 2).sum(axis=-1)
-    near = np.exp(-square / _AROUND**2)
-    np.fill_diagonal(near, 0.0)
-    centred = ndtri(student_t.cdf(deviations - np.median(deviations), _TAIL))
-    rng = np.random.default_rng(0)
-    drawn = np.array([rng.permutation(centred) for _ in range(_N_PERMUTED)])
-    chance = np.einsum("pi,ij,pj->p", drawn, near, drawn)
-    return float((1 + (chance >= centred @ near @ centred).sum()) / (1 + _N_PERMUTED))
 
 
 def _places(palpation: Palpation) -> FloatArray:
@@ -331,8 +317,14 @@ def _places(palpation: Palpation) -> FloatArray:
     return palpation.tip[last]
 
 
-def _deviations(touch: np.ndarray, misfit: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Sum of the misfits of each touch over its standard deviation, shape (n_touches,)."""
-    member = (np.arange(touch[-1] + 1)[:, None] == touch).astype(float)
-    variance = np.einsum("ti,ij,tj->t", member, covariance, member)
-    return np.asarray(member @ misfit / np.sqrt(variance))
+def _together(touch: np.ndarray, covariance: FloatArray) -> FloatArray:
+    """From misfits of samples to one for each touch, over its deviation, (n_touches, n_samples).
+
+    The weights are those of least variance within a touch, C^-1 1 / sqrt(1^T C^-1 1).
+    """
+    out = np.zeros((touch[-1] + 1, len(touch)))
+    for row, k in zip(out, range(len(out)), strict=True):
+        own = np.flatnonzero(touch == k)
+        weight = np.linalg.solve(covariance[np.ix_(own, own)], np.ones(len(own)))
+        row[own] = weight / np.sqrt(weight.sum())
+    return out

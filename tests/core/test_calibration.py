@@ -12,19 +12,12 @@ import numpy as np
 import pytest
 
 from avatar_core.cli.main import main
-from avatar_core.contact.model import FAR_AWAY, prepare, step
-from avatar_core.contact.tool_path import palpation as push
-from avatar_core.contact.tool_path import starts_apart
 from avatar_core.errors import ContactError, CoordinateError, StorageError
-from avatar_core.geometry.tip import Tip
-from avatar_core.scene.file import write_scene
-from avatar_core.scene.model import Scene
-from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
+from avatar_core.scene.recording import save_recording
 from avatar_core.uncertainty.calibration import (
     LEAST_PROBABILITY,
     Errors,
     TouchTable,
-    _alike,
     calibrated,
     touch_table,
 )
@@ -41,30 +34,11 @@ from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
 from tests.core.soft_organ import organ_on_springs, soft_organ
+from tests.core.touches import SPHERE, felt, path_over, recording_of
 
-RADIUS = 5e-3
-SPHERE = Tip("sphere", RADIUS)
 N_TOUCHES = 8
-DEPTH = 5e-3
 TRUE = {"young": 6e3, "poisson": 0.45, "contrast": 5.0}
 SENSOR_ALONE = Errors(sensor=0.02, least=1e-9, depth=0.0, mesh=1e-9)
-
-
-def path_over(organ: Vademecum, n: int) -> np.ndarray:
-    """Pushes at n places, the tool far away between them, shape (periods, 3)."""
-    parts = [push(organ, RADIUS, DEPTH, 120, j) for j in starts_apart(organ, n)]
-    away = np.full((5, 3), FAR_AWAY)
-    return np.concatenate([row for part in parts for row in (away, part)] + [away])
-
-
-def felt(organ: Vademecum, tips: np.ndarray) -> np.ndarray:
-    """Force on the tip, shape (n, 3)."""
-    model = prepare(organ, (SPHERE,), cloud="off")
-    force = np.empty(tips.shape)
-    for k, tip in enumerate(tips):
-        step(model, tip[None])
-        force[k] = model.out.force[0]
-    return force
 
 
 @pytest.fixture(scope="module")
@@ -243,22 +217,6 @@ def test_a_posterior_becomes_what_is_known(organ: Vademecum, table: TouchTable) 
 # --- the command -------------------------------------------------------------------------------
 
 
-def recording_of(organ: Vademecum, tips: np.ndarray, forces: np.ndarray) -> Recording:
-    n = len(tips)
-    periods = Periods(
-        number=np.arange(n),
-        stamp=np.arange(n) * 1_000_000,
-        tip=tips[:, None],
-        turn=np.zeros((n, 1, 3)),
-        status=np.zeros((n, 1), np.uint8),
-        force=forces[:, None],
-        error=np.zeros((n, 1)),
-        sent_fraction=np.ones((n, 1)),
-    )
-    clouds = Clouds(np.zeros(0, np.int64), np.zeros((0, 0, 3), np.float32))
-    return Recording("", organ.name, write_scene(Scene()), 1e3, True, periods, clouds)
-
-
 @pytest.fixture
 def run(
     monkeypatch: pytest.MonkeyPatch,
@@ -317,18 +275,6 @@ def test_the_command_calls_a_wrong_model_wrong(
     assert json.loads((tmp_path / "found.json").read_text())["explained"] is False
 
 
-def test_touches_that_deviate_alike_beside_one_another_are_found_out() -> None:
-    """As over something hard that the model lacks; the same deviations elsewhere are chance."""
-    across = 20e-3 * np.arange(5)
-    tips = np.stack([*np.meshgrid(across, across)], axis=-1).reshape(-1, 2)
-    tips = np.c_[tips, np.zeros(25)]
-    over = np.linalg.norm(tips - tips[12], axis=1) < 25e-3
-    deviations = np.where(over, 1.2, -0.3)
-    assert _alike(deviations, tips) < LEAST_PROBABILITY / 2.0
-    anywhere = [_alike(np.random.default_rng(k).permutation(deviations), tips) for k in range(20)]
-    assert 0.25 < np.mean(anywhere) < 0.75
-
-
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
@@ -336,7 +282,7 @@ def test_touches_that_deviate_alike_beside_one_another_are_found_out() -> None:
         (("-o", "push.json", "--sensor", "0"), "--sensor is 0"),
         (("--least", "0"), "--least is 0"),
         (("--depth", "-1"), "--depth is -1"),
-        (("--tool", "2"), "--tool is '2'; push.h5 has tools 1 to 1"),
+        (("--tool", "2"), "tool '2' is not in push.h5, which has tools 1 to 1"),
         (("--given", "stiffness=fixed:1"), "no 'stiffness'"),
     ],
 )
