@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,9 +18,8 @@ from avatar_core.cli.uncertainty import given_of
 from avatar_core.cli.vademecum import finite, require
 
 if TYPE_CHECKING:
-    from avatar_core.common.arrays import FloatArray
-    from avatar_core.geometry.tip import Tip
     from avatar_core.uncertainty.calibration import Calibration
+    from avatar_core.uncertainty.touched import Touched, TouchFile
 
 EXIT_NOT_EXPLAINED = 3
 _FORMATS = (".yaml", ".json", ".png", ".pdf", ".svg")
@@ -88,6 +87,7 @@ def calibrate(
     from avatar_core.uncertainty.calibration_report import say
     from avatar_core.uncertainty.palpation import palpation_of
     from avatar_core.uncertainty.priors import priors_of
+    from avatar_core.uncertainty.touched import TouchFile
     from avatar_core.vademecum.storage import load_vademecum
 
     for one in output or []:
@@ -98,7 +98,8 @@ def calibrate(
     if set_them:
         require_ros()
     known = given_of(given or [])
-    touched = _touched(recording, tool, tool_transform, radius)
+    transform = None if tool_transform is None else pose("--tool-transform", tool_transform)
+    touched = _read(TouchFile(recording, tool, transform, 1e-3 * radius))
     palpation = palpation_of(touched.position, touched.force)
     vademecum = load_vademecum(file)
     priors = priors_of(vademecum, known)
@@ -116,52 +117,14 @@ def calibrate(
         _set(found)
 
 
-class _Touched(NamedTuple):
-    """What a file says of a tool: its tip, where it was (n, 3) [m], the forces (n,) [N]."""
-
-    tip: Tip
-    position: FloatArray
-    force: FloatArray
-    notes: tuple[str, ...]
-
-
-def _touched(recording: Path, tool: str | None, transform: str | None, radius: float) -> _Touched:
+def _read(file: TouchFile) -> Touched:
     from avatar_core.bags.files import is_bag
+    from avatar_core.uncertainty.touched import read_touched
 
-    if not is_bag(recording):
-        return _of_recording(recording, tool)
-    from avatar_core.bags.palpation import measured_path
-    from avatar_core.geometry.tip import Tip
-
-    given = None
-    if transform is not None:
-        given = pose("--tool-transform", transform)
-    tip = Tip("sphere", 1e-3 * radius)
+    if not is_bag(file.path):
+        return read_touched(file)
     with progress_bar("messages") as progress:
-        path = measured_path(recording, tool, given, progress)
-    return _Touched(tip, path.tip, path.force, path.notes)
-
-
-def _of_recording(file: Path, tool: str | None) -> _Touched:
-    import numpy as np
-
-    from avatar_core.scene.recording import load_recording
-    from avatar_core.scene.replay import scene_of
-
-    found = load_recording(file)
-    tips = [one.tip for one in scene_of(found).tools]
-    number = int(tool) if tool is not None and tool.isdecimal() else 1
-    right = tool is None or tool == str(number)
-    require(
-        right and 1 <= number <= len(tips), f"--tool is '{tool}'; {file} has tools 1 to {len(tips)}"
-    )
-    periods, k = found.periods, number - 1
-    return _Touched(
-        tips[k],
-        periods.tip[:, k],
-        np.linalg.norm(periods.force[:, k], axis=1),
-        ("forces of a recording are those that the cell computed, unless a sensor's were put in",),
-    )
+        return read_touched(file, progress)
 
 
 def _write(output: Path, name: str, table: object, found: Calibration) -> None:

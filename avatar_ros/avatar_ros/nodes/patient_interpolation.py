@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 from array import array
 from collections.abc import Callable
 from dataclasses import asdict
@@ -13,12 +12,12 @@ from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.task import Future
 
 from avatar_core.errors import one_line
 from avatar_core.geometry.label_files import is_label_map
 from avatar_ros.action import BuildPatient
 from avatar_ros.framework import conversions, promises
+from avatar_ros.framework.beside import Beside
 from avatar_ros.framework.library import RefusedError, file_name, find_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
@@ -117,7 +116,7 @@ class PatientInterpolationNode(ManagedNode):
         self._settings: InterpolationSettings | None = None
         self._builder: PatientBuilder | None = None
         self._active = False
-        self._n_awaited = 0
+        self._beside = Beside(self, "patient")
         super().__init__("patient_interpolation", PATIENT_INTERPOLATION)
         group = ReentrantCallbackGroup()
         self.create_service(
@@ -159,7 +158,7 @@ class PatientInterpolationNode(ManagedNode):
 
     @property
     def has_pending_answers(self) -> bool:
-        return self._n_awaited > 0
+        return self._beside.n_awaited > 0
 
     def build(
         self,
@@ -190,7 +189,7 @@ class PatientInterpolationNode(ManagedNode):
         self, request: InterpolatePatient.Request, response: InterpolatePatient.Response
     ) -> InterpolatePatient.Response:
         try:
-            _fill(response, await self._beside(lambda: self.build(request)), request.fidelity)
+            _fill(response, await self._beside.done(lambda: self.build(request)), request.fidelity)
         except Exception as error:  # a service always answers; the surface decides what is raised
             self._refuse("interpolate_patient", response, error)
         return response
@@ -205,7 +204,7 @@ class PatientInterpolationNode(ManagedNode):
             return self.build(goal.request, tell, lambda: goal.is_cancel_requested)
 
         try:
-            _fill(result, await self._beside(work), goal.request.fidelity)
+            _fill(result, await self._beside.done(work), goal.request.fidelity)
             goal.succeed()
         except Exception as error:  # as above
             self._refuse("build_patient", result, error)
@@ -214,26 +213,6 @@ class PatientInterpolationNode(ManagedNode):
             else:
                 goal.abort()
         return result
-
-    async def _beside(self, work: Callable[[], Built | Previewed]) -> Built | Previewed:
-        """Wait for work in a separate thread while the executor keeps running."""
-        executor = self.executor
-        assert executor is not None  # which runs this
-        done = Future(executor=executor)
-
-        def run() -> None:
-            try:
-                done.set_result(work())
-            except Exception as error:
-                done.set_exception(error)
-            executor.wake()
-
-        self._n_awaited += 1
-        try:
-            threading.Thread(target=run, name="patient", daemon=True).start()
-            return await done
-        finally:
-            self._n_awaited -= 1
 
     def _refuse(self, what: str, answer: Any, error: Exception) -> None:
         answer.success = False

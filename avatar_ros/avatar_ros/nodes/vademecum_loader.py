@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from shape_msgs.msg import Mesh
 from std_msgs.msg import Header
@@ -15,6 +16,7 @@ from avatar_core.common.confined import Imported
 from avatar_core.common.processes import return_memory
 from avatar_core.errors import AvatarError, StorageError, one_line
 from avatar_ros.framework import conversions, promises, qos
+from avatar_ros.framework.beside import Beside
 from avatar_ros.framework.library import read_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import (
@@ -28,7 +30,8 @@ from avatar_ros.framework.parameters import (
 from avatar_ros.framework.reader import Reader
 from avatar_ros.framework.saved_state import STATE_DIR, SavedState
 from avatar_ros.msg import VademecumFile, VademecumInfo
-from avatar_ros.srv import LoadVademecum
+from avatar_ros.nodes.calibration import Calibrator
+from avatar_ros.srv import CalibrateMaterial, LoadVademecum
 
 SUMMARY = Imported("avatar_ros.framework.summary", "summary")
 
@@ -66,11 +69,20 @@ class LoaderNode(ManagedNode):
     def __init__(self) -> None:
         self._settings: LoaderSettings | None = None
         self._reader: Reader | None = None
+        self._calibrator: Calibrator | None = None
+        self._loaded = ""
         self._outlets: dict[type, Any] = {}
         self._is_active = False
         super().__init__("vademecum_loader", VADEMECUM_LOADER)
         # Exists as long as the node: an inactive one says so, where a client would wait for ever.
         self.create_service(LoadVademecum, "load_vademecum", self._answer)
+        self._beside = Beside(self, "calibration")
+        self.create_service(
+            CalibrateMaterial,
+            "calibrate_material",
+            self._calibrate,
+            callback_group=ReentrantCallbackGroup(),
+        )
         started = self.get_parameter("vademecum").value
         self._state = SavedState(self, {"vademecum": started})
 
@@ -81,6 +93,7 @@ class LoaderNode(ManagedNode):
                 f"parameter library_dir: {self._settings.library_dir} is not a directory"
             )
         self._reader = Reader(self._settings.max_bytes)
+        self._calibrator = Calibrator(self._settings.library_dir, self._settings.max_bytes)
         self._outlets = {
             kind: self.ports.publisher(kind, topic, qos.ONCE)
             for kind, topic in (
@@ -102,10 +115,14 @@ class LoaderNode(ManagedNode):
     def clean_up(self) -> None:
         if self._reader is not None:
             self._reader.close()
-        self._reader = None
+        self._reader = self._calibrator = None
         for publisher in self._outlets.values():
             self.destroy_publisher(publisher)
         self._outlets = {}
+
+    @property
+    def has_pending_answers(self) -> bool:
+        return self._beside.n_awaited > 0
 
     def _load_first(self, name: str) -> None:
         """Load the saved vademecum, or else that of the parameter."""
@@ -132,6 +149,7 @@ class LoaderNode(ManagedNode):
         header = Header(frame_id=self._settings.frame_id, stamp=self.get_clock().now().to_msg())
         info = conversions.vademecum_info(found, header)
         surface = conversions.surface_mesh(vertices, faces)
+        self._loaded = name
         self._outlets[VademecumInfo].publish(info)
         self._outlets[Mesh].publish(surface)
         self._outlets[VademecumFile].publish(conversions.vademecum_file(info.id, info.name, data))
@@ -156,6 +174,20 @@ class LoaderNode(ManagedNode):
             response.message = one_line(error)
             self.get_logger().error(f"load_vademecum: {response.message}")
         return_memory()
+        return response
+
+    async def _calibrate(
+        self, request: CalibrateMaterial.Request, response: CalibrateMaterial.Response
+    ) -> CalibrateMaterial.Response:
+        try:
+            calibrator = self._calibrator
+            if not self._is_active or calibrator is None:
+                raise StorageError("the node is inactive; activate it first")
+            loaded = self._loaded
+            return await self._beside.done(lambda: calibrator.answered(request, loaded, response))
+        except Exception as error:  # as above
+            response.message = one_line(error)
+            self.get_logger().error(f"calibrate_material: {response.message}")
         return response
 
 

@@ -1,0 +1,114 @@
+"""Touches with measured forces from a file: a bag of a sensor, or a recording of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from avatar_core.bags.files import is_bag
+from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import StorageError
+from avatar_core.geometry.tip import Tip
+from avatar_core.scene.recording import load_recording
+from avatar_core.scene.replay import scene_of
+from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
+from avatar_core.uncertainty.calibration_report import numbers, verdict
+from avatar_core.uncertainty.distributions import parse
+from avatar_core.uncertainty.palpation import palpation_of
+from avatar_core.uncertainty.priors import priors_of
+from avatar_core.vademecum.storage import load_vademecum
+
+RADIUS = 5e-3  # of a tip of which no radius is given [m]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class TouchFile:
+    """A file with touches.
+
+    tool : of a bag of several tools, NAME of the topics NAME/measured_cp; of a recording, number of
+        the tool, from 1; None: the only one
+    transform : of a bag, pose of the poses' frame in the organ's: position [m] and quaternion
+    radius : of a bag, of the spherical tip [m]
+    """
+
+    path: Path
+    tool: str | None = None
+    transform: tuple[float, ...] | None = None
+    radius: float = RADIUS
+
+
+class Touched(NamedTuple):
+    """What a file says of a tool: its tip, where it was (n, 3) [m], the forces (n,) [N]."""
+
+    tip: Tip
+    position: FloatArray
+    force: FloatArray
+    notes: tuple[str, ...]
+
+
+def read_touched(file: TouchFile, progress: Progress | None = None) -> Touched:
+    """Read the path of a tool and the forces on it.
+
+    Raises
+    ------
+    StorageError
+        For a file that cannot be read, a tool that it does not have, or a bag without forces.
+    """
+    return _of_bag(file, progress) if is_bag(file.path) else _of_recording(file)
+
+
+def _of_bag(file: TouchFile, progress: Progress | None) -> Touched:
+    from avatar_core.bags.palpation import measured_path  # of the extra bags
+
+    path = measured_path(file.path, file.tool, file.transform, progress)
+    return Touched(Tip("sphere", file.radius), path.tip, path.force, path.notes)
+
+
+def _of_recording(file: TouchFile) -> Touched:
+    found = load_recording(file.path)
+    tips = [one.tip for one in scene_of(found).tools]
+    number = int(file.tool) if file.tool is not None and file.tool.isdecimal() else 1
+    right = file.tool is None or file.tool == str(number)
+    if not right or not 1 <= number <= len(tips):
+        raise StorageError(
+            f"tool '{file.tool}' is not in {file.path}, which has tools 1 to {len(tips)}"
+        )
+    periods, k = found.periods, number - 1
+    return Touched(
+        tips[k],
+        periods.tip[:, k],
+        np.linalg.norm(periods.force[:, k], axis=1),
+        ("forces of a recording are those that the cell computed, unless a sensor's were put in",),
+    )
+
+
+def calibrated_files(
+    vademecum: Path,
+    recording: Path,
+    tool: str | None,
+    transform: tuple[float, ...] | None,
+    radius: float,
+    given: Sequence[str],
+) -> dict[str, Any]:
+    """What ``avatar calibrate`` writes as JSON, with the verdict on the fit as ``verdict``.
+
+    recording, tool, transform, radius : as of :class:`TouchFile`
+    given : what is known before, as ``young=lognormal:5300:1.5``
+
+    Raises
+    ------
+    AvatarError
+        As of what reads the files, and :func:`avatar_core.uncertainty.calibration.touch_table`.
+    """
+    known = dict(parse(one) for one in given)
+    touched = read_touched(TouchFile(recording, tool, transform, radius))
+    organ = load_vademecum(vademecum)
+    priors = priors_of(organ, known)
+    table = touch_table(organ, touched.tip, palpation_of(touched.position, touched.force))
+    found = calibrated(table, priors, Errors())
+    return numbers(table, found) | {"verdict": verdict(table, found)[0]}

@@ -1,0 +1,97 @@
+"""Calibration for a service: files are read, and all is computed, in a process of its own."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+from avatar_core.common.confined import Confined, ConfinedError, Imported
+from avatar_ros.framework.library import RefusedError, find_in_library
+from avatar_ros.srv import CalibrateMaterial
+
+RADIUS = 5e-3  # of a tip of which no radius is given [m]
+_CALIBRATED = Imported("avatar_core.uncertainty.touched", "calibrated_files")
+_BYTES = 6 << 30  # address space of the process [bytes]
+_SECONDS = 600.0  # of processor time
+
+
+class Calibrator:
+    """Answers one request at a time.
+
+    library_dir, max_bytes : where files are found, and how large they may be
+    """
+
+    def __init__(self, library_dir: str, max_bytes: int) -> None:
+        self._library_dir, self._max_bytes = library_dir, max_bytes
+        self._confined = Confined(_BYTES)
+        self._busy = False
+
+    def answered(
+        self, request: CalibrateMaterial.Request, loaded: str, response: CalibrateMaterial.Response
+    ) -> CalibrateMaterial.Response:
+        """Fill the answer; it takes up to a minute.
+
+        loaded : vademecum that is meant where the request names none
+
+        Raises
+        ------
+        AvatarError
+            For a field that is refused, or files that do not give a calibration.
+        """
+        if self._busy:
+            raise RefusedError("another calibration is being computed; ask again after it")
+        self._busy, begin = True, time.monotonic()
+        try:
+            told = self._confined.call(_SECONDS, _CALIBRATED, *self._arguments(request, loaded))
+        except ConfinedError as error:
+            raise RefusedError(f"{error}; check the files, or use 'avatar calibrate'") from error
+        finally:
+            self._confined.close()
+            self._busy = False
+        for name, value in _fields(told).items():
+            setattr(response, name, value)
+        response.seconds = time.monotonic() - begin
+        response.success = True
+        return response
+
+    def _arguments(self, request: CalibrateMaterial.Request, loaded: str) -> tuple[Any, ...]:
+        """Of ``calibrated_files``."""
+        name = request.name or loaded
+        if not name:
+            raise RefusedError("no vademecum was loaded; load one, or give name")
+        if not request.recording:
+            raise RefusedError("recording is empty; give a bag or a recording in library_dir")
+        if not (math.isfinite(request.radius) and request.radius >= 0.0):
+            raise RefusedError(f"radius is {request.radius:g} m; give a positive one, or 0")
+        transform = tuple(request.tool_transform)
+        if len(transform) not in (0, 7):
+            raise RefusedError(
+                f"tool_transform has {len(transform)} numbers; give position and quaternion, seven"
+            )
+        return (
+            self._file(name),
+            self._file(request.recording),
+            request.tool or None,
+            transform or None,
+            request.radius or RADIUS,
+            list(request.given),
+        )
+
+    def _file(self, name: str) -> Path:
+        return find_in_library(name, self._library_dir, self._max_bytes)
+
+
+def _fields(told: dict[str, Any]) -> dict[str, Any]:
+    """Of an answer, from the numbers of a calibration."""
+    found = [told["values"][name] for name in told["parameters"]]
+    return {
+        "message": told["verdict"],
+        "explained": told["explained"],
+        "probability": told["probability"],
+        "parameters": told["parameters"],
+        "values": [one["value"] for one in found],
+        "low": [one["low"] for one in found],
+        "high": [one["high"] for one in found],
+    }
