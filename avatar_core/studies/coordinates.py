@@ -444,4 +444,4 @@ def _draw_modes(axis, rows: Sequence[dict[str, Value]]) -> None:  # type: ignore
         )
     axis.set(xlabel="modes", ylabel="mean relative L2 error [-]")
     axis.grid(which="both", alpha=0.3)
-    axis.legend(fontsize=6, loc="upper right")
+    axis.legend(fontsize=6, loc="best")
