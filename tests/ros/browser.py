@@ -81,7 +81,8 @@ def opened(port: int, shots: Path) -> Iterator[Any]:
             page.screenshot(path=shots / "first.png")
         page.wait_for_timeout(3000)  # software rendering takes its time, and says so
         for close in page.locator(".mantine-Notification-closeButton").all():
-            close.click()
+            with suppress(Error):  # it closed by itself
+                close.click(timeout=2000)
         yield page
         browser.close()
         local = ("http://127.0.0.1", "ws://127.0.0.1", "data:", "blob:")
@@ -152,6 +153,15 @@ def drag(page: Any, shown: Organ, begin: float, end: float) -> None:
 def choose(page: Any, label: str, option: str) -> None:
     page.get_by_label(label, exact=True).click()
     page.get_by_role("option", name=option, exact=True).click()
+
+
+def input_of(page: Any, label: str) -> Any:
+    """The text, or the number beside a slider, of a label, which is no label of theirs in HTML."""
+    return (
+        page.get_by_text(label, exact=True)
+        .locator("xpath=ancestor::*[.//input[not(@type='hidden')]][1]//input[not(@type='hidden')]")
+        .first
+    )
 
 
 def open_tab(page: Any, name: str) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("avatar_ros.ui.measuring", reason="avatar_ros is not installed")
 
-from avatar_ros.ui.measuring import Place, gap, hit, is_plane, margin
+from avatar_ros.ui.measuring import Place, depth, gap, hit, is_plane, margin
 
 from tests.hard.small_files import ball
 
@@ -41,6 +41,16 @@ def test_a_gap_is_the_shortest_way() -> None:
     assert found.length == pytest.approx(0.02, abs=FACETS)
     np.testing.assert_array_equal(found.begin, body[1])
     assert np.linalg.norm(found.end - found.begin) == pytest.approx(found.length)
+
+
+@pytest.mark.parametrize("height", [0.06, 0.052, 0.047])
+def test_a_depth_is_that_of_the_deepest_point(height: float) -> None:
+    tip = np.array([0.0, height, 0.0]) + ball(200, 4e-3)[0]
+    assert depth(tip, POINTS, FACES) == pytest.approx(RADIUS + 4e-3 - height, abs=FACETS)
+
+
+def test_far_from_the_surface_there_is_no_depth() -> None:
+    assert depth(np.array([[0.0, 0.3, 0.0]]), POINTS, FACES) == -np.inf
 
 
 @pytest.mark.parametrize(("height", "expected"), [(0.06, 0.01), (-0.07, 0.02), (0.045, -0.005)])

@@ -33,6 +33,7 @@ from tests.ros.browser import (
     TOKEN,
     force_of,
     free_port,
+    input_of,
     nodes_of_a_page,
     open_tab,
     opened,
@@ -102,15 +103,6 @@ def page(folder: Path, own_domain: dict[str, str], shots: Path) -> Iterator[Any]
         yield page
 
 
-def slider(page: Any, label: str) -> Any:
-    """The number beside a slider."""
-    return (
-        page.get_by_text(label, exact=True)
-        .locator("xpath=ancestor::*[.//input[not(@type='hidden')]][1]//input[not(@type='hidden')]")
-        .first
-    )
-
-
 def in_force(probe: Probe, name: str) -> float:
     request = GetParameters.Request(names=[f"material.{name}"])
     (value,) = probe.ask(GetParameters, "/contact/get_parameters", request).values
@@ -134,7 +126,7 @@ def test_a_tumour_is_seen_in_the_organ(page: Any, shots: Path) -> None:
 
 def test_what_another_client_chose_is_shown(page: Any) -> None:
     open_tab(page, "Organ")
-    shown = slider(page, "E [kPa]")
+    shown = input_of(page, "E [kPa]")
     until(page, lambda: shown.input_value() == f"{CHOSEN_BY_ANOTHER / 1e3:g}", "the value", 30.0)
 
 
@@ -152,7 +144,7 @@ def test_a_slider_is_felt(
     pressed(page)
     open_tab(page, "Organ")
     before = force_of(page)
-    box = slider(page, label)
+    box = input_of(page, label)
     box.fill(f"{value:g}")
     box.press("Enter")
     until(

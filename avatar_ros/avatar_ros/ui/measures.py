@@ -9,19 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar_core.common.splines import evaluate
 from avatar_core.contact.error_map import force_error_at
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_ros.ui.measures_view import MeasuresView
-from avatar_ros.ui.measuring import Place, gap, hit, is_plane, margin
+from avatar_ros.ui.measuring import Place, depth, gap, hit, is_plane, margin
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.tip_body import tip_body, turn_to
 
 PROBE, RULER, PLANE = "probe", "ruler (2 points)", "plane (3 points)"
 _NEEDED = {PROBE: 1, RULER: 2, PLANE: 3}
 _DOTS = {PROBE: 0, RULER: 1, PLANE: 3}  # the first of each
-_FAR = 10.0  # distance off the grid of the tip field [m]
 _AROUND = 0.03  # distance from the organ up to which a depth is said [m]
 _N_BODY = 200  # points of a tip between which and a structure the way is measured
 
@@ -111,8 +109,8 @@ class Measures:
         return lines
 
     def _around_tool(self, organ: Organ, now: Now) -> list[str]:
-        lines = [f"Tip {_side(depth_of(organ, now, self._body))}"]
         body = now.tip + _turned(self._body, turn_to(organ.outward(now.tip)))
+        lines = [f"Tip {_side(depth(body, organ.vertices, organ.faces))}"]
         gaps = {name: gap(body, now.points, faces) for name, faces in organ.structures.items()}
         if not gaps:
             self._view.line("gap", None)
@@ -159,17 +157,10 @@ class Measures:
                 self._view.plane(whole, size)
 
 
-def depth_of(organ: Organ, now: Now, body: np.ndarray) -> float:
-    """How deep the tip's foremost point is below the surface at rest [m]; negative: above it."""
-    field, slope = organ.vademecum.tip_field, np.zeros(3)
-    height = evaluate(field.distance, field.origin, field.spacing[0], now.tip, slope, _FAR)
-    return float(-body[:, 2].min() - height)
-
-
-def _side(depth: float) -> str:
-    if depth < -_AROUND:
+def _side(deep: float) -> str:
+    if deep < -_AROUND:
         return "off the organ"
-    return f"{1e3 * abs(depth):.1f} mm {'below' if depth > 0.0 else 'above'} the surface at rest"
+    return f"{1e3 * abs(deep):.1f} mm {'below' if deep > 0.0 else 'above'} the surface at rest"
 
 
 def _at(places: list[Place], points: np.ndarray) -> np.ndarray:

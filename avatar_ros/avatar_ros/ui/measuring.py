@@ -8,6 +8,7 @@ import igl
 import numpy as np
 
 _PARALLEL = 1e-12
+_AROUND = 0.05  # distance from a tool of the faces that its depth is measured from [m]
 _EDGE = 1e-9  # barycentric coordinates down to minus this count as inside
 
 
@@ -69,6 +70,31 @@ def gap(body: np.ndarray, points: np.ndarray, faces: np.ndarray) -> Gap:
     )
     k = int(np.argmin(square))
     return Gap(float(np.sqrt(square[k])), body[k], closest[k])
+
+
+def depth(body: np.ndarray, points: np.ndarray, faces: np.ndarray) -> float:
+    """How deep the deepest point of a tool is below a closed surface [m]; negative: above it.
+
+    That of the surface as it is drawn and exported. The surface that a tool feels is smoother: on a
+    coarse mesh it lies some tenths of a millimetre beside it.
+
+    Far from it, minus infinity: only faces around the tool are looked at.
+
+    body : ndarray, shape (k, 3); points : (n, 3) [m]; faces : (m, 3)
+    """
+    middle = body.mean(axis=0)
+    reach = float(np.linalg.norm(body - middle, axis=1).max()) + _AROUND
+    is_near = np.linalg.norm(points - middle, axis=1) < reach
+    near = faces[is_near[faces].any(axis=1)]
+    if len(near) == 0:
+        return -np.inf
+    signed, *_ = igl.signed_distance(
+        np.ascontiguousarray(body, float),
+        np.ascontiguousarray(points, float),
+        np.ascontiguousarray(near, np.int64),
+        igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
+    )
+    return -float(signed.min())
 
 
 def margin(plane: np.ndarray, points: np.ndarray) -> float:

@@ -36,9 +36,15 @@ Progress = Callable[[str, float, float], None]
 
 
 class Requests:
-    """Clients of the cell's services and of its action."""
+    """Clients of the cell's services and of its action.
+
+    The page calls from threads of its own. rclpy notes a goal, unlike a request of a service, only
+    after it was sent: an answer that the executor takes before is lost, and the end of the build
+    with it. So goals are sent in the executor's thread.
+    """
 
     def __init__(self, node: Node) -> None:
+        self._node = node
         self._load_vademecum = node.create_client(LoadVademecum, "load_vademecum")
         self._load_scene = node.create_client(LoadScene, "load_scene")
         self._set = node.create_client(SetParameters, "contact/set_parameters")
@@ -160,12 +166,23 @@ class Requests:
             self._goal = done.result()
             self._goal.get_result_async().add_done_callback(finished)
 
-        self._build.send_goal_async(goal, note).add_done_callback(accepted)
+        self._in_executor(
+            lambda: self._build.send_goal_async(goal, note).add_done_callback(accepted)
+        )
 
     def cancel_patient(self) -> None:
         """Cancel the build that is under way, if any."""
-        if self._goal is not None:
-            self._goal.cancel_goal_async()
+
+        def cancel() -> None:
+            if self._goal is not None:
+                self._goal.cancel_goal_async()
+
+        self._in_executor(cancel)
+
+    def _in_executor(self, do: Callable[[], object]) -> None:
+        """Call in the thread that takes the answers."""
+        assert self._node.executor is not None  # which runs the node
+        self._node.executor.create_task(do)
 
 
 def _double(name: str, value: float) -> Parameter:

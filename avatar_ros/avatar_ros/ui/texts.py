@@ -36,10 +36,7 @@ def warnings(
         lines.append(explanation(status))
     if "contact" not in missing and missed > _MANY_MISSED:
         whole = "" if lines else "all nodes answer, but "
-        lines.append(
-            f"{whole}{missed:.0%} of the periods come late, since the machine has other work; "
-            "close other programs"
-        )
+        lines.append(f"{whole}{missed:.0%} of the periods come late; close other programs")
     if not lines:
         engaging = status == ContactState.STATUS_ENGAGING
         return "All nodes answer." + (" The force is being faded in." if engaging else "")

@@ -1,0 +1,96 @@
+"""Requests of the planning page, which its users make in threads of the page's own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from threading import Thread
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
+
+import rclpy
+from avatar_ros.ui.actions import Wanted
+from avatar_ros.ui.requests import Requests
+from rclpy.action import ActionServer
+from rclpy.executors import SingleThreadedExecutor
+
+from avatar_ros.action import BuildPatient
+from tests.slowness import Deadline
+
+pytestmark = pytest.mark.ros
+
+AWAY = 0.5  # of a thread, right after it sent a goal: the answer comes meanwhile [s]
+
+
+class Slow:
+    """The middleware's client of an action, which keeps its caller after a goal is sent."""
+
+    def __init__(self, handle: Any) -> None:
+        self._handle = handle
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._handle, name)
+
+    def __enter__(self) -> Any:
+        return self._handle.__enter__()
+
+    def __exit__(self, *given: Any) -> Any:
+        return self._handle.__exit__(*given)
+
+    def send_goal_request(self, request: Any) -> int:
+        number = int(self._handle.send_goal_request(request))
+        time.sleep(AWAY)
+        return number
+
+
+def build_at_once(goal: Any) -> BuildPatient.Result:
+    goal.succeed()
+    return BuildPatient.Result(success=True, file="case.h5")
+
+
+@pytest.fixture
+def until_built(own_domain: dict[str, str]) -> Iterator[Callable[[list[Any]], None]]:
+    """Asks for a patient in a thread of its own, and spins until there is a result."""
+    context = rclpy.Context()
+    context.init()
+    server, page = (rclpy.create_node(n, context=context) for n in ("server", "page"))
+    action = ActionServer(server, BuildPatient, "build_patient", build_at_once)
+    other, own = (SingleThreadedExecutor(context=context) for _ in range(2))
+    other.add_node(server)
+    own.add_node(page)
+    thread = Thread(target=other.spin, daemon=True)
+    thread.start()
+    requests = Requests(page)
+
+    def ask(results: list[Any]) -> None:
+        passed = Deadline(60.0)
+        while "patient_interpolation" in requests.missing:
+            assert not passed, "the action is not found"
+            own.spin_once(timeout_sec=0.05)
+        requests._build._client_handle = Slow(requests._build._client_handle)
+        given = (Wanted("case.stl"), lambda *stage: None, lambda text: None, results.append)
+        Thread(target=requests.build_patient, args=given).start()
+        passed = Deadline(20.0)
+        while not results and not passed:
+            own.spin_once(timeout_sec=0.05)
+
+    yield ask
+    requests.close()
+    other.shutdown()
+    thread.join()
+    action.destroy()
+    own.shutdown()
+    for node in (server, page):
+        node.destroy_node()
+    context.try_shutdown()
+
+
+def test_the_end_of_a_build_is_heard_however_early_the_goal_is_accepted(until_built: Any) -> None:
+    results: list[Any] = []
+    until_built(results)
+    assert [result.file for result in results] == ["case.h5"]
