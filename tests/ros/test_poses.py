@@ -318,6 +318,30 @@ def test_a_stream_below_the_timeout_is_slow_all_along(bench: Any, touch: Any, he
     assert force.any()
 
 
+@pytest.mark.parametrize("hertz", [1, 5, 20, 33, 45])
+def test_a_slow_stream_is_called_so_before_its_second_pose(
+    bench: Any, touch: Any, hertz: int
+) -> None:
+    """A first pose is answered; that none follows it in time is the rate, not an end."""
+    cell = bench(timeout=0.02)
+    cell.step(None, after=60.0)  # that nobody was there
+    counter = FaultCounter(cell.tools)
+    period, said = 1000 // hertz, set()
+    for k in range(3000):
+        status, _ = cell.step(pose(touch[0]) if k % period == 0 else None)
+        if k != 20:  # at the timeout itself
+            assert status == (OK if k < 20 else SLOW)
+        if k % 1000 == 50:
+            said |= {faults.text for faults in counter.window()}
+    assert len(said) == 1 and "more slowly than pose_timeout allows" in said.pop()
+
+
+def test_one_pose_and_no_other_is_a_stream_that_ended(bench: Any, touch: Any) -> None:
+    cell = bench(timeout=0.02)
+    statuses = [cell.step(pose(touch[0]) if k == 0 else None)[0] for k in range(3000)]
+    assert statuses[:20] == [OK] * 20 and statuses[2600:] == [STALE] * 400
+
+
 @pytest.mark.parametrize("hertz", [100, 1000])
 def test_one_gap_in_a_stream_makes_it_not_slow(bench: Any, touch: Any, hertz: int) -> None:
     cell = bench(timeout=0.02)

@@ -212,8 +212,12 @@ class ToolChannel:
             return self.status
         if not self.publishers:
             return LOST_TOOL
-        refused = self.status in _OF_A_STREAM and now - self._heard <= _SILENCE
-        return self.status if refused else STALE_POSE
+        if now - self._heard > _SILENCE:
+            return STALE_POSE
+        if self.status in _OF_A_STREAM:
+            return self.status
+        # silence before the last pose as well as after it: a slow stream, as far as is known
+        return SLOW_POSES if self._intervals[-1] > timeout else STALE_POSE
 
     def _comes_from_several(self, info: Any, now: int) -> bool:
         """Whether message numbers decreased twice lately; once is a restart. Real-time safe."""
