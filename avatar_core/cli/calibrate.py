@@ -18,8 +18,8 @@ from avatar_core.cli.uncertainty import given_of
 from avatar_core.cli.vademecum import finite, require
 
 if TYPE_CHECKING:
+    from avatar_core.bags.touched import Touched, TouchFile
     from avatar_core.uncertainty.calibration import Calibration
-    from avatar_core.uncertainty.touched import Touched, TouchFile
 
 EXIT_NOT_EXPLAINED = 3
 _FORMATS = (".yaml", ".json", ".png", ".pdf", ".svg")
@@ -83,11 +83,11 @@ def calibrate(
     ] = False,
 ) -> None:
     """Find Young's modulus and the coordinates of a vademecum from touches with measured forces."""
+    from avatar_core.bags.touched import TouchFile
     from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
     from avatar_core.uncertainty.calibration_report import say
     from avatar_core.uncertainty.palpation import palpation_of
     from avatar_core.uncertainty.priors import priors_of
-    from avatar_core.uncertainty.touched import TouchFile
     from avatar_core.vademecum.storage import load_vademecum
 
     for one in output or []:
@@ -119,7 +119,7 @@ def calibrate(
 
 def _read(file: TouchFile) -> Touched:
     from avatar_core.bags.files import is_bag
-    from avatar_core.uncertainty.touched import read_touched
+    from avatar_core.bags.touched import read_touched
 
     if not is_bag(file.path):
         return read_touched(file)

@@ -12,7 +12,7 @@ from avatar_ros.framework.library import RefusedError, find_in_library
 from avatar_ros.srv import CalibrateMaterial
 
 RADIUS = 5e-3  # of a tip of which no radius is given [m]
-_CALIBRATED = Imported("avatar_core.uncertainty.touched", "calibrated_files")
+_CALIBRATED = Imported("avatar_core.bags.touched", "calibrated_files")
 _BYTES = 6 << 30  # address space of the process [bytes]
 _SECONDS = 600.0  # of processor time
 
