@@ -69,6 +69,13 @@ def calibrate(
             "of the registration of tool and organ"
         ),
     ] = 0.3,
+    extent: Annotated[
+        float,
+        typer.Option(
+            help="standard deviation by what the mesh makes of a tumour's or a support's extent, a "
+            "part of contrast and stiffness"
+        ),
+    ] = 0.2,
     output: Annotated[
         list[Path] | None,
         typer.Option(
@@ -95,6 +102,7 @@ def calibrate(
     require(0.0 < sensor < 1.0, f"--sensor is {sensor}; give a part of the force, such as 0.02")
     require(least > 0.0, f"--least is {least} N; give a positive force")
     require(0.0 <= depth <= 20.0, f"--depth is {depth} mm; give 0 to 20")
+    require(0.0 <= extent <= 1.0, f"--extent is {extent}; give a part of the value, 0 to 1")
     if set_them:
         require_ros()
     known = given_of(given or [])
@@ -105,7 +113,8 @@ def calibrate(
     priors = priors_of(vademecum, known)
     with progress_bar("materials") as progress:
         table = touch_table(vademecum, touched.tip, palpation, progress)
-    found = calibrated(table, priors, Errors(sensor, least, 1e-3 * depth))
+    errors = Errors(sensor, least, 1e-3 * depth, extent=extent)
+    found = calibrated(table, priors, errors)
     for note in touched.notes:
         print(f"notice: {note}", file=sys.stderr)
     say(vademecum.name, table, found)

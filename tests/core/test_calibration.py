@@ -16,6 +16,7 @@ from avatar_core.errors import ContactError, CoordinateError, StorageError
 from avatar_core.scene.recording import save_recording
 from avatar_core.uncertainty.calibration import (
     LEAST_PROBABILITY,
+    Calibration,
     Errors,
     TouchTable,
     calibrated,
@@ -38,7 +39,7 @@ from tests.core.touches import SPHERE, felt, path_over, recording_of
 
 N_TOUCHES = 8
 TRUE = {"young": 6e3, "poisson": 0.45, "contrast": 5.0}
-SENSOR_ALONE = Errors(sensor=0.02, least=1e-9, depth=0.0, mesh=1e-9)
+SENSOR_ALONE = Errors(sensor=0.02, least=1e-9, depth=0.0, mesh=1e-9, extent=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +161,7 @@ def test_all_values_are_found_again(organ: Vademecum, table: TouchTable) -> None
 def test_intervals_hold_the_truth_as_often_as_they_say(table: TouchTable) -> None:
     """Errors drawn from C itself; a right model is rarely called wrong."""
     known = {"young": Lognormal(5e3, 1.5), "poisson": Fixed(0.45), "contrast": LogUniform(1, 9.9)}
-    errors, rng = Errors(), np.random.default_rng(2)
+    errors, rng = Errors(extent=0.0), np.random.default_rng(2)  # which is not in C
     held, chances = [], []
     for _ in range(60):
         true = {name: float(one.ppf(rng.random())) for name, one in known.items()}
@@ -174,6 +175,25 @@ def test_intervals_hold_the_truth_as_often_as_they_say(table: TouchTable) -> Non
             held.append(low <= true[name] <= high)
     assert 0.82 <= np.mean(held) <= 0.97
     assert np.mean(np.array(chances) < LEAST_PROBABILITY) <= 0.05
+
+
+def test_the_extent_of_a_tumour_is_known_no_better_than_its_mesh(
+    organ: Vademecum, table: TouchTable
+) -> None:
+    """However exact the forces: ln of the contrast has at least that deviation, others do not."""
+    exact = without_error(table)
+    known = priors_of(organ)
+    alone = calibrated(exact, known, SENSOR_ALONE)
+    found = calibrated(exact, known, replace(SENSOR_ALONE, extent=0.3))
+
+    def deviation(of: Calibration, name: str) -> float:
+        return float(np.log(of.value(name, 1.0) / of.value(name, -1.0)) / 2.0)
+
+    own = deviation(alone, "contrast")
+    assert deviation(found, "contrast") == pytest.approx(np.hypot(own, 0.3), rel=0.15)
+    for name in ("young", "poisson"):
+        assert deviation(found, name) == pytest.approx(deviation(alone, name), rel=1e-6)
+    assert found.probability == alone.probability
 
 
 def test_larger_errors_widen_the_interval_of_young(organ: Vademecum, table: TouchTable) -> None:
@@ -282,6 +302,7 @@ def test_the_command_calls_a_wrong_model_wrong(
         (("-o", "push.json", "--sensor", "0"), "--sensor is 0"),
         (("--least", "0"), "--least is 0"),
         (("--depth", "-1"), "--depth is -1"),
+        (("--extent", "-1"), "--extent is -1"),
         (("--tool", "2"), "tool '2' is not in push.h5, which has tools 1 to 1"),
         (("--given", "stiffness=fixed:1"), "no 'stiffness'"),
     ],
