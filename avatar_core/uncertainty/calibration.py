@@ -20,7 +20,7 @@ C holds what is off about a force, each with its own reach:
     all        the mesh that all forces share
 
 To the covariance comes what no force tells: a tumour's contrast and a support's stiffness are found
-for the bodies that the mesh makes of them. On four meshes of one organ they came out up to a
+for the bodies that the mesh makes of them. On three meshes of one organ they came out up to a
 quarter off, on each to one side, however many the touches.
 
 The vademecum's error has long tails: at few places it is many times what it is elsewhere. It is
