@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from avatar_core.cli.bench import require_ros
-from avatar_core.cli.numbers import pose
+from avatar_core.cli.numbers import ToolTransform, pose
 from avatar_core.cli.output import require_output
 from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.uncertainty import given_of
@@ -48,13 +48,7 @@ def calibrate(
             "number of the tool, from 1"
         ),
     ] = None,
-    tool_transform: Annotated[
-        str | None,
-        typer.Option(
-            help="of a bag: pose of the poses' frame in the organ's, x,y,z [m] and quaternion "
-            "x,y,z,w, as the node's parameter tool_transform"
-        ),
-    ] = None,
+    tool_transform: ToolTransform = None,
     radius: Annotated[float, typer.Option(help="of a bag: radius of the spherical tip [mm]")] = 5.0,
     sensor: Annotated[
         float, typer.Option(help="standard deviation of a measured force, a part of it")

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import typer
+
 from avatar_core.errors import AvatarError
+
+ToolTransform = Annotated[
+    str | None,
+    typer.Option(
+        help="of a bag: pose of the poses' frame in the organ's, x,y,z [m] and quaternion "
+        "x,y,z,w, as the node's parameter tool_transform"
+    ),
+]
 
 
 def numbers(option: str, text: str, counts: tuple[int, ...], remedy: str) -> list[float]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from avatar_core.cli.numbers import pose
+from avatar_core.cli.numbers import ToolTransform, pose
 from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.vademecum import require
 
@@ -48,13 +48,7 @@ def replay(
             "default: a sphere of 5 mm and the natural effects of the vademecum"
         ),
     ] = None,
-    tool_transform: Annotated[
-        str | None,
-        typer.Option(
-            help="of a bag: pose of the poses' frame in the organ's, x,y,z [m] and quaternion "
-            "x,y,z,w, as the node's parameter tool_transform"
-        ),
-    ] = None,
+    tool_transform: ToolTransform = None,
     rate: Annotated[
         float | None, typer.Option(help="of a bag: of the contact loop [Hz]; default: as it shows")
     ] = None,
