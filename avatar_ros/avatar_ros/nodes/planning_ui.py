@@ -91,7 +91,7 @@ class PlanningNode(ManagedNode):
         self._alerts: list[str] = []
         self._reader = Reader(1 << 30)
         self._cloud: NewestCloud | None = None
-        self._band: NewestBand | None = None
+        self._band = NewestBand(self)
         self._was_missing, self._is_to_restore = True, False
         self._frame, self._frame_id = 0, FRAME
         self._began = time.monotonic()
@@ -209,7 +209,7 @@ class PlanningNode(ManagedNode):
                 LoopStatistics, "statistics", self._take_statistics, qos.STATISTICS
             ),
         ]
-        self._band = NewestBand(self, self._tool, self._state.force_of)
+        self._band.listen(self._tool, self._state.force_of)
         self.get_logger().info(f"planning page at {guard.address(server.get_port())}")
 
     def activate(self) -> None:
@@ -229,9 +229,7 @@ class PlanningNode(ManagedNode):
         if self._cloud is not None:
             self._cloud.close()
             self._cloud = None
-        if self._band is not None:
-            self._band.close()
-            self._band = None
+        self._band.close()
         if self._server is not None:
             self._requests.close()
             self._reader.close()
@@ -279,8 +277,7 @@ class PlanningNode(ManagedNode):
         self._view.show(organ, tip)
         self._measures.show_organ(organ, tip)
         self._periods.forget()
-        if self._band is not None:
-            self._band.forget()
+        self._band.forget()
         self._panels.show_organ(organ)
         self._chosen.organ = organ
         self._listen_to_clouds()
@@ -305,8 +302,7 @@ class PlanningNode(ManagedNode):
             return
         if self._frame % _CUT_FRAMES == 0:
             self._chosen.settle()
-        if self._band is not None:
-            self._band.take()
+        self._band.take()
         recorded = self._player.state(organ)
         if recorded is not None:
             self._show_recorded(organ, *recorded)
@@ -321,7 +317,7 @@ class PlanningNode(ManagedNode):
 
     def _with_band(self, shown: ShownPeriod) -> ShownPeriod:
         """With the band of its force, where the contact node sends one."""
-        if self._band is None or shown.is_held:
+        if shown.is_held:
             return shown
         return shown._replace(band=self._band.of(float(np.linalg.norm(shown.force))))
 

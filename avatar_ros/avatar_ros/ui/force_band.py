@@ -47,16 +47,21 @@ class BandRatios:
 
 
 class NewestBand(BandRatios):
-    """Subscribes both edges of a tool's force.
+    """Subscribes both edges of a tool's force, once it is told to."""
 
-    force_of : the force of the period of a stamp [ns], in newtons; NaN if it is not known
-    """
-
-    def __init__(self, node: Node, tool: str, force_of: Callable[[int], float]) -> None:
+    def __init__(self, node: Node) -> None:
         super().__init__()
-        self._node, self._force_of = node, force_of
+        self._node = node
+        self._subscriptions: list[Any] = []
+
+    def listen(self, tool: str, force_of: Callable[[int], float]) -> None:
+        """Subscribe the edges of a tool.
+
+        force_of : the force of the period of a stamp [ns], in newtons; NaN if it is not known
+        """
+        self._force_of = force_of
         self._subscriptions = [
-            node.create_subscription(
+            self._node.create_subscription(
                 WrenchStamped,
                 f"{tool}/{edge}",
                 _never_called,
@@ -81,6 +86,7 @@ class NewestBand(BandRatios):
         """Stop listening."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
+        self._subscriptions = []
 
 
 def _never_called(message: Any) -> None:
