@@ -92,12 +92,12 @@ def calibrated_files(
     recording: Path,
     tool: str | None,
     transform: tuple[float, ...] | None,
-    radius: float,
+    radius: float | None,
     given: Sequence[str],
 ) -> dict[str, Any]:
     """What ``avatar calibrate`` writes as JSON, with the verdict on the fit as ``verdict``.
 
-    recording, tool, transform, radius : as of :class:`TouchFile`
+    recording, tool, transform, radius : as of :class:`TouchFile`, None for its default
     given : what is known before, as ``young=lognormal:5300:1.5``
 
     Raises
@@ -106,7 +106,7 @@ def calibrated_files(
         As of what reads the files, and :func:`avatar_core.uncertainty.calibration.touch_table`.
     """
     known = dict(parse(one) for one in given)
-    touched = read_touched(TouchFile(recording, tool, transform, radius))
+    touched = read_touched(TouchFile(recording, tool, transform, radius or RADIUS))
     organ = load_vademecum(vademecum)
     priors = priors_of(organ, known)
     table = touch_table(organ, touched.tip, palpation_of(touched.position, touched.force))

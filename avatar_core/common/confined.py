@@ -129,8 +129,13 @@ class Confined:
         """
         self.call(_START_SECONDS, _nothing, function)
 
+    def kill(self) -> None:
+        """End the process, whatever it does; a call that waits for it raises ConfinedError."""
+        if (process := self._process) is not None:
+            process.kill()
+
     def close(self) -> None:
-        """End the process, if there is one."""
+        """End the process, if there is one, after the call that it is in."""
         with self._lock:
             self._stop()
 

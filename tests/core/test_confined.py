@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,17 @@ def test_a_crash_is_an_error_and_the_next_call_works(confined: Confined) -> None
     with pytest.raises(ConfinedError, match="Segmentation fault"):
         confined.call(SECONDS, os.kill, first, signal.SIGSEGV)
     assert confined.call(SECONDS, os.getpid) not in (first, os.getpid())
+
+
+def test_a_call_is_given_up_by_another_thread(confined: Confined) -> None:
+    first = confined.call(SECONDS, os.getpid)
+    giving_up = Timer(0.3, confined.kill)
+    giving_up.start()
+    with within(15.0), pytest.raises(ConfinedError, match="Killed"):
+        confined.call(SECONDS, time.sleep, 60.0)
+    giving_up.join()
+    assert confined.call(SECONDS, os.getpid) != first
+    Confined().kill()  # which has no process
 
 
 @pytest.mark.parametrize("hang", [(time.sleep, 60.0), (sum, range(10**12))])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +16,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.bench.cell import Module
+from avatar_ros.bench.footprint import children
 
 from avatar_core.scene.recording import load_recording, save_recording
 from avatar_core.vademecum.at_values import at_values
@@ -21,12 +24,14 @@ from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.srv import CalibrateMaterial, LoadVademecum
 from tests.core.soft_organ import organ_on_springs
 from tests.core.touches import felt, path_over, recording_of
+from tests.slowness import Deadline
 
 pytestmark = pytest.mark.ros
 
 SUPPORT = "support.bare_area"
 TRUE = {"young": 6e3, SUPPORT: 3e6}
 N_TOUCHES = 4
+IMPORTED = 4.0  # processor time after which touches are followed [s]
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +39,10 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, organ = tmp_path_factory.mktemp("library"), organ_on_springs()
     save_vademecum(organ, folder / "springs.h5")
     tips = path_over(organ, N_TOUCHES)
-    found = recording_of(organ, tips, felt(at_values(organ, TRUE), tips))
-    save_recording(found, folder / "push.h5")
+    forces = felt(at_values(organ, TRUE), tips)
+    save_recording(recording_of(organ, tips, forces), folder / "push.h5")
+    again = (np.tile(one, (100, 1)) for one in (tips, forces))
+    save_recording(recording_of(organ, *again), folder / "hundredfold.h5")
     return folder
 
 
@@ -108,6 +115,30 @@ def test_the_loader_goes_on_to_serve(loader: Module, probe: Any) -> None:
     assert not busy.success and "ask again" in busy.message
     probe.until(slow.done, 120.0)
     assert slow.result().success
+
+
+def computed(pid: int) -> float:
+    """Processor time of a process [s]."""
+    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def test_a_loader_that_ends_leaves_nothing_behind(
+    own_domain: dict[str, str], library: Path, probe: Any
+) -> None:
+    options = ["--ros-args", "-r", "__ns:=/ending", "-p", f"library_dir:={library}"]
+    loader = Module("vademecum_loader", [*options, "-p", "vademecum:=springs.h5"], own_domain)
+    client = probe.client(CalibrateMaterial, "/ending/calibrate_material")
+    before = set(children(loader.pid))
+    client.call_async(CalibrateMaterial.Request(recording="hundredfold.h5"))
+    probe.until(lambda: bool(set(children(loader.pid)) - before), 30.0)
+    (started,) = set(children(loader.pid)) - before
+    probe.until(lambda: computed(started) > IMPORTED, 120.0)
+    assert loader.finish() == 0
+    passed = Deadline(3.0)
+    while Path(f"/proc/{started}").exists():
+        assert not passed, "the calibration goes on"
+        time.sleep(0.01)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ from avatar_core.common.confined import Confined, ConfinedError, Imported
 from avatar_ros.framework.library import RefusedError, find_in_library
 from avatar_ros.srv import CalibrateMaterial
 
-RADIUS = 5e-3  # of a tip of which no radius is given [m]
 _CALIBRATED = Imported("avatar_core.bags.touched", "calibrated_files")
 _BYTES = 6 << 30  # address space of the process [bytes]
 _SECONDS = 600.0  # of processor time
@@ -26,7 +26,7 @@ class Calibrator:
     def __init__(self, library_dir: str, max_bytes: int) -> None:
         self._library_dir, self._max_bytes = library_dir, max_bytes
         self._confined = Confined(_BYTES)
-        self._busy = False
+        self._busy = threading.Lock()
 
     def answered(
         self, request: CalibrateMaterial.Request, loaded: str, response: CalibrateMaterial.Response
@@ -40,21 +40,25 @@ class Calibrator:
         AvatarError
             For a field that is refused, or files that do not give a calibration.
         """
-        if self._busy:
+        if not self._busy.acquire(blocking=False):
             raise RefusedError("another calibration is being computed; ask again after it")
-        self._busy, begin = True, time.monotonic()
+        begin = time.monotonic()
         try:
             told = self._confined.call(_SECONDS, _CALIBRATED, *self._arguments(request, loaded))
         except ConfinedError as error:
             raise RefusedError(f"{error}; check the files, or use 'avatar calibrate'") from error
         finally:
             self._confined.close()
-            self._busy = False
+            self._busy.release()
         for name, value in _fields(told).items():
             setattr(response, name, value)
         response.seconds = time.monotonic() - begin
         response.success = True
         return response
+
+    def stop(self) -> None:
+        """Give up what is being computed, if anything is."""
+        self._confined.kill()
 
     def _arguments(self, request: CalibrateMaterial.Request, loaded: str) -> tuple[Any, ...]:
         """Of ``calibrated_files``."""
@@ -75,7 +79,7 @@ class Calibrator:
             self._file(request.recording),
             request.tool or None,
             transform or None,
-            request.radius or RADIUS,
+            request.radius or None,
             list(request.given),
         )
 

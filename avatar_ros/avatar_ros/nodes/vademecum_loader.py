@@ -115,6 +115,8 @@ class LoaderNode(ManagedNode):
     def clean_up(self) -> None:
         if self._reader is not None:
             self._reader.close()
+        if self._calibrator is not None:
+            self._calibrator.stop()
         self._reader = self._calibrator = None
         for publisher in self._outlets.values():
             self.destroy_publisher(publisher)
