@@ -223,7 +223,7 @@ def _trials(
 
 
 def _touches(rng: np.random.Generator) -> np.ndarray:
-    """Those of a trial, a mask of all places: errors of places are other ones in each trial."""
+    """Those of a trial, a mask of all places, (n,): drawn anew, as each place has its own error."""
     chosen = np.zeros(POOL_AT_TUMOUR + POOL, bool)
     chosen[rng.permutation(POOL_AT_TUMOUR)[:N_AT_TUMOUR]] = True
     chosen[POOL_AT_TUMOUR + rng.permutation(POOL)[: N_TOUCHES - N_AT_TUMOUR]] = True

@@ -323,7 +323,8 @@ def calibrated(
 def _extents(
     known: Mapping[str, Distribution], names: tuple[str, ...], at: FloatArray, errors: Errors
 ) -> FloatArray:
-    """Variances of the standard normal numbers by ``errors.extent``, shape (n,)."""
+    """Variances of the standard normal numbers by ``errors.extent``, shape (n,), no larger than
+    before anything was known."""
     found = np.zeros(len(names))
     for k, name in enumerate(names):
         if name == "contrast" or name.startswith("support."):
@@ -345,7 +346,7 @@ def _together(touch: np.ndarray, covariance: FloatArray) -> FloatArray:
     The weights are those of least variance within a touch, C^-1 1 / sqrt(1^T C^-1 1).
     """
     out = np.zeros((touch[-1] + 1, len(touch)))
-    for row, k in zip(out, range(len(out)), strict=True):
+    for k, row in enumerate(out):
         own = np.flatnonzero(touch == k)
         weight = np.linalg.solve(covariance[np.ix_(own, own)], np.ones(len(own)))
         row[own] = weight / np.sqrt(weight.sum())
