@@ -176,3 +176,14 @@ def news(page: Any, text: str) -> None:
 
 def press(page: Any, button: str) -> None:
     page.get_by_role("button", name=button, exact=True).click()
+
+
+def pressed(page: Any, least: float = 0.5) -> None:
+    """The tool so deep that the page says so much force [N]; a drag ends within 3 mm of its aim."""
+    open_tab(page, "Tool")
+    for _ in range(60):
+        if force_of(page) > least:
+            return
+        page.get_by_text("press 1 mm", exact=True).click()
+        page.wait_for_timeout(300)
+    raise AssertionError("no force")

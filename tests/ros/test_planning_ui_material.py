@@ -37,6 +37,7 @@ from tests.ros.browser import (
     nodes_of_a_page,
     open_tab,
     opened,
+    pressed,
     shots_in,
     until,
 )
@@ -156,17 +157,6 @@ def test_a_slider_is_felt(
     change = 0.2 if name == "young_modulus" else 0.005
     until(page, lambda: abs(force_of(page) - before) > change, "another force", 30.0)
     page.screenshot(path=shots / f"{name}.png")
-
-
-def pressed(page: Any) -> None:
-    """The tool some millimetres deep."""
-    open_tab(page, "Tool")
-    for _ in range(60):
-        if force_of(page) > 0.5:
-            return
-        page.get_by_text("press 1 mm", exact=True).click()
-        page.wait_for_timeout(300)
-    raise AssertionError("no force")
 
 
 def test_no_tumour_is_drawn_in_an_organ_without_one(
