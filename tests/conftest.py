@@ -73,6 +73,7 @@ def same_fields() -> Iterator[None]:
 def same_responses() -> Iterator[None]:
     """The response of one organ to a tip, and the modes of its cloud, are computed once."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layout, "tip_carriers", kept(layout.tip_carriers))
         patch.setattr(layout, "make_tip_response", kept(layout.make_tip_response))
         patch.setattr(layout, "cloud_arrays", kept(layout.cloud_arrays, of_cloud))
         yield

@@ -37,9 +37,11 @@ def smooth(
     regions: Regions,
     patch_radius: float,
     outline: SurfaceMesh | None = None,
-    offsets: Offsets | None = None,  # which follow from the others
+    offsets: Offsets | None = None,
 ) -> TipField:
-    """In the place of ``make_tip_field``; what it refuses is not kept."""
+    """In the place of ``make_tip_field``; what it refuses is not kept, nor what has offsets."""
+    if offsets is not None:
+        return _smooth(mesh, regions, patch_radius, outline, offsets)
     return _found(ByContent(mesh, regions, float(patch_radius), outline))
 
 

@@ -8,7 +8,7 @@ from scipy.ndimage import map_coordinates
 
 from avatar_core.contact.layout import force_error_grid
 from avatar_core.contact.locate import FULL_ACCESS
-from avatar_core.contact.tip_response import make_tip_response
+from avatar_core.contact.tip_response import make_tip_response, tip_carriers
 from avatar_core.vademecum.model import Vademecum
 
 _OFF = 5e-3  # of the accessible surface, up to which a point belongs to it [m]
@@ -27,7 +27,8 @@ def force_error_at(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
     """
     field, surface = vademecum.tip_field, vademecum.surface
     load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
-    response = make_tip_response(surface, field, load, vademecum.contact_near, _SHELL, _SHELL)
+    carriers = tip_carriers(surface, field, _SHELL, _SHELL)
+    response = make_tip_response(surface, field, carriers, load, vademecum.contact_near)
     grid = ((np.asarray(points, float) - field.origin) / field.spacing[0]).T
     access = map_coordinates(field.access.astype(float), grid, order=1, mode="nearest")
     square, _, _ = igl.point_mesh_squared_distance(

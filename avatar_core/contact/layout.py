@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -35,16 +35,23 @@ from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, UNSHIFTED, tip_la
 from avatar_core.contact.effects.tip_profile import ANISOTROPY, KAPPA, STIFFNESS, TAKEN, TAU
 from avatar_core.contact.kernels import ModelArrays
 from avatar_core.contact.locate import MAX_DEPTH
-from avatar_core.contact.tip_response import TipResponse, make_tip_response, sampled_at_tip
+from avatar_core.contact.tip_response import (
+    TipCarriers,
+    TipResponse,
+    make_tip_response,
+    sampled_at_tip,
+    tip_carriers,
+)
 from avatar_core.errors import ContactError, SceneError
 from avatar_core.geometry.tip import Tip
-from avatar_core.reduction.near_field import LocalBlocks, hash_rows
+from avatar_core.reduction.near_field import hash_rows
 from avatar_core.vademecum.accuracy import Cloud, Detail, Precision
 from avatar_core.vademecum.certificate import Certificate
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.large_deformation import LargeDeformation
     from avatar_core.vademecum.model import Vademecum
+    from avatar_core.vademecum.tip_field import BallShift
 
 LANES = 32  # float32 numbers that a vectorised loop processes at once
 PERIOD = 1e-3  # of the steps [s]
@@ -99,6 +106,29 @@ class Layout:
         return int(sum(array.nbytes for array in self.flat().values()))
 
 
+@dataclass(frozen=True)
+class _Shape:
+    """What a layout takes of the organ's shape and the tips, whatever the organ is made of."""
+
+    carriers: TipCarriers
+    reach: float  # longest distance between the two positions of a block [m]
+    shift: BallShift  # of each tip
+
+    @classmethod
+    def of(cls, vademecum: Vademecum, tips: Sequence[Tip]) -> _Shape:
+        # Here, because the contact node needs none of it.
+        from avatar_core.contact.ball_shift import shifts_of
+
+        surface, field = vademecum.surface, vademecum.tip_field
+        height = max(tip.offset for tip in tips)
+        far = vademecum.contact_near.distances(surface.centers).max(initial=0.0)
+        return cls(
+            tip_carriers(surface, field, MAX_DEPTH, height),
+            float(far) * (1.0 + 1e-9),
+            shifts_of(field, tips),
+        )
+
+
 def lay_out(
     vademecum: Vademecum,
     tips: Sequence[Tip] = (Tip(),),
@@ -125,13 +155,31 @@ def lay_out_details(
 
     Nothing is checked before the first is asked for.
     """
+    yield from _laid_out(vademecum, tips, details, effects, period)
+
+
+def lay_out_materials(
+    materials: Iterable[Vademecum], tips: Sequence[Tip], detail: Detail
+) -> Iterator[tuple[Vademecum, Layout]]:
+    """:func:`lay_out` for one material of an organ after the other; they share its shape."""
+    shape = None
+    for vademecum in materials:
+        shape = shape or _Shape.of(vademecum, tips)
+        yield vademecum, next(_laid_out(vademecum, tips, [detail], shape=shape))
+
+
+def _laid_out(
+    vademecum: Vademecum,
+    tips: Sequence[Tip],
+    details: Sequence[Detail],
+    effects: Sequence[Effect] | None = None,
+    period: float = PERIOD,
+    shape: _Shape | None = None,
+) -> Iterator[Layout]:
     for detail in details:
         _check(vademecum, tips, detail)
     if effects is None:
         effects = default_effects(vademecum, len(tips))
-    # Here, because the contact node needs none of it.
-    from avatar_core.contact.ball_shift import shifts_of
-
     for effect in effects:
         effect.require(vademecum)
     if len(tips) > 1 and find(effects, SeveralTools) is None:
@@ -147,11 +195,10 @@ def lay_out_details(
     load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
     padded, softness = _padded(load), float((load**2).sum(axis=(1, 2)).mean() / 3.0)
     field, offset = vademecum.tip_field, np.array([tip.offset for tip in tips])
-    response = make_tip_response(surface, field, load, contact, MAX_DEPTH, max(offset))
+    shape = shape or _Shape.of(vademecum, tips)
+    response = make_tip_response(surface, field, shape.carriers, load, contact)
     large = vademecum.large if find(effects, LargeDeformationEffect) is not None else None
     error = force_error_grid(vademecum.certificate, large, response.smoothing)
-    reach = _reach(contact, surface.centers)
-    shift = shifts_of(field, tips)
     tilt = tilt_arrays(leaning, tips, field) if leaning is not None else None
     law = tip_law_arrays(
         tips,
@@ -175,9 +222,9 @@ def lay_out_details(
             access=field.access,
             origin=field.origin,
             spacing=field.spacing,
-            brick=shift.brick,
-            shift=shift.value,
-            shift_spacing=shift.spacing,
+            brick=shape.shift.brick,
+            shift=shape.shift.value,
+            shift_spacing=shape.shift.spacing,
             row=response.row,
             carrier=response.carrier,
             carrier_weight=response.carrier_weight,
@@ -212,7 +259,7 @@ def lay_out_details(
         yield Layout(
             arrays,
             selected_arrays(
-                vademecum, effects, mass, nonlinear, reach, period, law, dent, tilt, fine
+                vademecum, effects, mass, nonlinear, shape.reach, period, law, dent, tilt, fine
             ),
         )
 
@@ -263,11 +310,6 @@ def force_error_grid(
     if large is not None:
         nonlinear = large.certificate.contact_mean if large.certificate else float("nan")
     return (certificate or Certificate.unknown()).force_error.relative(smoothing, nonlinear)
-
-
-def _reach(near: LocalBlocks, centers: np.ndarray) -> float:
-    """Longest distance between the two positions of a block [m]."""
-    return float(near.distances(centers).max(initial=0.0)) * (1.0 + 1e-9)
 
 
 def _padded(load: np.ndarray) -> np.ndarray:

@@ -33,6 +33,11 @@ if TYPE_CHECKING:
 SMOOTHING = 0.1  # standard deviation of K, in patch radii
 MAX_STENCIL = 27 * 6  # load positions that carry one tip, at most: six at each grid point of a cell
 
+# What carries a tip, by the organ's shape alone: shell (nx, ny, nz) bool, the n grid points that a
+# tip may need; normal (n, 3), the direction of pressing; carrier, weight (n, 3 or 6), load
+# positions and their weights
+TipCarriers = namedtuple("TipCarriers", ["shell", "normal", "carrier", "weight"])
+
 # row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
 # 6) int32 load positions and carrier_weight (n_rows, 3 or 6) float32;
 # self_compliance, smoothing (nx, ny, nz) float32, gamma [m/N] and its relative change by
@@ -42,47 +47,59 @@ TipResponse = namedtuple(
 )
 
 
-def make_tip_response(
-    surface: LoadSurface,
-    field: TipField,
-    load: np.ndarray,
-    near: LocalBlocks,
-    depth: float,
-    height: float,
-) -> TipResponse:
-    """Sample weights and self-compliance at the grid points that a tip may need.
+def tip_carriers(surface: LoadSurface, field: TipField, depth: float, height: float) -> TipCarriers:
+    """Load positions and weights at the grid points that a tip may need.
 
     Parameters
     ----------
     surface, field : of the organ
-    load : ndarray, shape (n_positions, 3, rank), far factor of the contact compliance
-    near : LocalBlocks, its near part [m/N]
     depth, height : farthest tip centre below and above the surface [m]
     """
     # Here, because the contact node needs none of it.
-    from avatar_core.vademecum.tip_field import grid_normals, smoothed
+    from avatar_core.vademecum.tip_field import grid_normals
 
     spacing = float(field.spacing[0])
     margin = 3.0 * spacing  # half the splines' support, along its diagonal
     shell = (field.distance > -depth - margin) & (field.distance < height + margin)
     shell &= _dilated(field.access > 0.0)
-    normal = grid_normals(field.distance, spacing)[shell]
     points = field.origin + spacing * np.argwhere(shell)
-    carrier, carrier_weight = closest_weights(surface, points)
+    normal = grid_normals(field.distance, spacing)[shell]
+    return TipCarriers(shell, normal, *closest_weights(surface, points))
+
+
+def make_tip_response(
+    surface: LoadSurface,
+    field: TipField,
+    carriers: TipCarriers,
+    load: np.ndarray,
+    near: LocalBlocks,
+) -> TipResponse:
+    """Sample the self-compliance where a tip is carried.
+
+    Parameters
+    ----------
+    surface, field, carriers : of the organ
+    load : ndarray, shape (n_positions, 3, rank), far factor of the contact compliance
+    near : LocalBlocks, its near part [m/N]
+    """
+    # Here, because the contact node needs none of it.
+    from avatar_core.vademecum.tip_field import smoothed
+
+    shell, carrier, weight = carriers.shell, carriers.carrier, carriers.weight
     compliance = np.zeros(shell.shape)
     compliance[shell] = _self_compliance(
-        carrier, carrier_weight, normal, load, *hash_rows(near), near.block
+        carrier, weight, carriers.normal, load, *hash_rows(near), near.block
     )
-    deviation = SMOOTHING * surface.patch_radius / spacing
+    deviation = SMOOTHING * surface.patch_radius / float(field.spacing[0])
     smooth = smoothed(compliance, deviation, shell)
     change = np.zeros(shell.shape)
     change[shell] = np.abs(compliance[shell] / smooth[shell] - 1.0)
     row = np.full(shell.shape, -1, np.int32)
-    row[shell] = np.arange(len(points), dtype=np.int32)
+    row[shell] = np.arange(len(carrier), dtype=np.int32)
     return TipResponse(
         row,
         carrier.astype(np.int32),
-        carrier_weight.astype(np.float32),
+        weight.astype(np.float32),
         smooth.astype(np.float32),
         smoothed(change, deviation, shell).astype(np.float32),
     )

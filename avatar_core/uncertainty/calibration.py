@@ -41,7 +41,7 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.contact.layout import lay_out
+from avatar_core.contact.layout import Layout, lay_out_materials
 from avatar_core.contact.model import Status, estimate_error, make_model, step
 from avatar_core.errors import ContactError
 from avatar_core.geometry.tip import Tip
@@ -203,8 +203,9 @@ def touch_table(
     """
     grid, force = MaterialGrid.of(vademecum), []
     error = np.zeros(len(palpation.tip))
-    for done, here in enumerate(grid.materials(vademecum)):
-        found, expected = _followed(here, tip, palpation)
+    layouts = lay_out_materials(grid.materials(vademecum), (tip,), Detail(1, "off"))
+    for done, (_, layout) in enumerate(layouts):
+        found, expected = _followed(layout, palpation)
         force.append(found)
         error = np.maximum(error, expected)
         progress(done + 1, grid.n_points)
@@ -239,11 +240,9 @@ def _of_felt(
     )
 
 
-def _followed(
-    vademecum: Vademecum, tip: Tip, palpation: Palpation
-) -> tuple[FloatArray, FloatArray]:
+def _followed(layout: Layout, palpation: Palpation) -> tuple[FloatArray, FloatArray]:
     """Force along the paths [N], and its error as a part of it, each (n,)."""
-    model = make_model(lay_out(vademecum, (tip,), Detail(1, "off")))
+    model = make_model(layout)
     force, error = np.zeros((2, len(palpation.tip)))
     before = -1
     for k, (touch, at) in enumerate(zip(palpation.touch, palpation.tip, strict=True)):

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.contact.layout import lay_out
+from avatar_core.contact.layout import Layout, lay_out_materials
 from avatar_core.contact.model import Status, make_model, step
 from avatar_core.errors import ContactError
+from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.tip import Tip
 from avatar_core.uncertainty.material_grid import MaterialGrid
 from avatar_core.vademecum.accuracy import Detail
@@ -71,8 +72,9 @@ def force_table(
         If a tip finds no surface at a place, or is not felt there.
     """
     grid, force, moved = MaterialGrid.of(vademecum), [], []
-    for done, here in enumerate(grid.materials(vademecum)):
-        found = _pressed(here, tip, places, depths)
+    layouts = lay_out_materials(grid.materials(vademecum), (tip,), Detail(1, "off"))
+    for done, (here, layout) in enumerate(layouts):
+        found = _pressed(layout, here.surface, tip, places, depths)
         force.append(found)
         moved.append(found * _motion(here, places, target)[:, None])
         progress(done + 1, grid.n_points)
@@ -81,11 +83,11 @@ def force_table(
 
 
 def _pressed(
-    vademecum: Vademecum, tip: Tip, places: Sequence[int], depths: Sequence[float]
+    layout: Layout, surface: LoadSurface, tip: Tip, places: Sequence[int], depths: Sequence[float]
 ) -> FloatArray:
     """Forces on a tip that is pressed along the normal, (n_places, n_depths) [N]."""
-    model = make_model(lay_out(vademecum, (tip,), Detail(1, "off")))
-    surface, force = vademecum.surface, np.empty((len(places), len(depths)))
+    model = make_model(layout)
+    force = np.empty((len(places), len(depths)))
     for i, j in enumerate(places):
         model.reset()
         before = -_ABOVE

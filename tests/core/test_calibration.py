@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +15,7 @@ import pytest
 from avatar_core.cli.main import main
 from avatar_core.errors import ContactError, CoordinateError, StorageError
 from avatar_core.scene.recording import save_recording
+from avatar_core.uncertainty import material_grid
 from avatar_core.uncertainty.calibration import (
     LEAST_PROBABILITY,
     Calibration,
@@ -119,14 +121,14 @@ def test_touches_off_the_organ_are_counted_or_refused(
     organ: Vademecum, tips: np.ndarray, forces: np.ndarray
 ) -> None:
     size = np.linalg.norm(forces, axis=1)
-    found = palpation_of(tips, size)
+    found, of_one_material = palpation_of(tips, size), replace(organ, parametric=None)
     moved = found.tip.copy()
     moved[found.touch == 2] += 0.5
-    left = touch_table(organ, SPHERE, replace(found, tip=moved))
+    left = touch_table(of_one_material, SPHERE, replace(found, tip=moved))
     assert (left.left_out, left.palpation.n_touches) == (1, N_TOUCHES - 1)
     assert np.isfinite(left.log_force).all()
     with pytest.raises(ContactError, match="0 of 8 touches meet the organ"):
-        touch_table(organ, SPHERE, replace(found, tip=found.tip + 0.5))
+        touch_table(of_one_material, SPHERE, replace(found, tip=found.tip + 0.5))
 
 
 # --- the posterior -----------------------------------------------------------------------------
@@ -237,17 +239,26 @@ def test_a_posterior_becomes_what_is_known(organ: Vademecum, table: TouchTable) 
 # --- the command -------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def liver(organ: Vademecum, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("organ") / "liver.h5"
+    save_vademecum(organ, file)
+    return file
+
+
 @pytest.fixture
 def run(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
+    liver: Path,
     organ: Vademecum,
     tips: np.ndarray,
     forces: np.ndarray,
 ) -> Callable[..., tuple[int, str]]:
     """Runs ``avatar calibrate liver.h5 --recording push.h5 ...``: exit code and what was said."""
-    save_vademecum(organ, tmp_path / "liver.h5")
+    monkeypatch.setattr(material_grid, "N_POINTS", 3)
+    os.link(liver, tmp_path / "liver.h5")
     save_recording(recording_of(organ, tips, forces), tmp_path / "push.h5")
 
     def call(*arguments: str, recording: str = "push.h5") -> tuple[int, str]:

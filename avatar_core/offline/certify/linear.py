@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.common.splines import evaluate
-from avatar_core.contact.tip_response import make_tip_response
+from avatar_core.contact.tip_response import make_tip_response, tip_carriers
 from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
 from avatar_core.offline.certify.accuracy_curve import DisplayErrors, curve_of
@@ -132,7 +132,8 @@ def _tip_force(
     contacts = draw_contacts(vademecum, n, seed)
     surface, field = vademecum.surface, vademecum.tip_field
     load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
-    response = make_tip_response(surface, field, load, vademecum.contact_near, 0.0, HEIGHTS[1])
+    carriers = tip_carriers(surface, field, 0.0, HEIGHTS[1])
+    response = make_tip_response(surface, field, carriers, load, vademecum.contact_near)
     slope = np.zeros(3)
     compliance, smoothing = (
         np.array(
