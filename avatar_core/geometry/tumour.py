@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.local_profile import tangents
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
@@ -51,7 +50,7 @@ def volume_fraction_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:
     volume_fraction = np.zeros(len(mesh.tets))
     if len(near):
         points = np.einsum("pc,tcd->tpd", lattice, corners[near])
-        inside = signed_distance(points.reshape(-1, 3), tumour) < 0.0
+        inside = tumour.skin.contains(points.reshape(-1, 3))
         volume_fraction[near] = inside.reshape(len(near), -1).mean(axis=1)
     volume = float(volume_fraction @ mesh.tet_volumes)
     if volume < mesh.tet_volumes.mean():
@@ -102,7 +101,7 @@ def strained_fraction(
     frame = np.stack([first, second, -normals[near]], axis=1)
     rays = np.einsum("kc,ncd->nkd", direction, frame)
     at = points[near, None, None] + distance[:, None] * rays[:, :, None]
-    inside = signed_distance(at.reshape(-1, 3), tumour).reshape(at.shape[:3]) < 0.0
+    inside = tumour.skin.contains(at.reshape(-1, 3)).reshape(at.shape[:3])
     fraction[near] = inside.mean(axis=1) @ weight
     return fraction
 
