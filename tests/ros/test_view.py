@@ -154,7 +154,7 @@ def test_little_error_looks_unlike_no_access(view: OrganView) -> None:
     reached = shown.faces[shown.accessible]
     errors[np.unique(reached)] = 0.5e-3  # half a band of a scale to 2 %
     is_known = np.isfinite(errors)[shown.faces].all(axis=1)
-    view.paint_errors(errors)
+    view.paint(errors)
     (first,) = meshes(view, "bands")
     assert first is view._surface._nodes["bands", 0]
     corners = shown.vertices[shown.faces[is_known]].astype(float)

@@ -18,7 +18,6 @@ try:
 except ImportError as error:
     raise SystemExit("planning_ui: viser is missing; pip install 'avatar[ui]'") from error
 
-from avatar_core.contact.error_map import force_error_at
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.storage import parse_vademecum
@@ -34,10 +33,10 @@ from avatar_ros.ui.alerts import alerts
 from avatar_ros.ui.bookmarks import Bookmark
 from avatar_ros.ui.camera import turn_camera
 from avatar_ros.ui.chosen import Chosen, Page
+from avatar_ros.ui.coloured import Coloured
 from avatar_ros.ui.display import RATE, NewestCloud
 from avatar_ros.ui.force_band import NewestBand
 from avatar_ros.ui.guard import Guard, guarded
-from avatar_ros.ui.legend import EXPECTED_ERROR, legend
 from avatar_ros.ui.library import Library
 from avatar_ros.ui.measures import Measures, Now
 from avatar_ros.ui.measures_view import MeasuresView
@@ -128,6 +127,7 @@ class PlanningNode(ManagedNode):
             ),
         )
         self._view = OrganView(server, chosen.drag, self._show_cube, chosen.drag_cut)
+        self._coloured = Coloured(self._view, chosen, self._requests, self._say)
         self._measures = Measures(MeasuresView(server))
         server.scene.on_click()(self._click)
         self._plan = Plan(
@@ -184,7 +184,7 @@ class PlanningNode(ManagedNode):
                 turn=self._view.turn_to,
                 look=chosen.choose_look,
                 mark_reach=self._view.mark_reach,
-                errors=self._show_errors,
+                colours=self._coloured.choose,
                 style=self._view.style,
                 scan=self._scan.choose,
                 place_scan=self._scan.place,
@@ -278,6 +278,7 @@ class PlanningNode(ManagedNode):
         self._measures.show_organ(organ, tip)
         self._periods.forget()
         self._band.forget()
+        self._coloured.forget()
         self._panels.show_organ(organ)
         self._chosen.organ = organ
         self._listen_to_clouds()
@@ -347,7 +348,7 @@ class PlanningNode(ManagedNode):
         measured = self._measures.lines(now)
         self._panels.measure.show(measured)
         self._lines = [*map(plain, numbers), *measured]
-        self._panels.show_scale(self._legend())
+        self._panels.show_scale(self._coloured.legend())
         size = 0.0 if shown.is_held else float(np.linalg.norm(shown.force))
         self._panels.tool.show_force(time.monotonic() - self._began, size, shown.error, shown.band)
 
@@ -379,23 +380,6 @@ class PlanningNode(ManagedNode):
         """Whether the contact node answered recently."""
         silence = time.monotonic_ns() - int(self._state.live["heard"][0])
         return silence < _SILENCE * 1e9
-
-    def _legend(self) -> str:
-        view = self._view
-        if view.shows_errors:
-            return legend(view.error_top, EXPECTED_ERROR, 1e-2, view.opacity)
-        return legend(view.top, opacity=view.opacity)
-
-    def _show_errors(self, wanted: bool) -> None:
-        """Colour by the expected error of the force, or by the displacement."""
-        organ = self._organ
-        if organ is None:
-            return
-        errors = force_error_at(organ.vademecum, organ.vertices) if wanted else None
-        if errors is not None and not np.isfinite(errors).any():
-            self._say("errors of this organ were never measured; build it with a certificate")
-            return
-        self._view.paint_errors(errors)
 
     def _status(self) -> int | None:
         """Of the last ContactState, if one came recently."""

@@ -50,7 +50,7 @@ class Actions:
     turn: Callable[[str], None]  # to a side of the patient, as "A", or beside the tool
     look: Callable[[str, str, float], None]  # whole, glass or cut open; from a side, by a part
     mark_reach: Callable[[bool], None]  # where tools reach
-    errors: Callable[[bool], None]  # colours show the expected error, or the displacement
+    colours: Callable[[str], None]  # show another field, of avatar_ros.ui.coloured
     style: Callable[
         [str, bool, tuple[int, int, int], float], None
     ]  # of a structure: colour, opacity

@@ -6,6 +6,7 @@ from avatar_ros.ui.colours import ACCESS, CLAMP, N_BANDS, TISSUE, band_colours, 
 
 DISPLACEMENT = "displacement [mm]"
 EXPECTED_ERROR = "error of the force [%]"
+SPREAD = "spread of the force [%]"
 _KEY = "display:inline-block;width:15px;height:11px;vertical-align:-1px;margin:0 3px 0 9px"
 
 
@@ -15,15 +16,15 @@ def legend(top: float, what: str = DISPLACEMENT, unit: float = 1e-3, opacity: fl
     top : end of the scale; unit : one shown unit, both in SI
     opacity : of the organ, so that both look alike before the same ground
     """
-    is_error = what == EXPECTED_ERROR
-    colours = scale_colours() if is_error else band_colours()
+    is_everywhere = what != DISPLACEMENT  # where tools reach, from the first band on
+    colours = scale_colours() if is_everywhere else band_colours()
     shades = [f"rgb({r},{g},{b})" for r, g, b in colours.tolist()]
     stops = ", ".join(
         f"{shade} {100 * i / N_BANDS:g}% {100 * (i + 1) / N_BANDS:g}%"
         for i, shade in enumerate(shades)
     )
     ticks = "".join(f"<span>{top / unit * i / 5:g}</span>" for i in range(6))
-    tissue = "tissue: no access" if is_error else f"tissue: below {top / unit / N_BANDS:g}"
+    tissue = "tissue: no access" if is_everywhere else f"tissue: below {top / unit / N_BANDS:g}"
     return (
         f'<div id="colour-bar" role="img" aria-label="colour scale of {what}, 0 to '
         f'{top / unit:g}" style="margin:0 1em;font-size:12px">{what}; {tissue}'

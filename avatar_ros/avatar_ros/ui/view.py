@@ -22,7 +22,7 @@ from avatar_ros.ui.tip_body import turn_to
 from avatar_ros.ui.tool_view import LEAST_FORCE, ToolView
 
 CLEARANCE = 0.015  # of a new organ's tool over the surface [m]
-ERROR_TOPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # possible ends of the scale of the error
+FIELD_TOPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # possible ends of the scale of another field
 LOOKS = WHOLE, GLASS, CUT = "whole", "glass", "cut open"  # how the organ is shown
 _ROOTS = ("/organ", "/structures", "/tools", "/measures")  # nodes above what is of an organ
 _LEAST_MARKED = 0.1e-3  # displacement whose place is marked [m]
@@ -33,7 +33,7 @@ class OrganView:
 
     on_drag : gets where a user drags the tip, and whether along its shaft; on_cube : a browser and
     its cube; on_cut : the part that a user cuts away with the plane's handle
-    top, error_top : ends of the colour scales, of the displacement [m] and the expected error
+    top, field_top : ends of the colour scales, of the displacement [m] and of another field
     """
 
     def __init__(
@@ -54,8 +54,8 @@ class OrganView:
         self._cameras = Cameras(server, on_cube)
         self._drawn: np.ndarray | None = None  # the cloud that is seen
         self._largest = 0.0
-        self._errors: np.ndarray | None = None  # at the cloud's points, if these are shown
-        self.error_top = ERROR_TOPS[0]
+        self._field: np.ndarray | None = None  # other than the displacement, at the cloud's points
+        self.field_top = FIELD_TOPS[0]
         self.top = top_for(0.0)
         server.scene.set_up_direction("+z")
         server.scene.world_axes.visible = False
@@ -68,7 +68,7 @@ class OrganView:
         scene = self._server.scene
         for name in _ROOTS:
             self._roots[name] = scene.add_frame(name, show_axes=False)
-        self._organ, self.top, self._drawn, self._errors = organ, top_for(0.0), None, None
+        self._organ, self.top, self._drawn, self._field = organ, top_for(0.0), None, None
         self._structures.show(organ.vertices, organ.structures)
         self._surface.show(organ.vertices, organ.faces, organ.clamped, organ.accessible)
         self.look(GLASS if organ.structures else WHOLE)
@@ -109,23 +109,18 @@ class OrganView:
         if self._drawn is not None:
             self._surface.redraw()
 
-    @property
-    def shows_errors(self) -> bool:
-        """Whether the expected error is drawn in place of the displacement."""
-        return self._errors is not None
+    def paint(self, field: np.ndarray | None) -> None:
+        """Draw another field than the displacement, or the displacement again.
 
-    def paint_errors(self, errors: np.ndarray | None) -> None:
-        """Draw the expected error of the force at each point of the cloud, or the displacement.
-
-        errors : ndarray, shape (n,), relative; NaN where there is no access
+        field : ndarray, shape (n,), at each point of the cloud; NaN where it is not known
         """
         organ, drawn = self._organ, self._drawn
         if organ is None:
             return
-        if errors is not None:
-            largest = float(np.nanmax(errors, initial=0.0))
-            self.error_top = next((x for x in ERROR_TOPS if x >= largest), ERROR_TOPS[-1])
-        self._errors, self._drawn = errors, None
+        if field is not None:
+            largest = float(np.nanmax(field, initial=0.0))
+            self.field_top = next((x for x in FIELD_TOPS if x >= largest), FIELD_TOPS[-1])
+        self._field, self._drawn = field, None
         rest = np.hstack([organ.vertices, np.zeros_like(organ.vertices)])
         self.move(rest if drawn is None else drawn, np.zeros(3), np.zeros(3))
 
@@ -187,10 +182,10 @@ class OrganView:
         self._largest = float(size[place])
         self.top = top_for(self._largest, self.top)
         with self._server.atomic():
-            if self._errors is None:
+            if self._field is None:
                 self._surface.move(shown, self.top)
             else:
-                self._surface.paint(plain, self._errors, self.error_top)
+                self._surface.paint(plain, self._field, self.field_top)
             self._structures.move(points[:, :3])
             self._mark(shown.positions[place])
         return self._largest

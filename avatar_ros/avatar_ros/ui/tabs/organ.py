@@ -9,13 +9,13 @@ import numpy as np
 
 from avatar_core.common.supports import SUPPORT
 from avatar_ros.ui.actions import Actions
+from avatar_ros.ui.coloured import DISPLACEMENT, FIELDS
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import NAMES
 from avatar_ros.ui.presets import HINTS, PRESETS, SLIDERS, source_of
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
 from avatar_ros.ui.view import CUT, GLASS, WHOLE
 
-DISPLACEMENT, ERROR = "displacement", "expected error"
 _AS_BUILT = "as built"
 _NO_PRESET = "as the sliders say"
 
@@ -37,7 +37,7 @@ class OrganTab:
             control.on_update(self._on_look)
         reach = gui.add_checkbox("Mark where tools reach", False)
         reach.on_update(lambda _: actions.mark_reach(reach.value))
-        self._colour = gui.add_dropdown("Colours show", (DISPLACEMENT, ERROR))
+        self._colour = gui.add_dropdown("Colours show", FIELDS)
         self._colour.on_update(self._on_colour)
         self._material = gui.add_folder("Material")
         self._sliders: dict[str, Any] = {}
@@ -118,7 +118,7 @@ class OrganTab:
 
     def _on_colour(self, event: Any) -> None:
         if event.client is not None:
-            self._actions.errors(event.target.value == ERROR)
+            self._actions.colours(event.target.value)
 
     def _on_look(self, event: Any) -> None:
         is_cut = self._look.value == CUT

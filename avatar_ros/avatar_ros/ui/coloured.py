@@ -1,0 +1,94 @@
+"""What the colours of the organ show: the displacement, or error and spread of the force."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from avatar_core.contact.error_map import force_error_at
+from avatar_core.errors import AvatarError, one_line
+from avatar_core.uncertainty.distributions import Distribution, Fixed
+from avatar_core.uncertainty.known import Held
+from avatar_core.uncertainty.spread_map import force_spread_at
+from avatar_ros.framework.parameters import ParameterError
+from avatar_ros.loop.settings import chosen_known
+from avatar_ros.prepare.bands import usable_known
+from avatar_ros.ui import legend
+from avatar_ros.ui.chosen import Chosen
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.requests import Requests
+from avatar_ros.ui.view import OrganView
+
+DISPLACEMENT, ERROR, SPREAD = "displacement", "expected error", "spread of the force"
+FIELDS = (DISPLACEMENT, ERROR, SPREAD)
+_LEGENDS = {ERROR: legend.EXPECTED_ERROR, SPREAD: legend.SPREAD}
+_NO_DISTRIBUTIONS = "nothing is said to be unknown; give contact the parameter uncertainty"
+
+
+class Coloured:
+    """Chooses the field that is drawn on the organ."""
+
+    def __init__(
+        self, view: OrganView, chosen: Chosen, requests: Requests, say: Callable[[str], None]
+    ) -> None:
+        self._view, self._chosen, self._requests, self._say = view, chosen, requests, say
+        self._field = DISPLACEMENT
+
+    def forget(self) -> None:
+        """Another organ shows its displacement first."""
+        self._field = DISPLACEMENT
+
+    def legend(self) -> str:
+        """The scale of what is drawn, as HTML."""
+        view = self._view
+        if self._field == DISPLACEMENT:
+            return legend.legend(view.top, opacity=view.opacity)
+        return legend.legend(view.field_top, _LEGENDS[self._field], 1e-2, view.opacity)
+
+    def choose(self, field: str) -> None:
+        """Colour by one of ``FIELDS``."""
+        organ = self._chosen.organ
+        if organ is None:
+            return
+        if field == SPREAD:
+            self._requests.parameters_of_contact(("uncertainty",), self._show_spread)
+        elif field == ERROR:
+            errors = force_error_at(organ.vademecum, organ.vertices)
+            missing = "errors of this organ were never measured; build it with a certificate"
+            self._paint(ERROR, errors, missing)
+        else:
+            self._field = DISPLACEMENT
+            self._view.paint(None)
+
+    def _show_spread(self, parameters: dict[str, Any]) -> None:
+        organ = self._chosen.organ
+        if organ is None:
+            return
+        try:
+            known = self._known(organ, chosen_known(str(parameters["uncertainty"])))
+        except (AvatarError, ParameterError) as error:
+            self._say(one_line(error))
+            return
+        if all(isinstance(one, Fixed) for one in known.values()):
+            self._say(_NO_DISTRIBUTIONS)
+            return
+        spread = force_spread_at(organ.vademecum, self._chosen.tip, known, organ.vertices)
+        self._paint(SPREAD, spread, "no tool reaches this organ")
+
+    def _known(self, organ: Organ, given: dict[str, Distribution]) -> dict[str, Distribution]:
+        """Of all parameters of the organ; without a distribution, the value in use is meant."""
+        held = Held.by(organ.vademecum)
+        used, notices = usable_known(organ.name, held, given)
+        for notice in notices:
+            self._say(notice)
+        values = {name: Fixed(value) for name, value in self._chosen.values(organ).items()}
+        return held.known({**values, **used})
+
+    def _paint(self, field: str, values: np.ndarray, missing: str) -> None:
+        if not np.isfinite(values).any():
+            self._say(missing)
+            return
+        self._field = field
+        self._view.paint(values)
