@@ -95,3 +95,15 @@ def test_another_organ_shows_its_displacement(known: str) -> None:
     page.coloured.choose(SPREAD)
     page.coloured.forget()
     assert "displacement [mm]" in page.coloured.legend()
+
+
+def test_a_late_answer_does_not_change_what_was_chosen_since(known: str) -> None:
+    """The contact node may answer when another field, or another organ, is shown already."""
+    for change in (lambda page: page.coloured.choose(DISPLACEMENT), lambda p: p.coloured.forget()):
+        page, answers = Shown(known), []
+        page.parameters_of_contact = lambda names, then, into=answers: into.append(then)  # type: ignore[method-assign,misc]
+        page.coloured.choose(SPREAD)
+        change(page)
+        answers[0]({"uncertainty": known})
+        assert all(field is None for field in page.painted)
+        assert "displacement [mm]" in page.coloured.legend()

@@ -34,11 +34,11 @@ class Coloured:
         self, view: OrganView, chosen: Chosen, requests: Requests, say: Callable[[str], None]
     ) -> None:
         self._view, self._chosen, self._requests, self._say = view, chosen, requests, say
-        self._field = DISPLACEMENT
+        self._field = self._wanted = DISPLACEMENT  # drawn, and asked for
 
     def forget(self) -> None:
         """Another organ shows its displacement first."""
-        self._field = DISPLACEMENT
+        self._field = self._wanted = DISPLACEMENT
 
     def legend(self) -> str:
         """The scale of what is drawn, as HTML."""
@@ -52,6 +52,7 @@ class Coloured:
         organ = self._chosen.organ
         if organ is None:
             return
+        self._wanted = field
         if field == SPREAD:
             self._requests.parameters_of_contact(("uncertainty",), self._show_spread)
         elif field == ERROR:
@@ -64,7 +65,7 @@ class Coloured:
 
     def _show_spread(self, parameters: dict[str, Any]) -> None:
         organ = self._chosen.organ
-        if organ is None:
+        if organ is None or self._wanted != SPREAD:  # the answer came too late
             return
         try:
             known = self._known(organ, chosen_known(str(parameters["uncertainty"])))
