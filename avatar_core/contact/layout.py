@@ -150,32 +150,14 @@ def lay_out_details(
     details: Sequence[Detail],
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
+    shape: _Shape | None = None,
 ) -> Iterator[Layout]:
     """:func:`lay_out` for one detail after the other; they share what does not depend on it.
 
     Nothing is checked before the first is asked for.
+
+    shape : of the organ and the tips, if it was found for another material
     """
-    yield from _laid_out(vademecum, tips, details, effects, period)
-
-
-def lay_out_materials(
-    materials: Iterable[Vademecum], tips: Sequence[Tip], detail: Detail
-) -> Iterator[tuple[Vademecum, Layout]]:
-    """:func:`lay_out` for one material of an organ after the other; they share its shape."""
-    shape = None
-    for vademecum in materials:
-        shape = shape or _Shape.of(vademecum, tips)
-        yield vademecum, next(_laid_out(vademecum, tips, [detail], shape=shape))
-
-
-def _laid_out(
-    vademecum: Vademecum,
-    tips: Sequence[Tip],
-    details: Sequence[Detail],
-    effects: Sequence[Effect] | None = None,
-    period: float = PERIOD,
-    shape: _Shape | None = None,
-) -> Iterator[Layout]:
     for detail in details:
         _check(vademecum, tips, detail)
     if effects is None:
@@ -262,6 +244,16 @@ def _laid_out(
                 vademecum, effects, mass, nonlinear, shape.reach, period, law, dent, tilt, fine
             ),
         )
+
+
+def lay_out_materials(
+    materials: Iterable[Vademecum], tips: Sequence[Tip], detail: Detail
+) -> Iterator[tuple[Vademecum, Layout]]:
+    """:func:`lay_out` for one material of an organ after the other; they share its shape."""
+    shape = None
+    for vademecum in materials:
+        shape = shape or _Shape.of(vademecum, tips)
+        yield vademecum, next(lay_out_details(vademecum, tips, [detail], shape=shape))
 
 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
