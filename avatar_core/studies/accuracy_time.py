@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 JND = 0.07  # of force, that a hand just notices (Jones, Brain 2000; Pang et al. 1991)
+_NOTICED = "7 %: just noticed of a force"
 PERIOD_US = 1000.0
 PAPER: dict[str, Value] = {"modes_for_10_percent": "11", "rate_hz": "1000, without a table"}
 FRESH = 1001  # seed of loads that no certificate draws
@@ -313,16 +314,7 @@ def _online(rows: list[dict[str, Value]], cloud: str, axes: Axes) -> None:
     axes.plot(PERIOD_US, 0.10, "*", ms=14, c="#999999", mec="k", label="paper: 11 modes, 1 kHz")
     axes.axvline(PERIOD_US, color="#888888", ls=":")
     axes.text(PERIOD_US, axes.get_ylim()[0], " 1 ms", va="bottom", color="#555555")
-    axes.axhline(JND, color="#888888", ls=":")
-    axes.text(
-        0.99,
-        JND,
-        "7 %: just noticed of a force",
-        transform=axes.get_yaxis_transform(),
-        ha="right",
-        va="bottom",
-        color="#555555",
-    )
+    axes.axhline(JND, color="#888888", ls=":", label=_NOTICED)
     _logarithmic(axes, "time of a step, median [us]", "error that 95 % of fresh loads keep [-]")
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes.set_title(f"{cloud}: error against time online")
@@ -334,8 +326,7 @@ def _force(contacts: ForceErrors, axes: Axes) -> None:
     ends = np.array([1e-4, 1.0])
     axes.plot(ends, ends, "k-", lw=1, label="said = true")
     axes.plot(ends, 3 * ends, "k:", lw=1, label="said = 3 x true")
-    axes.axhline(JND, color="#888888", ls=":")
-    axes.text(1.1e-4, JND, "7 %: just noticed", va="bottom", color="#555555")
+    axes.axhline(JND, color="#888888", ls="-.", label=_NOTICED)
     axes.set_xlim(1e-4, 1.0)
     _logarithmic(axes, "true error of the force [-]", "error said with the force [-]")
     axes.set_title("the error that goes with the force")
@@ -347,8 +338,8 @@ def _effects(rows: list[dict[str, Value]], axes: Axes) -> None:
     axes.barh(names, _numbers(mine, "p99_us"), color="#56B4E9", label="p99")
     axes.barh(names, _numbers(mine, "p50_us"), color="#0072B2", label="median")
     axes.invert_yaxis()
-    axes.set_xlabel("time of a step [us]; the period is 1000 us")
-    axes.legend(loc="lower right", fontsize=8)
+    axes.set_xlabel(f"time of a step [us] of {PERIOD_US:.0f}")
+    axes.legend(loc="upper right", fontsize=8)
     axes.set_title("what each effect costs")
 
 
@@ -405,7 +396,6 @@ def _logarithmic(axes: Axes, x: str, y: str) -> None:
 
 
 def _overview(panels: tuple[Panel, ...], figure: Figure) -> None:
-    for axes, panel in zip(
-        np.ravel(figure.subplots(1, 3)), (panels[0], panels[2], panels[3]), strict=True
-    ):
+    shown = (panels[0], panels[2], panels[3])
+    for axes, panel in zip(figure.subplots(1, 3, width_ratios=(5, 3, 3)), shown, strict=True):
         panel.draw(axes)

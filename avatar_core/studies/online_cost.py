@@ -22,7 +22,7 @@ from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm, relative_l2
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.offline.certify.linear import UnseenErrors
-from avatar_core.studies.bench.effects import CASES, effect_rows
+from avatar_core.studies.bench.effects import cases_on, effect_rows
 from avatar_core.studies.bench.methods import (
     StepRow,
     table_over_steps,
@@ -233,7 +233,8 @@ def _optimum_rows(
 
 def cost_of_effects(vademecum: Vademecum) -> list[dict[str, Value]]:
     """Times of a step with each effect alone that a linear vademecum serves, surface and volume."""
-    cases = [case for case in CASES if not isinstance(case[2][0], LargeDeformationEffect)]
+    every = cases_on(vademecum)
+    cases = [case for case in every if not isinstance(case[2][0], LargeDeformationEffect)]
     return [
         {
             "stage": "effects",
