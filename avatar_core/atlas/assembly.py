@@ -57,6 +57,7 @@ def assembled(
         tip_field=tip_field,
         convergence=convergence,
         provenance=provenance(problem),
+        supports=problem.elasticity.supports,
     )
 
 
@@ -96,13 +97,17 @@ def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
 
 
 def provenance(problem: PatientProblem) -> Provenance:
-    """The patient's surface, and the template from which clamp and access are."""
+    """The patient's surface, and the template from which clamp, access and supports are."""
     surface = problem.surface
+    held = " ".join(f"{s.name}={s.stiffness:g}" for s in problem.elasticity.supports)
+    parameters = {"template": problem.registration.template.name} | (
+        {"supports": held} if held else {}
+    )
     return Provenance(
         source=surface.name,
         source_sha256=surface.source_sha256,
         unit=surface.unit,
         axes=surface.axes_name,
-        parameters=(f"template={problem.registration.template.name}",),
+        parameters=tuple(f"{name}={value}" for name, value in parameters.items()),
         notices=surface.notices,
     )

@@ -3,7 +3,7 @@
 ``interpolated`` combines the neighbours' responses (Eq. 18). ``reduced`` uses their load functions
 to span a Galerkin space on the patient's own mesh, and enriches it. ``solved`` is the full build.
 All share the patient's mesh, and the clamp and accessible region transferred from the template, so
-that they differ in the response only.
+that they differ in the response only. Supports hold a patient that is ``reduced`` or ``solved``.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.certify.linear import certify
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
+from avatar_core.offline.supports import SupportOption
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.reduction.galerkin import (
     GalerkinErrorEstimate,
@@ -71,8 +72,9 @@ class PatientOptions:
     max_modes : modes of the vademecum at a place; see :class:`BuildRule`
     n_certified : unseen loads of the certificate; None for 24, or 200 with ``solved``; 0 for none
     leave_out : numbers of anatomies that get no weight, such as other scans of the patient
-    groups : points that are clamped and accessible, in place of the template's; see
-        :func:`avatar_core.geometry.groups.regions_of_groups`
+    groups : points that are clamped, accessible or held, in place of the template's; see
+        :func:`avatar_core.atlas.patient_problem.patient_problem`
+    supports : springs of fixed stiffness that hold the organ instead of the clamp
     inside : what lies inside the organ and is displayed with it, as tumours; as stiff as the organ
     """
 
@@ -84,6 +86,7 @@ class PatientOptions:
     n_certified: int | None = None
     leave_out: tuple[int, ...] = ()
     groups: Mapping[str, np.ndarray] | None = None
+    supports: tuple[SupportOption, ...] = ()
     inside: tuple[SurfaceMesh, ...] = ()
     build: BuildRule = field(default_factory=BuildRule)
     reduction: ReductionRule = field(default_factory=ReductionRule)
@@ -91,6 +94,12 @@ class PatientOptions:
     def __post_init__(self) -> None:
         if not 0.0 < self.tolerance < 1.0:
             raise PatientError(f"tolerance {self.tolerance:g}; choose between 0 and 1")
+        free = [s.name for s in self.supports if s.coordinate is not None]
+        if free:
+            raise PatientError(
+                f"support {free[0]} has a range; give a patient's supports one stiffness each, or "
+                "build its surface without the atlas"
+            )
 
     @property
     def rule(self) -> BuildRule:
@@ -185,10 +194,10 @@ def posed_patient(
     Parameters and errors as of :func:`patient_vademecum`.
     """
     require_fidelity(fidelity)
-    if options.groups is not None and fidelity == "interpolated":
+    if (options.groups is not None or options.supports) and fidelity == "interpolated":
         raise PatientError(
             "interpolated responses are those of organs clamped as the template; choose reduced or "
-            "solved for a clamp of your own"
+            "solved for a clamp or supports of your own"
         )
     clock = {} if clock is None else clock
     progress("registration", 0.0, np.nan)
@@ -204,7 +213,9 @@ def posed_patient(
             problem = member_problem(surface, base, weights.member, registration)
         else:
             mesh = tetrahedralize(surface, options.n_vertices)
-            problem = patient_problem(surface, base, registration, mesh, options.groups)
+            problem = patient_problem(
+                surface, base, registration, mesh, options.groups, options.supports
+            )
     return problem, weights
 
 

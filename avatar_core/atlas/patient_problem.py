@@ -1,8 +1,8 @@
-"""The elastic problem of a patient: an own mesh, clamped and loaded where the template is."""
+"""The elastic problem of a patient: an own mesh, held and loaded where the template is."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,10 +10,13 @@ import numpy as np
 from avatar_core.atlas.base import PatientBase
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_normals
-from avatar_core.geometry.groups import regions_of_groups
+from avatar_core.fem.supports import Support
+from avatar_core.geometry.attachments import attachments_by_rule
+from avatar_core.geometry.groups import faces_of_groups, regions_of_groups
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.correspondence import carry_regions, registered_positions
+from avatar_core.offline.supports import SupportOption, held_at
+from avatar_core.shapes.correspondence import carry_faces, carry_regions, registered_positions
 from avatar_core.shapes.registration import Registration
 
 
@@ -45,23 +48,37 @@ def patient_problem(
     registration: Registration,
     mesh: TetMesh,
     groups: Mapping[str, np.ndarray] | None = None,
+    supports: Sequence[SupportOption] = (),
 ) -> PatientProblem:
-    """Transfer clamp, accessible region and patch radius of the base to a patient's mesh.
+    """Transfer clamp or supports, accessible region and patch radius to a patient's mesh.
 
-    groups : points that are clamped and accessible, as of
-        :func:`avatar_core.geometry.groups.regions_of_groups`, in place of the template's
+    groups : points of the clamp, the accessible region and supports, in place of the template's
+        (:mod:`avatar_core.geometry.groups`); without supports, of both regions
+    supports : that hold the organ instead of the clamp
 
     Raises
     ------
-    RegistrationError, MeshError
-        If the mesh lies elsewhere, or is too coarse for the regions or the patch.
+    RegistrationError, MeshError, MaterialError
+        If the mesh lies elsewhere, or is too coarse for the regions, supports or the patch.
     """
-    regions = (
-        carry_regions(registration, mesh) if groups is None else regions_of_groups(mesh, groups)
-    )
+    springs: tuple[Support, ...] = ()
+    if supports:
+        places = template_places(registration, mesh) | faces_of_groups(mesh, groups or {})
+        regions, springs = held_at(mesh, supports, places)
+    elif groups is not None:
+        regions = regions_of_groups(mesh, groups)
+    else:
+        regions = carry_regions(registration, mesh)
     loads = load_surface(mesh, regions, base.loads.patch_radius)
-    elasticity = Elasticity(mesh, base.material, regions.clamped)
+    elasticity = Elasticity(mesh, base.material, regions.clamped, supports=springs)
     return PatientProblem(surface, registration, mesh, regions, loads, elasticity)
+
+
+def template_places(registration: Registration, mesh: TetMesh) -> dict[str, np.ndarray]:
+    """Faces of a patient's mesh where the template is accessible, and where its attachments are."""
+    template = registration.template
+    parts = attachments_by_rule(template.mesh) | {"accessible": template.regions.accessible}
+    return carry_faces(registration, mesh, parts)
 
 
 def member_problem(

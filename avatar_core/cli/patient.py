@@ -14,7 +14,9 @@ from avatar_core.cli.timings import StageClock, Timings, require_timings, show_t
 from avatar_core.cli.vademecum import (
     EXIT_NOT_CONVERGED,
     Axes,
+    Groups,
     Label,
+    Supports,
     Surface,
     Unit,
     Vertices,
@@ -63,6 +65,8 @@ def patient(
     unit: Unit = "mm",
     axes: Axes = None,
     label: Label = None,
+    groups: Groups = None,
+    support: Supports = None,
     vertices: Vertices = 2850,
     modes: Annotated[int, typer.Option(help="maximum number of modes at a place")] = 100,
     certify: Annotated[
@@ -78,15 +82,19 @@ def patient(
     from avatar_core.atlas.base import base_of, numbers_of
     from avatar_core.atlas.patient import PatientOptions, patient_vademecum, require_fidelity
     from avatar_core.atlas.storage import load_atlas
+    from avatar_core.geometry.groups import read_groups
+    from avatar_core.offline.supports import SupportOption
     from avatar_core.vademecum.storage import is_vademecum, load_vademecum, save_vademecum
 
     require_fidelity(fidelity)
     require(weighting in WEIGHTINGS, f"--weighting is {weighting}; choose {', '.join(WEIGHTINGS)}")
     require(modes >= 1, f"--modes is {modes}; ask for at least 1")
     require(neighbors is None or neighbors >= 1, f"--neighbors is {neighbors}; ask for at least 1")
-    inputs = (None if surface == "phantom" else surface, atlas)
+    inputs = (None if surface == "phantom" else surface, atlas, groups)
     require_output(output, [".h5"], inputs, is_vademecum, overwrite)
     require_timings(timings)
+    supports = tuple(SupportOption.parse(text) for text in support or ())
+    points = None if groups is None else read_groups(groups)
     clock = StageClock()
     clock.begin("atlas")
     base = base_of(load_atlas(atlas))
@@ -99,6 +107,8 @@ def patient(
         max_modes=modes,
         n_certified=certify,
         leave_out=numbers_of(base, leave_out or ()),
+        groups=points,
+        supports=supports,
     )
     organ = read_organ(surface, unit, axes, label)
     for notice in organ.notices:

@@ -44,6 +44,23 @@ Axes = Annotated[
 Label = Annotated[
     str | None, typer.Option(help="number or name (.seg.nrrd, .dcm) of the organ in a label map")
 ]
+Groups = Annotated[
+    Path | None,
+    typer.Option(
+        help=".npz file with points 'clamped' and 'accessible' [m], instead of the rule (or the "
+        "atlas's template), and of supports by name"
+    ),
+]
+Supports = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--support",
+        help="springs that hold the organ instead of the clamp, per area [N/m^3]: "
+        "bare_area=1e6, bare_area=1e5:1e9 to choose it later (not from an atlas), "
+        "bare_area=clamped, or bare_area alone for a guess; also cava_groove, falciform, "
+        "right_triangular, left_triangular and groups of --groups; may be repeated",
+    ),
+]
 Vertices = Annotated[int, typer.Option(help="approximate number of mesh vertices")]
 
 
@@ -71,22 +88,8 @@ def vademecum(
         float | None,
         typer.Option(help="target for the mean relative error of displacement [-]; default: 0.006"),
     ] = None,
-    groups: Annotated[
-        Path | None,
-        typer.Option(
-            help=".npz file with points 'clamped' and 'accessible' [m], instead of the rule, and "
-            "of supports by name"
-        ),
-    ] = None,
-    support: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="springs that hold the organ instead of the clamp, per area [N/m^3]: "
-            "bare_area=1e6, bare_area=1e5:1e9 to choose it later, bare_area=clamped, or bare_area "
-            "alone for a guess; also cava_groove, falciform, right_triangular, left_triangular "
-            "and groups of --groups; may be repeated"
-        ),
-    ] = None,
+    groups: Groups = None,
+    support: Supports = None,
     element: Annotated[
         str | None,
         typer.Option(help="finite element: P1, P2 or Taylor-Hood; default: by Poisson's ratio"),

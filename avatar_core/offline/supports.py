@@ -18,7 +18,7 @@ Each may be wrong by a factor of 100 (``UNCERTAIN``). Where this matters, keep i
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -101,19 +101,29 @@ class SupportOption:
 def held_by(
     mesh: TetMesh, options: Sequence[SupportOption], groups: Path | None = None
 ) -> tuple[Regions, tuple[Support, ...]]:
+    """:func:`held_at` the attachments by rule, and what a file of groups says."""
+    given = {} if groups is None else faces_of_groups(mesh, read_groups(groups))
+    return held_at(mesh, options, attachments_by_rule(mesh) | given)
+
+
+def held_at(
+    mesh: TetMesh, options: Sequence[SupportOption], places: Mapping[str, np.ndarray]
+) -> tuple[Regions, tuple[Support, ...]]:
     """The regions of an organ that supports hold instead of the usual clamp, and its supports.
 
-    Tools reach what looks forward and is not held; a file of groups may say otherwise, and which
-    other faces are clamped.
+    Tools reach what looks forward and is not held, unless the places say otherwise.
+
+    Parameters
+    ----------
+    places : faces of each support, ndarrays of bool, shape (n_faces,); of ``clamped`` and
+        ``accessible`` too, if they are not left to the supports and the rule
 
     Raises
     ------
     MaterialError, MeshError
         For a support that is nowhere, or without faces.
     """
-    given = {} if groups is None else faces_of_groups(mesh, read_groups(groups))
-    places = attachments_by_rule(mesh) | given
-    clamped = given.get(CLAMPED, np.zeros(len(mesh.boundary_faces), bool)).copy()
+    clamped = places.get(CLAMPED, np.zeros(len(mesh.boundary_faces), bool)).copy()
     held = clamped.copy()
     supports = []
     for option in options:
@@ -127,5 +137,5 @@ def held_by(
         else:
             supports.append(Support(option.name, faces, option.stiffness))
     covered = held | touching(mesh, clamped)
-    accessible = given.get("accessible", accessible_by_rule(mesh, covered)) & ~covered
+    accessible = places.get("accessible", accessible_by_rule(mesh, covered)) & ~covered
     return checked(Regions(clamped, accessible), on_supports=bool(supports)), tuple(supports)

@@ -10,6 +10,8 @@ Fields are thus transferred by sparse matrices whose rows sum to one and reprodu
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -30,19 +32,42 @@ _PIECES = 3  # a patient's face is split into 3^2 pieces, whose majority decides
 def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
     """Clamped and accessible faces of the patient's mesh, from those of the template.
 
-    Each piece of a patient's face takes the region of the closest registered face, and the face
-    that of most of its pieces. Accessible faces that touch the clamp and islands below 5 % of the
-    accessible area are dropped, as by the anatomical rule.
+    Accessible faces that touch the clamp and islands below 5 % of the accessible area are dropped,
+    as by the anatomical rule. Parameters and errors as of :func:`carry_faces`; RegistrationError
+    if a region would be empty, too.
+    """
+    regions = registration.template.regions
+    parts = {"clamped": regions.clamped, "accessible": regions.accessible}
+    clamped, accessible = carry_faces(registration, patient, parts).values()
+    faces = patient.boundary_faces
+    accessible &= ~np.isin(faces, faces[clamped]).any(axis=1)
+    accessible = without_islands(faces, patient.face_areas, accessible, least=0.05)
+    if not (clamped.any() and accessible.any()):
+        raise RegistrationError(
+            "no face of the patient's mesh falls into the template's clamp or accessible region; "
+            "use a finer patient mesh"
+        )
+    return Regions(clamped, accessible)
+
+
+def carry_faces(
+    registration: Registration, patient: TetMesh, parts: Mapping[str, NDArray[np.bool_]]
+) -> dict[str, NDArray[np.bool_]]:
+    """Parts of the template's surface on the patient's mesh, by name, each of shape (n_faces,).
+
+    Each piece of a patient's face belongs to what the closest registered face belongs to, and the
+    face to what most of its pieces do.
 
     Parameters
     ----------
     registration : Registration
     patient : TetMesh of the surface that was registered to
+    parts : ndarrays of bool over the template's boundary faces
 
     Raises
     ------
     RegistrationError
-        If the mesh does not lie on the registered template, or a region would be empty.
+        If the mesh does not lie on the registered template.
     """
     _require_same_place(registration, patient)
     faces = patient.boundary_faces
@@ -52,17 +77,7 @@ def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
         registration.mesh.vertices, registration.mesh.boundary_faces, pieces
     )
     owner = owner.reshape(len(faces), -1)
-    regions = registration.template.regions
-    clamped = regions.clamped[owner].mean(axis=1) > 0.5
-    accessible = regions.accessible[owner].mean(axis=1) > 0.5
-    accessible &= ~np.isin(faces, faces[clamped]).any(axis=1)
-    accessible = without_islands(faces, patient.face_areas, accessible, least=0.05)
-    if not (clamped.any() and accessible.any()):
-        raise RegistrationError(
-            "no face of the patient's mesh falls into the template's clamp or accessible region; "
-            "use a finer patient mesh"
-        )
-    return Regions(clamped, accessible)
+    return {name: part[owner].mean(axis=1) > 0.5 for name, part in parts.items()}
 
 
 def registered_positions(registration: Registration, loads: LoadSurface) -> FloatArray:

@@ -329,7 +329,7 @@ def _force(contacts: ForceErrors, axes: Axes) -> None:
     axes.axhline(JND, color="#888888", ls="-.", label=_NOTICED)
     axes.set_xlim(1e-4, 1.0)
     _logarithmic(axes, "true error of the force [-]", "error said with the force [-]")
-    axes.set_title("the error that goes with the force")
+    axes.set_title("error said with a force")
 
 
 def _effects(rows: list[dict[str, Value]], axes: Axes) -> None:
@@ -338,9 +338,9 @@ def _effects(rows: list[dict[str, Value]], axes: Axes) -> None:
     axes.barh(names, _numbers(mine, "p99_us"), color="#56B4E9", label="p99")
     axes.barh(names, _numbers(mine, "p50_us"), color="#0072B2", label="median")
     axes.invert_yaxis()
-    axes.set_xlabel(f"time of a step [us] of {PERIOD_US:.0f}")
+    axes.set_xlabel("time of a step [us]")
     axes.legend(loc="upper right", fontsize=8)
-    axes.set_title("what each effect costs")
+    axes.set_title("cost of effects")
 
 
 def _offline(rows: list[dict[str, Value]], stages: tuple[str, ...], axes: Axes) -> None:

@@ -15,30 +15,18 @@ from avatar_core.atlas.patient import PatientOptions, build_patient, patient_vad
 from avatar_core.atlas.patient_problem import PatientProblem, patient_problem
 from avatar_core.atlas.transfer import combine, kriging, patient_weights
 from avatar_core.errors import LLEError
-from avatar_core.fem.elasticity import Elasticity, Material
-from avatar_core.fem.patch_loads import load_surface, patch_loads
-from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
-from avatar_core.geometry.phantom import phantom_liver, population
-from avatar_core.reduction.compact_response import CompactResponse
+from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.reduction.galerkin import (
     GalerkinBasis,
     ReductionRule,
-    compact_response,
     estimate_errors,
     reduce,
     relative_residual,
     residual_compliance_blocks,
     solve_probes,
 )
-from avatar_core.shapes.registration import (
-    Registration,
-    RegistrationQuality,
-    SimilarityTransform,
-    Template,
-)
-from tests.stored import stored
+from tests.core.bent_base import bent_phantoms, patient_mesh, registration_of
 
-N_BASE = 5
 ROOMY = ReductionRule(n_start=20, n_block=6, n_probes=8, max_solution_fraction=0.6)
 
 
@@ -52,52 +40,15 @@ class Case:
     exact: np.ndarray  # (3 n_vertices, n_loads)
 
 
-def _registration(template: Template, vertices: np.ndarray) -> Registration:
-    still = SimilarityTransform(1.0, np.eye(3), np.zeros(3))
-    quality = RegistrationQuality(0.0, 0.0, 0.0, 0.0, 1.0, 0.0, None)  # type: ignore[arg-type]
-    mesh = TetMesh(vertices, template.mesh.tets)
-    return Registration(template, mesh, still, quality, (), True)
-
-
 @pytest.fixture(scope="module")
 def case() -> Case:
-    organ = phantom_liver(0.012)
-    mesh = tetrahedralize(organ, 300)
-    template = Template("phantom", mesh, regions_by_rule(mesh))
-    loads = load_surface(mesh, template.regions)
-    maps = population(N_BASE + 1, seed=3, bend=0.01)
-    vertices = np.array([shape(mesh.vertices) for shape in maps])
-    names = tuple(f"phantom-{i}" for i in range(N_BASE))
-    base = PatientBase(template, loads, Material(), names, vertices[:-1], _responses())
-    surface = replace(maps[-1].moved(organ), name="patient")
-    registration = _registration(template, vertices[-1])
-    problem = patient_problem(surface, base, registration, _patient_mesh())
+    base, surface, registration = bent_phantoms()
+    problem = patient_problem(surface, base, registration, patient_mesh())
     patches = patch_loads(
         problem.elasticity, problem.loads.centers, problem.loads.patch_radius
     ).tocsr()
     exact = problem.elasticity.at_vertices(problem.elasticity.solve(patches))
     return Case(base, problem, patches, exact)
-
-
-@stored
-def _responses() -> list[CompactResponse]:
-    """Of the anatomies of the base."""
-    mesh = tetrahedralize(phantom_liver(0.012), 300)
-    regions = regions_by_rule(mesh)
-    loads, responses = load_surface(mesh, regions), []
-    for shape in population(N_BASE + 1, seed=3, bend=0.01)[:-1]:
-        elasticity = Elasticity(
-            TetMesh(shape(mesh.vertices), mesh.tets), Material(), regions.clamped
-        )
-        patches = patch_loads(elasticity, shape(loads.centers), loads.patch_radius)
-        responses.append(compact_response(elasticity, patches, 40))
-    return responses
-
-
-@stored
-def _patient_mesh() -> TetMesh:
-    surface = population(N_BASE + 1, seed=3, bend=0.01)[-1].moved(phantom_liver(0.012))
-    return tetrahedralize(surface, 350)
 
 
 def _error(case: Case, estimate: np.ndarray) -> np.ndarray:
@@ -147,7 +98,7 @@ def test_scans_of_one_person_are_left_out_together(case: Case) -> None:
 
 
 def test_a_member_gets_its_own_response(case: Case) -> None:
-    registration = _registration(case.base.template, case.base.vertices[2])
+    registration = registration_of(case.base.template, case.base.vertices[2])
     weights = patient_weights(case.base, registration, case.problem.surface)
     assert combine(case.base.responses, weights) is case.base.responses[2]
 
