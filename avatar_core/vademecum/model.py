@@ -325,6 +325,12 @@ class Vademecum:
         return self._displayed(self.regions.clamped)
 
     @property
+    def supported_faces(self) -> np.ndarray:
+        """Which of :attr:`organ_faces` springs hold, shape (m,) bool."""
+        faces = [support.faces for support in self.supports]
+        return self._displayed(np.any([np.zeros_like(self.regions.clamped), *faces], axis=0))
+
+    @property
     def accessible_faces(self) -> np.ndarray:
         """Which of :attr:`organ_faces` tools reach, shape (m,) bool."""
         return self._displayed(self.regions.accessible)

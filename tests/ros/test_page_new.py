@@ -20,24 +20,27 @@ pytest.importorskip("viser", reason="the extra ui is not installed")
 
 import viser
 from avatar_ros.framework.conversions import surface_mesh
+from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING
 from avatar_ros.ui.actions import Wanted
 from avatar_ros.ui.cut_handle import CutHandle
 from avatar_ros.ui.new_patient import NewPatient
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.player import Player
-from avatar_ros.ui.preview_view import ACCESSIBLE, BRUSHES, CLAMPED
+from avatar_ros.ui.preview_view import BRUSHES
 from avatar_ros.ui.report_pdf import report_pdf
 from avatar_ros.ui.scan import read_scan, slice_of
 from avatar_ros.ui.scan_view import ScanView
 from avatar_ros.ui.structures_view import STRUCTURE
 from avatar_ros.ui.surface_view import section
 from avatar_ros.ui.tabs.inside import InsideTab
-from avatar_ros.ui.tabs.patient import PatientTab
+from avatar_ros.ui.tabs.patient import FREE, GUESS, SPRUNG, PatientTab
 from avatar_ros.ui.tabs.scan import ScanTab
 
+from avatar_core.common.supports import ATTACHMENTS
 from avatar_core.contact.effects.selection import default_effects
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry.groups import read_groups, regions_of_groups
+from avatar_core.geometry.groups import faces_of_groups, read_groups, regions_of_groups
+from avatar_core.offline.supports import SupportOption
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
@@ -65,6 +68,7 @@ class Cell:
         self.result, self.asked = result, []
         self.labels: list[tuple[str, ...]] = []
         self.previews: list[bool] = []
+        self.springs: dict[str, float] = {}
         self.drawn: list[np.ndarray] = []
         self.hidden = self.used = 0
 
@@ -78,8 +82,9 @@ class Cell:
     def offer_labels(self, labels: tuple[str, ...]) -> None:
         self.labels.append(labels)
 
-    def show_preview(self, is_shown: bool) -> None:
+    def show_preview(self, is_shown: bool, springs: dict[str, float] | None = None) -> None:
         self.previews.append(is_shown)
+        self.springs = springs or {}
 
     def show(self, points: np.ndarray, faces: np.ndarray, regions: np.ndarray) -> None:
         self.drawn.append(regions)
@@ -105,6 +110,15 @@ def previewed(tmp_path: Path) -> tuple[NewPatient, Cell]:
     return NewPatient(tmp_path, reader, *parts), cell
 
 
+def towards(face: int) -> tuple[np.ndarray, np.ndarray]:
+    """A ray from outside to the middle of a face of the cube."""
+    cube = Organ.of(organ("cube"))
+    corners = cube.vertices[cube.faces[face]].astype(float)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    normal /= np.linalg.norm(normal)
+    return corners.mean(axis=0) + 0.05 * normal, -normal
+
+
 def test_painted_regions_reach_the_next_build_of_that_organ_alone(
     previewed: tuple[NewPatient, Cell], tmp_path: Path
 ) -> None:
@@ -114,12 +128,7 @@ def test_painted_regions_reach_the_next_build_of_that_organ_alone(
     assert new.is_previewing and cell.previews == [True]
     assert "hidden" in new.alerts("liver")[0]
     free = int(np.flatnonzero(cell.drawn[-1] == 0)[0])
-    cube = Organ.of(organ("cube"))
-    place = cube.vertices[cube.faces[free]].mean(axis=0).astype(float)
-    corners = cube.vertices[cube.faces[free]].astype(float)
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    normal /= np.linalg.norm(normal)
-    ray = place + 0.05 * normal, -normal
+    ray = towards(free)
     new.paint(*ray)  # without a brush
     assert len(cell.drawn) == 1
     new.brush("clamp", 2e-3)
@@ -136,6 +145,38 @@ def test_painted_regions_reach_the_next_build_of_that_organ_alone(
     assert not new.is_previewing and cell.hidden == 1
     new.build(wanted._replace(preview=False))
     assert cell.asked[-1].groups == ""
+
+
+def test_springs_are_painted_by_name_and_kept_for_the_build(
+    previewed: tuple[NewPatient, Cell], tmp_path: Path
+) -> None:
+    new, cell = previewed
+    free = np.flatnonzero(cell.result.regions == 0)
+    cell.result.regions[free[:2]] = FIRST_SPRING + 1
+    wanted = Wanted(
+        "cube.stl",
+        fidelity="reduced",
+        supports=("cava_groove", "bare_area=clamped", "falciform=1e6"),
+        preview=True,
+    )
+    new.build(wanted)
+    assert list(cell.springs) == ["cava_groove", "falciform"]  # what is clamped is no spring
+    cube = Organ.of(organ("cube"))
+    a, b, c = cube.vertices[cube.faces[free[:2]]].swapaxes(0, 1)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert cell.springs["cava_groove"] == 0.0
+    assert cell.springs["falciform"] == pytest.approx(area, rel=1e-5)
+    new.brush("cava_groove", 2e-3)
+    new.paint(*towards(free[-1]))
+    assert cell.drawn[-1][free[-1]] == FIRST_SPRING and cell.springs["cava_groove"] > 0.0
+    new.build(wanted._replace(preview=False))
+    groups = read_groups(tmp_path / cell.asked[-1].groups)
+    assert set(groups) == {"clamped", "accessible", "cava_groove", "falciform"}
+    faces = faces_of_groups(organ("cube").mesh, groups)
+    painted = cell.drawn[-1] == FIRST_SPRING
+    assert faces["cava_groove"][painted].all() and not faces["falciform"][painted].all()
+    new.build(wanted._replace(preview=False, supports=()))
+    assert cell.asked[-1].groups == ""  # springs were painted, and a clamp is asked for
 
 
 def test_labels_are_offered_of_a_label_map_alone(
@@ -303,6 +344,29 @@ def test_labels_and_boxes_of_a_file_reach_the_build(server: viser.ViserServer) -
     assert list(tab._boxes) == ["liver", "vein"]
     tab.offer_labels(())
     assert tab._wanted().label == "" and tab._wanted().inside == ()
+
+
+def test_springs_are_asked_for_by_stiffness(server: viser.ViserServer) -> None:
+    asked: Any = Asked()
+    tab = PatientTab(server.gui, asked, tuple(BRUSHES))
+    assert tab._wanted().supports == () and not tab._stiffness.visible
+    tab._held.value = SPRUNG
+    assert tab._stiffness.visible
+    for name in ATTACHMENTS:
+        tab._springs[name].value = FREE
+    tab._springs["bare_area"].value, tab._springs["falciform"].value = "1e6", GUESS
+    tab._springs["cava_groove"].value = "clamped"
+    assert tab._wanted().supports == ("cava_groove=clamped", "bare_area=1e6", "falciform")
+    for text in tab._wanted().supports:
+        SupportOption.parse(text)
+    tab.show_preview(True, {"bare_area": 50e-4})
+    assert "bare_area 50 cm" in tab._areas.content and tab._areas.visible
+    tab._brush.value = "bare_area"
+    assert asked.calls[-1][:2] == ("brush", "bare_area")
+    tab.show_preview(True, {"bare_area": 60e-4})
+    assert tab._brush.value == "bare_area"  # painting goes on
+    tab.show_preview(False)
+    assert not tab._areas.visible and "bare_area" not in tab._brush.options
 
 
 def test_structures_and_planes_have_their_controls(

@@ -179,6 +179,26 @@ def test_a_mesh_in_the_request_is_built_by_the_action(
     assert any(told.error > 0.0 for told in pursuit.told)  # the estimate of the reduced space
 
 
+def test_springs_are_previewed_and_hold_what_is_built(
+    node: Module, probe: Any, folder: Path
+) -> None:
+    springs = ["cava_groove=1e7", "right_triangular=clamped", "bare_area"]
+    asked = PATIENT | {"fidelity": "reduced", "tolerance": 0.2, "supports": springs}
+    status, shown = Pursuit(probe, **asked, preview=True).result()
+    assert (status, shown.success) == (GoalStatus.STATUS_SUCCEEDED, True), shown.message
+    regions = np.array(shown.regions)
+    # 1 clamped, 2 accessible, from 3 on the springs by their place in the request
+    assert set(regions) == {0, 1, 2, 3, 5}
+    status, built = Pursuit(probe, **asked, name="sprung").result()
+    assert built.success, built.message
+    vademecum = load_vademecum(folder / "sprung.h5")
+    stiffness = {spring.name: spring.stiffness for spring in vademecum.supports}
+    assert stiffness == {"cava_groove": 1e7, "bare_area": 1e6}
+    held = {spring.name: spring.faces for spring in vademecum.supports}
+    np.testing.assert_array_equal(held["bare_area"], regions == 5)
+    np.testing.assert_array_equal(vademecum.regions.clamped, regions == 1)
+
+
 # --- what the pages say -----------------------------------------------------------------------
 
 
@@ -258,6 +278,9 @@ BAD_REQUESTS: list[tuple[dict[str, Any], str]] = [
     ({**PATIENT, "axes": "XYZ"}, "axes: 'XYZ' is unknown"),
     ({**PATIENT, "leave_out": ["nobody"]}, "no anatomy 'nobody'"),
     ({**PATIENT, "leave_out": ["liver0", "liver1", "liver2"]}, "no anatomy is left"),
+    ({**PATIENT, "supports": ["bare_area"]}, "choose reduced or solved"),
+    ({**PATIENT, "fidelity": "reduced", "supports": ["bare_area=1e5:1e9"]}, "one stiffness each"),
+    ({**PATIENT, "fidelity": "reduced", "supports": ["nowhere"]}, "NAME alone for one of"),
     ({**PATIENT, "name": "../escaped"}, "plain file name"),
     ({**PATIENT, "name": "x" * 300}, "shorter"),
     ({**PATIENT, "name": "atlas.h5"}, "is no vademecum; choose another name"),

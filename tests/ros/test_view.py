@@ -16,11 +16,14 @@ pytest.importorskip("avatar_ros.ui.view", reason="avatar_ros is not installed")
 import viser
 from avatar_ros.ui import tone
 from avatar_ros.ui.colours import HELD, N_BANDS, N_SHADES, TISSUE
+from avatar_ros.ui.legend import legend
 from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.patterns import GAP
+from avatar_ros.ui.patterns import GAP, HATCH_GAP
+from avatar_ros.ui.surface_view import N_TONES
 from avatar_ros.ui.view import CUT, GLASS, WHOLE, OrganView
 
 from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.fem.supports import Support
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
@@ -122,7 +125,7 @@ def test_cut_open_shows_half_and_the_far_wall(view: OrganView) -> None:
 def shades(view: OrganView, first: int) -> list[Any]:
     """Meshes of tissue that are no shades, from one beyond these on, and not empty."""
     nodes = view._surface._nodes
-    beyond = [nodes["tissue", k] for k in range(N_SHADES + first, N_SHADES + 3)]
+    beyond = [nodes["tissue", k] for k in range(N_SHADES + first, N_TONES)]
     return [mesh for mesh in beyond if np.any(mesh.faces)]
 
 
@@ -145,6 +148,24 @@ def test_the_clamp_has_checks_and_access_has_stripes(view: OrganView) -> None:
     assert area(meshes(view, "tissue")) == pytest.approx(whole, rel=1e-6)
     view.mark_reach(False)
     assert len(shades(view, 0)) == 2
+
+
+def test_what_springs_hold_is_hatched(view: OrganView) -> None:
+    """And nothing else changes; the legend names it then alone."""
+    cube = organ("cube")
+    held = np.zeros(len(cube.regions.clamped), bool)
+    held[np.flatnonzero(~cube.regions.clamped & ~cube.regions.accessible)[:60]] = True
+    shown = Organ.of(replace(cube, supports=(Support("bare_area", held, 1e6),)))
+    np.testing.assert_array_equal(shown.sprung, held)
+    whole = area(meshes(view, "tissue"))
+    view.show(shown, SPHERE)
+    corners = shown.vertices[shown.faces[held]].astype(float)
+    a, b, c = corners.transpose(1, 0, 2)
+    there = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    _, _, hatching = shades(view, 0)
+    assert area([hatching]) == pytest.approx(there / HATCH_GAP, rel=0.2)
+    assert area(meshes(view, "tissue")) == pytest.approx(whole, rel=1e-6)
+    assert "springs" in legend(1e-3, has_springs=True) and "springs" not in legend(1e-3)
 
 
 def test_little_error_looks_unlike_no_access(view: OrganView) -> None:

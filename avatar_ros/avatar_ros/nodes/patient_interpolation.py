@@ -86,6 +86,7 @@ def patient_request(request: Any, settings: InterpolationSettings) -> PatientReq
         label=request.label or None,
         inside=tuple(request.inside),
         groups=groups,
+        supports=tuple(request.supports),
         preview=getattr(request, "preview", False),
         leave_out=tuple(request.leave_out),
         neighbors=request.neighbors,

@@ -8,6 +8,9 @@ import numpy as np
 
 from avatar_core.errors import AvatarError
 
+# Regions of a face of a preview, as in BuildPatient.action; springs are numbered from the last on.
+FREE, CLAMPED, ACCESSIBLE, FIRST_SPRING = range(4)
+
 
 class BuildError(AvatarError):
     """A patient's vademecum was not built."""
@@ -45,7 +48,8 @@ class PatientRequest:
     surface : file, or empty if there are vertices, shape (n, 3) [m], and faces, shape (m, 3)
     unit, axes : of the file; axes None for those that it states, else RAS
     label, inside : of a label map, the organ and what lies inside; label None for the only one
-    groups : file of clamped and accessible points; empty for the template's
+    groups : file of clamped, accessible and held points; empty for the template's
+    supports : as on the command line; empty for the clamp
     preview : only register, mesh and clamp
     neighbors : 0 for all
     tolerance : 0 for the default
@@ -60,6 +64,7 @@ class PatientRequest:
     label: str | None
     inside: tuple[str, ...]
     groups: str
+    supports: tuple[str, ...]
     preview: bool
     leave_out: tuple[str, ...]
     neighbors: int
@@ -97,7 +102,8 @@ class Previewed:
     """The surface of a patient's mesh and its regions; nothing was written.
 
     vertices : ndarray, shape (n, 3) [m]; faces : (m, 3)
-    regions : ndarray of uint8, shape (m,): 0 free, 1 clamped, 2 accessible
+    regions : ndarray of uint8, shape (m,): 0 free, 1 clamped, 2 accessible, 3 on the first of the
+        springs, and so on
     """
 
     vertices: np.ndarray

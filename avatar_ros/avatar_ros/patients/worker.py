@@ -11,7 +11,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -32,12 +32,17 @@ from avatar_core.atlas.storage import load_atlas
 from avatar_core.errors import one_line
 from avatar_core.geometry.groups import read_groups
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.offline.supports import SupportOption
 from avatar_core.vademecum import storage
 from avatar_core.vademecum.display import boundary
 from avatar_ros.framework import realtime
 from avatar_ros.framework.library import RefusedError
 from avatar_ros.framework.reader import Reader
 from avatar_ros.patients.protocol import (
+    ACCESSIBLE,
+    CLAMPED,
+    FIRST_SPRING,
+    FREE,
     BuildError,
     BuildSettings,
     Built,
@@ -74,7 +79,7 @@ def build(
     reader: Reader,
     connection: Connection,
 ) -> Built | Previewed:
-    """Build one patient and write it, or show what would be clamped.
+    """Build one patient and write it, or show what would hold it.
 
     Raises
     ------
@@ -94,7 +99,7 @@ def build(
     fidelity: Fidelity = request.fidelity  # type: ignore[assignment]
     if request.preview:
         problem, _ = posed_patient(surface, atlas.base, fidelity, options, report)
-        previewed = preview_of(problem)
+        previewed = preview_of(problem, options.supports)
         connection.send(previewed)
         return previewed
     options = replace(options, inside=read_inside(request, reader))
@@ -108,11 +113,15 @@ def build(
     return built
 
 
-def preview_of(problem: PatientProblem) -> Previewed:
+def preview_of(problem: PatientProblem, supports: Sequence[SupportOption]) -> Previewed:
     """The boundary of a patient's mesh with its regions."""
     vertices, faces = boundary(problem.mesh)
-    regions = np.where(problem.regions.accessible, 2, 0)
-    regions[problem.regions.clamped] = 1
+    regions = np.where(problem.regions.accessible, ACCESSIBLE, FREE)
+    regions[problem.regions.clamped] = CLAMPED
+    springs = {spring.name: spring.faces for spring in problem.elasticity.supports}
+    for k, support in enumerate(supports):  # those that are clamped are none
+        if support.name in springs:
+            regions[springs[support.name]] = FIRST_SPRING + k
     notices = [*problem.surface.notices, *problem.registration.notices]
     return Previewed(vertices, faces, regions.astype(np.uint8), notices)
 
@@ -163,6 +172,7 @@ def _options(request: PatientRequest, base: PatientBase, settings: BuildSettings
         max_modes=settings.max_modes,
         n_certified=None if settings.n_certified < 0 else settings.n_certified,
         leave_out=left_out,
+        supports=tuple(SupportOption.parse(text) for text in request.supports),
     )
 
 

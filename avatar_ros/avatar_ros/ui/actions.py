@@ -13,8 +13,9 @@ class Wanted(NamedTuple):
     surface : file of the library; unit, axes : of its coordinates; empty: mm, and as it states
     tolerance : mean relative error of the displacement
     label, inside : of a label map, the organ and what lies inside; empty for the only one
-    groups : file of the library with clamp and access; empty for those of the template
-    preview : show what would be clamped, and build nothing
+    groups : file of the library with clamp, access and springs; empty for those of the template
+    supports : springs instead of the clamp, as on the command line; empty for the clamp
+    preview : show what would hold it, and build nothing
     """
 
     surface: str
@@ -25,6 +26,7 @@ class Wanted(NamedTuple):
     label: str = ""
     inside: tuple[str, ...] = ()
     groups: str = ""
+    supports: tuple[str, ...] = ()
     preview: bool = False
 
 

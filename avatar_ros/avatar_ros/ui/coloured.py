@@ -44,8 +44,11 @@ class Coloured:
         """The scale of what is drawn, as HTML."""
         view = self._view
         if self._field == DISPLACEMENT:
-            return legend.legend(view.top, opacity=view.opacity)
-        return legend.legend(view.field_top, _LEGENDS[self._field], 1e-2, view.opacity)
+            scale = (view.top, legend.DISPLACEMENT, 1e-3)
+        else:
+            scale = (view.field_top, _LEGENDS[self._field], 1e-2)
+        organ = self._chosen.organ
+        return legend.legend(*scale, view.opacity, organ is not None and bool(organ.sprung.any()))
 
     def choose(self, field: str) -> None:
         """Colour by one of ``FIELDS``."""

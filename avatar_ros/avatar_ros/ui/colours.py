@@ -18,6 +18,7 @@ N_BANDS = 20  # of the scale, the first of which is tissue
 N_SHADES = 20  # of tissue, from its dark to its light side
 TISSUE = (196, 112, 99)
 CLAMP = ((70, 70, 70), (165, 165, 165))  # checks where the organ is held
+SPRINGS = (70, 70, 70)  # hatching where springs hold the organ
 ACCESS = (38, 84, 124)  # stripes where tools reach
 HELD = (170, 170, 170)  # of a shape that is not that of now
 _DARKEST, _LIGHTEST = 0.42, 1.15  # over the colour of tissue

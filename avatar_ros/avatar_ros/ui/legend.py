@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from avatar_ros.ui.colours import ACCESS, CLAMP, N_BANDS, TISSUE, band_colours, scale_colours
+from avatar_ros.ui.colours import (
+    ACCESS,
+    CLAMP,
+    N_BANDS,
+    SPRINGS,
+    TISSUE,
+    band_colours,
+    scale_colours,
+)
 
 DISPLACEMENT = "displacement [mm]"
 EXPECTED_ERROR = "error of the force [%]"
@@ -10,10 +18,17 @@ SPREAD = "spread of the force [%]"
 _KEY = "display:inline-block;width:15px;height:11px;vertical-align:-1px;margin:0 3px 0 9px"
 
 
-def legend(top: float, what: str = DISPLACEMENT, unit: float = 1e-3, opacity: float = 1.0) -> str:
+def legend(
+    top: float,
+    what: str = DISPLACEMENT,
+    unit: float = 1e-3,
+    opacity: float = 1.0,
+    has_springs: bool = False,
+) -> str:
     """The bands with the values at their edges, and what patterns mean, as HTML.
 
     top : end of the scale; unit : one shown unit, both in SI
+    has_springs : of the organ, which are named then
     opacity : of the organ, so that both look alike before the same ground
     """
     is_everywhere = what != DISPLACEMENT  # where tools reach, from the first band on
@@ -28,7 +43,7 @@ def legend(top: float, what: str = DISPLACEMENT, unit: float = 1e-3, opacity: fl
     return (
         f'<div id="colour-bar" role="img" aria-label="colour scale of {what}, 0 to '
         f'{top / unit:g}" style="margin:0 1em;font-size:12px">{what}; {tissue}'
-        f"{key_of_clamp()}"
+        f"{key_of_clamp()}{key_of_springs() if has_springs else ''}"
         f'<div style="height:12px;opacity:{opacity:g};'
         f'background:linear-gradient(to right, {stops})"></div>'
         f'<div style="display:flex;justify-content:space-between">{ticks}</div></div>'
@@ -40,6 +55,12 @@ def key_of_clamp() -> str:
     dark, light = (f"rgb{colour}" for colour in CLAMP)
     checks = f"repeating-conic-gradient({dark} 0 25%, {light} 0 50%) 0 0/7px 7px"
     return f'<span style="{_KEY};background:{checks}"></span>clamp'
+
+
+def key_of_springs() -> str:
+    """The pattern of what springs hold, and its name."""
+    lines = f"repeating-linear-gradient(45deg, rgb{SPRINGS} 0 2px, rgb{TISSUE} 2px 5px)"
+    return f'<span style="{_KEY};background:{lines}"></span>springs'
 
 
 def key_of_access() -> str:

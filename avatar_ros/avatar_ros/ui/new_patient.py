@@ -18,9 +18,10 @@ from avatar_core.geometry.label_maps import labels_of
 from avatar_core.scene.written import replaced
 from avatar_ros.framework.conversions import mesh_arrays
 from avatar_ros.framework.reader import Reader
+from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING
 from avatar_ros.ui.actions import Wanted
 from avatar_ros.ui.measuring import hit
-from avatar_ros.ui.preview_view import ACCESSIBLE, BRUSHES, CLAMPED, PreviewView
+from avatar_ros.ui.preview_view import BRUSHES, PreviewView
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.tabs.patient import PatientTab
 
@@ -48,18 +49,39 @@ class Preview:
         regions = np.where(away < radius, region, self.regions).astype(np.uint8)
         return replace(self, regions=regions, is_painted=True)
 
-    def groups(self) -> dict[str, np.ndarray]:
-        """Middles of the faces of both regions, as ``regions_of_groups`` takes them."""
-        middle = self.points[self.faces].mean(axis=1)
+    @property
+    def named(self) -> dict[str, int]:
+        """Regions by their names in a file of groups: clamp, access, and springs by their own."""
+        springs = [text.partition("=")[0] for text in self.wanted.supports if not _clamps(text)]
+        own = {"clamped": CLAMPED, "accessible": ACCESSIBLE}
+        return own | {name: FIRST_SPRING + k for k, name in enumerate(springs)}
+
+    @property
+    def springs(self) -> dict[str, float]:
+        """Area of each of the springs [m^2], by name."""
+        a, b, c = self.points[self.faces].swapaxes(0, 1).astype(float)
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
         return {
-            "clamped": middle[self.regions == CLAMPED],
-            "accessible": middle[self.regions == ACCESSIBLE],
+            name: float(area[self.regions == region].sum())
+            for name, region in self.named.items()
+            if region >= FIRST_SPRING
         }
 
+    def groups(self) -> dict[str, np.ndarray]:
+        """Middles of the faces of each region, by name, as a file of groups has them."""
+        middle = self.points[self.faces].mean(axis=1)
+        return {name: middle[self.regions == region] for name, region in self.named.items()}
+
     def is_of(self, wanted: Wanted) -> bool:
-        """Whether it shows the organ of a request, whichever fidelity that asks for."""
+        """Whether it shows the organ of a request, however exactly or firmly that asks for it."""
         same = ("surface", "unit", "axes", "label", "inside")
-        return all(getattr(self.wanted, name) == getattr(wanted, name) for name in same)
+        return all(getattr(self.wanted, name) == getattr(wanted, name) for name in same) and (
+            bool(self.wanted.supports) == bool(wanted.supports)
+        )
+
+
+def _clamps(support: str) -> bool:
+    return support.endswith("=clamped")
 
 
 class NewPatient:
@@ -135,8 +157,7 @@ class NewPatient:
             return wanted
         name = f"{wanted.surface.split('.')[0]}-groups.npz"
         content = io.BytesIO()
-        groups = preview.groups()
-        np.savez_compressed(content, clamped=groups["clamped"], accessible=groups["accessible"])
+        np.savez_compressed(content, allow_pickle=False, **preview.groups())
         with replaced(self._folder / name) as file:
             file.write_bytes(content.getvalue())
         return wanted._replace(groups=name)
@@ -150,7 +171,7 @@ class NewPatient:
     def _show(self, preview: Preview) -> None:
         self._preview = preview
         self._view.show(preview.points, preview.faces, preview.regions)
-        self._tab().show_preview(True)
+        self._tab().show_preview(True, preview.springs)
 
     def end_preview(self) -> None:
         """Show the organ in use again."""
@@ -165,13 +186,14 @@ class NewPatient:
             return []
         painted = ", as painted" if self._preview.is_painted else ""
         return [
-            f"Preview of {self._preview.wanted.surface}: what would be clamped{painted}. "
+            f"Preview of {self._preview.wanted.surface}: what would be held{painted}. "
             f"Nothing is solved; forces and numbers are those of {in_use}, which is hidden"
         ]
 
     def brush(self, name: str, radius: float) -> None:
-        """Choose what a click paints, in a radius [m]."""
-        self._brush = BRUSHES[name], radius
+        """Choose what a click paints, in a radius [m]: one of ``BRUSHES``, or springs by name."""
+        springs = {} if self._preview is None else self._preview.named
+        self._brush = (BRUSHES | springs).get(name), radius
 
     def paint(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Paint where a ray meets the preview; origin, direction : ndarray, shape (3,) [m]."""

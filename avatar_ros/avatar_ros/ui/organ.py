@@ -22,7 +22,7 @@ class Organ:
 
     vertices : ndarray, shape (n, 3) float32, of the cloud [m]; faces : (m, 3), of the organ
     structures : faces of what lies inside, by name
-    clamped, accessible : ndarray of bool, shape (m,)
+    clamped, sprung, accessible : ndarray of bool, shape (m,)
     centre : of the bounding box [m]; size : its longest side [m]
     start, normal : a point in the middle of the accessible surface [m], and the normal there
     ranges : lowest, highest and present value of each coordinate of the material, by name
@@ -36,6 +36,7 @@ class Organ:
     faces: np.ndarray
     structures: dict[str, np.ndarray]
     clamped: np.ndarray
+    sprung: np.ndarray
     accessible: np.ndarray
     centre: np.ndarray
     size: float
@@ -66,6 +67,7 @@ class Organ:
             faces=v.organ_faces,
             structures=v.structures,
             clamped=v.clamped_faces,
+            sprung=v.supported_faces,
             accessible=v.accessible_faces,
             centre=0.5 * (low + high),
             size=float((high - low).max()),

@@ -1,4 +1,4 @@
-"""Patterns on a surface, that tell regions apart without any colour: checks and stripes.
+"""Patterns on a surface, that tell regions apart without any colour: checks, stripes, hatching.
 
 They are cut into the triangles by planes in space, so that they do not swim when the view turns.
 """
@@ -16,6 +16,8 @@ STRIPE, GAP = 1.5e-3, 4  # width of a stripe [m], and from one to the next, in w
 # Two directions of checks, no face of an organ being square to both, and one of stripes [-].
 _CHECKS = np.array([[0.80, 0.36, 0.48], [-0.48, 0.80, 0.36]])
 _STRIPES = np.array([0.70, 0.14, 0.70])
+HATCH, HATCH_GAP = 2e-3, 3  # width of a line [m], and from one to the next, in widths
+_HATCHES = np.array([-0.64, 0.48, 0.60])  # across the stripes
 
 
 class Patterned(NamedTuple):
@@ -46,6 +48,12 @@ def striped(points: np.ndarray, faces: np.ndarray) -> Patterned:
     """Thin stripes on some faces, as :func:`checkered`."""
     found = _sliced(points, faces, _STRIPES, STRIPE)
     return Patterned(found.points, found.faces, found.parent, found.band % GAP == 0)
+
+
+def hatched(points: np.ndarray, faces: np.ndarray) -> Patterned:
+    """Broad lines across the stripes on some faces, as :func:`checkered`."""
+    found = _sliced(points, faces, _HATCHES, HATCH)
+    return Patterned(found.points, found.faces, found.parent, found.band % HATCH_GAP == 0)
 
 
 def _sliced(points: np.ndarray, faces: np.ndarray, direction: np.ndarray, width: float) -> Banded:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import viser
 
-from avatar_ros.ui.surface_view import SurfaceView
+from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING, FREE
+from avatar_ros.ui.surface_view import Marks, SurfaceView
 
-FREE, CLAMPED, ACCESSIBLE = range(3)  # regions of a face, as in BuildPatient.action
 BRUSHES = {"nothing": None, "clamp": CLAMPED, "access": ACCESSIBLE, "neither": FREE}
 _ROOT = "/preview"
 
@@ -29,7 +29,8 @@ class PreviewView:
     def show(self, points: np.ndarray, faces: np.ndarray, regions: np.ndarray) -> None:
         """Show a surface; points (n, 3) [m], faces (m, 3), regions (m,) of the faces."""
         with self._server.atomic():
-            self._surface.show(points, faces, regions == CLAMPED, regions == ACCESSIBLE)
+            marks = Marks(regions == CLAMPED, regions >= FIRST_SPRING, regions == ACCESSIBLE)
+            self._surface.show(points, faces, marks)
             self._root.visible = True
             self._set_aside(True)
 

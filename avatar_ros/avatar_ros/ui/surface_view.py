@@ -21,19 +21,22 @@ from avatar_ros.ui.colours import (
     HELD,
     N_BANDS,
     N_SHADES,
+    SPRINGS,
     TISSUE,
     lightness,
     scale_colours,
     shaded,
     tissue_colours,
 )
-from avatar_ros.ui.patterns import Patterned, checkered, striped
+from avatar_ros.ui.patterns import Patterned, checkered, hatched, striped
 from avatar_ros.ui.refined import finer, refined
 
 GLASS = 0.45  # opacity of an organ that is seen through
 OUTLINE = (30, 16, 14)  # of a section
 INSIDE = (120, 52, 45)  # of the far wall of an organ that is cut open
-_HELD_DARK, _HELD_LIGHT, _REACHED = range(N_SHADES, N_SHADES + 3)  # colours beside the shades
+N_TONES = N_SHADES + 4  # of tissue: its shades, and the colours of patterns
+_HELD_DARK, _HELD_LIGHT, _SPRUNG, _REACHED = range(N_SHADES, N_TONES)
+_PATTERNS = ((checkered, _HELD_DARK), (hatched, _SPRUNG), (striped, _REACHED))  # of Marks
 _MOVED = 0.1e-3  # of tissue, that is seen [m]
 _NO_FACE = np.zeros((1, 3), np.uint32)  # of a mesh without faces, which must not be empty
 _NO_LINE = np.zeros((1, 2, 3), np.float32)
@@ -49,6 +52,17 @@ class Plane(NamedTuple):
     def above(self, points: np.ndarray) -> np.ndarray:
         """Height over the plane [m]."""
         return np.asarray((points - self.point) @ self.normal)
+
+
+class Marks(NamedTuple):
+    """Faces of regions that have a pattern, ndarrays of bool, shape (m,).
+
+    sprung : that springs hold
+    """
+
+    clamped: np.ndarray
+    sprung: np.ndarray
+    accessible: np.ndarray
 
 
 class Tissue(NamedTuple):
@@ -71,17 +85,9 @@ class Tissue(NamedTuple):
 
 
 def tissue_of(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    light: np.ndarray,
-    plane: Plane | None,
-    clamped: np.ndarray,
-    accessible: np.ndarray,
+    vertices: np.ndarray, faces: np.ndarray, light: np.ndarray, plane: Plane | None, marks: Marks
 ) -> Tissue:
-    """The organ's surface at rest, cut by shade and patterns, without what lies beyond a plane.
-
-    clamped, accessible : ndarray of bool, shape (m,), faces with a pattern
-    """
+    """The organ's surface at rest, cut by shade and patterns, without what lies beyond a plane."""
     data = np.column_stack([vertices, light])
     kept, parents = faces, np.arange(len(faces))
     if plane is not None:
@@ -89,19 +95,16 @@ def tissue_of(
     by_shade = cut(data, data[:, 3], kept, 1.0 / N_SHADES, N_SHADES)
     points, pieces = by_shade.points, by_shade.faces
     shade, parent = by_shade.band, parents[by_shade.parent]
-    for chosen, pattern in ((clamped, checkered), (accessible, striped)):
+    for chosen, (pattern, colour) in zip(marks, _PATTERNS, strict=True):
         there = chosen[parent]
         if not there.any():
             continue
         found: Patterned = pattern(points, pieces[there])
-        marks = shade[there][found.parent]
-        if pattern is checkered:
-            marks = np.where(found.is_marked, _HELD_DARK, _HELD_LIGHT)
-        else:
-            marks = np.where(found.is_marked, _REACHED, marks)
+        beside = _HELD_LIGHT if pattern is checkered else shade[there][found.parent]
+        drawn = np.where(found.is_marked, colour, beside)
         points = found.points
         pieces = np.concatenate([pieces[~there], found.faces])
-        shade = np.concatenate([shade[~there], marks])
+        shade = np.concatenate([shade[~there], drawn])
         parent = np.concatenate([parent[~there], parent[there][found.parent]])
     used, local = np.unique(pieces, return_inverse=True)
     local = local.reshape(-1, 3)
@@ -174,19 +177,14 @@ class SurfaceView:
         """Of the organ."""
         return 1.0 if self._opacity is None else self._opacity
 
-    def show(
-        self, vertices: np.ndarray, faces: np.ndarray, clamped: np.ndarray, accessible: np.ndarray
-    ) -> None:
-        """Show another organ, at rest.
-
-        clamped, accessible : ndarray of bool, shape (m,), faces of these regions
-        """
+    def show(self, vertices: np.ndarray, faces: np.ndarray, marks: Marks) -> None:
+        """Show another organ, at rest."""
         self._shape = refined(len(vertices), faces)
         self._vertices, self._faces = self._shape.blend @ vertices, self._shape.faces
         self._coarse = np.asarray(faces, np.uint32)
         self._plane, self._is_grey, self._last = None, False, None
         self._light = lightness(self._vertices, self._faces)
-        self._clamped, self._accessible = self._of_parts(clamped), self._of_parts(accessible)
+        self._marks = Marks(*(self._of_parts(region) for region in marks))
         self._make()
 
     def _of_parts(self, of_face: np.ndarray) -> np.ndarray:
@@ -213,10 +211,9 @@ class SurfaceView:
             self._faces,
             self._light,
             self._plane,
-            self._clamped,
-            self._accessible & self._is_reach_marked,
+            self._marks._replace(accessible=self._marks.accessible & self._is_reach_marked),
         )
-        tissue = np.vstack([tissue_colours(), *CLAMP, ACCESS])  # as the numbers of shades
+        tissue = np.vstack([tissue_colours(), *CLAMP, SPRINGS, ACCESS])  # as the numbers of shades
         groups = {"tissue": tissue, "rim": tissue, "bands": scale_colours()}
         inside = np.array(INSIDE) if self._plane is not None else shaded(TISSUE, np.array([0.6]))[0]
         with self._server.atomic():
@@ -256,7 +253,7 @@ class SurfaceView:
         self._sent, self._shown_faces = points, {}
         moved = tissue.moved(points.astype(float)).astype(np.float32)
         self._of_shade = []
-        for k in range(N_SHADES + 3):
+        for k in range(N_TONES):
             chosen = np.flatnonzero(tissue.shade == k)
             used, local = own(tissue.faces[chosen]) if len(chosen) else ([0], _NO_FACE[:0])
             self._of_shade.append((moved[used], local, tissue.parent[chosen]))
@@ -349,7 +346,7 @@ class SurfaceView:
     def _shade_of_faces(self) -> np.ndarray:
         light = self._light[self._faces].mean(axis=1)
         shade = np.minimum((N_SHADES * light).astype(int), N_SHADES - 1)
-        return np.where(self._clamped, _HELD_DARK, shade)
+        return np.where(self._marks.clamped, _HELD_DARK, shade)
 
     def _replace(self, node: tuple[str, int], points: np.ndarray, faces: np.ndarray) -> None:
         mesh = self._nodes[node]

@@ -17,7 +17,7 @@ from avatar_ros.ui.cut_handle import CutHandle
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import AXES
 from avatar_ros.ui.structures_view import StructuresView
-from avatar_ros.ui.surface_view import SurfaceView
+from avatar_ros.ui.surface_view import Marks, SurfaceView
 from avatar_ros.ui.tip_body import turn_to
 from avatar_ros.ui.tool_view import LEAST_FORCE, ToolView
 
@@ -70,7 +70,8 @@ class OrganView:
             self._roots[name] = scene.add_frame(name, show_axes=False)
         self._organ, self.top, self._drawn, self._field = organ, top_for(0.0), None, None
         self._structures.show(organ.vertices, organ.structures)
-        self._surface.show(organ.vertices, organ.faces, organ.clamped, organ.accessible)
+        marks = Marks(organ.clamped, organ.sprung, organ.accessible)
+        self._surface.show(organ.vertices, organ.faces, marks)
         self.look(GLASS if organ.structures else WHOLE)
         self._marker = scene.add_label(
             "/organ/largest", "", visible=False, anchor="top-left", font_screen_scale=0.9
