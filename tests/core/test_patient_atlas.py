@@ -240,6 +240,10 @@ def test_a_tolerance_out_of_reach_exits_with_three(
         (["--weighting", "nearest"], "choose kriging"),
         (["--tolerance", "2"], "between 0 and 1"),
         (["--leave-out", "nobody"], "avatar atlas show"),
+        (["--support", "bare_area=1e5:1e9"], "one stiffness each"),
+        (["--support", "bare_area", "--fidelity", "interpolated"], "choose reduced or solved"),
+        (["--support", "elbow=1e6"], "there is no support 'elbow'"),
+        (["--groups", "nowhere.npz"], "cannot read node groups"),
     ],
 )
 def test_bad_requests_are_one_line(
