@@ -152,7 +152,7 @@ def test_springs_are_painted_by_name_and_kept_for_the_build(
 ) -> None:
     new, cell = previewed
     free = np.flatnonzero(cell.result.regions == 0)
-    cell.result.regions[free[:2]] = FIRST_SPRING + 1
+    cell.result.regions[free[:2]] = FIRST_SPRING + 2  # by its place in the request
     wanted = Wanted(
         "cube.stl",
         fidelity="reduced",
@@ -171,10 +171,15 @@ def test_springs_are_painted_by_name_and_kept_for_the_build(
     assert cell.drawn[-1][free[-1]] == FIRST_SPRING and cell.springs["cava_groove"] > 0.0
     new.build(wanted._replace(preview=False))
     groups = read_groups(tmp_path / cell.asked[-1].groups)
-    assert set(groups) == {"clamped", "accessible", "cava_groove", "falciform"}
+    assert set(groups) == {"clamped", "accessible", "cava_groove", "bare_area", "falciform"}
+    # a clamp that was painted over must not come back from the template
+    np.testing.assert_array_equal(groups["bare_area"], groups["clamped"])
     faces = faces_of_groups(organ("cube").mesh, groups)
     painted = cell.drawn[-1] == FIRST_SPRING
     assert faces["cava_groove"][painted].all() and not faces["falciform"][painted].all()
+    new.build(wanted._replace(supports=("falciform", "cava_groove")))
+    new.paint(*towards(free[-1]))  # with the same brush, whose number is another now
+    assert cell.drawn[-1][free[-1]] == FIRST_SPRING + 1
     new.build(wanted._replace(preview=False, supports=()))
     assert cell.asked[-1].groups == ""  # springs were painted, and a clamp is asked for
 

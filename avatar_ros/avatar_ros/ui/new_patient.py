@@ -51,10 +51,15 @@ class Preview:
 
     @property
     def named(self) -> dict[str, int]:
-        """Regions by their names in a file of groups: clamp, access, and springs by their own."""
-        springs = [text.partition("=")[0] for text in self.wanted.supports if not _clamps(text)]
-        own = {"clamped": CLAMPED, "accessible": ACCESSIBLE}
-        return own | {name: FIRST_SPRING + k for k, name in enumerate(springs)}
+        """Regions by their names in a file of groups: clamp, access, and supports by their own.
+
+        Springs are numbered by their place in the request; what is clamped belongs to the clamp.
+        """
+        found = {"clamped": CLAMPED, "accessible": ACCESSIBLE}
+        for k, text in enumerate(self.wanted.supports):
+            name, _, value = text.partition("=")
+            found[name] = CLAMPED if value == "clamped" else FIRST_SPRING + k
+        return found
 
     @property
     def springs(self) -> dict[str, float]:
@@ -80,10 +85,6 @@ class Preview:
         )
 
 
-def _clamps(support: str) -> bool:
-    return support.endswith("=clamped")
-
-
 class NewPatient:
     """What the tab of a new patient does.
 
@@ -107,7 +108,7 @@ class NewPatient:
         self._tab, self._view, self._use, self._say = tab, view, use, say
         self._surface = ""
         self._preview: Preview | None = None
-        self._brush: tuple[int | None, float] = (None, 0.01)
+        self._brush = ("nothing", 0.01)
 
     def choose_surface(self, surface: str) -> None:
         """Offer the labels of a file, if it holds any; returns at once."""
@@ -192,13 +193,15 @@ class NewPatient:
 
     def brush(self, name: str, radius: float) -> None:
         """Choose what a click paints, in a radius [m]: one of ``BRUSHES``, or springs by name."""
-        springs = {} if self._preview is None else self._preview.named
-        self._brush = (BRUSHES | springs).get(name), radius
+        self._brush = name, radius
 
     def paint(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Paint where a ray meets the preview; origin, direction : ndarray, shape (3,) [m]."""
-        preview, (region, radius) = self._preview, self._brush
-        if preview is None or region is None:
+        preview, (name, radius) = self._preview, self._brush
+        if preview is None:
+            return
+        region = (BRUSHES | preview.named).get(name)  # of this preview: numbers are by request
+        if region is None:
             return
         place = hit(origin, direction, preview.points, preview.faces)
         if place is not None:

@@ -46,14 +46,19 @@ def checkered(points: np.ndarray, faces: np.ndarray) -> Patterned:
 
 def striped(points: np.ndarray, faces: np.ndarray) -> Patterned:
     """Thin stripes on some faces, as :func:`checkered`."""
-    found = _sliced(points, faces, _STRIPES, STRIPE)
-    return Patterned(found.points, found.faces, found.parent, found.band % GAP == 0)
+    return _lined(points, faces, _STRIPES, STRIPE, GAP)
 
 
 def hatched(points: np.ndarray, faces: np.ndarray) -> Patterned:
     """Broad lines across the stripes on some faces, as :func:`checkered`."""
-    found = _sliced(points, faces, _HATCHES, HATCH)
-    return Patterned(found.points, found.faces, found.parent, found.band % HATCH_GAP == 0)
+    return _lined(points, faces, _HATCHES, HATCH, HATCH_GAP)
+
+
+def _lined(
+    points: np.ndarray, faces: np.ndarray, direction: np.ndarray, width: float, gap: int
+) -> Patterned:
+    found = _sliced(points, faces, direction, width)
+    return Patterned(found.points, found.faces, found.parent, found.band % gap == 0)
 
 
 def _sliced(points: np.ndarray, faces: np.ndarray, direction: np.ndarray, width: float) -> Banded:
