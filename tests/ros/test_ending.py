@@ -1,15 +1,24 @@
-"""A process ends although its middleware does not let it."""
+"""A process ends although its middleware does not let it, or its node has not started yet."""
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("avatar_ros.framework.ending", reason="avatar_ros is not installed")
 
-from tests.slowness import end_of
+from avatar_ros.bench.cell import Module
+
+from avatar_core.vademecum.storage import save_vademecum
+from tests.slowness import Deadline, end_of
 
 pytestmark = pytest.mark.ros
 
@@ -39,3 +48,37 @@ def test_a_process_that_ends_by_itself_does_so_before() -> None:
     script = HANGS.format(seconds=3600, code=7, hangs=0)
     process = subprocess.run([sys.executable, "-c", script], cwd="/", timeout=60.0)
     assert process.returncode == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_that_still_reads_its_organ_ends(
+    own_domain: dict[str, str], organ: Any, tmp_path: Path, number: signal.Signals
+) -> None:
+    """However long that would take: the process that reads is held."""
+    save_vademecum(organ, tmp_path / "liver.h5")
+    arguments = ["-p", f"library_dir:={tmp_path}", "-p", "vademecum:=liver.h5"]
+    node = Module("vademecum_loader", ["--ros-args", *arguments], own_domain)
+    try:
+        reading = reader_of(node)
+        os.kill(reading, signal.SIGSTOP)
+        node.send_signal(number)
+        assert end_of(node, 5.0) == 0
+        assert not Path(f"/proc/{reading}").exists()
+    finally:
+        node.kill()
+
+
+def reader_of(node: Module) -> int:
+    """The process that reads files for a node, once there is one."""
+    late = Deadline(60.0)
+    while not late:
+        for child in children(node.pid):
+            if b"confined" in Path(f"/proc/{child}/cmdline").read_bytes():
+                return child
+        time.sleep(0.01)
+    raise AssertionError("nothing is read")
+
+
+def children(pid: int) -> Iterator[int]:
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        yield from map(int, (thread / "children").read_text().split())

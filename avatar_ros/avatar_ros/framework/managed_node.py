@@ -21,7 +21,7 @@ from avatar_ros.framework import discovery
 from avatar_ros.framework.ending import end_within
 from avatar_ros.framework.parameters import Parameter, ParameterError, declare
 from avatar_ros.framework.ports import Ports
-from avatar_ros.framework.stop_signal import StopSignal
+from avatar_ros.framework.stop_signal import Stopped, StopSignal
 
 _END = 1.0  # from the last answer to the end of the process [s]
 _LAST_ANSWERS = 1.0  # for requests that are pending when the node ends [s]
@@ -91,8 +91,12 @@ class ManagedNode(LifecycleNode, ABC):
         return self._attempt(self.clean_up)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt(self.release)
+
+    def release(self) -> None:
+        """Stop serving and release everything, in any state."""
         self.deactivate()
-        return self._attempt(self.clean_up)
+        self.clean_up()
 
     def _attempt(
         self, transition: Callable[[], None], undo: Callable[[], None] | None = None
@@ -155,17 +159,22 @@ def run(make_node: Callable[[], ManagedNode], keeps_time: bool = False) -> int:
 def _live(node: ManagedNode, stop: StopSignal) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    leave: Callable[[], object] = node.trigger_shutdown
     try:
-        if node.get_parameter("autostart").value and not node.bring_up():
-            return 1  # the reason was logged
+        with stop.interrupts():  # a large organ takes a while to read
+            if node.get_parameter("autostart").value and not node.bring_up():
+                return 1  # the reason was logged
         with stop.wakes(executor):
             while not stop and not node.failure:
                 executor.spin_once()
         if node.failure:
             node.get_logger().fatal(node.failure)
         return 1 if node.failure else 0
+    except Stopped:
+        leave = node.release  # no other transition leads out of one that has not ended
+        return 0
     finally:
-        node.trigger_shutdown()
+        leave()
         end = time.monotonic() + _LAST_ANSWERS
         while node.has_pending_answers and time.monotonic() < end:
             executor.spin_once(timeout_sec=_LOOK)

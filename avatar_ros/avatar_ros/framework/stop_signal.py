@@ -13,19 +13,40 @@ if TYPE_CHECKING:
     from rclpy.executors import Executor
 
 
+class Stopped(BaseException):
+    """A signal came before something was done; nothing but the end of the process handles it."""
+
+
 class StopSignal:
     """True once SIGINT or SIGTERM was received."""
 
     def __init__(self) -> None:
-        self._came = False
+        self._came = self._interrupts = False
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._note)
 
     def _note(self, *_: object) -> None:
         self._came = True
+        if self._interrupts:
+            self._interrupts = False  # what is released then is not interrupted by another one
+            raise Stopped
 
     def __bool__(self) -> bool:
         return self._came
+
+    @contextmanager
+    def interrupts(self) -> Iterator[None]:
+        """A signal ends the body, whatever it waits for or computes, by :class:`Stopped`.
+
+        In the main thread, where Python calls its handlers.
+        """
+        if self._came:
+            raise Stopped
+        self._interrupts = True
+        try:
+            yield
+        finally:
+            self._interrupts = False
 
     @contextmanager
     def wakes(self, executor: Executor) -> Iterator[None]:
