@@ -160,7 +160,7 @@ def _connected(address: str) -> tuple[Any, Any]:
         from distributed import as_completed as completed
     except ImportError as error:
         raise AtlasError(
-            f"--scheduler needs Dask ({error}); install it by: pip install 'avatar[cluster]'"
+            f"--scheduler needs Dask ({error}); install it by: pip install '.[cluster]'"
         ) from error
     try:
         return Client(address, timeout=CONNECT_SECONDS), completed

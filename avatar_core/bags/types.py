@@ -72,7 +72,7 @@ def rosbag2() -> ModuleType:
     try:
         from rosbags import rosbag2
     except ImportError as error:
-        raise StorageError("bags need rosbags; pip install 'avatar[bags]'") from error
+        raise StorageError("bags need rosbags; pip install '.[bags]'") from error
     module: ModuleType = rosbag2
     return module
 

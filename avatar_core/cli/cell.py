@@ -61,18 +61,18 @@ def cell(
 ) -> None:
     """Run the loader, the contact node and, with an atlas, the patient node, until Ctrl-C.
 
-    Options override the parameter file. A node that dies is started again; one that refuses to
-    start, or is told to end, ends all. Otherwise as `ros2 launch avatar_ros
-    planning_cell.launch.py`.
+    Options override the parameter file; without either, the library is the current folder. A node
+    that dies is started again; one that refuses to start, or is told to end, ends all. Otherwise
+    as `ros2 launch avatar_ros planning_cell.launch.py`.
     """
     require_ros()
     page = {"host": host, "port": str(port)} if ui else {}
     given = {
         "params": params and params.resolve(),
-        "library_dir": library_dir and library_dir.resolve(),
+        "library_dir": _library(library_dir, params),
         "vademecum": vademecum,
         "atlas": atlas and atlas.resolve(),
-        "scene": scene,
+        "scene": Path(scene).resolve() if Path(scene).is_file() else scene,
         "state_dir": state_dir and state_dir.resolve(),
         **page,
     }
@@ -85,6 +85,13 @@ def cell(
     sys.stdout.flush()
     os.chdir("/")  # -m would let a checkout here stand before what is installed
     os.execv(sys.executable, command)  # signals are for the cell
+
+
+def _library(given: Path | None, params: Path | None) -> Path | None:
+    """The folder of the vademecums; nodes start in another one."""
+    if given is None and params is None:
+        return Path.cwd()
+    return given and given.resolve()
 
 
 def require_ui() -> None:

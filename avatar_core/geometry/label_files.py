@@ -172,9 +172,7 @@ def _read_dicom(path: Path) -> LabelMap:
     try:
         import highdicom
     except ImportError as error:
-        raise SurfaceError(
-            f"{path.name}: DICOM needs highdicom; pip install 'avatar[dicom]'"
-        ) from error
+        raise SurfaceError(f"{path.name}: DICOM needs highdicom; pip install '.[dicom]'") from error
     from pydicom import dcmread
 
     head = dcmread(path, stop_before_pixels=True)

@@ -20,6 +20,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from avatar_ros.framework import qos
 from avatar_ros.nodes.cell import node_arguments, wait_after
 
+from avatar_core.cli.cell import cell
 from avatar_ros.msg import ContactState
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.pages import ROOT
@@ -128,3 +129,19 @@ def test_page_and_patients_run_only_if_asked_for() -> None:
     page = node_arguments(None, {"ui": "yes", "port": "8081"})
     assert set(page) == {*always, "planning_ui"}
     assert page["planning_ui"][-1] == "port:=8081"
+
+
+def test_paths_are_those_of_where_it_was_called(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Nodes start in another folder."""
+    (tmp_path / "drag.yaml").write_text("")
+    ran: list[list[str]] = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "execv", lambda _, command: ran.append(command))
+    cell(scene="drag.yaml")
+    os.chdir(tmp_path)
+    cell(scene="palpation", params=tmp_path / "p.yaml")
+    by_file, by_name = (" ".join(command[3:]) for command in ran)
+    assert by_file == f"--library_dir {tmp_path} --scene {tmp_path / 'drag.yaml'}"
+    assert by_name == f"--params {tmp_path / 'p.yaml'} --scene palpation"

@@ -16,7 +16,7 @@ import numpy as np
 try:
     import viser
 except ImportError as error:
-    raise SystemExit("planning_ui: viser is missing; pip install 'avatar[ui]'") from error
+    raise SystemExit("planning_ui: viser is missing; pip install '.[ui]'") from error
 
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip

@@ -29,7 +29,7 @@ try:
     from avatar_ros.slicer.follower import Follower
     from avatar_ros.slicer.link import Link
 except ImportError as error:
-    raise SystemExit("slicer_bridge: pyigtl is missing; pip install 'avatar[slicer]'") from error
+    raise SystemExit("slicer_bridge: pyigtl is missing; pip install '.[slicer]'") from error
 
 _DRIVE_PERIOD = 5e-3  # of the tool's poses while a program moves it [s]
 _FIDELITIES = ("interpolated", "reduced", "solved")
