@@ -47,7 +47,7 @@ def test_the_force_of_a_stamp_is_that_or_none() -> None:
 
 
 def test_the_band_stands_beside_the_force() -> None:
-    shown = ShownPeriod(np.zeros(3), np.array([0.0, 2.0, 0.0]), 0.1, 1.0, 1e-3, is_held=False)
+    shown = ShownPeriod(np.zeros(3), np.array([0.0, 2.0, 0.0]), 0.1, 1.0, 1e-3)
     assert BAND not in " ".join(frame_text(shown, "", None))
     lines = frame_text(shown._replace(band=(1.2, 3.4)), "", None)
     assert f"1.20 to 3.40 N: {BAND}" in lines

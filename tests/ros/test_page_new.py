@@ -44,6 +44,7 @@ from avatar_core.offline.supports import SupportOption
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
+from avatar_ros.msg import ContactState
 from tests.core.box_organ import organ
 from tests.hard.small_files import ball
 from tests.ros.test_page_plan import KEPT
@@ -251,6 +252,29 @@ def test_a_recording_is_scrubbed_and_each_state_is_one_period(tmp_path: Path) ->
     assert player.state(shown) is None and player.alerts == []
     assert "another organ" in player.open("recording-1.h5", replace(shown, id="b" * 64))
     assert not player.is_on
+
+
+def test_beyond_the_range_a_recording_shows_what_was_shown(tmp_path: Path) -> None:
+    """The last valid shape and why there is no force; nothing where the tool never touched."""
+    shown = replace(Organ.of(organ("cube")), id="a" * 64)
+    recording = recording_of(shown)
+    status = recording.periods.status.copy()
+    status[[0, 1]] = status[100:] = ContactState.STATUS_OUT_OF_RANGE
+    recording.periods.tip[120:] = 1e3  # no pose was used
+    periods = replace(recording.periods, status=status)
+    save_recording(replace(recording, periods=periods), tmp_path / "recording-1.h5")
+    reader: Any = AtOnce()
+    player = Player(tmp_path, reader)
+    assert player.open("recording-1.h5", shown) == ""
+    player.seek(0.0)
+    first = player.state(shown)
+    assert first is not None and first[1].missing and not first[1].is_held
+    assert np.isnan(first[1].largest) and not first[0][:, 3:].any()
+    player.seek(1.0)
+    last = player.state(shown)
+    assert last is not None and last[1].missing and last[1].is_held
+    assert np.abs(last[0][:, 4] + 2e-4 * 4).max() < 1e-8 and np.abs(last[1].tip).max() < 1.0
+    assert player.state(replace(shown, id="b" * 64)) is None  # another organ was loaded meanwhile
 
 
 # --- images, sections, PDF --------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields
 from typing import Any
 
@@ -13,9 +14,9 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.loop.statuses import EXPLANATIONS
 from avatar_ros.ui.alerts import alerts
-from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
+from avatar_ros.ui.shown_period import BEYOND, OTHER_ORGAN, SILENT, PeriodChooser, ShownPeriod
 from avatar_ros.ui.texts import frame_text, recorded_text, warnings
-from avatar_ros.ui.tool_state import N_RECENT, ROW, SharedToolState
+from avatar_ros.ui.tool_state import N_RECENT, ROW, SharedToolState, organ_number
 
 from avatar_core.scene.recording import Clouds, Periods, Recording
 from avatar_core.vademecum.model import VademecumInfo
@@ -28,7 +29,7 @@ TIP = np.array([0.0, 0.1, 0.0])
 
 
 def shown(force: float, error: float, fraction: float, largest: float) -> ShownPeriod:
-    return ShownPeriod(TIP, np.array([0.0, force, 0.0]), error, fraction, largest, is_held=False)
+    return ShownPeriod(TIP, np.array([0.0, force, 0.0]), error, fraction, largest)
 
 
 def row(status: int, force: float, stamp: int = 1) -> np.ndarray:
@@ -44,7 +45,7 @@ def test_a_limited_force_is_no_measurement() -> None:
     text = " ".join(frame_text(now, "E 170 kPa", None))
     assert "Force <b>25.00 N</b> ± 2.70 N, device 20.00 N" in text
     assert "<b>7.1 mm</b>" in text and "E 170 kPa" in text
-    (alert,) = alerts(info(0.01), OK, now)
+    (alert,) = alerts(info(0.01), now)
     assert alert == "Force limited: the device gets 20.00 N of 25.00 N"
 
 
@@ -52,7 +53,7 @@ def test_a_force_that_the_device_gets_is_written_once() -> None:
     free = shown(0.0, 0.0, 0.0, 0.0)  # nothing is held back
     for now in (shown(3.3, 0.1, 1.0, 0.001), free):
         assert "device" not in " ".join(frame_text(now, "", None))
-        assert alerts(info(0.01), OK, now) == []
+        assert alerts(info(0.01), now) == []
 
 
 def test_no_displacement_is_not_none() -> None:
@@ -84,7 +85,7 @@ def test_beyond_the_range_the_last_valid_shape_stays() -> None:
         assert held.is_held and held.force[1] == 20.0 and held.largest == 2e-3
     text = " ".join(frame_text(held, "", None))
     assert "No force" in text and "20.00 N" in text and "2.0 mm" in text
-    (alert,) = alerts(info(0.01), OUT, held)
+    (alert,) = alerts(info(0.01), held)
     assert "No force" in alert and "beyond" in alert
     assert chooser.take(row(OK, 0.0))
     assert not chooser.drawn(row(OK, 0.0), 0.0, TIP).is_held
@@ -98,6 +99,33 @@ def test_a_tool_that_never_touched_holds_nothing() -> None:
     chooser.drawn(row(OK, 3.0), 1e-3, TIP)
     chooser.forget()  # another organ
     assert chooser.take(row(OUT, 0.0))
+
+
+@pytest.mark.parametrize("missing", [BEYOND, SILENT, OTHER_ORGAN])
+def test_what_is_not_known_is_not_zero(missing: str) -> None:
+    """Pressed too deep from afar, a contact node that is gone, forces of another patient."""
+    now = ShownPeriod.without_force(TIP, missing)
+    if missing == BEYOND:
+        chooser = PeriodChooser()
+        chooser.take(row(OUT, 0.0))
+        now = chooser.drawn(row(OUT, 0.0), 0.0, TIP)
+    assert re.search(r"\d (N|mm)", " ".join(frame_text(now, "", None))) is None
+    assert alerts(info(0.01), now) == [f"No force: {missing}"]
+    assert np.isnan(now.size)
+
+
+def test_an_error_that_was_never_measured_is_not_zero() -> None:
+    chooser, pressed = PeriodChooser(), row(OK, 12.0)
+    pressed["error"] = np.nan
+    chooser.take(pressed)
+    text = frame_text(chooser.drawn(pressed, 1e-3, TIP), "", None)[0]
+    assert text == "Force <b>12.00 N</b> (error unknown)"
+
+
+def test_organs_are_told_apart_by_their_ids() -> None:
+    ids = ("", 64 * "a", "b" + 63 * "a", 15 * "a" + 49 * "b")
+    assert len({organ_number(identity) for identity in ids}) == len(ids)
+    row(OK, 1.0)["organ"] = organ_number(64 * "f")  # fits
 
 
 def test_a_tool_without_a_pose_is_drawn_where_it_was_sent() -> None:
@@ -126,16 +154,17 @@ def test_each_line_ends_with_one_mark(status: int | None) -> None:
 def test_a_patient_of_large_expected_error_is_marked() -> None:
     """Interpolated patients are 16 % wrong; what was never measured is no better."""
     now = shown(0.0, 0.0, 1.0, 0.0)
-    (alert,) = alerts(info(0.16), OK, now)
+    (alert,) = alerts(info(0.16), now)
     assert "Large expected error" in alert and "16%" in alert
-    assert "never measured" in alerts(info(float("nan")), OK, now)[0]
-    assert alerts(info(0.02), OK, now) == []
+    assert "never measured" in alerts(info(float("nan")), now)[0]
+    assert alerts(info(0.02), now) == []
 
 
 def test_an_extrapolated_force_is_marked_and_one_that_fades_in_is_not() -> None:
     now = shown(3.0, 0.1, 0.5, 1e-3)
-    assert "Extrapolated" in alerts(info(0.01), ContactState.STATUS_EXTRAPOLATED, now)[0]
-    assert alerts(info(0.01), ContactState.STATUS_ENGAGING, now) == []
+    extrapolated = now._replace(status=ContactState.STATUS_EXTRAPOLATED)
+    assert "Extrapolated" in alerts(info(0.01), extrapolated)[0]
+    assert alerts(info(0.01), now._replace(status=ContactState.STATUS_ENGAGING)) == []
 
 
 def info(error: float) -> VademecumInfo:

@@ -221,5 +221,8 @@ def test_a_held_shape_is_grey_until_it_is_that_of_now(view: OrganView) -> None:
     colours = [tuple(mesh.color) for mesh in bands]
     view.grey(True)
     assert {tuple(mesh.color) for mesh in bands} == {tuple(tone.material(np.array(HELD)))}
+    view.look(GLASS, "A", 0.5)  # made anew
+    bands = [view._surface._nodes["bands", k] for k in range(N_BANDS)]
+    assert {tuple(mesh.color) for mesh in bands} == {tuple(tone.material(np.array(HELD)))}
     view.grey(False)
     assert [tuple(mesh.color) for mesh in bands] == colours

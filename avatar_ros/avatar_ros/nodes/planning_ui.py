@@ -53,9 +53,9 @@ from avatar_ros.ui.recordings import Page as RecordingsPage
 from avatar_ros.ui.recordings import Recordings
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.scan_view import ScanView
-from avatar_ros.ui.shown_period import PeriodChooser, ShownPeriod
+from avatar_ros.ui.shown_period import OTHER_ORGAN, SILENT, PeriodChooser, ShownPeriod
 from avatar_ros.ui.texts import frame_text, plain, scene_texts, warnings
-from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess
+from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess, organ_number
 from avatar_ros.ui.view import CLEARANCE, GLASS, WHOLE, OrganView
 
 FRAME = "organ"
@@ -96,6 +96,7 @@ class PlanningNode(ManagedNode):
         self._began = time.monotonic()
         self._periods = PeriodChooser()
         self._shown: ShownPeriod | None = None
+        self._number = 0  # of the organ that is shown
         self._last_cloud, self._missed = 0.0, 0.0  # [s], part of the periods
         self._own_subscriptions: list[Any] = []
         self._timer: Any = None
@@ -280,7 +281,8 @@ class PlanningNode(ManagedNode):
         self._band.forget()
         self._coloured.forget()
         self._panels.show_organ(organ)
-        self._chosen.organ = organ
+        self._chosen.organ, self._number = organ, organ_number(organ.id)
+        self._shown, self._lines, self._alerts = None, [], []
         self._listen_to_clouds()
         self._requests.parameters_of_contact(tuple(MATERIAL), self._note_material)
         self._plan.show_organ(organ)
@@ -309,7 +311,7 @@ class PlanningNode(ManagedNode):
             self._show_recorded(organ, *recorded)
             return
         shown = self._shown = self._period_to_show()
-        self._view.place_tool(shown.tip, (0.0 if shown.is_held else shown.fraction) * shown.force)
+        self._view.place_tool(shown.tip, (0.0 if shown.missing else shown.fraction) * shown.force)
         if self._frame % _PLOT_FRAMES == 0:
             values = self._chosen.values(organ)
             poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
@@ -318,9 +320,7 @@ class PlanningNode(ManagedNode):
 
     def _with_band(self, shown: ShownPeriod) -> ShownPeriod:
         """With the band of its force, where the contact node sends one."""
-        if shown.is_held:
-            return shown
-        return shown._replace(band=self._band.of(float(np.linalg.norm(shown.force))))
+        return shown if shown.missing else shown._replace(band=self._band.of(shown.size))
 
     def _show_recorded(
         self, organ: Organ, cloud: np.ndarray, shown: ShownPeriod, material: str
@@ -328,8 +328,8 @@ class PlanningNode(ManagedNode):
         """Update the page from a recording that plays."""
         self._shown = None  # of now, nothing is drawn
         largest = self._view.move(cloud, shown.tip, shown.force)
-        self._view.grey(False)
-        self._view.place_tool(shown.tip, shown.fraction * shown.force)
+        self._view.grey(bool(shown.missing))
+        self._view.place_tool(shown.tip, (0.0 if shown.missing else shown.fraction) * shown.force)
         if self._frame % _PLOT_FRAMES == 0:
             self._panels.recordings.show(self._player.part)
             self._show_numbers(organ, shown._replace(largest=largest), material)
@@ -339,26 +339,24 @@ class PlanningNode(ManagedNode):
         n_kept = self._recorder.n_periods if self._recorder.is_on else None
         numbers = frame_text(shown, material, n_kept)
         self._panels.show_numbers("<br>".join(numbers))
-        status = None if self._player.is_on else self._status()  # that is of now
-        self._alerts = alerts(organ.info, status, shown)
+        self._alerts = alerts(organ.info, shown)
         over = [*self._new_patient.alerts(organ.name), *self._player.alerts]
         self._panels.show_alerts([*over, *self._alerts])
         young = self._chosen.values(organ)["young"]
-        now = Now(self._view.points, shown.tip, young)
-        measured = self._measures.lines(now)
+        measured = self._measures.lines(Now(self._view.points, shown.tip, young))
         self._panels.measure.show(measured)
         self._lines = [*map(plain, numbers), *measured]
         self._panels.show_scale(self._coloured.legend())
-        size = 0.0 if shown.is_held else float(np.linalg.norm(shown.force))
-        self._panels.tool.show_force(time.monotonic() - self._began, size, shown.error, shown.band)
+        if not shown.missing and not self._player.is_on:
+            now = time.monotonic() - self._began
+            self._panels.tool.show_force(now, shown.size, np.nan_to_num(shown.error), shown.band)
 
     def _period_to_show(self) -> ShownPeriod:
         """Draw the newest cloud, and return what belongs to it."""
         sent, cloud, now = self._state.live[0]["tip"].copy(), self._cloud, time.monotonic()
         taken = cloud.take() if cloud is not None else None
         if not self._answers():
-            largest = self._view.move(taken[1], sent, np.zeros(3)) if taken else float("nan")
-            return ShownPeriod(sent, np.zeros(3), 0.0, 1.0, largest, is_held=False)
+            return self._without_force(sent, SILENT)
         if taken is not None:
             self._last_cloud = now
             row = self._state.period(stamp_nanoseconds(taken[0]))
@@ -366,15 +364,21 @@ class PlanningNode(ManagedNode):
             return self._shown
         else:  # the contact node sends another cloud, or none
             row = self._state.period()
-        if row is None:
-            return ShownPeriod(sent, np.zeros(3), 0.0, 1.0, float("nan"), is_held=False)
+        if row is None or int(row["organ"]) != self._number:
+            return self._without_force(sent, OTHER_ORGAN)
         largest = float("nan")
         if self._periods.take(row) and taken is not None:
             largest = self._view.move(taken[1], row["tip"], row["force"])
-        self._view.grey(self._periods.is_held)
+        self._view.grey(self._periods.is_beyond)
         if taken is not None and self._recorder.is_on:
             self._recorder.note_cloud(taken[1][:, 3:], int(row["number"]))
         return self._periods.drawn(row, largest, sent)
+
+    def _without_force(self, sent: np.ndarray, missing: str) -> ShownPeriod:
+        """Whatever is drawn is not of now."""
+        self._view.grey(True)
+        self._periods.forget()
+        return ShownPeriod.without_force(sent, missing)
 
     def _answers(self) -> bool:
         """Whether the contact node answered recently."""

@@ -12,12 +12,9 @@ from avatar_ros.ui.texts import SHOWN_FORCE
 LARGE_ERROR = 0.10  # expected of the displacement or the force, from which a patient is marked
 
 
-def alerts(info: VademecumInfo, status: int | None, shown: ShownPeriod | None) -> list[str]:
-    """One line each; none if the numbers are what they seem.
-
-    status : of the last ContactState, None if none came lately
-    """
-    return [*_of_patient(info), *_of_period(status, shown)]
+def alerts(info: VademecumInfo, shown: ShownPeriod) -> list[str]:
+    """One line each; none if the numbers are what they seem."""
+    return [*_of_patient(info), *_of_period(shown)]
 
 
 def _of_patient(info: VademecumInfo) -> list[str]:
@@ -34,20 +31,15 @@ def _of_patient(info: VademecumInfo) -> list[str]:
     return [f"Large expected error: {', '.join(large)}. Build this patient as reduced or solved"]
 
 
-def _of_period(status: int | None, shown: ShownPeriod | None) -> list[str]:
-    if status is None or shown is None:
-        return []
+def _of_period(shown: ShownPeriod) -> list[str]:
+    if shown.missing:
+        return [f"No force: {shown.missing}"]
     lines = []
-    if shown.is_held:
-        lines.append(
-            "No force: the tool is beyond what the vademecum covers, too deep or off the "
-            "accessible surface"
-        )
-    if status == ContactState.STATUS_EXTRAPOLATED:
+    if shown.status == ContactState.STATUS_EXTRAPOLATED:
         lines.append("Extrapolated: pressed beyond what was computed; the force is a guess")
     force = float(np.linalg.norm(shown.force))
     got = force * shown.fraction
-    is_engaging = status == ContactState.STATUS_ENGAGING
-    if not shown.is_held and not is_engaging and force - got >= SHOWN_FORCE:
+    is_engaging = shown.status == ContactState.STATUS_ENGAGING
+    if not is_engaging and force - got >= SHOWN_FORCE:
         lines.append(f"Force limited: the device gets {got:.2f} N of {force:.2f} N")
     return lines

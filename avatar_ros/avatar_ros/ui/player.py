@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from avatar_core.contact.effects import Tumour
 from avatar_core.errors import AvatarError
 from avatar_core.scene.file import parse_scene
 from avatar_core.scene.recording import Recording, load_recording
 from avatar_ros.framework.reader import Reader
+from avatar_ros.msg import ContactState
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.presets import material_text
-from avatar_ros.ui.shown_period import ShownPeriod
+from avatar_ros.ui.shown_period import BEYOND, PLACE, ShownPeriod
 
 _REPEATED = 1.0  # s: the last state stays so long before it begins again
 
@@ -29,6 +31,7 @@ class Player:
         self._recording: Recording | None = None
         self._name = ""
         self._rows = np.zeros(0, int)  # period of each cloud
+        self._valid = self._placed = np.zeros(0, int)  # the last cloud within the range, or placed
         self._times = np.zeros(0)  # of each cloud, from the first [s]
         self._place, self._began = 0.0, 0.0  # [s], and when it was there
         self._runs = False
@@ -73,6 +76,9 @@ class Player:
         rows = np.clip(np.searchsorted(number, found.clouds.period), 0, len(number) - 1)
         stamps = found.periods.stamp[rows]
         self._rows, self._times = rows, (stamps - stamps[0]) * 1e-9
+        tips, status = found.periods.tip[rows, 0], found.periods.status[rows, 0]
+        self._valid = _last(status != ContactState.STATUS_OUT_OF_RANGE)
+        self._placed = _last((np.abs(tips) < PLACE).all(axis=1))
         self._material = _material_of(found, organ)
         self._name, self._recording = name, found
         self._place, self._began, self._runs = 0.0, time.monotonic(), True
@@ -95,23 +101,32 @@ class Player:
         self._place, self._runs = part * self.seconds, False
 
     def state(self, organ: Organ) -> tuple[np.ndarray, ShownPeriod, str] | None:
-        """Cloud (n, 6) [m] and numbers of the state to show, and its material; None of now."""
+        """Cloud (n, 6) [m] and numbers of the state to show, and its material; None of now.
+
+        As live, the last valid shape stays while the tool is beyond the range.
+        """
         recording = self._recording
-        if recording is None:
+        if recording is None or recording.vademecum_id != organ.id:
             return None
-        k = int(np.searchsorted(self._times, self.place, side="right")) - 1
-        moved = recording.clouds.displacement[max(k, 0)]
-        row, periods = int(self._rows[max(k, 0)]), recording.periods
-        error = float(periods.error[row, 0])
-        shown = ShownPeriod(
-            periods.tip[row, 0],
-            periods.force[row, 0],
-            error if np.isfinite(error) else 0.0,
-            float(periods.sent_fraction[row, 0]),
-            float(np.linalg.norm(moved, axis=1).max()),
-            is_held=False,
-        )
-        return np.hstack([organ.vertices + moved, moved]), shown, self._material
+        k = max(int(np.searchsorted(self._times, self.place, side="right")) - 1, 0)
+        valid = int(self._valid[k])
+        moved = recording.clouds.displacement[valid] if valid >= 0 else np.zeros((1, 3), np.float32)
+        shown = self._shown(recording, k, float(np.linalg.norm(moved, axis=1).max()))
+        cloud = np.hstack([organ.vertices + moved, np.broadcast_to(moved, organ.vertices.shape)])
+        return cloud, shown, self._material
+
+    def _shown(self, recording: Recording, k: int, largest: float) -> ShownPeriod:
+        """Numbers of a cloud, or of the last valid one."""
+        periods, valid, placed = recording.periods, int(self._valid[k]), int(self._placed[k])
+        tip = periods.tip[self._rows[placed], 0] if placed >= 0 else np.full(3, PLACE)
+        row = self._rows[valid]
+        force = periods.force[row, 0]
+        if valid < 0 or (valid < k and not force.any()):
+            return ShownPeriod.without_force(tip, BEYOND)
+        error = float(periods.error[row, 0]) if force.any() else 0.0
+        fraction, status = float(periods.sent_fraction[row, 0]), int(periods.status[row, 0])
+        missing = BEYOND if valid < k else ""
+        return ShownPeriod(tip, force, error, fraction, largest, missing, valid < k, status)
 
     @property
     def alerts(self) -> list[str]:
@@ -124,9 +139,19 @@ class Player:
         ]
 
 
+def _last(known: np.ndarray) -> np.ndarray:
+    """For each place the last one up to it that is known, -1 before the first."""
+    return np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
+
+
 def _material_of(recording: Recording, organ: Organ) -> str:
     """The material that was in force, in a line."""
-    given = parse_scene(recording.scene, recording.vademecum_name).values
+    scene = parse_scene(recording.scene, recording.vademecum_name)
+    given = scene.values
+    tumours = [effect for effect in scene.effects if isinstance(effect, Tumour)]
+    contrast = tumours[0].contrast if tumours else 1.0
+    if contrast is not None:  # that of the file
+        given["contrast"] = contrast
     values = {name: given.get(name, built) for name, (_, _, built) in organ.ranges.items()}
     poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
     return material_text(values["young"], poisson, values.get("contrast"))

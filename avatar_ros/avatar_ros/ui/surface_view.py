@@ -214,7 +214,7 @@ class SurfaceView:
             self._marks._replace(accessible=self._marks.accessible & self._is_reach_marked),
         )
         tissue = np.vstack([tissue_colours(), *CLAMP, SPRINGS, ACCESS])  # as the numbers of shades
-        groups = {"tissue": tissue, "rim": tissue, "bands": scale_colours()}
+        groups = {"tissue": tissue, "rim": tissue, "bands": self._band_colours()}
         inside = np.array(INSIDE) if self._plane is not None else shaded(TISSUE, np.array([0.6]))[0]
         with self._server.atomic():
             for group, colours in groups.items():
@@ -360,10 +360,12 @@ class SurfaceView:
         if held == self._is_grey or not self._nodes:
             return
         self._is_grey = held
-        colours = np.tile(HELD, (N_BANDS, 1)) if held else scale_colours()
         with self._server.atomic():
-            for k, colour in enumerate(tone.material(colours).tolist()):
+            for k, colour in enumerate(tone.material(self._band_colours()).tolist()):
                 self._nodes["bands", k].color = tuple(colour)
+
+    def _band_colours(self) -> np.ndarray:
+        return np.tile(HELD, (N_BANDS, 1)) if self._is_grey else scale_colours()
 
 
 def draw(mesh: Any, vertices: np.ndarray, faces: np.ndarray) -> None:

@@ -54,10 +54,13 @@ def frame_text(shown: ShownPeriod, material: str, n_kept: int | None) -> list[st
     material : that is in force; n_kept : recorded periods, or None
     """
     force = float(np.linalg.norm(shown.force))
-    numbers = f"<b>{force:.2f} N</b> ± {shown.error:.2f} N"
+    error = f"± {shown.error:.2f} N" if np.isfinite(shown.error) else "(error unknown)"
+    numbers = f"<b>{force:.2f} N</b> {error}"
     moved = f"<b>{1e3 * shown.largest:.1f} mm</b>"
     if shown.is_held:
         lines = [f"No force. In grey, the last valid shape: {numbers}, {moved}"]
+    elif shown.missing:
+        lines = ["No force, no displacement"]
     else:
         less = force * (1.0 - shown.fraction) >= SHOWN_FORCE
         device = f", device {force * shown.fraction:.2f} N" if less else ""

@@ -26,7 +26,7 @@ from avatar_ros.framework.stop_signal import StopSignal
 from avatar_ros.framework.templates import PoseTemplate, stamp_bytes
 from avatar_ros.loop.tool_channel import FAR_AWAY
 from avatar_ros.msg import ContactState
-from avatar_ros.ui.tool_state import N_RECENT, N_ROWS, SharedToolState
+from avatar_ros.ui.tool_state import N_RECENT, N_ROWS, SharedToolState, organ_number
 
 PERIOD = 1_000_000  # [ns]
 _APPROACH = 0.04  # part of the remaining distance moved in a period: lags the mouse by 25 ms
@@ -117,6 +117,7 @@ class ToolDriver:
         row["tip"] = self._used(state.status, stamp)
         row["force"], row["error"] = force, state.force_error
         row["sent_fraction"], row["status"] = state.force_share, state.status
+        row["organ"] = organ_number(state.vademecum_id)
         row["stamp"] = stamp
         live["n_recent"][0] = recent + 1
         n = int(live["n_rows"][0])
