@@ -14,7 +14,7 @@ pytest.importorskip("viser", reason="the extra ui is not installed")
 
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.ui.chosen import Chosen, Page
-from avatar_ros.ui.view import GLASS, WHOLE
+from avatar_ros.ui.view import CUT, GLASS, WHOLE
 
 pytestmark = pytest.mark.ros
 
@@ -32,12 +32,26 @@ class Cell:
         self.stopped: list[str] = []
         self.tips: list[Any] = []
 
-    def set_material(self, values: dict[str, float], report: Any) -> None:
+    def set_material(self, values: dict[str, float], report: Any, refused: Any) -> None:
         self.material.append(values)
+        if values.get("young") == 13.0:
+            refused()
 
-    def load_scene(self, name: str, report: Any, then: Any) -> None:
+    def parameters_of_contact(self, names: Any, then: Any) -> None:
+        then({name: 0.0 for name in names} | {"material.young_modulus": 90e3})
+
+    def load_scene(self, name: str, report: Any, yaml: str, then: Any) -> None:
         self.scenes.append(name)
         then(name != "refused")
+
+
+def usable(material: dict[str, float]) -> dict[str, float]:
+    """Of all values, those that the organ holds."""
+    return {
+        name: material[name]
+        for name, (low, high, _) in RANGES.items()
+        if low <= material.get(name, -1.0) <= high
+    }
 
 
 @pytest.fixture
@@ -57,7 +71,9 @@ def chosen(cell: Cell) -> Chosen:
     )
     found = Chosen(live, cell, page)  # type: ignore[arg-type]
     up = np.array([0.0, 0.0, 1.0])
-    found.organ = SimpleNamespace(ranges=RANGES, outward=lambda place: up)  # type: ignore[assignment]
+    found.organ = SimpleNamespace(  # type: ignore[assignment]
+        ranges=RANGES, outward=lambda place: up, usable=usable
+    )
     return found
 
 
@@ -99,10 +115,56 @@ def test_values_are_those_of_coordinates_that_the_organ_has(chosen: Chosen) -> N
     assert chosen.values(chosen.organ) == {"young": 300e3, "poisson": 0.48}
 
 
+def test_a_material_that_is_refused_is_not_shown(chosen: Chosen) -> None:
+    chosen.choose_material({"young": 13.0})
+    assert chosen.organ is not None and chosen.values(chosen.organ)["young"] == 90e3
+
+
+def test_of_a_slider_the_last_look_is_drawn(chosen: Chosen, cell: Cell) -> None:
+    """A cut takes longer than a step of the slider, and controls call from several threads."""
+    for part in np.linspace(0.0, 1.0, 50):
+        chosen.choose_look(CUT, "A", float(part))
+    chosen.settle()
+    chosen.settle()
+    assert cell.looks == [(CUT, "A", 1.0)]
+    chosen.choose_look(GLASS, "A", 0.5)
+    chosen.forget(WHOLE)  # another organ
+    chosen.settle()
+    assert len(cell.looks) == 1
+
+
 def test_a_scene_that_is_refused_is_not_in_use(chosen: Chosen, cell: Cell) -> None:
     chosen.choose_scene("refused")
     assert chosen.scene == "" and cell.tips == []
     assert cell.stopped == ["the scene changed"]
+
+
+def test_the_first_switch_of_a_scene_is_taken_back(chosen: Chosen, cell: Cell, organ: Any) -> None:
+    """By the effects and the tip that the contact node had been started with."""
+    chosen.choose_scene("palpation")
+    chosen.undo()
+    assert chosen.scene == "palpation" and "does not say" in cell.said[-2]
+    assert chosen.organ is not None
+    chosen.organ.vademecum = organ  # type: ignore[misc]
+    chosen.contact = {"scene": "", "cloud": "surface", "cloud_divisor": 1}
+    chosen.choose_scene("needle_probe")
+    for back in ("palpation", ""):
+        chosen.undo() if back else chosen.return_to("", {}, chosen.look, chosen.target)
+        assert chosen.scene == back
+    assert cell.scenes == [
+        "palpation",
+        "needle_probe",
+        "palpation",
+        "the scene of the contact node's start",
+    ]
+
+
+def test_a_contrast_is_that_of_the_scene_that_runs(chosen: Chosen) -> None:
+    organ: Any = chosen.organ
+    organ.ranges, organ.usable = RANGES | {"contrast": (0.5, 20.0, 4.0)}, dict
+    for scene, contrast in (("", 4.0), ("tumour", 5.0), ("palpation", 1.0)):
+        chosen.scene = scene
+        assert chosen.values(organ)["contrast"] == contrast
 
 
 def test_another_organ_comes_in_its_own_material(chosen: Chosen, cell: Cell) -> None:

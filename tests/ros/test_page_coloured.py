@@ -107,3 +107,17 @@ def test_a_late_answer_does_not_change_what_was_chosen_since(known: str) -> None
         answers[0]({"uncertainty": known})
         assert all(field is None for field in page.painted)
         assert "displacement [mm]" in page.coloured.legend()
+
+
+def test_errors_of_the_last_organ_are_not_painted_on_the_next(
+    known: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = Shown(known)
+
+    def slow(*_: object) -> np.ndarray:
+        page.chosen.organ = None
+        return np.ones(3)
+
+    monkeypatch.setattr("avatar_ros.ui.coloured.force_error_at", slow)
+    page.coloured.choose(ERROR)
+    assert page.painted == []

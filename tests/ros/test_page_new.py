@@ -20,7 +20,7 @@ pytest.importorskip("viser", reason="the extra ui is not installed")
 
 import viser
 from avatar_ros.framework.conversions import surface_mesh
-from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING
+from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING, stem
 from avatar_ros.ui.actions import Wanted
 from avatar_ros.ui.cut_handle import CutHandle
 from avatar_ros.ui.new_patient import NewPatient
@@ -34,7 +34,7 @@ from avatar_ros.ui.structures_view import STRUCTURE
 from avatar_ros.ui.surface_view import section
 from avatar_ros.ui.tabs.inside import InsideTab
 from avatar_ros.ui.tabs.patient import FREE, GUESS, SPRUNG, PatientTab
-from avatar_ros.ui.tabs.scan import ScanTab
+from avatar_ros.ui.tabs.scan import NONE, ScanTab
 
 from avatar_core.common.supports import ATTACHMENTS
 from avatar_core.contact.effects.selection import default_effects
@@ -417,6 +417,7 @@ def test_structures_and_planes_have_their_controls(
     planes = ScanView(server, tmp_path, reader, lambda: tab, said.append)
     planes.choose("mr.nii")
     assert said == [] and len(planes._planes) == 3
+    assert tab._files.value == "mr.nii" and "mr.nii" in planes.alerts[0]
     before = planes._planes[2].image.copy()
     tab._sliders[2].value = 90
     assert asked.calls[-1] == ("place_scan", 2, 0.9)
@@ -424,7 +425,40 @@ def test_structures_and_planes_have_their_controls(
     assert (planes._planes[2].image != before).any()
     np.testing.assert_allclose(planes._planes[2].position[2], 9e-3)
     planes.forget()
-    assert planes._planes == [] and not tab._controls.visible
+    assert planes._planes == [] and not tab._controls.visible and tab._files.value == NONE
+    assert planes.alerts == []
+
+
+def test_an_image_that_comes_late_is_not_drawn_in_the_next_organ(
+    server: viser.ViserServer, tmp_path: Path
+) -> None:
+    tab = ScanTab(server.gui, Asked())  # type: ignore[arg-type]
+    tab.offer(["mr.nii"])
+    nibabel.save(nibabel.Nifti1Image(np.ones((3, 3, 3), np.int16), np.eye(4)), tmp_path / "mr.nii")
+
+    class Slow(AtOnce):
+        def read(self, *words: Any, **options: Any) -> Any:
+            planes.forget()  # another organ has come
+            return super().read(*words, **options)
+
+    reader: Any = Slow()
+    planes = ScanView(server, tmp_path, reader, lambda: tab, lambda text: None)
+    planes.choose("mr.nii")
+    assert planes._planes == [] and tab._files.value == NONE
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("1.2.840.17.nii.gz", "1.2.840.17"),
+        ("ct.seg.nrrd", "ct"),
+        ("a.b.OBJ", "a.b"),
+        ("organs.dcm", "organs"),
+        ("liver", "liver"),
+    ],
+)
+def test_files_of_two_patients_have_two_names(file: str, name: str) -> None:
+    assert stem(file) == name
 
 
 def test_the_plane_of_a_cut_follows_its_handle(server: viser.ViserServer) -> None:

@@ -45,6 +45,14 @@ def test_states_are_kept_by_organ_and_come_back(tmp_path: Path) -> None:
     assert Bookmarks(tmp_path, "a" * 64, "liver").kept == []
 
 
+def test_two_states_of_one_minute_are_two(tmp_path: Path) -> None:
+    bookmarks = Bookmarks(tmp_path, "a" * 64, "liver")
+    later = replace(KEPT, made="2026-11-26T12:00:07", scene="palpation")
+    for state in (KEPT, later):
+        bookmarks.keep(state)
+    assert bookmarks.find(KEPT.label) == KEPT and bookmarks.find(later.label) == later
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -111,6 +119,36 @@ def plan(tmp_path: Path) -> tuple[Plan, list[str], list[str], PlanNow]:
     made = Plan(tmp_path, lambda: now, lambda kept, client: None, offer, said.append)
     made.show_organ(shown)
     return made, said, labels, now
+
+
+def test_a_recording_and_another_organ_are_not_kept(
+    plan: tuple[Plan, list[str], list[str], PlanNow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The picture of a busy browser may come when another patient is shown."""
+    made, said, labels, now = plan
+    monkeypatch.setattr(made, "_now", lambda: replace(now, is_recorded=True))
+    made.keep("then", None)
+    assert labels == [] and "go back to now" in said[-1]
+
+    def picture(client: None) -> str:
+        made.show_organ(replace(now.organ, id="d" * 64))
+        return ""
+
+    monkeypatch.setattr(made, "_now", lambda: now)
+    monkeypatch.setattr("avatar_ros.ui.plan._picture", picture)
+    made.keep("late", None)
+    assert labels == [] and "another organ" in said[-1]
+
+
+def test_what_must_not_be_missed_is_kept_with_a_state(
+    plan: tuple[Plan, list[str], list[str], PlanNow], tmp_path: Path
+) -> None:
+    made, _, _, now = plan
+    made._now = lambda: replace(now, alerts=("Extrapolated: a guess",))
+    made.keep("", None)
+    (path,) = tmp_path.glob("plan-*.json")
+    (state,) = json.loads(path.read_text())["states"]
+    assert state["lines"] == ["⚠ Extrapolated: a guess", "Force 2.00 N ± 0.10 N"]
 
 
 def test_a_report_holds_numbers_errors_and_notes(

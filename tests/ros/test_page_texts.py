@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,16 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.loop.statuses import EXPLANATIONS
 from avatar_ros.ui.alerts import alerts
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.recorder import Recorder
 from avatar_ros.ui.shown_period import BEYOND, OTHER_ORGAN, SILENT, PeriodChooser, ShownPeriod
 from avatar_ros.ui.texts import frame_text, recorded_text, warnings
-from avatar_ros.ui.tool_state import N_RECENT, ROW, SharedToolState, organ_number
+from avatar_ros.ui.tool_state import N_RECENT, N_ROWS, ROW, SharedToolState, organ_number
 
 from avatar_core.scene.recording import Clouds, Periods, Recording
 from avatar_core.vademecum.model import VademecumInfo
 from avatar_ros.msg import ContactState
+from tests.core.box_organ import organ
 
 pytestmark = pytest.mark.ros
 
@@ -120,6 +123,23 @@ def test_an_error_that_was_never_measured_is_not_zero() -> None:
     chooser.take(pressed)
     text = frame_text(chooser.drawn(pressed, 1e-3, TIP), "", None)[0]
     assert text == "Force <b>12.00 N</b> (error unknown)"
+
+
+def test_a_name_is_no_html() -> None:
+    """Anybody may have named an organ, and a page that ran it would move the tool for them."""
+    named = replace(Organ.of(organ("cube")), name="<img src=x onerror=alert(1)>")
+    assert "<img" not in named.summary() and "&lt;img" in named.summary()
+
+
+def test_a_recording_ends_where_nothing_more_is_kept() -> None:
+    state = SharedToolState.make()
+    recorder = Recorder(state)
+    state.live["recording"][0] = 1
+    assert not recorder.is_full
+    state.live["n_rows"][0] = N_ROWS
+    assert recorder.is_full
+    recorder.drop()
+    assert not recorder.is_full
 
 
 def test_organs_are_told_apart_by_their_ids() -> None:

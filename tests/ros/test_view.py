@@ -129,6 +129,17 @@ def shades(view: OrganView, first: int) -> list[Any]:
     return [mesh for mesh in beyond if np.any(mesh.faces)]
 
 
+def test_what_is_cut_away_is_not_clicked(view: OrganView) -> None:
+    whole = view.faces
+    view.look(CUT, "A", 0.5)
+    kept = view.faces
+    assert 0.2 * len(whole) < len(kept) < 0.8 * len(whole)
+    front = view.points[whole].mean(axis=1)[:, 1].max()
+    assert view.points[kept].mean(axis=1)[:, 1].max() < 0.6 * front
+    view.look(WHOLE)
+    assert len(view.faces) == len(whole)
+
+
 def test_the_clamp_has_checks_and_access_has_stripes(view: OrganView) -> None:
     """Both kinds of checks together are the clamp; stripes lie where tools reach, if asked for."""
     shown = Organ.of(organ("cube"))

@@ -29,6 +29,7 @@ from avatar_ros.patients.protocol import (
     PatientRequest,
     Previewed,
     Stage,
+    stem,
 )
 from avatar_ros.patients.settings import (
     PATIENT_INTERPOLATION,
@@ -62,7 +63,9 @@ def patient_request(request: Any, settings: InterpolationSettings) -> PatientReq
             "default"
         )
     fidelity = request.fidelity or _DEFAULT_FIDELITY
-    stem = "mesh" if inline else Path(request.surface).name.split(".")[0] or "surface"
+    made_of = "mesh" if inline else stem(Path(request.surface).name) or "surface"
+    if request.label:
+        made_of += f"-{request.label.replace('/', '_')}"
     if inline and (request.label or request.inside):
         raise RefusedError("label and inside are those of a file that holds a label map")
     if request.inside and not is_label_map(Path(request.surface)):
@@ -70,7 +73,7 @@ def patient_request(request: Any, settings: InterpolationSettings) -> PatientReq
     groups = ""
     if request.groups:
         groups = str(find_in_library(request.groups, settings.library_dir, settings.max_bytes))
-    output = file_name(request.name or f"{stem}-{fidelity}")
+    output = file_name(request.name or f"{made_of}-{fidelity}")
     surface, vertices, faces = "", None, None
     if inline:
         _require_metres(request, settings.max_bytes)

@@ -8,6 +8,7 @@ times a second, so neither the page nor its users can delay the contact loop.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,8 @@ class PlanningNode(ManagedNode):
         self._recorder = Recorder(self._state)
         self._lines: list[str] = []  # numbers that are shown
         self._alerts: list[str] = []
-        self._reader = Reader(1 << 30)
+        self._reader = Reader(1 << 30)  # of organs, for which the page waits
+        self._files = Reader(1 << 30)  # of what users choose, in threads of their own
         self._cloud: NewestCloud | None = None
         self._band = NewestBand(self)
         self._was_missing, self._is_to_restore = True, False
@@ -138,7 +140,7 @@ class PlanningNode(ManagedNode):
             lambda labels: self._panels.plan.offer(labels),
             self._say,
         )
-        self._player = Player(self._library.folder, self._reader)
+        self._player = Player(self._library.folder, self._files)
         self._recordings = Recordings(
             self._library.folder,
             self._recorder,
@@ -153,11 +155,11 @@ class PlanningNode(ManagedNode):
             ),
         )
         self._scan = ScanView(
-            server, self._library.folder, self._reader, lambda: self._panels.scan, self._say
+            server, self._library.folder, self._files, lambda: self._panels.scan, self._say
         )
         self._new_patient = new = NewPatient(
             self._library.folder,
-            self._reader,
+            self._files,
             self._requests,
             lambda: self._panels.patient,
             PreviewView(server, self._view.set_aside),
@@ -184,7 +186,7 @@ class PlanningNode(ManagedNode):
                 stop_playing=self._player.close,
                 turn=self._view.turn_to,
                 look=chosen.choose_look,
-                mark_reach=self._view.mark_reach,
+                mark_reach=lambda on: self._in_executor(lambda: self._view.mark_reach(on)),
                 colours=self._coloured.choose,
                 style=self._view.style,
                 scan=self._scan.choose,
@@ -200,6 +202,7 @@ class PlanningNode(ManagedNode):
                 export=self._plan.export,
             ),
         )
+        server.on_client_disconnect(self._panels.forget_client)
         self._panels.scene.offer(scene_texts())
         self._own_subscriptions = [
             self.create_subscription(
@@ -234,6 +237,7 @@ class PlanningNode(ManagedNode):
         if self._server is not None:
             self._requests.close()
             self._reader.close()
+            self._files.close()
             self._server.stop()
             self._server = None
 
@@ -284,7 +288,7 @@ class PlanningNode(ManagedNode):
         self._chosen.organ, self._number = organ, organ_number(organ.id)
         self._shown, self._lines, self._alerts = None, [], []
         self._listen_to_clouds()
-        self._requests.parameters_of_contact(tuple(MATERIAL), self._note_material)
+        self._requests.parameters_of_contact(tuple(MATERIAL), self._chosen.note_contact)
         self._plan.show_organ(organ)
         self._say(f"{organ.name} is shown")
 
@@ -305,13 +309,15 @@ class PlanningNode(ManagedNode):
             return
         if self._frame % _CUT_FRAMES == 0:
             self._chosen.settle()
+        if self._recorder.is_full:
+            self._recordings.stop("no more is kept of one recording")
         self._band.take()
         recorded = self._player.state(organ)
         if recorded is not None:
             self._show_recorded(organ, *recorded)
             return
         shown = self._shown = self._period_to_show()
-        self._view.place_tool(shown.tip, (0.0 if shown.missing else shown.fraction) * shown.force)
+        self._view.place_tool(shown.tip, (not shown.missing) * shown.force)
         if self._frame % _PLOT_FRAMES == 0:
             values = self._chosen.values(organ)
             poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
@@ -329,7 +335,7 @@ class PlanningNode(ManagedNode):
         self._shown = None  # of now, nothing is drawn
         largest = self._view.move(cloud, shown.tip, shown.force)
         self._view.grey(bool(shown.missing))
-        self._view.place_tool(shown.tip, (0.0 if shown.missing else shown.fraction) * shown.force)
+        self._view.place_tool(shown.tip, (not shown.missing) * shown.force)
         if self._frame % _PLOT_FRAMES == 0:
             self._panels.recordings.show(self._player.part)
             self._show_numbers(organ, shown._replace(largest=largest), material)
@@ -340,7 +346,7 @@ class PlanningNode(ManagedNode):
         numbers = frame_text(shown, material, n_kept)
         self._panels.show_numbers("<br>".join(numbers))
         self._alerts = alerts(organ.info, shown)
-        over = [*self._new_patient.alerts(organ.name), *self._player.alerts]
+        over = [*self._new_patient.alerts(organ.name), *self._player.alerts, *self._scan.alerts]
         self._panels.show_alerts([*over, *self._alerts])
         young = self._chosen.values(organ)["young"]
         measured = self._measures.lines(Now(self._view.points, shown.tip, young))
@@ -394,7 +400,7 @@ class PlanningNode(ManagedNode):
         missing, status = self._requests.missing, self._status()
         has_organ = self._organ is not None
         self._panels.show_cell(warnings(missing, has_organ, status, self._missed))
-        self._panels.offer(*self._library.offer())
+        self._offer_files()
         if self._organ is not None:
             self._driver.ensure_running(self._tool, self._frame_id)
         if "contact" in missing:
@@ -412,6 +418,7 @@ class PlanningNode(ManagedNode):
 
     def _on_contact_started(self, values: dict[str, Any]) -> None:
         """The contact node runs, for the first time or again."""
+        self._requests.contact_started()
         self._chosen.contact, self._is_to_restore = values, True
         self._change_tip(self._chosen.tip)
         self._panels.organ.show_material(self._chosen.in_force)
@@ -419,11 +426,6 @@ class PlanningNode(ManagedNode):
     def _change_tip(self, tip: Tip) -> None:
         self._view.change_tip(tip)
         self._measures.change_tip(tip)
-
-    def _note_material(self, values: dict[str, Any]) -> None:
-        """Show the material in force, even if another client chose it."""
-        self._chosen.contact |= values
-        self._panels.organ.show_material(self._chosen.in_force)
 
     # --- From the page -----------------------------------------------------------------------
 
@@ -440,10 +442,21 @@ class PlanningNode(ManagedNode):
         if self._new_patient.is_previewing:
             self._new_patient.paint(*ray)
         elif self._organ is not None:
-            self._say(self._measures.click(*ray, self._view.points))
+            self._say(self._measures.click(*ray, self._view.points, self._view.faces))
+
+    def _in_executor(self, do: Callable[[], None]) -> None:
+        """Draw in the thread that draws the organ: controls call from several."""
+        assert self.executor is not None  # which runs this node
+        self.executor.create_task(do)
+
+    def _offer_files(self) -> None:
+        try:
+            self._panels.offer(*self._library.offer())
+        except OSError as error:  # as of a share that is not mounted any more
+            self._say(f"the library cannot be read: {error.strerror}")
 
     def _use_built(self, file: str) -> None:
-        self._panels.offer(*self._library.offer())
+        self._offer_files()
         self._panels.organ.choose_file(file)
         self._requests.load_vademecum(file, self._say)
 
@@ -467,6 +480,7 @@ class PlanningNode(ManagedNode):
             tuple(self._lines),
             tuple(self._alerts),
             self._view.points,
+            self._player.is_on,
         )
 
     def _return_to(self, kept: Bookmark, client: Any) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from avatar_core.errors import AvatarError
+from avatar_core.geometry.label_files import LABEL_SUFFIXES
 
 # Regions of a face of a preview, as in BuildPatient.action; springs are numbered from the last on.
 FREE, CLAMPED, ACCESSIBLE, FIRST_SPRING = range(4)
@@ -127,3 +129,13 @@ class Built:
     displacement_error: float
     notices: list[str]
     seconds: float = 0.0
+
+
+def stem(name: str) -> str:
+    """The name of a surface's or a label map's file without its suffix, and with all other dots.
+
+    Two studies called 1.2.840.17.nii.gz and 1.2.840.18.nii.gz are not one patient.
+    """
+    ends = sorted((*LABEL_SUFFIXES, *(f".seg{end}" for end in LABEL_SUFFIXES)), key=len)
+    found = [end for end in ends if name.lower().endswith(end)]
+    return name[: -len(found[-1])] if found else Path(name).stem

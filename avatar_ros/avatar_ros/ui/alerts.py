@@ -14,10 +14,11 @@ LARGE_ERROR = 0.10  # expected of the displacement or the force, from which a pa
 
 def alerts(info: VademecumInfo, shown: ShownPeriod) -> list[str]:
     """One line each; none if the numbers are what they seem."""
-    return [*_of_patient(info), *_of_period(shown)]
+    return [*alerts_of_organ(info), *_of_period(shown)]
 
 
-def _of_patient(info: VademecumInfo) -> list[str]:
+def alerts_of_organ(info: VademecumInfo) -> list[str]:
+    """What must not be missed of an organ, whatever touches it."""
     errors = {"displacement": info.l2_mean, "force": info.force_mean}
     if not np.isfinite(info.l2_mean):
         return ["Errors of this organ were never measured: build it with a certificate"]

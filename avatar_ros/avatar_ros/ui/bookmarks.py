@@ -32,7 +32,7 @@ class Bookmark:
     material : values by coordinate [SI]
     camera : position, what is looked at, what is up, nine numbers [m]; empty without a browser
     look : whole, glass or cut open; side, part : of the cut
-    lines : numbers as shown then
+    lines : numbers as shown then, after what must not be missed
     picture : PNG, base64; empty if the browser gave none
     """
 
@@ -49,7 +49,7 @@ class Bookmark:
     @property
     def label(self) -> str:
         """To choose it by."""
-        return f"{self.made[5:16].replace('T', ' ')} {self.note}".strip()
+        return f"{self.made[5:19].replace('T', ' ')} {self.note}".strip()
 
 
 class Bookmarks:

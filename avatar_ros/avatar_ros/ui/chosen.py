@@ -7,13 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
-from avatar_core.scene.file import read_scene, shipped_scenes
+from avatar_core.scene.file import read_scene, shipped_scenes, write_scene
 from avatar_core.scene.model import Scene
 from avatar_ros.loop.settings import MATERIAL, chosen_tips
 from avatar_ros.prepare.scenes import scene_file
 from avatar_ros.ui.history import History
 from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.presets import values_of
 from avatar_ros.ui.recorder import scene_in_force
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.view import CUT, WHOLE
@@ -55,13 +57,15 @@ class Chosen:
         self.contact: dict[str, Any] = {}
         self.scene = ""
         self.look = (WHOLE, "A", 0.5)
+        self._known_scene: tuple[str, dict[str, float]] = ("", {})
         self._dragged: float | None = None  # part that the handle of the cut is dragged to
+        self._look_wanted: tuple[str, str, float] | None = None
 
     def forget(self, look: str) -> None:
         """Another organ comes, in its own material, and is shown as ``look``."""
         self._material = {}
         self._history.forget()
-        self.look = (look, "A", 0.5)
+        self.look, self._dragged, self._look_wanted = (look, "A", 0.5), None, None
 
     def undo(self) -> None:
         """Take the last choice back."""
@@ -75,6 +79,10 @@ class Chosen:
         """Of the first tool."""
         if self.scene:
             return read_scene(shipped_scenes()[self.scene]).tools[0].tip
+        return self._own_tip
+
+    @property
+    def _own_tip(self) -> Tip:
         if "tools" not in self.contact:
             return Tip()
         return chosen_tips(self.contact, len(self.contact["tools"]))[0]
@@ -127,9 +135,20 @@ class Chosen:
         return given | self._material
 
     def values(self, organ: Organ) -> dict[str, float]:
-        """Of the organ's own coordinates, as built where nothing was chosen [SI]."""
-        in_force = self.in_force
-        return {name: in_force.get(name, built) for name, (_, _, built) in organ.ranges.items()}
+        """Of the organ's own coordinates, as built where nothing was chosen [SI].
+
+        A tumour has the contrast of the scene that runs, and feels like the organ where that has
+        none. What the organ does not hold, the contact node does not use.
+        """
+        used = organ.usable(self._of_scene() | self.in_force)
+        return {name: used.get(name, built) for name, (_, _, built) in organ.ranges.items()}
+
+    def _of_scene(self) -> dict[str, float]:
+        """Values that the scene gives; none of natural effects."""
+        given = self.scene or self.contact.get("scene", "")
+        if given != self._known_scene[0]:
+            self._known_scene = given, _values_of(given)
+        return self._known_scene[1]
 
     def choose_material(self, values: dict[str, float]) -> None:
         """Set some values, by coordinate [SI]."""
@@ -145,17 +164,32 @@ class Chosen:
     def _set(self, values: dict[str, float]) -> None:
         self._page.stop_recording("the material changed")
         self._material |= values
-        self._requests.set_material(dict(values), self._page.say)
+        self._requests.set_material(dict(values), self._page.say, self._read_back)
         self._page.show_material(values)
+
+    def _read_back(self) -> None:
+        """Show what is in force after a refusal."""
+        self._material = {}
+        self._requests.parameters_of_contact(tuple(MATERIAL), self.note_contact)
+
+    def note_contact(self, values: dict[str, Any]) -> None:
+        """Parameters of the contact node, whoever set them."""
+        self.contact |= values
+        self._page.show_material(self.in_force)
 
     def choose_scene(self, name: str) -> None:
         """Switch to a shipped scene."""
         before = self.scene
-        if before and before != name:
+        if before != name:
             self._history.note("scene", "the scene", lambda: self._switch(before))
         self._switch(name)
 
     def _switch(self, name: str) -> None:
+        """To a shipped scene, or with an empty name back to the contact node's own."""
+        text = "" if name else self._own_scene()
+        if not name and not text:
+            self._page.say("the contact node does not say which scene it had; start it again")
+            return
         self._page.stop_recording("the scene changed")
 
         def note(switched: bool) -> None:
@@ -163,31 +197,38 @@ class Chosen:
                 self.scene = name
                 self._page.change_tip(self.tip)
 
-        self._requests.load_scene(name, self._page.say, then=note)
+        shown = name or "the scene of the contact node's start"
+        self._requests.load_scene(shown, self._page.say, yaml=text, then=note)
 
     def scene_in_force(self, organ: Organ) -> Scene:
         """The scene that reproduces what runs now; ``contact`` must be known."""
-        given = self.scene or self.contact["scene"]
-        return scene_in_force(
-            read_scene(scene_file(given)) if given else None,
-            organ.vademecum,
-            self.in_force,
-            self.tip,
-            self.contact["cloud"],
-            self.contact["cloud_divisor"],
-        )
+        return self._scene_of(organ, self.scene or self.contact["scene"], self.in_force, self.tip)
+
+    def _own_scene(self) -> str:
+        """As the contact node was started, as YAML; empty if that is not known."""
+        if self.organ is None or "cloud" not in self.contact:
+            return ""
+        return write_scene(self._scene_of(self.organ, self.contact["scene"], {}, self._own_tip))
+
+    def _scene_of(self, organ: Organ, given: str, material: dict[str, float], tip: Tip) -> Scene:
+        chosen = read_scene(scene_file(given)) if given else None
+        cloud, divisor = self.contact["cloud"], self.contact["cloud_divisor"]
+        return scene_in_force(chosen, organ.vademecum, material, tip, cloud, divisor)
 
     def send_again(self) -> None:
         """Send what was chosen here to a contact node that was started again."""
         if self.scene:
             self._switch(self.scene)
         if self._material:
-            self._requests.set_material(dict(self._material), self._page.say)
+            self._requests.set_material(dict(self._material), self._page.say, self._read_back)
 
     # --- The look, and all at once -----------------------------------------------------------
 
     def choose_look(self, how: str, side: str, part: float) -> None:
-        """Show the organ whole, as glass or cut open, from a side, by a part."""
+        """Show the organ whole, as glass or cut open, from a side, by a part: by :meth:`settle`."""
+        self._look_wanted = how, side, part
+
+    def _choose_look(self, how: str, side: str, part: float) -> None:
         before = self.look
         self._history.note("look", "how the organ is shown", lambda: self._show_look(*before))
         self._show_look(how, side, part)
@@ -197,11 +238,18 @@ class Chosen:
         self._dragged = part
 
     def settle(self) -> None:
-        """Cut where the handle was dragged to: not for each of its steps, as a cut takes time."""
+        """Show the organ as was asked for last, and cut where the handle was dragged to.
+
+        Not for each step of a slider or of the handle, as a cut takes time, and in one thread:
+        controls call from several.
+        """
+        wanted, self._look_wanted = self._look_wanted, None
         part, self._dragged = self._dragged, None
+        if wanted is not None and wanted != self.look:
+            self._choose_look(*wanted)
         how, side, before = self.look
         if part is not None and how == CUT and part != before:
-            self.choose_look(how, side, part)
+            self._choose_look(how, side, part)
 
     def _show_look(self, how: str, side: str, part: float) -> None:
         self.look = how, side, part
@@ -235,7 +283,7 @@ class Chosen:
         look: tuple[str, str, float],
         target: np.ndarray,
     ) -> None:
-        if scene and scene != self.scene and scene in shipped_scenes():
+        if scene != self.scene and scene in ("", *shipped_scenes()):
             self._switch(scene)
         present = self.values(organ)
         wanted = {
@@ -248,3 +296,12 @@ class Chosen:
             self._set(changed)
         self._show_look(*look)
         self.put(target)
+
+
+def _values_of(scene: str) -> dict[str, float]:
+    """Of a scene by name or path; none if it cannot be read."""
+    try:
+        found = read_scene(scene_file(scene)) if scene else None
+    except AvatarError:
+        return {}
+    return values_of(found) if found else {}

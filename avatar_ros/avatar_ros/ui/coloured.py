@@ -61,7 +61,7 @@ class Coloured:
         elif field == ERROR:
             errors = force_error_at(organ.vademecum, organ.vertices)
             missing = "errors of this organ were never measured; build it with a certificate"
-            self._paint(ERROR, errors, missing)
+            self._paint(organ, ERROR, errors, missing)
         else:
             self._field = DISPLACEMENT
             self._view.paint(None)
@@ -79,7 +79,7 @@ class Coloured:
             self._say(_NO_DISTRIBUTIONS)
             return
         spread = force_spread_at(organ.vademecum, self._chosen.tip, known, organ.vertices)
-        self._paint(SPREAD, spread, "no tool reaches this organ")
+        self._paint(organ, SPREAD, spread, "no tool reaches this organ")
 
     def _known(self, organ: Organ, given: dict[str, Distribution]) -> dict[str, Distribution]:
         """Of all parameters of the organ; without a distribution, the value in use is meant."""
@@ -90,7 +90,9 @@ class Coloured:
         values = {name: Fixed(value) for name, value in self._chosen.values(organ).items()}
         return held.known({**values, **used})
 
-    def _paint(self, field: str, values: np.ndarray, missing: str) -> None:
+    def _paint(self, organ: Organ, field: str, values: np.ndarray, missing: str) -> None:
+        if organ is not self._chosen.organ or field != self._wanted:  # it took its time
+            return
         if not np.isfinite(values).any():
             self._say(missing)
             return

@@ -18,7 +18,12 @@ class Library:
         self._known: dict[tuple[str, int], bool] = {}
 
     def offer(self) -> tuple[list[str], list[str], list[str], list[str]]:
-        """Names of the vademecums, surfaces, images and recordings, sorted."""
+        """Names of the vademecums, surfaces, images and recordings, sorted.
+
+        Raises
+        ------
+        OSError : the folder is gone, as a share that is not mounted any more
+        """
         files = sorted(path for path in self.folder.iterdir() if path.is_file())
         vademecums = [path.name for path in files if path.suffix == ".h5" and self._is_one(path)]
         surfaces = [path.name for path in files if path.name.lower().endswith(SUFFIXES)]
@@ -27,7 +32,10 @@ class Library:
         return vademecums, surfaces, images, recordings
 
     def _is_one(self, path: Path) -> bool:
-        key = (path.name, path.stat().st_mtime_ns)
+        try:
+            key = (path.name, path.stat().st_mtime_ns)
+        except FileNotFoundError:  # removed just now
+            return False
         if key not in self._known:
             self._known[key] = is_vademecum(path)
         return self._known[key]

@@ -67,12 +67,14 @@ class Measures:
         """What the next click places."""
         self._mode = mode
 
-    def click(self, origin: np.ndarray, direction: np.ndarray, points: np.ndarray) -> str:
-        """Place a point where a ray meets the drawn organ; returns what is to be done next."""
+    def click(
+        self, origin: np.ndarray, direction: np.ndarray, points: np.ndarray, faces: np.ndarray
+    ) -> str:
+        """Place a point where a ray meets faces that are drawn; returns what is to be done next."""
         organ, mode = self._organ, self._mode
         if organ is None:
             return ""
-        place = hit(origin, direction, points, organ.faces)
+        place = hit(origin, direction, points, faces)
         if place is None:
             return ""
         placed = self._places.get(mode, [])

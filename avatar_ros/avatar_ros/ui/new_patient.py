@@ -18,7 +18,7 @@ from avatar_core.geometry.label_maps import labels_of
 from avatar_core.scene.written import replaced
 from avatar_ros.framework.conversions import mesh_arrays
 from avatar_ros.framework.reader import Reader
-from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING
+from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING, stem
 from avatar_ros.ui.actions import Wanted
 from avatar_ros.ui.measuring import hit
 from avatar_ros.ui.preview_view import BRUSHES, PreviewView
@@ -156,7 +156,7 @@ class NewPatient:
         preview = self._preview
         if preview is None or not preview.is_painted or not preview.is_of(wanted):
             return wanted
-        name = f"{wanted.surface.split('.')[0]}-groups.npz"
+        name = f"{stem(wanted.surface)}-groups.npz"
         content = io.BytesIO()
         np.savez_compressed(content, allow_pickle=False, **preview.groups())
         with replaced(self._folder / name) as file:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum, VademecumInfo
 from avatar_ros.loop.settings import MATERIAL
+from avatar_ros.prepare.scenes import usable_material
 
 YOUNG_RANGE = (0.5e3, 1e6)  # that can be chosen [Pa]: the force is proportional to E
 
@@ -86,15 +88,19 @@ class Organ:
         j = int(np.argmin(np.linalg.norm(surface.centers - point, axis=1)))
         return np.asarray(surface.normals[j] / np.linalg.norm(surface.normals[j]))
 
+    def usable(self, material: dict[str, float]) -> dict[str, float]:
+        """Values by coordinate that the contact node uses for this organ, of those it was given."""
+        return usable_material(self.vademecum, material)[0]
+
     def summary(self) -> str:
-        """Name, volume, material and certified errors, as Markdown."""
+        """Name, volume, material and certified errors, as HTML; the name is of anybody's file."""
         info = self.info
         errors = (
             f"Errors certified: displacement {info.l2_mean:.1%} (worst {info.l2_worst:.1%}), "
             f"force {info.force_mean:.1%} (worst {info.force_worst:.1%})."
         )
         return (
-            f"**{self.name}**, {info.volume * 1e6:.0f} ml, E {info.young_modulus / 1e3:.0f} kPa, "
-            f"nu {info.poisson_ratio:.3g}. "
+            f"<b>{escape(self.name)}</b>, {info.volume * 1e6:.0f} ml, "
+            f"E {info.young_modulus / 1e3:.4g} kPa, nu {info.poisson_ratio:.3g}. "
             + (errors if np.isfinite(info.l2_mean) else "Errors: not measured.")
         )

@@ -89,6 +89,10 @@ class Panels:
         else:
             self._cubes[client.client_id].content = content
 
+    def forget_client(self, client: Any) -> None:
+        """A browser has left."""
+        self._cubes.pop(client.client_id, None)
+
     def offer(
         self, files: list[str], surfaces: list[str], images: list[str], recordings: list[str]
     ) -> None:
@@ -125,7 +129,7 @@ class Panels:
 
     def show_alerts(self, alerts: list[str]) -> None:
         """Show over the picture what must not be missed."""
-        lines = "".join(f'<div style="{_ALERT}">⚠ {text}</div>' for text in alerts)
+        lines = "".join(f'<div style="{_ALERT}">⚠ {escape(text)}</div>' for text in alerts)
         _set(self._banner, f'<div id="alerts" role="alert" style="{_BANNER}">{lines}</div>')
 
     def show_scale(self, content: str) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from avatar_core.errors import AvatarError
 from avatar_core.scene.surface_export import write_surfaces
 from avatar_core.scene.written import replaced
+from avatar_ros.ui.alerts import alerts_of_organ
 from avatar_ros.ui.bookmarks import Bookmark, Bookmarks
 from avatar_ros.ui.camera import pose_of
 from avatar_ros.ui.organ import Organ
@@ -40,7 +41,9 @@ _PATIENCE = 20.0  # with a browser that draws a picture [s]
 class PlanNow:
     """What is shown at the moment of a request; as in :class:`Bookmark`.
 
+    alerts : what must not be missed of the numbers
     points : ndarray, shape (n, 3), of the cloud [m]
+    is_recorded : a recording is shown, which is no state to return to
     """
 
     organ: Organ
@@ -51,6 +54,7 @@ class PlanNow:
     lines: tuple[str, ...]
     alerts: tuple[str, ...]
     points: np.ndarray
+    is_recorded: bool = False
 
 
 class Plan:
@@ -93,6 +97,9 @@ class Plan:
         if now is None or bookmarks is None:
             self._say("nothing to keep yet: choose an organ first")
             return
+        if now.is_recorded:
+            self._say("a recording is shown: go back to now, and keep that")
+            return
         camera: tuple[float, ...] = ()
         if client is not None:
             camera = tuple(float(x) for row in pose_of(client.camera) for x in row)
@@ -104,9 +111,12 @@ class Plan:
             material=now.material,
             camera=camera,
             look=now.look,
-            lines=now.lines,
+            lines=(*(f"⚠ {line}" for line in now.alerts), *now.lines),
             picture=_picture(client),
         )
+        if bookmarks is not self._bookmarks:  # a picture takes its time
+            self._say("not kept: another organ was loaded meanwhile")
+            return
         self._try(lambda: bookmarks.keep(bookmark), f"kept in {bookmarks.path.name}")
         self._show()
 
@@ -133,7 +143,7 @@ class Plan:
             self._say("nothing to report yet: choose an organ first")
             return
         path = self._folder / time.strftime(f"report-%Y%m%d-%H%M%S{suffix}")
-        made = REPORTS[suffix](now.organ, bookmarks.kept, now.alerts)
+        made = REPORTS[suffix](now.organ, bookmarks.kept, alerts_of_organ(now.organ.info))
 
         def write() -> None:
             with replaced(path) as file:

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar_core.contact.effects import Tumour
 from avatar_core.errors import AvatarError
 from avatar_core.scene.file import parse_scene
 from avatar_core.scene.recording import Recording, load_recording
 from avatar_ros.framework.reader import Reader
 from avatar_ros.msg import ContactState
 from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.presets import material_text
+from avatar_ros.ui.presets import material_text, values_of
 from avatar_ros.ui.shown_period import BEYOND, PLACE, ShownPeriod
 
 _REPEATED = 1.0  # s: the last state stays so long before it begins again
@@ -147,11 +146,7 @@ def _last(known: np.ndarray) -> np.ndarray:
 def _material_of(recording: Recording, organ: Organ) -> str:
     """The material that was in force, in a line."""
     scene = parse_scene(recording.scene, recording.vademecum_name)
-    given = scene.values
-    tumours = [effect for effect in scene.effects if isinstance(effect, Tumour)]
-    contrast = tumours[0].contrast if tumours else 1.0
-    if contrast is not None:  # that of the file
-        given["contrast"] = contrast
+    given = values_of(scene)
     values = {name: given.get(name, built) for name, (_, _, built) in organ.ranges.items()}
     poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
     return material_text(values["young"], poisson, values.get("contrast"))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from avatar_core.common.supports import ATTACHMENTS, SUPPORT
+from avatar_core.contact.effects import Tumour
+from avatar_core.scene.model import Scene
 
 # Label and unit of each coordinate of the material, and what one shown unit is in SI.
 SLIDERS = {
@@ -59,3 +61,10 @@ def material_text(young: float, poisson: float, contrast: float | None) -> str:
     """The material in force, in one line; young [Pa]."""
     tumour = "" if contrast is None else f", tumour {contrast:.3g} x E"
     return f"E {young / 1e3:.4g} kPa, nu {poisson:.3g}{tumour}"
+
+
+def values_of(scene: Scene) -> dict[str, float]:
+    """Values of a scene by coordinate [SI]; without its effect, a tumour is like the organ."""
+    tumours = [effect.contrast for effect in scene.effects if isinstance(effect, Tumour)]
+    contrast = tumours[0] if tumours else 1.0
+    return scene.values | ({} if contrast is None else {"contrast": contrast})

@@ -17,7 +17,9 @@ from avatar_core.scene.model import Scene, SupportStiffness, Tool
 from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
 from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.model import Vademecum
-from avatar_ros.ui.tool_state import SharedToolState
+from avatar_ros.ui.tool_state import N_ROWS, SharedToolState
+
+_MOST_BYTES = 1 << 30  # of all surfaces of a recording
 
 
 def scene_in_force(
@@ -72,6 +74,15 @@ class Recorder:
     @property
     def is_on(self) -> bool:
         return bool(self._state.live["recording"][0])
+
+    @property
+    def is_full(self) -> bool:
+        """Nothing more is kept: of periods, or of surfaces."""
+        n = len(self._clouds)
+        return self.is_on and (
+            int(self._state.live["n_rows"][0]) >= N_ROWS
+            or (n > 0 and n * self._clouds[0].nbytes > _MOST_BYTES)
+        )
 
     @property
     def n_periods(self) -> int:

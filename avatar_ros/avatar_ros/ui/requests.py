@@ -58,6 +58,10 @@ class Requests:
         """Release what the middleware holds for the action."""
         self._build.destroy()
 
+    def contact_started(self) -> None:
+        """What the node before was asked for is not answered any more."""
+        self._waiting, self._setting = {}, False
+
     @property
     def missing(self) -> tuple[str, ...]:
         """Names of the nodes whose services are not available."""
@@ -106,8 +110,13 @@ class Requests:
 
         self._load_scene.call_async(request).add_done_callback(answered)
 
-    def set_material(self, values: dict[str, float], report: Report) -> None:
-        """Set values by coordinate; while a request is pending, only the newest are kept."""
+    def set_material(
+        self, values: dict[str, float], report: Report, refused: Callable[[], None] = lambda: None
+    ) -> None:
+        """Set values by coordinate; while a request is pending, only the newest are kept.
+
+        refused : called if some were
+        """
         self._waiting |= values
         if self._setting or not self._waiting:
             return
@@ -122,7 +131,9 @@ class Requests:
             results = done.result().results if done.result() is not None else []
             refusals = [result.reason for result in results if not result.successful]
             report("; ".join(refusals) if refusals else "")
-            self.set_material({}, report)
+            if refusals:
+                refused()
+            self.set_material({}, report, refused)
 
         request = SetParameters.Request(parameters=parameters)
         self._set.call_async(request).add_done_callback(answered)

@@ -36,32 +36,49 @@ class ScanView:
         self._server, self._folder, self._reader = server, folder, reader
         self._tab, self._say = tab, say
         self._scan: Scan | None = None
+        self._file = ""  # that was asked for last
         self._parts = [_MIDDLE] * 3
         self._grey = (0.0, 1.0)
         self._planes: list[Any] = []
 
     def choose(self, file: str) -> None:
         """Show the image of a file; an empty name shows none."""
-        self.forget()
+        self._clear(file)
         if not file:
             return
         try:
             scan = self._reader.read(file, MAX_LABEL_BYTES, read_scan, self._folder / file)
         except AvatarError as error:
             self._say(str(error))
+            scan = None
+        if file != self._file:  # another was chosen meanwhile, or another organ has come
+            return
+        if scan is None:
+            self.forget()
             return
         self._scan, self._parts = scan, [_MIDDLE] * 3
         self._grey = (scan.level, scan.window)
-        self._tab().show_scan(scan)
+        self._tab().show_scan(scan, file)
         self._draw(range(3))
 
     def forget(self) -> None:
         """Another organ is shown, or none of the planes is wanted."""
-        self._scan = None
+        self._clear("")
+
+    def _clear(self, wanted: str) -> None:
+        """Remove the planes before a file is shown, or none."""
+        self._scan, self._file = None, wanted
         for plane in self._planes:
             plane.remove()
         self._planes = []
-        self._tab().show_scan(None)
+        self._tab().show_scan(None, wanted)
+
+    @property
+    def alerts(self) -> list[str]:
+        """What must not be missed while planes are drawn."""
+        if self._scan is None:
+            return []
+        return [f"Image {self._file}: check that it is of this patient; it does not move"]
 
     def place(self, axis: int, part: float) -> None:
         """Move a plane along its axis of the voxels, to a part of the way."""

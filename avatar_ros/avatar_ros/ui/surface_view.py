@@ -198,6 +198,11 @@ class SurfaceView:
             if len(self._faces):
                 self._make()
 
+    @property
+    def plane(self) -> Plane | None:
+        """Where the organ is cut open."""
+        return self._plane
+
     def look_inside(self, glass: bool, plane: Plane | None) -> None:
         """See through the organ, or cut it open; the next cloud is drawn so."""
         self._opacity, self._plane = (GLASS if glass else None), plane

@@ -92,6 +92,16 @@ class OrganView:
         return self._drawn[:, :3]
 
     @property
+    def faces(self) -> np.ndarray:
+        """Of the organ as it is drawn, without what is cut away, shape (n, 3)."""
+        organ, plane = self._organ, self._surface.plane
+        if organ is None:
+            return np.zeros((0, 3), int)
+        if plane is None:
+            return organ.faces
+        return np.asarray(organ.faces[plane.above(organ.vertices[organ.faces].mean(axis=1)) <= 0])
+
+    @property
     def opacity(self) -> float:
         """Of the organ."""
         return self._surface.opacity

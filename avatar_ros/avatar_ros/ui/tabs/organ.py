@@ -18,6 +18,7 @@ from avatar_ros.ui.view import CUT, GLASS, WHOLE
 
 _AS_BUILT = "as built"
 _NO_PRESET = "as the sliders say"
+_ABOUT = "margin:0 1em;font-size:14px;line-height:1.5"
 
 
 class OrganTab:
@@ -27,7 +28,7 @@ class OrganTab:
         self._gui, self._actions = gui, actions
         self._files = gui.add_dropdown("Vademecum", (NOTHING,))
         gui.add_button("Load vademecum").on_click(lambda _: actions.vademecum(self._files.value))
-        self._about = gui.add_markdown("")
+        self._about = gui.add_html("")
         self._look = gui.add_dropdown("Show organ", (WHOLE, GLASS, CUT))
         self._side = gui.add_dropdown("Cut from", tuple(NAMES.values()), visible=False)
         self._depth = gui.add_slider(
@@ -59,9 +60,10 @@ class OrganTab:
     def show_organ(self, organ: Organ) -> None:
         """Show name and certificate, and a slider for each coordinate of the vademecum."""
         self._organ = organ
-        self._about.content = organ.summary()
+        self._about.content = f'<div style="{_ABOUT}">{organ.summary()}</div>'
         self._look.value = GLASS if organ.structures else WHOLE
         self._colour.value = DISPLACEMENT
+        self._no_preset()
         for slider in self._sliders.values():
             slider.remove()
         self._sliders = {}
@@ -91,6 +93,9 @@ class OrganTab:
 
     def show_material(self, values: dict[str, float]) -> None:
         """Set the sliders to the values in force, by coordinate [SI]."""
+        preset, young = PRESETS.get(self._preset.value), values.get("young")
+        if young is not None and preset is not None and preset.young_modulus != young:
+            self._no_preset()
         for name, value in values.items():
             if name in self._sliders:
                 slider = self._sliders[name]
@@ -100,9 +105,12 @@ class OrganTab:
     def _on_slider(self, name: str, unit: float, bounds: tuple[float, float], event: Any) -> None:
         if event.client is None:  # not moved by a user, but by show_material
             return
-        self._preset.value = _NO_PRESET
-        self._source.content = ""
+        self._no_preset()
         self._actions.material({name: float(np.clip(event.target.value * unit, *bounds))})
+
+    def _no_preset(self) -> None:
+        """The material is that of no source."""
+        self._preset.value, self._source.content = _NO_PRESET, ""
 
     def _on_preset(self, event: Any) -> None:
         if event.client is None or self._organ is None or event.target.value == _NO_PRESET:

@@ -35,15 +35,15 @@ class ScanTab:
             file = self._files.value
             self._actions.scan("" if file == NONE else file)
 
-    def show_scan(self, scan: Scan | None) -> None:
-        """Controls of an image; None for no image."""
+    def show_scan(self, scan: Scan | None, file: str) -> None:
+        """Controls of the image of a file; None while none is drawn."""
         for slider in self._sliders:
             slider.remove()
         self._sliders = []
         self._controls.visible = scan is not None
+        if self._files.value != (file or NONE):
+            self._files.value = file or NONE
         if scan is None:
-            if self._files.value != NONE:
-                self._files.value = NONE
             return
         gui = self._gui
         with self._controls:
