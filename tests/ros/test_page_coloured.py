@@ -29,7 +29,7 @@ class Shown:
     def __init__(self, parameter: str = "") -> None:
         self.parameter, self.painted, self.said = parameter, [], []
         self.view: Any = SimpleNamespace(
-            top=1e-3, field_top=0.5, opacity=1.0, paint=self.painted.append
+            top=1e-3, field_top=0.5, opacity=1.0, paint=self.painted.append, is_reach_marked=False
         )
         cube = organ("cube").with_certificate(Certificate.unknown())
         self.organ = Organ.of(cube)
@@ -121,3 +121,10 @@ def test_errors_of_the_last_organ_are_not_painted_on_the_next(
     monkeypatch.setattr("avatar_ros.ui.coloured.force_error_at", slow)
     page.coloured.choose(ERROR)
     assert page.painted == []
+
+
+def test_a_pattern_is_in_the_legend_while_it_is_drawn(known: str) -> None:
+    page = Shown(known)
+    assert "access" not in page.coloured.legend()
+    page.view.is_reach_marked = True
+    assert "</span>access" in page.coloured.legend()

@@ -122,9 +122,12 @@ def test_a_drag_is_felt_and_the_surface_gives_way(page: Any, shown: Organ, shots
     until(page, lambda: force_of(page) == 0.0, "the organ left")
 
 
-def test_a_page_of_another_site_in_the_same_browser_is_refused(page: Any, port: int) -> None:
+def test_a_page_of_another_site_in_the_same_browser_is_refused(
+    page: Any, port: int, folder: Path
+) -> None:
     """On another port of this machine, to which the browser sends this page's cookie as well."""
     handler = partial(SimpleHTTPRequestHandler, directory="/dev/null")
+    before = sorted(folder.iterdir())
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as site:
         Thread(target=site.serve_forever, daemon=True).start()
         other = page.context.new_page()
@@ -132,14 +135,17 @@ def test_a_page_of_another_site_in_the_same_browser_is_refused(page: Any, port: 
         answer = other.evaluate(
             """([port, version]) => new Promise(done => {
                 const socket = new WebSocket(`ws://127.0.0.1:${port}`, [version]);
-                socket.onopen = () => done("open");
+                socket.onopen = () => {  // then whatever it can send
+                    for (let n = 0; n < 200; n++) socket.send(new Uint8Array([n]));
+                    done("open");
+                };
                 socket.onerror = () => done("refused");
             })""",
             [port, f"viser-v{viser.__version__}"],
         )
         other.close()
         site.shutdown()
-    assert answer == "refused"
+    assert answer == "refused" and sorted(folder.iterdir()) == before
     assert "All nodes answer" in page.inner_text("body")
 
 

@@ -48,7 +48,8 @@ class Coloured:
         else:
             scale = (view.field_top, _LEGENDS[self._field], 1e-2)
         organ = self._chosen.organ
-        return legend.legend(*scale, view.opacity, organ is not None and bool(organ.sprung.any()))
+        has_springs = organ is not None and bool(organ.sprung.any())
+        return legend.legend(*scale, view.opacity, has_springs, view.is_reach_marked)
 
     def choose(self, field: str) -> None:
         """Colour by one of ``FIELDS``."""

@@ -24,11 +24,12 @@ def legend(
     unit: float = 1e-3,
     opacity: float = 1.0,
     has_springs: bool = False,
+    has_access: bool = False,
 ) -> str:
     """The bands with the values at their edges, and what patterns mean, as HTML.
 
     top : end of the scale; unit : one shown unit, both in SI
-    has_springs : of the organ, which are named then
+    has_springs, has_access : these are marked, too
     opacity : of the organ, so that both look alike before the same ground
     """
     is_everywhere = what != DISPLACEMENT  # where tools reach, from the first band on
@@ -44,6 +45,7 @@ def legend(
         f'<div id="colour-bar" role="img" aria-label="colour scale of {what}, 0 to '
         f'{top / unit:g}" style="margin:0 1em;font-size:12px">{what}; {tissue}'
         f"{key_of_clamp()}{key_of_springs() if has_springs else ''}"
+        f"{key_of_access() if has_access else ''}"
         f'<div style="height:12px;opacity:{opacity:g};'
         f'background:linear-gradient(to right, {stops})"></div>'
         f'<div style="display:flex;justify-content:space-between">{ticks}</div></div>'

@@ -155,11 +155,12 @@ class SurfaceView:
     """Draws the surface into a viser server, more smoothly than it is given.
 
     root : name of the node above all of its meshes
+    is_reach_marked : a pattern is drawn where tools reach
     """
 
     def __init__(self, server: viser.ViserServer, root: str = "/organ") -> None:
         self._server, self._root = server, root
-        self._is_reach_marked = False
+        self.is_reach_marked = False
         self._known: np.ndarray | None = None  # faces on which another field is known
         self._nodes: dict[tuple[str, int], Any] = {}
         self._faces = np.empty((0, 3), int)
@@ -193,8 +194,8 @@ class SurfaceView:
 
     def mark_reach(self, wanted: bool) -> None:
         """Draw a pattern where tools reach, or none."""
-        if wanted != self._is_reach_marked:
-            self._is_reach_marked = wanted
+        if wanted != self.is_reach_marked:
+            self.is_reach_marked = wanted
             if len(self._faces):
                 self._make()
 
@@ -216,7 +217,7 @@ class SurfaceView:
             self._faces,
             self._light,
             self._plane,
-            self._marks._replace(accessible=self._marks.accessible & self._is_reach_marked),
+            self._marks._replace(accessible=self._marks.accessible & self.is_reach_marked),
         )
         tissue = np.vstack([tissue_colours(), *CLAMP, SPRINGS, ACCESS])  # as the numbers of shades
         groups = {"tissue": tissue, "rim": tissue, "bands": self._band_colours()}

@@ -135,6 +135,11 @@ class OrganView:
         rest = np.hstack([organ.vertices, np.zeros_like(organ.vertices)])
         self.move(rest if drawn is None else drawn, np.zeros(3), np.zeros(3))
 
+    @property
+    def is_reach_marked(self) -> bool:
+        """Whether a pattern is drawn where tools reach."""
+        return self._surface.is_reach_marked
+
     def mark_reach(self, wanted: bool) -> None:
         """Draw a pattern where tools reach, or none."""
         self._surface.mark_reach(wanted)
