@@ -121,15 +121,15 @@ def _draw_organ(figure, vademecum: Vademecum, cloud: np.ndarray, tip: np.ndarray
     scale = ScalarMappable(Normalize(0.0, moved.max()), "viridis")
     color = scale.to_rgba(moved)
     color[:, :3] *= (0.55 + 0.45 * np.clip(light @ np.array([-0.4, 0.75, 0.5]), 0, 1))[:, None]
-    # radiological view: the patient's right is on the viewer's left
-    flat = np.stack([-corner[front, :, 0], corner[front, :, 2]], axis=2) * 1e3
+    flat = np.stack([corner[front, :, 0], corner[front, :, 2]], axis=2) * 1e3
     axes.add_collection(
         PolyCollection(list(flat), facecolors=color, edgecolors="face", linewidths=0.2)
     )
-    axes.plot(-tip[0] * 1e3, tip[2] * 1e3, "o", ms=9, mfc="none", mec="crimson", mew=2)
+    axes.plot(tip[0] * 1e3, tip[2] * 1e3, "o", ms=9, mfc="none", mec="crimson", mew=2)
     axes.autoscale_view()
+    axes.invert_xaxis()  # radiological view: the patient's right is on the viewer's left
     axes.set_aspect("equal")
-    axes.set_xlabel("patient right  <-  x [mm]  ->  left")
+    axes.set_xlabel("patient's right    x [mm]    patient's left")
     axes.set_ylabel("z, superior [mm]")
     axes.set_title(f"{vademecum.name}: deformed organ, tool tip circled")
     figure.colorbar(scale, ax=axes, label="displacement [mm]", shrink=0.8)

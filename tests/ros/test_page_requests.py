@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from threading import Thread
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -94,3 +95,28 @@ def test_the_end_of_a_build_is_heard_however_early_the_goal_is_accepted(until_bu
     results: list[Any] = []
     until_built(results)
     assert [result.file for result in results] == ["case.h5"]
+
+
+class Silent:
+    """A client of a node that ends before it answers."""
+
+    def __init__(self) -> None:
+        self.asked: list[float] = []
+
+    def service_is_ready(self) -> bool:
+        return True
+
+    def call_async(self, request: Any) -> Any:
+        self.asked.append(request.parameters[0].value.double_value)
+        return SimpleNamespace(add_done_callback=lambda answered: None)
+
+
+def test_a_contact_node_that_starts_again_is_asked_again() -> None:
+    silent, requests = Silent(), Requests.__new__(Requests)  # without a node
+    requests.__dict__ |= {"_set": silent, "_waiting": {}, "_setting": False}
+    for young in (1e3, 2e3, 3e3):
+        requests.set_material({"young": young}, print)
+    assert silent.asked == [1e3]  # the others wait for its answer
+    requests.contact_started()
+    requests.set_material({"young": 4e3}, print)
+    assert silent.asked == [1e3, 4e3]
