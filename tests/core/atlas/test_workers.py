@@ -154,7 +154,7 @@ def test_without_dask_the_extra_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     workers = Workers(scheduler="tcp://127.0.0.1:1")
-    with pytest.raises(AtlasError, match=r"avatar\[cluster\]"):
+    with pytest.raises(AtlasError, match=r"\.\[cluster\]"):
         create_atlas(tmp_path / "a.h5", livers[:1], OPTIONS, template=template, workers=workers)
     assert not any(tmp_path.iterdir())
 

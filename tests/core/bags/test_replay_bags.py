@@ -484,5 +484,5 @@ def test_without_the_extra(
         lambda: read_bag(whole),
         lambda: export(recorded(organ, ()), tmp_path / "a.mcap"),
     ):
-        with pytest.raises(StorageError, match=r"pip install 'avatar\[bags\]'"):
+        with pytest.raises(StorageError, match=r"pip install '\.\[bags\]'"):
             needs()
