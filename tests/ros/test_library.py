@@ -122,6 +122,20 @@ def test_nothing_but_a_vademecum_is_replaced(shelf: Path, library: Path) -> None
     reader.close()
 
 
+def test_two_labels_of_one_file_are_two_patients(shelf: Path) -> None:
+    settings: Any = SimpleNamespace(library_dir=str(shelf), max_bytes=1 << 20)
+    written = set()
+    for file, label in (("1.2.17.nii", "1"), ("1.2.17.nii", "2"), ("1.2.18.nii", "a/b")):
+        (shelf / file).write_bytes(b"#")
+        request = InterpolatePatient.Request(surface=file, label=label)
+        written.add(Path(patient_request(request, settings).output).name)
+    assert written == {
+        "1.2.17-1-interpolated.h5",
+        "1.2.17-2-interpolated.h5",
+        "1.2.18-a_b-interpolated.h5",
+    }
+
+
 def test_a_large_mesh_is_refused_before_it_is_copied(
     shelf: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

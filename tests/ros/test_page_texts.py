@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields, replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,10 +13,15 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+pytest.importorskip("viser", reason="the extra ui is not installed")
 
+from avatar_ros.framework.templates import stamp_bytes
 from avatar_ros.loop.statuses import EXPLANATIONS
+from avatar_ros.nodes.planning_ui import PlanningNode
 from avatar_ros.ui.alerts import alerts
+from avatar_ros.ui.library import Library
 from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.panels import Panels
 from avatar_ros.ui.recorder import Recorder
 from avatar_ros.ui.shown_period import BEYOND, OTHER_ORGAN, SILENT, PeriodChooser, ShownPeriod
 from avatar_ros.ui.texts import frame_text, recorded_text, warnings
@@ -117,6 +124,29 @@ def test_what_is_not_known_is_not_zero(missing: str) -> None:
     assert np.isnan(now.size)
 
 
+def test_a_cloud_of_another_organ_is_not_drawn() -> None:
+    """The contact node still uses the last patient, whose cloud may have as many points."""
+    state, drawn, greys = SharedToolState.make(), [], []
+    stamp = stamp_bytes(5)
+    page: Any = SimpleNamespace(
+        _state=state,
+        _cloud=SimpleNamespace(take=lambda: (stamp, np.ones((4, 6), np.float32))),
+        _view=SimpleNamespace(move=lambda *given: drawn.append(given) or 1e-3, grey=greys.append),
+        _recorder=SimpleNamespace(is_on=False),
+        _periods=PeriodChooser(),
+        _answers=lambda: True,
+        _number=organ_number("b" * 64),
+    )
+    page._without_force = lambda *given: PlanningNode._without_force(page, *given)
+    state.recent[0], state.live["n_recent"][0] = row(OK, 3.0, stamp=5), 1
+    for identity, missing in (("a" * 64, OTHER_ORGAN), ("", OTHER_ORGAN), ("b" * 64, "")):
+        state.recent["organ"][0] = organ_number(identity)
+        found = PlanningNode._period_to_show(page)
+        assert found.missing == missing
+    assert len(drawn) == 1 and greys == [True, True, False]
+    assert found.size == 3.0 and found.largest == 1e-3
+
+
 def test_an_error_that_was_never_measured_is_not_zero() -> None:
     chooser, pressed = PeriodChooser(), row(OK, 12.0)
     pressed["error"] = np.nan
@@ -129,6 +159,19 @@ def test_a_name_is_no_html() -> None:
     """Anybody may have named an organ, and a page that ran it would move the tool for them."""
     named = replace(Organ.of(organ("cube")), name="<img src=x onerror=alert(1)>")
     assert "<img" not in named.summary() and "&lt;img" in named.summary()
+    page: Any = SimpleNamespace(_banner=SimpleNamespace(content=""))
+    Panels.show_alerts(page, [f"Image {named.name}"])
+    assert "<img" not in page._banner.content and "&lt;img" in page._banner.content
+
+
+def test_a_library_that_is_gone_is_said_and_ends_nothing(tmp_path: Path) -> None:
+    said: list[str] = []
+    panels = SimpleNamespace(offer=lambda *names: None)
+    page: Any = SimpleNamespace(
+        _library=Library(tmp_path / "gone"), _say=said.append, _panels=panels
+    )
+    PlanningNode._offer_files(page)
+    assert said == ["the library cannot be read: No such file or directory"]
 
 
 def test_a_recording_ends_where_nothing_more_is_kept() -> None:
@@ -140,6 +183,9 @@ def test_a_recording_ends_where_nothing_more_is_kept() -> None:
     assert recorder.is_full
     recorder.drop()
     assert not recorder.is_full
+    state.live["n_rows"][0], state.live["recording"][0] = 0, 1
+    recorder._clouds = 3 * [np.broadcast_to(np.float32(0.0), (100_000_000, 1))]
+    assert recorder.is_full
 
 
 def test_organs_are_told_apart_by_their_ids() -> None:

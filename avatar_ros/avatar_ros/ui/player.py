@@ -118,7 +118,7 @@ class Player:
         """Numbers of a cloud, or of the last valid one."""
         periods, valid, placed = recording.periods, int(self._valid[k]), int(self._placed[k])
         tip = periods.tip[self._rows[placed], 0] if placed >= 0 else np.full(3, PLACE)
-        row = self._rows[valid]
+        row = self._rows[valid]  # any, where none is valid
         force = periods.force[row, 0]
         if valid < 0 or (valid < k and not force.any()):
             return ShownPeriod.without_force(tip, BEYOND)
