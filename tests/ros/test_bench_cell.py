@@ -66,6 +66,7 @@ def test_the_cell_keeps_time(library: Path, tmp_path: Path) -> None:
         if run is None:
             continue
         assert on_time(run)
+        assert 0.0 < run.bare_work_on_time_fraction <= 1.0
         assert run.material_changes == 0
         assert run.answered_fraction > 0.9
         assert run.latency.p50_ms < 1.0

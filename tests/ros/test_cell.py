@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
+from avatar_ros.bench import bare_loop
 from avatar_ros.framework import promises, qos
-from avatar_ros.framework.realtime import wake_up_periods
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
@@ -211,7 +211,7 @@ def test_the_loop_keeps_its_rate_without_poses(cell: Any, probe: Any) -> None:
         assert not passed, f"{windows[-1].rate:.0f} Hz, {least:.0f} Hz at least"
         probe.until(lambda: bool(windows), START_TIMEOUT)
         windows.clear()
-        slept = wake_up_periods(1.2)  # of a loop that only sleeps, meanwhile
+        slept = bare_loop.periods(1.2)  # of a loop that only sleeps, meanwhile
         # The design rate is 1000 Hz; the bound only tells a working loop from a broken one, since
         # these tests share their cores with whatever else runs: of the time that the machine left
         # to the loop that sleeps. `avatar bench cell` measures it.

@@ -2,8 +2,10 @@
 
 The cell consists of loader, contact node, a palpating tool, a cloud viewer and, on request, a
 slider of the material. A loop that only sleeps runs beside it and shows which periods the machine
-itself misses. The memory, files and threads of every process are compared between begin and end,
-so a run of ten minutes is a soak test. ``avatar bench cell`` and ``avatar demo`` run it as
+itself misses. After it, alone, runs one that also computes as long as the contact node does: any
+program that does as much misses what this one misses. The memory, files and threads of every
+process are compared between begin and end, so a run of ten minutes is a soak test.
+``avatar bench cell`` and ``avatar demo`` run it as
 ``python -m avatar_ros.bench.cell VADEMECUM SECONDS``.
 """
 
@@ -39,6 +41,7 @@ PRIORITY = 80  # of contact node, tool and sleeping loop in the real-time mode
 _START_TIMEOUT = 120.0  # compilation included [s]
 _WARM = 0.1  # part of a run before the first comparison of the processes
 _LAST = 1.5  # before the end, while the tool still runs, for the second one [s]
+_ALONE = 20.0  # longest run of the loop that works alone [s]
 _STOP_TIMEOUT = 20.0  # a node ends within 2 s, but not where it gets a tenth of a core [s]
 _DOMAINS = range(1, 102)  # of DDS, those that work on every platform
 
@@ -112,9 +115,9 @@ def _measure(
             if changes > 0.0:
                 of_slider = [str(path), str(changes), str(count_file)]
                 slider = Module("bench.material_slider", of_slider, environment)
-            floor = Module("framework.realtime", [str(seconds), str(priority)], environment)
+            floor = Module("bench.bare_loop", [str(seconds), str(priority)], environment)
             grown = _growths(seconds, processes | {"cloud_viewer": viewer, "scripted_tool": tool})
-            bare, _ = floor.communicate(timeout=seconds + _START_TIMEOUT)
+            slept = _periods(floor, seconds)
             if tool.wait(timeout=seconds + _START_TIMEOUT) != 0:
                 raise CellError(f"the tool failed: {tool.last_line()}")
         finally:
@@ -126,7 +129,33 @@ def _measure(
         accepted = 0 if slider is None else json.loads(count_file.read_text())["accepted"]
         round_trips = RoundTrips.load(trips_file)
         view = json.loads(view_file.read_text())
-        return _evaluate(round_trips, view, json.loads(bare), load, accepted, grown)
+    windows = _windows(round_trips, view)
+    shortly = min(seconds, _ALONE)
+    work = str(float(np.mean([w["compute_mean"] for w in windows])))
+    alone = Module("bench.bare_loop", [str(shortly), str(priority), work], isolated_environment())
+    bare = slept, _periods(alone, shortly)
+    return _evaluate(round_trips, view, windows, bare, load, accepted, grown)
+
+
+def _periods(loop: Module, seconds: float) -> np.ndarray:
+    """What a bare loop printed [s]."""
+    said, _ = loop.communicate(timeout=seconds + _START_TIMEOUT)
+    if loop.returncode != 0:
+        raise CellError(f"the bare loop failed: {loop.last_line()}")
+    return np.array(json.loads(said)["periods"])
+
+
+def _windows(round_trips: RoundTrips, view: dict[str, Any]) -> list[dict[str, Any]]:
+    """The contact node's statistics of the measured part."""
+    begin, end = float(round_trips.begin), float(round_trips.end)
+    found = [
+        w
+        for w in view["statistics"]
+        if begin <= w["received"] - w["window"] and w["received"] <= end
+    ]
+    if not found:
+        raise CellError("no statistics from the contact node: measure for 3 s or longer")
+    return found
 
 
 def _growths(seconds: float, processes: dict[str, Module]) -> tuple[Growth, ...]:
@@ -147,23 +176,17 @@ def _growths(seconds: float, processes: dict[str, Module]) -> tuple[Growth, ...]
 def _evaluate(
     round_trips: RoundTrips,
     view: dict[str, Any],
-    bare: dict[str, Any],
+    windows: list[dict[str, Any]],
+    bare: tuple[np.ndarray, np.ndarray],
     load: float,
     accepted: int,
     grown: tuple[Growth, ...],
 ) -> CellMeasurement:
     begin, end = float(round_trips.begin), float(round_trips.end)
-    windows = [
-        w
-        for w in view["statistics"]
-        if begin <= w["received"] - w["window"] and w["received"] <= end
-    ]
-    if not windows:
-        raise CellError("no statistics from the contact node: measure for 3 s or longer")
     periods = sum(w["periods"] for w in windows)
     duration = end - begin
     clouds = [n for at, n in view["clouds"].items() if begin < int(at) < end - 1.0]
-    floor = np.array(bare["periods"])
+    slept, worked = bare
     at_tool = np.diff(round_trips.arrivals)
     answered = round_trips.latencies[np.isfinite(round_trips.latencies)]
     return CellMeasurement(
@@ -178,8 +201,9 @@ def _evaluate(
         latency=Times.of(answered),
         answered_fraction=len(answered) / len(round_trips.latencies),
         compute_p99_ms=1e3 * max(w["compute_p99"] for w in windows),
-        floor=Times.of(floor),
-        floor_on_time_fraction=float(np.mean(floor <= ON_TIME)),
+        floor=Times.of(slept),
+        floor_on_time_fraction=float(np.mean(slept <= ON_TIME)),
+        bare_work_on_time_fraction=float(np.mean(worked <= ON_TIME)),
         cloud_hz=float(np.mean(clouds)) if clouds else 0.0,
         cloud_bytes=view["cloud_bytes"],
         material_changes=accepted,

@@ -43,6 +43,7 @@ class CellMeasurement:
     answered_fraction : poses that got a wrench of their own
     compute_p99_ms : worst second of the contact node, from pose in hand to wrench published
     floor : periods of the sleeping loop in the same seconds
+    bare_work_on_time_fraction : of a loop that computes as long as the contact node, alone
     cloud_hz, cloud_bytes : what the viewer got
     material_changes : that the contact node accepted in the run
     force_max_n : largest force on the tool
@@ -63,6 +64,7 @@ class CellMeasurement:
     compute_p99_ms: float
     floor: Times
     floor_on_time_fraction: float
+    bare_work_on_time_fraction: float
     cloud_hz: float
     cloud_bytes: int
     material_changes: int
@@ -148,6 +150,7 @@ _ROWS = (
     ("  computing, worst p99 [ms]", lambda run: f"{run.compute_p99_ms:.3f}"),
     ("bare sleep p50 p99 max [ms]", lambda run: _times(run.floor)),
     ("  periods <= 1.5 ms", lambda run: f"{run.floor_on_time_fraction:.3%}"),
+    ("bare work alone, <= 1.5 ms", lambda run: f"{run.bare_work_on_time_fraction:.3%}"),
     ("clouds at the viewer [Hz]", lambda run: f"{run.cloud_hz:.1f}"),
     ("  bytes each", lambda run: f"{run.cloud_bytes}"),
     ("changes of the material", lambda run: f"{run.material_changes}"),

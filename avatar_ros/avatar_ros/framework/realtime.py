@@ -5,10 +5,8 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import gc
-import json
 import os
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -123,17 +121,6 @@ def sleep_until(deadline: int) -> None:
         pass  # interrupted by a signal
 
 
-def wake_up_periods(seconds: float, period: float = 1e-3) -> np.ndarray:
-    """Periods of a loop that only sleeps, the best this machine can do; shape (n,) [s]."""
-    step = round(period * 1e9)
-    wakes = np.empty(max(2, round(seconds / period)), dtype=np.int64)
-    start = time.monotonic_ns()
-    for i in range(len(wakes)):
-        sleep_until(start + (i + 1) * step)
-        wakes[i] = time.monotonic_ns()
-    return np.diff(wakes) * 1e-9
-
-
 def prefault(pages: np.ndarray) -> None:
     """Map every page of ``pages`` now, without holding the global lock, not at first use."""
     page = os.sysconf("SC_PAGESIZE")
@@ -150,18 +137,3 @@ def die_with_parent(signal_number: int) -> None:
 
 def _threads() -> list[int]:
     return [int(task.name) for task in Path("/proc/self/task").iterdir()]
-
-
-def main() -> int:
-    """Print this machine's wake-up periods as JSON: ``-m ...realtime SECONDS PRIORITY``."""
-    seconds, priority = float(sys.argv[1]), int(sys.argv[2])
-    granted = claim(priority)
-    bind_thread(-1)
-    tune_interpreter()
-    periods = wake_up_periods(seconds)
-    print(json.dumps({"priority": granted.priority, "periods": periods.tolist()}))
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

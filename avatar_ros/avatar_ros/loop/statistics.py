@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from avatar_ros.msg import LoopStatistics
@@ -58,23 +60,21 @@ class TimingRecord:
 
 def statistics(record: TimingRecord, end: int) -> LoopStatistics:
     """Summary of a record that ended at ``end`` [ns]."""
-    periods = record.periods[: record.n_periods] * 1e-9
-    computes = record.computes[: record.n_steps] * 1e-9
-    ages = record.ages[: record.n_ages] * 1e-9
     window = (end - record.begin) * 1e-9
-    period_p50, period_p99, period_max = _percentiles(periods)
+    computes = record.computes[: record.n_steps]
+    period_p50, period_p99, period_max = _percentiles(record.periods[: record.n_periods])
     compute_p50, compute_p99, compute_max = _percentiles(computes)
-    age_p50, age_p99, _ = _percentiles(ages)
-    model_p50, model_p99, _ = _percentiles(record.models[: record.n_models] * 1e-9)
+    age_p50, age_p99, _ = _percentiles(record.ages[: record.n_ages])
+    model_p50, model_p99, _ = _percentiles(record.models[: record.n_models])
     return LoopStatistics(
         window=window,
-        rate=len(periods) / window,
-        periods=len(periods),
+        rate=record.n_periods / window,
+        periods=record.n_periods,
         missed=record.n_missed,
         period_p50=period_p50,
         period_p99=period_p99,
         period_max=period_max,
-        compute_mean=float(computes.mean()) if len(computes) else np.nan,
+        compute_mean=1e-9 * float(computes.mean()) if len(computes) else np.nan,
         compute_p50=compute_p50,
         compute_p99=compute_p99,
         compute_max=compute_max,
@@ -85,9 +85,14 @@ def statistics(record: TimingRecord, end: int) -> LoopStatistics:
     )
 
 
-def _percentiles(values: np.ndarray) -> tuple[float, float, float]:
-    """Median, 99th percentile and maximum; NaN of nothing."""
-    if len(values) == 0:
-        return (np.nan, np.nan, np.nan)
-    p50, p99, largest = np.percentile(values, (50, 99, 100))
-    return float(p50), float(p99), float(largest)
+def _percentiles(times: np.ndarray) -> tuple[float, float, float]:
+    """Median, 99th percentile and maximum of times [ns], by nearest rank [s]; NaN of none.
+
+    A tenth of the time of ``numpy.percentile``, which would hold the loop up by as much.
+    """
+    n = len(times)
+    if n == 0:
+        return (math.nan, math.nan, math.nan)
+    ordered = np.sort(times)
+    p50, p99 = (1e-9 * int(ordered[math.ceil(part * n) - 1]) for part in (0.5, 0.99))
+    return p50, p99, 1e-9 * int(ordered[-1])

@@ -1,4 +1,8 @@
-"""What the contact node reports once a second: statistics, diagnostics, and lines in the log."""
+"""What the contact node reports once a second: statistics, diagnostics, and lines in the log.
+
+The loop waits for Python's global lock while a report is made. Between the parts of a report the
+lock is left to the loop, so that none of its periods waits for two of them.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,8 @@ from avatar_ros.msg import LoopStatistics
 REPORT_PERIOD = 1.0  # [s]
 _COUNT_PERIOD = 0.1  # between two counts of who is connected; with each report, if nobody was [s]
 _MINUTE = 60.0  # [s]
+_PAUSE = 0.005  # between two parts of a report [s]
+_COLLECTED = 10  # reports between two collections of garbage
 
 
 class ContactReports:
@@ -47,6 +53,7 @@ class ContactReports:
         self._logged: dict[str, str] = {}  # last fault, by tool
         self._shown_modes_log = ShownModesLog(node)
         self._timers: list[Timer] = []  # of the reports, and of the counts between them
+        self._n_reports = 0
 
     def start(self) -> None:
         """Report and count until :meth:`stop`."""
@@ -86,8 +93,12 @@ class ContactReports:
         shown_modes = loop.active.shown_modes
         report = shown_modes.update(window, self._is_watched()) if shown_modes is not None else None
         self._publishers.statistics.publish(window)
+        time.sleep(_PAUSE)
         self._publish_diagnostics(window, record.nominal_rate, report)
-        gc.collect()  # the loop's process does it nowhere else
+        self._n_reports += 1
+        if self._n_reports % _COLLECTED == 0:
+            time.sleep(_PAUSE)
+            gc.collect()  # the loop's process does it nowhere else
 
     def _is_watched(self) -> bool:
         """Whether a tool touches the organ, or somebody receives the cloud."""
@@ -102,10 +113,12 @@ class ContactReports:
         name = node.get_fully_qualified_name()
         limits = {p.name: node.get_parameter(p.name).value for p in THRESHOLDS}
         promise = active.shown_modes.promise if active.shown_modes is not None else ""
+        mismatches = self._ports.mismatches()
+        time.sleep(_PAUSE)
         statuses = [
             diagnostics.loop_status(name, window, nominal, limits),
             diagnostics.vademecum_status(name, active.id, promise),
-            diagnostics.qos_status(name, self._ports.mismatches()),
+            diagnostics.qos_status(name, mismatches),
         ]
         if report is not None:
             self._shown_modes_log.note(report)
