@@ -309,6 +309,7 @@ class PlanningNode(ManagedNode):
             return
         if self._frame % _CUT_FRAMES == 0:
             self._chosen.settle()
+            self._scan.follow(organ, self._view.points)
         if self._recorder.is_full:
             self._recordings.stop("no more is kept of one recording")
         self._band.take()

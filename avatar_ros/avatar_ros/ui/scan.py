@@ -12,6 +12,7 @@ import numpy as np
 
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.label_files import read_label_map
+from avatar_ros.ui.scan_dicom import read_series
 
 MOST = 256  # voxels that are kept along an axis, evenly
 _AIR = -500.0  # an image that goes below is CT in Hounsfield units
@@ -59,15 +60,12 @@ class Slice(NamedTuple):
 
 
 def read_scan(path: str | Path) -> Scan:
-    """The image of a NIfTI or NRRD file.
+    """The image of a NIfTI, NRRD or DICOM file, or of a folder with a series of DICOM.
 
     Raises SurfaceError of a file that is none, holds several images, or whose axes are sheared.
     """
     path = Path(path)
-    found = read_label_map(path)
-    if len(found.values) != 1:
-        raise SurfaceError(f"{path.name}: {len(found.values)} layers; give one image")
-    values, affine = found.values[0], found.affine.copy()
+    values, affine = _read(path)
     step = np.maximum(-(-np.array(values.shape) // MOST), 1)
     values = values[:: step[0], :: step[1], :: step[2]]
     kind = np.int16 if np.can_cast(values.dtype, np.int16) else np.float32
@@ -84,6 +82,16 @@ def read_scan(path: str | Path) -> Scan:
     if not light > dark:
         dark, light = low, max(high, low + 1.0)
     return Scan(values, affine, float(dark + light) / 2.0, float(light - dark), low, high)
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Voxels (nx, ny, nz), and where they lie in RAS [mm]."""
+    if path.is_dir() or path.suffix.lower() == ".dcm":
+        return read_series(path)
+    found = read_label_map(path)
+    if len(found.values) != 1:
+        raise SurfaceError(f"{path.name}: {len(found.values)} layers; give one image")
+    return found.values[0], found.affine.copy()
 
 
 def slice_of(scan: Scan, axis: int, part: float, level: float, window: float) -> Slice:

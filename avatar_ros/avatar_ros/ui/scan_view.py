@@ -1,4 +1,7 @@
-"""An image in three planes: which file, where the planes lie, and how they are drawn."""
+"""An image in three planes: which file, where the planes lie, and how they are drawn.
+
+The image stays as it was taken. Lines show where its planes cut the organ and what is in it now.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,16 @@ from scipy.spatial.transform import Rotation
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.label_files import MAX_LABEL_BYTES
 from avatar_ros.framework.reader import Reader
-from avatar_ros.ui.scan import Scan, read_scan, slice_of
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.scan import Scan, Slice, read_scan, slice_of
+from avatar_ros.ui.structures_view import STRUCTURE
+from avatar_ros.ui.surface_view import section
 from avatar_ros.ui.tabs.scan import ScanTab
 
 _MIDDLE = 0.5
+ORGAN_LINE = (86, 180, 233)  # sky blue of Okabe and Ito, distinguishable on grey
+_LINE_WIDTH = 2.0  # [px]
+_IN_FRONT = 0.3e-3  # of the plane, on both sides, so that it does not hide its lines [m]
 
 
 class ScanView:
@@ -40,6 +49,9 @@ class ScanView:
         self._parts = [_MIDDLE] * 3
         self._grey = (0.0, 1.0)
         self._planes: list[Any] = []
+        self._slices: list[Slice] = []  # that are drawn
+        self._lines: dict[int, Any] = {}
+        self._followed: np.ndarray | None = None  # points whose lines are drawn
 
     def choose(self, file: str) -> None:
         """Show the image of a file; an empty name shows none."""
@@ -54,7 +66,7 @@ class ScanView:
         if file != self._file:  # another was chosen meanwhile, or another organ has come
             return
         if scan is None:
-            self.forget()
+            self._clear("")
             return
         self._scan, self._parts = scan, [_MIDDLE] * 3
         self._grey = (scan.level, scan.window)
@@ -62,15 +74,16 @@ class ScanView:
         self._draw(range(3))
 
     def forget(self) -> None:
-        """Another organ is shown, or none of the planes is wanted."""
+        """Another organ is shown. Of the thread that draws the organ, as ``follow``."""
         self._clear("")
+        self._remove_lines()
 
     def _clear(self, wanted: str) -> None:
         """Remove the planes before a file is shown, or none."""
         self._scan, self._file = None, wanted
         for plane in self._planes:
             plane.remove()
-        self._planes = []
+        self._planes, self._slices, self._followed = [], [], None
         self._tab().show_scan(None, wanted)
 
     @property
@@ -79,6 +92,39 @@ class ScanView:
         if self._scan is None:
             return []
         return [f"Image {self._file}: check that it is of this patient; it does not move"]
+
+    def follow(self, organ: Organ, points: np.ndarray) -> None:
+        """Draw where the planes cut the organ and its structures, moved to points (n, 3) [m]."""
+        slices = list(self._slices)
+        if len(slices) < 3:
+            self._remove_lines()
+            return
+        if self._followed is not None and np.array_equal(points, self._followed):
+            return
+        self._followed = points
+        bodies = [(organ.faces, ORGAN_LINE)]
+        bodies += [(faces, STRUCTURE) for faces in organ.structures.values()]
+        with self._server.atomic():
+            for number, (faces, colour) in enumerate(bodies):
+                self._draw_lines(number, _cuts(points, faces, slices), colour)
+
+    def _remove_lines(self) -> None:
+        for lines in self._lines.values():
+            lines.remove()
+        self._lines = {}
+
+    def _draw_lines(self, number: int, segments: np.ndarray, colour: tuple[int, int, int]) -> None:
+        held = self._lines.get(number)
+        if held is not None:
+            held.points = segments
+            return
+        self._lines[number] = self._server.scene.add_line_segments(
+            f"/organ/cuts/{number}",
+            segments,
+            colour,
+            thickness=_LINE_WIDTH,
+            thickness_units="screen",
+        )
 
     def place(self, axis: int, part: float) -> None:
         """Move a plane along its axis of the voxels, to a part of the way."""
@@ -97,6 +143,7 @@ class ScanView:
         with self._server.atomic():
             for axis in axes:
                 found = slice_of(scan, axis, self._parts[axis], *self._grey)
+                self._slices[axis : axis + 1] = [found]
                 image = np.repeat(found.grey[:, :, None], 3, axis=2)
                 x, y, z, w = Rotation.from_matrix(found.turn).as_quat()
                 if len(self._planes) < 3:
@@ -114,3 +161,14 @@ class ScanView:
                     continue
                 self._planes[axis].image = image
                 self._planes[axis].position = tuple(found.middle)
+        self._followed = None
+
+
+def _cuts(points: np.ndarray, faces: np.ndarray, slices: list[Slice]) -> np.ndarray:
+    """Where planes cut triangles, on both sides of each plane; shape (m, 2, 3) [m]."""
+    found = []
+    for one in slices:
+        normal = one.turn[:, 2]
+        lines = section(points, (points - one.middle) @ normal, faces)
+        found += [lines + _IN_FRONT * normal, lines - _IN_FRONT * normal]
+    return np.concatenate(found).astype(np.float32)

@@ -12,7 +12,10 @@ if TYPE_CHECKING:
     from avatar_ros.ui.scan import Scan
 
 NONE = "none"
-_UNDEFORMED = "Planes stay as they were taken: they do not move with the organ."
+_UNDEFORMED = (
+    "The image stays as it was taken. Lines are where its planes cut the organ (blue) and what is "
+    "in it (orange) now."
+)
 
 
 class ScanTab:
