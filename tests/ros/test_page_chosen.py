@@ -72,7 +72,10 @@ def chosen(cell: Cell) -> Chosen:
     found = Chosen(live, cell, page)  # type: ignore[arg-type]
     up = np.array([0.0, 0.0, 1.0])
     found.organ = SimpleNamespace(  # type: ignore[assignment]
-        ranges=RANGES, outward=lambda place: up, usable=usable
+        ranges=RANGES,
+        outward=lambda place: up,
+        lifted=lambda place, clearance: place + clearance * up,
+        usable=usable,
     )
     return found
 

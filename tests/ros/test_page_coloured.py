@@ -37,7 +37,14 @@ class Shown:
         self.chosen: Any = SimpleNamespace(
             organ=self.organ, tip=Tip("sphere", 5e-3), values=lambda _: values
         )
-        self.coloured = Coloured(self.view, self.chosen, self, self.said.append)  # type: ignore[arg-type]
+        self.control: list[str] = []
+        self.coloured = Coloured(
+            self.view,
+            self.chosen,
+            self,  # type: ignore[arg-type]
+            self.said.append,
+            self.control.append,
+        )
 
     def parameters_of_contact(
         self, names: tuple[str, ...], then: Callable[[dict[str, Any]], None]
@@ -87,6 +94,7 @@ def test_what_cannot_be_shown_is_said_in_a_line(field: str, parameter: str, said
     page.coloured.choose(field)
     assert not page.painted
     assert len(page.said) == 1 and said in page.said[0] and "\n" not in page.said[0]
+    assert page.control == [DISPLACEMENT]
     assert "displacement [mm]" in page.coloured.legend()
 
 

@@ -237,3 +237,11 @@ def test_a_held_shape_is_grey_until_it_is_that_of_now(view: OrganView) -> None:
     assert {tuple(mesh.color) for mesh in bands} == {tuple(tone.material(np.array(HELD)))}
     view.grey(False)
     assert [tuple(mesh.color) for mesh in bands] == colours
+
+
+@pytest.mark.parametrize("depth", [-5e-3, 4e-3, 25e-3])
+def test_a_tool_is_lifted_off_the_organ_however_deep_it_is(depth: float) -> None:
+    """Of a cube of 200 mm, whose top is accessible."""
+    shown = Organ.of(organ("cube"))
+    lifted = shown.lifted(top("cube") - depth * UP, 0.03)
+    np.testing.assert_allclose(lifted, top("cube") + (0.03 + max(0.0, -depth)) * UP, atol=1e-6)

@@ -25,7 +25,7 @@ EXPLANATIONS: dict[int, tuple[str, str]] = {
         "lift the tool a little",
     ),
     ContactState.STATUS_OUT_OF_RANGE: (
-        "the tool is outside what the vademecum covers: too deep, or off the accessible surface",
+        "the tool is too deep for the vademecum, or off the accessible surface",
         "lift it off the organ",
     ),
     ContactState.STATUS_UNKNOWN_FRAME: (

@@ -130,7 +130,13 @@ class PlanningNode(ManagedNode):
             ),
         )
         self._view = OrganView(server, chosen.drag, self._show_cube, chosen.drag_cut)
-        self._coloured = Coloured(self._view, chosen, self._requests, self._say)
+        self._coloured = Coloured(
+            self._view,
+            chosen,
+            self._requests,
+            self._say,
+            lambda field: self._panels.organ.show_colours(field),
+        )
         self._measures = Measures(MeasuresView(server))
         server.scene.on_click()(self._click)
         self._plan = Plan(
@@ -401,6 +407,7 @@ class PlanningNode(ManagedNode):
         missing, status = self._requests.missing, self._status()
         has_organ = self._organ is not None
         self._panels.show_cell(warnings(missing, has_organ, status, self._missed))
+        self._panels.scene.show_scene(self._chosen.scene_name)
         self._offer_files()
         if self._organ is not None:
             self._driver.ensure_running(self._tool, self._frame_id)

@@ -117,8 +117,7 @@ class Chosen:
     def lift(self) -> None:
         """Move the tool off the organ."""
         if self.organ is not None:
-            target = self.target
-            self._move(target + _LIFT * self.organ.outward(target), "lift")
+            self._move(self.organ.lifted(self.target, _LIFT), "lift")
 
     def _move(self, target: np.ndarray, how: str) -> None:
         before = self.target
@@ -199,6 +198,11 @@ class Chosen:
 
         shown = name or "the scene of the contact node's start"
         self._requests.load_scene(shown, self._page.say, yaml=text, then=note)
+
+    @property
+    def scene_name(self) -> str:
+        """Of what runs now, in words."""
+        return self.scene or str(self.contact.get("scene") or "natural effects")
 
     def scene_in_force(self, organ: Organ) -> Scene:
         """The scene that reproduces what runs now; ``contact`` must be known."""

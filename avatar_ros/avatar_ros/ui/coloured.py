@@ -28,12 +28,21 @@ _NO_DISTRIBUTIONS = "nothing is said to be unknown; give contact the parameter u
 
 
 class Coloured:
-    """Chooses the field that is drawn on the organ."""
+    """Chooses the field that is drawn on the organ.
+
+    show : sets the page's control to a field
+    """
 
     def __init__(
-        self, view: OrganView, chosen: Chosen, requests: Requests, say: Callable[[str], None]
+        self,
+        view: OrganView,
+        chosen: Chosen,
+        requests: Requests,
+        say: Callable[[str], None],
+        show: Callable[[str], None],
     ) -> None:
         self._view, self._chosen, self._requests, self._say = view, chosen, requests, say
+        self._show = show
         self._field = self._wanted = DISPLACEMENT  # drawn, and asked for
 
     def forget(self) -> None:
@@ -74,10 +83,10 @@ class Coloured:
         try:
             known = self._known(organ, chosen_known(str(parameters["uncertainty"])))
         except (AvatarError, ParameterError) as error:
-            self._say(one_line(error))
+            self._refuse(one_line(error))
             return
         if all(isinstance(one, Fixed) for one in known.values()):
-            self._say(_NO_DISTRIBUTIONS)
+            self._refuse(_NO_DISTRIBUTIONS)
             return
         spread = force_spread_at(organ.vademecum, self._chosen.tip, known, organ.vertices)
         self._paint(organ, SPREAD, spread, "no tool reaches this organ")
@@ -95,7 +104,13 @@ class Coloured:
         if organ is not self._chosen.organ or field != self._wanted:  # it took its time
             return
         if not np.isfinite(values).any():
-            self._say(missing)
+            self._refuse(missing)
             return
         self._field = field
         self._view.paint(values)
+
+    def _refuse(self, reason: str) -> None:
+        """What is drawn stays, and the control says so."""
+        self._say(reason)
+        self._wanted = self._field
+        self._show(self._field)

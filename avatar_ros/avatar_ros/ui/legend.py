@@ -15,7 +15,7 @@ from avatar_ros.ui.colours import (
 DISPLACEMENT = "displacement [mm]"
 EXPECTED_ERROR = "error of the force [%]"
 SPREAD = "spread of the force [%]"
-_KEY = "display:inline-block;width:15px;height:11px;vertical-align:-1px;margin:0 3px 0 9px"
+_KEY = "display:inline-block;width:15px;height:11px;vertical-align:-1px;margin:0 2px 0 7px"
 
 
 def legend(
@@ -40,10 +40,12 @@ def legend(
         for i, shade in enumerate(shades)
     )
     ticks = "".join(f"<span>{top / unit * i / 5:g}</span>" for i in range(6))
-    tissue = "tissue: no access" if is_everywhere else f"tissue: below {top / unit / N_BANDS:g}"
+    tissue = "; tissue: no access" if is_everywhere else f"; tissue: below {top / unit / N_BANDS:g}"
+    if has_access:  # a line has room for the keys, or for this
+        tissue = ""
     return (
         f'<div id="colour-bar" role="img" aria-label="colour scale of {what}, 0 to '
-        f'{top / unit:g}" style="margin:0 1em;font-size:12px">{what}; {tissue}'
+        f'{top / unit:g}" style="margin:0 1em;font-size:12px">{what}{tissue}'
         f"{key_of_clamp()}{key_of_springs() if has_springs else ''}"
         f"{key_of_access() if has_access else ''}"
         f'<div style="height:12px;opacity:{opacity:g};'

@@ -14,6 +14,7 @@ from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum, VademecumInfo
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.prepare.scenes import usable_material
+from avatar_ros.ui.measuring import hit
 
 YOUNG_RANGE = (0.5e3, 1e6)  # that can be chosen [Pa]: the force is proportional to E
 
@@ -87,6 +88,19 @@ class Organ:
         surface = self.vademecum.surface
         j = int(np.argmin(np.linalg.norm(surface.centers - point, axis=1)))
         return np.asarray(surface.normals[j] / np.linalg.norm(surface.normals[j]))
+
+    def lifted(self, point: np.ndarray, clearance: float) -> np.ndarray:
+        """A point off the organ at rest, straight out from another, however deep that is.
+
+        clearance : from the other, or from where the way out leaves the organ [m]
+        """
+        out = self.outward(point)
+        met = hit(point, out, self.vertices, self.faces)
+        if met is not None:
+            a, b, c = self.vertices[met.corners]
+            if np.cross(b - a, c - a) @ out > 0.0:  # from within
+                point = met.at(self.vertices)
+        return np.asarray(point + clearance * out)
 
     def usable(self, material: dict[str, float]) -> dict[str, float]:
         """Values by coordinate that the contact node uses for this organ, of those it was given."""

@@ -91,6 +91,10 @@ class OrganTab:
         self._depth.value = round(100.0 * part)
         self._side.visible = self._depth.visible = how == CUT
 
+    def show_colours(self, field: str) -> None:
+        """Set the control to the field that is drawn, of ``FIELDS``."""
+        self._colour.value = field
+
     def show_material(self, values: dict[str, float]) -> None:
         """Set the sliders to the values in force, by coordinate [SI]."""
         preset, young = PRESETS.get(self._preset.value), values.get("young")

@@ -148,5 +148,6 @@ class PatientTab:
         spent = now - self._began[stage]
         left = f", {spent / fraction - spent:.0f} s left" if 0.05 < fraction < 1.0 else ""
         known = "" if np.isnan(error) else f", expected error {error:.1%}"
-        self._stage.content = f"{stage}: {fraction:.0%}{left}{known}"
+        part = f": {fraction:.0%}" if fraction > 0.0 else ""  # of some stages, none is known
+        self._stage.content = f"{stage}{part}{left}{known}"
         self._progress.value = float(np.clip(100.0 * fraction, 0.0, 100.0))

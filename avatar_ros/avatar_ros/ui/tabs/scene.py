@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+from html import escape
 from typing import Any
 
 from avatar_ros.ui.actions import Actions
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
+
+_IN_USE = "margin:0 1em;font-size:14px"
 
 
 class SceneTab:
     """Choice of a scene, with what it simulates."""
 
     def __init__(self, gui: Any, actions: Actions) -> None:
+        self._in_use = gui.add_html("")
         self._scenes = gui.add_dropdown("Scene", (NOTHING,))
         self._text = gui.add_markdown("")
         self._scenes.on_update(lambda _: self._describe())
         gui.add_button("Switch to scene").on_click(lambda _: actions.scene(self._scenes.value))
         self._texts: dict[str, str] = {}
+
+    def show_scene(self, name: str) -> None:
+        """Say which scene is in use."""
+        content = f'<div style="{_IN_USE}">In use: <b>{escape(name)}</b></div>'
+        if self._in_use.content != content:
+            self._in_use.content = content
 
     def offer(self, texts: dict[str, str]) -> None:
         """Offer scenes by name, with their descriptions."""
