@@ -26,6 +26,7 @@ from avatar_ros.ui.cut_handle import CutHandle
 from avatar_ros.ui.new_patient import NewPatient
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.player import Player
+from avatar_ros.ui.presets import material_text
 from avatar_ros.ui.preview_view import BRUSHES
 from avatar_ros.ui.report_pdf import report_pdf
 from avatar_ros.ui.scan import read_scan, slice_of
@@ -245,7 +246,7 @@ def test_a_recording_is_scrubbed_and_each_state_is_one_period(tmp_path: Path) ->
         assert np.linalg.norm(period.force) == pytest.approx(0.2 * k)
         assert np.abs(cloud[:, 4] + 2e-4 * k).max() < 1e-8
         np.testing.assert_allclose(cloud[:, :3] - cloud[:, 3:], shown.vertices, atol=1e-8)
-        assert material.startswith("E 50 kPa")
+        assert material["young"] == 50e3 and material_text(shown, material).startswith("E 50 kPa")
         assert player.part == pytest.approx(part)
     assert "not what the tool feels now" in player.alerts[0]
     player.close()

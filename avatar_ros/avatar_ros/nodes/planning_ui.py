@@ -326,17 +326,14 @@ class PlanningNode(ManagedNode):
         shown = self._shown = self._period_to_show()
         self._view.place_tool(shown.tip, (not shown.missing) * shown.force)
         if self._frame % _PLOT_FRAMES == 0:
-            values = self._chosen.values(organ)
-            poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
-            material = material_text(values["young"], poisson, values.get("contrast"))
-            self._show_numbers(organ, self._with_band(shown), material)
+            self._show_numbers(organ, self._with_band(shown), self._chosen.values(organ))
 
     def _with_band(self, shown: ShownPeriod) -> ShownPeriod:
         """With the band of its force, where the contact node sends one."""
         return shown if shown.missing else shown._replace(band=self._band.of(shown.size))
 
     def _show_recorded(
-        self, organ: Organ, cloud: np.ndarray, shown: ShownPeriod, material: str
+        self, organ: Organ, cloud: np.ndarray, shown: ShownPeriod, material: dict[str, float]
     ) -> None:
         """Update the page from a recording that plays."""
         self._shown = None  # of now, nothing is drawn
@@ -347,16 +344,15 @@ class PlanningNode(ManagedNode):
             self._panels.recordings.show(self._player.part)
             self._show_numbers(organ, shown._replace(largest=largest), material)
 
-    def _show_numbers(self, organ: Organ, shown: ShownPeriod, material: str) -> None:
-        """Beside the picture, of the same period."""
+    def _show_numbers(self, organ: Organ, shown: ShownPeriod, material: dict[str, float]) -> None:
+        """Beside the picture, of the same period; material: in force then, by coordinate [SI]."""
         n_kept = self._recorder.n_periods if self._recorder.is_on else None
-        numbers = frame_text(shown, material, n_kept)
+        numbers = frame_text(shown, material_text(organ, material), n_kept)
         self._panels.show_numbers("<br>".join(numbers))
         self._alerts = alerts(organ.info, shown)
         over = [*self._new_patient.alerts(organ.name), *self._player.alerts, *self._scan.alerts]
         self._panels.show_alerts([*over, *self._alerts])
-        young = self._chosen.values(organ)["young"]
-        measured = self._measures.lines(Now(self._view.points, shown.tip, young))
+        measured = self._measures.lines(Now(self._view.points, shown.tip, material["young"]))
         self._panels.measure.show(measured)
         self._lines = [*map(plain, numbers), *measured]
         self._panels.show_scale(self._coloured.legend())

@@ -13,7 +13,7 @@ from avatar_core.scene.recording import Recording, load_recording
 from avatar_ros.framework.reader import Reader
 from avatar_ros.msg import ContactState
 from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.presets import material_text, values_of
+from avatar_ros.ui.presets import values_of
 from avatar_ros.ui.shown_period import BEYOND, PLACE, ShownPeriod
 
 _REPEATED = 1.0  # s: the last state stays so long before it begins again
@@ -32,6 +32,7 @@ class Player:
         self._rows = np.zeros(0, int)  # period of each cloud
         self._valid = self._placed = np.zeros(0, int)  # the last cloud within the range, or placed
         self._times = np.zeros(0)  # of each cloud, from the first [s]
+        self._values: dict[str, float] = {}  # of the material, by coordinate [SI]
         self._place, self._began = 0.0, 0.0  # [s], and when it was there
         self._runs = False
 
@@ -78,7 +79,7 @@ class Player:
         tips, status = found.periods.tip[rows, 0], found.periods.status[rows, 0]
         self._valid = _last(status != ContactState.STATUS_OUT_OF_RANGE)
         self._placed = _last((np.abs(tips) < PLACE).all(axis=1))
-        self._material = _material_of(found, organ)
+        self._values = _values_of(found, organ)
         self._name, self._recording = name, found
         self._place, self._began, self._runs = 0.0, time.monotonic(), True
         return ""
@@ -99,8 +100,9 @@ class Player:
         """Stay at a part of the time, 0 to 1."""
         self._place, self._runs = part * self.seconds, False
 
-    def state(self, organ: Organ) -> tuple[np.ndarray, ShownPeriod, str] | None:
-        """Cloud (n, 6) [m] and numbers of the state to show, and its material; None of now.
+    def state(self, organ: Organ) -> tuple[np.ndarray, ShownPeriod, dict[str, float]] | None:
+        """Cloud (n, 6) [m], numbers and material (values by coordinate, SI) of the state to show;
+        None of now.
 
         As live, the last valid shape stays while the tool is beyond the range.
         """
@@ -112,7 +114,7 @@ class Player:
         moved = recording.clouds.displacement[valid] if valid >= 0 else np.zeros((1, 3), np.float32)
         shown = self._shown(recording, k, float(np.linalg.norm(moved, axis=1).max()))
         cloud = np.hstack([organ.vertices + moved, np.broadcast_to(moved, organ.vertices.shape)])
-        return cloud, shown, self._material
+        return cloud, shown, self._values
 
     def _shown(self, recording: Recording, k: int, largest: float) -> ShownPeriod:
         """Numbers of a cloud, or of the last valid one."""
@@ -143,10 +145,7 @@ def _last(known: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
 
 
-def _material_of(recording: Recording, organ: Organ) -> str:
-    """The material that was in force, in a line."""
-    scene = parse_scene(recording.scene, recording.vademecum_name)
-    given = values_of(scene)
-    values = {name: given.get(name, built) for name, (_, _, built) in organ.ranges.items()}
-    poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
-    return material_text(values["young"], poisson, values.get("contrast"))
+def _values_of(recording: Recording, organ: Organ) -> dict[str, float]:
+    """The material that was in force, by coordinate of the organ [SI]."""
+    given = values_of(parse_scene(recording.scene, recording.vademecum_name))
+    return {name: given.get(name, built) for name, (_, _, built) in organ.ranges.items()}

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from avatar_core.common.supports import ATTACHMENTS, SUPPORT
 from avatar_core.contact.effects import Tumour
 from avatar_core.scene.model import Scene
+from avatar_ros.ui.organ import Organ
 
 # Label and unit of each coordinate of the material, and what one shown unit is in SI.
 SLIDERS = {
@@ -57,10 +58,12 @@ def source_of(name: str) -> str:
     return f"E from {PRESETS[name].source}."
 
 
-def material_text(young: float, poisson: float, contrast: float | None) -> str:
-    """The material in force, in one line; young [Pa]."""
+def material_text(organ: Organ, values: dict[str, float]) -> str:
+    """The material in force, by coordinate of an organ [SI], in one line."""
+    poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
+    contrast = values.get("contrast")
     tumour = "" if contrast is None else f", tumour {contrast:.3g} x E"
-    return f"E {young / 1e3:.4g} kPa, nu {poisson:.3g}{tumour}"
+    return f"E {values['young'] / 1e3:.4g} kPa, nu {poisson:.3g}{tumour}"
 
 
 def values_of(scene: Scene) -> dict[str, float]:
