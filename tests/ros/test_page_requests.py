@@ -120,3 +120,30 @@ def test_a_contact_node_that_starts_again_is_asked_again() -> None:
     requests.contact_started()
     requests.set_material({"young": 4e3}, print)
     assert silent.asked == [1e3, 4e3]
+
+
+def building() -> tuple[Requests, list[Any], list[str]]:
+    """A build that is under way; its results, and what was said."""
+    requests, results, said = Requests.__new__(Requests), [], []
+    ready = SimpleNamespace(
+        server_is_ready=lambda: True,
+        send_goal_async=lambda *given: SimpleNamespace(add_done_callback=lambda accepted: None),
+    )
+    at_once = SimpleNamespace(executor=SimpleNamespace(create_task=lambda do: do()))
+    requests.__dict__ |= {"_build": ready, "_pending": None, "_goal": None, "_node": at_once}
+    requests.build_patient(Wanted("a.obj"), lambda *stage: None, said.append, results.append)
+    return requests, results, said
+
+
+def test_a_build_whose_node_ends_comes_to_nothing() -> None:
+    requests, results, said = building()
+    requests.builder_is_missing()
+    requests.builder_is_missing()  # once a second
+    assert results == [None]
+    assert len(said) == 1 and "ended; the node that builds patients is not running" in said[0]
+
+
+def test_a_second_build_is_refused_and_the_first_one_goes_on() -> None:
+    requests, results, said = building()
+    requests.build_patient(Wanted("b.obj"), lambda *stage: None, said.append, results.append)
+    assert results == [] and said == ["a patient is being built already; cancel it first"]

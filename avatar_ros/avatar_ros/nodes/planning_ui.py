@@ -407,6 +407,8 @@ class PlanningNode(ManagedNode):
         self._offer_files()
         if self._organ is not None:
             self._driver.ensure_running(self._tool, self._frame_id)
+        if "patient_interpolation" in missing:
+            self._requests.builder_is_missing()
         if "contact" in missing:
             if not self._was_missing:
                 self._recordings.stop("the contact node ended")

@@ -7,7 +7,7 @@ not run.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
@@ -35,6 +35,13 @@ Report = Callable[[str], None]
 Progress = Callable[[str, float, float], None]
 
 
+class _Build(NamedTuple):
+    """Who hears of a build: in words, and its result."""
+
+    report: Report
+    then: Callable[[Any], None]
+
+
 class Requests:
     """Clients of the cell's services and of its action.
 
@@ -50,6 +57,7 @@ class Requests:
         self._set = node.create_client(SetParameters, "contact/set_parameters")
         self._get = node.create_client(GetParameters, "contact/get_parameters")
         self._build = ActionClient(node, BuildPatient, "build_patient")
+        self._pending: _Build | None = None  # that is under way
         self._goal: Any = None
         self._waiting: dict[str, float] = {}  # values of the material not sent yet
         self._setting = False
@@ -155,31 +163,52 @@ class Requests:
     def build_patient(
         self, wanted: Wanted, progress: Progress, report: Report, then: Callable[[Any], None]
     ) -> None:
-        """Build or preview a patient; calls ``then`` with the result, None if there is none."""
+        """Build or preview a patient; calls ``then`` with the result, None if there is none.
+
+        One at a time: another is refused until then.
+        """
+        if self._pending is not None:
+            report("a patient is being built already; cancel it first")
+            return
         if not self._build.server_is_ready():
             report(START["patient_interpolation"])
             then(None)
             return
         goal = BuildPatient.Goal(**wanted._asdict())
+        self._pending = pending = _Build(report, then)
 
         def note(message: Any) -> None:
             stage = message.feedback
             progress(stage.stage, stage.fraction, stage.error)
 
         def finished(done: Any) -> None:
-            self._goal = None
             result = done.result().result
             what = "previewed" if wanted.preview else f"{result.file} built"
             report(f"{what} in {result.seconds:.0f} s" if result.success else result.message)
-            then(result if result.success else None)
+            self._end_build(pending, result if result.success else None)
 
         def accepted(done: Any) -> None:
+            if not done.result().accepted:
+                report("the patients' node refuses it; try again")
+                self._end_build(pending, None)
+                return
             self._goal = done.result()
             self._goal.get_result_async().add_done_callback(finished)
 
         self._in_executor(
             lambda: self._build.send_goal_async(goal, note).add_done_callback(accepted)
         )
+
+    def _end_build(self, build: _Build, result: Any) -> None:
+        if self._pending is build:  # it was not given up
+            self._goal = self._pending = None
+            build.then(result)
+
+    def builder_is_missing(self) -> None:
+        """The patients' node is not there: a build that it was asked for has come to nothing."""
+        if self._pending is not None:
+            self._pending.report(f"the patients' node ended; {START['patient_interpolation']}")
+            self._end_build(self._pending, None)
 
     def cancel_patient(self) -> None:
         """Cancel the build that is under way, if any."""
