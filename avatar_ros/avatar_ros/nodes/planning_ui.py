@@ -19,6 +19,7 @@ try:
 except ImportError as error:
     raise SystemExit("planning_ui: viser is missing; pip install '.[ui]'") from error
 
+from avatar_core.common.processes import free_at_once
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.storage import parse_vademecum
@@ -499,6 +500,7 @@ class PlanningNode(ManagedNode):
 
 
 def main() -> int:
+    free_at_once()  # recordings and images come and go
     return run(PlanningNode)
 
 
