@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,22 +55,34 @@ def test_the_band_stands_beside_the_force() -> None:
     assert f"1.20 to 3.40 N: {BAND}" in lines
 
 
-def test_the_plot_has_the_band_for_as_long_as_it_shows_one() -> None:
+@pytest.fixture
+def tab() -> Iterator[Any]:
     viser = pytest.importorskip("viser", reason="the extra ui is not installed")
     from avatar_ros.ui.tabs.tool import ToolTab
 
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    try:
-        tab = ToolTab(server.gui, SimpleNamespace())
-        plain, wide = tab._plot, tab._plot_of_band
-        tab.show_force(0.0, 1.0, 0.1)
-        assert plain.visible and not wide.visible and len(plain.data) == 4
-        tab.show_force(0.2, 1.5, 0.1, (1.0, 2.5))
-        assert wide.visible and not plain.visible
-        assert [row.tolist() for row in wide.data[4:]] == [[1.0, 1.0], [1.0, 2.5]]
-        assert sum(BAND in series["label"] for series in wide.series) == 2
-        for k in range(60):
-            tab.show_force(0.4 + k, 1.0, 0.1)
-        assert plain.visible and not wide.visible
-    finally:
-        server.stop()
+    yield ToolTab(server.gui, SimpleNamespace())  # type: ignore[arg-type]
+    server.stop()
+
+
+def test_the_plot_has_the_band_for_as_long_as_it_shows_one(tab: Any) -> None:
+    plain, wide = tab._plot, tab._plot_of_band
+    tab.show_force(0.0, 1.0, 0.1)
+    assert plain.visible and not wide.visible and len(plain.data) == 4
+    tab.show_force(0.2, 1.5, 0.1, (1.0, 2.5))
+    assert wide.visible and not plain.visible
+    assert [row.tolist() for row in wide.data[4:]] == [[1.0, 1.0], [1.0, 2.5]]
+    assert sum(BAND in series["label"] for series in wide.series) == 2
+    for k in range(60):
+        tab.show_force(0.4 + k, 1.0, 0.1)
+    assert plain.visible and not wide.visible
+
+
+def test_a_force_that_was_not_known_is_not_bridged_by_a_line(tab: Any) -> None:
+    for k in range(5):
+        tab.show_force(k, 50.0, 1.0)
+    assert len(tab._plot.data[0]) == 5
+    tab.forget_force()  # too deep, from here on
+    tab.show_force(12.0, 0.0, 0.0)
+    times, forces = tab._plot.data[:2]
+    assert times.tolist() == [12.0] and forces.tolist() == [0.0]

@@ -245,3 +245,15 @@ def test_a_tool_is_lifted_off_the_organ_however_deep_it_is(depth: float) -> None
     shown = Organ.of(organ("cube"))
     lifted = shown.lifted(top("cube") - depth * UP, 0.03)
     np.testing.assert_allclose(lifted, top("cube") + (0.03 + max(0.0, -depth)) * UP, atol=1e-6)
+
+
+def test_the_scale_never_shrinks_during_a_touch_and_begins_anew_at_rest(view: OrganView) -> None:
+    rest = np.zeros((len(view.points), 6))
+    rest[:, :3] = view.points
+    tops = []
+    for largest in (7e-3, 1e-3, 0.0, 1e-3):
+        cloud = rest.copy()
+        cloud[0, 3:] = 0.0, 0.0, largest
+        view.move(cloud, np.ones(3), np.zeros(3))
+        tops.append(view.top)
+    assert tops == [1e-2, 1e-2, 1e-3, 1e-3]

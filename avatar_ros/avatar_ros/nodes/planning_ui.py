@@ -357,9 +357,12 @@ class PlanningNode(ManagedNode):
         self._panels.measure.show(measured)
         self._lines = [*map(plain, numbers), *measured]
         self._panels.show_scale(self._coloured.legend())
-        if not shown.missing and not self._player.is_on:
+        tool = self._panels.tool
+        if shown.missing or self._player.is_on:
+            tool.forget_force()
+        else:
             now = time.monotonic() - self._began
-            self._panels.tool.show_force(now, shown.size, np.nan_to_num(shown.error), shown.band)
+            tool.show_force(now, shown.size, np.nan_to_num(shown.error), shown.band)
 
     def _period_to_show(self) -> ShownPeriod:
         """Draw the newest cloud, and return what belongs to it."""

@@ -46,7 +46,7 @@ def colours(displacement: np.ndarray, top: float) -> np.ndarray:
 
 
 def top_for(largest: float, before: float = TOPS[0]) -> float:
-    """The end of a scale that holds the largest displacement and never shrinks [m]."""
+    """The end of a scale that holds the largest displacement, and no less than before [m]."""
     wanted = max(largest, before)
     return next((top for top in TOPS if top >= wanted), TOPS[-1])
 

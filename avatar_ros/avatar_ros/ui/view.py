@@ -25,6 +25,7 @@ CLEARANCE = 0.015  # of a new organ's tool over the surface [m]
 FIELD_TOPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # possible ends of the scale of another field
 LOOKS = WHOLE, GLASS, CUT = "whole", "glass", "cut open"  # how the organ is shown
 _ROOTS = ("/organ", "/structures", "/tools", "/measures")  # nodes above what is of an organ
+_AT_REST = 0.02e-3  # displacement of an organ that nothing touches; its scale begins anew [m]
 _LEAST_MARKED = 0.1e-3  # displacement whose place is marked [m]
 
 
@@ -196,7 +197,7 @@ class OrganView:
         outer[shown.faces] = True
         place = int(np.argmax(np.where(outer, size, 0.0)))
         self._largest = float(size[place])
-        self.top = top_for(self._largest, self.top)
+        self.top = top_for(self._largest, self.top if self._largest > _AT_REST else 0.0)
         with self._server.atomic():
             if self._field is None:
                 self._surface.move(shown, self.top)

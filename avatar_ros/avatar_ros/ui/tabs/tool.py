@@ -103,6 +103,11 @@ class ToolTab:
         if not shown.visible:
             shown.visible, hidden.visible = True, False
 
+    def forget_force(self) -> None:
+        """No force is known: the next one begins another curve, not joined to the last."""
+        for history in (self._times, self._forces, self._bands):
+            history.clear()
+
     def show_recording(self, is_on: bool) -> None:
         """Label the button with what it does next."""
         self._recording.label = "Stop and save" if is_on else "Record"
