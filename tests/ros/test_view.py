@@ -235,8 +235,14 @@ def test_a_held_shape_is_grey_until_it_is_that_of_now(view: OrganView) -> None:
     view.look(GLASS, "A", 0.5)  # made anew
     bands = [view._surface._nodes["bands", k] for k in range(N_BANDS)]
     assert {tuple(mesh.color) for mesh in bands} == {tuple(tone.material(np.array(HELD)))}
+    for group in ("tissue", "rim"):  # at rest too
+        for k in range(N_SHADES):
+            red, green, blue = view._surface._nodes[group, k].color
+            assert red == green == blue
     view.grey(False)
     assert [tuple(mesh.color) for mesh in bands] == colours
+    red, green, _ = view._surface._nodes["tissue", 0].color
+    assert red > green
 
 
 @pytest.mark.parametrize("depth", [-5e-3, 4e-3, 25e-3])

@@ -69,9 +69,9 @@ def scale_colours() -> np.ndarray:
 
 
 @cache
-def tissue_colours() -> np.ndarray:
+def tissue_colours(colour: tuple[int, int, int] = TISSUE) -> np.ndarray:
     """Tissue from its dark to its light side, shape (N_SHADES, 3), 0 to 255."""
-    return np.round(shaded(TISSUE, (np.arange(N_SHADES) + 0.5) / N_SHADES)).astype(int)
+    return np.round(shaded(colour, (np.arange(N_SHADES) + 0.5) / N_SHADES)).astype(int)
 
 
 def shaded(colour: tuple[int, int, int], light: np.ndarray) -> np.ndarray:

@@ -219,11 +219,9 @@ class SurfaceView:
             self._plane,
             self._marks._replace(accessible=self._marks.accessible & self.is_reach_marked),
         )
-        tissue = np.vstack([tissue_colours(), *CLAMP, SPRINGS, ACCESS])  # as the numbers of shades
-        groups = {"tissue": tissue, "rim": tissue, "bands": self._band_colours()}
         inside = np.array(INSIDE) if self._plane is not None else shaded(TISSUE, np.array([0.6]))[0]
         with self._server.atomic():
-            for group, colours in groups.items():
+            for group, colours in self._colours().items():
                 for k, colour in enumerate(tone.material(colours).tolist()):
                     self._nodes[group, k] = self._add(f"{self._root}/{group}/{k}", colour, "front")
             self._nodes["inside", 0] = self._add(
@@ -362,16 +360,22 @@ class SurfaceView:
         draw(mesh, points[used], local)  # the points of all would be sent many times
 
     def grey(self, held: bool) -> None:
-        """Draw the bands in grey while the shape is the last valid one, or in colours again."""
+        """Draw all in grey while the shape is not that of now, or in colours again."""
         if held == self._is_grey or not self._nodes:
             return
         self._is_grey = held
         with self._server.atomic():
-            for k, colour in enumerate(tone.material(self._band_colours()).tolist()):
-                self._nodes["bands", k].color = tuple(colour)
+            for group, colours in self._colours().items():
+                for k, colour in enumerate(tone.material(colours).tolist()):
+                    self._nodes[group, k].color = tuple(colour)
 
-    def _band_colours(self) -> np.ndarray:
-        return np.tile(HELD, (N_BANDS, 1)) if self._is_grey else scale_colours()
+    def _colours(self) -> dict[str, np.ndarray]:
+        """What is seen of each group of meshes; patterns keep their colours in grey."""
+        shades, bands = tissue_colours(), scale_colours()
+        if self._is_grey:
+            shades, bands = tissue_colours(HELD), np.tile(HELD, (N_BANDS, 1))
+        tissue = np.vstack([shades, *CLAMP, SPRINGS, ACCESS])  # as the numbers of shades
+        return {"tissue": tissue, "rim": tissue, "bands": bands}
 
 
 def draw(mesh: Any, vertices: np.ndarray, faces: np.ndarray) -> None:
