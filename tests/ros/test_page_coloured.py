@@ -44,7 +44,11 @@ class Shown:
             self,  # type: ignore[arg-type]
             self.said.append,
             self.control.append,
+            self.in_executor,
         )
+
+    def in_executor(self, do: Callable[[], None]) -> None:
+        do()
 
     def parameters_of_contact(
         self, names: tuple[str, ...], then: Callable[[dict[str, Any]], None]
@@ -136,3 +140,14 @@ def test_a_pattern_is_in_the_legend_while_it_is_drawn(known: str) -> None:
     assert "access" not in page.coloured.legend()
     page.view.is_reach_marked = True
     assert "</span>access" in page.coloured.legend()
+
+
+def test_a_field_is_drawn_by_the_thread_of_the_organ_and_not_on_the_next_one(known: str) -> None:
+    waiting: list[Callable[[], None]] = []
+    page = Shown(known)
+    page.coloured._in_executor = waiting.append
+    page.coloured.choose(SPREAD)
+    assert page.painted == [] and len(waiting) == 1
+    page.chosen.organ = Organ.of(organ("cube"))  # another has come
+    waiting[0]()
+    assert page.painted == []

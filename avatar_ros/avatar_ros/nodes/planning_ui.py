@@ -137,6 +137,7 @@ class PlanningNode(ManagedNode):
             self._requests,
             self._say,
             lambda field: self._panels.organ.show_colours(field),
+            self._in_executor,
         )
         self._measures = Measures(MeasuresView(server))
         server.scene.on_click()(self._click)

@@ -31,6 +31,7 @@ class Coloured:
     """Chooses the field that is drawn on the organ.
 
     show : sets the page's control to a field
+    in_executor : calls in the thread that draws the organ
     """
 
     def __init__(
@@ -40,9 +41,10 @@ class Coloured:
         requests: Requests,
         say: Callable[[str], None],
         show: Callable[[str], None],
+        in_executor: Callable[[Callable[[], None]], None],
     ) -> None:
         self._view, self._chosen, self._requests, self._say = view, chosen, requests, say
-        self._show = show
+        self._show, self._in_executor = show, in_executor
         self._field = self._wanted = DISPLACEMENT  # drawn, and asked for
 
     def forget(self) -> None:
@@ -73,8 +75,7 @@ class Coloured:
             missing = "errors of this organ were never measured; build it with a certificate"
             self._paint(organ, ERROR, errors, missing)
         else:
-            self._field = DISPLACEMENT
-            self._view.paint(None)
+            self._in_executor(lambda: self._draw(organ, DISPLACEMENT, None))
 
     def _show_spread(self, parameters: dict[str, Any]) -> None:
         organ = self._chosen.organ
@@ -101,13 +102,19 @@ class Coloured:
         return held.known({**values, **used})
 
     def _paint(self, organ: Organ, field: str, values: np.ndarray, missing: str) -> None:
-        if organ is not self._chosen.organ or field != self._wanted:  # it took its time
-            return
-        if not np.isfinite(values).any():
+        if np.isfinite(values).any():
+            self._in_executor(lambda: self._draw(organ, field, values))
+        elif self._is_wanted(organ, field):
             self._refuse(missing)
-            return
-        self._field = field
-        self._view.paint(values)
+
+    def _draw(self, organ: Organ, field: str, values: np.ndarray | None) -> None:
+        if self._is_wanted(organ, field):
+            self._field = field
+            self._view.paint(values)
+
+    def _is_wanted(self, organ: Organ, field: str) -> bool:
+        """Whether neither another organ nor another field was chosen meanwhile."""
+        return organ is self._chosen.organ and field == self._wanted
 
     def _refuse(self, reason: str) -> None:
         """What is drawn stays, and the control says so."""
