@@ -186,3 +186,13 @@ def test_the_tool_is_lifted_along_the_normal_and_dragged_along_its_shaft(chosen:
     np.testing.assert_allclose(chosen.target, [0.0, 0.0, 0.004])
     chosen.drag(np.array([np.nan, 0.0, 0.0]), along_shaft=False)
     np.testing.assert_allclose(chosen.target, [0.0, 0.0, 0.004])
+
+
+def test_the_scene_in_use_is_named_whoever_chose_it(chosen: Chosen, cell: Cell) -> None:
+    assert chosen.scene_name == "natural effects"
+    chosen.note_contact({"scene": "hanging"})  # as the contact node was started
+    assert chosen.scene_name == "hanging"
+    chosen.choose_scene("breathing")
+    assert chosen.scene_name == "breathing"
+    chosen.choose_scene("refused")
+    assert chosen.scene_name == "breathing"

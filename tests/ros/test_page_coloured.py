@@ -140,6 +140,7 @@ def test_a_pattern_is_in_the_legend_while_it_is_drawn(known: str) -> None:
     assert "access" not in page.coloured.legend()
     page.view.is_reach_marked = True
     assert "</span>access" in page.coloured.legend()
+    assert "tissue" not in page.coloured.legend()  # no room is left for it in the line
 
 
 def test_a_field_is_drawn_by_the_thread_of_the_organ_and_not_on_the_next_one(known: str) -> None:

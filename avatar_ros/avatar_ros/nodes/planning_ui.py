@@ -25,7 +25,7 @@ from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.storage import parse_vademecum
 from avatar_ros.framework import qos
 from avatar_ros.framework.managed_node import ManagedNode, run
-from avatar_ros.framework.parameters import AUTOSTART, Parameter, ParameterError, values
+from avatar_ros.framework.parameters import ParameterError, values
 from avatar_ros.framework.reader import Reader
 from avatar_ros.framework.templates import stamp_nanoseconds
 from avatar_ros.loop.settings import MATERIAL, TIP
@@ -55,6 +55,7 @@ from avatar_ros.ui.recordings import Page as RecordingsPage
 from avatar_ros.ui.recordings import Recordings
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.scan_view import ScanView
+from avatar_ros.ui.settings import PLANNING_UI
 from avatar_ros.ui.shown_period import OTHER_ORGAN, SILENT, PeriodChooser, ShownPeriod
 from avatar_ros.ui.texts import frame_text, plain, scene_texts, warnings
 from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess, organ_number
@@ -65,18 +66,14 @@ _PLOT_FRAMES = 6  # between two points of the plots
 _CUT_FRAMES = 3  # between two places of a cut that is dragged
 _POLL_FRAMES = 30  # between two checks of library and nodes
 _SILENCE = 1.0  # after which the contact node counts as not answering [s]
-_TIP = tuple(parameter.name for parameter in TIP)
-_OF_CONTACT = (*_TIP, "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
-
-PLANNING_UI = (
-    AUTOSTART,
-    Parameter("host", "127.0.0.1", "address to listen on; 0.0.0.0: all"),
-    Parameter(
-        "port", 8080, "port to listen on; the next free one if it is in use", range=(1, 65535)
-    ),
-    Parameter("token", "", "at the end of the page's address; empty: a new one at each start"),
-    Parameter("library_dir", ".", "directory of the loader's files; recordings are written there"),
-    Parameter("tool", "tool", "name of the tool to move, one of those of contact"),
+_OF_CONTACT = (
+    *(p.name for p in TIP),
+    "rate",
+    "tools",
+    "frame_id",
+    "scene",
+    "cloud",
+    "cloud_divisor",
 )
 
 
@@ -130,7 +127,9 @@ class PlanningNode(ManagedNode):
                 show_look=self._show_look,
             ),
         )
-        self._view = OrganView(server, chosen.drag, self._show_cube, chosen.drag_cut)
+        self._view = OrganView(
+            server, chosen.drag, lambda *given: self._panels.show_cube(*given), chosen.drag_cut
+        )
         self._coloured = Coloured(
             self._view,
             chosen,
@@ -443,9 +442,6 @@ class PlanningNode(ManagedNode):
     def _say(self, text: str) -> None:
         if self._server is not None:
             self._panels.say(text)
-
-    def _show_cube(self, client: Any, drawing: str) -> None:
-        self._panels.show_cube(client, drawing)
 
     def _click(self, event: Any) -> None:
         """A click on the organ: measure there; on a preview: paint."""

@@ -51,7 +51,7 @@ class ScanView:
         self._planes: list[Any] = []
         self._slices: list[Slice] = []  # that are drawn
         self._lines: dict[int, Any] = {}
-        self._followed: np.ndarray | None = None  # points whose lines are drawn
+        self._cut: tuple[np.ndarray, list[Slice]] | None = None  # points and planes of the lines
 
     def choose(self, file: str) -> None:
         """Show the image of a file; an empty name shows none."""
@@ -83,7 +83,7 @@ class ScanView:
         self._scan, self._file = None, wanted
         for plane in self._planes:
             plane.remove()
-        self._planes, self._slices, self._followed = [], [], None
+        self._planes, self._slices = [], []
         self._tab().show_scan(None, wanted)
 
     @property
@@ -99,9 +99,9 @@ class ScanView:
         if len(slices) < 3:
             self._remove_lines()
             return
-        if self._followed is not None and np.array_equal(points, self._followed):
+        if self._cut is not None and self._is_drawn(*self._cut, points, slices):
             return
-        self._followed = points
+        self._cut = points, slices
         bodies = [(organ.faces, ORGAN_LINE)]
         bodies += [(faces, STRUCTURE) for faces in organ.structures.values()]
         with self._server.atomic():
@@ -111,7 +111,14 @@ class ScanView:
     def _remove_lines(self) -> None:
         for lines in self._lines.values():
             lines.remove()
-        self._lines = {}
+        self._lines, self._cut = {}, None
+
+    @staticmethod
+    def _is_drawn(
+        before: np.ndarray, planes: list[Slice], points: np.ndarray, slices: list[Slice]
+    ) -> bool:
+        same = all(one is other for one, other in zip(planes, slices, strict=True))
+        return same and np.array_equal(before, points)
 
     def _draw_lines(self, number: int, segments: np.ndarray, colour: tuple[int, int, int]) -> None:
         held = self._lines.get(number)
@@ -161,7 +168,6 @@ class ScanView:
                     continue
                 self._planes[axis].image = image
                 self._planes[axis].position = tuple(found.middle)
-        self._followed = None
 
 
 def _cuts(points: np.ndarray, faces: np.ndarray, slices: list[Slice]) -> np.ndarray:
