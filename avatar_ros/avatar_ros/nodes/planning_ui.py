@@ -66,15 +66,8 @@ _PLOT_FRAMES = 6  # between two points of the plots
 _CUT_FRAMES = 3  # between two places of a cut that is dragged
 _POLL_FRAMES = 30  # between two checks of library and nodes
 _SILENCE = 1.0  # after which the contact node counts as not answering [s]
-_OF_CONTACT = (
-    *(p.name for p in TIP),
-    "rate",
-    "tools",
-    "frame_id",
-    "scene",
-    "cloud",
-    "cloud_divisor",
-)
+_TIP = tuple(parameter.name for parameter in TIP)
+_OF_CONTACT = (*_TIP, "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
 
 
 class PlanningNode(ManagedNode):
@@ -113,8 +106,7 @@ class PlanningNode(ManagedNode):
         self._tool = value["tool"]
         guard = Guard(value["host"], value["token"])
         with guarded(guard):
-            server = viser.ViserServer(value["host"], value["port"], verbose=False)
-        self._server = server
+            self._server = server = viser.ViserServer(value["host"], value["port"], verbose=False)
         self._requests = Requests(self)
         self._chosen = chosen = Chosen(
             self._state.live,
