@@ -1,5 +1,5 @@
-"""The L2 norm of displacement over an organ, by lumped masses, |u|^2 = sum_i m_i u_i^2, and
-orthonormality in any inner product.
+"""The L2 norm of displacement over an organ, by lumped masses, |u|^2 = sum_i m_i u_i^2, its mean
+strain, and orthonormality in any inner product.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import ConvergenceError
+from avatar_core.geometry.mesh import TetMesh
 
 
 def l2_norm(field: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
@@ -34,6 +35,20 @@ def l2_by_position(columns: FloatArray, mass: FloatArray) -> NDArray[np.float64]
 def relative_l2(estimate: FloatArray, truth: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
     """|u - u_ref| / |u_ref| of each column; arguments as of :func:`l2_norm`."""
     return l2_norm(estimate - truth, mass) / l2_norm(truth, mass)
+
+
+def mean_strain(mesh: TetMesh, displacement: FloatArray) -> float:
+    """Root mean square of the strain |sym grad u| over an organ, (int |eps|^2 dx / V)^(1/2).
+
+    Parameters
+    ----------
+    displacement : ndarray, shape (n_vertices, 3) [m], linear in each tetrahedron
+    """
+    at, moved = mesh.vertices[mesh.tets], displacement[mesh.tets]
+    gradient = np.linalg.solve(at[:, 1:] - at[:, :1], moved[:, 1:] - moved[:, :1])
+    strain = (gradient + gradient.swapaxes(1, 2)) / 2.0
+    square = (strain**2).sum(axis=(1, 2))
+    return float(np.sqrt(mesh.tet_volumes @ square / mesh.volume))
 
 
 def require_orthonormal(

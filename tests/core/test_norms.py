@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatar_core.errors import ConvergenceError
-from avatar_core.fem.norms import l2_norm, relative_l2, require_orthonormal
+from avatar_core.fem.norms import l2_norm, mean_strain, relative_l2, require_orthonormal
 from avatar_core.geometry.mesh import TetMesh
 
 
@@ -14,6 +14,15 @@ def test_a_unit_translation_has_the_root_of_the_volume(phantom_mesh: TetMesh) ->
     translation = np.tile(np.eye(3), (len(phantom_mesh.vertices), 1))
     norm = l2_norm(translation, phantom_mesh.lumped_mass)
     np.testing.assert_allclose(norm, 3 * [np.sqrt(phantom_mesh.volume)], rtol=1e-12)
+
+
+def test_the_mean_strain_of_an_affine_field_is_its_own(phantom_mesh: TetMesh) -> None:
+    gradient = np.random.default_rng(0).standard_normal((3, 3))
+    expected = np.linalg.norm((gradient + gradient.T) / 2.0)
+    found = mean_strain(phantom_mesh, phantom_mesh.vertices @ gradient)
+    assert found == pytest.approx(expected, rel=1e-9)
+    turn = gradient - gradient.T
+    assert mean_strain(phantom_mesh, phantom_mesh.vertices @ turn) < 1e-9
 
 
 @pytest.mark.parametrize("shape", [(30,), (30, 4), (30, 4, 3)])
