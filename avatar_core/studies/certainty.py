@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.studies.certainty_bands import bands_section
 from avatar_core.studies.certainty_calibration import calibration_section
+from avatar_core.studies.certainty_registration import registration_section
 from avatar_core.studies.certainty_section import FULL, QUICK, CertaintySettings, Section
 from avatar_core.studies.certainty_supports import supports_section
 from avatar_core.studies.report import Panel, write_report
@@ -27,8 +28,9 @@ SECTIONS: tuple[Callable[[SurfaceMesh, CertaintySettings, ProgressBar], Section]
     supports_section,
     bands_section,
     calibration_section,
+    registration_section,
 )
-N_STAGES = 6  # of the progress bar, over all sections
+N_STAGES = 7  # of the progress bar, over all sections
 
 
 def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:

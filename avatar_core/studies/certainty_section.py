@@ -20,6 +20,7 @@ class CertaintySettings:
     n_draws : of the material, each solved in full
     n_places : that are pressed for them
     n_trials : of a calibration, each solved in full
+    n_registrations : of each class of deformations
     """
 
     n_vertices: int = 2850
@@ -29,11 +30,12 @@ class CertaintySettings:
     n_draws: int = 1000
     n_places: int = 3
     n_trials: int = 100
+    n_registrations: int = 4
 
 
 FULL = CertaintySettings()
 QUICK = CertaintySettings(
-    n_vertices=700, n_values=4, n_loads=6, n_draws=40, n_places=2, n_trials=12
+    n_vertices=700, n_values=4, n_loads=6, n_draws=40, n_places=2, n_trials=12, n_registrations=1
 )
 
 

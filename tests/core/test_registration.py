@@ -15,8 +15,7 @@ import scipy.sparse as sp
 
 from avatar_core.cli import main as cli
 from avatar_core.errors import RegistrationError
-from avatar_core.fem.elasticity import Elasticity
-from avatar_core.geometry.mesh import regions_by_rule
+from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.point_location import carriers
 from avatar_core.registration.cloud import Cloud, read_cloud
 from avatar_core.registration.fit import RegistrationRule, rigid_motion
@@ -24,7 +23,8 @@ from avatar_core.registration.posterior import Scales, averaged, cells_of, equat
 from avatar_core.registration.register import register, target_at, targets
 from avatar_core.registration.rigid import RigidMotion
 from avatar_core.registration.traction import load_basis
-from avatar_core.studies.registration import Case, RegistrationSettings, Truth, measured
+from avatar_core.studies.registration import measured
+from avatar_core.studies.registration_truth import Case, RegistrationSettings, Truth
 from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
@@ -33,10 +33,9 @@ SETTINGS = RegistrationSettings(n_points=1500, peak=(0.012, 0.012))
 
 
 @pytest.fixture(scope="module")
-def truth(phantom_elasticity: Elasticity) -> Truth:
+def truth(phantom_mesh: TetMesh) -> Truth:
     """On another mesh than the vademecum's, 700 vertices for 900."""
-    mesh = phantom_elasticity.mesh
-    return Truth(phantom_elasticity, regions_by_rule(mesh))
+    return Truth.on(phantom_mesh)
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +133,17 @@ def test_traction_is_correlated_over_the_length_that_is_asked_for(
         assert np.median(correlation[pairs]) == pytest.approx(expected, abs=0.06)
 
 
+def test_the_truth_is_in_equilibrium_at_large_deformation(truth: Truth) -> None:
+    """Small loads deform it as small strains do, large ones otherwise, moved supports too."""
+    for kind in ("pushes", "moved support"):
+        for peak, low, high in ((1e-5, 0.0, 1e-3), (0.012, 0.01, 0.5)):
+            settings = replace(SETTINGS, peak=(peak, peak))
+            case = truth.case(kind, settings, np.random.default_rng(4))
+            off = np.linalg.norm(case.small_strains - case.displacement, axis=1)
+            part = case.volume @ off / (case.volume @ np.linalg.norm(case.displacement, axis=1))
+            assert low <= part < high
+
+
 def test_the_organ_is_found_from_a_part_of_its_surface(
     phantom_vademecum: Vademecum, case: Case
 ) -> None:
@@ -169,6 +179,23 @@ def test_what_no_load_explains_is_said(phantom_vademecum: Vademecum, case: Case)
     found = register(phantom_vademecum, Cloud(np.stack([x, y + ripple, z], axis=1)))
     assert found.problems and "off the surface together" in " ".join(found.problems)
     assert not register(phantom_vademecum, case.cloud).problems
+
+
+def test_a_deformation_beyond_small_strains_is_not_called_good(
+    phantom_vademecum: Vademecum,
+) -> None:
+    """The model fits it, as it is its own; no organ gives way like this."""
+    v = phantom_vademecum
+    basis, mesh = load_basis(v), v.mesh
+    coefficient = np.zeros((basis.size, 1))
+    coefficient[2] = 1.0
+    moved = basis.displacement(v, np.arange(len(mesh.vertices)), coefficient)[:, :, 0]
+    seen = mesh.vertex_normals[:, 1] > 0.3
+    size = np.linalg.norm(moved, axis=1).max()
+    for peak, is_good in ((0.01, True), (0.08, False)):
+        place = mesh.vertices + moved * peak / size
+        problems = register(v, Cloud(place[seen])).problems
+        assert not problems if is_good else "strained by" in " ".join(problems)
 
 
 def test_a_cloud_at_rest_moves_nothing(phantom_vademecum: Vademecum, truth: Truth) -> None:
