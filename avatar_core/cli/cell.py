@@ -44,8 +44,12 @@ def cell(
             exists=True, dir_okay=False, help="atlas for the node that builds patients (.h5)"
         ),
     ] = None,
+    tools: Annotated[
+        str, typer.Option(help="names of the tools, as left,right; default: one, tool")
+    ] = "",
     scene: Annotated[
-        str, typer.Option(help="scene to simulate: name of a shipped one, or a path")
+        str,
+        typer.Option(help="scene to simulate, of as many tools: name of a shipped one, or a path"),
     ] = "",
     state_dir: Annotated[
         Path | None,
@@ -72,6 +76,7 @@ def cell(
         "library_dir": _library(library_dir, params),
         "vademecum": vademecum,
         "atlas": atlas and atlas.resolve(),
+        "tools": tools,
         "scene": Path(scene).resolve() if Path(scene).is_file() else scene,
         "state_dir": state_dir and state_dir.resolve(),
         **page,

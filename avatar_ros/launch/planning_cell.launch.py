@@ -18,7 +18,7 @@ from launch_ros.substitutions import FindPackageShare
 # As in avatar_ros.nodes.cell, which the Python of `ros2 launch` need not be able to import.
 OVERRIDES = {
     "vademecum_loader": ("library_dir", "vademecum", "state_dir"),
-    "contact": ("scene", "state_dir"),
+    "contact": ("tools", "scene", "state_dir"),
     "patient_interpolation": ("library_dir", "atlas"),
     "planning_ui": ("library_dir", "host", "port"),
 }
@@ -26,7 +26,8 @@ REQUIRED = {"patient_interpolation": "atlas", "planning_ui": "ui"}
 ARGUMENTS = {
     "library_dir": "directory of the vademecums",
     "vademecum": "file in library_dir to load",
-    "scene": "scene to simulate: name of a shipped one, or a path",
+    "tools": "names of the tools, as left,right",
+    "scene": "scene to simulate, of as many tools: name of a shipped one, or a path",
     "atlas": "atlas; empty: no patient_interpolation",
     "state_dir": "directory of saved state; empty: none",
     "ui": "true: also serve the planning page",
@@ -75,15 +76,17 @@ def nodes(context: LaunchContext) -> list[Node]:
         Node(
             package="avatar_ros",
             executable=node,
-            parameters=[str(params), {n: typed(n) for n in names if n in given}],
+            parameters=[str(params), {n: typed(n, given[n]) for n in names if n in given}],
         )
         for node, names in OVERRIDES.items()
         if REQUIRED.get(node, "params") in given
     ]
 
 
-def typed(name: str) -> ParameterValue:
+def typed(name: str, given: str) -> ParameterValue | list[str]:
     """An argument as a parameter; launch by itself would take a folder called 2024 for a number."""
+    if name == "tools":
+        return [word.strip() for word in given.split(",")]
     return ParameterValue(LaunchConfiguration(name), value_type=int if name == "port" else str)
 
 

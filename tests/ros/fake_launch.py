@@ -104,6 +104,9 @@ def evaluate(description: LaunchDescription, argv: list[str]) -> dict[str, list[
         else:
             for node in entity.function(context):
                 file, values = node.parameters
-                values = {name: value.evaluate(context) for name, value in values.items()}
+                values = {
+                    name: value.evaluate(context) if isinstance(value, ParameterValue) else value
+                    for name, value in values.items()
+                }
                 started[node.executable] = [file, values]
     return started

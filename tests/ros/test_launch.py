@@ -67,7 +67,9 @@ def test_the_arguments_are_the_options_of_avatar_cell(file: dict[str, Any]) -> N
     assert file["REQUIRED"] == cell.REQUIRED
 
 
-@pytest.mark.parametrize("more", [{}, {"atlas": "a.h5"}, {"ui": "true", "port": "8081"}])
+@pytest.mark.parametrize(
+    "more", [{}, {"atlas": "a.h5"}, {"ui": "true", "port": "8081"}, {"tools": "left,right"}]
+)
 def test_it_starts_the_nodes_of_avatar_cell_with_the_same_parameters(
     file: dict[str, Any], more: dict[str, str]
 ) -> None:
@@ -75,12 +77,17 @@ def test_it_starts_the_nodes_of_avatar_cell_with_the_same_parameters(
     found = started(file, f"params:={PARAMS}", *(f"{n}:={value}" for n, value in given.items()))
     words = {
         node: ["--ros-args", "--params-file", params]
-        + [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
+        + [word for name, value in values.items() for word in ("-p", f"{name}:={as_yaml(value)}")]
         for node, (params, values) in found.items()
     }
     assert words == cell.node_arguments(PARAMS, given)
-    texts = [v for _, values in found.values() for n, v in values.items() if n != "port"]
+    others = {"port", *cell.LISTS}
+    texts = [v for _, values in found.values() for n, v in values.items() if n not in others]
     assert all(isinstance(text, str) for text in texts)  # the node refuses a number
+
+
+def as_yaml(value: Any) -> str:
+    return f"[{','.join(value)}]" if isinstance(value, list) else str(value)
 
 
 def test_without_arguments_it_starts_what_needs_none_from_the_installed_file(

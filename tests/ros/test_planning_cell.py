@@ -126,6 +126,8 @@ def test_page_and_patients_run_only_if_asked_for() -> None:
     assert set(node_arguments(None, {"atlas": "atlas.h5"})) == {*always, "patient_interpolation"}
     kept = node_arguments(None, {"state_dir": "/kept"})
     assert all(kept[node][-1] == "state_dir:=/kept" for node in always)
+    both = node_arguments(None, {"tools": "left,right"})
+    assert both["contact"][-1] == "tools:=[left,right]" and both["vademecum_loader"] == []
     page = node_arguments(None, {"ui": "yes", "port": "8081"})
     assert set(page) == {*always, "planning_ui"}
     assert page["planning_ui"][-1] == "port:=8081"
@@ -141,7 +143,7 @@ def test_paths_are_those_of_where_it_was_called(
     monkeypatch.setattr(os, "execv", lambda _, command: ran.append(command))
     cell(scene="drag.yaml")
     os.chdir(tmp_path)
-    cell(scene="palpation", params=tmp_path / "p.yaml")
+    cell(scene="palpation", params=tmp_path / "p.yaml", tools="left,right")
     by_file, by_name = (" ".join(command[3:]) for command in ran)
     assert by_file == f"--library_dir {tmp_path} --scene {tmp_path / 'drag.yaml'}"
-    assert by_name == f"--params {tmp_path / 'p.yaml'} --scene palpation"
+    assert by_name == f"--params {tmp_path / 'p.yaml'} --tools left,right --scene palpation"

@@ -28,12 +28,13 @@ _LONGEST_WAIT = 30.0  # before a node is started again [s]
 # Parameters that override those of the file, by node.
 OVERRIDES = {
     "vademecum_loader": ("library_dir", "vademecum", "state_dir"),
-    "contact": ("scene", "state_dir"),
+    "contact": ("tools", "scene", "state_dir"),
     "patient_interpolation": ("library_dir", "atlas"),
     "planning_ui": ("library_dir", "host", "port"),
 }
 # Nodes that run only if this was given.
 REQUIRED = {"patient_interpolation": "atlas", "planning_ui": "ui"}
+LISTS = ("tools",)  # given as words with commas
 
 
 def node_arguments(params: Path | None, given: dict[str, str]) -> dict[str, list[str]]:
@@ -42,11 +43,16 @@ def node_arguments(params: Path | None, given: dict[str, str]) -> dict[str, list
     for node, names in OVERRIDES.items():
         if REQUIRED.get(node, node) not in {node, *given}:
             continue
-        own = [f"{name}:={given[name]}" for name in names if name in given]
+        own = [f"{name}:={_value(name, given[name])}" for name in names if name in given]
         arguments = ["--params-file", str(params)] if params is not None else []
         arguments += [word for pair in own for word in ("-p", pair)]
         found[node] = ["--ros-args", *arguments] if arguments else []
     return found
+
+
+def _value(name: str, given: str) -> str:
+    """As ROS reads it."""
+    return f"[{given}]" if name in LISTS else given
 
 
 class KeptNode:
