@@ -1,4 +1,4 @@
-"""A coarse surface shown finely around the dent of a tip, for pictures; nothing here is felt.
+"""A coarse surface shown finely around the dents of tips, for pictures; nothing here is felt.
 
 The edges of an organ's mesh are some 9 mm long, a tip's dent a few. Triangles with a corner within
 two patch radii of the tip are split twice, each into four. With D = u_tip - u_patch faded as in
@@ -7,6 +7,7 @@ two patch radii of the tip are split twice, each into four. With D = u_tip - u_p
     u(x) = I[u + n D](x) - n D(rho(x)),
 
 I being linear interpolation on the coarse triangles. At the cloud's own points that is the cloud.
+Of several tips, the D add up.
 
 A cloud does not say what made its dent; it is found again from the tip's depth d on the linear
 organ at rest, delta + F (gamma - c) = d, gamma the compliance for the patch. That holds for any
@@ -16,6 +17,7 @@ deformation are left out of D, of which only what is not linear between the clou
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -65,31 +67,40 @@ class Touch(NamedTuple):
 
 
 def fine_surface(
-    vademecum: Vademecum, points: np.ndarray, tip: Tip, pose: np.ndarray
+    vademecum: Vademecum, points: np.ndarray, tips: Sequence[Tip], poses: np.ndarray
 ) -> FineSurface:
-    """The surface of an organ under a cloud, split around a tip that presses, if it is coarse.
+    """The surface of an organ under a cloud, split around tips that press, if it is coarse.
 
     The points of the cloud stay the first, those of structures inside among them.
 
     Parameters
     ----------
     points : ndarray, shape (n_surface_vertices, 6), deformed positions and displacements [m]
-    pose : ndarray, shape (3,), of the tip, in the frame of the positions [m]
+    poses : ndarray, shape (n_tips, 3), in the frame of the positions [m]
     """
     rest, faces = vademecum.surface_vertices, vademecum.organ_faces
     points = np.asarray(points, float)
     moved = points[:, 3:]
     breath = points[0, :3] - rest[0] - moved[0]  # of an organ whose frame moves
-    touch = find_touch(vademecum, tip, np.asarray(pose, float) - breath)
+    found = (
+        (tip, find_touch(vademecum, tip, pose - breath))
+        for tip, pose in zip(tips, poses, strict=True)
+    )
+    touches = [(tip, touch) for tip, touch in found if touch is not None]
     is_fine = len(faces) > len(vademecum.mesh.boundary_faces)
-    if touch is None or is_fine:
+    if not touches or is_fine:
         return FineSurface(points[:, :3], moved, faces, np.arange(len(faces)))
     patch_radius = vademecum.surface.patch_radius
-    near = np.linalg.norm(rest - touch.point, axis=1) < REACH * patch_radius
+    near = np.zeros(len(rest), bool)
+    for _, touch in touches:
+        near |= np.linalg.norm(rest - touch.point, axis=1) < REACH * patch_radius
     split = near[faces].any(axis=1)
     blend, finer = _split(faces[split], len(rest))
     places = blend @ rest
-    change = _change(tip, touch, patch_radius, places)[:, None] * touch.normal
+    changes = [
+        _change(tip, touch, patch_radius, places)[:, None] * touch.normal for tip, touch in touches
+    ]
+    change = np.sum(changes, axis=0)
     displacements = blend @ (moved + change[: len(rest)]) - change
     displacements[: len(rest)] = moved  # to the bit
     positions = places + breath + displacements

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from avatar_core.contact.effects import SeveralTools
 from avatar_core.contact.effects.tip_law import dent
 from avatar_core.contact.fine_surface import FineSurface, find_touch, fine_surface
 from avatar_core.contact.model import prepare
@@ -50,7 +51,7 @@ def test_between_the_points_of_a_cloud_the_dent_is_sneddons(
 ) -> None:
     errors = []
     for aside, cloud in zip(ASIDE, clouds, strict=True):
-        shown = fine_surface(cube, cloud, SPHERE, pose(aside))
+        shown = fine_surface(cube, cloud, [SPHERE], pose(aside)[None])
         rest = at_rest(shown)
         distance = np.linalg.norm(rest - place(aside), axis=1)
         near = np.flatnonzero((distance < END) & (np.abs(rest[:, 1] - place(aside)[1]) < 1e-6))
@@ -65,7 +66,7 @@ def test_between_the_points_of_a_cloud_the_dent_is_sneddons(
 def test_the_points_of_a_cloud_stay_where_they_are(
     cube: Vademecum, clouds: list[np.ndarray]
 ) -> None:
-    shown = fine_surface(cube, clouds[1], SPHERE, pose(ASIDE[1]))
+    shown = fine_surface(cube, clouds[1], [SPHERE], pose(ASIDE[1])[None])
     n = len(clouds[1])
     np.testing.assert_array_equal(shown.positions[:n], clouds[1][:, :3])
     np.testing.assert_array_equal(shown.displacements[:n], clouds[1][:, 3:])
@@ -73,7 +74,7 @@ def test_the_points_of_a_cloud_stay_where_they_are(
 
 def test_the_fine_triangles_are_the_coarse_ones(cube: Vademecum, clouds: list[np.ndarray]) -> None:
     """Sixteen for each near the dent, facing the same way, and without gaps along their rim."""
-    shown = fine_surface(cube, clouds[1], SPHERE, pose(ASIDE[1]))
+    shown = fine_surface(cube, clouds[1], [SPHERE], pose(ASIDE[1])[None])
     rest, faces = at_rest(shown), cube.surface_faces
     area, coarse = vector_area(rest, shown.faces), vector_area(cube.surface_vertices, faces)
     size, coarse_size = (np.linalg.norm(each, axis=1).sum() for each in (area, coarse))
@@ -112,13 +113,32 @@ def test_the_dent_of_a_cloud_is_found_again(cube: Vademecum, tip: Tip) -> None:
     np.testing.assert_allclose(touch.point, model.state.point[0], atol=1e-6)
 
 
+def test_two_dents_are_both_drawn(cube: Vademecum) -> None:
+    """Far from one another, each as if it were alone; those between them meet in the cloud."""
+    far = ((-20e-3, 0.0), (20e-3, 0.0))
+    model = prepare(cube, (SPHERE, SPHERE), effects=(SeveralTools(),))
+    pressed(model, (SPHERE, SPHERE), np.array([*map(place, far)]), np.array([UP, UP]), DEPTH)
+    cloud, poses = model.out.cloud, np.array([*map(pose, far)])
+    both = fine_surface(cube, cloud, [SPHERE, SPHERE], poses)
+    for k, aside in enumerate(far):
+        one = fine_surface(cube, cloud, [SPHERE], poses[[k]])
+        found = []
+        for shown in (one, both):
+            rest = at_rest(shown)[len(cloud) :]
+            near = np.linalg.norm(rest - place(aside), axis=1) < 0.5 * END
+            order = np.lexsort(np.round(rest[near], 9).T)
+            found.append(shown.displacements[len(cloud) :][near][order])
+        assert len(found[0]) > 10
+        np.testing.assert_allclose(found[1], found[0], atol=1e-6)  # of a dent of 1e-3
+
+
 def test_an_organ_that_breathes_carries_its_dent_along(
     cube: Vademecum, clouds: list[np.ndarray]
 ) -> None:
     breath = np.array([1e-3, -2e-3, 12e-3])
     moved = clouds[1] + np.pad(breath, (0, 3)).astype(np.float32)
-    still = fine_surface(cube, clouds[1], SPHERE, pose(ASIDE[1]))
-    shown = fine_surface(cube, moved, SPHERE, pose(ASIDE[1]) + breath)
+    still = fine_surface(cube, clouds[1], [SPHERE], pose(ASIDE[1])[None])
+    shown = fine_surface(cube, moved, [SPHERE], (pose(ASIDE[1]) + breath)[None])
     np.testing.assert_allclose(shown.positions, still.positions + breath, atol=1e-6)
     np.testing.assert_allclose(shown.displacements, still.displacements, atol=1e-6)
 
@@ -130,6 +150,8 @@ def test_without_a_dent_the_triangles_are_the_meshs(
     cube: Vademecum, clouds: list[np.ndarray], tip: Tip, height: float
 ) -> None:
     """Above the surface, under a patch, and far away."""
-    shown = fine_surface(cube, clouds[1], tip, place(ASIDE[1]) + (tip.offset + height) * UP)
+    shown = fine_surface(
+        cube, clouds[1], [tip], (place(ASIDE[1]) + (tip.offset + height) * UP)[None]
+    )
     np.testing.assert_array_equal(shown.faces, cube.surface_faces)
     np.testing.assert_array_equal(shown.positions, clouds[1][:, :3])

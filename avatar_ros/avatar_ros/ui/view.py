@@ -189,7 +189,7 @@ class OrganView:
         self._drawn = points.copy()
         plain = FineSurface(points[:, :3], points[:, 3:], organ.faces, np.arange(len(organ.faces)))
         if np.linalg.norm(force) > LEAST_FORCE:
-            shown = fine_surface(organ.vademecum, points, self._tip, tip)
+            shown = fine_surface(organ.vademecum, points, [self._tip], tip[None])
         else:
             shown = plain
         size = np.linalg.norm(shown.displacements, axis=1)
