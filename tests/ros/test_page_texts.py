@@ -27,7 +27,8 @@ from avatar_ros.ui.shown_period import BEYOND, OTHER_ORGAN, SILENT, PeriodChoose
 from avatar_ros.ui.texts import frame_text, recorded_text, warnings
 from avatar_ros.ui.tool_state import N_RECENT, N_ROWS, ROW, SharedToolState, organ_number
 
-from avatar_core.scene.recording import Clouds, Periods, Recording
+from avatar_core.scene.model import Scene
+from avatar_core.scene.recording import Clouds, Periods, Recording, load_recording
 from avatar_core.vademecum.model import VademecumInfo
 from avatar_ros.msg import ContactState
 from tests.core.box_organ import organ
@@ -186,6 +187,18 @@ def test_a_recording_ends_where_nothing_more_is_kept() -> None:
     state.live["n_rows"][0], state.live["recording"][0] = 0, 1
     recorder._clouds = 3 * [np.broadcast_to(np.float32(0.0), (100_000_000, 1))]
     assert recorder.is_full
+
+
+def test_a_recording_without_a_surface_is_written(tmp_path: Path) -> None:
+    """Of a contact node that sends none."""
+    state, cube = SharedToolState.make(), replace(organ("cube"), id="a" * 64)
+    recorder = Recorder(state)
+    recorder.open(cube, Scene(effects=()), 1000.0)
+    recorder.begin()
+    state.rows[0], state.live["n_rows"][0] = row(OK, 1.0), 1
+    saved = recorder.save(tmp_path)
+    assert saved is not None and len(saved[1].clouds.period) == 0
+    assert len(load_recording(saved[0]).periods) == 1
 
 
 def test_organs_are_told_apart_by_their_ids() -> None:

@@ -141,7 +141,7 @@ class Recorder:
             periods=_periods(kept),
             clouds=Clouds(
                 np.array([self._after[i] for i in same], np.int64),
-                np.array([self._clouds[i] for i in same], np.float32).reshape(-1, *size),
+                np.array([self._clouds[i] for i in same], np.float32).reshape(len(same), *size),
             ),
         )
         path = folder / time.strftime("recording-%Y%m%d-%H%M%S.h5")
