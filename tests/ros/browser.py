@@ -101,9 +101,10 @@ def draw_in_idle_time() -> None:
                     os.sched_setscheduler(int(thread.name), os.SCHED_IDLE, os.sched_param(0))
 
 
-def force_of(page: Any) -> float:
-    """As the page writes it [N]."""
-    found = re.search(r"Force ([\d.]+) N", page.inner_text("body"))
+def force_of(page: Any, tool: str = "") -> float:
+    """As the page writes it [N]; of several tools, that of the named one, 0 if another is shown."""
+    on = f"on {tool} " if tool else ""
+    found = re.search(rf"Force {on}([\d.]+) N", page.inner_text("body"))
     return float(found[1]) if found else 0.0
 
 
@@ -135,10 +136,19 @@ def screen_of(page: Any, pose: Pose, point: np.ndarray) -> tuple[float, float]:
     return float(x), float(box["y"] + 0.5 * box["height"] - scale * (way @ up))
 
 
+def look_beside(page: Any) -> None:
+    page.keyboard.press("7")  # the view beside the chosen tool
+    page.wait_for_timeout(1500)
+
+
 def drag(page: Any, shown: Organ, begin: float, end: float) -> None:
     """The tool from one height over the organ to another, with the mouse; the button stays down."""
-    page.keyboard.press("7")  # the view beside the tool
-    page.wait_for_timeout(1500)
+    look_beside(page)
+    drag_there(page, shown, begin, end)
+
+
+def drag_there(page: Any, shown: Organ, begin: float, end: float) -> None:
+    """The same, seen from there already."""
     pose = beside_pose(shown)
     x0, y0 = screen_of(page, pose, shown.above(begin))
     x1, y1 = screen_of(page, pose, shown.above(end))
@@ -178,11 +188,11 @@ def press(page: Any, button: str) -> None:
     page.get_by_role("button", name=button, exact=True).click()
 
 
-def pressed(page: Any, least: float = 0.5) -> None:
+def pressed(page: Any, least: float = 0.5, tool: str = "") -> None:
     """The tool so deep that the page says so much force [N]; a drag ends within 3 mm of its aim."""
     open_tab(page, "Tool")
     for _ in range(60):
-        if force_of(page) > least:
+        if force_of(page, tool) > least:
             return
         page.get_by_text("press 1 mm", exact=True).click()
         page.wait_for_timeout(300)

@@ -256,7 +256,7 @@ def keep(page: Any, session: Session) -> None:
     press(page, "Keep this state")
     news(page, "kept in plan-")
     (file,) = session.folder.glob("plan-*.json")
-    session.tip = np.array(json.loads(file.read_text())["states"][-1]["target"])
+    session.tip = np.array(json.loads(file.read_text())["states"][-1]["targets"][0])
 
 
 def record(page: Any, session: Session) -> None:

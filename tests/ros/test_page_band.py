@@ -40,12 +40,15 @@ def test_the_page_shows_a_band_in_proportion_to_the_force_beside_it() -> None:
 
 def test_the_force_of_a_stamp_is_that_or_none() -> None:
     state = SharedToolState.make()
-    row = np.zeros(1, ROW)[0]
-    row["stamp"], row["force"] = 7, (0.0, 3.0, 4.0)
-    state.recent[3] = row
-    state.live["n_recent"][0] = 4
-    assert state.force_of(7) == pytest.approx(5.0)
-    assert np.isnan(state.force_of(8))
+    state.use(np.zeros((2, 3)))
+    for tool, force in enumerate([(0.0, 3.0, 4.0), (0.0, 0.0, 1.0)]):
+        row = np.zeros(1, ROW)[0]
+        row["stamp"], row["force"] = 7 + tool, force
+        state.recent[tool, 3] = row
+    state.all["n_recent"] = 4
+    assert state.force_of(0, 7) == pytest.approx(5.0)
+    assert state.force_of(1, 8) == pytest.approx(1.0)
+    assert np.isnan(state.force_of(0, 8))
 
 
 def test_the_band_stands_beside_the_force() -> None:

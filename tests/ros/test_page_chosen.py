@@ -14,6 +14,7 @@ pytest.importorskip("viser", reason="the extra ui is not installed")
 
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.ui.chosen import Chosen, Page
+from avatar_ros.ui.tool_state import SharedToolState
 from avatar_ros.ui.view import CUT, GLASS, WHOLE
 
 pytestmark = pytest.mark.ros
@@ -61,15 +62,14 @@ def cell() -> Cell:
 
 @pytest.fixture
 def chosen(cell: Cell) -> Chosen:
-    live = np.zeros(1, [("target", float, 3), ("tip", float, 3)])
     page = Page(
         say=cell.said.append,
         stop_recording=cell.stopped.append,
-        change_tip=cell.tips.append,
+        change_tips=cell.tips.append,
         show_material=lambda values: None,
         show_look=lambda *look: cell.looks.append(look),
     )
-    found = Chosen(live, cell, page)  # type: ignore[arg-type]
+    found = Chosen(SharedToolState.make(), cell, page)  # type: ignore[arg-type]
     up = np.array([0.0, 0.0, 1.0])
     found.organ = SimpleNamespace(  # type: ignore[assignment]
         ranges=RANGES,
@@ -81,15 +81,20 @@ def chosen(cell: Cell) -> Chosen:
 
 
 def test_a_return_is_taken_back_as_a_whole(chosen: Chosen, cell: Cell) -> None:
-    chosen.put(np.array([0.01, 0.0, 0.0]))
+    chosen.tools.put(0, np.array([0.01, 0.0, 0.0]))
     chosen.choose_material({"young": 50e3})
-    kept = ("bare", {"young": 90e3, "poisson": 0.6}, (GLASS, "R", 0.3), np.array([0.0, 0.02, 0.0]))
+    kept = (
+        "bare",
+        {"young": 90e3, "poisson": 0.6},
+        (GLASS, "R", 0.3),
+        np.array([[0.0, 0.02, 0.0]]),
+    )
     chosen.return_to(*kept)
     assert cell.material[-1] == {"young": 90e3, "poisson": 0.49}  # within the organ's range
-    assert chosen.look == (GLASS, "R", 0.3) and chosen.target.tolist() == [0.0, 0.02, 0.0]
+    assert chosen.look == (GLASS, "R", 0.3) and chosen.tools.targets.tolist() == [[0.0, 0.02, 0.0]]
     chosen.undo()
     assert cell.material[-1] == {"young": 50e3, "poisson": 0.48}
-    assert chosen.look == (WHOLE, "A", 0.5) and chosen.target.tolist() == [0.01, 0.0, 0.0]
+    assert chosen.look == (WHOLE, "A", 0.5) and chosen.tools.targets.tolist() == [[0.01, 0.0, 0.0]]
     chosen.undo()
     assert cell.material[-1] == {"young": 170e3}
     chosen.undo()
@@ -97,7 +102,7 @@ def test_a_return_is_taken_back_as_a_whole(chosen: Chosen, cell: Cell) -> None:
 
 
 def test_what_is_in_force_is_not_sent_again(chosen: Chosen, cell: Cell) -> None:
-    chosen.return_to("", {"young": 170e3, "poisson": 0.48}, (WHOLE, "A", 0.5), np.zeros(3))
+    chosen.return_to("", {"young": 170e3, "poisson": 0.48}, (WHOLE, "A", 0.5), np.zeros((1, 3)))
     assert cell.material == [] and cell.scenes == [] and cell.stopped == []
 
 
@@ -149,10 +154,12 @@ def test_the_first_switch_of_a_scene_is_taken_back(chosen: Chosen, cell: Cell, o
     assert chosen.scene == "palpation" and "does not say" in cell.said[-2]
     assert chosen.organ is not None
     chosen.organ.vademecum = organ  # type: ignore[misc]
-    chosen.contact = {"scene": "", "cloud": "surface", "cloud_divisor": 1}
+    chosen.contact = {"scene": "", "cloud": "surface", "cloud_divisor": 1, "tools": ["tool"]}
+    chosen.contact |= {"tip.shape": "sphere", "tip.radius": 5e-3}
+    chosen.contact |= {"tip.half_angle": 0.0, "tip.rounding": 0.0}
     chosen.choose_scene("needle_probe")
     for back in ("palpation", ""):
-        chosen.undo() if back else chosen.return_to("", {}, chosen.look, chosen.target)
+        chosen.undo() if back else chosen.return_to("", {}, chosen.look, chosen.tools.targets)
         assert chosen.scene == back
     assert cell.scenes == [
         "palpation",
@@ -179,13 +186,14 @@ def test_another_organ_comes_in_its_own_material(chosen: Chosen, cell: Cell) -> 
 
 
 def test_the_tool_is_lifted_along_the_normal_and_dragged_along_its_shaft(chosen: Chosen) -> None:
-    chosen.put(np.array([0.01, 0.02, 0.03]))
-    chosen.lift()
-    np.testing.assert_allclose(chosen.target, [0.01, 0.02, 0.06])
-    chosen.drag(np.array([0.5, 0.5, 0.004]), along_shaft=True)  # the tip is at the origin
-    np.testing.assert_allclose(chosen.target, [0.0, 0.0, 0.004])
-    chosen.drag(np.array([np.nan, 0.0, 0.0]), along_shaft=False)
-    np.testing.assert_allclose(chosen.target, [0.0, 0.0, 0.004])
+    tools = chosen.tools
+    tools.put(0, np.array([0.01, 0.02, 0.03]))
+    tools.lift()
+    np.testing.assert_allclose(tools.targets, [[0.01, 0.02, 0.06]])
+    tools.drag(0, np.array([0.5, 0.5, 0.064]), along_shaft=True)
+    np.testing.assert_allclose(tools.targets, [[0.01, 0.02, 0.064]])
+    tools.drag(0, np.array([np.nan, 0.0, 0.0]), along_shaft=False)
+    np.testing.assert_allclose(tools.targets, [[0.01, 0.02, 0.064]])
 
 
 def test_the_scene_in_use_is_named_whoever_chose_it(chosen: Chosen, cell: Cell) -> None:

@@ -236,13 +236,13 @@ def test_a_recording_is_scrubbed_and_each_state_is_one_period(tmp_path: Path) ->
     reader: Any = AtOnce()
     player = Player(tmp_path, reader)
     assert player.state(shown) is None
-    assert player.open("recording-1.h5", shown) == ""
+    assert player.open("recording-1.h5", shown, 1) == ""
     assert player.seconds == pytest.approx(0.18)
     for part, k in ((0.0, 0), (0.5, 4), (1.0, 9)):
         player.seek(part)
         found = player.state(shown)
         assert found is not None
-        cloud, period, material = found
+        cloud, (period,), material = found
         assert np.linalg.norm(period.force) == pytest.approx(0.2 * k)
         assert np.abs(cloud[:, 4] + 2e-4 * k).max() < 1e-8
         np.testing.assert_allclose(cloud[:, :3] - cloud[:, 3:], shown.vertices, atol=1e-8)
@@ -251,7 +251,7 @@ def test_a_recording_is_scrubbed_and_each_state_is_one_period(tmp_path: Path) ->
     assert "not what the tool feels now" in player.alerts[0]
     player.close()
     assert player.state(shown) is None and player.alerts == []
-    assert "another organ" in player.open("recording-1.h5", replace(shown, id="b" * 64))
+    assert "another organ" in player.open("recording-1.h5", replace(shown, id="b" * 64), 1)
     assert not player.is_on
 
 
@@ -266,15 +266,19 @@ def test_beyond_the_range_a_recording_shows_what_was_shown(tmp_path: Path) -> No
     save_recording(replace(recording, periods=periods), tmp_path / "recording-1.h5")
     reader: Any = AtOnce()
     player = Player(tmp_path, reader)
-    assert player.open("recording-1.h5", shown) == ""
+    assert player.open("recording-1.h5", shown, 1) == ""
     player.seek(0.0)
     first = player.state(shown)
-    assert first is not None and first[1].missing and not first[1].is_held
-    assert np.isnan(first[1].largest) and not first[0][:, 3:].any()
+    assert first is not None
+    (period,) = first.shown
+    assert period.missing and not period.is_held
+    assert np.isnan(period.largest) and not first.cloud[:, 3:].any()
     player.seek(1.0)
     last = player.state(shown)
-    assert last is not None and last[1].missing and last[1].is_held
-    assert np.abs(last[0][:, 4] + 2e-4 * 4).max() < 1e-8 and np.abs(last[1].tip).max() < 1.0
+    assert last is not None
+    (period,) = last.shown
+    assert period.missing and period.is_held
+    assert np.abs(last.cloud[:, 4] + 2e-4 * 4).max() < 1e-8 and np.abs(period.tip).max() < 1.0
     assert player.state(replace(shown, id="b" * 64)) is None  # another organ was loaded meanwhile
 
 

@@ -51,8 +51,8 @@ def view_and_page(shown: Organ) -> Iterator[tuple[OrganView, Any]]:
         port = free.getsockname()[1]
     server = viser.ViserServer("127.0.0.1", port, verbose=False)
     server.gui.main_panel.minimize()
-    view = OrganView(server, lambda place, along_shaft: None)
-    view.show(shown, Tip())
+    view = OrganView(server, lambda tool, place, along_shaft: None)
+    view.show(shown, (Tip(),))
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
         page = browser.new_page(viewport={"width": 700, "height": 600})
@@ -96,7 +96,7 @@ def test_pixels_have_the_colours_of_the_legend_and_right_is_on_the_left(
     """Seen from the front, the patient's right is at the left: there the field is largest."""
     view, page = view_and_page
     cloud = ramp(shown)
-    view.move(cloud, np.ones(3), np.zeros(3))
+    view.move(cloud, np.ones((1, 3)), np.zeros((1, 3)))
     pixels, pose = picture(page), first_pose(shown)
     page.screenshot(path=shots_in(tmp_path) / "ramp.png")
     low, high = shown.vertices.min(axis=0), shown.vertices.max(axis=0)
@@ -126,7 +126,7 @@ def test_glass_has_no_dark_patch_and_rest_is_tissue(
 ) -> None:
     view, page = view_and_page
     rest = np.hstack([shown.vertices, np.zeros_like(shown.vertices)])
-    view.move(rest, np.ones(3), np.zeros(3))
+    view.move(rest, np.ones((1, 3)), np.zeros((1, 3)))
     pose = first_pose(shown)
     grid = [
         shown.centre + np.array([u, 0.5, v]) * (np.ptp(shown.vertices, axis=0) * 0.7)

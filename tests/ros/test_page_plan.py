@@ -27,7 +27,7 @@ pytestmark = pytest.mark.ros
 KEPT = Bookmark(
     note="over <the> tumour",
     made="2026-11-26T12:00:00",
-    target=(0.01, 0.02, 0.03),
+    targets=((0.01, 0.02, 0.03), (0.04, 0.05, 0.06)),
     scene="relaxation",
     material={"young": 5.5e3},
     camera=(0.0, 1, 0, 0, 0, 0, 0, 0, 1),
@@ -45,6 +45,17 @@ def test_states_are_kept_by_organ_and_come_back(tmp_path: Path) -> None:
     assert Bookmarks(tmp_path, "a" * 64, "liver").kept == []
 
 
+def test_states_of_the_time_of_one_tool_are_read(tmp_path: Path) -> None:
+    bookmarks = Bookmarks(tmp_path, "a" * 64, "liver")
+    bookmarks.keep(KEPT)
+    whole = json.loads(bookmarks.path.read_text())
+    del whole["states"][0]["targets"]
+    whole["version"], whole["states"][0]["target"] = 1, [0.01, 0.02, 0.03]
+    bookmarks.path.write_text(json.dumps(whole))
+    (kept,) = Bookmarks(tmp_path, "a" * 64, "liver").kept
+    assert kept == replace(KEPT, targets=((0.01, 0.02, 0.03),))
+
+
 def test_two_states_of_one_minute_are_two(tmp_path: Path) -> None:
     bookmarks = Bookmarks(tmp_path, "a" * 64, "liver")
     later = replace(KEPT, made="2026-11-26T12:00:07", scene="palpation")
@@ -56,8 +67,8 @@ def test_two_states_of_one_minute_are_two(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("target", [0.0, float("nan"), 0.0]),
-        ("target", [0.0]),
+        ("targets", [[0.0, float("nan"), 0.0]]),
+        ("targets", [[0.0, 0.0, 0.1], [0.0]]),
         ("camera", [1.0, 2.0]),
         ("look", ["upside down", "A", 0.5]),
         ("look", ["whole", "<b>", 0.5]),
@@ -104,7 +115,7 @@ def plan(tmp_path: Path) -> tuple[Plan, list[str], list[str], PlanNow]:
     shown = Organ.of(replace(organ("cube"), id="c" * 64))
     now = PlanNow(
         shown,
-        (0.0, 0.0, 0.1),
+        ((0.0, 0.0, 0.1),),
         "",
         {"young": 170e3},
         ("whole", "A", 0.5),

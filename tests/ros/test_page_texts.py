@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from avatar_ros.loop.statuses import EXPLANATIONS
 from avatar_ros.nodes.planning_ui import PlanningNode
 from avatar_ros.ui.alerts import alerts
 from avatar_ros.ui.library import Library
+from avatar_ros.ui.live import Live
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.panels import Panels
 from avatar_ros.ui.recorder import Recorder
@@ -37,6 +39,7 @@ pytestmark = pytest.mark.ros
 
 OK, OUT = ContactState.STATUS_OK, ContactState.STATUS_OUT_OF_RANGE
 TIP = np.array([0.0, 0.1, 0.0])
+TIPS = TIP[None]
 
 
 def shown(force: float, error: float, fraction: float, largest: float) -> ShownPeriod:
@@ -44,7 +47,7 @@ def shown(force: float, error: float, fraction: float, largest: float) -> ShownP
 
 
 def row(status: int, force: float, stamp: int = 1) -> np.ndarray:
-    out = np.zeros(1, ROW)[0]
+    out = np.zeros(1, ROW)
     out["status"], out["stamp"], out["tip"] = status, stamp, TIP
     out["force"], out["touches"], out["sent_fraction"] = (0.0, force, 0.0), force > 0.0, 1.0
     return out
@@ -56,7 +59,7 @@ def test_a_limited_force_is_no_measurement() -> None:
     text = " ".join(frame_text(now, "E 170 kPa", None))
     assert "Force <b>25.00 N</b> ± 2.70 N, device 20.00 N" in text
     assert "<b>7.1 mm</b>" in text and "E 170 kPa" in text
-    (alert,) = alerts(info(0.01), now)
+    (alert,) = alerts(info(0.01), [now])
     assert alert == "Force limited: the device gets 20.00 N of 25.00 N"
 
 
@@ -64,7 +67,7 @@ def test_a_force_that_the_device_gets_is_written_once() -> None:
     free = shown(0.0, 0.0, 0.0, 0.0)  # nothing is held back
     for now in (shown(3.3, 0.1, 1.0, 0.001), free):
         assert "device" not in " ".join(frame_text(now, "", None))
-        assert alerts(info(0.01), now) == []
+        assert alerts(info(0.01), [now]) == []
 
 
 def test_no_displacement_is_not_none() -> None:
@@ -77,37 +80,37 @@ def test_a_force_is_that_of_the_clouds_period() -> None:
     state = SharedToolState.make()
     assert state.period(5) is None
     for n in range(3 * N_RECENT):
-        state.recent[n % N_RECENT] = row(OK, 0.001 * n, stamp=1000 + n)
-        state.live["n_recent"][0] = n + 1
+        state.recent[:, n % N_RECENT] = row(OK, 0.001 * n, stamp=1000 + n)
+        state.all["n_recent"] = n + 1
     found = state.period(1000 + 3 * N_RECENT - 100)
-    assert found is not None and found["force"][1] == 0.001 * (3 * N_RECENT - 100)
+    assert found is not None and found["force"][0, 1] == 0.001 * (3 * N_RECENT - 100)
     newest = state.period(77)  # of a cloud whose state has not come: the newest
-    assert newest is not None and newest["stamp"] == 1000 + 3 * N_RECENT - 1
+    assert newest is not None and newest["stamp"].tolist() == [1000 + 3 * N_RECENT - 1]
 
 
 def test_beyond_the_range_the_last_valid_shape_stays() -> None:
     chooser = PeriodChooser()
     for force in (1.0, 20.0):
         assert chooser.take(row(OK, force))
-        chooser.drawn(row(OK, force), 1e-4 * force, TIP)
+        chooser.drawn(row(OK, force), 1e-4 * force, TIPS)
     for _ in range(3):  # the organ of these periods lies at rest
         assert not chooser.take(row(OUT, 0.0))
-        held = chooser.drawn(row(OUT, 0.0), float("nan"), TIP)
+        (held,) = chooser.drawn(row(OUT, 0.0), float("nan"), TIPS)
         assert held.is_held and held.force[1] == 20.0 and held.largest == 2e-3
     text = " ".join(frame_text(held, "", None))
     assert "No force" in text and "20.00 N" in text and "2.0 mm" in text
-    (alert,) = alerts(info(0.01), held)
+    (alert,) = alerts(info(0.01), [held])
     assert "No force" in alert and "beyond" in alert
     assert chooser.take(row(OK, 0.0))
-    assert not chooser.drawn(row(OK, 0.0), 0.0, TIP).is_held
+    assert not chooser.drawn(row(OK, 0.0), 0.0, TIPS)[0].is_held
 
 
 def test_a_tool_that_never_touched_holds_nothing() -> None:
     chooser = PeriodChooser()
     assert chooser.take(row(OUT, 0.0))
-    assert not chooser.drawn(row(OUT, 0.0), 0.0, TIP).is_held
+    assert not chooser.drawn(row(OUT, 0.0), 0.0, TIPS)[0].is_held
     chooser.take(row(OK, 3.0))
-    chooser.drawn(row(OK, 3.0), 1e-3, TIP)
+    chooser.drawn(row(OK, 3.0), 1e-3, TIPS)
     chooser.forget()  # another organ
     assert chooser.take(row(OUT, 0.0))
 
@@ -119,9 +122,9 @@ def test_what_is_not_known_is_not_zero(missing: str) -> None:
     if missing == BEYOND:
         chooser = PeriodChooser()
         chooser.take(row(OUT, 0.0))
-        now = chooser.drawn(row(OUT, 0.0), 0.0, TIP)
+        (now,) = chooser.drawn(row(OUT, 0.0), 0.0, TIPS)
     assert re.search(r"\d (N|mm)", " ".join(frame_text(now, "", None))) is None
-    assert alerts(info(0.01), now) == [f"No force: {missing}"]
+    assert alerts(info(0.01), [now]) == [f"No force: {missing}"]
     assert np.isnan(now.size)
 
 
@@ -129,20 +132,15 @@ def test_a_cloud_of_another_organ_is_not_drawn() -> None:
     """The contact node still uses the last patient, whose cloud may have as many points."""
     state, drawn, greys = SharedToolState.make(), [], []
     stamp = stamp_bytes(5)
-    page: Any = SimpleNamespace(
-        _state=state,
-        _cloud=SimpleNamespace(take=lambda: (stamp, np.ones((4, 6), np.float32))),
-        _view=SimpleNamespace(move=lambda *given: drawn.append(given) or 1e-3, grey=greys.append),
-        _recorder=SimpleNamespace(is_on=False),
-        _periods=PeriodChooser(),
-        _answers=lambda: True,
-        _number=organ_number("b" * 64),
-    )
-    page._without_force = lambda *given: PlanningNode._without_force(page, *given)
-    state.recent[0], state.live["n_recent"][0] = row(OK, 3.0, stamp=5), 1
+    view: Any = SimpleNamespace(move=lambda *given: drawn.append(given) or 1e-3, grey=greys.append)
+    live = Live(None, state, Recorder(state))  # type: ignore[arg-type]
+    cloud: Any = SimpleNamespace(take=lambda: (stamp, np.ones((4, 6), np.float32)))
+    live._cloud, live.organ = cloud, organ_number("b" * 64)
+    state.recent[:, 0], state.all["n_recent"] = row(OK, 3.0, stamp=5), 1
+    state.all["heard"] = time.monotonic_ns()
     for identity, missing in (("a" * 64, OTHER_ORGAN), ("", OTHER_ORGAN), ("b" * 64, "")):
-        state.recent["organ"][0] = organ_number(identity)
-        found = PlanningNode._period_to_show(page)
+        state.recent["organ"][0, 0] = organ_number(identity)
+        (found,) = live.draw(view)
         assert found.missing == missing
     assert len(drawn) == 1 and greys == [True, True, False]
     assert found.size == 3.0 and found.largest == 1e-3
@@ -152,7 +150,7 @@ def test_an_error_that_was_never_measured_is_not_zero() -> None:
     chooser, pressed = PeriodChooser(), row(OK, 12.0)
     pressed["error"] = np.nan
     chooser.take(pressed)
-    text = frame_text(chooser.drawn(pressed, 1e-3, TIP), "", None)[0]
+    text = frame_text(chooser.drawn(pressed, 1e-3, TIPS)[0], "", None)[0]
     assert text == "Force <b>12.00 N</b> (error unknown)"
 
 
@@ -178,13 +176,13 @@ def test_a_library_that_is_gone_is_said_and_ends_nothing(tmp_path: Path) -> None
 def test_a_recording_ends_where_nothing_more_is_kept() -> None:
     state = SharedToolState.make()
     recorder = Recorder(state)
-    state.live["recording"][0] = 1
+    state.all["recording"] = 1
     assert not recorder.is_full
-    state.live["n_rows"][0] = N_ROWS
+    state.all["n_rows"] = N_ROWS
     assert recorder.is_full
     recorder.drop()
     assert not recorder.is_full
-    state.live["n_rows"][0], state.live["recording"][0] = 0, 1
+    state.all["n_rows"], state.all["recording"] = 0, 1
     recorder._clouds = 3 * [np.broadcast_to(np.float32(0.0), (100_000_000, 1))]
     assert recorder.is_full
 
@@ -195,7 +193,7 @@ def test_a_recording_without_a_surface_is_written(tmp_path: Path) -> None:
     recorder = Recorder(state)
     recorder.open(cube, Scene(effects=()), 1000.0)
     recorder.begin()
-    state.rows[0], state.live["n_rows"][0] = row(OK, 1.0), 1
+    state.rows[:, 0], state.all["n_rows"] = row(OK, 1.0), 1
     saved = recorder.save(tmp_path)
     assert saved is not None and len(saved[1].clouds.period) == 0
     assert len(load_recording(saved[0]).periods) == 1
@@ -212,20 +210,20 @@ def test_a_tool_without_a_pose_is_drawn_where_it_was_sent() -> None:
     for away in (np.full(3, 1e3), np.full(3, np.nan)):
         far["tip"] = away
         chooser.take(far)
-        np.testing.assert_array_equal(chooser.drawn(far, 0.0, TIP).tip, TIP)
+        np.testing.assert_array_equal(chooser.drawn(far, 0.0, TIPS)[0].tip, TIP)
 
 
 def test_missed_periods_are_said_beside_nodes_that_answer() -> None:
-    assert warnings((), True, OK, 0.001) == "All nodes answer."
-    busy = warnings((), True, OK, 0.2)
+    assert warnings((), True, (OK,), missed=0.001) == "All nodes answer."
+    busy = warnings((), True, (OK,), missed=0.2)
     assert busy.startswith("⚠ All nodes answer, but 20% of the periods come late")
-    alone = warnings(("vademecum_loader",), True, OK, 0.2)
+    alone = warnings(("vademecum_loader",), True, (OK,), missed=0.2)
     assert "nodes answer" not in alone and "20% of the periods come late" in alone
 
 
-@pytest.mark.parametrize("status", [None, OK, *EXPLANATIONS])
-def test_each_line_ends_with_one_mark(status: int | None) -> None:
-    for line in warnings(("vademecum_loader",), False, status, 0.2).splitlines():
+@pytest.mark.parametrize("statuses", [(), (OK,), *((status,) for status in EXPLANATIONS)])
+def test_each_line_ends_with_one_mark(statuses: tuple[int, ...]) -> None:
+    for line in warnings(("vademecum_loader",), False, statuses, missed=0.2).splitlines():
         assert line[0] == "⚠" and not line[2].islower()
         assert line[-1] in ".?" and line[-2].isalnum() | (line[-2] in "`')")
 
@@ -233,17 +231,17 @@ def test_each_line_ends_with_one_mark(status: int | None) -> None:
 def test_a_patient_of_large_expected_error_is_marked() -> None:
     """Interpolated patients are 16 % wrong; what was never measured is no better."""
     now = shown(0.0, 0.0, 1.0, 0.0)
-    (alert,) = alerts(info(0.16), now)
+    (alert,) = alerts(info(0.16), [now])
     assert "Large expected error" in alert and "16%" in alert
-    assert "never measured" in alerts(info(float("nan")), now)[0]
-    assert alerts(info(0.02), now) == []
+    assert "never measured" in alerts(info(float("nan")), [now])[0]
+    assert alerts(info(0.02), [now]) == []
 
 
 def test_an_extrapolated_force_is_marked_and_one_that_fades_in_is_not() -> None:
     now = shown(3.0, 0.1, 0.5, 1e-3)
     extrapolated = now._replace(status=ContactState.STATUS_EXTRAPOLATED)
-    assert "Extrapolated" in alerts(info(0.01), extrapolated)[0]
-    assert alerts(info(0.01), now._replace(status=ContactState.STATUS_ENGAGING)) == []
+    assert "Extrapolated" in alerts(info(0.01), [extrapolated])[0]
+    assert alerts(info(0.01), [now._replace(status=ContactState.STATUS_ENGAGING)]) == []
 
 
 def info(error: float) -> VademecumInfo:
@@ -270,3 +268,5 @@ def test_a_recording_says_what_it_lacks() -> None:
     assert recorded_text(made) == (
         "recorded 1.0 s, 490 of 1,000 periods (500 came late in the loop, 10 lost)"
     )
+    often = replace(periods, stamp=periods.stamp // 5, number=np.arange(n))  # of several tools
+    assert recorded_text(replace(made, periods=often)) == "recorded 0.2 s, 490 of 490 periods"

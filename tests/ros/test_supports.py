@@ -18,9 +18,8 @@ from avatar_ros.ui.presets import HINTS, SLIDERS
 from avatar_ros.ui.recorder import scene_in_force
 
 from avatar_core.common.supports import ATTACHMENTS
-from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import parse_scene, write_scene
-from avatar_core.scene.model import SupportStiffness
+from avatar_core.scene.model import SupportStiffness, Tool
 from avatar_core.scene.prepare import scene_spec
 from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum
@@ -106,7 +105,7 @@ def test_a_fixed_support_keeps_the_modulus_as_built(organ: Vademecum) -> None:
 
 
 def test_a_recording_keeps_the_stiffness_in_its_scene(organ: Vademecum) -> None:
-    scene = scene_in_force(None, organ, {BARE: 2e7, "young": 0.1e6}, Tip())
+    scene = scene_in_force(None, organ, {BARE: 2e7, "young": 0.1e6}, (Tool(),))
     assert scene.supports == (SupportStiffness("bare_area", 2e7),)
     assert parse_scene(write_scene(scene), "again") == scene
 

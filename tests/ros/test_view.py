@@ -41,8 +41,8 @@ def view() -> Iterator[OrganView]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     server = viser.ViserServer("127.0.0.1", port, verbose=False)
-    view = OrganView(server, lambda place, along_shaft: None)
-    view.show(Organ.of(organ("cube")), SPHERE)
+    view = OrganView(server, lambda tool, place, along_shaft: None)
+    view.show(Organ.of(organ("cube")), (SPHERE,))
     yield view
     server.stop()
 
@@ -73,9 +73,9 @@ def test_under_a_tip_that_presses_the_page_draws_its_dent(
     """Deeper than any point of the cloud; and none of it when the tip lets go."""
     cloud, force = pressed.out.cloud, pressed.out.force[0]
     sizes = np.linalg.norm(cloud[:, 3:], axis=1)
-    assert view.move(cloud, POSE, force) > 0.8 * DEPTH > 1.5 * sizes.max()
+    assert view.move(cloud, POSE[None], force[None]) > 0.8 * DEPTH > 1.5 * sizes.max()
     assert len(meshes(view, "bands")) > 0.7 * N_BANDS * 0.8 * DEPTH / view.top
-    assert view.move(0.5 * cloud, POSE, 0.0 * force) == pytest.approx(0.5 * sizes.max())
+    assert view.move(0.5 * cloud, POSE[None], 0.0 * force[None]) == pytest.approx(0.5 * sizes.max())
 
 
 def test_at_rest_the_organ_is_tissue_whole_and_once(view: OrganView) -> None:
@@ -93,7 +93,7 @@ def test_bands_and_tissue_together_cover_the_organ(view: OrganView, pressed: Con
     cloud[:, 3:] *= 0.05 * view.top / np.linalg.norm(cloud[:, 3:], axis=1).max() * 4.0
     cloud[:, :3] = organ("cube").surface_vertices + cloud[:, 3:]
     before = area(meshes(view, "tissue"))
-    view.move(cloud, POSE, np.zeros(3))
+    view.move(cloud, POSE[None], np.zeros((1, 3)))
     groups = [meshes(view, group) for group in ("tissue", "rim", "bands")]
     assert all(groups)
     assert sum(map(area, groups)) == pytest.approx(before, rel=5e-3)
@@ -102,10 +102,10 @@ def test_bands_and_tissue_together_cover_the_organ(view: OrganView, pressed: Con
 def test_the_same_cloud_is_not_sent_twice(view: OrganView, pressed: ContactModel) -> None:
     """A tool at rest would cost the browser thirty pictures a second."""
     cloud, force = pressed.out.cloud, pressed.out.force[0]
-    largest = view.move(cloud, POSE, force)
+    largest = view.move(cloud, POSE[None], force[None])
     (first, *_) = meshes(view, "bands")
     first.vertices = np.zeros_like(first.vertices)
-    assert view.move(cloud.copy(), POSE, force) == largest
+    assert view.move(cloud.copy(), POSE[None], force[None]) == largest
     assert not np.any(first.vertices)
 
 
@@ -169,7 +169,7 @@ def test_what_springs_hold_is_hatched(view: OrganView) -> None:
     shown = Organ.of(replace(cube, supports=(Support("bare_area", held, 1e6),)))
     np.testing.assert_array_equal(shown.sprung, held)
     whole = area(meshes(view, "tissue"))
-    view.show(shown, SPHERE)
+    view.show(shown, (SPHERE,))
     corners = shown.vertices[shown.faces[held]].astype(float)
     a, b, c = corners.transpose(1, 0, 2)
     there = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
@@ -197,8 +197,8 @@ def test_little_error_looks_unlike_no_access(view: OrganView) -> None:
 
 
 def test_under_a_patch_the_page_draws_the_cloud(view: OrganView, pressed: ContactModel) -> None:
-    view.change_tip(Tip("patch", 3e-3))
-    largest = view.move(pressed.out.cloud, POSE, pressed.out.force[0])
+    view.change_tips((Tip("patch", 3e-3),))
+    largest = view.move(pressed.out.cloud, POSE[None], pressed.out.force)
     assert largest == pytest.approx(np.linalg.norm(pressed.out.cloud[:, 3:], axis=1).max())
 
 
@@ -212,18 +212,18 @@ def with_lesion() -> Vademecum:
 
 def test_a_structure_belongs_to_its_organ_and_moves_with_it(view: OrganView) -> None:
     sick = with_lesion()
-    view.show(Organ.of(sick), SPHERE)
+    view.show(Organ.of(sick), (SPHERE,))
     parts = view._structures._parts
     before = [np.array(part.mesh.vertices) for part in parts]
     assert sum(len(part.mesh.faces) for part in parts) == 4
     model = prepare(sick, (SPHERE,), effects=())
     for height in np.linspace(DEPTH, 0.0, 9):
         step(model, (POSE + height * UP)[None])
-    view.move(model.out.cloud, POSE, model.out.force[0])
+    view.move(model.out.cloud, POSE[None], model.out.force)
     for part, old in zip(parts, before, strict=True):
         np.testing.assert_array_equal(part.mesh.vertices, model.out.cloud[part.used, :3])
         assert np.abs(np.array(part.mesh.vertices) - old).max() > 0.05 * DEPTH
-    view.show(Organ.of(organ("cube")), SPHERE)
+    view.show(Organ.of(organ("cube")), (SPHERE,))
     assert view._structures._parts == []
 
 
@@ -260,6 +260,6 @@ def test_the_scale_never_shrinks_during_a_touch_and_begins_anew_at_rest(view: Or
     for largest in (7e-3, 1e-3, 0.0, 1e-3):
         cloud = rest.copy()
         cloud[0, 3:] = 0.0, 0.0, largest
-        view.move(cloud, np.ones(3), np.zeros(3))
+        view.move(cloud, np.ones((1, 3)), np.zeros((1, 3)))
         tops.append(view.top)
     assert tops == [1e-2, 1e-2, 1e-3, 1e-3]

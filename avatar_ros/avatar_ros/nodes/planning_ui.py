@@ -1,14 +1,14 @@
 """The planning page: an organ in the browser that is pressed with the mouse, simulated at 1 kHz.
 
 Needs the extra ``ui``. viser serves the page. A process of its own
-(:mod:`avatar_ros.ui.tool_driver`) sends the poses and reads the answers, and clouds are shown 30
-times a second, so neither the page nor its users can delay the contact loop.
+(:mod:`avatar_ros.ui.tool_driver`) sends the poses of all tools and reads the answers, and clouds
+are shown 30 times a second, so neither the page nor its users can delay the contact loop.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,11 @@ except ImportError as error:
 
 from avatar_core.common.processes import free_at_once
 from avatar_core.errors import AvatarError
-from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.storage import parse_vademecum
 from avatar_ros.framework import qos
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError, values
 from avatar_ros.framework.reader import Reader
-from avatar_ros.framework.templates import stamp_nanoseconds
 from avatar_ros.loop.settings import MATERIAL, TIP
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
 from avatar_ros.ui.actions import Actions
@@ -36,10 +34,11 @@ from avatar_ros.ui.bookmarks import Bookmark
 from avatar_ros.ui.camera import turn_camera
 from avatar_ros.ui.chosen import Chosen, Page
 from avatar_ros.ui.coloured import Coloured
-from avatar_ros.ui.display import RATE, NewestCloud
+from avatar_ros.ui.display import RATE
 from avatar_ros.ui.force_band import NewestBand
 from avatar_ros.ui.guard import Guard, guarded
 from avatar_ros.ui.library import Library
+from avatar_ros.ui.live import Live
 from avatar_ros.ui.measures import Measures, Now
 from avatar_ros.ui.measures_view import MeasuresView
 from avatar_ros.ui.new_patient import NewPatient
@@ -47,7 +46,7 @@ from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import Pose
 from avatar_ros.ui.panels import Panels
 from avatar_ros.ui.plan import Plan, PlanNow
-from avatar_ros.ui.player import Player
+from avatar_ros.ui.player import Played, Player
 from avatar_ros.ui.presets import material_text
 from avatar_ros.ui.preview_view import PreviewView
 from avatar_ros.ui.recorder import Recorder
@@ -56,16 +55,15 @@ from avatar_ros.ui.recordings import Recordings
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.scan_view import ScanView
 from avatar_ros.ui.settings import PLANNING_UI
-from avatar_ros.ui.shown_period import OTHER_ORGAN, SILENT, PeriodChooser, ShownPeriod
-from avatar_ros.ui.texts import frame_text, plain, scene_texts, warnings
+from avatar_ros.ui.shown_period import ShownPeriod
+from avatar_ros.ui.texts import frame_text, plain, warnings
 from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess, organ_number
-from avatar_ros.ui.view import CLEARANCE, GLASS, WHOLE, OrganView
+from avatar_ros.ui.view import GLASS, WHOLE, OrganView
 
 FRAME = "organ"
 _PLOT_FRAMES = 6  # between two points of the plots
 _CUT_FRAMES = 3  # between two places of a cut that is dragged
 _POLL_FRAMES = 30  # between two checks of library and nodes
-_SILENCE = 1.0  # after which the contact node counts as not answering [s]
 _TIP = tuple(parameter.name for parameter in TIP)
 _OF_CONTACT = (*_TIP, "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
 
@@ -82,15 +80,12 @@ class PlanningNode(ManagedNode):
         self._alerts: list[str] = []
         self._reader = Reader(1 << 30)  # of organs, for which the page waits
         self._files = Reader(1 << 30)  # of what users choose, in threads of their own
-        self._cloud: NewestCloud | None = None
-        self._band = NewestBand(self)
+        self._live = Live(self, self._state, self._recorder)
+        self._band = NewestBand(self, self._state.force_of)
         self._was_missing, self._is_to_restore = True, False
         self._frame, self._frame_id = 0, FRAME
         self._began = time.monotonic()
-        self._periods = PeriodChooser()
-        self._shown: ShownPeriod | None = None
-        self._number = 0  # of the organ that is shown
-        self._last_cloud, self._missed = 0.0, 0.0  # [s], part of the periods
+        self._missed = 0.0  # part of the periods
         self._own_subscriptions: list[Any] = []
         self._timer: Any = None
         super().__init__("planning_ui", PLANNING_UI)
@@ -103,24 +98,26 @@ class PlanningNode(ManagedNode):
         if not folder.is_dir():
             raise ParameterError(f"parameter library_dir: {folder} is not a directory")
         self._library = Library(folder.resolve())
-        self._tool = value["tool"]
         guard = Guard(value["host"], value["token"])
         with guarded(guard):
             self._server = server = viser.ViserServer(value["host"], value["port"], verbose=False)
         self._requests = Requests(self)
         self._chosen = chosen = Chosen(
-            self._state.live,
+            self._state,
             self._requests,
             Page(
                 say=self._say,
                 stop_recording=lambda why: self._recordings.stop(why),
-                change_tip=self._change_tip,
+                change_tips=lambda tips: self._view.change_tips(tips),
                 show_material=lambda values: self._panels.organ.show_material(values),
                 show_look=self._show_look,
             ),
         )
         self._view = OrganView(
-            server, chosen.drag, lambda *given: self._panels.show_cube(*given), chosen.drag_cut
+            server,
+            chosen.tools.drag,
+            lambda *given: self._panels.show_cube(*given),
+            chosen.drag_cut,
         )
         self._coloured = Coloured(
             self._view,
@@ -146,11 +143,11 @@ class PlanningNode(ManagedNode):
             self._player,
             self._requests,
             chosen,
-            self._state.live,
+            self._state,
             RecordingsPage(
                 say=self._say,
                 show_recording=lambda on: self._panels.tool.show_recording(on),
-                answers=self._answers,
+                answers=lambda: self._live.answers,
             ),
         )
         self._scan = ScanView(
@@ -176,8 +173,9 @@ class PlanningNode(ManagedNode):
                 end_preview=new.end_preview,
                 brush=new.brush,
                 cancel=self._requests.cancel_patient,
-                nudge=chosen.nudge,
-                lift=chosen.lift,
+                tool=chosen.tools.choose,
+                nudge=chosen.tools.nudge,
+                lift=chosen.tools.lift,
                 record=self._recordings.record,
                 play=self._recordings.play,
                 pause=lambda: self._player.pause(True),
@@ -202,7 +200,7 @@ class PlanningNode(ManagedNode):
             ),
         )
         server.on_client_disconnect(self._panels.forget_client)
-        self._panels.scene.offer(scene_texts())
+        self._panels.scene.offer(len(chosen.tools.labels))
         self._own_subscriptions = [
             self.create_subscription(
                 VademecumInfo, "vademecum_info", self._take_frame, qos.LATCHED
@@ -212,7 +210,6 @@ class PlanningNode(ManagedNode):
                 LoopStatistics, "statistics", self._take_statistics, qos.STATISTICS
             ),
         ]
-        self._band.listen(self._tool, self._state.force_of)
         self.get_logger().info(f"planning page at {guard.address(server.get_port())}")
 
     def activate(self) -> None:
@@ -229,9 +226,7 @@ class PlanningNode(ManagedNode):
         for subscription in self._own_subscriptions:
             self.destroy_subscription(subscription)
         self._own_subscriptions = []
-        if self._cloud is not None:
-            self._cloud.close()
-            self._cloud = None
+        self._live.close()
         self._band.close()
         if self._server is not None:
             self._requests.close()
@@ -254,11 +249,8 @@ class PlanningNode(ManagedNode):
             self._listen_to_clouds()
 
     def _listen_to_clouds(self) -> None:
-        if self._cloud is not None:
-            self._cloud.close()
-            self._cloud = None
         if self._organ is not None:
-            self._cloud = NewestCloud(self, self._frame_id, len(self._organ.vertices))
+            self._live.listen(self._frame_id, len(self._organ.vertices))
 
     def _take_organ(self, message: VademecumFile) -> None:
         if self._organ is not None and self._organ.id == message.id:
@@ -273,19 +265,18 @@ class PlanningNode(ManagedNode):
             return
         self._recordings.stop("the organ changed")
         self._chosen.forget(GLASS if organ.structures else WHOLE)
-        tip = self._chosen.tip
-        self._chosen.put(organ.above(tip.offset + CLEARANCE))
+        self._chosen.tools.put_all(organ.starts(self._chosen.tips))
         self._player.close()
         self._new_patient.end_preview()
         self._scan.forget()
-        self._view.show(organ, tip)
-        self._measures.show_organ(organ, tip)
-        self._periods.forget()
+        self._view.show(organ, self._chosen.tips)
+        self._measures.show_organ(organ, self._chosen.tip)
+        self._live.forget()
         self._band.forget()
         self._coloured.forget()
         self._panels.show_organ(organ)
-        self._chosen.organ, self._number = organ, organ_number(organ.id)
-        self._shown, self._lines, self._alerts = None, [], []
+        self._chosen.organ, self._live.organ = organ, organ_number(organ.id)
+        self._lines, self._alerts = [], []
         self._listen_to_clouds()
         self._requests.parameters_of_contact(tuple(MATERIAL), self._chosen.note_contact)
         self._plan.show_organ(organ)
@@ -304,117 +295,97 @@ class PlanningNode(ManagedNode):
         self._frame += 1
         if self._frame % _POLL_FRAMES == 1:
             self._poll_cell()
-        if organ is None or self._cloud is None:
+        if organ is None or not self._live.is_listening:
             return
+        self._follow_choice()
         if self._frame % _CUT_FRAMES == 0:
             self._chosen.settle()
             self._scan.follow(organ, self._view.points)
         if self._recorder.is_full:
             self._recordings.stop("no more is kept of one recording")
         self._band.take()
-        recorded = self._player.state(organ)
-        if recorded is not None:
-            self._show_recorded(organ, *recorded)
+        played = self._player.state(organ)
+        if played is not None:
+            self._live.pause()
+            self._show_played(organ, played)
             return
-        shown = self._shown = self._period_to_show()
-        self._view.place_tool(shown.tip, (not shown.missing) * shown.force)
+        shown = self._live.draw(self._view)
+        self._place_tools(shown)
         if self._frame % _PLOT_FRAMES == 0:
-            self._show_numbers(organ, self._with_band(shown), self._chosen.values(organ))
+            self._show_numbers(organ, shown, self._chosen.values(organ))
 
-    def _with_band(self, shown: ShownPeriod) -> ShownPeriod:
-        """With the band of its force, where the contact node sends one."""
-        return shown if shown.missing else shown._replace(band=self._band.of(shown.size))
+    def _follow_choice(self) -> None:
+        """Show which tool is chosen, and listen to the band of its force."""
+        tools = self._chosen.tools
+        self._band.follow(tools.chosen, tools.name)
+        self._view.name_tools(tools.labels, tools.chosen)
+        self._panels.tool.show_tools(tools.names, tools.name)
 
-    def _show_recorded(
-        self, organ: Organ, cloud: np.ndarray, shown: ShownPeriod, material: dict[str, float]
-    ) -> None:
+    def _place_tools(self, shown: Sequence[ShownPeriod]) -> None:
+        forces = [(not one.missing) * one.force for one in shown]
+        self._view.place_tools(np.array([one.tip for one in shown]), np.array(forces))
+
+    def _show_played(self, organ: Organ, played: Played) -> None:
         """Update the page from a recording that plays."""
-        self._shown = None  # of now, nothing is drawn
-        largest = self._view.move(cloud, shown.tip, shown.force)
-        self._view.grey(bool(shown.missing))
-        self._view.place_tool(shown.tip, (not shown.missing) * shown.force)
+        tips = np.array([one.tip for one in played.shown])
+        forces = np.array([one.force for one in played.shown])
+        largest = self._view.move(played.cloud, tips, forces)
+        self._view.grey(any(one.missing for one in played.shown))
+        self._place_tools(played.shown)
         if self._frame % _PLOT_FRAMES == 0:
             self._panels.recordings.show(self._player.part)
-            self._show_numbers(organ, shown._replace(largest=largest), material)
+            drawn = [one._replace(largest=largest) for one in played.shown]
+            self._show_numbers(organ, drawn, played.material)
 
-    def _show_numbers(self, organ: Organ, shown: ShownPeriod, material: dict[str, float]) -> None:
-        """Beside the picture, of the same period; material: in force then, by coordinate [SI]."""
+    def _show_numbers(
+        self, organ: Organ, shown: Sequence[ShownPeriod], material: dict[str, float]
+    ) -> None:
+        """Beside the picture, of the same period; material: in force then, by coordinate [SI].
+
+        Numbers are those of the chosen tool, alerts those of all.
+        """
+        tools, is_live = self._chosen.tools, not self._player.is_on
+        mine = shown[tools.chosen]
+        if is_live and not mine.missing:
+            mine = mine._replace(band=self._band.of(mine.size))
         n_kept = self._recorder.n_periods if self._recorder.is_on else None
-        numbers = frame_text(shown, material_text(organ, material), n_kept)
+        numbers = frame_text(mine, material_text(organ, material), n_kept, tools.label)
         self._panels.show_numbers("<br>".join(numbers))
-        self._alerts = alerts(organ.info, shown)
+        self._alerts = alerts(organ.info, shown, tools.labels)
         over = [*self._new_patient.alerts(organ.name), *self._player.alerts, *self._scan.alerts]
         self._panels.show_alerts([*over, *self._alerts])
-        measured = self._measures.lines(Now(self._view.points, shown.tip, material["young"]))
+        self._measures.change_tip(self._chosen.tip)
+        measured = self._measures.lines(Now(self._view.points, mine.tip, material["young"]))
         self._panels.measure.show(measured)
         self._lines = [*map(plain, numbers), *measured]
         self._panels.show_scale(self._coloured.legend())
         tool = self._panels.tool
-        if shown.missing or self._player.is_on:
+        if mine.missing or not is_live:
             tool.forget_force()
         else:
             now = time.monotonic() - self._began
-            tool.show_force(now, shown.size, np.nan_to_num(shown.error), shown.band)
-
-    def _period_to_show(self) -> ShownPeriod:
-        """Draw the newest cloud, and return what belongs to it."""
-        sent, cloud, now = self._state.live[0]["tip"].copy(), self._cloud, time.monotonic()
-        taken = cloud.take() if cloud is not None else None
-        if not self._answers():
-            return self._without_force(sent, SILENT)
-        if taken is not None:
-            self._last_cloud = now
-            row = self._state.period(stamp_nanoseconds(taken[0]))
-        elif self._shown is not None and now - self._last_cloud < _SILENCE:
-            return self._shown
-        else:  # the contact node sends another cloud, or none
-            row = self._state.period()
-        if row is None or int(row["organ"]) != self._number:
-            return self._without_force(sent, OTHER_ORGAN)
-        largest = float("nan")
-        if self._periods.take(row) and taken is not None:
-            largest = self._view.move(taken[1], row["tip"], row["force"])
-        self._view.grey(self._periods.is_beyond)
-        if taken is not None and self._recorder.is_on:
-            self._recorder.note_cloud(taken[1][:, 3:], int(row["number"]))
-        return self._periods.drawn(row, largest, sent)
-
-    def _without_force(self, sent: np.ndarray, missing: str) -> ShownPeriod:
-        """Whatever is drawn is not of now."""
-        self._view.grey(True)
-        self._periods.forget()
-        return ShownPeriod.without_force(sent, missing)
-
-    def _answers(self) -> bool:
-        """Whether the contact node answered recently."""
-        silence = time.monotonic_ns() - int(self._state.live["heard"][0])
-        return silence < _SILENCE * 1e9
-
-    def _status(self) -> int | None:
-        """Of the last ContactState, if one came recently."""
-        return int(self._state.live["status"][0]) if self._answers() else None
+            tool.show_force(now, mine.size, np.nan_to_num(mine.error), mine.band)
 
     def _poll_cell(self) -> None:
         """Check which nodes run, what the library holds, and that the tool driver runs."""
-        missing, status = self._requests.missing, self._status()
-        has_organ = self._organ is not None
-        self._panels.show_cell(warnings(missing, has_organ, status, self._missed))
+        missing, statuses = self._requests.missing, self._live.statuses
+        tools, has_organ = self._chosen.tools, self._organ is not None
+        self._panels.show_cell(warnings(missing, has_organ, statuses, tools.labels, self._missed))
         self._panels.scene.show_scene(self._chosen.scene_name)
         self._offer_files()
-        if self._organ is not None:
-            self._driver.ensure_running(self._tool, self._frame_id)
+        self._drive()
         if "patient_interpolation" in missing:
             self._requests.builder_is_missing()
         if "contact" in missing:
             if not self._was_missing:
                 self._recordings.stop("the contact node ended")
             self._was_missing = True
-        elif self._was_missing:
+        elif self._was_missing or not tools.names:  # an answer may be lost
             self._was_missing = False
             self._requests.parameters_of_contact(
                 (*_OF_CONTACT, *MATERIAL), self._on_contact_started
             )
-        elif self._is_to_restore and status not in (None, ContactState.STATUS_NO_MODEL):
+        elif self._is_to_restore and statuses and ContactState.STATUS_NO_MODEL not in statuses:
             self._is_to_restore = False
             self._chosen.send_again()
 
@@ -422,12 +393,32 @@ class PlanningNode(ManagedNode):
         """The contact node runs, for the first time or again."""
         self._requests.contact_started()
         self._chosen.contact, self._is_to_restore = values, True
-        self._change_tip(self._chosen.tip)
+        self._use_tools(tuple(values["tools"]))
+        self._view.change_tips(self._chosen.tips)
         self._panels.organ.show_material(self._chosen.in_force)
 
-    def _change_tip(self, tip: Tip) -> None:
-        self._view.change_tip(tip)
-        self._measures.change_tip(tip)
+    def _use_tools(self, names: tuple[str, ...]) -> None:
+        """Those of the contact node; of another number, they begin at places of their own."""
+        tools, organ = self._chosen.tools, self._organ
+        if names != tools.names:
+            self._driver.end()
+            targets = tools.targets
+            if len(names) != len(targets):
+                self._chosen.scene = ""  # was of another number of tools
+                self._player.close()
+                self._live.forget()
+                tips = self._chosen.tips
+                targets = np.zeros((len(tips), 3)) if organ is None else organ.starts(tips)
+                self._view.show_tools(tips, targets)
+            tools.use(names, targets)
+            self._panels.scene.offer(len(names))
+        self._drive()
+
+    def _drive(self) -> None:
+        """Send the tools' poses, once it is known which there are, and over what."""
+        names = self._chosen.tools.names
+        if self._organ is not None and names:
+            self._driver.ensure_running(names, self._frame_id)
 
     # --- From the page -----------------------------------------------------------------------
 
@@ -469,10 +460,9 @@ class PlanningNode(ManagedNode):
         organ, chosen = self._organ, self._chosen
         if organ is None:
             return None
-        x, y, z = chosen.target.tolist()
         return PlanNow(
             organ,
-            (x, y, z),
+            tuple((x, y, z) for x, y, z in chosen.tools.targets.tolist()),
             chosen.scene,
             chosen.values(organ),
             chosen.look,
@@ -486,7 +476,7 @@ class PlanningNode(ManagedNode):
         """Scene, material, look, tool and view of a kept state."""
         if self._organ is None:
             return
-        self._chosen.return_to(kept.scene, kept.material, kept.look, np.array(kept.target))
+        self._chosen.return_to(kept.scene, kept.material, kept.look, np.array(kept.targets))
         if client is not None and kept.camera:
             turn_camera(client, Pose(*np.array(kept.camera).reshape(3, 3)))
 

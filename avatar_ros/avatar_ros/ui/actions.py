@@ -42,6 +42,7 @@ class Actions:
     end_preview: Callable[[], None]
     brush: Callable[[str, float], None]  # what a click on the preview paints, in a radius [m]
     cancel: Callable[[], None]
+    tool: Callable[[str], None]  # that is moved from now on, by its name
     nudge: Callable[[Any, float], None]  # along an axis, None for the normal, by a distance [m]
     lift: Callable[[], None]
     record: Callable[[bool], None]

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from avatar_core.vademecum.model import VademecumInfo
 from avatar_ros.msg import ContactState
 from avatar_ros.ui.shown_period import ShownPeriod
-from avatar_ros.ui.texts import SHOWN_FORCE
+from avatar_ros.ui.texts import SHOWN_FORCE, of_tools
 
 LARGE_ERROR = 0.10  # expected of the displacement or the force, from which a patient is marked
 
 
-def alerts(info: VademecumInfo, shown: ShownPeriod) -> list[str]:
-    """One line each; none if the numbers are what they seem."""
-    return [*alerts_of_organ(info), *_of_period(shown)]
+def alerts(
+    info: VademecumInfo, shown: Sequence[ShownPeriod], labels: Sequence[str] = ("",)
+) -> list[str]:
+    """One line each; none if the numbers are what they seem.
+
+    labels : of the tools, each of which has a period in ``shown``
+    """
+    return [*alerts_of_organ(info), *of_tools(map(_of_period, shown), labels)]
 
 
 def alerts_of_organ(info: VademecumInfo) -> list[str]:

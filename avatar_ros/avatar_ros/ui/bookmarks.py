@@ -1,4 +1,4 @@
-"""States of the planning page that a user keeps: pose, scene, material and view, with a note.
+"""States of the planning page that a user keeps: poses, scene, material and view, with a note.
 
 They lie in a file of the library, ``plan-ID.json`` for each vademecum, by its id: a state is worth
 nothing on another organ.
@@ -20,7 +20,7 @@ from avatar_ros.ui.view import LOOKS
 
 _ID = 16  # letters of the vademecum's id in the name of the file
 _MOST_BYTES = 64 << 20
-_VERSION = 1
+_VERSION = 2  # in the first, a state had one tool, ``target``
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Bookmark:
     """A kept state.
 
     note : of the user; made : local time, ISO 8601
-    target : of the tip [m]; scene : its name, empty for natural effects
+    targets : of each tool's tip [m]; scene : its name, empty for natural effects
     material : values by coordinate [SI]
     camera : position, what is looked at, what is up, nine numbers [m]; empty without a browser
     look : whole, glass or cut open; side, part : of the cut
@@ -38,7 +38,7 @@ class Bookmark:
 
     note: str
     made: str
-    target: tuple[float, float, float]
+    targets: tuple[tuple[float, float, float], ...]
     scene: str
     material: dict[str, float]
     camera: tuple[float, ...]
@@ -99,7 +99,7 @@ def _read(path: Path, identity: str) -> list[Bookmark]:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError(f"more than {_MOST_BYTES >> 20} MB")
         whole = json.loads(path.read_text())
-        if whole["version"] != _VERSION or whole["vademecum_id"] != identity:
+        if whole["version"] not in (1, _VERSION) or whole["vademecum_id"] != identity:
             raise ValueError("of another version or vademecum")
         return [_checked(state) for state in whole["states"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -115,13 +115,13 @@ def _checked(state: dict[str, Any]) -> Bookmark:
         raise ValueError("a camera has nine numbers")
     if look not in LOOKS or side not in AXES or not 0.0 <= float(part) <= 1.0:
         raise ValueError("an organ is not shown so")
-    x, y, z = _numbers(state["target"])
+    targets = state["targets"] if "targets" in state else [state["target"]]
     picture = str(state.get("picture", ""))
     base64.b64decode(picture, validate=True)
     return Bookmark(
         note=str(state["note"]),
         made=str(state["made"]),
-        target=(x, y, z),
+        targets=tuple(map(_place, targets)),
         scene=str(state["scene"]),
         material={str(key): _numbers([value])[0] for key, value in state["material"].items()},
         camera=camera,
@@ -129,6 +129,11 @@ def _checked(state: dict[str, Any]) -> Bookmark:
         lines=tuple(str(line) for line in state["lines"]),
         picture=picture,
     )
+
+
+def _place(values: Any) -> tuple[float, float, float]:
+    x, y, z = _numbers(values)
+    return x, y, z
 
 
 def _numbers(values: Any) -> tuple[float, ...]:

@@ -1,8 +1,9 @@
-"""What a user chose on the planning page: scene, material, look and the tool's place."""
+"""What a user chose on the planning page: scene, material, look, and the tools' places."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scenes, write_scene
-from avatar_core.scene.model import Scene
+from avatar_core.scene.model import Scene, Tool
 from avatar_ros.loop.settings import MATERIAL, chosen_tips
 from avatar_ros.prepare.scenes import scene_file
 from avatar_ros.ui.history import History
@@ -18,9 +19,9 @@ from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.presets import values_of
 from avatar_ros.ui.recorder import scene_in_force
 from avatar_ros.ui.requests import Requests
+from avatar_ros.ui.tool_state import SharedToolState
+from avatar_ros.ui.tools import Tools
 from avatar_ros.ui.view import CUT, WHOLE
-
-_LIFT = 0.03  # off the organ [m]
 
 
 class Page(NamedTuple):
@@ -28,7 +29,7 @@ class Page(NamedTuple):
 
     say: Callable[[str], None]
     stop_recording: Callable[[str], None]  # and why
-    change_tip: Callable[[Tip], None]
+    change_tips: Callable[[tuple[Tip, ...]], None]  # of all tools
     show_material: Callable[[dict[str, float]], None]  # values by coordinate [SI]
     show_look: Callable[[str, str, float], None]  # how, from which side, which part
 
@@ -38,20 +39,22 @@ class Chosen:
 
     Parameters
     ----------
-    live : of :class:`avatar_ros.ui.tool_state.SharedToolState`, where the tool's place is
+    state : where the tools' places are
     requests, page : what choices change in the cell and on the page
 
     Attributes
     ----------
     organ : that is shown, None before the first
+    tools : their places
     contact : parameters of the contact node, by name; empty until it was asked
     scene : name of the one chosen here, empty for the contact node's own
     look : how the organ is shown, from which side, and which part of it
     """
 
-    def __init__(self, live: np.ndarray, requests: Requests, page: Page) -> None:
-        self._live, self._requests, self._page = live, requests, page
+    def __init__(self, state: SharedToolState, requests: Requests, page: Page) -> None:
+        self._requests, self._page = requests, page
         self._history = History()
+        self.tools = Tools(state, self._history, lambda: self.organ)
         self._material: dict[str, float] = {}  # by coordinate
         self.organ: Organ | None = None
         self.contact: dict[str, Any] = {}
@@ -72,57 +75,25 @@ class Chosen:
         what = self._history.undo()
         self._page.say(f"undone: {what}" if what else "nothing to undo")
 
-    # --- The tool ----------------------------------------------------------------------------
+    # --- The tools' tips ---------------------------------------------------------------------
 
     @property
     def tip(self) -> Tip:
-        """Of the first tool."""
-        if self.scene:
-            return read_scene(shipped_scenes()[self.scene]).tools[0].tip
-        return self._own_tip
+        """Of the chosen tool."""
+        return self.tips[self.tools.chosen]
 
     @property
-    def _own_tip(self) -> Tip:
+    def tips(self) -> tuple[Tip, ...]:
+        """Of all tools, in their order."""
+        return (self.scene and _tips_of(self.scene)) or self._own_tips
+
+    @property
+    def _own_tips(self) -> tuple[Tip, ...]:
+        """As the contact node was started: those of its scene, if it was given one."""
         if "tools" not in self.contact:
-            return Tip()
-        return chosen_tips(self.contact, len(self.contact["tools"]))[0]
-
-    @property
-    def target(self) -> np.ndarray:
-        """Where the tool is to go, shape (3,) [m]."""
-        return np.array(self._live["target"][0])
-
-    def put(self, target: np.ndarray) -> None:
-        """Send the tool to a place, which cannot be undone, shape (3,) [m]."""
-        self._live["target"][0] = target
-
-    def drag(self, target: np.ndarray, along_shaft: bool) -> None:
-        """Move the tool to where the mouse is, or as far along its shaft as the mouse moved up."""
-        organ = self.organ
-        if organ is None or not np.isfinite(target).all():
-            return
-        if along_shaft:
-            here = self._live["tip"][0].copy()
-            target = here + float((target - here)[2]) * organ.outward(here)
-        self._move(target, "drag")
-
-    def nudge(self, axis: Any, way: float) -> None:
-        """Move the tool along an axis, None for the surface's normal, by a distance [m]."""
-        target = self.target
-        if axis is None and self.organ is not None:
-            axis = self.organ.outward(target)
-        if axis is not None:
-            self._move(target + way * np.asarray(axis), "nudge")
-
-    def lift(self) -> None:
-        """Move the tool off the organ."""
-        if self.organ is not None:
-            self._move(self.organ.lifted(self.target, _LIFT), "lift")
-
-    def _move(self, target: np.ndarray, how: str) -> None:
-        before = self.target
-        self._history.note(how, "the tool's place", lambda: self.put(before))
-        self.put(target)
+            return (Tip(),)
+        given = self.contact["scene"]
+        return (given and _tips_of(given)) or chosen_tips(self.contact, len(self.contact["tools"]))
 
     # --- Material and scene ------------------------------------------------------------------
 
@@ -194,7 +165,7 @@ class Chosen:
         def note(switched: bool) -> None:
             if switched:
                 self.scene = name
-                self._page.change_tip(self.tip)
+                self._page.change_tips(self.tips)
 
         shown = name or "the scene of the contact node's start"
         self._requests.load_scene(shown, self._page.say, yaml=text, then=note)
@@ -206,18 +177,22 @@ class Chosen:
 
     def scene_in_force(self, organ: Organ) -> Scene:
         """The scene that reproduces what runs now; ``contact`` must be known."""
-        return self._scene_of(organ, self.scene or self.contact["scene"], self.in_force, self.tip)
+        given = self.scene or self.contact["scene"]
+        return self._scene_of(organ, given, self.in_force, self.tips)
 
     def _own_scene(self) -> str:
         """As the contact node was started, as YAML; empty if that is not known."""
         if self.organ is None or "cloud" not in self.contact:
             return ""
-        return write_scene(self._scene_of(self.organ, self.contact["scene"], {}, self._own_tip))
+        return write_scene(self._scene_of(self.organ, self.contact["scene"], {}, self._own_tips))
 
-    def _scene_of(self, organ: Organ, given: str, material: dict[str, float], tip: Tip) -> Scene:
+    def _scene_of(
+        self, organ: Organ, given: str, material: dict[str, float], tips: tuple[Tip, ...]
+    ) -> Scene:
         chosen = read_scene(scene_file(given)) if given else None
+        tools = tuple(Tool(*each) for each in zip(self.contact["tools"], tips, strict=True))
         cloud, divisor = self.contact["cloud"], self.contact["cloud_divisor"]
-        return scene_in_force(chosen, organ.vademecum, material, tip, cloud, divisor)
+        return scene_in_force(chosen, organ.vademecum, material, tools, cloud, divisor)
 
     def send_again(self) -> None:
         """Send what was chosen here to a contact node that was started again."""
@@ -264,20 +239,22 @@ class Chosen:
         scene: str,
         material: dict[str, float],
         look: tuple[str, str, float],
-        target: np.ndarray,
+        targets: np.ndarray,
     ) -> None:
         """Choose all of a kept state; one step to undo.
 
-        material : values by coordinate [SI]; target : ndarray, shape (3,) [m]
+        material : values by coordinate [SI]
+        targets : ndarray, shape (n, 3), of the tools [m]; of more or fewer than there are, those
+            that there are go to theirs
         """
         organ = self.organ
         if organ is None:
             return
-        before = self.scene, self.values(organ), self.look, self.target
+        before = self.scene, self.values(organ), self.look, self.tools.targets
         self._history.note(
             "return", "the return to a kept state", lambda: self._arrange(organ, *before)
         )
-        self._arrange(organ, scene, material, look, target)
+        self._arrange(organ, scene, material, look, targets)
 
     def _arrange(
         self,
@@ -285,7 +262,7 @@ class Chosen:
         scene: str,
         material: dict[str, float],
         look: tuple[str, str, float],
-        target: np.ndarray,
+        targets: np.ndarray,
     ) -> None:
         if scene != self.scene and scene in ("", *shipped_scenes()):
             self._switch(scene)
@@ -299,7 +276,17 @@ class Chosen:
         if changed:
             self._set(changed)
         self._show_look(*look)
-        self.put(target)
+        for tool, target in enumerate(targets[: len(self.tools.targets)]):
+            self.tools.put(tool, target)
+
+
+@cache
+def _tips_of(scene: str) -> tuple[Tip, ...]:
+    """Of a scene by name or path; none if it cannot be read."""
+    try:
+        return tuple(tool.tip for tool in read_scene(scene_file(scene)).tools)
+    except AvatarError:
+        return ()
 
 
 def _values_of(scene: str) -> dict[str, float]:

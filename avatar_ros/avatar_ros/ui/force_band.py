@@ -1,4 +1,4 @@
-"""The band of the force on the planning page's tool: 90 % of what is known of the material.
+"""The band of the force on the planning page's chosen tool: 90 % of what is known of the material.
 
 Its edges come by two topics, a thousand times a second; the page takes the newest of each for a
 picture. Each is set against the force of its own period, so that what is shown beside another
@@ -47,23 +47,29 @@ class BandRatios:
 
 
 class NewestBand(BandRatios):
-    """Subscribes both edges of a tool's force, once it is told to."""
+    """Subscribes both edges of a tool's force, once it is told of which.
 
-    def __init__(self, node: Node) -> None:
+    force_of : of a tool, by its place in the list, in the period of a stamp [ns], in newtons; NaN
+        if it is not known
+    """
+
+    def __init__(self, node: Node, force_of: Callable[[int, int], float]) -> None:
         super().__init__()
-        self._node = node
+        self._node, self._force_of = node, force_of
+        self._tool = (0, "")
         self._subscriptions: list[Any] = []
 
-    def listen(self, tool: str, force_of: Callable[[int], float]) -> None:
-        """Subscribe the edges of a tool.
-
-        force_of : the force of the period of a stamp [ns], in newtons; NaN if it is not known
-        """
-        self._force_of = force_of
+    def follow(self, tool: int, name: str) -> None:
+        """Subscribe the edges of a tool, in place of those of another."""
+        if (tool, name) == self._tool:
+            return
+        self.close()
+        self.forget()
+        self._tool = (tool, name)
         self._subscriptions = [
             self._node.create_subscription(
                 WrenchStamped,
-                f"{tool}/{edge}",
+                f"{name}/{edge}",
                 _never_called,
                 qos.NEWEST,
                 callback_group=PolledSubscriptions(),
@@ -80,13 +86,13 @@ class NewestBand(BandRatios):
                 message, force = taken[0], taken[0].wrench.force
                 stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
                 size = float(np.linalg.norm([force.x, force.y, force.z]))
-                self.note(k, size, self._force_of(stamp))
+                self.note(k, size, self._force_of(self._tool[0], stamp))
 
     def close(self) -> None:
         """Stop listening."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
-        self._subscriptions = []
+        self._subscriptions, self._tool = [], (0, "")
 
 
 def _never_called(message: Any) -> None:

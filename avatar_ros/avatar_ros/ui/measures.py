@@ -27,7 +27,7 @@ _N_BODY = 200  # points of a tip between which and a structure the way is measur
 class Now(NamedTuple):
     """The period that is drawn.
 
-    points : ndarray, shape (n, 3), of the cloud; tip : of the tool [m]
+    points : ndarray, shape (n, 3), of the cloud; tip : of the chosen tool [m]
     young : modulus in force [Pa]
     """
 
@@ -42,6 +42,7 @@ class Measures:
     def __init__(self, view: MeasuresView) -> None:
         self._view = view
         self._organ: Organ | None = None
+        self._tip: Tip | None = None
         self._body = np.zeros((1, 3))
         self._places: dict[str, list[Place]] = {}
         self._mode = PROBE
@@ -54,8 +55,10 @@ class Measures:
         self.clear()
 
     def change_tip(self, tip: Tip) -> None:
-        """Another tip, whose distance from structures is measured."""
-        body = tip_body(tip)[0]
+        """The tip whose distance from structures is measured."""
+        if tip == self._tip:
+            return
+        self._tip, body = tip, tip_body(tip)[0]
         self._body = body[:: max(len(body) // _N_BODY, 1)]
 
     def clear(self) -> None:

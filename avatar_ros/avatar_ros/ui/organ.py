@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 
 from avatar_core.common.supports import SUPPORT
-from avatar_core.contact.tool_path import middle_of_access
+from avatar_core.contact.tool_path import middle_of_access, starts_apart
+from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum, VademecumInfo
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.prepare.scenes import usable_material
 from avatar_ros.ui.measuring import hit
 
+CLEARANCE = 0.015  # of a new organ's tools over the surface [m]
 YOUNG_RANGE = (0.5e3, 1e6)  # that can be chosen [Pa]: the force is proportional to E
 
 
@@ -82,6 +85,17 @@ class Organ:
     def above(self, height: float) -> np.ndarray:
         """A point over the middle of the accessible surface [m]."""
         return np.asarray(self.start + height * self.normal)
+
+    def starts(self, tips: Sequence[Tip]) -> np.ndarray:
+        """Where tools begin, over the accessible surface, shape (n, 3) [m].
+
+        The first is over its middle, and each other one as far from those before as can be.
+        """
+        surface, places = self.vademecum.surface, starts_apart(self.vademecum, len(tips))
+        normals = surface.normals[places]
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        heights = np.array([tip.offset + CLEARANCE for tip in tips])
+        return np.asarray(surface.centers[places] + heights[:, None] * normals)
 
     def outward(self, point: np.ndarray) -> np.ndarray:
         """The outward normal of the accessible surface nearest to a point."""

@@ -47,7 +47,7 @@ class PlanNow:
     """
 
     organ: Organ
-    target: tuple[float, float, float]
+    targets: tuple[tuple[float, float, float], ...]
     scene: str
     material: dict[str, float]
     look: tuple[str, str, float]
@@ -106,7 +106,7 @@ class Plan:
         bookmark = Bookmark(
             note=note.strip(),
             made=time.strftime("%Y-%m-%dT%H:%M:%S"),
-            target=now.target,
+            targets=now.targets,
             scene=now.scene,
             material=now.material,
             camera=camera,

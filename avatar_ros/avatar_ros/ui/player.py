@@ -4,19 +4,33 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from avatar_core.errors import AvatarError
 from avatar_core.scene.file import parse_scene
-from avatar_core.scene.recording import Recording, load_recording
+from avatar_core.scene.recording import Periods, Recording, load_recording
 from avatar_ros.framework.reader import Reader
 from avatar_ros.msg import ContactState
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.presets import values_of
-from avatar_ros.ui.shown_period import BEYOND, PLACE, ShownPeriod
+from avatar_ros.ui.shown_period import PLACE, ShownPeriod, why_missing
 
 _REPEATED = 1.0  # s: the last state stays so long before it begins again
+
+
+class Played(NamedTuple):
+    """A state of a recording.
+
+    cloud : ndarray, shape (n, 6) [m]
+    shown : numbers of each tool
+    material : values by coordinate [SI]
+    """
+
+    cloud: np.ndarray
+    shown: tuple[ShownPeriod, ...]
+    material: dict[str, float]
 
 
 class Player:
@@ -30,7 +44,8 @@ class Player:
         self._recording: Recording | None = None
         self._name = ""
         self._rows = np.zeros(0, int)  # period of each cloud
-        self._valid = self._placed = np.zeros(0, int)  # the last cloud within the range, or placed
+        self._valid = np.zeros(0, int)  # the last cloud within the range
+        self._placed = np.zeros((0, 1), int)  # the last cloud at which each tool was placed
         self._times = np.zeros(0)  # of each cloud, from the first [s]
         self._values: dict[str, float] = {}  # of the material, by coordinate [SI]
         self._place, self._began = 0.0, 0.0  # [s], and when it was there
@@ -58,8 +73,8 @@ class Player:
         since = self._place + time.monotonic() - self._began
         return min(since % (self.seconds + _REPEATED), self.seconds)
 
-    def open(self, name: str, organ: Organ) -> str:
-        """Play a recording of an organ; returns why not, empty if it plays."""
+    def open(self, name: str, organ: Organ, n_tools: int) -> str:
+        """Play a recording of an organ and of so many tools; returns why not, empty if it plays."""
         self.close()
         path = self._folder / name
         try:
@@ -70,15 +85,18 @@ class Player:
         if found.vademecum_id != organ.id:
             return f"{name} is of {found.vademecum_name}, another organ; load that one first"
         n_points = len(organ.vertices)
-        if found.clouds.displacement.shape[1:] != (n_points, 3) or found.periods.tip.shape[1] != 1:
-            return f"{name} holds no surface that was shown, or several tools; record again"
+        if found.clouds.displacement.shape[1:] != (n_points, 3):
+            return f"{name} holds no surface that was shown; record again"
+        n_recorded = found.periods.tip.shape[1]
+        if n_recorded != n_tools:
+            return f"{name} is of {n_recorded} tools, the cell has {n_tools}; start it with as many"
         number = found.periods.number
         rows = np.clip(np.searchsorted(number, found.clouds.period), 0, len(number) - 1)
         stamps = found.periods.stamp[rows]
         self._rows, self._times = rows, (stamps - stamps[0]) * 1e-9
-        tips, status = found.periods.tip[rows, 0], found.periods.status[rows, 0]
-        self._valid = _last(status != ContactState.STATUS_OUT_OF_RANGE)
-        self._placed = _last((np.abs(tips) < PLACE).all(axis=1))
+        tips, status = found.periods.tip[rows], found.periods.status[rows]
+        self._valid = _last((status != ContactState.STATUS_OUT_OF_RANGE).all(axis=1))
+        self._placed = _last((np.abs(tips) < PLACE).all(axis=2))
         self._values = _values_of(found, organ)
         self._name, self._recording = name, found
         self._place, self._began, self._runs = 0.0, time.monotonic(), True
@@ -100,11 +118,10 @@ class Player:
         """Stay at a part of the time, 0 to 1."""
         self._place, self._runs = part * self.seconds, False
 
-    def state(self, organ: Organ) -> tuple[np.ndarray, ShownPeriod, dict[str, float]] | None:
-        """Cloud (n, 6) [m], numbers and material (values by coordinate, SI) of the state to show;
-        None of now.
+    def state(self, organ: Organ) -> Played | None:
+        """What is to be shown; None of now.
 
-        As live, the last valid shape stays while the tool is beyond the range.
+        As live, the last valid shape stays while a tool is beyond the range.
         """
         recording = self._recording
         if recording is None or recording.vademecum_id != organ.id:
@@ -114,20 +131,35 @@ class Player:
         moved = recording.clouds.displacement[valid] if valid >= 0 else np.zeros((1, 3), np.float32)
         shown = self._shown(recording, k, float(np.linalg.norm(moved, axis=1).max()))
         cloud = np.hstack([organ.vertices + moved, np.broadcast_to(moved, organ.vertices.shape)])
-        return cloud, shown, self._values
+        return Played(cloud, shown, self._values)
 
-    def _shown(self, recording: Recording, k: int, largest: float) -> ShownPeriod:
-        """Numbers of a cloud, or of the last valid one."""
-        periods, valid, placed = recording.periods, int(self._valid[k]), int(self._placed[k])
-        tip = periods.tip[self._rows[placed], 0] if placed >= 0 else np.full(3, PLACE)
-        row = self._rows[valid]  # any, where none is valid
-        force = periods.force[row, 0]
-        if valid < 0 or (valid < k and not force.any()):
-            return ShownPeriod.without_force(tip, BEYOND)
-        error = float(periods.error[row, 0]) if force.any() else 0.0
-        fraction, status = float(periods.sent_fraction[row, 0]), int(periods.status[row, 0])
-        missing = BEYOND if valid < k else ""
-        return ShownPeriod(tip, force, error, fraction, largest, missing, valid < k, status)
+    def _shown(self, recording: Recording, k: int, largest: float) -> tuple[ShownPeriod, ...]:
+        """Numbers of each tool at a cloud, or at the last valid one."""
+        periods, valid = recording.periods, int(self._valid[k])
+        row, is_held = self._rows[valid], valid < k  # any row, where none is valid
+        tips = [self._tip(periods, tool, k) for tool in range(periods.tip.shape[1])]
+        status = periods.status[self._rows[k]]
+        missing = why_missing(status) if is_held else [""] * len(tips)
+        if valid < 0 or (is_held and not periods.force[row].any()):
+            return tuple(map(ShownPeriod.without_force, tips, missing))
+        return tuple(
+            ShownPeriod(
+                tip,
+                periods.force[row, tool],
+                float(periods.error[row, tool]) if periods.force[row, tool].any() else 0.0,
+                float(periods.sent_fraction[row, tool]),
+                largest,
+                missing[tool],
+                is_held,
+                int(periods.status[row, tool]),
+            )
+            for tool, tip in enumerate(tips)
+        )
+
+    def _tip(self, periods: Periods, tool: int, k: int) -> np.ndarray:
+        """Where a tool was placed last, up to a cloud [m]."""
+        placed = int(self._placed[k, tool])
+        return periods.tip[self._rows[placed], tool] if placed >= 0 else np.full(3, PLACE)
 
     @property
     def alerts(self) -> list[str]:
@@ -141,8 +173,9 @@ class Player:
 
 
 def _last(known: np.ndarray) -> np.ndarray:
-    """For each place the last one up to it that is known, -1 before the first."""
-    return np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
+    """For each place along the first axis the last one up to it that is known, -1 before it."""
+    places = np.arange(len(known)).reshape(-1, *[1] * (known.ndim - 1))
+    return np.asarray(np.maximum.accumulate(np.where(known, places, -1)))
 
 
 def _values_of(recording: Recording, organ: Organ) -> dict[str, float]:

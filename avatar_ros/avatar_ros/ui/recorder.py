@@ -10,7 +10,6 @@ import numpy as np
 
 from avatar_core.contact.effects import Tumour
 from avatar_core.contact.effects.selection import default_effects
-from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.coordinates import stiffness_of
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene, SupportStiffness, Tool
@@ -26,21 +25,21 @@ def scene_in_force(
     chosen: Scene | None,
     vademecum: Vademecum,
     material: dict[str, float],
-    tip: Tip,
+    tools: tuple[Tool, ...],
     cloud: Cloud = "surface",
     cloud_divisor: int = 1,
 ) -> Scene:
-    """The scene of one tool that reproduces what runs now, including its material.
+    """The scene that reproduces what runs now, including its material.
 
-    chosen : None for the natural effects of the vademecum, with tip and cloud as given
+    chosen : None for the natural effects of the vademecum, with tools and cloud as given
     material : values by coordinate, which override those of the scene
     """
     scene = chosen or Scene(
         name="natural effects",
-        tools=(Tool(tip=tip),),
+        tools=tools,
         cloud=cloud,
         cloud_divisor=cloud_divisor,
-        effects=default_effects(vademecum, 1),
+        effects=default_effects(vademecum, len(tools)),
     )
     effects = scene.effects
     if "contrast" in material:
@@ -73,47 +72,47 @@ class Recorder:
 
     @property
     def is_on(self) -> bool:
-        return bool(self._state.live["recording"][0])
+        return bool(self._state.all["recording"][0])
 
     @property
     def is_full(self) -> bool:
         """Nothing more is kept: of periods, or of surfaces."""
         n = len(self._clouds)
         return self.is_on and (
-            int(self._state.live["n_rows"][0]) >= N_ROWS
+            int(self._state.all["n_rows"][0]) >= N_ROWS
             or (n > 0 and n * self._clouds[0].nbytes > _MOST_BYTES)
         )
 
     @property
     def n_periods(self) -> int:
         """Periods recorded so far."""
-        return int(self._state.live["n_rows"][0]) - max(self._begin, 0)
+        return int(self._state.all["n_rows"][0]) - max(self._begin, 0)
 
     def open(self, vademecum: Vademecum, scene: Scene, rate: float) -> str:
         """Record from now on, before the new model is in use; returns the scene's text."""
         text = write_scene(scene)
         self._about = (vademecum.id, vademecum.name, text, rate)
         self._clouds, self._after, self._begin = [], [], -1
-        self._state.live["n_rows"][0] = 0
-        self._state.live["recording"][0] = 1
+        self._state.all["n_rows"][0] = 0
+        self._state.all["recording"][0] = 1
         return text
 
     def begin(self) -> None:
         """The new model is in use: discard what was recorded before."""
-        self._begin = int(self._state.live["n_rows"][0])
+        self._begin = int(self._state.all["n_rows"][0])
 
     def note_cloud(self, displacement: np.ndarray, period: int) -> None:
         """Record a cloud that was shown, (n_points, 3) [m], of the period of a number."""
-        n = int(self._state.live["n_rows"][0])
+        n = int(self._state.all["n_rows"][0])
         if self._begin >= 0 and n > self._begin:
-            first = int(self._state.rows["number"][self._begin])
+            first = int(self._state.rows["number"][0, self._begin])
             if period >= first:
                 self._clouds.append(displacement.astype(np.float32))
                 self._after.append(period)
 
     def drop(self) -> None:
         """Stop and discard the recording."""
-        self._state.live["recording"][0] = 0
+        self._state.all["recording"][0] = 0
         self._begin = -1
 
     def save(self, folder: Path) -> tuple[Path, Recording] | None:
@@ -126,10 +125,10 @@ class Recorder:
         begin = self._begin
         self.drop()
         rows = self._state.recorded()
-        if begin < 0 or len(rows) <= begin:
+        if begin < 0 or rows.shape[1] <= begin:
             return None
         identity, name, scene, rate = self._about
-        kept, before = rows[begin:], rows[:begin]
+        kept, before = rows[:, begin:], rows[:, :begin]
         size = self._clouds[0].shape if self._clouds else (0, 3)
         same = [i for i, cloud in enumerate(self._clouds) if cloud.shape == size]
         recording = Recording(
@@ -150,14 +149,15 @@ class Recorder:
 
 
 def _periods(rows: np.ndarray) -> Periods:
-    """The recorded periods of one tool."""
+    """The recorded periods, of rows (n_tools, n)."""
+    rows = rows.T.copy()
     return Periods(
-        number=rows["number"].copy(),
-        stamp=rows["stamp"].copy(),
-        tip=rows["tip"][:, None].copy(),
-        turn=np.zeros((len(rows), 1, 3)),  # the page's tool does not turn
-        status=rows["status"][:, None].astype(np.uint8),
-        force=rows["force"][:, None].copy(),
-        error=rows["error"][:, None].copy(),
-        sent_fraction=rows["sent_fraction"][:, None].copy(),
+        number=rows["number"][:, 0].copy(),
+        stamp=rows["stamp"][:, 0].copy(),
+        tip=rows["tip"].copy(),
+        turn=np.zeros(rows["tip"].shape),  # the page's tools do not turn
+        status=rows["status"].astype(np.uint8),
+        force=rows["force"].copy(),
+        error=rows["error"].copy(),
+        sent_fraction=rows["sent_fraction"].copy(),
     )

@@ -1,4 +1,4 @@
-"""Records at the planning page what its tool does, and plays what was recorded."""
+"""Records at the planning page what its tools do, and plays what was recorded."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from avatar_ros.ui.player import Player
 from avatar_ros.ui.recorder import Recorder
 from avatar_ros.ui.requests import Requests
 from avatar_ros.ui.texts import recorded_text
+from avatar_ros.ui.tool_state import SharedToolState
 
 
 class Page(NamedTuple):
@@ -36,7 +37,7 @@ class Recordings:
     ----------
     folder : of the files
     chosen : organ, scene and material that a recording is of
-    live : of :class:`avatar_ros.ui.tool_state.SharedToolState`, which tells if the tool touches
+    state : tells if a tool touches
     """
 
     def __init__(
@@ -46,11 +47,11 @@ class Recordings:
         player: Player,
         requests: Requests,
         chosen: Chosen,
-        live: np.ndarray,
+        state: SharedToolState,
         page: Page,
     ) -> None:
         self._folder, self._recorder, self._player = folder, recorder, player
-        self._requests, self._chosen, self._live, self._page = requests, chosen, live, page
+        self._requests, self._chosen, self._state, self._page = requests, chosen, state, page
 
     def play(self, name: str) -> None:
         """Play a recording from its begin, or go on with the one that was paused."""
@@ -60,7 +61,7 @@ class Recordings:
         elif self._player.is_playing(name):
             self._player.pause(False)
         else:
-            self._page.say(self._player.open(name, organ))
+            self._page.say(self._player.open(name, organ, len(self._chosen.tools.labels)))
 
     def record(self, on: bool) -> None:
         """Begin a recording, once the scene in force has been loaded anew; or end it."""
@@ -71,11 +72,8 @@ class Recordings:
         if organ is None or not self._page.answers():
             say("nothing to record: there is no organ, or the contact node does not answer")
             return
-        if len(self._chosen.contact.get("tools", ())) != 1:
-            say("a recording holds one tool; start the contact node with one")
-            return
-        if self._live["touches"][0]:
-            say("lift the tool off the organ first: a recording starts at rest")
+        if touching := self._touching():
+            say(f"lift {touching} off the organ first: a recording starts at rest")
             return
         scene = self._chosen.scene_in_force(organ)
         rate = float(self._chosen.contact["rate"])
@@ -84,14 +82,20 @@ class Recordings:
         self._requests.load_scene(scene.name, say, yaml=text, then=self._begin)
 
     def _begin(self, switched: bool) -> None:
-        touches = bool(self._live["touches"][0])  # half a minute after the click
-        if switched and not touches:
+        touching = self._touching()  # half a minute after the click
+        if switched and not touching:
             self._recorder.begin()
             return
         self._recorder.drop()
         self._page.show_recording(False)
-        if touches:
-            self._page.say("not recorded: the tool touched the organ again; lift it, and record")
+        if touching:
+            self._page.say(f"not recorded: {touching} touched the organ again; lift, and record")
+
+    def _touching(self) -> str:
+        """Which tools touch now, in words; empty if none does."""
+        period, labels = self._state.period(), self._chosen.tools.labels
+        touches = [] if period is None else np.flatnonzero(period["touches"]).tolist()
+        return " and ".join(labels[k] or "the tool" for k in touches)
 
     def stop(self, why: str) -> None:
         """End a recording and write its file, if there is one; ``why`` if nobody asked for it."""

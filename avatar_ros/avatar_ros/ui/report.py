@@ -62,9 +62,13 @@ def _errors(mean: float, worst: float) -> str:
 
 def lines_of(kept: Bookmark) -> list[str]:
     """What a report says of a kept state."""
-    x, y, z = (1e3 * value for value in kept.target)
+    places = (", ".join(f"{1e3 * value:.1f}" for value in target) for target in kept.targets)
     scene = kept.scene or "natural effects"
-    return [*kept.lines, f"Tip at {x:.1f}, {y:.1f}, {z:.1f} mm; scene {scene}"]
+    tips = "Tip" if len(kept.targets) == 1 else "Tips"
+    return [
+        *kept.lines,
+        f"{tips} at {' and '.join(f'{place} mm' for place in places)}; scene {scene}",
+    ]
 
 
 def _state(kept: Bookmark) -> str:

@@ -12,5 +12,4 @@ PLANNING_UI = (
     ),
     Parameter("token", "", "at the end of the page's address; empty: a new one at each start"),
     Parameter("library_dir", ".", "directory of the loader's files; recordings are written there"),
-    Parameter("tool", "tool", "name of the tool to move, one of those of contact"),
 )

@@ -2,9 +2,10 @@
 
 A cloud and the forces that belong to it come by two ways. Shown together are those of one stamp. A
 tip that is pressed beyond what the vademecum covers has no force any more, and the organ of that
-period lies at rest with the tool in it. Nothing says what it would look like, so that the shape of
-the last period with a force stays, marked as what it is, until the tool is lifted. Where there was
-none, where nobody answers or an answer is of another organ, no number is written: zero is one.
+period lies as if this tool did not touch it. Nothing says what it would look like, so that the
+shape of the last period with a force stays, marked as what it is, until the tool is lifted; with
+it, the forces of all tools. Where there was none, where nobody answers or an answer is of another
+organ, no number is written: zero is one.
 """
 
 from __future__ import annotations
@@ -16,18 +17,19 @@ import numpy as np
 from avatar_ros.msg import ContactState
 
 BEYOND = "the tool is beyond what the vademecum covers, too deep or off the accessible surface"
+OTHER_BEYOND = "another tool is beyond what the vademecum covers"
 SILENT = "the contact node does not answer"
 OTHER_ORGAN = "the contact node does not use this organ: it is preparing it, or has refused it"
 PLACE = 10.0  # no tool of an organ is farther off; a step without a pose has it far away [m]
 
 
 class ShownPeriod(NamedTuple):
-    """Numbers beside the picture.
+    """Numbers of one tool beside the picture.
 
     tip : where the tool is drawn [m]
     force : of the organ [N]; fraction : of it, that the device gets
     error : of the force [N]; NaN if unknown
-    largest : displacement [m]; NaN where no cloud comes
+    largest : displacement of the organ [m]; NaN where no cloud comes
     missing : why there is no force; empty if there is one
     is_held : there is none, and force and displacement are those of the last valid period
     status : of avatar_ros/msg/ContactState
@@ -56,43 +58,55 @@ class ShownPeriod(NamedTuple):
 
 
 class PeriodChooser:
-    """Takes each period that could be shown, and says what is.
+    """Takes each period that could be shown, and says what is; of all tools, in their order.
 
-    is_beyond : the tool is where the vademecum has no force
+    is_beyond : a tool is where the vademecum has no force
     """
 
     def __init__(self) -> None:
-        self._valid: ShownPeriod | None = None  # the last with a force, while the tool is in
+        self._valid: tuple[ShownPeriod, ...] = ()  # the last with a force, while a tool is in
         self.is_beyond = False
 
     def forget(self) -> None:
-        """Another organ: nothing of the last one is held."""
-        self._valid, self.is_beyond = None, False
+        """Another organ, or other tools: nothing of the last one is held."""
+        self._valid, self.is_beyond = (), False
 
-    def take(self, row: np.ndarray) -> bool:
-        """Whether the cloud of a period is to be drawn; ``row`` as in the shared memory."""
-        self.is_beyond = int(row["status"]) == ContactState.STATUS_OUT_OF_RANGE
-        is_held = self.is_beyond and self._valid is not None
+    def take(self, rows: np.ndarray) -> bool:
+        """Whether the cloud of a period is to be drawn; ``rows`` as in the shared memory."""
+        self.is_beyond = bool((rows["status"] == ContactState.STATUS_OUT_OF_RANGE).any())
+        is_held = self.is_beyond and bool(self._valid)
         if not is_held:
-            self._valid = None  # until it is known what is drawn
+            self._valid = ()  # until it is known what is drawn
         return not is_held
 
-    def drawn(self, row: np.ndarray, largest: float, sent: np.ndarray) -> ShownPeriod:
+    def drawn(self, rows: np.ndarray, largest: float, sent: np.ndarray) -> tuple[ShownPeriod, ...]:
         """What is shown, once the cloud was drawn or left as it was.
 
         largest : displacement of the cloud, if it was drawn [m]
-        sent : pose that was sent last, for periods whose step did not use one [m]
+        sent : poses that were sent last, for periods whose step did not use one, (n_tools, 3) [m]
         """
-        used = row["tip"]
-        tip = used.copy() if np.isfinite(used).all() and np.abs(used).max() < PLACE else sent
-        if self.is_beyond and self._valid is not None:
-            return self._valid._replace(tip=tip, missing=BEYOND, is_held=True)
+        used = rows["tip"]
+        is_placed = np.isfinite(used).all(axis=1) & (np.abs(used) < PLACE).all(axis=1)
+        tips = np.where(is_placed[:, None], used, sent)
         if self.is_beyond:
-            return ShownPeriod.without_force(tip, BEYOND)
-        touches = int(row["touches"]) > 0
-        error = float(row["error"]) if touches else 0.0
-        sent_fraction, status = float(row["sent_fraction"]), int(row["status"])
-        now = ShownPeriod(tip, row["force"].copy(), error, sent_fraction, largest, status=status)
-        if touches:
+            missing = why_missing(rows["status"])
+            if self._valid:
+                held = zip(self._valid, tips, missing, strict=True)
+                return tuple(v._replace(tip=t, missing=why, is_held=True) for v, t, why in held)
+            return tuple(map(ShownPeriod.without_force, tips, missing))
+        now = tuple(_of_tool(row, tip, largest) for row, tip in zip(rows, tips, strict=True))
+        if rows["touches"].any():
             self._valid = now
         return now
+
+
+def why_missing(status: np.ndarray) -> list[str]:
+    """Why each tool has no force where one is beyond what is covered; status : shape (n_tools,)"""
+    beyond = status == ContactState.STATUS_OUT_OF_RANGE
+    return [BEYOND if one else OTHER_BEYOND for one in beyond.tolist()]
+
+
+def _of_tool(row: np.ndarray, tip: np.ndarray, largest: float) -> ShownPeriod:
+    error = float(row["error"]) if int(row["touches"]) > 0 else 0.0
+    fraction, status = float(row["sent_fraction"]), int(row["status"])
+    return ShownPeriod(tip, row["force"].copy(), error, fraction, largest, status=status)

@@ -52,3 +52,9 @@ def turn_to(direction: np.ndarray) -> np.ndarray:
     quaternion = np.array([1.0 + z, -y, x, 0.0])
     size = float(np.linalg.norm(quaternion))
     return quaternion / size if size > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+
+
+def along_shaft(quaternion: np.ndarray) -> np.ndarray:
+    """Where z points that a quaternion w x y z has turned."""
+    w, x, y, z = quaternion
+    return 2.0 * np.array([x * z + w * y, y * z - w * x, 0.5 - x * x - y * y])

@@ -1,4 +1,4 @@
-"""The tool on the planning page: its tip, its shaft, and the force on it with its number."""
+"""A tool on the planning page: its tip, its shaft, its name, and the force on it."""
 
 from __future__ import annotations
 
@@ -12,42 +12,57 @@ from avatar_core.geometry.tip import Tip
 from avatar_ros.ui import tone
 from avatar_ros.ui.colours import lightness, shaded
 from avatar_ros.ui.glb import unlit_glb
-from avatar_ros.ui.tip_body import shaft_body, tip_body
+from avatar_ros.ui.tip_body import along_shaft, shaft_body, tip_body
 
 TOOL, SHAFT = (0, 114, 178), (150, 160, 170)
 ARROW = (213, 94, 0)
 LEAST_FORCE = 1e-3  # that is shown [N]
 _UNSEEN = 1e-5  # change of positions [m], turns and forces [N] that nobody sees
 _SCALE = 0.004  # length of the arrow per force [m/N]
+_BESIDE = 0.01  # from a tip that feels nothing to its name [m]
 _LENGTHS = (0.012, 0.06)  # of the arrow, at least and at most [m]
 
 
 class ToolView:
-    """Draws the tool; ``on_drag`` gets where a user drags its tip to [m], and whether along the
-    shaft alone."""
+    """Draws a tool.
+
+    number : among the tools, from 0
+    on_drag : gets the tool's number, where a user drags its tip to [m], and whether along the shaft
+        alone
+    """
 
     def __init__(
-        self, server: viser.ViserServer, on_drag: Callable[[np.ndarray, bool], None]
+        self,
+        server: viser.ViserServer,
+        number: int,
+        on_drag: Callable[[int, np.ndarray, bool], None],
     ) -> None:
-        self._server, self._on_drag = server, on_drag
+        self._server, self._number, self._on_drag = server, number, on_drag
+        self._root = f"/tools/{number}"
+        self._node = server.scene.add_frame(self._root, show_axes=False)
         self._tool: Any = None
         self._arrow: Any = None
-        self._number: Any = None
+        self._text: Any = None
+        self._label = ""
         self._placed: np.ndarray | None = None  # tip, turn and force that are seen
+
+    def remove(self) -> None:
+        """Draw the tool no more."""
+        self._node.remove()
 
     def show(self, tip: Tip, position: np.ndarray, wxyz: np.ndarray) -> None:
         """Show a tool at a position [m]."""
         self._placed = None
-        scene = self._server.scene
+        scene, root = self._server.scene, self._root
         body, shaft = tip_body(tip), shaft_body(tip)
         self._tool = scene.add_glb(
-            "/tools/tool", _shaded_glb(body, TOOL), position=position, wxyz=wxyz, cast_shadow=False
+            f"{root}/body", _shaded_glb(body, TOOL), position=position, wxyz=wxyz, cast_shadow=False
         )
-        scene.add_glb("/tools/tool/shaft", _shaded_glb(shaft, SHAFT), cast_shadow=False)
+        scene.add_glb(f"{root}/body/shaft", _shaded_glb(shaft, SHAFT), cast_shadow=False)
         self._tool.on_drag("left")(lambda event: self._dragged(event, False))
         self._tool.on_drag("left", modifier="shift")(lambda event: self._dragged(event, True))
         self._arrow = scene.add_arrows(
-            "/tools/force",
+            f"{root}/force",
             np.zeros((1, 2, 3)),
             tuple(tone.instance(np.array(ARROW)).tolist()),
             shaft_radius=0.0015,
@@ -55,13 +70,15 @@ class ToolView:
             head_length=0.008,
             visible=False,
         )
-        self._number = scene.add_label(
-            "/tools/force_number", "", visible=False, anchor="bottom-center", font_screen_scale=1.1
+        self._text = scene.add_label(
+            f"{root}/force_number", "", visible=False, anchor="bottom-center", font_screen_scale=1.1
         )
 
-    @property
-    def is_shown(self) -> bool:
-        return self._tool is not None
+    def name(self, label: str, is_chosen: bool) -> None:
+        """Write a name beside the tip, the chosen tool's in brackets; empty: none."""
+        text = f"[{label}]" if label and is_chosen else label
+        if text != self._label:
+            self._label, self._placed = text, None
 
     @property
     def position(self) -> np.ndarray:
@@ -70,7 +87,7 @@ class ToolView:
 
     def _dragged(self, event: Any, along_shaft: bool) -> None:
         way = np.array(event.end_position) - np.array(event.start_position)
-        self._on_drag(self.position + way, along_shaft)
+        self._on_drag(self._number, self.position + way, along_shaft)
 
     def place(self, tip: np.ndarray, wxyz: np.ndarray, force: np.ndarray) -> None:
         """Show the tool at its tip [m], with the force on it [N].
@@ -84,15 +101,22 @@ class ToolView:
         self._tool.position, self._tool.wxyz = tuple(tip), wxyz
         size = float(np.linalg.norm(force))
         is_felt = size > LEAST_FORCE
+        end = tip + _BESIDE * along_shaft(wxyz)
         if is_felt:
             end = tip + force * (np.clip(_SCALE * size, *_LENGTHS) / size)
             self._arrow.points = np.stack([tip, end])[None]
-            self._number.position = tuple(end)
-            text = f"{size:.1f} N"
-            if self._number.text != text:
-                self._number.text = text
-        if self._arrow.visible != is_felt:
-            self._arrow.visible = self._number.visible = is_felt
+        _set(self._arrow, "visible", is_felt)
+        text = f"{self._label} {size:.1f} N".strip() if is_felt else self._label
+        if text:
+            self._text.position = tuple(end)
+            _set(self._text, "text", text)
+        _set(self._text, "visible", bool(text))
+
+
+def _set(node: Any, name: str, value: Any) -> None:
+    """Change a property of a node, and send it only then."""
+    if getattr(node, name) != value:
+        setattr(node, name, value)
 
 
 def _shaded_glb(body: tuple[np.ndarray, np.ndarray], colour: tuple[int, int, int]) -> bytes:

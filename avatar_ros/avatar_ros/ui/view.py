@@ -1,8 +1,8 @@
-"""The three-dimensional part of the planning page: organ, what is in it, tool and force."""
+"""The three-dimensional part of the planning page: organ, what is in it, tools and forces."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,6 @@ from avatar_ros.ui.surface_view import Marks, SurfaceView
 from avatar_ros.ui.tip_body import turn_to
 from avatar_ros.ui.tool_view import LEAST_FORCE, ToolView
 
-CLEARANCE = 0.015  # of a new organ's tool over the surface [m]
 FIELD_TOPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # possible ends of the scale of another field
 LOOKS = WHOLE, GLASS, CUT = "whole", "glass", "cut open"  # how the organ is shown
 _ROOTS = ("/organ", "/structures", "/tools", "/measures")  # nodes above what is of an organ
@@ -32,26 +31,27 @@ _LEAST_MARKED = 0.1e-3  # displacement whose place is marked [m]
 class OrganView:
     """Draws into a viser server; everything in metres, in the organ's frame.
 
-    on_drag : gets where a user drags the tip, and whether along its shaft; on_cube : a browser and
-    its cube; on_cut : the part that a user cuts away with the plane's handle
+    on_drag : gets which tool a user drags, where to, and whether along its shaft
+    on_cube : gets a browser and its cube; on_cut : the part that a user cuts away by the handle
     top, field_top : ends of the colour scales, of the displacement [m] and of another field
     """
 
     def __init__(
         self,
         server: viser.ViserServer,
-        on_drag: Callable[[np.ndarray, bool], None],
+        on_drag: Callable[[int, np.ndarray, bool], None],
         on_cube: Callable[[Any, str], None] = lambda client, drawing: None,
         on_cut: Callable[[float], None] = lambda part: None,
     ) -> None:
-        self._server = server
+        self._server, self._on_drag = server, on_drag
         self._organ: Organ | None = None
         self._handle = CutHandle(server, on_cut)
         self._roots: dict[str, Any] = {}
         self._surface = SurfaceView(server)
         self._structures = StructuresView(server)
-        self._tip = Tip()
-        self._tool = ToolView(server, on_drag)
+        self._tips: tuple[Tip, ...] = ()
+        self._tools: list[ToolView] = []
+        self._beside = 0  # the tool to which a view can be turned
         self._cameras = Cameras(server, on_cube)
         self._drawn: np.ndarray | None = None  # the cloud that is seen
         self._largest = 0.0
@@ -64,9 +64,13 @@ class OrganView:
         server.scene.configure_environment_map(hdri=None)
         server.scene.add_light_ambient("/light", intensity=tone.AMBIENT)
 
-    def show(self, organ: Organ, tip: Tip) -> None:
-        """Show another organ, at rest, with the structures of its own file and no others."""
+    def show(self, organ: Organ, tips: tuple[Tip, ...]) -> None:
+        """Show another organ, at rest, with the structures of its own file and no others, and with
+        a tool over it for each tip."""
         scene = self._server.scene
+        for tool in self._tools:
+            tool.remove()
+        self._tools = []
         for name in _ROOTS:
             self._roots[name] = scene.add_frame(name, show_axes=False)
         self._organ, self.top, self._drawn, self._field = organ, top_for(0.0), None, None
@@ -80,9 +84,7 @@ class OrganView:
         self._place = scene.add_icosphere(
             "/organ/largest/place", 0.0012, color=(0, 0, 0), cast_shadow=False, visible=True
         )
-        self._tip = tip
-        position = organ.above(tip.offset + CLEARANCE)
-        self._tool.show(tip, position, self._upright(position))
+        self.show_tools(tips, organ.starts(tips))
         self._cameras.show(organ.vertices)
 
     @property
@@ -134,7 +136,7 @@ class OrganView:
             self.field_top = next((x for x in FIELD_TOPS if x >= largest), FIELD_TOPS[-1])
         self._field, self._drawn = field, None
         rest = np.hstack([organ.vertices, np.zeros_like(organ.vertices)])
-        self.move(rest if drawn is None else drawn, np.zeros(3), np.zeros(3))
+        self.move(rest if drawn is None else drawn, *np.zeros((2, len(self._tips), 3)))
 
     @property
     def is_reach_marked(self) -> bool:
@@ -160,26 +162,42 @@ class OrganView:
         """A standard view, as "A", or that beside the tool, in every browser."""
         if side in AXES:
             self._cameras.turn_to(side)
-        elif self._organ is not None and self._tool.is_shown:
-            self._cameras.turn_beside(self._organ.outward(self._tool.position))
+        elif self._organ is not None and self._tools:
+            self._cameras.turn_beside(self._organ.outward(self._tools[self._beside].position))
 
     def _upright(self, position: np.ndarray) -> np.ndarray:
         """Turns the shaft along the surface's normal, for which the force is computed."""
         assert self._organ is not None
         return turn_to(self._organ.outward(position))
 
-    def change_tip(self, tip: Tip) -> None:
-        """Show another tip in the same place."""
-        self._tip = tip
-        if self._tool.is_shown:
-            position = self._tool.position
-            self._tool.show(tip, position, self._upright(position))
+    def show_tools(self, tips: tuple[Tip, ...], places: np.ndarray) -> None:
+        """Show tools, in place of those before, with their tips at places (n, 3) [m]."""
+        self._tips, self._beside = tips, 0
+        if self._organ is None:
+            return
+        for tool in self._tools[len(tips) :]:
+            tool.remove()
+        del self._tools[len(tips) :]
+        for k in range(len(self._tools), len(tips)):
+            self._tools.append(ToolView(self._server, k, self._on_drag))
+        for tool, tip, place in zip(self._tools, tips, places, strict=True):
+            tool.show(tip, place, self._upright(place))
 
-    def move(self, points: np.ndarray, tip: np.ndarray, force: np.ndarray) -> float:
+    def change_tips(self, tips: tuple[Tip, ...]) -> None:
+        """Show other tips in the same places."""
+        self.show_tools(tips, np.array([tool.position for tool in self._tools]))
+
+    def name_tools(self, labels: Sequence[str], chosen: int) -> None:
+        """Write the names of the tools beside them, and turn to the chosen one if asked to."""
+        self._beside = chosen
+        for k, (tool, label) in enumerate(zip(self._tools, labels, strict=False)):
+            tool.name(label, k == chosen)
+
+    def move(self, points: np.ndarray, tips: np.ndarray, forces: np.ndarray) -> float:
         """Move the surface as in a cloud, (n, 6) [m]; returns the largest displacement [m].
 
-        Under a tip [m] that feels a force [N], smaller triangles show its dent. The same cloud is
-        not drawn twice.
+        Under tips (n_tools, 3) [m] that feel a force [N], smaller triangles show their dents. The
+        same cloud is not drawn twice.
         """
         organ = self._organ
         if organ is None or len(points) != len(organ.vertices):
@@ -188,8 +206,10 @@ class OrganView:
             return self._largest
         self._drawn = points.copy()
         plain = FineSurface(points[:, :3], points[:, 3:], organ.faces, np.arange(len(organ.faces)))
-        if np.linalg.norm(force) > LEAST_FORCE:
-            shown = fine_surface(organ.vademecum, points, [self._tip], tip[None])
+        (pressing,) = np.nonzero(np.linalg.norm(forces, axis=1) > LEAST_FORCE)
+        if len(pressing):
+            pressed = [self._tips[k] for k in pressing]
+            shown = fine_surface(organ.vademecum, points, pressed, tips[pressing])
         else:
             shown = plain
         size = np.linalg.norm(shown.displacements, axis=1)
@@ -222,9 +242,8 @@ class OrganView:
         """Draw the organ in grey while its shape is the last valid one, or in colours again."""
         self._surface.grey(held)
 
-    def place_tool(self, tip: np.ndarray, force: np.ndarray) -> None:
-        """Show the tool at its tip [m], with the force on it [N]."""
-        if not self._tool.is_shown:
-            return
+    def place_tools(self, tips: np.ndarray, forces: np.ndarray) -> None:
+        """Show the tools at their tips, (n, 3) [m], with the forces on them [N]."""
         with self._server.atomic():
-            self._tool.place(tip, self._upright(tip), force)
+            for tool, tip, force in zip(self._tools, tips, forces, strict=False):
+                tool.place(tip, self._upright(tip), force)

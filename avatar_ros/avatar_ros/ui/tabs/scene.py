@@ -7,6 +7,7 @@ from typing import Any
 
 from avatar_ros.ui.actions import Actions
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
+from avatar_ros.ui.texts import other_scenes, scene_texts
 
 _IN_USE = "margin:0 1em;font-size:14px"
 
@@ -20,6 +21,7 @@ class SceneTab:
         self._text = gui.add_markdown("")
         self._scenes.on_update(lambda _: self._describe())
         gui.add_button("Switch to scene").on_click(lambda _: actions.scene(self._scenes.value))
+        self._others = gui.add_markdown("")
         self._texts: dict[str, str] = {}
 
     def show_scene(self, name: str) -> None:
@@ -28,10 +30,10 @@ class SceneTab:
         if self._in_use.content != content:
             self._in_use.content = content
 
-    def offer(self, texts: dict[str, str]) -> None:
-        """Offer scenes by name, with their descriptions."""
-        self._texts = texts
-        set_options(self._scenes, list(texts))
+    def offer(self, n_tools: int) -> None:
+        """Offer the scenes of a cell of so many tools, and say how to come to the others."""
+        self._texts, self._others.content = scene_texts(n_tools), other_scenes(n_tools)
+        set_options(self._scenes, list(self._texts))
         self._describe()
 
     def _describe(self) -> None:

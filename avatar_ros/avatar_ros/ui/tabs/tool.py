@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,6 +12,7 @@ from viser import uplot
 
 from avatar_ros.ui.actions import Actions
 from avatar_ros.ui.orientation import AXES
+from avatar_ros.ui.tabs.choices import NOTHING, set_options
 from avatar_ros.ui.tabs.plots import plot
 from avatar_ros.ui.texts import BAND
 
@@ -47,17 +49,20 @@ def _plot_of_force(gui: Any, has_band: bool) -> Any:
 
 
 class ToolTab:
-    """Plot of the force, buttons that move the tool, and its recording."""
+    """Choice of a tool, plot of the force on it, buttons that move it, and the recording."""
 
     def __init__(self, gui: Any, actions: Actions) -> None:
         self._gui, self._actions = gui, actions
+        self._tools = gui.add_dropdown("Tool", (NOTHING,), visible=False)
+        self._tools.on_update(self._on_tool)
+        self._chosen = ""
         n = round(_HISTORY * 5)
         self._times: deque[float] = deque(maxlen=n)
         self._forces: deque[tuple[float, float, float]] = deque(maxlen=n)
         self._bands: deque[tuple[float, float]] = deque(maxlen=n)  # the force, where it has none
         self._plot, self._plot_of_band = _plot_of_force(gui, False), _plot_of_force(gui, True)
         self._plot_of_band.visible = False
-        for name, labels in (("Tool", ("press 1 mm", "lift 1 mm")), ("1 mm", tuple(_SIDES))):
+        for name, labels in (("Depth", ("press 1 mm", "lift 1 mm")), ("1 mm", tuple(_SIDES))):
             group = gui.add_button_group(name, labels)
             group.on_click(lambda event: self._nudge(event.target.value))
         gui.add_button("Lift off the organ").on_click(lambda _: actions.lift())
@@ -71,6 +76,19 @@ class ToolTab:
             way = -STEP if key == "U" else STEP
             command = gui.add_command(f"{label}, 1 mm", hotkey=key)
             command.on_trigger(partial(self._on_key, side, way))
+
+    def show_tools(self, names: Sequence[str], chosen: str) -> None:
+        """Offer the tools, if there are several, and show which one is chosen."""
+        set_options(self._tools, list(names))
+        if chosen != self._chosen:  # the list may be ahead, of a choice that is on its way
+            self._chosen = self._tools.value = chosen
+            self.forget_force()  # of another tool
+        if self._tools.visible != (len(names) > 1):
+            self._tools.visible = len(names) > 1
+
+    def _on_tool(self, event: Any) -> None:
+        if event.client is not None:
+            self._actions.tool(self._tools.value)
 
     def _nudge(self, label: str) -> None:
         way = -STEP if label.startswith("press") else STEP
