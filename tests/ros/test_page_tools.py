@@ -143,6 +143,29 @@ def test_tips_are_those_of_the_scene_that_runs(state: SharedToolState) -> None:
     assert chosen.tip == Tip("flat", 2e-3)
 
 
+def test_beside_a_device_the_page_has_a_tool_of_its_own(state: SharedToolState) -> None:
+    said: list[str] = []
+    nothing: Any = SimpleNamespace()
+    chosen = Chosen(state, nothing, nothing, only="page")
+    chosen.organ = SimpleNamespace(ranges={})  # type: ignore[assignment]
+    chosen.contact = {
+        "tools": ["stylus", "page"],
+        "scene": "",
+        "tip.shape": ["sphere", "flat"],
+        "tip.radius": [4e-3, 2e-3],
+        "tip.half_angle": 0.0,
+        "tip.rounding": 0.0,
+    }
+    assert chosen.moved == ("page",) and not chosen.moves_all
+    assert chosen.tips == (Tip("flat", 2e-3),)
+    page = Page(say=said.append, show_recording=lambda on: None, answers=lambda: True)
+    recordings = Recordings(Path(), nothing, nothing, nothing, chosen, state, page)
+    recordings.record(True)
+    assert "record a bag" in said[0]
+    chosen.only = "probe"
+    assert chosen.moved == ()
+
+
 # --- What is shown ----------------------------------------------------------------------------
 
 
@@ -281,7 +304,7 @@ def test_tools_are_offered_only_where_there_are_several(server: viser.ViserServe
 
 def test_no_recording_begins_while_any_tool_touches(state: SharedToolState, tools: Tools) -> None:
     said: list[str] = []
-    chosen: Any = SimpleNamespace(organ=object(), tools=tools)
+    chosen: Any = SimpleNamespace(organ=object(), tools=tools, moves_all=True)
     nothing: Any = SimpleNamespace()
     recorder = Recorder(state)
     page = Page(say=said.append, show_recording=lambda on: None, answers=lambda: True)

@@ -56,7 +56,7 @@ def driven(
     state: SharedToolState, own_domain: dict[str, str]
 ) -> Iterator[tuple[SharedToolState, ToolDriverProcess]]:
     process = ToolDriverProcess(state)
-    process.ensure_running(NAMES, "organ")
+    process.ensure_running(NAMES, NAMES, "organ")
     yield state, process
     process.end()
 
@@ -105,10 +105,15 @@ def answer(tool: str, step: int, force: float) -> Any:
     )
 
 
+def used(tool: int, _status: int, stamp: int) -> np.ndarray:
+    """A place that tells tool and pose."""
+    return np.full(3, tool + 1e-9 * stamp)
+
+
 def test_a_period_has_the_states_of_one_step_or_is_lost(state: SharedToolState) -> None:
     """Of step 2 the first state is lost, of step 4 the last one; the count goes on."""
     state.all["recording"] = 1
-    periods = Periods(NAMES, state, lambda tool, status, stamp: np.full(3, tool + 1e-9 * stamp))
+    periods = Periods(NAMES, NAMES, state, used)
     number = 1
     for step in range(7):
         for tool, name in enumerate(NAMES):
@@ -122,6 +127,19 @@ def test_a_period_has_the_states_of_one_step_or_is_lost(state: SharedToolState) 
     np.testing.assert_allclose(rows["tip"][1] - rows["tip"][0], 1.0)
     newest = state.period()
     assert newest is not None and newest["force"][:, 1].tolist() == [6.0, 16.0]
+
+
+def test_beside_a_device_the_states_of_its_tool_are_passed_over() -> None:
+    """The page has the second tool of three."""
+    state = SharedToolState.make()
+    state.use(PLACES[:1])
+    every = ("stylus", "page", "other")
+    periods = Periods(every[1:2], every, state, used)
+    for number in range(12):
+        periods.note(answer(every[number % 3], number // 3, float(number)), number)
+    newest = state.period()
+    assert newest is not None and newest["force"][:, 1].tolist() == [10.0]
+    assert [int(state.recent[0]["number"][k]) for k in range(4)] == [0, 1, 2, 3]
 
 
 # --- In a cell --------------------------------------------------------------------------------
@@ -142,7 +160,7 @@ def cell(
     driver = ToolDriverProcess(state)
 
     def start() -> None:
-        driver.ensure_running(NAMES, "organ")
+        driver.ensure_running(NAMES, NAMES, "organ")
 
     yield state, start
     driver.end()

@@ -112,6 +112,7 @@ class PlanningNode(ManagedNode):
                 show_material=lambda values: self._panels.organ.show_material(values),
                 show_look=self._show_look,
             ),
+            value["tool"],
         )
         self._view = OrganView(
             server,
@@ -393,13 +394,17 @@ class PlanningNode(ManagedNode):
         """The contact node runs, for the first time or again."""
         self._requests.contact_started()
         self._chosen.contact, self._is_to_restore = values, True
-        self._use_tools(tuple(values["tools"]))
+        self._use_tools(self._chosen.moved)
         self._view.change_tips(self._chosen.tips)
         self._panels.organ.show_material(self._chosen.in_force)
 
     def _use_tools(self, names: tuple[str, ...]) -> None:
-        """Those of the contact node; of another number, they begin at places of their own."""
+        """Those of the contact node that are moved here; of another number, they begin at places
+        of their own."""
         tools, organ = self._chosen.tools, self._organ
+        if not names:
+            self._say(f"the contact node has no tool '{self._chosen.only}': set the page's `tool`")
+            return
         if names != tools.names:
             self._driver.end()
             targets = tools.targets
@@ -411,14 +416,15 @@ class PlanningNode(ManagedNode):
                 targets = np.zeros((len(tips), 3)) if organ is None else organ.starts(tips)
                 self._view.show_tools(tips, targets)
             tools.use(names, targets)
-            self._panels.scene.offer(len(names))
+            self._panels.scene.offer(len(self._chosen.contact["tools"]))
         self._drive()
 
     def _drive(self) -> None:
         """Send the tools' poses, once it is known which there are, and over what."""
         names = self._chosen.tools.names
         if self._organ is not None and names:
-            self._driver.ensure_running(names, self._frame_id)
+            every = self._chosen.contact["tools"]
+            self._driver.ensure_running(names, every, self._frame_id)
 
     # --- From the page -----------------------------------------------------------------------
 

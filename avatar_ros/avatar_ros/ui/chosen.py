@@ -47,12 +47,15 @@ class Chosen:
     organ : that is shown, None before the first
     tools : their places
     contact : parameters of the contact node, by name; empty until it was asked
+    only : name of the one tool that the page moves, where devices move the others; empty: all
     scene : name of the one chosen here, empty for the contact node's own
     look : how the organ is shown, from which side, and which part of it
     """
 
-    def __init__(self, state: SharedToolState, requests: Requests, page: Page) -> None:
-        self._requests, self._page = requests, page
+    def __init__(
+        self, state: SharedToolState, requests: Requests, page: Page, only: str = ""
+    ) -> None:
+        self._requests, self._page, self.only = requests, page, only
         self._history = History()
         self.tools = Tools(state, self._history, lambda: self.organ)
         self._material: dict[str, float] = {}  # by coordinate
@@ -84,7 +87,25 @@ class Chosen:
 
     @property
     def tips(self) -> tuple[Tip, ...]:
-        """Of all tools, in their order."""
+        """Of the tools that the page moves, in their order."""
+        if "tools" not in self.contact:
+            return self._all_tips
+        tips = dict(zip(self.contact["tools"], self._all_tips, strict=False))
+        return tuple(tips.get(name, Tip()) for name in self.moved) or (Tip(),)
+
+    @property
+    def moved(self) -> tuple[str, ...]:
+        """Names of the contact node's tools that the page moves."""
+        return tuple(name for name in self.contact["tools"] if self.only in ("", name))
+
+    @property
+    def moves_all(self) -> bool:
+        """Whether no device moves another of the contact node's tools."""
+        return len(self.moved) == len(self.contact["tools"])
+
+    @property
+    def _all_tips(self) -> tuple[Tip, ...]:
+        """Of all tools of the contact node."""
         return (self.scene and _tips_of(self.scene)) or self._own_tips
 
     @property
@@ -178,7 +199,7 @@ class Chosen:
     def scene_in_force(self, organ: Organ) -> Scene:
         """The scene that reproduces what runs now; ``contact`` must be known."""
         given = self.scene or self.contact["scene"]
-        return self._scene_of(organ, given, self.in_force, self.tips)
+        return self._scene_of(organ, given, self.in_force, self._all_tips)
 
     def _own_scene(self) -> str:
         """As the contact node was started, as YAML; empty if that is not known."""

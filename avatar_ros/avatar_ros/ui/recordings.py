@@ -72,6 +72,9 @@ class Recordings:
         if organ is None or not self._page.answers():
             say("nothing to record: there is no organ, or the contact node does not answer")
             return
+        if not self._chosen.moves_all:
+            say("a recording holds all tools, and devices move some; record a bag instead")
+            return
         if touching := self._touching():
             say(f"lift {touching} off the organ first: a recording starts at rest")
             return

@@ -12,4 +12,5 @@ PLANNING_UI = (
     ),
     Parameter("token", "", "at the end of the page's address; empty: a new one at each start"),
     Parameter("library_dir", ".", "directory of the loader's files; recordings are written there"),
+    Parameter("tool", "", "the one tool to move, where devices move the others; empty: all"),
 )

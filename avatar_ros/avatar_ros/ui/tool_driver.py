@@ -3,8 +3,9 @@
 It is a process of its own, because the page is served in bursts. It reads every state that the
 contact node answers, and on request records it with the pose that the step used.
 
-Run as ``python -m avatar_ros.ui.tool_driver FRAME TOOL ...`` by ``planning_ui``, never by hand; the
-tools are all of the contact node's, in its order, and the shared memory comes as standard input.
+Run as ``python -m avatar_ros.ui.tool_driver FRAME ALL TOOL ...`` by ``planning_ui``, never by hand:
+ALL are the names of the contact node's tools, with commas, the others those of them that are to be
+moved, in the same order. The shared memory comes as standard input.
 """
 
 from __future__ import annotations
@@ -54,10 +55,15 @@ _N_STATES = 200
 
 
 class ToolDriver:
-    """Publishes the poses of all tools and reads the answers."""
+    """Publishes the poses of tools and reads the answers."""
 
     def __init__(
-        self, node: Any, tools: Sequence[str], frame_id: str, state: SharedToolState
+        self,
+        node: Any,
+        tools: Sequence[str],
+        all_tools: Sequence[str],
+        frame_id: str,
+        state: SharedToolState,
     ) -> None:
         self._all, self._each = state.all, state.each
         self._publishers = [
@@ -67,7 +73,7 @@ class ToolDriver:
             ContactState,
             "contact_state",
             lambda _: None,
-            QoSProfile(depth=_N_STATES * len(tools), reliability=ReliabilityPolicy.RELIABLE),
+            QoSProfile(depth=_N_STATES * len(all_tools), reliability=ReliabilityPolicy.RELIABLE),
             callback_group=PolledSubscriptions(),
             raw=True,
         )
@@ -75,7 +81,7 @@ class ToolDriver:
         self._tips = self._each["target"].copy()
         self._sent = np.full((_N_SENT, len(tools), 3), np.nan)
         self._first = 0  # stamp of pose 0 [ns]
-        self._periods = Periods(tools, state, self._used)
+        self._periods = Periods(tools, all_tools, state, self._used)
 
     def run(self, stop: StopSignal) -> None:
         """Run until the signal comes."""
@@ -121,36 +127,41 @@ class ToolDriver:
 
 
 class Periods:
-    """Collects the states of all tools of a period, and writes it once it is whole.
+    """Collects the states of the tools of a period, and writes it once it is whole.
 
-    The contact node sends the states of a step in the order of its tools, from one publisher. The
-    publisher's count therefore tells which states are of one step, although the poses that they
+    The contact node sends the states of a step in the order of all its tools, from one publisher.
+    The publisher's count therefore tells which states are of one step, although the poses that they
     answer may be of two: one may have come too late for its step.
 
     used : position of the tip that a step used [m], of a tool, a status and a stamp [ns]
     """
 
     def __init__(
-        self, tools: Sequence[str], state: SharedToolState, used: Callable[[int, int, int], Any]
+        self,
+        tools: Sequence[str],
+        all_tools: Sequence[str],
+        state: SharedToolState,
+        used: Callable[[int, int, int], Any],
     ) -> None:
-        self._places = {tool: k for k, tool in enumerate(tools)}
+        self._places = {tool: (k, all_tools.index(tool)) for k, tool in enumerate(tools)}
+        self._n_all = len(all_tools)
         self._all, self._recent, self._rows = state.all, state.recent, state.rows
         self._used = used
         self._period = np.zeros(len(tools), ROW)
-        self._first = -1  # count of the first tool's state, of the period that is collected
+        self._first = -1  # count of the first of all states of the period that is collected
         self._n_missing = 0
 
     def note(self, state: Any, number: int) -> None:
         """A state, and the number that its publisher gave it."""
-        tool = self._places.get(state.tool)
-        if tool is None:
+        if state.tool not in self._places:
             return
-        if number - tool != self._first:  # another step; what is missing of the last one is lost
-            self._first, self._n_missing = number - tool, len(self._places)
+        tool, before = self._places[state.tool]
+        if number - before != self._first:  # another step; what is missing of the last one is lost
+            self._first, self._n_missing = number - before, len(self._places)
         self._read(tool, state)
         self._n_missing -= 1
         if self._n_missing == 0:
-            self._period["number"] = self._first // len(self._places)
+            self._period["number"] = self._first // self._n_all
             self._write()
 
     def _read(self, tool: int, state: Any) -> None:
@@ -182,7 +193,7 @@ class Periods:
 
 
 def main() -> int:
-    frame, *tools = sys.argv[1:]
+    frame, names, *tools = sys.argv[1:]
     stop = StopSignal()
     state = SharedToolState(sys.stdin.fileno(), len(tools))
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
@@ -190,7 +201,7 @@ def main() -> int:
         "_planning_ui_hand", enable_rosout=False, start_parameter_services=False
     )
     try:
-        driver = ToolDriver(node, tools, frame, state)
+        driver = ToolDriver(node, tools, names.split(","), frame, state)
         realtime.bind_thread(-1)
         realtime.tune_interpreter()
         driver.run(stop)

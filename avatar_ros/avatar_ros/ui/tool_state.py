@@ -153,13 +153,17 @@ class ToolDriverProcess:
         self._state = state
         self._process: ModuleProcess | None = None
 
-    def ensure_running(self, tools: Sequence[str], frame_id: str) -> None:
-        """Start the driver unless it runs; it continues from the targets in the shared memory."""
+    def ensure_running(self, tools: Sequence[str], all_tools: Sequence[str], frame_id: str) -> None:
+        """Start the driver unless it runs; it continues from the targets in the shared memory.
+
+        tools : to be moved, some or all of the contact node's
+        """
         if self._process is not None and self._process.poll() is None:
             return
         self._process = ModuleProcess(
             "avatar_ros.ui.tool_driver",
             frame_id,
+            ",".join(all_tools),
             *tools,
             stdin=self._state.handle,
             preexec_fn=partial(realtime.die_with_parent, signal.SIGINT),
