@@ -30,6 +30,7 @@ SECTIONS: tuple[Callable[[SurfaceMesh, CertaintySettings, ProgressBar], Section]
     calibration_section,
     registration_section,
 )
+_IN_ROW = 3  # panels of the picture
 N_STAGES = 7  # of the progress bar, over all sections
 
 
@@ -59,5 +60,8 @@ def study(surface: SurfaceMesh, settings: CertaintySettings, folder: Path) -> St
 
 
 def _draw(figure: Figure, panels: list[Panel]) -> None:
-    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        panel.draw(axes)
+    """Panels in rows of three; the sentence above them takes two inches."""
+    n_rows = -(-len(panels) // _IN_ROW)
+    figure.set_size_inches(15.0, 2.0 + 4.5 * n_rows)
+    for k, panel in enumerate(panels):
+        panel.draw(figure.add_subplot(n_rows, _IN_ROW, k + 1))
