@@ -76,7 +76,8 @@ def fine_surface(
     Parameters
     ----------
     points : ndarray, shape (n_surface_vertices, 6), deformed positions and displacements [m]
-    poses : ndarray, shape (n_tips, 3), in the frame of the positions [m]
+    tips : that press
+    poses : ndarray, shape (n_tips, 3), of the tips, in the frame of the positions [m]
     """
     rest, faces = vademecum.surface_vertices, vademecum.organ_faces
     points = np.asarray(points, float)

@@ -23,6 +23,8 @@ from avatar_core.studies.certainty_supports import (
     _summary,
     rigid_part,
 )
+from avatar_core.studies.registration import draw_errors, summarise
+from avatar_core.studies.registration_truth import CLASSES
 from avatar_core.studies.report import Panel
 from avatar_core.studies.study import ProgressBar
 from tests.core.conftest import box_mesh
@@ -75,6 +77,25 @@ def test_sections_share_one_page(
     figure = Figure()
     found.draw(figure)
     assert len(figure.axes) == 2
+
+
+def test_registrations_are_summed_up_over_all_and_by_what_deformed_the_organ() -> None:
+    one = {"vademecum_of_peak": 0.05, "explained": True, "small_strains_off": 0.04}
+    one |= {"rigid_error": 0.5, "splines_error": 0.4, "coverage": 0.9}
+    rows = [
+        {"class": kind, "vademecum_error": 0.1 * k, "seconds": 2.0**k, **one}
+        for k, kind in enumerate(CLASSES)
+    ]
+    found = summarise(rows)
+    assert found["registration_error"] == pytest.approx(0.2)
+    assert found["registration_worst"] == pytest.approx(0.4)
+    assert found["registration_error_turned_weight"] == pytest.approx(0.4)
+    assert found["registration_seconds"] == 4.0
+    assert all(key.startswith("registration_") for key in found)  # of its section
+    axes = Figure().subplots()
+    draw_errors(axes, rows)
+    heights = [bar.get_height() for bar in axes.containers[0]]
+    np.testing.assert_allclose(heights, [0.0, 10.0, 20.0, 30.0, 40.0])
 
 
 def test_the_error_of_a_force_is_told_apart_from_that_of_its_band() -> None:

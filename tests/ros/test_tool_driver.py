@@ -129,17 +129,16 @@ def test_a_period_has_the_states_of_one_step_or_is_lost(state: SharedToolState) 
     assert newest is not None and newest["force"][:, 1].tolist() == [6.0, 16.0]
 
 
-def test_beside_a_device_the_states_of_its_tool_are_passed_over() -> None:
-    """The page has the second tool of three."""
-    state = SharedToolState.make()
-    state.use(PLACES[:1])
-    every = ("stylus", "page", "other")
-    periods = Periods(every[1:2], every, state, used)
+def test_beside_a_device_the_states_of_its_tool_are_passed_over(state: SharedToolState) -> None:
+    """The device's is the second of three, so that the last one's place is not its count."""
+    state.all["recording"] = 1
+    every = ("left", "stylus", "right")
+    periods = Periods(NAMES, every, state, used)
     for number in range(12):
         periods.note(answer(every[number % 3], number // 3, float(number)), number)
-    newest = state.period()
-    assert newest is not None and newest["force"][:, 1].tolist() == [10.0]
-    assert [int(state.recent[0]["number"][k]) for k in range(4)] == [0, 1, 2, 3]
+    rows = state.recorded()
+    assert rows["number"].tolist() == 2 * [[0, 1, 2, 3]]
+    np.testing.assert_array_equal(rows["force"][:, :, 1], [[0, 3, 6, 9], [2, 5, 8, 11]])
 
 
 # --- In a cell --------------------------------------------------------------------------------
