@@ -342,6 +342,20 @@ def test_one_pose_and_no_other_is_a_stream_that_ended(bench: Any, touch: Any) ->
     assert statuses[:20] == [OK] * 20 and statuses[2600:] == [STALE] * 400
 
 
+@pytest.mark.parametrize("publishers", [0, 1])
+def test_a_stream_is_not_slow_for_the_one_before_it(
+    bench: Any, touch: Any, publishers: int
+) -> None:
+    cell = bench(timeout=0.02)
+    slow = [cell.step(pose(touch[0]) if k % 30 == 0 else None)[0] for k in range(600)]
+    assert slow[-1] == SLOW
+    cell.tools[0].publishers = publishers
+    ended = [cell.step(None)[0] for _ in range(3000)]
+    assert ended[-1] == (STALE if publishers else LOST)
+    statuses = {cell.step(pose(touch[0]) if k % 10 == 0 else None)[0] for k in range(600)}
+    assert SLOW not in statuses and OK in statuses
+
+
 @pytest.mark.parametrize("hertz", [100, 1000])
 def test_one_gap_in_a_stream_makes_it_not_slow(bench: Any, touch: Any, hertz: int) -> None:
     cell = bench(timeout=0.02)

@@ -38,6 +38,7 @@ _SLOW = 0.75  # of the timeout: poses that lie farther apart are slow
 # a stream that was refused is so until the next message, or until none came for this long [ns]
 _SILENCE = 2_500_000_000
 _OF_A_STREAM = (INVALID_POSE, UNKNOWN_FRAME, SEVERAL_PUBLISHERS, SLOW_POSES)
+_NO_INTERVALS = (0, 0, 0)  # [ns]
 _ALTERNATION = 500_000_000  # within which messages of several publishers alternate [ns]
 _NO_NUMBER = 2**64 - 1  # of middleware that does not count messages
 _N_STATUS = 32
@@ -89,7 +90,7 @@ class ToolChannel:
         self._last = np.full(3, FAR_AWAY)  # valid position, in the tool's frame [m]
         self._received = 0  # the last valid pose [ns]
         self._heard = 0  # the last message, valid or not [ns]
-        self._intervals = (0, 0, 0)  # between the last valid poses [ns]
+        self._intervals = _NO_INTERVALS  # between the last valid poses of this stream
         self._number = -1  # of the last message, as its publisher counts
         self._last_decrease = -_ALTERNATION  # when the numbers last decreased [ns]
         self._several_until = 0  # [ns]
@@ -210,10 +211,9 @@ class ToolChannel:
         """The status of a period without a message. Real-time safe."""
         if self.status == NO_POSE or now - self._received <= timeout:
             return self.status
-        if not self.publishers:
-            return LOST_TOOL
-        if now - self._heard > _SILENCE:
-            return STALE_POSE
+        if not self.publishers or now - self._heard > _SILENCE:
+            self._intervals = _NO_INTERVALS  # what comes next is another stream
+            return STALE_POSE if self.publishers else LOST_TOOL
         if self.status in _OF_A_STREAM:
             return self.status
         # silence before the last pose as well as after it: a slow stream, as far as is known
