@@ -89,14 +89,14 @@ def opened(port: int, shots: Path) -> Iterator[Any]:
         assert not [url for url in foreign if not url.startswith(local)]
 
 
-def draw_in_idle_time() -> None:
-    """Leave the cores to others first, as a graphics card would: here they draw the page.
+def browse_in_idle_time() -> None:
+    """Leave the cores to all others first, as a browser on another machine would.
 
     Chromium raises the priority of drawing above that of ordinary processes, if it may.
     """
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it ended meanwhile
-            if b"--type=gpu-process" in (process / "cmdline").read_bytes():
+            if (process / "comm").read_text().startswith("chrom"):
                 for thread in (process / "task").iterdir():
                     os.sched_setscheduler(int(thread.name), os.SCHED_IDLE, os.sched_param(0))
 

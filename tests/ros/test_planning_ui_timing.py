@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -29,8 +27,8 @@ from tests.ros.browser import (
     CHROMIUM,
     TOKEN,
     beside_pose,
+    browse_in_idle_time,
     drag,
-    draw_in_idle_time,
     force_of,
     free_port,
     news,
@@ -54,7 +52,7 @@ DEEP = -0.002  # of the tip's centre over the surface, while it presses [m]
 ENOUGH = 3.0  # force that stays one while the tool swings [N]
 SWING = 10.0  # of the mouse [px]
 SECONDS = 10.0  # of a measurement
-NEIGHBOUR = "import numpy as np\nx = np.ones(1_000_000)\nwhile True: x *= 1.0"
+PRIORITY = 80  # of the loop: without one, cores are shared by whoever runs
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +72,7 @@ def nodes(folder: Path, own_domain: dict[str, str], port: int) -> Iterator[dict[
     library = ["-p", f"library_dir:={folder}"]
     arguments = {
         "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
-        "contact": PATIENT[1:],
+        "contact": [*PATIENT[1:], "-p", f"realtime.priority:={PRIORITY}"],
         "planning_ui": [*library, "-p", f"port:={port}", "-p", f"token:={TOKEN}"],
     }
     with nodes_of_a_page(arguments, own_domain) as running:
@@ -106,40 +104,27 @@ def figures(probe: Probe, meanwhile: Callable[[], None]) -> np.ndarray:
     return np.median(windows[1:-1], axis=0)
 
 
-@contextmanager
-def neighbour() -> Iterator[None]:
-    """A process that computes as a browser draws: one core, and the memory that all share.
-
-    A planner's browser draws on his own machine; what it takes from the loop on
-    this one is not what the page's node takes.
-    """
-    process = subprocess.Popen([sys.executable, "-c", NEIGHBOUR])
-    try:
-        yield
-    finally:
-        process.kill()
-        process.wait()
-
-
 def test_the_loop_keeps_its_figures_while_the_page_is_dragged(
     page: Any, folder: Path, nodes: dict[str, Module], lasting_probe: Probe
 ) -> None:
-    """In turns, since a machine's neighbours come and go; the tool presses all the time."""
+    """In turns, since a machine's neighbours come and go; the tool presses all the time.
+
+    A planner's browser draws on his own machine: what it takes from the loop on this one is not
+    what the page's node takes, so that it draws in both halves.
+    """
     shown = Organ.of(load_vademecum(folder / "liver.h5"))
     drag(page, shown, 0.020, DEEP)
     page.mouse.up()
     pressed(page, ENOUGH)
-    draw_in_idle_time()
-    address, found = page.url, []
+    browse_in_idle_time()
+    page.keyboard.press("7")  # the view beside the tool
+    page.wait_for_timeout(1500)
+    found = []
     for _ in range(3):
-        page.goto("about:blank")
-        nodes["planning_ui"].send_signal(signal.SIGSTOP)
-        with neighbour():
-            without = figures(lasting_probe, lambda: None)
-        nodes["planning_ui"].send_signal(signal.SIGCONT)
-        page.goto(address)
+        with stopped(nodes["planning_ui"]):
+            without = swung(page, shown, lasting_probe)
         news(page, "All nodes answer")
-        page.wait_for_timeout(3000)
+        pressed(page, ENOUGH)
         found.append((without, dragged(page, shown, lasting_probe)))
     without, beside = np.median(found, axis=0)
     for name, (rate, on_time, step) in (("without", without), ("dragged", beside)):
@@ -149,21 +134,30 @@ def test_the_loop_keeps_its_figures_while_the_page_is_dragged(
     assert beside[2] < 1.1 * without[2]
 
 
+@contextmanager
+def stopped(node: Module) -> Iterator[None]:
+    """A node that stands still meanwhile."""
+    node.send_signal(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        node.send_signal(signal.SIGCONT)
+
+
 def dragged(page: Any, shown: Organ, probe: Probe) -> np.ndarray:
     """Figures while the mouse swings the tool about where it presses."""
-    pressed(page, ENOUGH)
-    page.keyboard.press("7")  # the view beside the tool
-    page.wait_for_timeout(1500)
+    found = swung(page, shown, probe)
+    until(page, lambda: force_of(page) > 0.05, "a force after it swung", 20.0)
+    return found
+
+
+def swung(page: Any, shown: Organ, probe: Probe) -> np.ndarray:
+    """Figures while the mouse swings about the tool, whether or not the page's node follows."""
     x, y = screen_of(page, beside_pose(shown), shown.above(DEEP))
     swing = iter(SWING * np.sin(np.arange(100_000) / 5.0))
     page.mouse.move(x, y)
     page.mouse.down()
-
-    def swung() -> None:
-        page.mouse.move(x, y + next(swing))
-
-    found = figures(probe, swung)
-    until(page, lambda: bool(swung() or force_of(page) > 0.05), "a force while it swings", 20.0)
+    found = figures(probe, lambda: page.mouse.move(x, y + next(swing)))
     page.mouse.move(x, y)
     page.mouse.up()
     return found
