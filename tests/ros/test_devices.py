@@ -24,6 +24,7 @@ from rclpy.serialization import deserialize_message
 
 from avatar_ros.msg import ContactState
 from tests.ros.conftest import PATIENT
+from tests.ros.refusals import refusal
 from tests.ros.test_poses import bench, pose
 
 pytestmark = pytest.mark.ros
@@ -153,6 +154,52 @@ def test_a_driver_feels_the_organ_by_its_file(
     forces = np.array([_size(message) for message in felt])
     assert forces.max() <= limit * (1.0 + 1e-9)
     assert felt[-1].header.frame_id == frame
+
+
+
+def test_beside_a_device_a_tool_of_software_speaks_in_the_organs_frame(
+    own_domain: dict[str, str], library: Path, probe: Any, touch: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """As a planning page beside a Touch does, whose device has not been enabled yet."""
+    timeout = [part for part in PATIENT if part != "--ros-args"]
+    arguments = ["--ros-args", "--params-file", str(DEVICES / "touch.yaml"), *timeout]
+    elsewhere = "tool_transform:=[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]"
+    for value in ("tools:=[stylus, page]", "software_tools:=page", elsewhere):
+        arguments += ["-p", value]
+    processes = [
+        Module(
+            "vademecum_loader",
+            ["--ros-args", "-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"],
+            own_domain,
+        ),
+        Module("contact", arguments, own_domain),
+    ]
+    node, felt, states = probe.node, [], []
+    poses = node.create_publisher(PoseStamped, "page/measured_cp", CRTK)
+    node.create_subscription(WrenchStamped, "page/servo_cf", felt.append, CRTK)
+    node.create_subscription(ContactState, "contact_state", states.append, CRTK)
+
+    def send() -> None:
+        message = PoseStamped()
+        message.header.frame_id, message.header.stamp = "organ", node.get_clock().now().to_msg()
+        at = message.pose.position
+        at.x, at.y, at.z = map(float, touch[0])
+        message.pose.orientation.w = 1.0
+        poses.publish(message)
+
+    node.create_timer(2e-3, send)
+    try:
+        probe.until(lambda: bool(felt) and _size(felt[-1]) > 0.5, 60.0)
+        of_device = {s.status for s in states if s.tool == "stylus"}
+    finally:
+        assert [process.finish() for process in processes] == [0, 0]
+    assert felt[-1].header.frame_id == "organ"
+    assert ContactState.STATUS_OK not in of_device
+
+
+def test_software_that_is_no_tool_is_refused() -> None:
+    said = refusal("contact", "tools:=[stylus, page]", "software_tools:=[page, pgae]")
+    assert said == "parameter software_tools: there is no tool 'pgae' among stylus, page"
 
 
 def _size(message: WrenchStamped) -> float:

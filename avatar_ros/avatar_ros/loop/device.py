@@ -88,12 +88,12 @@ class Device:
 
 
 def devices(node: Node, settings: ContactSettings, tools: Sequence[ToolChannel]) -> list[Device]:
-    """The devices of all tools; none unless ``tool_operating_state`` asks for them."""
-    safety = settings.safety
-    if not safety.hears_state:
-        return []
+    """The devices of all tools that have one, if ``tool_operating_state`` asks for them."""
     made = []
     for name, tool in zip(settings.tools, tools, strict=True):
+        safety = settings.safety_of(name)
+        if not safety.hears_state:
+            continue
         device = Device(tool, safety.commands, lambda: node.get_clock().now().to_msg())
         device.subscription = node.create_subscription(
             OperatingState, f"{name}/operating_state", device.hear, qos.LATCHED

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from avatar_core.contact.haptics.force_guard import DEVICES, ForceLimits
@@ -113,6 +113,12 @@ class Safety:
     wrench: str = "absolute"
     hears_state: bool = False
     commands: tuple[str, ...] = ()
+
+    def of_software(self) -> Safety:
+        """The same for a tool that is no device and speaks in the organ's frame."""
+        return replace(
+            self, frame="", transform=IDENTITY, wrench="absolute", hears_state=False, commands=()
+        )
 
     def observer(self, n_tools: int, period: float) -> Passivity | None:
         """The observer of the energies; None if passivity is off."""

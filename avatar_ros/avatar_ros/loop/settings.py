@@ -71,6 +71,13 @@ CONTACT = (
         "pose of frame_id in parent_frame, for tf_static: x y z [m] and quaternion x y z w",
     ),
     Parameter("tools", ["tool"], "names of the tools; the topics of each are below NAME/"),
+    Parameter(
+        "software_tools",
+        "",
+        "those of tools, one or several, that are no devices, as those of the planning page and of "
+        "Slicer: tool_frame, tool_transform, tool_wrench and tool_operating_state are not theirs",
+        any_type=True,
+    ),
     *TIP,
     Parameter(
         "scene",
@@ -193,6 +200,7 @@ class ContactSettings:
     material : values chosen, by name of the coordinate; the others are those of the vademecum
     budget : of error and time; None for none
     known : what is known of the material, by name of the coordinate; empty for no bands
+    software_tools : those of ``tools`` that are no devices
     """
 
     tools: tuple[str, ...]
@@ -213,6 +221,29 @@ class ContactSettings:
     parent_frame: str = ""
     parent_transform: tuple[float, ...] = IDENTITY
     known: dict[str, Distribution] = field(default_factory=dict)
+    software_tools: tuple[str, ...] = ()
+
+    def safety_of(self, tool: str) -> Safety:
+        """That of one of the tools."""
+        return self.safety.of_software() if tool in self.software_tools else self.safety
+
+
+def chosen_software_tools(value: Any, tools: tuple[str, ...]) -> tuple[str, ...]:
+    """The tools that the parameter ``software_tools`` names.
+
+    Raises
+    ------
+    ParameterError : for a name that is none of the tools'
+    """
+    named = value if isinstance(value, list) else [value]
+    chosen = tuple(name for name in named if name != "")
+    unknown = [str(name) for name in chosen if name not in tools]
+    if unknown:
+        raise ParameterError(
+            f"parameter software_tools: there is no tool {one_line(unknown[0], 60)!r} among "
+            f"{', '.join(tools)}"
+        )
+    return chosen
 
 
 def chosen_tips(value: dict[str, Any], n_tools: int) -> tuple[Tip, ...]:

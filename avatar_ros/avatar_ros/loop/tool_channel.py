@@ -250,30 +250,32 @@ def tool_channels(ports: Ports, settings: ContactSettings) -> list[ToolChannel]:
     ------
     ParameterError : an override of the quality of service has a value that is refused
     """
-    period, polled = 1.0 / settings.rate, PolledSubscriptions()
-    return [
-        ToolChannel(
-            ports.subscription(
-                PoseStamped,
-                f"{name}/measured_cp",
-                lambda message: None,  # never called
-                qos.poses(period),
-                silent=True,
-                callback_group=polled,
-                raw=True,
-            ),
-            ports.publisher(
-                WrenchStamped, f"{name}/{WRENCHES[settings.safety.wrench]}", qos.wrenches(period)
-            ),
-            settings.frame_id,
-            settings.safety,
-            tuple(
-                ports.publisher(WrenchStamped, f"{name}/{edge}", qos.bands(period))
-                for edge in band_topics(settings.safety.wrench)
-            ),
-        )
-        for name in settings.tools
-    ]
+    polled = PolledSubscriptions()
+    return [_channel(ports, settings, name, polled) for name in settings.tools]
+
+
+def _channel(
+    ports: Ports, settings: ContactSettings, name: str, polled: PolledSubscriptions
+) -> ToolChannel:
+    period, safety = 1.0 / settings.rate, settings.safety_of(name)
+    return ToolChannel(
+        ports.subscription(
+            PoseStamped,
+            f"{name}/measured_cp",
+            lambda message: None,  # never called
+            qos.poses(period),
+            silent=True,
+            callback_group=polled,
+            raw=True,
+        ),
+        ports.publisher(WrenchStamped, f"{name}/{WRENCHES[safety.wrench]}", qos.wrenches(period)),
+        settings.frame_id,
+        safety,
+        tuple(
+            ports.publisher(WrenchStamped, f"{name}/{edge}", qos.bands(period))
+            for edge in band_topics(safety.wrench)
+        ),
+    )
 
 
 def _rotation(quaternion: tuple[float, ...]) -> np.ndarray:

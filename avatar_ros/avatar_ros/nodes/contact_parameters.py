@@ -20,6 +20,7 @@ from avatar_ros.loop.settings import (
     chosen_budget,
     chosen_known,
     chosen_material,
+    chosen_software_tools,
     chosen_tips,
 )
 from avatar_ros.prepare import scenes
@@ -68,6 +69,7 @@ def read_contact(node: Node, saved_scene: str = "") -> ContactSettings:
         parent_frame=value["parent_frame"],
         parent_transform=pose("parent_transform", value["parent_transform"]),
         known=chosen_known(value["uncertainty"]),
+        software_tools=chosen_software_tools(value["software_tools"], tools),
     )
     if saved_scene:
         kept = _with_scene(settings, lambda: parse_scene(saved_scene, "kept"))
