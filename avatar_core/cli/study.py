@@ -38,7 +38,8 @@ def study(
     ],
     surfaces: Annotated[
         Path | None,
-        typer.Option(help="folder of liver surfaces [mm]; default: ../shared/data/livers"),
+        typer.Option(help="folder of liver surfaces [mm]; default: ../shared/data/livers, or without it "
+            "generated ones, where a study can do with them"),
     ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="smaller version that takes minutes")
@@ -47,7 +48,7 @@ def study(
         bool, typer.Option("--resume", help="go on with an interrupted meshes or transport study")
     ] = False,
 ) -> None:
-    """Repeat an experiment of the paper, and write its figures beside ours."""
+    """Measure what avatar claims, or repeat an experiment of the paper, whose figures are beside ours."""
     from avatar_core.studies.study import write_study
 
     if name not in STUDIES:

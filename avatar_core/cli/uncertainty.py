@@ -26,8 +26,8 @@ def uncertainty(
     given: Annotated[
         list[str],
         typer.Option(
-            help="what is known of a parameter: NAME=lognormal:MEDIAN:FACTOR, uniform:LOW:HIGH or "
-            "fixed:VALUE, with NAME young [Pa] or a coordinate of the vademecum; or a file of them "
+            help="what is known of a parameter: NAME=lognormal:MEDIAN:FACTOR, uniform:LOW:HIGH, "
+            "loguniform:LOW:HIGH or fixed:VALUE, with NAME young [Pa] or a coordinate of the vademecum; or a file of them "
             "(.yaml), as params/uncertainty/liver.yaml. Others keep the vademecum's value"
         ),
     ],

@@ -84,7 +84,7 @@ def test_every_page_is_in_the_index() -> None:
     pages = {page.name for page in PAGES.glob("*.md")}
     pages -= {"README.md", "parameters.md", "security.md", "results.md", "limits.md"}
     pages -= {"clients.md", "devices.md", "slicer.md", "recordings.md", "planning_page.md"}
-    pages -= {"calibration.md", "registration.md", "supports.md", "uncertainty.md"}
+    pages -= {"calibration.md", "registration.md", "supports.md", "uncertainty.md", "scenes.md"}
     assert pages == {row["page"] for row in index()}
 
 
