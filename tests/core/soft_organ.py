@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from avatar_core.fem import patch_loads
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.pipeline import OrganOptions, build
@@ -55,11 +57,13 @@ def soft_organ() -> Vademecum:
 
 @stored
 def organ_on_springs() -> Vademecum:
-    """Over the stiffness of its bare area, which alone holds it."""
+    """Over the stiffness of its bare area, which alone holds it; loads at vertices alone."""
     options = OrganOptions(
         n_vertices=450,
         rule=BuildRule(max_modes=60),
         supports=(SupportOption.parse("bare_area=1e5:1e9:3"),),
         n_certified=8,
     )
-    return build(phantom_liver(12e-3), options)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(patch_loads, "MIDPOINTS_FROM", 1.0)
+        return build(phantom_liver(12e-3), options)

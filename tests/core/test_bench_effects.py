@@ -13,6 +13,7 @@ from avatar_core.studies.bench.methods import tool_paths
 from tests.core.box_organ import UP, organ
 
 
+@pytest.mark.long
 def test_a_leaning_punch_is_felt_all_along_its_path() -> None:
     """A flat face that is found too deep counts as set there, and is not felt."""
     cube = organ("cube")

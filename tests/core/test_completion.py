@@ -85,6 +85,7 @@ def test_the_compliance_is_symmetric_and_positive(box: tuple[Counting, LoadSurfa
     assert np.abs(found.compliance - exact.compliance).max() < 0.05 * size
 
 
+@pytest.mark.long
 def test_a_small_tolerance_solves_them_all(box: tuple[Counting, LoadSurface]) -> None:
     found, exact = completed(*box, replace(RULE, tolerance=1e-7))
     assert errors(box[0], found, exact).max() < ROUNDING

@@ -95,7 +95,9 @@ def pressed_bands(
 # --- what is prepared --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tip", [SPHERE, PATCH], ids=lambda tip: tip.shape)
+@pytest.mark.parametrize(
+    "tip", [SPHERE, pytest.param(PATCH, marks=pytest.mark.long)], ids=lambda tip: tip.shape
+)
 def test_edges_are_those_of_tips_pressed_anywhere(organ: Vademecum, tip: Tip) -> None:
     """Amid the load positions, at depths between and at those prepared; goal: 3 % of the force."""
     known, (points, normals) = known_of(organ, KNOWN), spots(organ, 6)

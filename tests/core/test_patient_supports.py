@@ -86,7 +86,7 @@ def test_stiff_supports_are_the_clamp_of_their_faces(bent: Bent) -> None:
     assert off[0] < 0.01 * np.linalg.norm(expected) < off[1]
 
 
-@pytest.mark.parametrize("fidelity", ["reduced", "solved"])
+@pytest.mark.parametrize("fidelity", [pytest.param("reduced", marks=pytest.mark.long), "solved"])
 def test_a_patient_on_supports_is_that_of_full_finite_elements(
     bent: Bent, fidelity: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

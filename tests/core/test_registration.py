@@ -133,6 +133,7 @@ def test_traction_is_correlated_over_the_length_that_is_asked_for(
         assert np.median(correlation[pairs]) == pytest.approx(expected, abs=0.06)
 
 
+@pytest.mark.long
 def test_the_truth_is_in_equilibrium_at_large_deformation(truth: Truth) -> None:
     """Small loads deform it as small strains do, large ones otherwise, moved supports too."""
     for kind in ("pushes", "moved support"):

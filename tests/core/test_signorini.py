@@ -78,6 +78,7 @@ def test_the_surface_gives_way_and_pushes_back(pressed: CondensedContact) -> Non
     np.testing.assert_allclose(-u[inside, 1], 2e-3 - SPHERE.height(r[r < 1.5e-3]), atol=0.03 * 2e-3)
 
 
+@pytest.mark.long
 def test_a_ball_pushed_askew_finds_the_axis_without_moment() -> None:
     """In a half-space that is its normal, and the force Sneddon's, whatever axis it began with."""
     depth, angle = 1e-3, np.radians(12.0)

@@ -78,6 +78,7 @@ def write_phantoms(folder: Path, n: int) -> Path:
 # --- the four studies -------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_meshes(tmp_path: Path) -> None:
     settings = meshes.MeshesSettings(n_built=0, n_again=1, n_vertices=300, n_points=2000)
     found = meshes.study(write_phantoms(tmp_path, 3), settings)

@@ -130,6 +130,7 @@ def on_a_soft_base(tip: Tip, depth: float, base: float) -> float:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("tip", TIPS)
 def test_a_tip_on_a_column_feels_it_give_way(tip: Tip) -> None:
     """The wider a tip, the more it feels that the coarse mesh is stiff: 5.5 % at 10 mm."""

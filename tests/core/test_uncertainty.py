@@ -242,6 +242,7 @@ def test_between_its_points_a_table_gives_the_force_of_the_vademecum(
         assert found[k] == pytest.approx(own[0, -1], rel=5e-3)
 
 
+@pytest.mark.long
 def test_bands_hold_what_full_finite_elements_find(
     organ: Vademecum, place: int, table: ForceTable
 ) -> None:

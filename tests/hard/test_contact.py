@@ -74,6 +74,7 @@ def check_start_inside(spot: Spot, depth: float, aside: float) -> None:
 STARTED: list[float] = []
 
 
+@pytest.mark.long
 @pytest.mark.examples
 def test_tip_that_starts_inside_gets_no_force_before_it_has_left(figure: Figure) -> None:
     STARTED.clear()

@@ -74,8 +74,8 @@ def test_a_wrench_comes_as_crtk_names_it(
     ("file", "name", "hears"),
     [
         ("touch.yaml", "arm", "servo_cf"),
-        ("force_dimension.yaml", "omega", "body/servo_cf"),
-        ("dvrk.yaml", "MTML", "body/servo_cf"),
+        pytest.param("force_dimension.yaml", "omega", "body/servo_cf", marks=pytest.mark.long),
+        pytest.param("dvrk.yaml", "MTML", "body/servo_cf", marks=pytest.mark.long),
     ],
 )
 def test_a_driver_feels_the_organ_by_its_file(
@@ -154,7 +154,6 @@ def test_a_driver_feels_the_organ_by_its_file(
     forces = np.array([_size(message) for message in felt])
     assert forces.max() <= limit * (1.0 + 1e-9)
     assert felt[-1].header.frame_id == frame
-
 
 
 def test_beside_a_device_a_tool_of_software_speaks_in_the_organs_frame(

@@ -67,6 +67,7 @@ def test_a_process_that_was_loaded_for_nothing_ends_too() -> None:
         reader.close()
 
 
+@pytest.mark.long
 def test_a_loader_keeps_little_beside_the_file_that_it_announces(
     cell: dict[str, Any], probe: Any, library: Path
 ) -> None:

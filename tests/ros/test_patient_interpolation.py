@@ -149,6 +149,7 @@ def test_the_service_writes_what_loader_and_contact_take(
         assert (loader.finish(), contact.finish()) == (0, 0)
 
 
+@pytest.mark.long
 def test_a_member_is_recognised_and_keeps_its_volume(node: Module, probe: Any) -> None:
     answer = _ask(probe, surface="liver1.obj", unit="mm", axes="RAS")
     assert answer.success, answer.message
@@ -158,6 +159,7 @@ def test_a_member_is_recognised_and_keeps_its_volume(node: Module, probe: Any) -
     assert "liver1" in answer.notices[0]
 
 
+@pytest.mark.long
 def test_a_mesh_in_the_request_is_built_by_the_action(
     node: Module, probe: Any, folder: Path, livers: list[SurfaceMesh]
 ) -> None:
@@ -179,6 +181,7 @@ def test_a_mesh_in_the_request_is_built_by_the_action(
     assert any(told.error > 0.0 for told in pursuit.told)  # the estimate of the reduced space
 
 
+@pytest.mark.long
 def test_springs_are_previewed_and_hold_what_is_built(
     node: Module, probe: Any, folder: Path
 ) -> None:
@@ -387,6 +390,7 @@ def _helpers(process: Module) -> list[int]:
     return [int(number) for listed in children for number in listed.read_text().split()]
 
 
+@pytest.mark.long
 def test_the_end_of_the_building_process_is_said_and_survived(
     node: Module, probe: Any, files: Any
 ) -> None:

@@ -77,6 +77,7 @@ def child(process: subprocess.Popen[str], node: str) -> int | None:
     return None
 
 
+@pytest.mark.long
 def test_a_node_that_dies_is_started_again_and_named(
     own_domain: dict[str, str], library: Path, probe: Any
 ) -> None:

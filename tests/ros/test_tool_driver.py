@@ -176,6 +176,7 @@ def until(reached: Callable[[], bool], what: str, seconds: float = START_TIMEOUT
         time.sleep(0.01)
 
 
+@pytest.mark.long
 def test_a_still_tool_feels_the_other_and_the_recording_of_both_replays(
     cell: tuple[SharedToolState, Callable[[], None]], library: Path, tmp_path: Path, probe: Probe
 ) -> None:

@@ -208,7 +208,7 @@ def recorded(organ: Vademecum, effects: tuple[Any, ...], turning: bool = False) 
     ("effects", "turning"),
     [
         pytest.param((), False, id="elastic"),
-        pytest.param((VISCOUS,), False, id="viscous"),
+        pytest.param((VISCOUS,), False, id="viscous", marks=pytest.mark.long),
         pytest.param((Friction(),), True, id="friction", marks=pytest.mark.long),
     ],
 )
