@@ -77,7 +77,10 @@ class Convergence:
 
 @dataclass(frozen=True)
 class VademecumInfo:
-    """Summary of a vademecum; the fields of avatar_ros/msg/VademecumInfo."""
+    """Summary of a vademecum; the fields of avatar_ros/msg/VademecumInfo.
+
+    force_mean, force_worst : relative error at a depth, anywhere on the surface that tips feel
+    """
 
     id: str
     name: str
@@ -368,7 +371,7 @@ class Vademecum:
             l2_worst=c.l2_worst,
             contact_mean=c.contact_mean,
             contact_worst=c.contact_worst,
-            force_mean=c.force_mean,
-            force_worst=c.force_worst,
+            force_mean=c.tip_force_mean,
+            force_worst=c.tip_force_worst,
             build_cpu_seconds=c.build_cpu_seconds,
         )

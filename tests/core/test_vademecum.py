@@ -122,6 +122,14 @@ def test_files_keep_their_names_for_the_force_on_a_tip(
     assert not [name for name in stored if name.startswith("tip_force")]
 
 
+def test_the_summary_has_the_error_of_the_force_where_tips_press(
+    phantom_vademecum: Vademecum,
+) -> None:
+    c, info = phantom_vademecum.certificate, phantom_vademecum.info()
+    assert c is not None and c.tip_force_worst > c.force_worst
+    assert (info.force_mean, info.force_worst) == (c.tip_force_mean, c.tip_force_worst)
+
+
 @pytest.mark.parametrize("at", [0.02, 0.3, 0.7, 0.99])
 def test_flipped_bit_is_refused(phantom_vademecum: Vademecum, tmp_path: Path, at: float) -> None:
     file = tmp_path / "a.h5"

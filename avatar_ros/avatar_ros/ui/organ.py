@@ -125,7 +125,7 @@ class Organ:
         info = self.info
         errors = (
             f"Errors certified: displacement {info.l2_mean:.1%} (worst {info.l2_worst:.1%}), "
-            f"force {info.force_mean:.1%} (worst {info.force_worst:.1%})."
+            f"force {info.force_mean:.1%} (worst place {info.force_worst:.1%})."
         )
         return (
             f"<b>{escape(self.name)}</b>, {info.volume * 1e6:.0f} ml, "
