@@ -38,8 +38,10 @@ def study(
     ],
     surfaces: Annotated[
         Path | None,
-        typer.Option(help="folder of liver surfaces [mm]; default: ../shared/data/livers, or without it "
-            "generated ones, where a study can do with them"),
+        typer.Option(
+            help="folder of liver surfaces [mm]; default: ../shared/data/livers, or without it "
+            "generated ones, where a study can do with them"
+        ),
     ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="smaller version that takes minutes")
@@ -48,7 +50,7 @@ def study(
         bool, typer.Option("--resume", help="go on with an interrupted meshes or transport study")
     ] = False,
 ) -> None:
-    """Measure what avatar claims, or repeat an experiment of the paper, whose figures are beside ours."""
+    """Measure what avatar claims, or repeat an experiment of the paper beside its figures."""
     from avatar_core.studies.study import write_study
 
     if name not in STUDIES:

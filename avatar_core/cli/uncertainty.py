@@ -27,8 +27,9 @@ def uncertainty(
         list[str],
         typer.Option(
             help="what is known of a parameter: NAME=lognormal:MEDIAN:FACTOR, uniform:LOW:HIGH, "
-            "loguniform:LOW:HIGH or fixed:VALUE, with NAME young [Pa] or a coordinate of the vademecum; or a file of them "
-            "(.yaml), as params/uncertainty/liver.yaml. Others keep the vademecum's value"
+            "loguniform:LOW:HIGH or fixed:VALUE, with NAME young [Pa] or a coordinate of the "
+            "vademecum; or a file of them (.yaml), as params/uncertainty/liver.yaml. Others keep "
+            "the vademecum's value"
         ),
     ],
     draws: Annotated[int, typer.Option(help="number of draws")] = 1000,

@@ -172,7 +172,6 @@ def endure(scene: str, minutes: float, n_stretches: int) -> str:
     )
 
 
-@pytest.mark.long
 def test_half_a_minute_changes_nothing(figure: Figure) -> None:
     figure(endure("bare", 0.5, 8))
 
