@@ -41,8 +41,8 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tips = path_over(organ, N_TOUCHES)
     forces = felt(at_values(organ, TRUE), tips)
     save_recording(recording_of(organ, tips, forces), folder / "push.h5")
-    again = (np.tile(one, (100, 1)) for one in (tips, forces))
-    save_recording(recording_of(organ, *again), folder / "hundredfold.h5")
+    again = (np.tile(one, (400, 1)) for one in (tips, forces))
+    save_recording(recording_of(organ, *again), folder / "many_times.h5")
     return folder
 
 
@@ -130,7 +130,7 @@ def test_a_loader_that_ends_leaves_nothing_behind(
     loader = Module("vademecum_loader", [*options, "-p", "vademecum:=springs.h5"], own_domain)
     client = probe.client(CalibrateMaterial, "/ending/calibrate_material")
     before = set(children(loader.pid))
-    client.call_async(CalibrateMaterial.Request(recording="hundredfold.h5"))
+    client.call_async(CalibrateMaterial.Request(recording="many_times.h5"))
     probe.until(lambda: bool(set(children(loader.pid)) - before), 30.0)
     (started,) = set(children(loader.pid)) - before
     probe.until(lambda: computed(started) > IMPORTED, 120.0)
