@@ -23,6 +23,7 @@ from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.ros.browser import (
     CHROMIUM,
     TOKEN,
+    browse_in_idle_time,
     choose,
     drag_there,
     force_of,
@@ -131,6 +132,11 @@ def test_a_kept_state_brings_both_back(page: Any, folder: Path) -> None:
 
 
 def test_a_recording_of_both_replays(page: Any, folder: Path) -> None:
+    """As far as it is known: not from a period that was lost until no tip touches.
+
+    Where both press, `test_tool_driver` compares, without a browser that takes the cores.
+    """
+    browse_in_idle_time()
     take(page, "right")
     press(page, "Record")
     news(page, "two tools runs, with several_tools")
@@ -144,8 +150,9 @@ def test_a_recording_of_both_replays(page: Any, folder: Path) -> None:
     (file,) = folder.glob("recording-*.h5")
     recording = load_recording(file)
     found = replay(recording, load_vademecum(folder / "liver.h5"))
-    assert np.linalg.norm(recording.periods.force, axis=2).max(axis=0).min() > 0.3
-    assert found.known.mean() > 0.5
+    force = np.linalg.norm(recording.periods.force, axis=2)
+    assert force.max(axis=0).min() > 0.3
+    assert ((force > 0.3).any(axis=1) & found.known).sum() > 100
     assert found.difference(recording) <= 1e-9
     assert len(recording.clouds.period) > 5
 
