@@ -193,7 +193,7 @@ def test_beside_a_device_a_tool_of_software_speaks_in_the_organs_frame(
     finally:
         assert [process.finish() for process in processes] == [0, 0]
     assert felt[-1].header.frame_id == "organ"
-    assert ContactState.STATUS_OK not in of_device
+    assert of_device and ContactState.STATUS_OK not in of_device
 
 
 def test_software_that_is_no_tool_is_refused() -> None:

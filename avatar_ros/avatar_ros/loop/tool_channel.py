@@ -90,7 +90,7 @@ class ToolChannel:
         self._last = np.full(3, FAR_AWAY)  # valid position, in the tool's frame [m]
         self._received = 0  # the last valid pose [ns]
         self._heard = 0  # the last message, valid or not [ns]
-        self._intervals = _NO_INTERVALS  # between the last valid poses of this stream
+        self._intervals = _NO_INTERVALS  # between the last valid poses of this stream [ns]
         self._number = -1  # of the last message, as its publisher counts
         self._last_decrease = -_ALTERNATION  # when the numbers last decreased [ns]
         self._several_until = 0  # [ns]
