@@ -25,18 +25,16 @@ from avatar_core.offline.large_deformation import hyperelastic_problem, with_lar
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
-
-from . import examples, kept_fields, kept_meshes
-from .alone import Turns
-from .kept_responses import kept, of_cloud
-from .slowest import SlowestFiles
-from .stored import stored
+from tests.helpers import cached_fields, cached_meshes, examples
+from tests.helpers.cached_responses import cached, of_cloud
+from tests.helpers.disk_cache import cached_on_disk
+from tests.helpers.paths import SHARED
+from tests.helpers.slowest_files import SlowestFiles
+from tests.helpers.timing_turns import Turns
 
 # Compiling makes millions of objects that live on: looked through less often, it takes a seventh
 # less.
 gc.set_threshold(100_000, 50, 1000)
-
-SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -54,7 +52,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def same_meshes() -> Iterator[None]:
     """A surface is filled once, whatever is built of it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mesh, "_fill", kept_meshes.kept)
+        patch.setattr(mesh, "_fill", cached_meshes.fill)
         yield
 
 
@@ -63,9 +61,9 @@ def same_fields() -> Iterator[None]:
     """The contact geometry of one organ is sampled once, whatever is built around it."""
     with pytest.MonkeyPatch.context() as patch:
         for builder in (linear, parametric, patient):
-            patch.setattr(builder, "make_felt_field", kept_fields.felt)
-        patch.setattr(ball_shift, "make_tip_field", kept_fields.smooth)
-        patch.setattr(patient, "make_tip_field", kept_fields.smooth)
+            patch.setattr(builder, "make_felt_field", cached_fields.felt)
+        patch.setattr(ball_shift, "make_tip_field", cached_fields.smooth)
+        patch.setattr(patient, "make_tip_field", cached_fields.smooth)
         yield
 
 
@@ -73,9 +71,9 @@ def same_fields() -> Iterator[None]:
 def same_responses() -> Iterator[None]:
     """The response of one organ to a tip, and the modes of its cloud, are computed once."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(layout, "tip_carriers", kept(layout.tip_carriers))
-        patch.setattr(layout, "make_tip_response", kept(layout.make_tip_response))
-        patch.setattr(layout, "cloud_arrays", kept(layout.cloud_arrays, of_cloud))
+        patch.setattr(layout, "tip_carriers", cached(layout.tip_carriers))
+        patch.setattr(layout, "make_tip_response", cached(layout.make_tip_response))
+        patch.setattr(layout, "cloud_arrays", cached(layout.cloud_arrays, of_cloud))
         yield
 
 
@@ -109,7 +107,7 @@ def bent() -> Vademecum:
     return _bent()
 
 
-@stored
+@cached_on_disk
 def _straight() -> Vademecum:
     options = OrganOptions(
         n_vertices=800, patch_radius=30e-3, rule=BuildRule(max_modes=60), n_certified=10
@@ -119,7 +117,7 @@ def _straight() -> Vademecum:
         return build(phantom_liver(12e-3), options)
 
 
-@stored
+@cached_on_disk
 def _bent() -> Vademecum:
     problem = hyperelastic_problem(_straight(), "neo-hookean")
     return with_large_deformation(_straight(), problem, "neo-hookean")

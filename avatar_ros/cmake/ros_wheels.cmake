@@ -1,5 +1,5 @@
 # Included right after project() by scikit-build-core (see pyproject.toml), and
-# by colcon where the wheels are its underlay (tests/ros/colcon_build.sh); on an
+# by colcon where the wheels are its underlay (tests/ros/helpers/colcon_build.sh); on an
 # installation by apt colcon never reads this file.
 #
 # Makes the ROS 2 wheels of PyPI (ros-jazzy-*) usable as a build underlay:

@@ -15,7 +15,9 @@ from avatar_core.geometry.surface import read_surface
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
-from tests.stored import stored
+from tests.helpers.disk_cache import cached_on_disk
+
+_FIGURE = "figure"  # property of a test's report: those cross from a worker's process
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 
@@ -82,7 +84,7 @@ def phantom_vademecum() -> Vademecum:
     return _phantom_vademecum()
 
 
-@stored
+@cached_on_disk
 def _phantom_vademecum() -> Vademecum:
     options = OrganOptions(n_vertices=900, rule=BuildRule(max_modes=60), n_certified=60)
     return build(phantom_liver(), options)
@@ -91,7 +93,7 @@ def _phantom_vademecum() -> Vademecum:
 REAL = ("LiTS-60", "Amos-007", "LiTS-23")  # of two sources; one cracked, one easily loses a lobe
 
 
-@stored
+@cached_on_disk
 def _vademecum_of_file(path: Path) -> Vademecum:
     options = OrganOptions(n_vertices=1500, rule=BuildRule(max_modes=60), n_certified=3)
     return build(read_surface(path), options)
@@ -100,3 +102,27 @@ def _vademecum_of_file(path: Path) -> Vademecum:
 @pytest.fixture(scope="session", params=REAL)
 def real_vademecum(request: pytest.FixtureRequest, livers_dir: Path) -> Vademecum:
     return _vademecum_of_file(livers_dir / f"{request.param}.obj")
+
+
+@pytest.fixture
+def figure(request: pytest.FixtureRequest) -> Callable[[str], None]:
+    """Reports what a case came to, beside its name."""
+    name = f"{request.path.stem.removeprefix('test_')}: {request.node.name.removeprefix('test_')}"
+
+    def report(value: str) -> None:
+        request.node.user_properties.append((_FIGURE, (name, value)))
+
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    reports = [r for key in ("passed", "failed") for r in terminalreporter.getreports(key)]
+    figures = sorted(
+        {tuple(value) for r in reports for key, value in r.user_properties if key == _FIGURE}
+    )
+    if not figures:
+        return
+    terminalreporter.section("hard cases")
+    width = max(len(name) for name, _ in figures)
+    for name, value in figures:
+        terminalreporter.line(f"{name:<{width}}  {value}")

@@ -18,9 +18,10 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline import pipeline
 from avatar_core.vademecum.accuracy import Detail
 from avatar_core.vademecum.model import Vademecum
-from tests.stored import stored
+from tests.helpers.disk_cache import cached_on_disk
+from tests.helpers.paths import ROOT
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+README = ROOT / "README.md"
 
 
 def test_names_for_type_checkers_are_the_names_that_exist() -> None:
@@ -76,7 +77,7 @@ def press(model: Any, vademecum: Vademecum) -> Sequence[float]:
     return list(model.out.force[0])
 
 
-@stored
+@cached_on_disk
 def built(n_vertices: int, n_certified: int) -> Vademecum:
     """The built-in liver by the options that the README gives."""
     options = av.OrganOptions(n_vertices=n_vertices, n_certified=n_certified)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers.paths import ROOT
+
 CORE, NODES = ROOT / "avatar_core", ROOT / "avatar_ros" / "avatar_ros"
 
 ORDER = {

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.slowness import Deadline, slowness
-from tests.stored import stored
+from tests.helpers.disk_cache import cached_on_disk
+from tests.helpers.slowness import Deadline, slowness
 
 _DOMAINS = range(1, 102)  # of DDS, those that work on every platform
 TIP_RADIUS = 0.005  # [m]
@@ -205,7 +205,7 @@ def organ() -> Any:
     return _organ()
 
 
-@stored
+@cached_on_disk
 def _organ() -> Any:
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.offline.pipeline import OrganOptions, build
@@ -253,7 +253,7 @@ def _livers() -> list[Any]:
     return [replace(shape.moved(coarse), name=f"liver{i}") for i, shape in enumerate(maps)]
 
 
-@stored
+@cached_on_disk
 def _patients() -> dict[str, bytes]:
     """The livers as files, and an atlas of all but the last; what matters is not how exact."""
     from avatar_core.atlas.growth import AtlasOptions, SurfaceFile, create_atlas

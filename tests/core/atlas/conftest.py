@@ -15,7 +15,7 @@ from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import RegistrationRule, Template
 from tests.core.atlas.rough import OPTIONS, N
-from tests.stored import stored
+from tests.helpers.disk_cache import cached_on_disk
 
 
 @pytest.fixture(scope="session")
@@ -48,7 +48,7 @@ def members() -> list[Anatomy]:
     return _members(OPTIONS, N)
 
 
-@stored
+@cached_on_disk
 def _members(options: AtlasOptions, n: int) -> list[Anatomy]:
     empty = new_atlas(_template(tetrahedralize(phantom_liver(), 700)), options)
     return [build_anatomy(empty, liver) for liver in _livers(n)]

@@ -28,6 +28,7 @@ from avatar_core.errors import StorageError
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import Template
 from tests.core.atlas.rough import ALONE, OPTIONS, ROUGH, StopError, same, stop_after, write_obj
+from tests.helpers.paths import ROOT
 
 
 def test_an_interrupted_build_goes_on_where_it_stopped(
@@ -142,8 +143,7 @@ def test_killed_in_the_middle_of_a_write(atlas: Atlas, tmp_path: Path) -> None:
         "atlas = load_atlas(sys.argv[1])\n"
         "save_atlas(atlas.with_anatomies(atlas.anatomies[:1]), sys.argv[1])\n"
     )
-    root = Path(__file__).resolve().parents[3]
-    killed = subprocess.run([sys.executable, "-c", script, str(file)], cwd=root, check=False)
+    killed = subprocess.run([sys.executable, "-c", script, str(file)], cwd=ROOT, check=False)
     assert killed.returncode == -9
     assert file.read_bytes() == before and same(load_atlas(file), atlas)
 

@@ -21,8 +21,9 @@ from avatar_core.contact.model import prepare
 from avatar_core.contact.tool_path import push_and_slide
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.paths import ROOT
 
-MESSAGES = Path(__file__).resolve().parents[3] / "avatar_ros" / "msg"
+MESSAGES = ROOT / "avatar_ros" / "msg"
 PERIOD = 1_000_000  # [ns]
 START = 1_700_000_000_000_000_000  # [ns]
 POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"

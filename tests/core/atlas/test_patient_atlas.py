@@ -1,0 +1,259 @@
+"""From surfaces over an atlas file to a patient: membership, copies, and the command."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+from avatar_core.atlas.base import PatientError, base_of, numbers_of
+from avatar_core.atlas.growth import AtlasOptions, build_anatomy, new_atlas
+from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.patient import PatientOptions, patient_vademecum
+from avatar_core.atlas.response import ResponseSolver
+from avatar_core.atlas.storage import load_atlas, save_atlas
+from avatar_core.cli import main as cli
+from avatar_core.errors import RegistrationError
+from avatar_core.fem.norms import relative_l2
+from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver, population
+from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.reduction.galerkin import ReductionRule
+from avatar_core.shapes.registration import RegistrationRule, Template
+from avatar_core.studies.transport import transport
+from avatar_core.vademecum.storage import load_vademecum
+from tests.helpers.disk_cache import cached_on_disk
+
+# rough and coarse, 1 s an anatomy; the atlas's own tests use the same rule
+ROUGH = RegistrationRule(
+    n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
+)
+QUICK = PatientOptions(n_vertices=350, n_certified=6, tolerance=0.1)
+N = 4
+
+
+@pytest.fixture(scope="module")
+def livers(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """N anatomies and a patient, as files."""
+    return _livers(tmp_path_factory.mktemp("livers"))
+
+
+def _livers(folder: Path) -> list[Path]:
+    coarse, paths = phantom_liver(12e-3), []
+    for i, shape in enumerate(population(N + 1, seed=3)):
+        path = folder / f"liver{i}.obj"
+        moved = shape.moved(coarse)
+        lines = [f"v {x} {y} {z}" for x, y, z in moved.vertices * 1e3]
+        lines += [f"f {a} {b} {c}" for a, b, c in moved.faces + 1]
+        path.write_text("\n".join(lines) + "\n")
+        paths.append(path)
+    return paths
+
+
+@pytest.fixture(scope="module")
+def atlas() -> Atlas:
+    return _atlas()
+
+
+@cached_on_disk
+def _atlas() -> Atlas:
+    phantom_mesh = tetrahedralize(phantom_liver(), 700)
+    with TemporaryDirectory() as folder:
+        surfaces = [read_surface(path) for path in _livers(Path(folder))[:N]]
+    template = Template("phantom", phantom_mesh, regions_by_rule(phantom_mesh))
+    empty = new_atlas(template, AtlasOptions(spacing=0.02, rule=ROUGH))
+    members = [build_anatomy(empty, surface, ResponseSolver(rank=30)) for surface in surfaces]
+    return empty.with_anatomies(members)
+
+
+@pytest.fixture(scope="module")
+def file(atlas: Atlas, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("atlas") / "atlas.h5"
+    save_atlas(atlas, path)
+    return path
+
+
+def test_responses_survive_the_file_bit_for_bit(atlas: Atlas, file: Path) -> None:
+    for one, other in zip(atlas.anatomies, load_atlas(file).anatomies, strict=True):
+        assert one.response is not None and other.response is not None
+        for key in ("space", "load", "residual_compliance"):
+            assert np.array_equal(getattr(one.response, key), getattr(other.response, key))
+
+
+def test_a_member_gets_its_own_vademecum_bit_for_bit(
+    atlas: Atlas, file: Path, livers: list[Path]
+) -> None:
+    member = patient_vademecum(read_surface(livers[2]), base_of(atlas), "interpolated", QUICK)
+    uncertified = replace(QUICK, n_certified=0)
+    again = patient_vademecum(
+        read_surface(livers[2]), base_of(load_atlas(file)), "interpolated", uncertified
+    )
+    assert member.neighbours[0] == "liver2" and member.weights[0] == 1.0
+    assert member.weights[1:].any() == np.False_
+    own, response = member.vademecum, atlas["liver2"].response
+    assert response is not None
+    assert np.array_equal(own.mesh.vertices, atlas["liver2"].registered)
+    np.testing.assert_allclose(  # modes are sorted by worth, which rotates them
+        own.contact_load @ own.contact_load.T, response.load @ response.load.T, atol=1e-8
+    )
+    for j in range(0, own.surface.n_positions, 11):
+        exact = response.space @ response.load[3 * j : 3 * j + 3].T
+        found = own.displacement(np.array([j]), np.ones(1))
+        rule = QUICK.build
+        worst = rule.worst_over_mean * rule.tolerance
+        assert (relative_l2(found, exact, own.mesh.lumped_mass) < 1.05 * worst).all()
+    for one, other in ((own.far.space, again.vademecum.far.space), (own.far.load,) * 2):
+        assert np.array_equal(one, other)
+    assert np.array_equal(own.contact_near.block, again.vademecum.contact_near.block)
+
+
+@pytest.mark.long
+def test_copies_count_once(atlas: Atlas, livers: list[Path]) -> None:
+    doubled = atlas.with_anatomies([atlas["liver1"]])
+    base = base_of(doubled)
+    assert base.copies == (N,)
+    patient = patient_vademecum(read_surface(livers[N]), base, "interpolated", QUICK)
+    assert "liver1-2" not in patient.neighbours
+    assert patient.weights.sum() == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.long
+def test_an_atlas_of_one_answers(atlas: Atlas, livers: list[Path]) -> None:
+    alone = atlas.without_anatomies().with_anatomies([atlas["liver0"]])
+    options = replace(QUICK, n_certified=0)
+    patient = patient_vademecum(read_surface(livers[N]), base_of(alone), "interpolated", options)
+    assert patient.neighbours == ("liver0",) and patient.weights.tolist() == [1.0]
+
+
+def test_shapes_without_responses_are_refused(atlas: Atlas) -> None:
+    bare = replace(atlas, anatomies=tuple(replace(one, response=None) for one in atlas.anatomies))
+    with pytest.raises(PatientError, match="--shapes-only"):
+        base_of(bare)
+    with pytest.raises(PatientError, match="nobody"):
+        numbers_of(base_of(atlas), ["nobody"])
+
+
+def test_another_kind_of_organ_is_refused(atlas: Atlas) -> None:
+    liver = phantom_liver(12e-3)
+    rod = replace(liver, vertices=liver.vertices * [3.0, 0.3, 0.3])
+    with pytest.raises(RegistrationError):
+        patient_vademecum(rod, base_of(atlas), "interpolated", QUICK)
+
+
+@pytest.mark.parametrize(
+    "stage",
+    [
+        *(pytest.param(each, marks=pytest.mark.long) for each in ("registration", "mesh")),
+        "response",
+        pytest.param("certify", marks=pytest.mark.long),
+    ],
+)
+def test_a_build_can_be_stopped_in_every_stage(
+    atlas: Atlas, livers: list[Path], stage: str
+) -> None:
+    def stop(now: str, fraction: float, error: float) -> None:
+        if now.startswith(stage):
+            raise InterruptedError(stage)
+
+    surface: SurfaceMesh = read_surface(livers[N])
+    with pytest.raises(InterruptedError, match=stage):
+        patient_vademecum(surface, base_of(atlas), "reduced", QUICK, stop)
+
+
+@pytest.mark.long
+def test_the_study_measures_each_fidelity_against_all_solutions(
+    atlas: Atlas, livers: list[Path]
+) -> None:
+    options = replace(QUICK, reduction=ReductionRule(max_solution_fraction=0.6))
+    found = transport([read_surface(livers[1])], base_of(atlas), options=options)
+    (row,) = found.rows
+    assert row.name == "liver1" and row.solved_solutions == 3 * row.n_positions
+    assert row.reduced < min(row.interpolated)
+    assert row.reduced_solutions < row.solved_solutions
+    assert row.clamp_rule > 0.0
+    assert row.cpu_seconds_from_file > row.total_cpu_seconds > row.reduced_cpu_seconds
+    assert found.summary["interpolated_kriging_mean"] == row.interpolated[2]
+    assert all(np.isfinite(value) for value in found.summary.values())
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    def command(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["avatar", "patient", *map(str, arguments)])
+        code = cli.main()
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return command
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "fidelity", ["interpolated", "reduced", pytest.param("solved", marks=pytest.mark.long)]
+)
+def test_the_command_writes_a_certified_vademecum(
+    run: Callable[..., tuple[int, str, str]],
+    file: Path,
+    livers: list[Path],
+    tmp_path: Path,
+    fidelity: str,
+) -> None:
+    output = tmp_path / "patient.h5"
+    arguments = ["--fidelity", fidelity, "--vertices", 350, "--certify", 6, "--tolerance", 0.2]
+    times = tmp_path / "times.json"
+    code, out, err = run(livers[N], "--atlas", file, "-o", output, "--timings", times, *arguments)
+    assert code == 0, err
+    assert "liver" in out and "CPU time" in out
+    spent = {one["stage"]: one["cpu_seconds"] for one in json.loads(times.read_text())}
+    assert list(spent)[:5] == ["start", "atlas", "surface", "registration", "mesh"]
+    certificate = load_vademecum(output).certificate
+    assert certificate is not None and certificate.build_cpu_seconds > 0
+    # an affine family, but 4 members and a rough registration for 'interpolated'
+    limit = {"interpolated": 0.25, "reduced": 0.2, "solved": 0.06}[fidelity]
+    assert certificate.l2_mean < limit
+
+
+@pytest.mark.long
+def test_a_tolerance_out_of_reach_exits_with_three(
+    run: Callable[..., tuple[int, str, str]], file: Path, livers: list[Path], tmp_path: Path
+) -> None:
+    output = tmp_path / "patient.h5"
+    arguments = ["--vertices", 350, "--certify", 6, "--tolerance", 1e-4]
+    code, _, err = run(livers[N], "--atlas", file, "-o", output, *arguments)
+    assert code == 3 and "not converged" in err
+    assert not load_vademecum(output).convergence.converged
+
+
+@pytest.mark.parametrize(
+    ("arguments", "remedy"),
+    [
+        (["--fidelity", "exact"], "choose one of interpolated, reduced, solved"),
+        (["--neighbors", "0"], "at least 1"),
+        (["--weighting", "nearest"], "choose kriging"),
+        (["--tolerance", "2"], "between 0 and 1"),
+        (["--leave-out", "nobody"], "avatar atlas show"),
+        (["--support", "bare_area=1e5:1e9"], "one stiffness each"),
+        (["--support", "bare_area", "--fidelity", "interpolated"], "choose reduced or solved"),
+        (["--support", "elbow=1e6"], "there is no support 'elbow'"),
+        (["--groups", "nowhere.npz"], "cannot read node groups"),
+    ],
+)
+def test_bad_requests_are_one_line(
+    run: Callable[..., tuple[int, str, str]],
+    file: Path,
+    livers: list[Path],
+    tmp_path: Path,
+    arguments: list[str],
+    remedy: str,
+) -> None:
+    code, _, err = run(livers[N], "--atlas", file, "-o", tmp_path / "p.h5", *arguments)
+    assert code == 1 and remedy in err and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())

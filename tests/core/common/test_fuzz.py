@@ -1,0 +1,35 @@
+"""Mutated files at the doors of the core: each is refused in one line or loaded, in any case."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from tests.helpers.fuzzing import campaign
+
+QUICK = range(300)  # a third for each door
+LONG = range(10_000, 10_800)
+
+
+def test_a_mutant_is_refused_or_loaded() -> None:
+    found = campaign("every", QUICK)
+    assert not found.failures()
+    assert min(found.counts[outcome] for outcome in ("refused", "loaded")) >= 30
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("door", ["vademecum", "atlas", "surface"])
+def test_hundreds_of_mutants_are_refused_or_loaded(
+    door: str, figure: Callable[[str], None]
+) -> None:
+    found = campaign(door, LONG)
+    assert not found.failures()
+    figure(found.figures())
+
+
+@pytest.mark.long
+def test_a_mutant_that_loads_can_be_touched(figure: Callable[[str], None]) -> None:
+    found = campaign("step", LONG)
+    assert not found.failures()
+    figure(found.figures())

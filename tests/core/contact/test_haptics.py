@@ -1,0 +1,323 @@
+"""Closed haptic loops: a tool in a hand, the organ's 1 kHz step, its force late and held.
+
+The tool is a linear device, its motion exact within each period, so that the energy which goes
+through the port, E = - sum F . (x' - x), is exact too.
+
+The quantisation bound. The controller sees readings x^ = x - e, |e| <= h = sqrt(3) q / 2, q their
+step. What it observes, E^, differs from E by the work of F on the errors, summed by parts, and, in
+periods in which no coordinate's reading changed by more than q, by counting the organ's own mean
+force m = (f + f') / 2 for F:
+
+    E - E^ = - sum F_k . (e_k+1 - e_k) - sum_slow (F_k - m_k) . (x^_k+1 - x^_k)
+           = - F_n . e_n+1 + sum (F_k - F_k-1) . e_k - sum_slow (F_k - m_k) . (x^_k+1 - x^_k),
+
+so |E - E^| <= Q = h |F_n| + h sum |F_k - F_k-1| + 2 h sum_slow |F_k - m_k|. The controller holds
+only forces that keep E^ + (E' - E) >= - bound for all that the tool may do until they end; hence
+E >= - bound - max Q, whatever the organ does, if the tool's acceleration is what it was told.
+Reading errors of a tool that moves average out, and E >= - bound itself is what is found.
+
+The border. Without control and without a grip, the swings of a tool of large mass neither grow nor
+fade at b = K (T / 2 + delay). That they fade is no claim of passivity.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from avatar_core.contact.haptics.haptic_loop import (
+    Device,
+    Loop,
+    expected_border,
+    run_loop,
+    stability_border,
+)
+from avatar_core.contact.haptics.passivity import Passivity, limit, make_passivity
+from avatar_core.contact.layout import PERIOD
+from avatar_core.contact.model import ContactModel, Status, step
+from avatar_core.studies.passivity import HANDS, hand_push
+from tests.helpers.examples import examples
+from tests.helpers.flat_organ import BALL, RADIUS, ball_organ, flat_organ
+
+RESOLUTION = 1e-5  # [m]
+ACCELERATION = 100.0  # what the controller is told [m/s^2]
+STIFFNESSES = (400.0, 1000.0, 2500.0)  # [N/m]
+MASSES, DAMPINGS, GRIPS = (0.1, 0.3, 1.0), (0.1, 0.5, 5.0), (0.0, 100.0, 1000.0)
+DELAYS = (1, 2)  # periods
+Figure = Callable[[str], None]
+
+
+class Run(NamedTuple):
+    """x before each period and after the last, its readings, f and F, and E after each period."""
+
+    position: np.ndarray
+    reading: np.ndarray
+    organ: np.ndarray
+    held: np.ndarray
+    energy: np.ndarray
+
+    @property
+    def given(self) -> float:
+        """Energy that the port has given at worst [J]."""
+        return max(0.0, -float(self.energy.min()))
+
+    @property
+    def acceleration(self) -> float:
+        """Largest change of the mean velocity of a period, over the period [m/s^2]."""
+        change = np.linalg.norm(np.diff(self.position, 2, axis=0), axis=1)
+        return float(change.max()) / PERIOD**2
+
+    def quantisation(self, q: float) -> float:
+        """Q after the last period, its sums only grow [J]."""
+        h = 0.5 * np.sqrt(3.0) * q
+        steps = np.diff(self.held, axis=0, prepend=np.zeros((1, 3)))
+        slow = (np.abs(np.diff(self.reading, axis=0)) < 1.5 * q).all(axis=1)
+        mean = 0.5 * (self.organ + np.vstack([self.organ[1:], self.organ[-1:]]))
+        off = np.linalg.norm(self.held - mean, axis=1)[:-1][slow[: len(mean) - 1]]
+        largest = np.linalg.norm(self.held, axis=1).max()
+        return float(h * (largest + np.linalg.norm(steps, axis=1).sum() + 2.0 * off.sum()))
+
+
+def closed_loop(
+    organ: ContactModel,
+    device: Device,
+    delay: int,
+    push: np.ndarray,
+    start: np.ndarray,
+    passivity: Passivity | None,
+    q: float = RESOLUTION,
+) -> Run:
+    """The loop with the organ's own step, from rest at ``start``; push (n, 3) of the hand [N]."""
+    a, b = device.transition()
+    organ.reset()
+    n = len(push)
+    run = Run(*(np.zeros((n + extra, 3)) for extra in (1, 1, 0, 0)), energy=np.zeros(n))
+    x, v, energy = start.copy(), np.zeros(3), 0.0
+    sent = np.zeros((n + delay, 3))
+    force = np.zeros((1, 3))
+    for k in range(n):
+        run.position[k] = x
+        run.reading[k] = np.rint(x / q) * q if q > 0.0 else x
+        status = step(organ, run.reading[k : k + 1])
+        assert status == Status.OK or passivity is None  # out of range, if it flies off
+        run.organ[k] = force[0] = organ.out.force[0]
+        if passivity is not None:
+            limit(passivity, run.reading[k : k + 1], force)
+        sent[k + delay] = force[0]
+        total = sent[k] + push[k]
+        new = a[0, 0] * (x - start) + a[0, 1] * v + b[0] * total + start
+        v = a[1, 0] * (x - start) + a[1, 1] * v + b[1] * total
+        energy -= float(sent[k] @ (new - x))
+        x = new
+        run.energy[k] = energy
+    run.position[n], run.reading[n] = x, np.rint(x / q) * q if q > 0.0 else x
+    return run._replace(held=sent[:n])
+
+
+def controller(delay: int, q: float = RESOLUTION) -> Passivity:
+    return make_passivity(1, delay, q, stiffness=STIFFNESSES[-1], acceleration=ACCELERATION)
+
+
+# --- Passive with control -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_port_is_passive_for_every_tool_and_grip(delay: int, figure: Figure) -> None:
+    start, n = np.array([0.0, 0.0, RADIUS + 1e-3]), 700
+    worst = free = quantised = account = 0.0
+    for stiffness in STIFFNESSES:
+        organ = flat_organ(compliance=1.0 / stiffness)
+        for mass, damping, grip in itertools.product(MASSES, DAMPINGS, GRIPS):
+            for hand in ("press", "tremor"):
+                push = np.zeros((n, 3))
+                push[:, 2] = hand_push(hand, grip, n) - 1e-3 * grip  # the grip is at rest at start
+                passivity = controller(delay)
+                run = closed_loop(organ, Device(mass, damping, grip), delay, push, start, passivity)
+                assert run.acceleration < ACCELERATION
+                q = run.quantisation(RESOLUTION)
+                case = f"K {stiffness}, m {mass}, b {damping}, k {grip}, {hand}"
+                assert run.given <= passivity.bound + q, case
+                assert run.given <= passivity.bound, case
+                # what it keeps account of is what went through the port
+                off = abs(passivity.energy[0] - run.energy[-2])
+                assert off <= q, case
+                worst, quantised = max(worst, run.given), max(quantised, q)
+                account = max(account, off)
+    device = Device(MASSES[0], DAMPINGS[0], GRIPS[1])
+    push[:, 2] = hand_push("press", GRIPS[1], n) - 1e-3 * GRIPS[1]
+    free = closed_loop(organ, device, delay, push, start, None).given
+    assert free > 10.0 * passivity.bound
+    figure(
+        f"gives {1e3 * worst:.3f} mJ, bound {1e3 * passivity.bound:.2f} mJ; quantisation up to "
+        f"{1e3 * quantised:.2f} mJ, found {1e3 * account:.3f} mJ; without {1e3 * free:.0f} mJ"
+    )
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_port_is_passive_over_the_grid_of_the_map(delay: int, figure: Figure) -> None:
+    """More hands, longer: with the spring of the study, equal to the organ's step (below)."""
+    worst = free = 0.0
+    bound = controller(delay).bound
+    cases = itertools.product(HANDS, MASSES, DAMPINGS, GRIPS, STIFFNESSES)
+    for hand, mass, damping, grip, stiffness in cases:
+        loop = Loop(Device(mass, damping, grip), stiffness, delay, RESOLUTION)
+        push = hand_push(hand, grip, 3000)
+        given_ = -run_loop(loop, push, 1e-3, controller(delay)).energy.min()
+        assert given_ <= bound, f"K {stiffness}, m {mass}, b {damping}, k {grip}, {hand}"
+        worst = max(worst, given_)
+        free = max(free, -run_loop(loop, push, 1e-3).energy.min())
+    assert free > 1.0
+    figure(f"gives {1e3 * worst:.3f} mJ at worst, bound {1e3 * bound:.2f} mJ; without {free:.0f} J")
+
+
+def test_the_loop_of_the_study_is_that_of_the_step(figure: Figure) -> None:
+    stiffness, start, n = 1000.0, 1e-3, 600
+    organ, device = flat_organ(compliance=1.0 / stiffness), Device(0.3, 2.0)
+    push = np.zeros((n, 3))
+    push[:, 2] = -1.0
+    off = 0.0
+    for passivity, again in ((None, None), (controller(2, 0.0), controller(2, 0.0))):
+        at = np.array([0.0, 0.0, RADIUS + start])
+        mine = closed_loop(organ, device, 2, push, at, passivity, q=0.0)
+        other = run_loop(Loop(device, stiffness, 2), push[:, 2], start, again)
+        off = max(off, float(np.abs(mine.held[:, 2] - other.held).max()))
+    assert off < 1e-5  # the organ's fields are single precision: 1e-2 m to 1e-9 m, times K
+    figure(f"forces differ by {1e6 * off:.2f} uN")
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_port_is_passive_on_a_ball(delay: int, figure: Figure) -> None:
+    """Pushed in beside its top, the tool slides off: the force turns with the surface."""
+    organ, n = ball_organ(1.0 / 1500.0), 1200
+    start = np.array([4e-3, 1e-3, BALL + RADIUS + 1e-3])
+    push = np.tile([0.0, 0.3, -2.0], (n, 1))
+    device = Device(0.1, 0.2, 150.0)
+    passivity = controller(delay)
+    run = closed_loop(organ, device, delay, push, start, passivity)
+    free = closed_loop(organ, device, delay, push, start, None)
+    assert np.ptp(run.position[:, 0]) > 2e-3
+    assert run.given <= passivity.bound < free.given
+    figure(f"gives {1e3 * run.given:.3f} mJ; without control {1e3 * free.given:.1f} mJ")
+
+
+# --- Whatever hand and organ do -----------------------------------------------------------------
+
+
+def shaken(seed: int, active: str, delay: int, q: float, n: int = 300) -> tuple[Run, Passivity]:
+    """A tool that is thrown about, on an organ that pushes it as it likes."""
+    rng = np.random.default_rng(seed)
+    passivity = make_passivity(1, delay, q)
+    turn = rng.standard_normal((n, 3))
+    turn *= rng.uniform(0.0, 1.0, (n, 1)) ** 0.2 / np.linalg.norm(turn, axis=1, keepdims=True)
+    calm = rng.uniform(0.0, 1.0, n) < 0.5  # slow motion too
+    push = 100.0 * turn * np.where(calm, 0.1, 1.0)[:, None]
+    x, v, energy = np.zeros(3), rng.uniform(-0.1, 0.1, 3), 0.0
+    run = Run(*(np.zeros((n + extra, 3)) for extra in (1, 1, 0, 0)), energy=np.zeros(n))
+    sent, force = np.zeros((n + delay, 3)), np.zeros((1, 3))
+    for k in range(n):
+        run.position[k] = x
+        run.reading[k] = np.rint(x / q) * q if q > 0.0 else x
+        if active == "along":  # always with the tool
+            force[0] = 5.0 * v / (np.linalg.norm(v) + 1e-9)
+        elif active == "random":
+            force[0] = rng.uniform(0.0, 20.0) * rng.standard_normal(3)
+        else:  # a spring that pushes back later than it was pushed, harder
+            force[0] = -1500.0 * run.reading[k - min(k, 5)] + 10.0 * v
+        run.organ[k] = force[0]
+        limit(passivity, run.reading[k : k + 1], force)
+        sent[k + delay] = force[0]
+        if active == "along":  # the worst of hands: towards the force that is held
+            push[k] = 100.0 * sent[k] / (np.linalg.norm(sent[k]) + 1e-12) * rng.uniform(-1.0, 1.0)
+        at = PERIOD * np.array([0.25, 0.5, 0.75, 1.0])[:, None]  # between the samples too
+        way = at * v + 0.5 * at**2 * push[k]
+        run.energy[k] = energy - (way @ sent[k]).max()
+        energy -= float(way[-1] @ sent[k])
+        x, v = x + way[-1], np.clip(v + PERIOD * push[k], -2.0, 2.0)
+    run.position[n], run.reading[n] = x, np.rint(x / q) * q if q > 0.0 else x
+    return run._replace(held=sent[:n]), passivity
+
+
+WORST: dict[str, float] = {}
+
+
+@examples(60)
+@given(
+    seed=st.integers(0, 10**6),
+    active=st.sampled_from(["along", "random", "late spring"]),
+    delay=st.integers(0, 2),
+    q=st.sampled_from([0.0, RESOLUTION]),
+)
+@example(seed=0, active="along", delay=2, q=0.0)
+def check_bound(seed: int, active: str, delay: int, q: float) -> None:
+    run, passivity = shaken(seed, active, delay, q)
+    exact = passivity.bound * (1.0 + 1e-9)  # sums of 300 terms
+    assert run.given <= exact + run.quantisation(q)
+    if q == 0.0:
+        assert run.given <= exact
+        WORST[active] = max(WORST.get(active, 0.0), run.given / passivity.bound)
+
+
+@pytest.mark.examples
+def test_bound_holds_for_any_force_and_any_motion(figure: Figure) -> None:
+    """An active organ spends what the bound allows, to the last, and no more."""
+    check_bound()
+    assert WORST["along"] > 0.5
+    figure(", ".join(f"{k} {v:.3f}" for k, v in sorted(WORST.items())) + " of the bound spent")
+
+
+# --- Without control ----------------------------------------------------------------------------
+
+
+BORDER: list[float] = []
+
+
+@examples(12)
+@given(stiffness=st.floats(100.0, 2500.0), delay=st.integers(0, 2), mass=st.floats(0.7, 1.0))
+@example(stiffness=2500.0, delay=2, mass=0.7)
+@example(stiffness=100.0, delay=0, mass=1.0)
+def check_border(stiffness: float, delay: int, mass: float) -> None:
+    found = stability_border(stiffness, delay, mass)
+    BORDER.append(found / expected_border(stiffness, delay) - 1.0)
+    # K sin(w tau) sinc(w T / 2) / w for K tau: (w tau)^2 / 6 of it at w tau = 0.15, and bisection
+    assert abs(BORDER[-1]) < 0.01
+
+
+@pytest.mark.examples
+def test_border_of_stability_without_grip(figure: Figure) -> None:
+    """Within 20 % is what was asked; at these masses it is a matter of 1 %."""
+    check_border()
+    figure(f"b / K (T/2 + delay) - 1 in {100 * min(BORDER):+.2f} to {100 * max(BORDER):+.2f} %")
+
+
+def test_control_takes_what_the_loop_made_and_no_more(figure: Figure) -> None:
+    """Pressed into the organ, a tool that would swing up fades as on an organ without delay.
+
+    Its swings have the envelope exp(- b t / 2 m) there, all energy being the tool's own to lose.
+    """
+    mass, damping, stiffness, depth, swing, n = 0.3, 1.0, 800.0, 5e-3, 2e-3, 1500
+    push = np.full(n, -stiffness * depth)
+    lasts = {}
+    for name, delay, passivity in (
+        ("without", 2, None),
+        ("with", 2, make_passivity(1, 2, RESOLUTION)),
+        ("no hold", 0, None),
+    ):
+        loop = Loop(Device(mass, damping), stiffness, delay, RESOLUTION)
+        position = run_loop(loop, push, swing - depth, passivity).position
+        lasts[name] = float(np.abs(position[-200:] + depth).max())
+    ideal = swing * np.exp(-damping * PERIOD * (n - 200) / (2.0 * mass))
+    energy = {name: 0.5 * stiffness * last**2 for name, last in lasts.items()}
+    tolerance = make_passivity(1, 2, RESOLUTION).tolerance
+    assert lasts["without"] > swing
+    assert energy["with"] <= 0.5 * stiffness * ideal**2 + 2.0 * tolerance
+    assert lasts["with"] == pytest.approx(ideal, rel=0.05)  # nor does it brake what is the tool's
+    figure(
+        f"swing of 2 mm after 1.3 s: {1e3 * lasts['without']:.1f} mm without, "
+        f"{1e3 * lasts['with']:.3f} mm with, {1e3 * ideal:.3f} mm ideal"
+    )

@@ -1,0 +1,186 @@
+"""A flat punch that leans: against the closed form, its own energy, and resolved contact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from avatar_core.contact.effects import Effect, Friction, Tilt, Viscoelasticity
+from avatar_core.contact.model import ContactModel, Status, prepare, step, stored_energy
+from avatar_core.contact.tool_path import inner_positions
+from avatar_core.errors import SceneError
+from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.signorini import CondensedContact, Push
+from avatar_core.geometry.tip import Tip
+from avatar_core.offline.resolved_contact import Resolution, refined_organ
+from avatar_core.scene.model import Scene, Tool
+from avatar_core.vademecum.model import Vademecum
+from tests.helpers.box_organ import MATERIAL, UP, body_mesh, organ, top
+from tests.helpers.flat_organ import E_STAR, flat_organ
+
+PUNCH = Tip("flat", 5e-3)
+
+
+def leaning(angle: float, about: float = 0.0) -> np.ndarray:
+    """The axis of a tool that leans off the flat organ's normal, in a direction [rad]."""
+    s = np.sin(angle)
+    return np.array([s * np.cos(about), s * np.sin(about), np.cos(angle)])
+
+
+def pressed(
+    angle: float, depth: float, about: float = 0.0, effects: tuple[Effect, ...] = ()
+) -> ContactModel:
+    """The flat organ's model after an approach of the face's centre to a depth."""
+    model = flat_organ((Tilt(), *effects), tip=PUNCH)
+    assert model.axes is not None
+    model.axes[:] = leaning(angle, about)
+    for at in np.linspace(-3e-3, depth, 50):
+        step(model, np.array([[0.0, 0.0, -at]]))
+    return model
+
+
+@pytest.mark.parametrize("about", [0.0, 2.0])
+def test_a_punch_that_touches_all_over_is_righted_by_its_closed_form(about: float) -> None:
+    """M = 4/3 E* a^3 sin cos about e x n, and the force of an upright punch."""
+    angle, depth = 0.02, 2e-3
+    upright, model = pressed(0.0, depth), pressed(angle, depth, about)
+    exact = 4.0 / 3.0 * E_STAR * PUNCH.radius**3 * np.sin(angle) * np.cos(angle)
+    axis = np.cross(leaning(angle, about), [0.0, 0.0, 1.0]) / np.sin(angle)
+    np.testing.assert_allclose(model.out.torque[0], exact * axis, atol=1e-5 * exact)
+    np.testing.assert_allclose(model.out.force[0], upright.out.force[0], rtol=1e-9, atol=1e-9)
+    assert not upright.out.torque.any()
+
+
+def test_an_edge_touches_before_the_centre_and_no_force_jumps() -> None:
+    """From the first touch of the edge, past the depth where the whole face touches."""
+    model = flat_organ((Tilt(),), tip=PUNCH)
+    assert model.axes is not None
+    model.axes[:] = leaning(0.2)
+    edge, force, torque = PUNCH.radius * np.sin(0.2), [], []
+    depths = np.arange(-edge - 1e-4, 6e-3, 1e-5)
+    for depth in depths:
+        step(model, np.array([[0.0, 0.0, -depth]]))
+        force.append(float(model.out.force[0, 2]))
+        torque.append(float(np.linalg.norm(model.out.torque[0])))
+    touched = np.array(force) > 0.0
+    assert depths[touched][0] == pytest.approx(-edge, abs=2e-5)
+    assert (np.diff(force)[touched[1:]] > 0.0).all()
+    assert np.abs(np.diff(force, 2)).max() < 0.2 * np.diff(force).max()
+    assert np.abs(np.diff(torque)).max() < 0.02 * max(torque)
+    arm = np.array(torque)[touched] / np.array(force)[touched]
+    assert (arm < PUNCH.radius).all() and (np.diff(arm) < 0.0).all()  # the load moves inwards
+
+
+@pytest.mark.parametrize("angle", [0.01, 0.1, 0.5])
+def test_force_and_torque_are_the_derivatives_of_the_energy(
+    straight: Vademecum, angle: float
+) -> None:
+    """On a curved organ, by the place of the tool and by the direction of its axis."""
+    model = prepare(straight, (PUNCH,), cloud="off", effects=(Tilt(),))
+    axes = model.axes
+    assert axes is not None
+    rng = np.random.default_rng(2)
+    for j in rng.choice(inner_positions(straight), 4):
+        centre, normal = straight.surface.centers[j], straight.surface.normals[j]
+        aside = np.cross(normal, rng.normal(size=3))
+        aside /= np.linalg.norm(aside)
+        place = centre - 3e-3 * normal + rng.uniform(-1e-3, 1e-3, 3)
+        model.reset()
+        axes[:] = np.cos(angle) * normal + np.sin(angle) * aside
+        step(model, (centre - 0.5e-3 * normal)[None])
+        assert step(model, place[None]) == Status.OK
+        force, torque = model.out.force[0].copy(), model.out.torque[0].copy()
+        by_place, by_turn = slopes(model, place, axes[0].copy())
+        np.testing.assert_allclose(force, -by_place, atol=1e-4 * np.linalg.norm(force))
+        np.testing.assert_allclose(torque, -by_turn, atol=1e-3 * np.linalg.norm(torque))
+
+
+def slopes(model: ContactModel, place: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Derivatives of the stored energy by the place [N] and by a rotation [N m]."""
+    assert model.axes is not None
+    out = np.empty((2, 3))
+    for kind, h in enumerate((1e-6, 1e-4)):
+        for d in range(3):
+            energy = []
+            for sign in (1.0, -1.0):
+                change = sign * h * np.eye(3)[d]
+                turned = axis + np.cross(change, axis) * kind
+                model.axes[:] = turned / np.linalg.norm(turned)
+                step(model, (place + change * (1 - kind))[None])
+                energy.append(stored_energy(model))
+            out[kind, d] = (energy[0] - energy[1]) / (2.0 * h)
+    model.axes[:] = axis
+    return out[0], out[1]
+
+
+@pytest.mark.long
+def test_torque_relaxes_and_friction_leaves_it() -> None:
+    """In the end that of the relaxed modulus; on the face itself friction has no arm."""
+    soft = Viscoelasticity((0.6,), (0.02,))
+    model, elastic = pressed(0.02, 2e-3, effects=(soft,)), pressed(0.02, 2e-3)
+    for _ in range(400):
+        step(model, np.array([[0.0, 0.0, -2e-3]]))
+    rough = pressed(0.02, 2e-3, effects=(Friction(),))
+    np.testing.assert_allclose(model.out.torque, 0.4 * elastic.out.torque, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(rough.out.torque, elastic.out.torque, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("angle", "bound"), [(0.05, 0.04), (0.2, 0.08)])
+def test_force_and_torque_are_those_of_resolved_contact(angle: float, bound: float) -> None:
+    """On a cube, of a face that touches all over and of one that has partly lifted off.
+
+    The reference presses along the tool's axis on elements that make both 1.6 % too large; small
+    angles are the theory's.
+    """
+    depth, axis = 1e-3, np.array([np.sin(angle), np.cos(angle), 0.0])
+    mesh, regions = body_mesh("cube")
+    elasticity = refined_organ(
+        *(None, mesh, regions, MATERIAL, [top("cube")], [UP], (PUNCH,), (depth,)),
+        Resolution(core=0.15, inner=0.08),
+    )
+    centre = top("cube") - depth * UP
+    push = Push(PUNCH, centre + depth * axis, axis)
+    contact = CondensedContact(elasticity, [push], depth, reach=2.0).solve([0], [depth])
+    model = prepare(organ("cube"), (PUNCH,), cloud="off", effects=(Tilt(),))
+    assert model.axes is not None
+    model.axes[:] = axis
+    for at in np.linspace(-4e-3, depth, 20):
+        step(model, (top("cube") - at * UP)[None])
+    torque = torque_on_tip(elasticity, contact.loads, centre)
+    assert np.linalg.norm(model.out.force[0]) == pytest.approx(contact.forces[0], rel=0.03)
+    assert model.out.torque[0, 2] == pytest.approx(torque[2], rel=bound)
+
+
+def torque_on_tip(elasticity: Elasticity, loads: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """About a point, of what nodal loads on the organ's boundary do to the tip, (3,) [N m]."""
+    place = np.zeros((elasticity.n_nodes, 3))
+    corner = elasticity.mesh.vertices[elasticity.mesh.boundary_faces]
+    middle = 0.5 * (corner + np.roll(corner, -1, axis=1))
+    place[elasticity.face_nodes] = np.concatenate([corner, middle], axis=1)
+    return np.asarray(np.cross(place - centre, -loads.reshape(-1, 3)).sum(axis=0))
+
+
+def test_a_tool_on_its_side_or_without_an_axis_has_no_torque() -> None:
+    for angle in (np.pi / 2.0 + 0.1, np.pi):
+        assert not pressed(angle, 2e-3).out.torque.any()
+    model = flat_organ((Tilt(),), tip=PUNCH)
+    step(model, np.array([[0.0, 0.0, -2e-3]]))
+    assert model.out.force[0, 2] > 0.0 and not model.out.torque.any()
+
+
+def test_a_reset_forgets_how_the_tool_leant() -> None:
+    model = pressed(0.2, 2e-3)
+    model.reset()
+    assert model.axes is not None and not model.axes.any()
+
+
+def test_only_flat_tips_lean() -> None:
+    assert flat_organ((), tip=PUNCH).axes is None
+    with pytest.raises(SceneError, match="tilt: no tool has a flat tip; give one, or leave tilt"):
+        Scene(effects=(Tilt(),))
+    with pytest.raises(SceneError, match=r"tilt\.axis is .*; give three numbers"):
+        Tilt((0.0, 0.0, 0.0))
+    scene = Scene(tools=(Tool(tip=PUNCH),), effects=(Tilt((0.0, 0.0, 2.0)),))
+    effect = scene.effect("tilt")
+    assert isinstance(effect, Tilt) and effect.axis == (0.0, 0.0, 1.0)

@@ -1,0 +1,251 @@
+"""The force of the step against the truth: Sneddon's on boxes, resolved contacts on organs.
+
+A cube of 200 mm, clamped below, is a half-space to a tip: its free sides let a patch of 12 mm in
+the middle of its top sink deeper, its clamp less deep, and what is left of both is 0.1 %. Sneddon's
+forces hold as they are. A column of half the width gives way besides: there the depth is Sneddon's
+plus the force times what the patch sinks more than on a half-space, on fine elements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+from avatar_core.contact.effects import LargeDeformationEffect, SeveralTools
+from avatar_core.contact.model import ContactModel, Status, prepare, step
+from avatar_core.fem.elasticity import Material
+from avatar_core.fem.signorini import CondensedContact, Push
+from avatar_core.fem.sphere_indentation import Domain, SphereIndentation
+from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
+from avatar_core.offline.certify.contact_sites import Site, draw_sites
+from avatar_core.offline.large_deformation import (
+    LargeRule,
+    hyperelastic_problem,
+    with_large_deformation,
+)
+from avatar_core.offline.resolved_contact import contacts_at, refined_organ
+from avatar_core.vademecum.model import Vademecum
+from tests.helpers.box_organ import (
+    MATERIAL,
+    MODULUS,
+    PATCH_RADIUS,
+    UP,
+    Body,
+    organ,
+    patch_compliance,
+    top,
+)
+from tests.helpers.disk_cache import cached_on_disk
+
+RADII = (1e-3, 3e-3, 5e-3, 10e-3)
+DEPTHS = (0.5e-3, 1e-3, 2e-3, 5e-3)
+SHAPES: dict[str, Callable[[float], Tip]] = {
+    "sphere": lambda radius: Tip("sphere", radius),
+    "flat": lambda radius: Tip("flat", radius),
+    "cone": lambda radius: Tip("cone", radius, 45.0),
+    "rounded_cone": lambda radius: Tip("rounded_cone", radius, 50.0, 0.3 * radius),
+}
+TIPS = [
+    pytest.param(make(radius), id=f"{shape}-{1e3 * radius:g}mm")
+    for shape, make in SHAPES.items()
+    for radius in RADII
+]
+ASIDE = ((0.0, 0.0), (3e-3, 2e-3), (-9e-3, 7e-3))  # of the middle, between load positions [m]
+HALF_SPACE = 0.7665 / (MODULUS * PATCH_RADIUS)  # what a patch sinks there [m/N]
+
+PAIR = (Tip("sphere", 3e-3), Tip("sphere", 5e-3))
+PAIR_DEPTHS = ((2e-3, 4e-3), (4e-3, 2e-3))
+LIGHT = 0.1
+APART, LEAST_COSINE = 25e-3, np.cos(np.radians(30.0))
+
+
+def sneddon(tip: Tip, depth: float) -> float:
+    """Force on a half-space (Sneddon 1965), by Abel's integrals over the profile's slope [N]."""
+    if tip.shape == "flat":
+        return 2.0 * MODULUS * tip.radius * depth
+
+    def integral(a: float, power: int) -> float:
+        """int_0^a r^power f'(r) / sqrt(a^2 - r^2) dr."""
+
+        def inner(angle: float) -> float:
+            r = a * np.sin(angle)
+            return float(r**power * slope(tip, r))
+
+        return float(quad(inner, 0.0, 0.5 * np.pi, limit=400)[0])
+
+    a = brentq(lambda a: a * integral(a, 0) - depth, 0.0, (1.0 - 1e-9) * tip.radius)
+    return 2.0 * MODULUS * integral(a, 2)
+
+
+def slope(tip: Tip, r: float) -> float:
+    """f'(r) of a sphere or a cone, rounded or not."""
+    ball, cotangent = tip.radius, np.inf
+    if tip.half_angle is not None:
+        ball, cotangent = tip.rounding or 0.0, 1.0 / np.tan(np.radians(tip.half_angle))
+    steepness = r / np.sqrt(ball**2 - r**2) if r < ball else np.inf
+    return float(min(steepness, cotangent))
+
+
+def depths_of(tip: Tip) -> list[float]:
+    """Those at which the contact does not reach the rim of a cone."""
+    rimless = tip.shape in ("sphere", "flat")
+    return [depth for depth in DEPTHS if rimless or depth <= tip.radius]
+
+
+def pressed(
+    model: ContactModel,
+    tips: Sequence[Tip],
+    points: np.ndarray,
+    normals: np.ndarray,
+    depths: Sequence[float],
+) -> np.ndarray:
+    """Forces along the normals at some depths, after an approach from outside [N]."""
+    model.reset()
+    height = np.array([tip.offset for tip in tips])
+    for part in np.linspace(-0.2, 1.0, 13):
+        lowest = height - part * np.array(depths)
+        status = step(model, points + lowest[:, None] * normals)
+    assert status == Status.OK
+    return np.asarray((model.out.force * normals).sum(axis=1))
+
+
+def on_top(body: Body, tip: Tip, aside: tuple[float, float]) -> Callable[[float], float]:
+    """The step's force on a tip at a depth in the top of a box."""
+    model = prepare(organ(body), (tip,), cloud="off", effects=())
+    point = top(body) + np.array([aside[0], 0.0, aside[1]])
+    return lambda depth: float(pressed(model, (tip,), point[None], UP[None], (depth,))[0])
+
+
+@pytest.mark.parametrize("tip", TIPS)
+def test_a_tip_feels_sneddons_force_on_a_cube(tip: Tip) -> None:
+    exact = [sneddon(tip, depth) for depth in depths_of(tip)]
+    for aside in ASIDE:
+        force = on_top("cube", tip, aside)
+        np.testing.assert_allclose([force(depth) for depth in depths_of(tip)], exact, rtol=0.03)
+
+
+def on_a_soft_base(tip: Tip, depth: float, base: float) -> float:
+    """Sneddon's force where the half-space gives way besides, by ``base`` [m/N]."""
+    return float(
+        brentq(lambda f: sneddon(tip, depth - base * f) - f, 0.0, sneddon(tip, depth), xtol=1e-9)
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("tip", TIPS)
+def test_a_tip_on_a_column_feels_it_give_way(tip: Tip) -> None:
+    """The wider a tip, the more it feels that the coarse mesh is stiff: 5.5 % at 10 mm."""
+    base = patch_compliance("column") - HALF_SPACE
+    exact = [on_a_soft_base(tip, depth, base) for depth in depths_of(tip)]
+    force = on_top("column", tip, ASIDE[0])
+    limit = 0.01 + 5.0 * tip.radius
+    np.testing.assert_allclose([force(depth) for depth in depths_of(tip)], exact, rtol=limit)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("radius", [3e-3, 10e-3])
+def test_a_sphere_feels_the_large_strain_of_a_neo_hookean_cube(radius: float) -> None:
+    """As finite elements of the sphere alone say, down to one radius, where it bears 7 % less."""
+    cube, rule = organ("cube"), LargeRule(max_push=12e-3)
+    problem = hyperelastic_problem(cube, "neo-hookean")
+    bent = with_large_deformation(cube, problem, "neo-hookean", rule)
+    tip = Tip("sphere", radius)
+    model = prepare(bent, (tip,), cloud="off", effects=(LargeDeformationEffect(),))
+    place = (top("cube")[None], UP[None])
+    elements = SphereIndentation(MATERIAL.poisson_ratio, domain=Domain(0.2))
+    for each in elements.press([0.25, 0.5, 1.0]):
+        force = pressed(model, (tip,), *place, (each.depth * radius,))[0]
+        truth = each.force * MATERIAL.young_modulus * radius**2
+        assert force == pytest.approx(truth, rel=0.04)
+
+
+@pytest.mark.long
+def test_a_patch_sinks_into_the_cube_as_into_a_half_space() -> None:
+    assert patch_compliance("cube") == pytest.approx(HALF_SPACE, rel=2e-3)
+
+
+@pytest.mark.long
+def test_tips_on_a_column_feel_resolved_contacts() -> None:
+    """As Sneddon's solution says on a soft base, to which the step is compared above."""
+    tips, depths, body = [make(5e-3) for make in SHAPES.values()], (2e-3, 5e-3), organ("column")
+    place = (top("column"), UP, tips, depths)
+    truth = contacts_at(None, body.mesh, body.regions, MATERIAL, *place).forces
+    base = patch_compliance("column") - HALF_SPACE
+    exact = [[on_a_soft_base(tip, depth, base) for depth in depths] for tip in tips]
+    np.testing.assert_allclose(exact, truth, rtol=0.02)
+    force = [[on_top("column", tip, ASIDE[0])(depth) for depth in depths] for tip in tips]
+    np.testing.assert_allclose(force, truth, rtol=0.04)
+
+
+@cached_on_disk
+def true_force(
+    point: tuple[float, ...], normal: tuple[float, ...], radius: float, depth: float
+) -> float:
+    """Of a resolved contact of a sphere with the coarse phantom [N]."""
+    surface = phantom_liver(12e-3)
+    mesh = tetrahedralize(surface, 800)
+    organ_there = (surface, mesh, regions_by_rule(mesh), Material())
+    place = (np.array(point), np.array(normal))
+    truth = contacts_at(*organ_there, *place, [Tip("sphere", radius)], [depth])
+    return float(truth.forces[0, 0])
+
+
+def test_a_tip_on_an_organ_feels_a_resolved_contact(straight: Vademecum) -> None:
+    tip, depth = Tip("sphere", 5e-3), 2e-3
+    site = draw_sites(straight, phantom_liver(12e-3), 8, 1)[2]
+    model = prepare(straight, (tip,), cloud="off", effects=())
+    force = pressed(model, (tip,), site.point[None], site.normal[None], (depth,))[0]
+    truth = true_force(tuple(site.point.tolist()), tuple(site.normal.tolist()), tip.radius, depth)
+    assert force == pytest.approx(truth, rel=0.05)
+
+
+def pairs_of(sites: Sequence[Site]) -> list[tuple[Site, Site]]:
+    """Sites that are the distance apart, to 1.5 mm, and face nearly the same way."""
+    return [
+        (first, second)
+        for k, first in enumerate(sites)
+        for second in sites[:k]
+        if abs(np.linalg.norm(first.point - second.point) - APART) < 1.5e-3
+        and first.normal @ second.normal > LEAST_COSINE
+    ]
+
+
+def pair_errors(vademecum: Vademecum, surface: SurfaceMesh, n: int) -> np.ndarray:
+    """Relative errors of both forces at some pairs of places, (n, depths, tips)."""
+    model = prepare(vademecum, PAIR, cloud="off", effects=(SeveralTools(),))
+    pairs = pairs_of(draw_sites(vademecum, surface, 60, 0)[:-2])[:n]
+    return np.array([errors_at(vademecum, surface, model, pair) for pair in pairs])
+
+
+def errors_at(
+    vademecum: Vademecum, surface: SurfaceMesh, model: ContactModel, pair: tuple[Site, Site]
+) -> np.ndarray:
+    """The same at one pair, (depths, tips).
+
+    What a tip feels that the other has all but lifted off is the small difference of two depths:
+    it is compared with ``LIGHT`` of the other's force.
+    """
+    points = np.array([site.point for site in pair])
+    normals = np.array([site.normal for site in pair])
+    coarse = (vademecum.mesh, vademecum.regions, vademecum.material)
+    depths = [depth for both in PAIR_DEPTHS for depth in both]
+    fine = refined_organ(surface, *coarse, list(points), list(normals), PAIR, depths)
+    pushes = [Push(*each) for each in zip(PAIR, points, normals, strict=True)]
+    both = CondensedContact(fine, pushes, np.max(PAIR_DEPTHS), reach=2.0)
+    truth = np.array([both.solve((0, 1), depths).forces for depths in PAIR_DEPTHS])
+    force = [pressed(model, PAIR, points, normals, depths) for depths in PAIR_DEPTHS]
+    off = np.array(force) - truth
+    return off / np.maximum(truth, LIGHT * truth.max(axis=1, keepdims=True))
+
+
+@pytest.mark.long
+def test_two_tips_on_the_phantom_feel_resolved_contacts(phantom_vademecum: Vademecum) -> None:
+    errors = pair_errors(phantom_vademecum, phantom_liver(), 2)
+    assert errors.shape == (2, 2, 2) and np.abs(errors).max() < 0.10

@@ -1,0 +1,294 @@
+"""Label maps: where their voxels lie, which label is meant, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import nrrd
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from avatar_core.errors import SurfaceError
+from avatar_core.geometry import label_files, surface_files
+from avatar_core.geometry.label_maps import labels_of
+from avatar_core.geometry.surface import read_surface
+from avatar_core.geometry.tumour import read_tumour
+from tests.core.geometry.test_surface import refused
+
+
+def label_map(path: Path, affine: np.ndarray, labels: tuple[int, ...] = (1,)) -> Path:
+    """An ellipsoid of 40, 50, 60 mm about (10, -20, 30) mm in world coordinates."""
+    shape = tuple(np.ceil(160 / np.linalg.norm(affine[:3, :3], axis=0)).astype(int))
+    voxels = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+    world = voxels @ affine[:3, :3].T + affine[:3, 3]
+    inside = np.linalg.norm((world - [10, -20, 30]) / [40, 50, 60], axis=-1) < 1
+    values = np.zeros(shape, dtype=np.uint8)
+    values[inside] = labels[0]
+    for label in labels[1:]:
+        values[-label:, 0, 0] = label
+    nibabel.save(nibabel.Nifti1Image(values, affine), path)
+    return path
+
+
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
+@pytest.mark.parametrize("size", [(2.0, 2.0, 2.0), (0.8, 0.8, 5.0)])
+def test_label_map_honours_its_affine(tmp_path, mirror, size):
+    affine = np.diag([mirror * size[0], size[1], size[2], 1.0])
+    affine[:3, 3] = [10 - mirror * 80, -100, -50]
+    surface = read_surface(label_map(tmp_path / "organ.nii.gz", affine))
+    low, high = surface.bounding_box
+    # half a coarsest voxel
+    assert np.allclose(low, [-0.03, -0.07, -0.03], atol=size[2] * 0.5e-3)
+    assert np.allclose(high, [0.05, 0.03, 0.09], atol=size[2] * 0.5e-3)
+    assert surface.volume == pytest.approx(4 / 3 * np.pi * 0.04 * 0.05 * 0.06, rel=0.02)
+    assert surface.notices == ()
+
+
+def test_label_map_asks_which_label(tmp_path):
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = [-70, -100, -50]
+    path = label_map(tmp_path / "organs.nii", affine, labels=(3, 7))
+    refused(path, "3, 7", "--label")
+    refused(path, "3, 7", "--label", label=5)
+    assert read_surface(path, label=3).volume == pytest.approx(5.03e-4, rel=0.02)
+
+
+def segmentation(path: Path, names: dict[str, int], layers: int = 1, **header: Any) -> Path:
+    """A file as 3D Slicer writes it: a liver about (10, -20, 30) mm in RAS, and a lesion."""
+    size = np.array([2.0, 2.5, 3.0])
+    turn = Rotation.from_euler("zx", [20.0, -35.0], degrees=True).as_matrix()
+    shape = np.ceil(170 / size).astype(int)
+    affine = np.eye(4)
+    affine[:3, :3] = turn * size
+    affine[:3, 3] = [10, -20, 30] - affine[:3, :3] @ (shape / 2)
+    voxels = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+    world = voxels @ affine[:3, :3].T + affine[:3, 3]
+    values = np.zeros((layers, *shape), np.uint8)
+    liver = np.linalg.norm((world - [10, -20, 30]) / [40, 50, 60], axis=-1) < 1
+    lesion = np.linalg.norm(world - [20, -10, 30], axis=-1) < 15
+    values[0][liver], values[layers - 1][lesion] = 1, 2
+    lps = np.diag([-1.0, -1.0, 1.0])
+    directions = [*(lps @ affine[:3, :3]).T]
+    fields: dict[str, Any] = {
+        "space": "left-posterior-superior",
+        "space directions": np.array(
+            [np.full(3, np.nan), *directions] if layers > 1 else directions
+        ),
+        "space origin": lps @ affine[:3, 3],
+        "kinds": ["list"] * (layers > 1) + ["domain"] * 3,
+        "encoding": "gzip",
+    }
+    for k, (name, value) in enumerate(names.items()):
+        layer = min(layers - 1, k)
+        fields |= {
+            f"Segment{k}_Name": name,
+            f"Segment{k}_LabelValue": str(value),
+            f"Segment{k}_Layer": str(layer),
+        }
+    nrrd.write(str(path), values if layers > 1 else values[0], fields | header)
+    return path
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("encoding", ["gzip", "raw"])
+def test_a_segmentation_of_slicer_is_read_by_its_names(tmp_path, layers, encoding):
+    path = segmentation(
+        tmp_path / "a.seg.nrrd", {"Liver": 1, "lesion 1": 2}, layers, encoding=encoding
+    )
+    refused(path, "Liver (1), lesion 1 (2)", "--label")
+    refused(path, "Liver (1)", label="spleen")
+    liver = read_surface(path, label="liver")
+    whole = 4 / 3 * np.pi * 0.04 * 0.05 * 0.06
+    cut_out = 0.0 if layers > 1 else 4 / 3 * np.pi * 0.015**3  # one layer holds one label a voxel
+    assert liver.volume == pytest.approx(whole - cut_out, rel=0.01)
+    low, high = liver.bounding_box
+    np.testing.assert_allclose(low, [-0.03, -0.07, -0.03], atol=1.5e-3)
+    np.testing.assert_allclose(high, [0.05, 0.03, 0.09], atol=1.5e-3)
+    tumour = read_tumour(path, label="lesion 1")
+    np.testing.assert_allclose(tumour.vertices.mean(axis=0), [0.02, -0.01, 0.03], atol=1e-3)
+    assert read_surface(path, label=1).volume == liver.volume
+    assert liver.notices == ()
+
+
+def test_a_label_map_in_nrrd_equals_that_in_nifti(tmp_path):
+    affine = np.diag([2.0, -2.0, 3.0, 1.0])
+    affine[:3, 3] = [-70, 60, -50]
+    nifti = label_map(tmp_path / "organ.nii", affine)
+    values = np.asarray(nibabel.load(nifti).dataobj)
+    fields = {"space": "RAS", "space directions": affine[:3, :3].T, "space origin": affine[:3, 3]}
+    nrrd.write(str(tmp_path / "organ.nrrd"), values, fields)
+    one, other = read_surface(nifti), read_surface(tmp_path / "organ.nrrd")
+    np.testing.assert_allclose(other.vertices, one.vertices, atol=1e-12)
+    np.testing.assert_array_equal(other.faces, one.faces)
+    refused(tmp_path / "organ.nrrd", "labels present: 1, without names", label="liver")
+    (notice,) = read_surface(nifti, axes="LPS").notices
+    assert "label map" in notice and "SPACE" not in notice
+
+
+def test_a_segmentation_that_cannot_be_read_says_why(tmp_path, monkeypatch):
+    values = np.ones((4, 4, 4), np.uint8)
+    nrrd.write(str(tmp_path / "nowhere.nrrd"), values, {"spacings": [1, 1, 1]})
+    refused(tmp_path / "nowhere.nrrd", "where its three axes point")
+    nrrd.write(str(tmp_path / "packed.nrrd"), values, {"encoding": "bzip2"})
+    refused(tmp_path / "packed.nrrd", "encoding bzip2")
+    nrrd.write(str(tmp_path / "parts.nhdr"), values)
+    (tmp_path / "parts.nhdr").rename(tmp_path / "parts.nrrd")
+    refused(tmp_path / "parts.nrrd", "in another file")
+    whole = segmentation(tmp_path / "whole.seg.nrrd", {"liver": 1, "lesion": 2, "vein": 3})
+    refused(whole, "the segment vein is empty", label="vein")
+    cut = tmp_path / "cut.seg.nrrd"
+    cut.write_bytes(whole.read_bytes()[:-400])
+    refused(cut, "bytes of voxels", label="liver")
+    monkeypatch.setattr(label_files, "MAX_LABEL_BYTES", 1000)
+    refused(whole, "crop it", label="liver")
+
+
+def test_voxels_of_no_organ_are_refused(tmp_path):
+    affine = np.diag([2.0, 2.0, 1e15, 1.0])  # the blur over them would take hours
+    nibabel.save(nibabel.Nifti1Image(np.ones((4, 4, 4), np.uint8), affine), tmp_path / "a.nii")
+    refused(tmp_path / "a.nii", "voxels of 2 x 2 x 1e+15 mm")
+
+
+def test_a_damaged_segmentation_is_refused_or_read(tmp_path):
+    """Bytes of the header, changed or cut: never another error, nor more memory than allowed."""
+    whole = segmentation(tmp_path / "whole.seg.nrrd", {"liver": 1, "lesion": 2}, 2).read_bytes()
+    head, path = whole.index(b"\n\n") + 2, tmp_path / "damaged.seg.nrrd"
+    rng, outcomes = np.random.default_rng(0), set()
+    for _ in range(200):
+        content = bytearray(whole)
+        for at in rng.integers(0, head, rng.integers(1, 4)):
+            content[at : at + rng.integers(0, 3)] = bytes([rng.integers(32, 127)])
+        path.write_bytes(content)
+        try:
+            vertices, _ = surface_files.parse(path, "liver")
+            outcomes.add("read" if len(vertices) else "empty")
+        except SurfaceError as error:
+            assert "\n" not in str(error)
+            outcomes.add("refused")
+    assert outcomes == {"read", "refused"}
+
+
+def test_label_map_is_bounded_before_it_is_loaded(tmp_path, monkeypatch):
+    path = label_map(tmp_path / "organ.nii.gz", np.diag([4.0, 4.0, 4.0, 1.0]))
+    monkeypatch.setattr(label_files, "MAX_LABEL_BYTES", 1000)
+    refused(path, "crop it")
+
+
+def dicom_segmentation(path: Path, tilt: float = 20.0) -> Path:
+    """A liver and a lesion as highdicom writes them, on oblique CT slices of 2 x 2 x 5 mm."""
+    pytest.importorskip("highdicom", reason="highdicom is missing: '.[dicom]'")
+    from highdicom.seg import Segmentation, SegmentDescription
+    from pydicom.dataset import Dataset, FileMetaDataset
+    from pydicom.sr.codedict import codes
+    from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+
+    rows, columns, slices = 110, 80, 40  # of y, x, z
+    turn = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+    origin = np.array([-90.0, -60.0, -90.0])  # LPS
+    study, series, frame = generate_uid(), generate_uid(), generate_uid()
+    images = []
+    for k in range(slices):
+        image = Dataset()
+        image.file_meta = FileMetaDataset()
+        image.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        image.SOPClassUID, image.SOPInstanceUID = CTImageStorage, generate_uid()
+        image.StudyInstanceUID, image.SeriesInstanceUID = study, series
+        image.FrameOfReferenceUID, image.Modality = frame, "CT"
+        image.PatientID = image.AccessionNumber = "1"
+        image.PatientName = "Drawn^Nobody"
+        image.PatientBirthDate = image.StudyDate = image.StudyTime = ""
+        image.PatientSex, image.StudyID, image.ReferringPhysicianName = "O", "1", ""
+        image.InstanceNumber, image.SeriesNumber = k + 1, 1
+        image.Rows, image.Columns, image.PixelSpacing = rows, columns, [2.0, 2.0]
+        image.SliceThickness, image.ImageOrientationPatient = 5.0, turn.T[:2].ravel().tolist()
+        image.ImagePositionPatient = (origin + 5.0 * k * turn[:, 2]).tolist()
+        image.BitsAllocated, image.BitsStored, image.HighBit = 16, 16, 15
+        image.SamplesPerPixel, image.PixelRepresentation = 1, 0
+        image.PhotometricInterpretation = "MONOCHROME2"
+        image.PixelData = bytes(2 * rows * columns)
+        images.append(image)
+    z, y, x = np.meshgrid(*map(np.arange, (slices, rows, columns)), indexing="ij")
+    world = origin + np.stack([2.0 * x, 2.0 * y, 5.0 * z], axis=-1) @ turn.T
+    world = world * [-1.0, -1.0, 1.0]  # RAS
+    sizes = {"liver": ([10, -20, 30], [40, 50, 60]), "lesion": ([10, 0, 30], [25, 20, 22])}
+    masks = [np.linalg.norm((world - c) / r, axis=-1) < 1 for c, r in sizes.values()]
+    about = [
+        SegmentDescription(
+            segment_number=n + 1,
+            segment_label=name,
+            segmented_property_category=codes.SCT.Organ,
+            segmented_property_type=codes.SCT.Liver,
+            algorithm_type="MANUAL",
+        )
+        for n, name in enumerate(sizes)
+    ]
+    Segmentation(
+        source_images=images,
+        pixel_array=np.stack(masks, axis=-1).astype(np.uint8),
+        segmentation_type="BINARY",
+        segment_descriptions=about,
+        series_instance_uid=generate_uid(),
+        series_number=2,
+        sop_instance_uid=generate_uid(),
+        instance_number=1,
+        manufacturer="drawn",
+        manufacturer_model_name="drawn",
+        software_versions="1",
+        device_serial_number="1",
+    ).save_as(path)
+    return path
+
+
+def test_a_dicom_segmentation_lies_in_the_patient(tmp_path):
+    path = dicom_segmentation(tmp_path / "organs.dcm")
+    refused(path, "liver (1), lesion (1)", "--label")
+    liver = read_surface(path, label="liver")
+    low, high = liver.bounding_box
+    np.testing.assert_allclose(0.5e3 * (low + high), [10, -20, 30], atol=2.0)
+    np.testing.assert_allclose(1e3 * (high - low), [80, 100, 120], atol=5.0)
+    assert liver.volume == pytest.approx(4 / 3 * np.pi * 0.04 * 0.05 * 0.06, rel=0.02)
+    assert liver.notices == ()  # one body, in known axes
+    lesion = read_tumour(path, label="lesion")
+    np.testing.assert_allclose(1e3 * lesion.vertices.mean(axis=0), [10, 0, 30], atol=1.0)
+    assert lesion.volume == pytest.approx(4 / 3 * np.pi * 0.025 * 0.020 * 0.022, rel=0.05)
+
+
+def test_other_dicom_files_are_refused(tmp_path, monkeypatch):
+    path = dicom_segmentation(tmp_path / "organs.dcm")
+    content = path.read_bytes()
+    (tmp_path / "cut.dcm").write_bytes(content[: len(content) // 3])
+    refused(tmp_path / "cut.dcm", "cut.dcm", label="liver")
+    (tmp_path / "no.dcm").write_bytes(b"nothing of the kind")
+    refused(tmp_path / "no.dcm", "not a readable DCM file")
+    from pydicom import dcmread
+
+    image = dcmread(path)
+    image.Modality = "CT"
+    image.save_as(tmp_path / "image.dcm")
+    refused(tmp_path / "image.dcm", "no segmentation")
+    monkeypatch.setattr(label_files, "MAX_LABEL_BYTES", 1000)
+    refused(path, "crop it", label="liver")
+
+
+def test_what_was_cut_out_of_the_organ_is_filled_by_its_labels(tmp_path):
+    """In one layer a lesion's voxels are no longer the liver's."""
+    path = segmentation(tmp_path / "a.seg.nrrd", {"Liver": 1, "lesion": 2})
+    assert labels_of(path) == ("Liver", "lesion")
+    whole = 4 / 3 * np.pi * 0.04 * 0.05 * 0.06
+    hollow, filled = (read_surface(path, label="Liver", inside=i) for i in ((), ("lesion",)))
+    assert hollow.volume == pytest.approx(whole - 4 / 3 * np.pi * 0.015**3, rel=0.01)
+    assert filled.volume == pytest.approx(whole, rel=0.01)
+    refused(path, "Liver (1), lesion (2)", label="Liver", inside=("vein",))
+
+
+def test_numbers_of_a_map_without_names_are_offered_and_an_image_has_none(tmp_path):
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = [-70, -100, -50]
+    assert labels_of(label_map(tmp_path / "organs.nii", affine, labels=(3, 7))) == ("3", "7")
+    grey = np.arange(1000, dtype=np.int16).reshape(10, 10, 10)
+    nibabel.save(nibabel.Nifti1Image(grey, affine), tmp_path / "ct.nii")
+    with pytest.raises(SurfaceError, match="an image, not a label map"):
+        labels_of(tmp_path / "ct.nii")

@@ -1,0 +1,369 @@
+"""Contact sites: resolved contacts in a certificate, and the error that is said after them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from avatar_core.cli import picture
+from avatar_core.contact.effects.tip_law import LAW_ERROR, UNSHIFTED
+from avatar_core.contact.model import estimate_error, prepare, step
+from avatar_core.errors import ContactError, CoordinateError, MeshError, StorageError
+from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.patch_loads import load_surface
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
+from avatar_core.offline import pipeline
+from avatar_core.offline.certify import contact_sites
+from avatar_core.offline.certify.contact_sites import (
+    LEAST_FACTOR,
+    Site,
+    SiteContact,
+    law_factor,
+    summarized,
+    with_contact_sites,
+)
+from avatar_core.offline.linear import build_vademecum
+from avatar_core.offline.pipeline import OrganOptions
+from avatar_core.offline.rule import BuildRule
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.vademecum import storage
+from avatar_core.vademecum.certificate import Certificate, ContactSites
+from avatar_core.vademecum.force_error import PROMISED, ForceError
+from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.core.cli.test_cli import run, write_obj
+from tests.core.conftest import box_mesh, box_regions
+from tests.helpers.box_organ import UP, organ
+
+SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
+FOUND = ContactSites(36, 3, 0.04, 0.1, 0.15, 0.92, 3.1, 1.4)
+Compared = Callable[..., Iterator[list[SiteContact]]]
+
+
+def contact(force: float, patch: float, law: float, site: Site = SITE) -> SiteContact:
+    """A contact whose resolved force is 2 N; the patch's and the law's part of its error [N]."""
+    return SiteContact(site, 3e-3, 1e-3, 2.0, force, 0.0, patch + law, law, 6.0, 1.0, 0.05)
+
+
+@pytest.fixture(scope="module")
+def box() -> Vademecum:
+    """A small box with a handful of modes, and a certificate."""
+    mesh = box_mesh(4)
+    regions = box_regions(mesh)
+    elasticity = Elasticity(mesh, Material(), regions.clamped, "P1")
+    vademecum = build_vademecum(
+        "box",
+        elasticity,
+        regions,
+        load_surface(mesh, regions),
+        BuildRule(tolerance=0.9, max_modes=10),
+        Provenance("box", ""),
+    )
+    known = replace(Certificate.unknown(), force_error=ForceError(1.0, 0.02))
+    return vademecum.with_certificate(known)
+
+
+def outline(vademecum: Vademecum) -> SurfaceMesh:
+    """The boundary of the organ's mesh."""
+    return SurfaceMesh(
+        vademecum.mesh.vertices[vademecum.mesh.surface_vertices], vademecum.surface_faces
+    )
+
+
+def certified(vademecum: Vademecum, found: ContactSites) -> Vademecum:
+    return vademecum.with_certificate(
+        replace(vademecum.certificate or Certificate.unknown(), contact_sites=found)
+    )
+
+
+# --- The error that is said ----------------------------------------------------------------------
+
+
+def pressed(vademecum: Vademecum) -> tuple[float, float, float]:
+    """Force on a sphere 2 mm deep, the error that is said, and sqrt(D) there."""
+    tip = Tip("sphere", 5e-3)
+    model = prepare(vademecum, (tip,), cloud="off", effects=())
+    centre = np.array([0.05, 0.1, 0.05])
+    for depth in (-1e-3, 2e-3):
+        step(model, (centre + (tip.offset - depth) * UP)[None])
+    estimate_error(model)
+    force = float(np.linalg.norm(model.out.force[0]))
+    return (force, float(model.out.force_error[0]), float(abs(model.state.steepness[0] - 1.0)))
+
+
+def test_the_factor_scales_the_laws_part_of_the_error_that_is_said(box: Vademecum) -> None:
+    force, once, steeper = pressed(box)
+    same, thrice, _ = pressed(certified(box, replace(FOUND, factor=3.0)))
+    assert force == same > 0.0
+    law = force * (LAW_ERROR + steeper)
+    assert thrice - once == pytest.approx(2.0 * law, rel=1e-5)
+
+
+def test_an_older_file_says_more_error(box: Vademecum) -> None:
+    """It does not know the surface around a ball."""
+    force, said, steeper = pressed(box)
+    older = replace(box, tip_field=box.tip_field._replace(shift=None))
+    law = force * (LAW_ERROR + steeper)
+    assert pressed(older)[1] - said == pytest.approx((UNSHIFTED - 1.0) * law, rel=1e-3)
+
+
+def test_an_organ_without_contact_sites_says_the_same_error_as_with_the_factor_one(
+    box: Vademecum,
+) -> None:
+    assert pressed(box) == pressed(certified(box, replace(FOUND, factor=1.0)))
+
+
+@pytest.mark.parametrize("scale", [0.3, 5.0])
+def test_the_factor_covers_nine_in_ten_contacts_and_hardly_more(scale: float) -> None:
+    """Both where the error said before was too small, and where it was too large."""
+    rng = np.random.default_rng(1)
+    contacts = [contact(2.0 + scale * e, 0.02, 0.1) for e in rng.normal(0.0, 0.1, 300)]
+    found = summarized(contacts, law_factor(contacts))
+    assert PROMISED <= found.coverage <= PROMISED + 0.02 or found.factor == LEAST_FACTOR
+    assert (found.factor > 1.0) == (scale > 1.0)
+
+
+def test_a_few_contacts_that_are_met_by_luck_leave_half_of_the_laws_error() -> None:
+    assert law_factor([contact(2.0, 0.1, 0.1)] * 5) == LEAST_FACTOR
+
+
+def test_key_figures_are_those_of_the_contacts() -> None:
+    other = replace(SITE, kind="ridge")
+    contacts = [contact(2.2, 0.1, 0.05), contact(2.1, 0.1, 0.05), contact(2.0, 0.0, 0.1, other)]
+    found = summarized(contacts)
+    assert (found.n_contacts, found.n_places, found.factor) == (3, 2, 1.0)
+    assert found.mean == pytest.approx(0.05)
+    assert found.worst == pytest.approx(0.1)
+    assert found.p95 == pytest.approx(0.095)
+    assert found.coverage == pytest.approx(2 / 3)  # 2.2 N is 0.2 N off and says 0.15 N
+    assert found.overestimate == pytest.approx(1.5)
+    assert summarized(contacts, 2.1).coverage == 1.0
+
+
+# --- Places that cannot be resolved --------------------------------------------------------------
+
+
+def met(fails: Sequence[str] = ()) -> Compared:
+    """In place of resolved contacts: 4 % off, or no mesh at places of some kinds."""
+
+    def compared(*arguments: Any) -> Iterator[list[SiteContact]]:
+        (site,) = arguments[2]
+        if site.kind in fails:
+            raise MeshError("too large")
+        yield [contact(2.08, 0.02, 0.04, site) for _ in range(12)]
+
+    return compared
+
+
+def test_places_that_cannot_be_resolved_are_counted_in_a_notice(
+    box: Vademecum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contact_sites, "compared", met(fails=["ridge", "hollow"]))
+    seen: list[tuple[str, float]] = []
+    found = with_contact_sites(box, outline(box), 5, 0, lambda *said: seen.append(said[:2]))
+    assert found.certificate is not None
+    sites = found.certificate.contact_sites
+    assert (sites.n_places, sites.n_contacts) == (3, 36)
+    assert sites.mean == pytest.approx(0.04)
+    assert sites.coverage == 1.0
+    (notice,) = found.provenance.notices
+    assert "2 that could not be resolved" in notice and "too large" in notice
+    assert [stage for stage, _ in seen] == ["contacts"] * 6
+    assert [fraction for _, fraction in seen] == pytest.approx(np.linspace(0.0, 1.0, 6))
+
+
+def test_an_organ_none_of_whose_places_can_be_resolved_has_no_figures(
+    box: Vademecum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contact_sites, "compared", met(fails=["drawn", "ridge", "hollow"]))
+    found = with_contact_sites(box, outline(box), 3, 0)
+    assert found.certificate is not None
+    assert repr(found.certificate.contact_sites) == repr(ContactSites())  # NaN differs from NaN
+    assert "3 that could not be resolved" in found.provenance.notices[0]
+
+
+def test_poses_that_the_step_refuses_are_counted_in_a_notice(
+    box: Vademecum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compared(*arguments: Any) -> Iterator[list[SiteContact]]:
+        yield [contact(force, 0.1, 0.1, arguments[2][0]) for force in (2.0, float("nan"))]
+
+    monkeypatch.setattr(contact_sites, "compared", compared)
+    found = with_contact_sites(box, outline(box), 3, 0)
+    assert found.certificate is not None
+    assert found.certificate.contact_sites.n_contacts == 3
+    assert "3 poses" in found.provenance.notices[0]
+
+
+@pytest.mark.parametrize("n", [-1, 1, 2])
+def test_too_few_places_are_refused(n: int) -> None:
+    with pytest.raises(ContactError, match="at least 3"):
+        OrganOptions(n_contact_sites=n)
+
+
+def test_several_materials_are_refused() -> None:
+    with pytest.raises(CoordinateError, match="one linear material"):
+        OrganOptions(n_contact_sites=3, coordinates=(Coordinate.parse("poisson=0.40:0.49"),))
+    with pytest.raises(CoordinateError, match="one linear material"):
+        OrganOptions(n_contact_sites=3, large="neo-hookean")
+
+
+# --- Files ---------------------------------------------------------------------------------------
+
+
+def test_a_file_gives_back_the_contact_sites(box: Vademecum, tmp_path: Path) -> None:
+    save_vademecum(certified(box, FOUND), tmp_path / "a.h5")
+    again = load_vademecum(tmp_path / "a.h5")
+    assert again.certificate is not None
+    assert again.certificate.contact_sites == FOUND
+    assert pressed(again) == pressed(certified(box, FOUND))
+
+
+def _stored_as(
+    monkeypatch: pytest.MonkeyPatch, changed: Callable[[dict[str, Any]], dict[str, Any]]
+) -> None:
+    whole = storage._certificate_attribute
+
+    def attribute(certificate: Certificate | None) -> dict[str, Any]:
+        return changed(whole(certificate) or {})
+
+    monkeypatch.setattr(storage, "_certificate_attribute", attribute)
+
+
+def test_a_file_without_contact_sites_still_loads(
+    box: Vademecum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As all files written before there were any."""
+    _stored_as(
+        monkeypatch,
+        lambda plain: {key: value for key, value in plain.items() if key != "contact_sites"},
+    )
+    save_vademecum(box, tmp_path / "a.h5")
+    again = load_vademecum(tmp_path / "a.h5")
+    assert again.certificate is not None
+    assert again.certificate.contact_sites.n_contacts == 0
+    assert pressed(again) == pressed(box)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0, float("nan"), float("inf")])
+def test_a_factor_that_is_none_is_refused(
+    box: Vademecum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float
+) -> None:
+    _stored_as(
+        monkeypatch,
+        lambda plain: plain | {"contact_sites": plain["contact_sites"] | {"factor": factor}},
+    )
+    save_vademecum(box, tmp_path / "a.h5")
+    with pytest.raises(StorageError, match="build the file again"):
+        load_vademecum(tmp_path / "a.h5")
+
+
+# --- The command ---------------------------------------------------------------------------------
+
+
+def test_the_command_resolves_contacts_and_says_what_it_left_out(
+    box: Vademecum,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setattr(contact_sites, "compared", met(fails=["ridge"]))
+    monkeypatch.setattr(pipeline, "tetrahedralize", lambda *_: box.mesh)
+    monkeypatch.setattr("avatar_core.contact.timing.timed", lambda _, curve, **__: curve)
+    write_obj(tmp_path / "box.obj", outline(box).vertices, outline(box).faces)
+    source, file = [tmp_path / "box.obj", "--unit", "m"], tmp_path / "v.h5"
+    small = ["--modes", "10", "--certify", "5", "--element", "P1", "--tolerance", "0.9"]
+    asked = ["--contact-sites", "4"]
+    assert run(monkeypatch, "vademecum", *source, "-o", file, *small, *asked) == 0
+    said = capsys.readouterr()
+    assert "notice: contact sites: left out 1 that could not be resolved" in said.err
+    assert "36 resolved contacts at 3 places" in said.out
+    assert run(monkeypatch, "show", file, "--json") == 0
+    stored = json.loads(capsys.readouterr().out)["certificate"]["contact_sites"]
+    assert stored["n_contacts"] == 36
+    assert stored["mean"] == pytest.approx(0.04)
+
+
+def test_show_prints_contact_sites_and_what_the_force_is_of(
+    box: Vademecum,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    save_vademecum(certified(box, FOUND), tmp_path / "a.h5")
+    save_vademecum(box, tmp_path / "b.h5")
+    assert run(monkeypatch, "show", tmp_path / "a.h5") == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "36 resolved contacts at 3 places" in shown and "covers 92%" in shown
+    assert "4.00% 15.00% (95 % below 10.00%)" in shown
+    assert "rigid, frictionless tip" in shown
+    assert run(monkeypatch, "show", tmp_path / "b.h5") == 0
+    assert "contact sites: none" in capsys.readouterr().out
+
+
+# --- The picture ---------------------------------------------------------------------------------
+
+
+def test_the_picture_compares_the_step_hertz_and_resolved_contact(
+    box: Vademecum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = np.arange(1.0, 6.0)
+    monkeypatch.setattr(
+        picture, "contacts_at", lambda *_, **__: SimpleNamespace(forces=truth[None])
+    )
+    place = np.array([[0.05, 0.1, 0.05]])
+    (site,) = contact_sites.nearest_sites(box, outline(box), place)
+    curve = picture.force_curve(box, outline(box), site, prepare(box, (picture.TIP,)))
+    stiffness = box.material.young_modulus / (1.0 - box.material.poisson_ratio**2)
+    assert curve.depth[-1] == 5e-3
+    assert curve.hertz[-1] == pytest.approx(4 / 3 * stiffness * np.sqrt(5e-3 * 5e-3**3))
+    assert curve.force[0] == pytest.approx(0.0, abs=1e-6)
+    assert (np.diff(curve.force) > 0.0).all() and (curve.error[1:] > 0.0).all()
+    assert (curve.force[1:] < curve.hertz[1:]).all()  # the box gives way besides
+    assert curve.misses(np.interp(curve.depth, picture.RESOLVED, 1.1 * truth)) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("resolved", [True, False])
+def test_the_picture_is_drawn_with_resolved_contact_or_without(
+    box: Vademecum,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    resolved: bool,
+) -> None:
+    def contacts_at(*_: Any, **__: Any) -> Any:
+        if not resolved:
+            raise MeshError("too large")
+        return SimpleNamespace(forces=np.ones((1, 5)))
+
+    monkeypatch.setattr(picture, "contacts_at", contacts_at)
+    picture.palpation_picture(box, outline(box), tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
+    assert ("too large" in capsys.readouterr().err) != resolved
+
+
+# --- Resolved contacts ---------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_resolved_contacts_on_a_cube_are_met_and_covered() -> None:
+    """Where the step agrees with Sneddon, it agrees with contacts resolved around it too."""
+    cube = organ("cube").with_certificate(
+        replace(Certificate.unknown(), force_error=ForceError(1.0, 0.01))
+    )
+    found = with_contact_sites(cube, outline(cube), 2, 1)
+    assert found.certificate is not None
+    assert found.provenance.notices == ()
+    sites = found.certificate.contact_sites
+    assert (sites.n_contacts, sites.n_places) == (24, 2)
+    assert sites.mean < 0.02
+    assert sites.worst < 0.06
+    assert sites.coverage >= PROMISED

@@ -1,0 +1,338 @@
+"""Coordinates: ranges, nodes, weights; a vademecum over materials against full finite elements."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar_core.contact.effects import Tumour
+from avatar_core.contact.model import Status, prepare, step
+from avatar_core.contact.tool_path import inner_positions, palpation
+from avatar_core.errors import CoordinateError, MaterialError, SceneError, SurfaceError
+from avatar_core.fem import patch_loads as loads
+from avatar_core.fem.elasticity import Elasticity, Inclusion, Material
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tumour import volume_fraction_inside
+from avatar_core.offline.certify.linear import certify
+from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.offline.rule import BuildRule
+from avatar_core.reduction.coordinates import Coordinate, node_values, node_weights, problem_at
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.helpers.soft_organ import CONTRAST, POISSON, ball, soft_organ, soft_tumour
+
+
+@pytest.fixture(scope="module")
+def tumour() -> SurfaceMesh:
+    return soft_tumour()
+
+
+@pytest.fixture(scope="module")
+def organ() -> Vademecum:
+    return soft_organ()
+
+
+@pytest.fixture(scope="module")
+def problem(organ: Vademecum, tumour: SurfaceMesh) -> Elasticity:
+    inclusion = Inclusion(volume_fraction_inside(organ.mesh, tumour), 1.0)
+    return Elasticity(organ.mesh, Material(), organ.regions.clamped, "P2", inclusion)
+
+
+# --- ranges and weights -----------------------------------------------------------------------
+
+
+def test_nodes_span_the_range_and_their_weights_interpolate() -> None:
+    for coordinate in (POISSON, CONTRAST):
+        assert coordinate.nodes[0] == coordinate.low
+        assert coordinate.nodes[-1] == coordinate.high
+        for k, node in enumerate(coordinate.nodes):
+            np.testing.assert_allclose(
+                coordinate.weights(node), np.eye(coordinate.n_nodes)[k], atol=1e-12
+            )
+        between = coordinate.weights(coordinate.value_at(0.3))
+        assert between.min() >= 0.0
+        assert between.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "n_nodes"),
+    [
+        ("poisson=0.45:0.48", 2),
+        ("poisson=0.40:0.49", 2),
+        ("poisson=0.40:0.499", 3),
+        ("contrast=0.5:20", 3),
+        ("contrast=0.5:20:5", 5),
+    ],
+)
+def test_a_wider_range_gets_more_nodes_unless_they_are_given(text: str, n_nodes: int) -> None:
+    assert Coordinate.parse(text).n_nodes == n_nodes
+
+
+def test_weights_of_several_coordinates_find_their_node() -> None:
+    both = (POISSON, CONTRAST)
+    for k, values in enumerate(node_values(both)):
+        assert node_weights(both, values)[k] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("poisson", "write NAME=LOW:HIGH"),
+        ("poisson=0.4:high", "write NAME=LOW:HIGH"),
+        ("poisson=0.49:0.40", "LOW < HIGH"),
+        ("poisson=0.40:0.5", "HIGH <= 0.4999"),
+        ("contrast=0:20", "0.01 <= LOW"),
+        ("colour=1:2", "unknown"),
+        ("poisson=0.40:0.49:1", "at least 2 nodes"),
+        ("poisson=nan:0.49", "LOW < HIGH"),
+    ],
+)
+def test_a_bad_coordinate_is_refused(text: str, reason: str) -> None:
+    with pytest.raises(CoordinateError, match=reason):
+        Coordinate.parse(text)
+
+
+# --- the stiffness is affine ------------------------------------------------------------------
+
+
+def test_stiffness_is_the_sum_of_its_terms(problem: Elasticity) -> None:
+    here = problem.at(Material(0.2e6, 0.45), 7.0)
+    u = np.random.default_rng(0).standard_normal((3 * problem.n_nodes, 2))
+    terms = [theta * here.apply_term(q, u) for q, theta in enumerate(here.factors)]
+    np.testing.assert_allclose(sum(terms), here.stiffness @ u, rtol=1e-9)
+
+
+def test_an_inclusion_that_is_everything_scales_the_stiffness(problem: Elasticity) -> None:
+    everywhere = Inclusion(np.ones(len(problem.mesh.tets)), 3.0)
+    clamped = np.zeros(len(problem.mesh.boundary_faces), bool)
+    stiff = Elasticity(problem.mesh, Material(), clamped, "P2", everywhere).stiffness
+    plain = Elasticity(problem.mesh, Material(), clamped, "P2").stiffness
+    assert abs(stiff - 3.0 * plain).max() < 1e-9 * abs(plain).max()
+
+
+def test_the_share_inside_a_ball_is_its_volume(organ: Vademecum, tumour: SurfaceMesh) -> None:
+    share = volume_fraction_inside(organ.mesh, tumour)
+    assert share.min() >= 0.0
+    assert share.max() <= 1.0
+    assert share @ organ.mesh.tet_volumes == pytest.approx(tumour.volume, rel=0.03)
+
+
+# --- the vademecum over materials -------------------------------------------------------------
+
+
+def test_the_certificate_holds_over_the_range(organ: Vademecum) -> None:
+    c = organ.certificate
+    assert c is not None
+    assert c.l2_mean < 0.05
+    assert c.contact_mean < 0.03
+
+
+@pytest.mark.parametrize("k", range(3))
+def test_unseen_values_agree_with_full_finite_elements(
+    organ: Vademecum, problem: Elasticity, k: int
+) -> None:
+    rng = np.random.default_rng(100 + k)
+    values = {c.name: c.value_at(rng.random()) for c in (POISSON, CONTRAST)}
+    c = certify(at_values(organ, values), problem_at(problem, values), 25, k)
+    assert c.l2_mean < 0.05
+    assert c.l2_worst < 0.12
+    assert c.contact_mean < 0.03
+
+
+@pytest.mark.long
+def test_too_few_modes_are_said_not_to_converge(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loads, "MIDPOINTS_FROM", 1.0)  # fewer load positions
+    rule = BuildRule(max_modes=5)
+    options = OrganOptions(
+        n_vertices=400, rule=rule, coordinates=(Coordinate("poisson", 0.45, 0.48),), n_certified=8
+    )
+    found = build(phantom_liver(12e-3), options)
+    assert found.n_modes == 5
+    assert not found.convergence.converged
+
+
+def test_at_a_node_the_contact_is_exact_at_the_load_positions(
+    organ: Vademecum, problem: Elasticity
+) -> None:
+    values = {"poisson": float(POISSON.nodes[1]), "contrast": float(CONTRAST.nodes[2])}
+    c = certify(at_values(organ, values), problem_at(problem, values), 5)
+    assert c.vertex_contact_worst < 1e-4
+
+
+def test_the_values_matter(organ: Vademecum, problem: Elasticity) -> None:
+    """Against a problem with another contrast the same vademecum is wrong."""
+    values = {"poisson": 0.45, "contrast": 10.0}
+    here = at_values(organ, values)
+    right = certify(here, problem_at(problem, values), 25).l2_mean
+    wrong = certify(here, problem_at(problem, {**values, "contrast": 1.0}), 25).l2_mean
+    assert wrong > 2.0 * right
+
+
+def test_young_modulus_divides_every_displacement(organ: Vademecum) -> None:
+    softer = at_values(organ, {"young": organ.material.young_modulus / 2.0})
+    where = np.array([3]), np.ones(1)
+    np.testing.assert_allclose(
+        softer.displacement(*where), 2.0 * organ.displacement(*where), rtol=1e-4, atol=1e-10
+    )
+    np.testing.assert_allclose(softer.compliance(*where), 2.0 * organ.compliance(*where), rtol=1e-4)
+    again = at_values(softer, {"poisson": organ.material.poisson_ratio})
+    np.testing.assert_allclose(again.compliance(*where), softer.compliance(*where), rtol=1e-4)
+
+
+def test_contact_stays_positive_definite_between_the_nodes(organ: Vademecum) -> None:
+    rng = np.random.default_rng(4)
+    n = organ.surface.n_positions
+    for values in ({"poisson": 0.33, "contrast": 0.8}, {"poisson": 0.478, "contrast": 6.0}):
+        here = at_values(organ, values)
+        scale = here.compliance(np.array([0]), np.ones(1)).trace()
+        for _ in range(40):
+            active = rng.choice(n, 12, replace=False)
+            matrix = np.block(
+                [[here.compliance(*_point(i), *_point(j)) for j in active] for i in active]
+            )
+            np.testing.assert_allclose(matrix, matrix.T, atol=1e-6 * scale)
+            assert np.linalg.eigvalsh(matrix).min() > 0.0
+
+
+def _point(position: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([position]), np.ones(1)
+
+
+def test_a_stiffer_organ_pushes_back_harder(organ: Vademecum) -> None:
+    force = []
+    for values in ({"young": 0.1e6}, {"young": 0.3e6}):
+        model = prepare(at_values(organ, values), (Tip("sphere", 5e-3),))
+        path = palpation(organ, 5e-3, 4e-3, 9)
+        step(model, path[4][None])
+        force.append(np.linalg.norm(model.out.force))
+    assert force[1] == pytest.approx(3.0 * force[0], rel=1e-3)
+
+
+def test_a_hard_inclusion_is_felt(
+    organ: Vademecum, problem: Elasticity, tumour: SurfaceMesh
+) -> None:
+    """The force rises over the tumour as full finite elements say, and only if the scene has it.
+
+    Of the patch, which full finite elements are loaded by.
+    """
+    surface = organ.surface
+    distance = np.linalg.norm(surface.centers - tumour.vertices.mean(axis=0), axis=1)
+    j = min(inner_positions(organ), key=lambda i: distance[i])
+    tip = (surface.centers[j] + 1e-3 * surface.normals[j])[None]  # 4 mm deep
+    felt, full = [], []
+    for contrast in (1.0, 10.0):
+        effects = (Tumour(contrast),) if contrast != 1.0 else ()
+        model = prepare(organ, (Tip("patch", 5e-3),), cloud="off", effects=effects)
+        assert step(model, tip) == Status.OK
+        felt.append(model.state.force[0])
+        here = problem_at(problem, {"poisson": organ.material.poisson_ratio, "contrast": contrast})
+        load = patch_loads(here, surface.centers[[j]], surface.patch_radius) @ surface.normals[j]
+        full.append(1.0 / float(load @ here.solve(load[:, None])[:, 0]))
+    assert full[1] > 1.2 * full[0]
+    assert felt[1] / felt[0] == pytest.approx(full[1] / full[0], rel=0.05)
+
+
+def test_a_tumour_that_no_file_has_is_refused(organ: Vademecum) -> None:
+    with pytest.raises(SceneError, match="--tumour FILE"):
+        prepare(replace(organ, parametric=None, contrast=None), effects=(Tumour(5.0),))
+    with pytest.raises(SceneError, match=r"contrast is 50, the vademecum holds 0\.5 to 10"):
+        prepare(organ, effects=(Tumour(50.0),))
+
+
+def test_tips_stay_in_contact_when_the_material_changes(organ: Vademecum) -> None:
+    before = prepare(organ, (Tip("sphere", 5e-3),))
+    path = palpation(organ, 5e-3, 15e-3, 400)
+    for tip in path[:200]:
+        step(before, tip[None].copy())
+    assert before.out.force.any()
+    after = prepare(at_values(organ, {"young": 0.3e6}), (Tip("sphere", 5e-3),))
+    after.resume(before)
+    step(after, path[200][None].copy())
+    assert np.linalg.norm(after.out.force) > np.linalg.norm(before.out.force)
+
+
+def test_it_is_read_as_it_was_written(organ: Vademecum, tmp_path: Path) -> None:
+    save_vademecum(organ, tmp_path / "organ.h5")
+    read = load_vademecum(tmp_path / "organ.h5")
+    assert read.parametric is not None
+    assert read.parametric.coordinates == (POISSON, CONTRAST)
+    assert read.contrast == organ.contrast
+    values = {"poisson": 0.4, "contrast": 3.0}
+    one, other = at_values(read, values), at_values(organ, values)
+    np.testing.assert_allclose(
+        one.far.load @ one.far.load.T,
+        other.far.load @ other.far.load.T,
+        atol=1e-6 * float((other.far.load**2).sum(axis=1).max()),
+    )
+    np.testing.assert_array_equal(one.contact_near.block, other.contact_near.block)
+
+
+# --- what is refused --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "reason"),
+    [
+        ({"poisson": 0.2}, CoordinateError, "holds 0.3 to 0.49"),
+        ({"contrast": 11.0}, CoordinateError, "holds 0.5 to 10"),
+        ({"magnitude": 1.0}, CoordinateError, "no coordinate 'magnitude'"),
+        ({"young": -1.0}, MaterialError, "positive"),
+        ({"poisson": float("nan")}, CoordinateError, "holds"),
+    ],
+)
+def test_a_value_out_of_range_is_refused(
+    organ: Vademecum, values: dict[str, float], error: type[Exception], reason: str
+) -> None:
+    with pytest.raises(error, match=reason):
+        at_values(organ, values)
+
+
+def test_a_contrast_needs_a_tumour() -> None:
+    with pytest.raises(CoordinateError, match="--tumour"):
+        OrganOptions(coordinates=(CONTRAST,))
+
+
+def test_a_coordinate_given_twice_is_refused() -> None:
+    with pytest.raises(CoordinateError, match="twice"):
+        OrganOptions(coordinates=(POISSON, replace(POISSON, low=0.4)))
+
+
+@pytest.mark.parametrize(
+    ("where", "radius", "reason"), [(10.0, 0.02, "check its unit"), (0.0, 1.0, "tumour alone")]
+)
+def test_a_tumour_elsewhere_or_everywhere_is_refused(
+    organ: Vademecum, where: float, radius: float, reason: str
+) -> None:
+    with pytest.raises(SurfaceError, match=reason):
+        volume_fraction_inside(organ.mesh, ball(np.full(3, where), radius))
+
+
+def test_an_incompressible_organ_with_a_tumour_is_refused(organ: Vademecum) -> None:
+    inclusion = Inclusion(np.zeros(len(organ.mesh.tets)), 2.0)
+    with pytest.raises(MaterialError, match=r"0\.49"):
+        Elasticity(
+            organ.mesh, Material(poisson_ratio=0.499), organ.regions.clamped, None, inclusion
+        )
+
+
+@pytest.mark.long
+def test_towards_incompressibility_on_taylor_hood() -> None:
+    """Poisson's ratio up to 0.499, where the canonical separated form stagnates."""
+    options = OrganOptions(
+        n_vertices=800,
+        rule=BuildRule(max_modes=60),
+        coordinates=(Coordinate("poisson", 0.40, 0.499),),
+        n_certified=16,
+    )
+    found = build(phantom_liver(12e-3), options)
+    assert found.element == "Taylor-Hood"
+    assert found.certificate is not None
+    assert found.certificate.l2_mean < 0.05
+    assert found.certificate.contact_mean < 0.03

@@ -1,0 +1,428 @@
+"""Load magnitude as a coordinate: the series, what is stored of it, and contact with it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar_core.cli.vademecum import show_text
+from avatar_core.contact.effects import Friction, LargeDeformationEffect
+from avatar_core.contact.model import ContactModel, Status, prepare, step
+from avatar_core.contact.tool_path import inner_positions, middle_of_access
+from avatar_core.errors import ConvergenceError, MaterialError, SceneError
+from avatar_core.fem.elasticity import Material
+from avatar_core.fem.hyperelasticity import Hyperelasticity
+from avatar_core.fem.newton import NewtonRule, solve
+from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.geometry.tip import Tip
+from avatar_core.offline import pipeline as organ
+from avatar_core.offline.certify.combinations import (
+    COMBINATIONS,
+    CombinedRow,
+    mean_error,
+    push_errors,
+)
+from avatar_core.offline.certify.large_deformation import (
+    certify_large,
+    push_rows,
+    summary,
+    with_combinations,
+)
+from avatar_core.offline.large_deformation import LargeRule, economised, hyperelastic_problem
+from avatar_core.offline.pipeline import OrganOptions
+from avatar_core.offline.rule import silent
+from avatar_core.reduction.asymptotic_series import path_series
+from avatar_core.scene.model import REFUSED, Scene, combinations
+from avatar_core.vademecum import storage
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.large_deformation import LargeCertificate, hyperelastic, powers
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.core.contact.test_contact import carriers, energy_slope
+
+Box = Callable[[int], tuple[TetMesh, Regions]]
+RADIUS = 5e-3
+SPHERE, PATCH = Tip("sphere", RADIUS), Tip("patch", RADIUS)
+both = pytest.mark.parametrize("material", ["neo-hookean", "st-venant-kirchhoff"])
+
+
+@pytest.fixture()
+def model(bent: Vademecum) -> ContactModel:
+    return prepare(bent, (PATCH,), cloud="volume")
+
+
+def tip_at(v: Vademecum, depth: float, position: int) -> np.ndarray:
+    return (v.surface.centers[position] + (RADIUS - depth) * v.surface.normals[position])[None]
+
+
+# --- the series -------------------------------------------------------------------------------
+
+
+@both
+def test_series_of_order_k_leaves_an_error_of_order_k_plus_one(box: Box, material: str) -> None:
+    mesh, regions = box(3)
+    problem = Hyperelasticity(mesh, hyperelastic(material, Material(1e3, 0.4)), regions.clamped)
+    load = patch_loads(problem.linear, np.array([[0.05, 0.1, 0.05]]), 0.04)
+    load = load @ np.array([0.3, -1.0, 0.2])
+    terms = path_series(problem, load[:, None], 3)[:, :, 0]
+    error = []
+    for force in (0.1, 0.2):
+        exact = solve(problem, force * load, NewtonRule(tolerance=1e-12)).displacement
+        error.append(np.abs(exact - terms.T @ force ** np.arange(1, 4)).max())
+    assert np.log2(error[1] / error[0]) == pytest.approx(4.0, abs=0.35)
+
+
+def test_powers_go_on_tangentially() -> None:
+    np.testing.assert_allclose(powers(2.0, 3.0), [4.0, 8.0])
+    np.testing.assert_allclose(powers(3.5, 3.0), [9.0 + 6.0 * 0.5, 27.0 + 27.0 * 0.5])
+
+
+def test_economised_terms_stand_for_the_whole_series() -> None:
+    """As far from x^4 and x^5 as stated, and no farther, over the whole reach."""
+    reach, a = 0.02, np.linspace(1e-4, 0.02, 400)
+    for order, left in ((4, 0.0385), (5, 0.0754)):
+        terms = np.zeros((5, 1))
+        terms[order - 1] = reach**-order
+        kept = economised(terms, reach)[:, 0]
+        off = np.abs(kept[0] * a**2 + kept[1] * a**3 - (a / reach) ** order) / (a / reach)
+        assert off.max() == pytest.approx(left, rel=0.01)
+
+
+def test_unknown_material_is_refused() -> None:
+    with pytest.raises(MaterialError, match="neo-hookean"):
+        hyperelastic("rubber", Material())
+
+
+# --- what is stored ---------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(bent: Vademecum) -> None:
+    """There nothing is interpolated: what is left is of the terms and the modes.
+
+    Of the terms, the rule lets the deeper push, close to the reach, be wrong by its tolerance.
+    """
+    problem, surface = hyperelastic_problem(bent, "neo-hookean"), bent.surface
+    distance = np.linalg.norm(surface.centers - surface.centers[middle_of_access(bent)], axis=1)
+    for j in np.argsort(distance)[[0, 12]]:
+        triangle, corner = np.argwhere(surface.corners == j)[0]
+        point = tuple(np.eye(3)[corner])
+        rows, lost = push_rows(bent, problem, triangle, np.array([7e-3, 14e-3]), point)
+        assert not lost
+        for row in rows:
+            assert row.contact < (0.02 if row.depth < 10e-3 else LargeRule().tolerance)
+            assert row.contact < 0.3 * row.linear_contact
+            assert row.l2 < row.linear_l2
+
+
+@pytest.mark.long
+def test_certificate_speaks_of_pushes_within_the_range(bent: Vademecum) -> None:
+    certificate, rows = certify_large(bent, hyperelastic_problem(bent, "neo-hookean"), 2, seed=1)
+    inside = [row for row in rows if row.within]
+    assert certificate.n_pushes == len(inside)
+    assert certificate.l2_worst == max(row.l2 for row in inside)
+
+
+def test_a_small_push_is_the_linear_one(bent: Vademecum) -> None:
+    here = np.array([middle_of_access(bent)]), np.ones(1)
+    force, found = bent.push_to(*here, 1e-5)
+    plain, straight = replace(bent, large=None).push_to(*here, 1e-5)
+    assert force == pytest.approx(plain, rel=1e-3)
+    assert np.abs(found.displacement - straight.displacement).max() < 1e-8
+
+
+def test_a_stiffer_organ_takes_more_force_for_the_same_shape(bent: Vademecum) -> None:
+    here = np.array([middle_of_access(bent)]), np.ones(1)
+    stiff = at_values(bent, {"young": 3.0 * bent.material.young_modulus})
+    force, found = bent.push_to(*here, 12e-3)
+    three, same = stiff.push_to(*here, 12e-3)
+    assert three == pytest.approx(3.0 * force, rel=1e-4)
+    np.testing.assert_allclose(same.displacement, found.displacement, atol=1e-7)
+
+
+def test_a_depth_that_no_force_reaches_is_refused(bent: Vademecum) -> None:
+    """A depth of a - 50 a^2 / m has its maximum at 5 mm."""
+    assert bent.large is not None
+    depth = np.zeros_like(bent.large.depth)
+    depth[0] = -50.0
+    soft = replace(bent.large, depth=depth, reach=np.ones_like(bent.large.reach))
+    here = np.array([middle_of_access(bent)]), np.ones(1)
+    with pytest.raises(ConvergenceError, match="12 mm deep"):
+        replace(bent, large=soft).push_to(*here, 12e-3)
+
+
+def test_reach_shrinks_with_the_tolerance(straight: Vademecum, bent: Vademecum) -> None:
+    from avatar_core.offline.large_deformation import _follow
+
+    problem = hyperelastic_problem(straight, "st-venant-kirchhoff")
+    few = replace(
+        straight.surface, centers=straight.surface.centers[:4], normals=straight.surface.normals[:4]
+    )
+    strict = _follow(problem, few, LargeRule(tolerance=1e-3), silent).reach
+    loose = _follow(problem, few, LargeRule(tolerance=3e-2), silent).reach
+    assert (strict <= loose).all()
+    assert strict.mean() < 0.9 * loose.mean()
+    assert (bent.large is not None) and (bent.large.reach <= 20e-3 * 1.5).all()
+
+
+def test_a_file_keeps_it(bent: Vademecum, tmp_path: Path) -> None:
+    save_vademecum(bent, tmp_path / "bent.h5")
+    again = load_vademecum(tmp_path / "bent.h5")
+    assert bent.large is not None and again.large is not None
+    assert again.large.material == "neo-hookean"
+    for name in ("depth", "reach"):
+        np.testing.assert_array_equal(getattr(again.large, name), getattr(bent.large, name))
+    for name in ("region", "start", "space", "load"):
+        one, other = getattr(again.large.terms, name), getattr(bent.large.terms, name)
+        np.testing.assert_array_equal(one, other)
+
+
+# --- together with other effects --------------------------------------------------------------
+
+FIGURES = ("oblique_contact_mean", "two_tools_contact_mean", "gravity_contact_mean")
+
+
+def combined_rows(*errors: float) -> list[CombinedRow]:
+    """One push of each combination."""
+    pairs = zip(COMBINATIONS, errors, strict=True)
+    return [CombinedRow(name, 0, 10e-3, error, 1.0, True) for name, error in pairs]
+
+
+def certified(bent: Vademecum, certificate: LargeCertificate | None = None) -> Vademecum:
+    """With a certificate of no push, unless another is given."""
+    return bent.with_large_certificate(certificate or summary(bent, [], 0, 0))
+
+
+@pytest.mark.long
+def test_what_is_added_linearly_to_a_large_push_is_nearly_right(bent: Vademecum) -> None:
+    """Wrong by less than half; at three sites less than without the bending of each tip itself."""
+    shares: list[float] = []
+    problem = hyperelastic_problem(bent, "neo-hookean")
+    rows = push_errors(bent, problem, (5e-3,), 3, progress=shares.append)
+    assert [row.combination for row in rows] == 3 * list(COMBINATIONS)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    assert len(shares) > 27  # each Newton iteration says so
+    for row in rows:
+        assert row.within and row.depth == 5e-3
+        assert row.contact < 0.5
+    assert sum(row.contact for row in rows) < sum(row.linear_contact for row in rows)
+    found = with_combinations(summary(bent, [], 0, 0), rows)
+    means = [mean_error(rows, combination) for combination in COMBINATIONS]
+    assert [getattr(found, key) for key in FIGURES] == means
+
+
+def test_no_equilibrium_is_sought_beyond_the_range(bent: Vademecum) -> None:
+    assert bent.large is not None
+    short = replace(bent, large=replace(bent.large, reach=np.full_like(bent.large.reach, 1e-3)))
+    shares: list[float] = []
+    problem = hyperelastic_problem(bent, "neo-hookean")
+    assert push_errors(short, problem, (9e-3, 12e-3), 2, progress=shares.append) == []
+    np.testing.assert_allclose(shares, np.arange(1, 7) / 6)
+
+
+def test_figures_are_of_pushes_within_the_range() -> None:
+    rows = combined_rows(0.1, 0.2, 0.3)
+    beyond = [replace(row, contact=0.9, within=False) for row in rows]
+    for name, error in zip(COMBINATIONS, (0.1, 0.2, 0.3), strict=True):
+        assert mean_error(rows + beyond, name) == error
+        assert np.isnan(mean_error(beyond, name))
+
+
+@pytest.mark.parametrize(("n_pushed", "n_combined"), [(12, 2), (1, 1), (0, 0)])
+def test_a_build_measures_combinations_at_few_of_its_sites(
+    bent: Vademecum, monkeypatch: pytest.MonkeyPatch, n_pushed: int, n_combined: int
+) -> None:
+    """As deep as three quarters of what is aimed at, and the bar goes on without a jump back."""
+    asked: list[tuple[object, int]] = []
+
+    def pushed(vademecum, problem, n, depth, seed, progress):  # type: ignore[no-untyped-def]
+        progress(0.5, 0.04)
+        progress(1.0, 0.04)
+        return summary(vademecum, [], n, 0), ()
+
+    def combined(vademecum, problem, depths, n, seed, progress):  # type: ignore[no-untyped-def]
+        asked.append((depths, n))
+        progress(0.5)
+        progress(1.0)
+        return combined_rows(0.07, 0.08, 0.05)
+
+    monkeypatch.setattr(organ, "with_large_deformation", lambda *_: bent)
+    monkeypatch.setattr(organ, "certify_large", pushed)
+    monkeypatch.setattr(organ, "push_errors", combined)
+    shares: list[float] = []
+
+    def progress(stage: str, share: float, _: float) -> None:
+        assert stage == "push"
+        shares.append(share)
+
+    options = OrganOptions(large="neo-hookean", n_pushed=n_pushed)
+    found = organ._with_large(bent, options, progress).large
+    assert found is not None
+    if n_pushed == 0:
+        assert found.certificate is None and not asked
+        return
+    assert [getattr(found.certificate, key) for key in FIGURES] == [0.07, 0.08, 0.05]
+    ((depths, n_sites),) = asked
+    assert depths == pytest.approx([5e-3, 10e-3, 15e-3])
+    assert n_sites == n_combined
+    assert shares == sorted(shares) and shares[-1] == 1.0
+
+
+def test_a_file_keeps_what_was_measured_and_what_was_not(
+    bent: Vademecum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stored(certificate: LargeCertificate) -> list[float]:
+        save_vademecum(certified(bent, certificate), tmp_path / "bent.h5")
+        again = load_vademecum(tmp_path / "bent.h5").large
+        assert again is not None and again.certificate is not None
+        assert again.certificate.reach_least == certificate.reach_least
+        return [getattr(again.certificate, key) for key in FIGURES]
+
+    unmeasured = summary(bent, [], 0, 0)
+    measured = with_combinations(unmeasured, combined_rows(0.07, 0.08, 0.05))
+    assert stored(measured) == [0.07, 0.08, 0.05]
+    assert np.isnan(stored(unmeasured)).all()
+    whole = storage._large_attribute
+
+    def of_an_older_version(large):  # type: ignore[no-untyped-def]
+        attribute = whole(large)
+        return {
+            **attribute,
+            "certificate": {k: v for k, v in attribute["certificate"].items() if k not in FIGURES},
+        }
+
+    monkeypatch.setattr(storage, "_large_attribute", of_an_older_version)
+    assert np.isnan(stored(measured)).all()
+
+
+def test_show_tells_what_combinations_cost(
+    bent: Vademecum, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nan = float("nan")
+    rows = combined_rows(0.0712, nan, 0.0512)
+    show_text(certified(bent, with_combinations(summary(bent, [], 0, 0), rows)))
+    shown = capsys.readouterr().out
+    for line in (
+        r"30 degrees off the normal +7\.12%",
+        r"two tools 40 mm apart +not measured",
+        r"an organ under its weight +5\.12%",
+    ):
+        assert re.search(line, shown)
+
+
+def test_a_scene_is_refused_where_the_file_says_that_its_effects_combine_badly(
+    bent: Vademecum,
+) -> None:
+    scene = Scene(effects=(Friction(), LargeDeformationEffect()))
+    scene.require(certified(bent))  # not measured
+    for error in (REFUSED, 0.163):
+        figures = with_combinations(summary(bent, [], 0, 0), combined_rows(error, 0.9, 0.9))
+        vademecum = certified(bent, figures)
+        assert [one.error for one in combinations(scene, vademecum)] == [error]
+        if error == REFUSED:
+            scene.require(vademecum)
+            continue
+        with pytest.raises(SceneError, match=r"large_deformation with friction: .*16%.*15%"):
+            scene.require(vademecum)
+
+
+# --- contact ----------------------------------------------------------------------------------
+
+
+def test_a_patch_feels_the_bent_force(bent: Vademecum, model: ContactModel) -> None:
+    """As the file says at the load position, but for the smoothing of what a tip feels."""
+    middle = bent.surface.centers[middle_of_access(bent)]
+    distance = np.linalg.norm(bent.surface.centers - middle, axis=1)
+    for j in np.argsort(distance)[:8:2]:
+        model.reset()
+        step(model, tip_at(bent, 4e-3, j))
+        assert step(model, tip_at(bent, 15e-3, j)) in (Status.OK, Status.EXTRAPOLATED)
+        depth = -model.state.gap[0]
+        state = model.state
+        a = state.self_compliance[0] * state.force[0]
+        second, third = powers(a, model.effects.large_deformation.coefficient[0, 2])
+        felt = (
+            a
+            + model.effects.large_deformation.coefficient[0, 0] * second
+            + model.effects.large_deformation.coefficient[0, 1] * third
+        )
+        assert felt == pytest.approx(depth, rel=1e-6)
+
+
+def test_a_deep_push_is_as_right_as_a_light_one(bent: Vademecum, model: ContactModel) -> None:
+    """At all depths the step feels what the vademecum itself says of the load position.
+
+    A wider kernel would take the response of faces beside and behind into that of a deep tip,
+    which would then be too stiff.
+    """
+    ratio = []
+    for j in inner_positions(bent)[::4]:
+        row = []
+        for depth in (2e-3, 15e-3):
+            model.reset()
+            step(model, tip_at(bent, 1e-3, j))
+            step(model, tip_at(bent, depth, j))
+            own, _ = bent.push_to(np.array([j]), np.ones(1), -model.state.gap[0])
+            row.append(model.state.force[0] / own)
+        ratio.append(row)
+    light, deep = np.array(ratio).T
+    assert np.median(light) == pytest.approx(1.0, abs=0.03)
+    assert np.median(deep / light) == pytest.approx(1.0, abs=0.03)
+    assert np.quantile(np.abs(deep / light - 1.0), 0.8) < 0.1
+
+
+def test_cloud_is_the_bent_field(bent: Vademecum, model: ContactModel) -> None:
+    """Linear under the force, and bent as at the depth that the tip feels."""
+    v, state = bent, model.state
+    j = middle_of_access(v)
+    step(model, tip_at(v, 4e-3, j))
+    step(model, tip_at(v, 12e-3, j))
+    positions, weights = carriers(model)
+    linear = replace(v, large=None)
+    force = state.force[0] * state.scale[0]
+    # along the normal of the step, which is not quite that of the patch
+    straight = v.displacement(positions, weights) @ (-state.normal[0] * force)
+    felt = state.self_compliance[0] * state.force[0]
+    same = force * felt / linear.push(positions, weights, force).depth  # as deep, on the surface
+    bend = v.push(positions, weights, same).displacement
+    bend -= linear.push(positions, weights, same).displacement
+    error = np.linalg.norm(model.out.cloud[:, 3:].ravel() - straight - bend)
+    assert error < 0.02 * np.linalg.norm(straight + bend)
+    assert error < 0.3 * np.linalg.norm(bend)
+
+
+@pytest.mark.parametrize("share", [0.5, 1.8])
+def test_force_is_the_derivative_of_the_energy(bent: Vademecum, share: float) -> None:
+    """Within the stored range, and where it goes on tangentially."""
+    assert bent.large is not None
+    short = replace(bent, large=replace(bent.large, reach=np.full_like(bent.large.reach, 8e-3)))
+    model = prepare(short, (PATCH,), cloud="volume")  # the compiled step of the other tests
+    rng = np.random.default_rng(2)
+    for j in rng.choice(inner_positions(bent), 4):
+        model.reset()
+        step(model, tip_at(bent, 4e-3, j))
+        tip = tip_at(bent, share * 8e-3, j) + rng.uniform(-1e-3, 1e-3, 3)
+        status = step(model, tip)
+        assert status == (Status.OK if share < 1 else Status.EXTRAPOLATED)
+        force = model.out.force[0].copy()
+        slope = energy_slope(model, tip)
+        np.testing.assert_allclose(force, -slope, atol=2e-3 * np.linalg.norm(force))
+
+
+@pytest.mark.long
+def test_two_tips_stay_coupled(bent: Vademecum) -> None:
+    model = prepare(bent, (SPHERE,) * 2, cloud="off")
+    one, other = inner_positions(bent)[[0, 20]]
+    tips = np.vstack([tip_at(bent, 4e-3, one), tip_at(bent, 4e-3, other)])
+    assert step(model, tips) in (Status.OK, Status.EXTRAPOLATED)
+    both_forces = model.state.force.copy()
+    away = tips.copy()
+    away[1] += 1.0
+    step(model, away)
+    assert model.state.force[0] > both_forces[0]  # the other tip had moved this place already

@@ -1,0 +1,296 @@
+"""YAML of scenes: what it means, what is refused and how it is said."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from avatar_core.contact.effects import EFFECTS, Friction, Inertia, SeveralTools, Tumour
+from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Tip
+from avatar_core.scene.file import parse_scene, read_scene
+from avatar_core.scene.model import Scene, Tool
+from avatar_core.scene.yaml_lines import MAX_BYTES
+from tests.helpers.scene_cases import PRONY, refusal
+from tests.helpers.slowness import within
+
+# --- YAML: what it means --------------------------------------------------------------------------
+
+
+def test_every_key_arrives_where_it_belongs() -> None:
+    scene = parse_scene(
+        """
+name: needle probe
+text: >
+  one line of what
+  is to be seen
+organ: {vademecum: liver.h5}
+material: {young_modulus: 0.17e6, poisson_ratio: 0.45}
+tools:
+  - {name: left, tip: {shape: rounded_cone, radius: 4e-3, half_angle: 30, rounding: 1e-3}}
+  - name: right
+outputs: {cloud: off, cloud_divisor: 2, modes: 50}
+effects:
+  friction: {static: 0.5}
+  viscoelasticity: {g: [0.3, 0.25], tau: [0.5, 8]}
+  several_tools:
+""",
+        "x",
+    )
+    assert scene == Scene(
+        name="needle probe",
+        text="one line of what is to be seen",
+        vademecum="liver.h5",
+        young_modulus=0.17e6,
+        poisson_ratio=0.45,
+        tools=(
+            Tool("left", Tip("rounded_cone", 4e-3, 30.0, 1e-3)),
+            Tool("right", Tip("sphere", 5e-3)),
+        ),
+        cloud="off",
+        cloud_divisor=2,
+        modes=50,
+        effects=(Friction(static=0.5), PRONY, SeveralTools()),
+    )
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        "{friction: , inertia: {damping: 0.2}}",
+        "[friction, inertia: {damping: 0.2}]",
+        "\n  - friction:\n  - inertia:\n      damping: 0.2",
+        "\n  friction: {static: }\n  inertia: {damping: 2e-1, density: 1060}",
+    ],
+)
+def test_effects_may_be_a_list_or_a_mapping(effects: str) -> None:
+    assert parse_scene(f"effects: {effects}", "x").effects == (Friction(), Inertia(damping=0.2))
+
+
+@pytest.mark.parametrize("text", ["20e-3", "2.e-2", "0.02", ".02", "+20E-3"])
+def test_a_number_is_a_number_however_it_is_written(text: str) -> None:
+    (tool,) = parse_scene(f"tools: [{{tip: {{radius: {text}}}}}]", "x").tools
+    assert tool.tip == Tip("sphere", 0.02)
+    assert isinstance(tool.tip.radius, float)
+
+
+def test_a_whole_number_stays_one() -> None:
+    scene = parse_scene("outputs: {modes: 1e2, cloud_divisor: 010}", "x")
+    assert (scene.modes, scene.cloud_divisor) == (100, 10)
+    assert isinstance(scene.modes, int)
+
+
+def test_keys_with_nothing_after_them_keep_their_defaults() -> None:
+    assert parse_scene("name:\ntools:\noutputs: {modes: }\neffects: ~\nmaterial:", "x") == Scene()
+
+
+@pytest.mark.parametrize("effects", ["{tumour: }", "[tumour]", "{tumour: {contrast: }}"])
+def test_a_tumour_without_a_number_has_the_contrast_of_the_file(effects: str) -> None:
+    assert parse_scene(f"effects: {effects}", "x").effects == (Tumour(),)
+    assert Tumour().contrast is None
+
+
+def test_words_that_yaml_takes_for_other_things_stay_words() -> None:
+    scene = parse_scene("name: no\ntext: 2024-01-01\norgan: {vademecum: 1e3}", "x")
+    assert (scene.name, scene.text, scene.vademecum) == ("no", "2024-01-01", "1e3")
+
+
+# --- YAML: what is refused ------------------------------------------------------------------------
+
+TIP = "tools:\n- name: a\n  tip: {{{}}}\n"
+FRICTION = "name: a\neffects:\n  friction:\n    static: {}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "reasons"),
+    [
+        # no scene
+        ("", 1, ["is empty"]),
+        ("# nothing\n", 1, ["is empty"]),
+        ("---\n", 2, ["the scene is empty"]),
+        ("- a\n- b\n", 1, ["the scene is a list"]),
+        ("hello\n", 1, ["the scene is hello", "name, text"]),
+        # no YAML
+        ("name: a\ntext: [1, 2\neffects: x\n", 3, ["is not YAML"]),
+        ("name: a\n\ttext: b\n", 2, ["is not YAML"]),
+        ("name: a\ntext: 'b\n", 3, ["is not YAML"]),
+        ("name: a\n---\nname: b\n", 2, ["is not YAML", "another document"]),
+        ("name: a\ntext: \x07\n", 2, ["is not YAML"]),
+        # keys
+        ("name: a\nefects: []\n", 2, ["efects is unknown", "did you mean 'effects'?", "known: "]),
+        ("name: a\nzzz: 1\n", 2, ["zzz is unknown; known: name, text, organ"]),
+        ("name: a\nname: b\n", 2, ["name is given twice, first in line 1"]),
+        ("name: a\n? [x]\n: 1\n", 2, ["a list is unknown"]),
+        ("outputs:\n  cloud: off\n  mode: 5\n", 3, ["outputs.mode", "did you mean 'modes'?"]),
+        ("tools:\n  - {nam: a}\n", 2, ["tools[0].nam", "did you mean 'name'?"]),
+        ("effects:\n  fricton:\n", 2, ["effects.fricton", "did you mean 'friction'?", "inertia"]),
+        ("effects:\n- friction\n- frictoin\n", 3, ["did you mean 'friction'?"]),
+        ("effects:\n- friction\n- friction\n", 3, ["effects.friction is given twice"]),
+        ("effects:\n  friction:\n  friction:\n", 3, ["effects.friction is given twice"]),
+        ("effects:\n  friction:\n    sttic: 1\n", 3, ["friction.sttic", "'static'?"]),
+        ("effects:\n  several_tools: {n: 2}\n", 2, ["several_tools.n", "no settings"]),
+        # shapes
+        ("effects: friction\n", 1, ["effects is friction", "write a list: [large_deformation"]),
+        ("effects: [[friction]]\n", 1, ["effects holds a list"]),
+        ("effects: [{friction: , inertia: }]\n", 1, ["effects holds a mapping"]),
+        ("effects:\n  friction: 0.4\n", 2, ["friction is 0.4", "static, kinetic"]),
+        ("effects:\n  friction: false\n", 2, ["friction is false", "key: value"]),
+        ("effects:\n  large_deformation: true\n", 2, ["large_deformation is true", "no settings"]),
+        ("tools: {name: a}\n", 1, ["tools is a mapping", "write a list"]),
+        ("tools: [a]\n", 1, ["tools[0] is a", "name, tip"]),
+        ("organ: liver.h5\n", 1, ["organ is liver.h5", "vademecum"]),
+        ("name: [a]\n", 1, ["name is a list", "one line of text"]),
+        ("text: |\n  a\n  b\n", 1, ["text must be one line"]),
+        # numbers
+        (FRICTION.format("7"), 4, ["friction.static is 7; it must lie in 0 to 1"]),
+        (FRICTION.format("-0.1"), 4, ["friction.static is -0.1; it must lie in 0 to 1"]),
+        (FRICTION.format("high"), 4, ["friction.static is high; it must be a number in 0 to 1"]),
+        (FRICTION.format("'0.4'"), 4, ["'0.4' in quotes; it must be a number"]),
+        (FRICTION.format("''"), 4, ["'' in quotes"]),
+        (FRICTION.format("true"), 4, ["friction.static is true; it must be a number"]),
+        (FRICTION.format("yes"), 4, ["friction.static is yes; it must be a number"]),
+        (FRICTION.format(".inf"), 4, ["friction.static is .inf"]),
+        (FRICTION.format("inf"), 4, ["friction.static is inf"]),
+        (FRICTION.format("1e999"), 4, ["friction.static is 1e999"]),
+        (FRICTION.format(".nan"), 4, ["friction.static is .nan"]),
+        (FRICTION.format("nan"), 4, ["friction.static is nan"]),
+        (FRICTION.format("0:30"), 4, ["friction.static is 0:30"]),  # 30 to YAML 1.1
+        (FRICTION.format("[1]"), 4, ["friction.static is a list"]),
+        (FRICTION.format("{a: 1}"), 4, ["friction.static is a mapping"]),
+        pytest.param(FRICTION.format("9" * 5000), 4, ["static is 999"], id="many digits"),
+        ("outputs: {modes: 2.5}\n", 1, ["outputs.modes is 2.5; it must be a whole number"]),
+        ("outputs: {cloud_divisor: 0}\n", 1, ["outputs.cloud_divisor is 0", "1 to 1000"]),
+        ("outputs: {cloud: on}\n", 1, ["outputs.cloud is on; it must be one of surface, vol"]),
+        ("material:\n  young_modulus: -1\n", 2, ["material.young_modulus is -1", "Pa"]),
+        ("material: {poisson_ratio: 0.5}\n", 1, ["material.poisson_ratio is 0.5", "0.4999"]),
+        # tips
+        (TIP.format("radius: 5"), 3, ["tools[0].tip.radius is 5", "0.001 to 0.02 m"]),
+        (TIP.format("radius: 0"), 3, ["tools[0].tip.radius is 0; it must lie in 0.001 to"]),
+        (TIP.format("radius: .nan"), 3, ["tip.radius is .nan; it must be a number in 0.001"]),
+        (TIP.format("radius: -1e-3"), 3, ["tip.radius is -1e-3"]),
+        (TIP.format("shape: ball"), 3, ["tip.shape is ball; it must be one of sphere, flat, con"]),
+        (TIP.format("shape: [cone]"), 3, ["tip.shape is a list"]),
+        (TIP.format("shape: cone, half_angle: 90"), 3, ["half_angle is 90", "10 to 85 deg"]),
+        (TIP.format("shape: cone"), 3, ["tip: shape cone needs half_angle; give one"]),
+        (TIP.format("shape: flat, half_angle: 60"), 3, ["flat does not use half_angle; leave it"]),
+        (TIP.format("shape: cone, angle: 60"), 3, ["tip.angle", "did you mean 'half_angle'?"]),
+        ("tools:\n- name: a\n  tip: 5e-3\n", 3, ["tools[0].tip is 5e-3", "shape, radius"]),
+        (
+            "tools:\n- name: a\n  tip_radius: 5e-3\n",
+            3,
+            ["tip_radius is of an earlier version; write tip: {shape: sphere, radius: 5e-3}"],
+        ),
+        # what contradicts itself
+        (FRICTION.format("0.2"), 3, ["kinetic is 0.3, above static 0.2"]),
+        ("name: a\ntools:\n- name: a\n- name: b\n", 2, ["2 tools without several_tools"]),
+        ("name: a\ntools: []\n", 2, ["give 1 to 8"]),
+        ("tools:\n- name: a\n- name: a\neffects: [several_tools]", 1, ["two are called 'a'"]),
+        ("tools:\n- name: a\n- name: b c\n", 3, ["'b c'", "topics"]),
+        ("effects:\n  respiration: {axis: [0, 0, 0]}\n", 2, ["axis", "not all zero"]),
+        (
+            "name: a\neffects: [large_deformation, tumour]\n",
+            1,
+            ["large_deformation and tumour exclude each other", "leave one of the two out"],
+        ),
+        # relaxation
+        ("effects: [viscoelasticity]\n", 1, ["viscoelasticity.g is missing", "0 to 0.999"]),
+        ("effects:\n  viscoelasticity:\n    g: [0.3]\n", 2, ["viscoelasticity.tau is missing"]),
+        ("effects: [viscoelasticity: {g: 0.3, tau: [1]}]", 1, ["g is 0.3", "list of numbers"]),
+        (
+            "effects:\n  viscoelasticity:\n    g:\n    - 0.3\n    - -0.2\n    tau: [1, 2]",
+            5,
+            ["viscoelasticity.g[1] is -0.2; it must lie in 0 to 0.999"],
+        ),
+        (
+            "effects:\n  viscoelasticity:\n    g: [0.3]\n    tau: [0]\n",
+            4,
+            ["viscoelasticity.tau[0] is 0; it must lie in 0.001 to 100000 s"],
+        ),
+        ("effects: [viscoelasticity: {g: [0.3], tau: [1, 2]}]", 1, ["1 g and 2 tau"]),
+        ("effects: [viscoelasticity: {g: [], tau: []}]", 1, ["0 g and 0 tau"]),
+        ("effects: [viscoelasticity: {g: [0.6, 0.6], tau: [1, 2]}]", 1, ["the sum of g is 1.2"]),
+        ("effects: [viscoelasticity: {file: p.csv}]", 1, ["this scene is no file"]),
+        # what YAML could do to whoever reads it
+        ("a: &a [x]\nb: *a\n", 2, ["aliases"]),
+        ("name: a\n<<: {text: b}\n", 2, ["<< is unknown"]),
+        ("name: a\ntext: !!python/object/apply:os.getcwd []\n", 2, ["tag", "os.getcwd"]),
+        ("name: a\ntext: !mine b\n", 2, ["the tag !mine"]),
+        pytest.param("name: " + 30_000 * "[", 1, ["more than 8 deep"], id="deep brackets"),
+        pytest.param(30_000 * "- ", 1, ["more than 8 deep"], id="deep dashes"),
+    ],
+)
+def test_a_bad_file_is_one_line_with_place_key_and_remedy(
+    text: str, line: int, reasons: list[str]
+) -> None:
+    message = refusal(text, line)
+    for reason in reasons:
+        assert reason in message
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_the_range_of_every_quantity_is_that_of_its_effect(name: str) -> None:
+    """A number beyond either end is refused with the range and the unit that the dataclass has."""
+    for field in fields(EFFECTS[name]):
+        allowed = field.metadata["quantity"]
+        for beyond in (allowed.low - 1.0, 2.0 * allowed.high + 1.0):
+            value = f"[{beyond}]" if "tuple" in str(field.type) else f"{beyond}"
+            message = refusal(f"effects:\n  {name}:\n    {field.name}: {value}\n", 3)
+            assert f"{name}.{field.name}" in message
+            assert message.endswith(str(allowed))
+
+
+@pytest.fixture
+def closed_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No file can be opened."""
+
+    def opened(*_: Any) -> None:
+        raise AssertionError("the file was opened")
+
+    monkeypatch.setattr(Path, "open", opened)
+
+
+@pytest.mark.usefixtures("closed_files")
+def test_a_hundred_megabytes_are_refused_without_a_look(tmp_path: Path) -> None:
+    path = tmp_path / "large.yaml"
+    path.touch()
+    os.truncate(path, 100 * 2**20)
+    said = rf"large\.yaml: has 104857600 bytes; at most {MAX_BYTES}"
+    with within(1.0), pytest.raises(SceneError, match=said):
+        read_scene(path)
+
+
+@pytest.mark.usefixtures("closed_files")
+def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.yaml")  # to open it would be to wait for ever
+    with pytest.raises(SceneError, match=r"pipe\.yaml: is not a file"):
+        read_scene(tmp_path / "pipe.yaml")
+    with pytest.raises(SceneError, match="is not a file"):
+        read_scene(tmp_path)
+    with pytest.raises(SceneError, match=r"none\.yaml: cannot be read \(No such file"):
+        read_scene(tmp_path / "none.yaml")
+
+
+def test_a_long_text_is_refused_too() -> None:
+    with pytest.raises(SceneError, match="at most 65536"):
+        parse_scene("name: a\n" + MAX_BYTES * "#", "service")
+
+
+def test_an_alias_bomb_is_refused_at_its_first_alias() -> None:
+    """Nine levels of nine aliases would stand for 9^9 words."""
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join(9 * [f'*a{i - 1}'])}]" for i in range(1, 10)]
+    with within(1.0):
+        assert "aliases" in refusal("\n".join(lines), 2)
+
+
+def test_a_file_in_another_encoding_is_refused_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "x.yaml"
+    path.write_bytes("name: a\ntext: Größe\n".encode("latin-1"))
+    with pytest.raises(SceneError, match=r"x\.yaml:2: is not UTF-8"):
+        read_scene(path)
+    path.write_bytes("name: Größe\n".encode("utf-8-sig"))
+    assert read_scene(path).name == "Größe"

@@ -1,0 +1,307 @@
+"""Bands of a step's force: against tips pressed at every material, and what a step makes of it."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from avatar_core.contact.effects import SeveralTools, Tumour
+from avatar_core.contact.force_band import DEPTH, RATIO, ForceBand
+from avatar_core.contact.layout import lay_out
+from avatar_core.contact.model import ContactModel, make_model, prepare, step
+from avatar_core.contact.tool_path import inner_positions, middle_of_access
+from avatar_core.errors import CoordinateError
+from avatar_core.geometry.tip import Tip
+from avatar_core.uncertainty.bands import bands_of
+from avatar_core.uncertainty.distributions import Distribution, Fixed, Lognormal, Uniform
+from avatar_core.uncertainty.force_ratios import DEPTHS, log_edges, log_forces
+from avatar_core.uncertainty.force_table import ForceTable
+from avatar_core.uncertainty.known import Held, known_of
+from avatar_core.uncertainty.material_grid import MaterialGrid
+from avatar_core.vademecum.accuracy import Detail
+from avatar_core.vademecum.at_values import at_values, own_compliance, own_compliance_at
+from avatar_core.vademecum.model import Vademecum
+from tests.helpers.soft_organ import organ_on_springs, soft_organ
+
+SPHERE, PATCH = Tip("sphere", 5e-3), Tip("patch", 8e-3)
+KNOWN: dict[str, Distribution] = {
+    "young": Lognormal(5e3, 1.4),
+    "poisson": Uniform(0.32, 0.48),
+    "contrast": Lognormal(3.0, 1.5),
+}
+PRESSED = (1e-3, 2e-3, 4e-3)
+
+
+@pytest.fixture(scope="module")
+def organ() -> Vademecum:
+    return soft_organ()
+
+
+def band_of(
+    vademecum: Vademecum, model: ContactModel, known: dict[str, Distribution], *tips: Tip
+) -> ForceBand:
+    """Of a model of a vademecum at its values."""
+    edges = log_edges(vademecum, tips, known)
+    ratio = edges - log_forces(vademecum, tips)[..., None]
+    return ForceBand(model, ratio.astype(np.float32), DEPTHS)
+
+
+def press(model: ContactModel, tip: Tip, point: np.ndarray, normal: np.ndarray, d: float) -> float:
+    """The force on a tip that comes down to a depth."""
+    model.reset()
+    for depth in np.append(np.arange(-2e-3, d, 1e-3), d):
+        step(model, (point + (tip.offset - depth) * normal)[None])
+    return float(np.linalg.norm(model.out.force[0]))
+
+
+def model_of(vademecum: Vademecum, tip: Tip) -> ContactModel:
+    return make_model(lay_out(vademecum, (tip,), Detail(1, "off")))
+
+
+def spots(vademecum: Vademecum, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points amid the load positions, and normals there: centroids of inner faces far apart."""
+    surface, inner = vademecum.surface, np.zeros(vademecum.surface.n_positions, bool)
+    inner[inner_positions(vademecum)] = True
+    faces = np.flatnonzero(inner[surface.corners].all(axis=1))
+    centroids, chosen = surface.centroids[faces], [0]
+    while len(chosen) < n:
+        away = np.linalg.norm(centroids[:, None] - centroids[chosen], axis=2).min(axis=1)
+        chosen.append(int(away.argmax()))
+    return centroids[chosen], surface.face_normals[faces[chosen]]
+
+
+def pressed_bands(
+    vademecum: Vademecum, tip: Tip, points: np.ndarray, normals: np.ndarray, known: Sequence
+) -> np.ndarray:
+    """Edges of tips that are pressed at every point of the coordinates, (2, n_places, n_depths)."""
+    grid, force = MaterialGrid.of(vademecum), []
+    for here in grid.materials(vademecum):
+        model = model_of(here, tip)
+        force.append(
+            [
+                [press(model, tip, p, n, d) for d in PRESSED]
+                for p, n in zip(points, normals, strict=True)
+            ]
+        )
+    logs = np.log(force)
+    table = ForceTable(grid, logs, np.zeros_like(logs))
+    return bands_of(table, known).force[[0, 2]]
+
+
+# --- what is prepared --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "tip", [SPHERE, pytest.param(PATCH, marks=pytest.mark.long)], ids=lambda tip: tip.shape
+)
+def test_edges_are_those_of_tips_pressed_anywhere(organ: Vademecum, tip: Tip) -> None:
+    """Amid the load positions, at depths between and at those prepared; goal: 3 % of the force."""
+    known, (points, normals) = known_of(organ, KNOWN), spots(organ, 6)
+    truth = pressed_bands(organ, tip, points, normals, known)
+    here = at_values(organ, {"young": 20e3, "poisson": 0.4, "contrast": 6.0})
+    model = model_of(here, tip)
+    band = band_of(here, model, known, tip)
+    found = np.empty_like(truth)
+    for i, (point, normal) in enumerate(zip(points, normals, strict=True)):
+        for k, depth in enumerate(PRESSED):
+            press(model, tip, point, normal, depth)
+            band.update()
+            found[:, i, k] = np.linalg.norm(band.edges[:, 0, :3], axis=1)
+    print(f"\n{tip.shape}: edges off by {np.abs(found / truth - 1.0).max():.2%} at most")
+    np.testing.assert_allclose(found, truth, rtol=0.03)
+
+
+def test_a_tip_over_a_tumour_feels_its_modulus(organ: Vademecum) -> None:
+    """Half of the energy under each tip is the tumour's, six times as stiff as the organ; or none
+    of it: what that makes of the force, in a step and as it is prepared."""
+    field, soft = organ.tip_field, at_values(organ, {"contrast": 6.0})
+    points, normals = organ.surface.centers, organ.surface.normals
+    places, found, prepared = inner_positions(organ)[::60], [], []
+    for part in (0.5, 0.0):
+        under = np.full(field.distance.shape, part, np.float32)
+        v = replace(soft, tip_field=field._replace(tumour=under))
+        model = model_of(v, SPHERE)
+        found.append([press(model, SPHERE, points[j], normals[j], DEPTHS[1]) for j in places])
+        prepared.append(np.exp(log_forces(v, [SPHERE])[0, places, 1]))
+    stiffer = np.divide(*found)
+    assert (stiffer > 1.05).all()
+    # a step's depth is that below the smooth surface
+    np.testing.assert_allclose(np.divide(*prepared), stiffer, rtol=0.04)
+
+
+@pytest.mark.parametrize("tip", [SPHERE, PATCH, Tip("flat", 4e-3), Tip("cone", 4e-3, 30.0)])
+def test_young_alone_scales_every_force(phantom_vademecum: Vademecum, tip: Tip) -> None:
+    v, factor = phantom_vademecum, 1.4
+    known = known_of(v, {"young": Lognormal(5e3, factor)})
+    ratio = log_edges(v, [tip], known, draws=2000) - log_forces(v, [tip])[..., None]
+    spread = 1.6449 * np.log(factor)
+    middle = np.log(5e3 / v.material.young_modulus)
+    np.testing.assert_allclose(ratio[..., 0], middle - spread, atol=0.01)
+    np.testing.assert_allclose(ratio[..., 1], middle + spread, atol=0.01)
+
+
+def test_the_band_stays_where_it_is_while_the_material_changes(organ: Vademecum) -> None:
+    """The distributions are about the values themselves."""
+    place = middle_of_access(organ)
+    point, normal = organ.surface.centers[place], organ.surface.normals[place]
+    bands, forces = [], []
+    for values in ({"poisson": 0.33}, {"poisson": 0.47, "contrast": 8.0}, {"young": 50e3}):
+        here = at_values(organ, values)
+        model = model_of(here, SPHERE)
+        band = band_of(here, model, known_of(here, KNOWN), SPHERE)
+        forces.append(press(model, SPHERE, point, normal, 3e-3))
+        band.update()
+        bands.append(np.linalg.norm(band.edges[:, 0, :3], axis=1))
+    assert max(forces) > 1.5 * min(forces)
+    np.testing.assert_allclose(bands, [bands[0]] * 3, rtol=0.01)
+
+
+def test_what_is_not_given_has_the_value_in_use(organ: Vademecum) -> None:
+    """Of Young's modulus alone, the ratio is the same wherever the others stand."""
+    young = {"young": Fixed(7e3)}
+    for values in ({"poisson": 0.33}, {"contrast": 8.0}):
+        here = at_values(organ, values)
+        ratio = (
+            log_edges(here, [SPHERE], known_of(here, young)) - log_forces(here, [SPHERE])[..., None]
+        )
+        np.testing.assert_allclose(ratio, np.log(7e3 / here.material.young_modulus), atol=2e-3)
+
+
+def test_a_support_counts_over_young() -> None:
+    """At twice the modulus and stiffness the force is twice as large; a stiffer support alone is
+    felt less."""
+    organ = organ_on_springs()
+    own = organ.supports[0].stiffness
+    edges = []
+    for e, k in ((0.17e6, own), (0.34e6, 2.0 * own), (0.17e6, 2.0 * own)):
+        given = {"young": Fixed(e), "support.bare_area": Fixed(k)}
+        edges.append(log_edges(organ, [PATCH], known_of(organ, given)))
+    np.testing.assert_allclose(edges[1] - edges[0], np.log(2.0), atol=1e-6)
+    stiffer = edges[2] - edges[0]
+    assert (stiffer > 0.0).all() and (stiffer < np.log(2.0)).all()
+    both = known_of(organ, {"young": Lognormal(0.17e6, 1.3)})
+    low, high = np.moveaxis(log_edges(organ, [PATCH], both), -1, 0)
+    assert (high - low < 2.0 * 1.6449 * np.log(1.3)).all()  # of which the support keeps a part
+
+
+def test_compliances_are_those_of_the_vademecum_at_these_values(organ: Vademecum) -> None:
+    assert organ.parametric is not None
+    young = organ.parametric.young_modulus
+    for values in ({"poisson": 0.31, "contrast": 0.6}, {"poisson": 0.45, "contrast": 4.0}):
+        whole = own_compliance(at_values(organ, values | {"young": young}))
+        np.testing.assert_allclose(own_compliance_at(organ, values), whole, rtol=1e-4, atol=1e-9)
+        j = np.array([5])
+        direct = at_values(organ, values | {"young": young}).compliance(j, np.ones(1))
+        np.testing.assert_allclose(whole[5], direct, rtol=1e-5, atol=1e-10)
+
+
+# --- what a step makes of it -------------------------------------------------------------------
+
+
+def ratios_of(model: ContactModel, low: float, high: float) -> np.ndarray:
+    """The same everywhere, of each tool its number times as much."""
+    shape = (model.n_tools, len(model.arrays.position), len(DEPTHS))
+    ratio = np.stack([np.full(shape, np.log(low)), np.full(shape, np.log(high))], axis=-1)
+    return (ratio * np.arange(1, model.n_tools + 1)[:, None, None, None]).astype(np.float32)
+
+
+def test_each_tool_has_the_edges_of_its_own_wrench(phantom_vademecum: Vademecum) -> None:
+    v = phantom_vademecum
+    model = prepare(v, (SPHERE, SPHERE), cloud="off", effects=(SeveralTools(),))
+    band = ForceBand(model, ratios_of(model, 0.5, 3.0), DEPTHS)
+    j = middle_of_access(v)
+    near = v.surface.centers[j] + 3e-3 * v.surface.normals[j]
+    away = np.array([1.0, 1.0, 1.0])
+    for tips, touching in (([near, away], [True, False]), ([away, near], [False, True])):
+        step(model, np.array(tips))
+        band.update()
+        for t, touches in enumerate(touching):
+            assert model.out.force[t].any() == touches
+            np.testing.assert_allclose(
+                band.edges[:, t, :3],
+                np.outer([0.5 ** (t + 1), 3.0 ** (t + 1)], model.out.force[t]),
+                rtol=1e-5,
+            )
+            np.testing.assert_array_equal(band.edges[:, t, 3:], 0.0)
+
+
+def test_depths_between_those_prepared_are_interpolated_and_others_held(
+    phantom_vademecum: Vademecum,
+) -> None:
+    v, model = phantom_vademecum, model_of(phantom_vademecum, SPHERE)
+    ratio = ratios_of(model, 1.0, 1.0)
+    ratio[..., 1] = np.arange(len(DEPTHS), dtype=np.float32)
+    band = ForceBand(model, ratio, DEPTHS)
+    j = middle_of_access(v)
+    for depth in (0.1e-3, 1e-3, 2e-3, 6e-3, 13e-3):
+        size = press(model, SPHERE, v.surface.centers[j], v.surface.normals[j], depth)
+        band.update()
+        own = float(-model.state.gap[0])  # of the smooth surface
+        place = np.clip(np.log(own / DEPTHS[0]) / np.log(3.0), 0.0, len(DEPTHS) - 1.0)
+        np.testing.assert_allclose(
+            np.linalg.norm(band.edges[:, 0, :3], axis=1), size * np.exp([0.0, place]), rtol=1e-5
+        )
+
+
+def test_a_step_allocates_nothing_for_the_band(phantom_vademecum: Vademecum) -> None:
+    v, model = phantom_vademecum, model_of(phantom_vademecum, SPHERE)
+    band = ForceBand(model, ratios_of(model, 0.5, 2.0), DEPTHS)
+    j = middle_of_access(v)
+    press(model, SPHERE, v.surface.centers[j], v.surface.normals[j], 3e-3)
+    band.update()
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        for _ in range(100):
+            band.update()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert band.edges.any()
+    assert peak - before < 512  # an array has more
+
+
+def test_without_prepared_arrays_there_is_no_band(phantom_vademecum: Vademecum) -> None:
+    model = model_of(phantom_vademecum, SPHERE)
+    assert ForceBand.of(model, model.layout.flat()) is None
+    arrays = model.layout.flat() | {RATIO: ratios_of(model, 0.5, 2.0), DEPTH: DEPTHS}
+    assert ForceBand.of(model, arrays) is not None
+
+
+# --- what a vademecum holds --------------------------------------------------------------------
+
+
+def test_what_a_vademecum_holds_is_sent_and_judges_alike(organ: Vademecum) -> None:
+    here = at_values(organ, {"poisson": 0.4})
+    held = Held.of_plain(Held.by(here).plain())
+    assert held == Held.by(here)
+    assert held.known(KNOWN) == known_of(here, KNOWN)
+    assert held.known({})["poisson"] == Fixed(0.4)
+    with pytest.raises(CoordinateError, match="build it with --support dome=LOW:HIGH"):
+        held.known({"support.dome": Fixed(1e6)})
+    with pytest.raises(CoordinateError, match="which the vademecum holds"):
+        held.known({"contrast": Uniform(5.0, 30.0)})
+
+
+def test_a_fixed_support_fixes_young_whatever_its_median() -> None:
+    organ = replace(organ_on_springs(), parametric=None)
+    own = organ.material.young_modulus
+    assert known_of(organ, {"young": Fixed(own)})["young"] == Fixed(own)
+    with pytest.raises(CoordinateError, match="support bare_area is fixed"):
+        known_of(organ, {"young": Lognormal(own, 1.3)})
+
+
+def test_a_tumour_of_the_scene_is_the_contrast_in_use(organ: Vademecum) -> None:
+    """A scene's contrast moves the force, and not the band."""
+    from avatar_core.contact.effects.tumour import at_contrast
+
+    found = [
+        log_edges(v, [SPHERE], known_of(v, KNOWN))
+        for v in (at_contrast(organ, Tumour(c)) for c in (1.0, 9.0))
+    ]
+    np.testing.assert_array_equal(*found)

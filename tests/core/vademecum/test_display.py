@@ -1,0 +1,233 @@
+"""What is displayed beside the mesh: a finer surface, and structures that move with the organ."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+
+from avatar_core.common.hdf5 import replace_file
+from avatar_core.contact.cloud import TOLERANCE
+from avatar_core.contact.model import prepare
+from avatar_core.errors import StorageError, SurfaceError
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.resampling import is_manifold, resampled, unified
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
+from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.offline.rule import BuildRule
+from avatar_core.vademecum.display import boundary, display_of, outline, structure
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.storage import _arrays, _attributes, load_vademecum, save_vademecum
+from tests.core.contact.test_dent import ASIDE, DEPTH, END, SPHERE, pressed, sneddon_dent, without
+from tests.helpers.box_organ import PATCH_RADIUS, UP, organ, top
+from tests.helpers.small_files import ball
+
+
+def finer(v: Vademecum, times: int = 2) -> Vademecum:
+    """The same with every triangle of the boundary split into four, so many times."""
+    return replace(v, display=display_of(v.mesh, igl.upsample(*boundary(v.mesh), times)))
+
+
+def lesion_at(centre: np.ndarray, radius: float) -> SurfaceMesh:
+    points, faces = ball(360, radius)
+    return SurfaceMesh(centre + points, faces, "lesion")
+
+
+@pytest.mark.parametrize("n", [300, 1500, 9000])
+def test_a_surface_gets_about_so_many_vertices_and_stays_itself(n: int) -> None:
+    vertices, faces = unified(*phantom_liver().skin.boundary)
+    fine, triangles = resampled(vertices, faces, n)
+    assert abs(len(fine) - n) <= 0.02 * n
+    assert is_manifold(triangles) and len(triangles) == 2 * len(fine) - 4  # one closed sphere
+    off = 1e3 * np.sqrt(igl.point_mesh_squared_distance(fine, vertices, faces)[0])
+    print(f"{off.max():.2f} mm off, rms {np.sqrt((off**2).mean()):.2f}")
+    assert off.max() < 3.0 and np.sqrt((off**2).mean()) < 0.7
+    normals = igl.per_face_normals(fine, triangles, np.zeros(3))
+    middle = fine[triangles].mean(axis=1)
+    assert (phantom_liver().skin.contains(middle - 5e-3 * normals)).mean() > 0.98
+
+
+def test_open_triangles_are_no_manifold() -> None:
+    vertices, faces = unified(*phantom_liver().skin.boundary)
+    assert is_manifold(faces) and not is_manifold(faces[1:])
+    assert not is_manifold(np.concatenate([faces, faces[:1]]))
+    fine, triangles = resampled(vertices, faces[1:], 3 * len(vertices))
+    assert len(fine) >= 3 * len(vertices) and len(triangles) % (len(faces) - 1) == 0
+
+
+def test_what_is_tied_moves_with_a_linear_field() -> None:
+    """A linear displacement is interpolated exactly, on the boundary."""
+    display = finer(organ("cube"), 1).display
+    assert display is not None
+    points, stretch = organ("cube").mesh.vertices, np.random.default_rng(1).normal(size=(3, 3))
+    moved = (points @ stretch)[display.corners]
+    np.testing.assert_allclose(
+        np.einsum("vk,vkd->vd", display.weights, moved), display.vertices @ stretch, atol=1e-7
+    )
+    np.testing.assert_allclose(display.weights.sum(axis=1), 1.0, atol=1e-6)
+    assert display.weights.min() >= 0.0
+
+
+def test_the_meshs_own_vertices_are_shown_as_without() -> None:
+    own = organ("cube")
+    hung = replace(own, display=display_of(own.mesh, boundary(own.mesh)))
+    for aside in ASIDE:
+        place = top("cube") + np.array([aside[0], 0.0, aside[1]])
+        clouds = [
+            pressed(prepare(v, (SPHERE,), effects=()), (SPHERE,), place[None], UP[None], DEPTH)
+            for v in (own, hung)
+        ]
+        np.testing.assert_allclose(clouds[1], clouds[0], atol=2e-7)
+    np.testing.assert_array_equal(hung.clamped_faces, own.clamped_faces)
+
+
+def test_a_fine_cube_shows_sneddons_dent() -> None:
+    """Between the vertices of the mesh too, where linear interpolation misses the dent."""
+    model = prepare(finer(organ("cube")), (SPHERE,), effects=())
+    patch, rest = without(model), model.arrays.rest[:, :3].astype(float)
+    coarse = organ("cube")
+    errors = []
+    for aside in ASIDE:
+        place = top("cube") + np.array([aside[0], 0.0, aside[1]])
+        at = (place[None], UP[None], DEPTH)
+        shown, plain = (pressed(each, (SPHERE,), *at)[:, 1] for each in (model, patch))
+        cloud = pressed(prepare(coarse, (SPHERE,), effects=()), (SPHERE,), *at)
+        display = display_of(coarse.mesh, igl.upsample(*boundary(coarse.mesh), 2))
+        index = np.searchsorted(coarse.mesh.surface_vertices, display.corners)
+        linear = np.einsum("vk,vkd->vd", display.weights, cloud[index])[:, 1]
+        distance = np.linalg.norm(rest - place, axis=1)
+        near = (distance < END) & (np.abs(rest[:, 1] - place[1]) < 1e-6)
+        exact = sneddon_dent(distance[near])
+        errors.append([-u[near] - exact for u in (shown, linear, plain)])
+    found, linear, plain = np.concatenate(errors, axis=1)
+    rms = [1e3 * np.sqrt((e**2).mean()) for e in (found, linear, plain)]
+    print(f"rms {rms[0]:.3f} mm (linear: {rms[1]:.3f}, patch: {rms[2]:.3f}), {len(found)} vertices")
+    print(f"worst {1e3 * np.abs(found).max():.3f} mm (linear: {1e3 * np.abs(linear).max():.3f})")
+    assert rms[0] < 0.03 < 0.1 < min(rms[1:])
+
+
+def test_a_patch_is_shown_by_interpolation_alone() -> None:
+    tip = Tip("patch", SPHERE.radius)
+    coarse, fine = organ("cube"), finer(organ("cube"))
+    assert fine.display is not None
+    at = (top("cube")[None], UP[None], DEPTH)
+    cloud, shown = (pressed(prepare(v, (tip,), effects=()), (tip,), *at) for v in (coarse, fine))
+    index = np.searchsorted(coarse.mesh.surface_vertices, fine.display.corners)
+    exact = np.einsum("vk,vkd->vd", fine.display.weights, cloud[index])
+    np.testing.assert_allclose(shown, exact, atol=1e-7)
+    assert np.abs(exact).max() > 1e-4
+
+
+def test_the_volume_shows_the_mesh() -> None:
+    fine = finer(organ("cube"))
+    assert len(prepare(fine, cloud="volume").out.cloud) == len(fine.mesh.vertices)
+    assert len(prepare(fine).out.cloud) == len(fine.surface_vertices) > len(fine.mesh.vertices)
+    assert fine.info().n_surface_vertices == len(fine.mesh.surface_vertices)
+
+
+def test_a_structure_moves_with_the_organ() -> None:
+    """As the volume does between the vertices of the mesh; the organ's own part is as without."""
+    cube, lesion = organ("cube"), lesion_at(top("cube") + np.array([2e-3, -12e-3, 1e-3]), 8e-3)
+    display = display_of(cube.mesh, boundary(cube.mesh), [("lesion", structure(lesion))])
+    with_lesion = replace(cube, display=display)
+    tip = Tip("patch", SPHERE.radius)  # whose field the modes hold as a whole
+    at = (top("cube")[None], UP[None], DEPTH)
+    cloud = pressed(prepare(with_lesion, (tip,), effects=()), (tip,), *at)
+    n, volume = len(cube.surface_vertices), prepare(cube, (tip,), cloud="volume", effects=())
+    whole = pressed(volume, (tip,), *at)
+    inside = np.unique(with_lesion.structures["lesion"])
+    np.testing.assert_array_equal(inside, np.arange(n, len(cloud)))
+    exact = np.einsum("vk,vkd->vd", display.weights[inside], whole[display.corners[inside]])
+    alike = 4.0 * TOLERANCE * DEPTH  # surface and volume have blocks of their own
+    np.testing.assert_allclose(cloud[inside], exact, atol=alike)
+    np.testing.assert_allclose(cloud[:n], whole[cube.mesh.surface_vertices], atol=alike)
+    rest = np.einsum("vk,vkd->vd", display.weights, cube.mesh.vertices[display.corners])
+    np.testing.assert_allclose(rest, display.vertices, atol=1e-6)
+    moved = np.linalg.norm(cloud[inside], axis=1)
+    assert 0.2 * DEPTH < moved.mean() < 0.8 * DEPTH and np.ptp(moved) > 0.1 * DEPTH
+    assert len(with_lesion.organ_faces) == len(cube.surface_faces)
+
+
+def test_a_structure_with_too_many_vertices_is_thinned() -> None:
+    lesion = lesion_at(np.zeros(3), 0.02)
+    fine = SurfaceMesh(*igl.upsample(lesion.vertices, lesion.faces.astype(np.int64), 3))
+    assert len(fine.vertices) > 4000 >= len(structure(fine)[0]) > 3900
+    assert len(structure(lesion)[0]) == len(lesion.vertices)
+
+
+@pytest.mark.long
+def test_a_tumour_is_stored_with_its_organ_and_stays_there(tmp_path: Path) -> None:
+    liver = phantom_liver(12e-3)
+    lesion = lesion_at(liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0]), 0.02)
+    options = OrganOptions(
+        n_vertices=450, rule=BuildRule(max_modes=20), tumour=lesion, contrast=5.0, n_certified=2
+    )
+    save_vademecum(build(liver, options), tmp_path / "sick.h5")
+    sick = load_vademecum(tmp_path / "sick.h5")
+    assert list(sick.structures) == ["lesion"]
+    used = sick.surface_vertices[np.unique(sick.structures["lesion"])]
+    assert np.linalg.norm(used - lesion.vertices.mean(axis=0), axis=1) == pytest.approx(
+        0.02, abs=1e-4
+    )
+    assert len(sick.organ_faces) == len(sick.mesh.boundary_faces)
+
+
+def with_both(v: Vademecum) -> Vademecum:
+    """A phantom with a finer surface and a lesion."""
+    lesion = structure(lesion_at(v.mesh.vertices.mean(axis=0), 9e-3))
+    organ_surface = outline(v.mesh, phantom_liver(), 3000)
+    return replace(v, display=display_of(v.mesh, organ_surface, [("lesion", lesion)]))
+
+
+def test_a_display_is_stored(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
+    fine = with_both(phantom_vademecum)
+    before = save_vademecum(phantom_vademecum, tmp_path / "plain.h5")
+    assert save_vademecum(fine, tmp_path / "fine.h5") != before
+    read = load_vademecum(tmp_path / "fine.h5").display
+    assert read is not None
+    for name, value in vars(fine.display).items():
+        np.testing.assert_array_equal(getattr(read, name), value)
+    assert load_vademecum(tmp_path / "plain.h5").display is None
+    assert len(fine.clamped_faces) == len(fine.organ_faces)
+    held = fine.surface_vertices[fine.organ_faces[fine.clamped_faces]].mean(axis=(0, 1))
+    mesh = phantom_vademecum.mesh
+    clamp = mesh.boundary_faces[phantom_vademecum.regions.clamped]
+    assert np.linalg.norm(held - mesh.vertices[clamp].mean(axis=(0, 1))) < PATCH_RADIUS
+
+
+@pytest.mark.parametrize(
+    ("key", "spoil", "message"),
+    [
+        ("faces", lambda a: a + len(a), "points outside"),
+        ("corners", lambda a: a - 1, "points outside"),
+        ("first_face", lambda a: a[::-1], "first_face"),
+        ("first_face", lambda a: a[[0, -1]], "parts"),
+        ("weights", lambda a: 2.0 * a, "no parts of a whole"),
+        ("weights", lambda a: a * np.nan, "NaN"),
+        ("weights", lambda a: a[:-1], "does not fit"),
+        ("vertices", lambda a: a * 1e4, "lengths above"),
+    ],
+)
+def test_a_spoilt_display_is_refused(
+    key: str,
+    spoil,  # type: ignore[no-untyped-def]
+    message: str,
+    phantom_vademecum: Vademecum,
+    tmp_path: Path,
+) -> None:
+    fine = with_both(phantom_vademecum)
+    arrays, attributes = _arrays(fine), _attributes(fine)
+    arrays[f"display/{key}"] = spoil(arrays[f"display/{key}"])
+    replace_file(tmp_path / "spoilt.h5", arrays, attributes, packed=True)
+    with pytest.raises(StorageError, match=message):
+        load_vademecum(tmp_path / "spoilt.h5")
+
+
+@pytest.mark.parametrize("n", [0, -5, 99, 2_000_000])
+def test_absurd_numbers_are_refused_before_any_work(n: int) -> None:
+    with pytest.raises(SurfaceError, match="displayed vertices; ask for"):
+        OrganOptions(n_displayed=n)

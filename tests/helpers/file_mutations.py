@@ -1,0 +1,328 @@
+"""Vademecum and atlas files, and what others may make of them.
+
+Bytes are changed blindly, and structure on purpose; then the checksum is made right again, so that
+it is the reader that has to notice. Each mutation is a function of a seed alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import signal
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from avatar_core.atlas.storage import save_atlas
+from avatar_core.common.hdf5 import UNREADABLE, checksum, root_attributes
+from avatar_core.vademecum.storage import save_vademecum
+from tests.helpers.byte_mutations import OF_BYTES, pick, some
+from tests.helpers.small_files import small_atlas, small_vademecum
+
+_SEALED = 0.7  # of the mutants get a checksum that is right
+_JSON_VALUES: tuple[Any, ...] = (
+    *(None, True, 0, -1, 10**400, 1e308, float("nan"), "", "x", [], {}, [1], [[1]], {"a": 1}),
+    *("\n\x1b[31m", "x" * 5000, 2**53, 0.5, "neo-hookean", [float("inf")] * 3),
+)
+_DTYPES = ("f2", "f4", "f8", ">f8", "i1", "i8", ">i4", "u8", "?", "S8", "c16", "f4,i4")
+_VALUES = (0.0, -1.0, 1.0, 1e300, -1e300, 1e-300, np.nan, np.inf, 2.0**31, 2.0**63)
+
+
+@cache
+def pristine(kind: str, variant: int = 0) -> bytes:
+    """The bytes of a small file; variants of a vademecum have ever more parts."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "small.h5"
+        if kind == "atlas":
+            save_atlas(small_atlas(), path)
+        else:
+            save_vademecum(small_vademecum(variant & 1 == 1, variant & 2 == 2), path)
+        return path.read_bytes()
+
+
+def mutant(kind: str, seed: int) -> bytes:
+    """A file of a kind that something has happened to."""
+    rng = np.random.default_rng(seed)
+    raw = pristine(kind, seed % 4 if kind == "vademecum" else 0)
+    if seed % 2:
+        raw = bytes(some(rng, bytearray(raw), OF_BYTES))
+        return sealed(raw) if rng.random() < _SEALED else raw
+    content = io.BytesIO(raw)
+    with h5py.File(content, "r+") as file:
+        for _ in range(int(rng.integers(1, 3))):
+            _pick_fitting(rng)(rng, file)
+        if rng.random() < _SEALED:
+            _seal(file)
+    return content.getvalue()
+
+
+# --- the checksum -------------------------------------------------------------------------------
+
+
+def sealed(raw: bytes) -> bytes:
+    """With the checksum of what the bytes hold now, if they can still be read."""
+    found = forked(_checksums, raw)
+    if not found:
+        return raw
+    stated, true = found.split()
+    return raw.replace(stated, true)
+
+
+def forked(function: Callable[[bytes], bytes], raw: bytes, seconds: int = 2) -> bytes:
+    """What a function gives, or nothing if it dies: of some of these bytes HDF5 does."""
+    ours, theirs = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        signal.alarm(seconds)
+        with contextlib.suppress(Exception):
+            os.write(theirs, function(raw))
+        os._exit(0)
+    os.close(theirs)
+    with os.fdopen(ours, "rb") as answer:
+        found = answer.read()
+    os.waitpid(pid, 0)
+    return found
+
+
+def _checksums(raw: bytes) -> bytes:
+    """The one that is stated and the one that is true."""
+    with h5py.File(io.BytesIO(raw), "r") as file:
+        attributes = root_attributes(file)
+        stated = attributes.pop("checksum")
+        return f"{stated} {checksum(_small_arrays(file), attributes)}".encode()
+
+
+def _small_arrays(file: h5py.File) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {}
+
+    def collect(key: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset) and item.nbytes < 1 << 20 and item.dtype.kind in "fiub":
+            arrays[key] = item[...]
+
+    file.visititems(collect)
+    return arrays
+
+
+def _seal(file: h5py.File) -> None:
+    try:
+        attributes = root_attributes(file)
+        attributes.pop("checksum", None)
+        file.attrs["checksum"] = checksum(_small_arrays(file), attributes)
+    except UNREADABLE:
+        return  # of what points nowhere there is no checksum
+
+
+# --- what happens to structure --------------------------------------------------------------------
+
+
+def _dataset(rng: np.random.Generator, file: h5py.File) -> h5py.Dataset:
+    found: list[h5py.Dataset] = []
+
+    def collect(_: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset):
+            found.append(item)
+
+    file.visititems(collect)
+    return found[int(rng.integers(0, len(found)))]
+
+
+def _replaced(file: h5py.File, dataset: h5py.Dataset, **made: Any) -> None:
+    key = dataset.name
+    del file[key]
+    file.create_dataset(key, **made)
+
+
+def _values(rng: np.random.Generator, file: h5py.File) -> None:
+    dataset = _dataset(rng, file)
+    array = dataset[...]
+    if array.size and array.dtype.kind in "fiu":
+        flat = array.reshape(-1)
+        hit = rng.integers(0, flat.size, int(rng.integers(1, 4)))
+        with np.errstate(all="ignore"):
+            flat[hit] = np.asarray(rng.choice(_VALUES)).astype(array.dtype)
+        dataset[...] = array
+
+
+def _shape(rng: np.random.Generator, file: h5py.File) -> None:
+    dataset = _dataset(rng, file)
+    array = dataset[...]
+    changed = (
+        lambda: array[: len(array) // 2] if array.ndim else array.reshape(1),
+        lambda: np.concatenate([array, array]) if array.ndim else array.reshape(1, 1),
+        lambda: array.reshape(-1),
+        lambda: array[..., None],
+        lambda: array[:0] if array.ndim else array,
+        lambda: array.T.copy(),
+    )
+    _replaced(file, dataset, data=changed[int(rng.integers(0, len(changed)))]())
+
+
+def _dtype(rng: np.random.Generator, file: h5py.File) -> None:
+    dataset = _dataset(rng, file)
+    dtype = np.dtype(_DTYPES[int(rng.integers(0, len(_DTYPES)))])
+    with np.errstate(all="ignore"):
+        data = dataset[...].astype(dtype) if dtype.names is None else np.zeros(dataset.shape, dtype)
+    _replaced(file, dataset, data=data)
+
+
+def _bomb(rng: np.random.Generator, file: h5py.File) -> None:
+    """A few bytes that claim 10^12 numbers, or a number of them that wraps round."""
+    dataset = _dataset(rng, file)
+    shape = [(10**12,), (10**6, 10**6), (2**32, 2**32), (2**62,)][int(rng.integers(0, 4))]
+    filters = {"compression": "gzip"} if rng.random() < 0.5 else {}
+    chunks = tuple(min(n, 1000) for n in shape)
+    dtype = "f4" if shape[-1] < 2**60 else "u1"
+    try:
+        _replaced(file, dataset, shape=shape, dtype=dtype, chunks=chunks, **filters)
+    except (ValueError, OSError):  # more than HDF5 itself would make
+        _replaced(file, dataset, shape=(10**12,), dtype="f4", chunks=(1000,))
+
+
+def _late(rng: np.random.Generator, file: h5py.File) -> None:
+    """Contiguous, of any size, never written: no byte of it is there."""
+    _replaced(file, _dataset(rng, file), shape=(int(rng.choice([1, 10**6, 10**12])),), dtype="f8")
+
+
+def _chunked(rng: np.random.Generator, file: h5py.File) -> None:
+    dataset = _dataset(rng, file)
+    array = dataset[...]
+    if array.ndim and array.size:
+        filters: dict[str, Any] = pick(
+            rng, ({}, {"compression": "gzip"}, {"shuffle": True}, {"fletcher32": True})
+        )
+        _replaced(file, dataset, data=array, chunks=array.shape, **filters)
+
+
+def _links(rng: np.random.Generator, file: h5py.File) -> None:
+    """Out of the file, to nowhere, round in a circle."""
+    key = _dataset(rng, file).name
+    group = key.rpartition("/")[0] or key
+    at = key if rng.random() < 0.5 else group
+    copy = file[at]
+    del file[at]
+    made: tuple[Callable[[], Any], ...] = (
+        lambda: h5py.ExternalLink("/etc/passwd", "/x"),
+        lambda: h5py.ExternalLink("other.h5", at),
+        lambda: h5py.SoftLink("/nowhere"),
+        lambda: h5py.SoftLink(at),
+        lambda: file["/"],
+        lambda: copy,
+    )
+    file[at] = made[int(rng.integers(0, len(made)))]()
+
+
+def _elsewhere(rng: np.random.Generator, file: h5py.File) -> None:
+    """Numbers in another file: raw, or another's array."""
+    dataset = _dataset(rng, file)
+    shape, dtype, key = dataset.shape, dataset.dtype, dataset.name
+    if not shape or 0 in shape:
+        return
+    del file[key]
+    if rng.random() < 0.5:
+        file.create_dataset(key, shape, dtype, external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)])
+    else:
+        layout = h5py.VirtualLayout(shape, dtype)
+        layout[...] = h5py.VirtualSource("other.h5", key, shape, dtype)
+        file.create_virtual_dataset(key, layout)
+
+
+def _removed(rng: np.random.Generator, file: h5py.File) -> None:
+    key = _dataset(rng, file).name
+    del file[key if rng.random() < 0.7 else key.rpartition("/")[0] or key]
+
+
+def _renamed(rng: np.random.Generator, file: h5py.File) -> None:
+    key = _dataset(rng, file).name
+    names = ("x", "a b", "\n", "x" * 300, "é", "..", "anatomies/x", "a/b/c/d/e/f/g/h")
+    name = names[int(rng.integers(0, len(names)))]
+    if name not in file:
+        file.move(key, name)
+
+
+def _groups(rng: np.random.Generator, file: h5py.File) -> None:
+    """Very deep, or very many."""
+    if rng.random() < 0.5:
+        group = file
+        for _ in range(200):
+            group = group.create_group("g")
+    else:
+        for k in range(300):
+            file.create_group(f"many/{k}")
+
+
+def _attribute(rng: np.random.Generator, file: h5py.File) -> None:
+    """Another type or size."""
+    name = pick(rng, tuple(file.attrs))
+    values: tuple[Any, ...] = (
+        1,
+        np.zeros(8000),
+        "x" * 5_000_000,
+        b"x",
+        np.bytes_(b"fixed"),
+        ["a", "b"],
+        h5py.Empty("f"),
+        "\ud800".encode(errors="surrogatepass"),
+        "99.0",
+        "2.x",
+        "-1",
+        "[" * 100_000,
+        "1" * 10_000,
+        "{" + '"a":' * 10,
+        "ball\nball",
+        "",
+    )
+    file.attrs[name] = values[int(rng.integers(0, len(values)))]
+
+
+def _json(rng: np.random.Generator, file: h5py.File) -> None:
+    """A value in the JSON of an attribute, or of an anatomy, becomes another."""
+    names = [name for name, value in file.attrs.items() if str(value)[:1] in "{["]
+    if "anatomies" in file and rng.random() < 0.7:
+        dataset = file["anatomies/000000/about"]
+        stored = json.loads(dataset[...].tobytes())
+        text = json.dumps(_changed(rng, stored)).encode()
+        _replaced(file, dataset, data=np.frombuffer(text, np.uint8))
+    elif names:
+        name = pick(rng, tuple(names))
+        file.attrs[name] = json.dumps(_changed(rng, json.loads(file.attrs[name])))
+
+
+def _changed(rng: np.random.Generator, value: Any) -> Any:
+    """JSON in which one value at some depth is another, missing or new."""
+    if isinstance(value, dict) and value and rng.random() < 0.9:
+        key = pick(rng, tuple(value))
+        if rng.random() < 0.1:
+            return {k: v for k, v in value.items() if k != key}
+        if rng.random() < 0.05:
+            return {**value, "unknown": 1}
+        return {**value, key: _changed(rng, value[key])}
+    if isinstance(value, list) and value and rng.random() < 0.6:
+        at = int(rng.integers(0, len(value)))
+        return [*value[:at], _changed(rng, value[at]), *value[at + 1 :]]
+    return pick(rng, _JSON_VALUES)
+
+
+_OF_STRUCTURE = (
+    *(_values, _values, _shape, _dtype, _bomb, _late, _chunked, _links, _elsewhere),
+    *(_removed, _renamed, _groups, _attribute, _json, _json),
+)
+
+
+def _pick_fitting(rng: np.random.Generator) -> Callable[..., None]:
+    change = pick(rng, _OF_STRUCTURE)
+
+    def attempt(rng: np.random.Generator, file: h5py.File) -> None:
+        try:
+            change(rng, file)
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError):
+            return  # a change before left nothing that this one could change
+
+    return attempt

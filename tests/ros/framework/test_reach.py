@@ -1,0 +1,232 @@
+"""Who reaches a node: by default this machine only, measured between two network namespaces."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.framework.discovery import (
+    BY_PROFILE,
+    LOCAL,
+    PROFILES,
+    RANGE,
+    TRANSPORTS,
+    stay_local,
+    udp_alone,
+)
+from lifecycle_msgs.srv import GetState
+
+from tests.helpers.slowness import end_of
+from tests.ros.conftest import START_TIMEOUT
+
+pytestmark = pytest.mark.ros
+
+FAST_DDS = "rmw_fastrtps_cpp"
+NODE = [sys.executable, "-m", "avatar_ros.nodes.vademecum_loader"]
+LISTENING = 8.0  # a peer that is answered is answered in 2 s [s]
+HEARD = """
+import time, rclpy
+from rcl_interfaces.msg import Log
+from rclpy.qos import QoSProfile, DurabilityPolicy
+rclpy.init()
+node = rclpy.create_node("peer")
+heard = []
+node.create_subscription(
+    Log, "/rosout", lambda message: heard.append(message.name),
+    QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+end = time.monotonic() + {seconds}
+while time.monotonic() < end and "vademecum_loader" not in heard + node.get_node_names():
+    rclpy.spin_once(node, timeout_sec=0.1)
+print("heard" if "vademecum_loader" in heard + node.get_node_names() else "nothing")
+"""
+
+
+def test_a_node_stays_local_unless_told_otherwise() -> None:
+    default: dict[str, str] = {}
+    stay_local(default)
+    assert default[RANGE] == LOCAL
+    assert "127.0.0.1" in Path(default[PROFILES]).read_text()
+    for told in ({RANGE: "SUBNET"}, {RANGE: LOCAL, "ROS_STATIC_PEERS": "10.0.0.1"}):
+        environment = dict(told)
+        stay_local(environment)
+        assert environment == told
+    own = {PROFILES: "/own.xml"}
+    stay_local(own)
+    assert own == {PROFILES: "/own.xml", RANGE: LOCAL}
+
+
+def test_what_keeps_time_has_udp_alone_and_leaves_no_trace() -> None:
+    environment: dict[str, str] = {}
+    stay_local(environment)
+    before = dict(environment)
+    with udp_alone(FAST_DDS, environment):
+        assert environment[RANGE] == BY_PROFILE
+        profile = Path(environment[PROFILES]).read_text()
+        assert "127.0.0.1" in profile and "<type>SHM" not in profile
+    assert environment == before
+
+
+@pytest.mark.parametrize(
+    ("middleware", "told", "added"),
+    [
+        (FAST_DDS, {RANGE: "SUBNET"}, {TRANSPORTS: "UDPv4"}),
+        (FAST_DDS, {RANGE: "SUBNET", TRANSPORTS: "LARGE_DATA"}, {}),
+        (FAST_DDS, {RANGE: LOCAL, PROFILES: "/own.xml"}, {}),
+        ("rmw_cyclonedds_cpp", {RANGE: LOCAL}, {}),
+    ],
+    ids=["subnet", "transports", "profile", "middleware"],
+)
+def test_udp_alone_leaves_what_the_user_chose(
+    middleware: str, told: dict[str, str], added: dict[str, str]
+) -> None:
+    environment = dict(told)
+    with udp_alone(middleware, environment):
+        assert environment == told | added
+    assert environment == told
+
+
+@pytest.mark.parametrize("middleware", ["rmw_cyclonedds_cpp", "rmw_zenoh_cpp"])
+def test_another_middleware_stays_on_this_machine(middleware: str) -> None:
+    """It reads no profile: without the range, everybody would hear it."""
+    environment: dict[str, str] = {}
+    stay_local(environment)
+    with udp_alone(middleware, environment):
+        assert environment[RANGE] == LOCAL
+
+
+def _plain(environment: dict[str, str]) -> dict[str, str]:
+    """As a user's shell: nothing is said about who may take part."""
+    kept = {k: v for k, v in environment.items() if k not in (RANGE, PROFILES, TRANSPORTS)}
+    return {k: v for k, v in kept.items() if k != "FASTDDS_DEFAULT_PROFILES_FILE"}
+
+
+def _listening(pid: int) -> set[str]:
+    """Addresses of the UDP ports of DDS on which a process receives, in this namespace."""
+    inodes = set()
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            target = os.readlink(link)
+        except FileNotFoundError:
+            continue
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    found = set()
+    for line in Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]:
+        words = line.split()
+        address, port = words[1].split(":")
+        if words[9] in inodes and 7400 <= int(port, 16) < 7400 + 250 * 233:
+            octets = bytes.fromhex(address)[::-1]
+            found.add((".".join(map(str, octets)), int(port, 16)))
+    domain = int(os.environ["ROS_DOMAIN_ID"])
+    first = 7400 + 250 * domain
+    return {address for address, port in found if first <= port < first + 250}
+
+
+def _threads(pid: int) -> str:
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return " ".join(sorted((task / "comm").read_text().strip() for task in tasks))
+
+
+@pytest.mark.parametrize(
+    ("name", "shared_memory"), [("vademecum_loader", True), ("contact", False)]
+)
+def test_a_node_receives_on_the_loopback_alone(
+    own_domain: dict[str, str], probe: Any, name: str, shared_memory: bool
+) -> None:
+    """And the one that keeps time through no shared memory."""
+    command = [sys.executable, "-m", f"avatar_ros.nodes.{name}"]
+    node = subprocess.Popen(command, env=_plain(own_domain), cwd="/")
+    try:
+        probe.ask(GetState, f"{name}/get_state", GetState.Request())  # it is heard here
+        assert _listening(node.pid) == {"127.0.0.1"}
+        assert ("dds.shm" in _threads(node.pid)) == shared_memory
+    finally:
+        node.terminate()
+        assert end_of(node, 10.0) == 0
+
+
+@dataclass(frozen=True)
+class Machines:
+    """Two network namespaces with a wire between them, each with shared memory of its own."""
+
+    names: tuple[str, str]
+    address: str
+
+    def start(self, machine: int, command: list[str], env: dict[str, str]) -> subprocess.Popen[str]:
+        inside = 'mount -t tmpfs tmpfs /dev/shm && exec "$@"'
+        there = f"ip netns exec {self.names[machine]} unshare -m sh -c".split()
+        return subprocess.Popen(
+            [*there, inside, "sh", *command], env=env, cwd="/", stdout=subprocess.PIPE, text=True
+        )
+
+
+@pytest.fixture
+def machines() -> Iterator[Machines]:
+    names = (f"avatar-a{os.getpid()}", f"avatar-b{os.getpid()}")
+    wires = (f"va{os.getpid()}", f"vb{os.getpid()}")
+    commands = [f"netns add {name}" for name in names]
+    commands += [f"link add {wires[0]} type veth peer name {wires[1]}"]
+    for k, (name, wire) in enumerate(zip(names, wires, strict=True)):
+        commands += [f"link set {wire} netns {name}"]
+        commands += [f"-n {name} addr add 10.231.7.{k + 1}/24 dev {wire}"]
+        commands += [f"-n {name} link set {wire} up multicast on", f"-n {name} link set lo up"]
+    try:
+        for command in commands:
+            try:
+                subprocess.run(["ip", *command.split()], check=True, capture_output=True)
+            except (OSError, subprocess.CalledProcessError) as error:
+                pytest.skip(f"no network namespaces here: ip {command}: {error}")
+        yield Machines(names, "10.231.7.1")
+    finally:
+        for name in names:
+            subprocess.run(["ip", "netns", "del", name], capture_output=True)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("said", "heard"),
+    [({}, "nothing"), ({RANGE: LOCAL}, "nothing"), ({RANGE: "SUBNET"}, "heard")],
+    ids=["default", "localhost", "subnet"],
+)
+def test_another_machine_reaches_a_node_only_if_told(
+    own_domain: dict[str, str], machines: Machines, said: dict[str, str], heard: str
+) -> None:
+    """The other machine even knows the address, and looks there."""
+    node = machines.start(0, NODE, _plain(own_domain) | said)
+    try:
+        time.sleep(2.0)
+        peer_environment = _plain(own_domain) | {RANGE: "SUBNET"}
+        peer_environment["ROS_STATIC_PEERS"] = machines.address
+        seconds = LISTENING if heard == "nothing" else START_TIMEOUT  # it ends when it hears
+        script = textwrap.dedent(HEARD.format(seconds=seconds))
+        peer = machines.start(1, [sys.executable, "-c", script], peer_environment)
+        assert peer.communicate(timeout=2 * START_TIMEOUT)[0].strip() == heard
+        assert node.poll() is None
+    finally:
+        node.terminate()
+        assert end_of(node, 10.0) == 0
+
+
+def test_security_that_is_not_there_lets_nothing_run(
+    own_domain: dict[str, str], tmp_path: Path
+) -> None:
+    """These wheels have no DDS security; with one that has, there is no key, and nothing runs."""
+    environment = own_domain | {
+        "ROS_SECURITY_ENABLE": "true",
+        "ROS_SECURITY_STRATEGY": "Enforce",
+        "ROS_SECURITY_KEYSTORE": str(tmp_path),
+    }
+    node = subprocess.run(NODE, env=environment, cwd="/", capture_output=True, timeout=60.0)
+    assert node.returncode == 1

@@ -1,0 +1,192 @@
+"""The contact node on one host, loader and tool on another, and no file in common.
+
+Two network namespaces joined by a virtual link; in that of the contact node the library is hidden.
+Needs the right to make them, and skips where that is not given.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_core.vademecum.storage import save_vademecum
+from avatar_ros.msg import ContactState
+from tests.helpers.paths import ROOT
+from tests.helpers.slowness import Deadline
+
+pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
+
+SCRIPTS = ROOT / "tests" / "ros" / "helpers"
+LOAD = """
+import sys, time, rclpy
+from avatar_ros.srv import LoadVademecum
+rclpy.init()
+node = rclpy.create_node("far_planner", enable_rosout=False)
+client = node.create_client(LoadVademecum, "load_vademecum")
+assert client.wait_for_service(30.0)
+time.sleep(0.5)
+begin = time.monotonic()
+answer = client.call_async(LoadVademecum.Request(name=sys.argv[1]))
+rclpy.spin_until_future_complete(node, answer, timeout_sec=30.0)
+print(begin, answer.result().info.id)
+"""
+
+
+class Hosts:
+    """``planning`` and ``haptic``, and the processes on them."""
+
+    def __init__(self, domain: dict[str, str], hidden: Path) -> None:
+        mark = f"{os.getpid() % 100000}"
+        self.names = {"planning": f"avp{mark}", "haptic": f"avh{mark}"}
+        self.environment = domain | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
+        self._hidden = hidden
+        self._shm = hidden.with_name("shm")  # no memory in common either
+        self._shm.mkdir()
+        self._processes: list[subprocess.Popen[str]] = []
+        for name in self.names.values():
+            _ip("netns", "add", name)
+            _ip("-n", name, "link", "set", "lo", "up")
+        planning, haptic = self.names.values()
+        _ip(
+            "link",
+            "add",
+            "far0",
+            "netns",
+            planning,
+            "type",
+            "veth",
+            "peer",
+            "far0",
+            "netns",
+            haptic,
+        )
+        for k, name in enumerate((planning, haptic), 1):
+            _ip("-n", name, "address", "add", f"10.77.0.{k}/24", "dev", "far0")
+            _ip("-n", name, "link", "set", "far0", "up")
+            _ip("-n", name, "route", "add", "224.0.0.0/4", "dev", "far0")
+
+    def run(self, host: str, *command: str) -> subprocess.Popen[str]:
+        """Start a Python command; on ``haptic`` the library is an empty folder."""
+        words = ["ip", "netns", "exec", self.names[host], sys.executable, *command]
+        if host == "haptic":
+            hide = f"mount -t tmpfs none {self._hidden} && mount --bind {self._shm} /dev/shm"
+            words = ["unshare", "-m", "sh", "-c", f'{hide} && exec "$@"', "sh", *words]
+        process = subprocess.Popen(
+            words, cwd="/", env=self.environment, stdout=subprocess.PIPE, text=True
+        )
+        self._processes.append(process)
+        return process
+
+    def link(self, state: str) -> None:
+        _ip("-n", self.names["planning"], "link", "set", "far0", state)
+        if state == "up":
+            with suppress(subprocess.CalledProcessError):
+                _ip("-n", self.names["planning"], "route", "add", "224.0.0.0/4", "dev", "far0")
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.terminate()
+        for process in self._processes:
+            try:
+                process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+        for name in self.names.values():
+            subprocess.run(["ip", "netns", "del", name], check=False)
+
+
+def _ip(*words: str) -> None:
+    subprocess.run(["ip", *words], check=True, capture_output=True)
+
+
+def _may() -> bool:
+    if shutil.which("ip") is None or shutil.which("unshare") is None:
+        return False
+    tried = subprocess.run(["unshare", "-n", "-m", "true"], check=False, capture_output=True)
+    return tried.returncode == 0 and os.access("/run", os.W_OK)
+
+
+@pytest.fixture
+def hosts(own_domain: dict[str, str], organ: Any, tmp_path: Path) -> Iterator[Hosts]:
+    if not _may():
+        pytest.skip("no right to make network namespaces")
+    library = tmp_path / "library"
+    library.mkdir()
+    save_vademecum(organ, library / "liver.h5")
+    save_vademecum(replace(organ, name="twin"), library / "twin.h5")
+    found = Hosts(own_domain, library)
+    yield found
+    found.close()
+
+
+class Ear:
+    """Lines of ``remote_listener.py``, until one is wanted."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+        self.lines: list[dict[str, Any]] = []
+
+    def until(self, wanted: Callable[[dict[str, Any]], bool], timeout: float) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        passed = Deadline(timeout)
+        while not passed:
+            line = json.loads(self._process.stdout.readline())
+            self.lines.append(line)
+            if wanted(line):
+                return line
+        raise AssertionError(f"not heard within {timeout:g} s; last: {self.lines[-1]}")
+
+
+def test_a_vademecum_crosses_and_a_dead_link_costs_no_more_than_itself(
+    hosts: Hosts, touch: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    library = tmp_path / "library"
+    files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
+    hosts.run("planning", "-m", "avatar_ros.nodes.vademecum_loader", "--ros-args", *files)
+    hosts.run("haptic", "-m", "avatar_ros.nodes.contact")
+    ear = Ear(hosts.run("haptic", str(SCRIPTS / "remote_listener.py")))
+    place = [f"{x:.9g}" for x in (*(touch[0] + 4e-3 * touch[1]), *touch[1])]
+    hosts.run("planning", str(SCRIPTS / "steady_tool.py"), *place)
+    sound = lambda line: line["status"] == ContactState.STATUS_OK and line["largest"] > 0.1  # noqa: E731
+    first = ear.until(lambda line: line["id"] and sound(line), 120.0)["id"]
+
+    hosts.link("down")
+    begin = time.monotonic()
+    ear.lines.clear()
+    ear.until(lambda line: line["at"] > begin + 5.0, 10.0)
+    dead = [line for line in ear.lines if line["at"] > begin + 0.15]
+    assert {line["status"] for line in dead} <= {
+        ContactState.STATUS_STALE_POSE,
+        ContactState.STATUS_LOST_TOOL,
+    }
+    assert all(line["largest"] == 0.0 for line in dead)  # a zero is sent, never silence
+    rate = (dead[-1]["n"] - dead[0]["n"]) / (dead[-1]["at"] - dead[0]["at"])
+    hosts.link("up")
+    up = time.monotonic()
+    recovery = ear.until(sound, 30.0)["at"] - up
+
+    planner = hosts.run("planning", "-c", LOAD, "twin.h5")
+    crossed = ear.until(lambda line: line["id"] not in ("", first), 60.0)
+    asked, identity = planner.communicate(timeout=30.0)[0].split()
+    assert crossed["id"] == identity
+    assert all(line["finite"] for line in ear.lines)
+    print(
+        f"\ndead link for 5 s: zeros at {rate:.0f} Hz heard; force again {recovery:.2f} s after it "
+        f"was up; another vademecum in use {crossed['at'] - float(asked):.2f} s after the request"
+    )
+    assert recovery <= 3.0  # 0.2 s where nothing else runs; tells it from waiting for discovery

@@ -1,0 +1,98 @@
+"""What the pages in msg_docs/ and the files in params/ say, and what a node offers."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import yaml
+from rclpy.node import NodeNameNonExistentError
+
+from tests.helpers.paths import ROOT
+
+PAGES = ROOT / "msg_docs"
+# Every managed node has these; the index says so in one sentence.
+COMMON_TOPICS = {"parameter_events", "rosout", "transition_event"}
+COMMON_SERVICES = re.compile(
+    r"/(change_state|get_\w*state\w*|get_available_\w+|get_transition_graph"
+    r"|\w*parameter\w*|get_type_description)$"
+)
+
+
+def index() -> list[dict[str, str]]:
+    """Rows of the index: interface, page, kind, type, node, direction."""
+    row = re.compile(
+        r"^\| \[`(?P<interface>[^`]+)`\]\((?P<page>[^)]+)\) \| (?P<kind>\w+)"
+        r" \| `(?P<type>[^`]+)` \| `(?P<node>[^`]+)` \| (?P<direction>\w+) \|$",
+        re.MULTILINE,
+    )
+    return [found.groupdict() for found in row.finditer((PAGES / "README.md").read_text())]
+
+
+def entry(page: str, key: str) -> str:
+    """What follows ``- **key**:`` on a page."""
+    found = re.search(rf"^- \*\*{key}\*\*: (.+)$", (PAGES / page).read_text(), re.MULTILINE)
+    assert found, f"{page} does not say its {key}"
+    return found[1]
+
+
+def topic(row: dict[str, str]) -> str:
+    return "/" + row["interface"].replace("NAME", "tool")
+
+
+def offered(graph: Any, node: str) -> set[tuple[str, str, str]]:
+    """Name, type and direction of what a node has beyond what every managed node has."""
+    offered = set()
+    for direction, ask in (
+        ("out", graph.get_publisher_names_and_types_by_node),
+        ("in", graph.get_subscriber_names_and_types_by_node),
+        ("server", graph.get_service_names_and_types_by_node),
+    ):
+        try:
+            found = ask(node, "/")
+        except NodeNameNonExistentError:  # not discovered yet
+            return set()
+        for name, types in found:
+            common = name.rsplit("/", 1)[-1] in COMMON_TOPICS or COMMON_SERVICES.search(name)
+            if not common:
+                offered.add((name, types[0], direction))
+    return offered
+
+
+def parameter_rows(node: str) -> dict[str, str]:
+    """Name of each documented parameter, and the rest of its row."""
+    page = (PAGES / "parameters.md").read_text()
+    section = page.split(f"## {node}\n")[1].split("\n## ")[0]
+    return dict(re.findall(r"^\| `([^`]+)` (\|.*)$", section, re.MULTILINE))
+
+
+def quality_rows(node: str) -> dict[str, str]:
+    """Of a node's topics: each ``qos_overrides`` parameter and the default that the page says."""
+    cells = r"`([^`]+)` \| (subscription|publisher) \| (.+) \| (.+) \| (.+) \| (.+)"
+    page = (PAGES / "parameters.md").read_text()
+    found = {}
+    own = {row["interface"] for row in index() if row["node"] == node}
+    for interface, side, *values in re.findall(rf"^\| {cells} \|$", page, re.MULTILINE):
+        if interface not in own:
+            continue
+        name = f"qos_overrides.{topic({'interface': interface})}.{side}"
+        policies = ("reliability", "durability", "depth", "deadline")
+        for policy, value in zip(policies, values, strict=True):
+            found[f"{name}.{policy}"] = re.split(r"[ ,]", value)[0]
+    return found
+
+
+def yaml_parameters(node: str) -> dict[str, Any]:
+    """The parameters in the cell's YAML file, nested names joined by dots."""
+    content = yaml.safe_load((ROOT / "params" / "planning_cell.yaml").read_text())
+    return _flat(content[node]["ros__parameters"])
+
+
+def _flat(values: dict[str, Any], before: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{before}{name}.")
+        else:
+            flat[before + name] = value
+    return flat

@@ -1,0 +1,103 @@
+"""The direction of a tool's axis, from its pose to the torque on it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.framework.templates import rotated
+from avatar_ros.loop.contact_loop import ActiveModel
+from avatar_ros.loop.safety import Safety
+from avatar_ros.loop.tool_channel import ToolChannel
+from geometry_msgs.msg import WrenchStamped
+from rclpy.serialization import deserialize_message
+
+from avatar_core.contact.effects import Tilt
+from avatar_core.contact.model import prepare, solve
+from avatar_core.geometry.tip import Tip
+from tests.ros.conftest import TIP_RADIUS, TOUCH_DEPTH
+from tests.ros.loop.test_poses import Bench, bench, pose
+
+pytestmark = pytest.mark.ros
+
+__all__ = ["bench"]  # a fixture
+PUNCH = Tip("flat", 4e-3)
+
+
+def punch_bench(bench: Any, organ: Any) -> Bench:
+    """A loop whose tool is a punch with its shaft along +x of its pose."""
+    made: Bench = bench(20e-3)
+    model = prepare(organ, (PUNCH,), cloud="off", effects=(Tilt((1.0, 0.0, 0.0)),), halves=True)
+    made.loop.active = made.loop._used = ActiveModel("a", model, made.settings)
+    return made
+
+
+def torque(bench: Bench) -> np.ndarray:
+    sent = deserialize_message(bench.poses[0].sent[-1], WrenchStamped).wrench.torque
+    return np.array([sent.x, sent.y, sent.z])
+
+
+def leaning(normal: np.ndarray, angle: float) -> Rotation:
+    """A pose whose x axis leans off a normal."""
+    aside = np.cross(normal, [0.3, 0.5, 0.8])
+    axis = np.cos(angle) * normal + np.sin(angle) * aside / np.linalg.norm(aside)
+    turn, _ = Rotation.align_vectors(axis[None], [[1.0, 0.0, 0.0]])
+    return turn
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_punch_leans_as_its_pose_says(
+    bench: Any, organ: Any, touch: tuple[np.ndarray, np.ndarray], turned: bool
+) -> None:
+    """The torque is the core's; in a frame of the tool it comes in that frame."""
+    made, normal = punch_bench(bench, organ), touch[1]
+    surface = touch[0] - (TIP_RADIUS - TOUCH_DEPTH) * normal
+    lean, frame, shift = leaning(normal, 0.2), Rotation.identity(), np.zeros(3)
+    if turned:
+        frame, shift = Rotation.from_euler("xyz", [0.4, -1.0, 2.0]), np.array([0.3, -0.1, 0.2])
+        own = Safety(leap=math.inf)
+        own = replace(own, frame="device", transform=(*shift, *frame.as_quat()))
+        made.tools[0] = ToolChannel(made.poses[0], made.poses[0], "organ", own)
+        made.loop._tools = made.tools
+    reference = prepare(organ, (PUNCH,), cloud="off", effects=(Tilt(),), halves=True)
+    assert reference.axes is not None
+    reference.axes[:] = lean.as_matrix()[:, 0]
+    own_turn = (frame.inv() * lean).as_quat()
+    for depth in np.arange(-2e-3, 3.1e-3, 0.5e-3):
+        tip = surface - depth * normal
+        where = frame.inv().apply(tip - shift)
+        made.step(pose(where, quaternion=own_turn, frame="device" if turned else "organ"))
+        solve(reference, tip[None])
+    expected = reference.out.torque[0]
+    assert np.linalg.norm(expected) > 1e-3
+    np.testing.assert_allclose(frame.apply(torque(made)), expected, atol=1e-9)
+
+
+def test_a_pose_that_is_refused_lets_the_torque_fade(
+    bench: Any, organ: Any, touch: tuple[np.ndarray, np.ndarray]
+) -> None:
+    made, normal = punch_bench(bench, organ), touch[1]
+    surface = touch[0] - (TIP_RADIUS - TOUCH_DEPTH) * normal
+    turn = leaning(normal, 0.2).as_quat()
+    for depth in np.arange(-2e-3, 3.1e-3, 0.5e-3):
+        made.step(pose(surface - depth * normal, quaternion=turn))
+    for _ in range(20):
+        made.step(pose(surface - 3e-3 * normal, quaternion=np.full(4, np.nan)))
+    assert not made.loop.active.model.axes.any()
+    assert np.isfinite(torque(made)).all()
+
+
+def test_a_vector_turns_as_scipys() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        quaternion, vector = Rotation.random(random_state=rng).as_quat(), rng.normal(size=3)
+        found = rotated(tuple(vector), tuple(quaternion))
+        np.testing.assert_allclose(found, Rotation.from_quat(quaternion).apply(vector), atol=1e-14)

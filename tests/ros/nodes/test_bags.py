@@ -1,0 +1,118 @@
+"""A bag of a running cell, as a recorder of ROS 2 writes it, is replayed."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from avatar_ros.framework.ports import PolledSubscriptions
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from avatar_core.bags.compare import comparable
+from avatar_core.bags.periods import path_of
+from avatar_core.bags.read import Bag, read_bag
+from avatar_core.contact.haptics.force_guard import DEVICES
+from avatar_core.scene.file import write_scene
+from avatar_core.scene.model import Scene
+from avatar_core.scene.replay import replay
+from avatar_core.vademecum.storage import load_vademecum
+from avatar_ros.msg import ContactState, VademecumInfo
+from tests.core.bags.bag_files import STORE
+from tests.helpers.slowness import Deadline
+
+pytestmark = pytest.mark.ros
+
+SECONDS = 4  # one touch
+_BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+_RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+TOPICS = {
+    "/tool/measured_cp": (PoseStamped, _BEST_EFFORT),
+    "/tool/servo_cf": (WrenchStamped, _RELIABLE),
+    "/contact_state": (ContactState, _RELIABLE),
+    "/vademecum_info": (VademecumInfo, qos.LATCHED),
+}
+
+
+class Recorder:
+    """Takes messages as they come from the middleware: bytes, with the time of their receipt."""
+
+    def __init__(self, node: Any) -> None:
+        group = PolledSubscriptions()
+        self.taken: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in TOPICS}
+        self._subscriptions = {
+            topic: node.create_subscription(
+                kind, topic, lambda _: None, quality, callback_group=group, raw=True
+            )
+            for topic, (kind, quality) in TOPICS.items()
+        }
+
+    def take(self) -> None:
+        for topic, subscription in self._subscriptions.items():
+            kind = TOPICS[topic][0]
+            while (taken := subscription.handle.take_message(kind, True)) is not None:
+                self.taken[topic].append((taken[1]["received_timestamp"], bytes(taken[0])))
+
+    def write(self, folder: Path, plugin: str, topics: set[str]) -> Path:
+        with Writer(folder, version=9, storage_plugin=StoragePlugin[plugin]) as writer:
+            for topic in topics:
+                kind = TOPICS[topic][0]
+                name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
+                connection = writer.add_connection(topic, name, typestore=STORE)
+                for received, content in self.taken[topic]:
+                    writer.write(connection, received, content)
+        return folder
+
+
+@pytest.fixture(scope="module")
+def recorder(cell: Any, lasting_probe: Any, library: Path, own_domain: dict[str, str]) -> Recorder:
+    """What one touch of the scripted tool gave."""
+    recorder = Recorder(lasting_probe.node)
+    lasting_probe.next(ContactState, "contact_state", qos.state(1), lambda s: s.vademecum_id)
+    arguments = [str(library / "liver.h5"), "--seconds", str(SECONDS)]
+    tool, passed = Module("bench.scripted_tool", arguments, own_domain), Deadline(120.0)
+    while tool.poll() is None:
+        assert not passed, "the tool does not end"
+        recorder.take()
+        time.sleep(1e-3)
+    assert tool.finish() == 0
+    return recorder
+
+
+def compared(bag: Bag, organ: Any) -> tuple[Any, Any]:
+    path = path_of(bag, write_scene(Scene()), organ.id)
+    return path, comparable(path, replay(path.recording, organ), DEVICES["sigma"])
+
+
+@pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
+@pytest.mark.parametrize("states", [True, False], ids=["states", "wrenches"])
+def test_a_bag_of_a_cell_is_replayed(
+    plugin: str, states: bool, recorder: Recorder, library: Path, tmp_path: Path
+) -> None:
+    organ = load_vademecum(library / "liver.h5")
+    topics = set(TOPICS) if states else set(TOPICS) - {"/contact_state"}
+    bag = read_bag(recorder.write(tmp_path / "bag", plugin, topics))
+    path, found = compared(bag, organ)
+    size = np.linalg.norm(path.recording.periods.force, axis=2)
+    touching = size[:, 0] > 0.1
+    known = found.known & touching
+    print(
+        f"{len(size)} periods, {touching.sum()} in contact, {known.sum()} of these known, largest "
+        f"force {size.max():.2f} N, difference {found.difference(path.recording):.1e} N"
+    )
+    assert bag.vademecum_ids == (organ.id,) and not bag.notes
+    assert path.answers == ("states" if states else "wrenches")
+    assert size.max() > 0.1
+    # On a busy machine, the force guard may alter forces all the time.
+    assert known.sum() > 200 if states else found.known.any()
+    assert found.difference(path.recording) <= 1e-9

@@ -1,0 +1,161 @@
+"""The service that finds the material from touches: its answers, and what it refuses."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.bench.cell import Module
+from avatar_ros.bench.footprint import children
+
+from avatar_core.scene.recording import load_recording, save_recording
+from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.storage import save_vademecum
+from avatar_ros.srv import CalibrateMaterial, LoadVademecum
+from tests.helpers.slowness import Deadline
+from tests.helpers.soft_organ import organ_on_springs
+from tests.helpers.touches import felt, path_over, recording_of
+
+pytestmark = pytest.mark.ros
+
+SUPPORT = "support.bare_area"
+TRUE = {"young": 6e3, SUPPORT: 3e6}
+N_TOUCHES = 4
+IMPORTED = 4.0  # processor time after which touches are followed [s]
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder, organ = tmp_path_factory.mktemp("library"), organ_on_springs()
+    save_vademecum(organ, folder / "springs.h5")
+    tips = path_over(organ, N_TOUCHES)
+    forces = felt(at_values(organ, TRUE), tips)
+    save_recording(recording_of(organ, tips, forces), folder / "push.h5")
+    again = (np.tile(one, (400, 1)) for one in (tips, forces))
+    save_recording(recording_of(organ, *again), folder / "many_times.h5")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def probe(lasting_probe: Any) -> Any:
+    return lasting_probe
+
+
+@pytest.fixture(scope="module")
+def loader(own_domain: dict[str, str], library: Path) -> Iterator[Module]:
+    options = ["--ros-args", "-p", f"library_dir:={library}", "-p", "vademecum:=springs.h5"]
+    process = Module("vademecum_loader", options, own_domain)
+    yield process
+    assert process.finish() == 0
+
+
+@pytest.fixture
+def ask(loader: Module, probe: Any) -> Callable[..., Any]:
+    def call(**fields: Any) -> Any:
+        request = CalibrateMaterial.Request(**fields)
+        return probe.call(CalibrateMaterial, "calibrate_material", request)
+
+    return call
+
+
+def test_it_finds_the_values_of_the_organ_that_was_loaded(ask: Callable[..., Any]) -> None:
+    """And says how sure they are, while the loader goes on to serve."""
+    answer = ask(recording="push.h5")
+    assert answer.success, answer.message
+    assert answer.explained and answer.message.startswith("the fit is good")
+    assert set(answer.parameters) == set(TRUE)
+    for name, value, low, high in zip(
+        answer.parameters, answer.values, answer.low, answer.high, strict=True
+    ):
+        assert low < TRUE[name] < high
+        assert low < value < high
+    assert answer.seconds > 0.0
+
+
+@pytest.mark.long
+def test_what_is_known_before_counts(ask: Callable[..., Any]) -> None:
+    answer = ask(recording="push.h5", name="springs.h5", given=[f"{SUPPORT}=fixed:3e6"])
+    assert answer.success, answer.message
+    assert list(answer.parameters) == ["young"]
+    assert answer.low[0] < TRUE["young"] < answer.high[0]
+
+
+@pytest.mark.long
+def test_a_model_that_cannot_be_is_called_so(ask: Callable[..., Any], library: Path) -> None:
+    """Forces that grow fourfold from one touch to the next are of no organ like this."""
+    found = load_recording(library / "push.h5")
+    force = np.array(found.periods.force)
+    force[: len(force) // 2] *= 4.0
+    save_recording(
+        replace(found, periods=replace(found.periods, force=force)), library / "wrong.h5"
+    )
+    answer = ask(recording="wrong.h5")
+    assert answer.success and not answer.explained
+    assert answer.message.startswith("NOT EXPLAINED") and answer.probability < 0.01
+
+
+def test_the_loader_goes_on_to_serve(loader: Module, probe: Any) -> None:
+    client = probe.client(CalibrateMaterial, "calibrate_material")
+    slow = client.call_async(CalibrateMaterial.Request(recording="push.h5"))
+    loaded = probe.call(LoadVademecum, "load_vademecum", LoadVademecum.Request(name="springs.h5"))
+    assert loaded.success and not slow.done()
+    busy = probe.call(
+        CalibrateMaterial, "calibrate_material", CalibrateMaterial.Request(recording="push.h5")
+    )
+    assert not busy.success and "ask again" in busy.message
+    probe.until(slow.done, 120.0)
+    assert slow.result().success
+
+
+def computed(pid: int) -> float:
+    """Processor time of a process [s]."""
+    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def test_a_loader_that_ends_leaves_nothing_behind(
+    own_domain: dict[str, str], library: Path, probe: Any
+) -> None:
+    options = ["--ros-args", "-r", "__ns:=/ending", "-p", f"library_dir:={library}"]
+    loader = Module("vademecum_loader", [*options, "-p", "vademecum:=springs.h5"], own_domain)
+    client = probe.client(CalibrateMaterial, "/ending/calibrate_material")
+    before = set(children(loader.pid))
+    client.call_async(CalibrateMaterial.Request(recording="many_times.h5"))
+    probe.until(lambda: bool(set(children(loader.pid)) - before), 30.0)
+    (started,) = set(children(loader.pid)) - before
+    probe.until(lambda: computed(started) > IMPORTED, 120.0)
+    assert loader.finish() == 0
+    passed = Deadline(3.0)
+    while Path(f"/proc/{started}").exists():
+        assert not passed, "the calibration goes on"
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({}, "recording is empty"),
+        ({"recording": "none.h5"}, "No such file"),
+        ({"recording": "../push.h5"}, "library_dir"),
+        ({"recording": "push.h5", "name": "/etc/passwd"}, "library_dir"),
+        ({"recording": "push.h5", "radius": -1.0}, "radius is -1 m"),
+        ({"recording": "push.h5", "tool_transform": [1.0]}, "has 1 numbers"),
+        ({"recording": "push.h5", "tool": "2"}, "which has tools 1 to 1"),
+        ({"recording": "push.h5", "given": ["stiffness=fixed:1"]}, "no 'stiffness'"),
+        ({"recording": "springs.h5"}, "springs.h5"),
+    ],
+)
+def test_a_refusal_is_a_line(ask: Callable[..., Any], fields: dict[str, Any], reason: str) -> None:
+    answer = ask(**fields)
+    assert not answer.success
+    assert reason in answer.message and "\n" not in answer.message

@@ -1,0 +1,207 @@
+"""Drivers of haptic devices: the wrench as they take it, their files, and one that stands in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.bench.cell import Module
+from avatar_ros.loop.safety import WRENCHES, Safety
+from avatar_ros.loop.tool_channel import ToolChannel
+from crtk_msgs.msg import OperatingState
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
+
+from avatar_ros.msg import ContactState
+from tests.helpers.paths import PARAMS
+from tests.ros.conftest import PATIENT
+from tests.ros.helpers.refusals import refusal
+from tests.ros.loop.test_poses import bench, pose
+
+pytestmark = pytest.mark.ros
+__all__ = ["bench"]  # a fixture
+
+DEVICES = PARAMS / "devices"
+CRTK = QoSProfile(depth=10)  # of crtk_python_client: reliable, the last ten
+# Of what cisst-ros publishes when it changes.
+LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def wrench(raw: bytes) -> tuple[np.ndarray, np.ndarray]:
+    sent = deserialize_message(raw, WrenchStamped).wrench
+    return tuple(np.array([v.x, v.y, v.z]) for v in (sent.force, sent.torque))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("kind", WRENCHES)
+def test_a_wrench_comes_as_crtk_names_it(
+    bench: Any, touch: tuple[np.ndarray, np.ndarray], kind: str
+) -> None:
+    """Of a device whose base is turned and shifted, held askew: one force, said in three ways."""
+    frame, shift = Rotation.from_euler("xyz", [0.4, -1.0, 2.0]), np.array([0.3, -0.1, 0.2])
+    held = Rotation.from_euler("xyz", [1.0, 0.3, -0.7])  # in the device's frame
+    found = {}
+    for each in ("absolute", kind):
+        own = Safety(leap=math.inf, frame="device", transform=(*shift, *frame.as_quat()))
+        made = bench(20e-3)
+        made.tools[0] = ToolChannel(
+            made.poses[0], made.poses[0], "organ", replace(own, wrench=each)
+        )
+        made.loop._tools = made.tools
+        for depth in np.arange(-6e-3, 0.1e-3, 1e-3):
+            where = frame.inv().apply(touch[0] - depth * touch[1] - shift)
+            made.step(pose(where, quaternion=held.as_quat(), frame="device"))
+        found[each] = wrench(made.poses[0].sent[-1])
+    force, torque = found["absolute"]
+    assert np.linalg.norm(force) > 1.0
+    expected = {
+        "absolute": (force, torque),
+        "body": (held.inv().apply(force), held.inv().apply(torque)),
+        "spatial": (force, torque + np.cross(where, force)),
+    }[kind]
+    np.testing.assert_allclose(found[kind], expected, atol=1e-12 * np.linalg.norm(force))
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "hears"),
+    [
+        ("touch.yaml", "arm", "servo_cf"),
+        pytest.param("force_dimension.yaml", "omega", "body/servo_cf", marks=pytest.mark.long),
+        pytest.param("dvrk.yaml", "MTML", "body/servo_cf", marks=pytest.mark.long),
+    ],
+)
+def test_a_driver_feels_the_organ_by_its_file(
+    own_domain: dict[str, str],
+    library: Path,
+    probe: Any,
+    touch: tuple[np.ndarray, np.ndarray],
+    file: str,
+    name: str,
+    hears: str,
+) -> None:
+    """Started by the lines of msg_docs/devices.md; poses at 500 Hz, as crtk's clients send them.
+
+    It feels nothing before it says that it is enabled and homed, and nothing any more when it is
+    paused or in fault.
+    """
+    frame = {"arm": "base", "omega": "omega_base", "MTML": "MTML_base"}[name]
+    own = "body/servo_cf" if name == "MTML" else "servo_cf"
+    topics = {"measured_cp": "measured_cp", "operating_state": "operating_state", own: hears}
+    remaps = [f"tool/{ours}:=/{name}/{theirs}" for ours, theirs in topics.items()]
+    arguments = ["--ros-args", "--params-file", str(DEVICES / file)]
+    for remap in remaps:
+        arguments += ["-r", remap]
+    loader = ["--ros-args", "-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
+    timeout = [part for part in PATIENT if part != "--ros-args"]  # of a busy machine
+    processes = [
+        Module("vademecum_loader", loader, own_domain),
+        Module("contact", arguments + timeout, own_domain),
+    ]
+    node, felt = probe.node, []
+    poses = node.create_publisher(PoseStamped, f"/{name}/measured_cp", CRTK)
+    states = node.create_publisher(OperatingState, f"/{name}/operating_state", LATCHED)
+    node.create_subscription(WrenchStamped, f"/{name}/{hears}", felt.append, CRTK)
+    now = {"status": -1}
+    node.create_subscription(
+        ContactState, "contact_state", lambda state: now.update(status=state.status), CRTK
+    )
+    turn = Rotation.from_euler("z", 0.5)
+
+    def send() -> None:
+        message = PoseStamped()
+        message.header.frame_id, message.header.stamp = frame, node.get_clock().now().to_msg()
+        at, to = message.pose.position, message.pose.orientation
+        at.x, at.y, at.z = map(float, touch[0])
+        to.x, to.y, to.z, to.w = map(float, turn.as_quat())
+        poses.publish(message)
+
+    node.create_timer(2e-3, send)
+    limit = {"arm": 2.0, "omega": 12.0, "MTML": 3.0}[name]
+
+    def says(state: str, homed: bool) -> None:
+        states.publish(OperatingState(state=state, is_homed=homed))
+
+    def reaches(status: int) -> None:
+        probe.until(lambda: now["status"] == status, 60.0)
+
+    try:
+        reaches(ContactState.STATUS_NO_OPERATING_STATE)
+        for state, homed, status in (
+            ("DISABLED", False, ContactState.STATUS_NOT_ENABLED),
+            ("ENABLED", False, ContactState.STATUS_NOT_HOMED),
+        ):
+            says(state, homed)
+            reaches(status)
+        assert not any(_size(message) for message in felt)
+        says("ENABLED", True)
+        probe.until(lambda: _size(felt[-1]) > 0.9 * min(limit, 3.0), 60.0)
+        for state in ("PAUSED", "FAULT"):
+            says(state, True)
+            probe.until(lambda: _size(felt[-1]) == 0.0, 60.0)
+            reaches(ContactState.STATUS_NOT_ENABLED)
+            says("ENABLED", True)
+            probe.until(lambda: _size(felt[-1]) > 0.9 * min(limit, 3.0), 60.0)
+    finally:
+        assert [process.finish() for process in processes] == [0, 0]
+    forces = np.array([_size(message) for message in felt])
+    assert forces.max() <= limit * (1.0 + 1e-9)
+    assert felt[-1].header.frame_id == frame
+
+
+def test_beside_a_device_a_tool_of_software_speaks_in_the_organs_frame(
+    own_domain: dict[str, str], library: Path, probe: Any, touch: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """As a planning page beside a Touch does, whose device has not been enabled yet."""
+    timeout = [part for part in PATIENT if part != "--ros-args"]
+    arguments = ["--ros-args", "--params-file", str(DEVICES / "touch.yaml"), *timeout]
+    elsewhere = "tool_transform:=[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]"
+    for value in ("tools:=[stylus, page]", "software_tools:=page", elsewhere):
+        arguments += ["-p", value]
+    processes = [
+        Module(
+            "vademecum_loader",
+            ["--ros-args", "-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"],
+            own_domain,
+        ),
+        Module("contact", arguments, own_domain),
+    ]
+    node, felt, states = probe.node, [], []
+    poses = node.create_publisher(PoseStamped, "page/measured_cp", CRTK)
+    node.create_subscription(WrenchStamped, "page/servo_cf", felt.append, CRTK)
+    node.create_subscription(ContactState, "contact_state", states.append, CRTK)
+
+    def send() -> None:
+        message = PoseStamped()
+        message.header.frame_id, message.header.stamp = "organ", node.get_clock().now().to_msg()
+        at = message.pose.position
+        at.x, at.y, at.z = map(float, touch[0])
+        message.pose.orientation.w = 1.0
+        poses.publish(message)
+
+    node.create_timer(2e-3, send)
+    try:
+        probe.until(lambda: bool(felt) and _size(felt[-1]) > 0.5, 60.0)
+        of_device = {s.status for s in states if s.tool == "stylus"}
+    finally:
+        assert [process.finish() for process in processes] == [0, 0]
+    assert felt[-1].header.frame_id == "organ"
+    assert of_device and ContactState.STATUS_OK not in of_device
+
+
+def test_software_that_is_no_tool_is_refused() -> None:
+    said = refusal("contact", "tools:=[stylus, page]", "software_tools:=[page, pgae]")
+    assert said == "parameter software_tools: there is no tool 'pgae' among stylus, page"
+
+
+def _size(message: WrenchStamped) -> float:
+    force = message.wrench.force
+    return math.hypot(force.x, force.y, force.z)

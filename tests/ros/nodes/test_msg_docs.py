@@ -1,0 +1,148 @@
+"""The pages in msg_docs/ and what the nodes offer, compared both ways."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rclpy.duration import Infinite
+from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+from avatar_ros.msg import ContactState
+from tests.ros.conftest import newcomer
+from tests.ros.helpers.doc_pages import (
+    PAGES,
+    entry,
+    index,
+    offered,
+    parameter_rows,
+    quality_rows,
+    topic,
+    yaml_parameters,
+)
+
+pytestmark = pytest.mark.ros
+
+NODES = ("vademecum_loader", "contact", "organ_markers")
+# Some of the contact node's topics exist only with these.
+ASKED = {"tool_operating_state": True, "tool_state_command": "enable"}
+OVERRIDABLE = NODES[:2]  # whose quality of service parameters may change
+
+
+@pytest.fixture(scope="module")
+def cell(own_domain: dict[str, str]) -> Iterator[list[Module]]:
+    """The nodes with nothing but their defaults, and what gives them all their topics."""
+    values = [word for name, value in ASKED.items() for word in ("-p", f"{name}:={value}")]
+    arguments = {"contact": ["--ros-args", *values]}
+    processes = [Module(node, arguments.get(node, []), own_domain) for node in NODES]
+    yield processes
+    assert [process.finish() for process in processes] == [0] * len(NODES)
+
+
+@pytest.fixture(scope="module")
+def probe(lasting_probe: Any) -> Any:
+    return lasting_probe
+
+
+def documented(node: str) -> set[tuple[str, str, str]]:
+    """Name, type and direction of what a node has by the index."""
+    return {(topic(row), row["type"], row["direction"]) for row in index() if row["node"] == node}
+
+
+@pytest.fixture(scope="module")
+def graph(cell: Any) -> Iterator[Any]:
+    """A node that discovered of the others all that the pages say."""
+    with newcomer(lambda graph: all(offered(graph, n) >= documented(n) for n in NODES)) as probe:
+        yield probe.node
+
+
+@pytest.fixture
+def running(cell: Any, probe: Any) -> Any:
+    """A probe beside a cell that is up."""
+    probe.next(ContactState, "contact_state", qos.state(1))
+    return probe
+
+
+@pytest.mark.parametrize("row", index(), ids=lambda row: row["interface"])
+def test_every_page_is_complete(row: dict[str, str]) -> None:
+    assert f"# {row['interface']}\n" in (PAGES / row["page"]).read_text()
+    assert row["type"] in entry(row["page"], "Type")
+    for key in ("Kind", "QoS", "Rate", "Frame", "Units"):
+        assert entry(row["page"], key)
+
+
+def test_every_page_is_in_the_index() -> None:
+    pages = {page.name for page in PAGES.glob("*.md")}
+    pages -= {"README.md", "parameters.md", "security.md", "results.md", "limits.md"}
+    pages -= {"clients.md", "devices.md", "slicer.md", "recordings.md", "planning_page.md"}
+    pages -= {"calibration.md", "registration.md", "supports.md", "uncertainty.md", "scenes.md"}
+    assert pages == {row["page"] for row in index()}
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_topics_and_services_are_those_of_the_pages(graph: Any, node: str) -> None:
+    # What one node sends any other may hear: it has its page.
+    heard = {(topic(row), row["type"], "in") for row in index() if row["direction"] == "out"}
+    assert offered(graph, node) - heard == documented(node)
+
+
+@pytest.mark.parametrize(
+    "row", [row for row in index() if row["kind"] == "topic"], ids=lambda row: row["interface"]
+)
+def test_quality_of_service_is_that_of_the_page(graph: Any, row: dict[str, str]) -> None:
+    look = (
+        graph.get_subscriptions_info_by_topic
+        if row["direction"] == "in"
+        else graph.get_publishers_info_by_topic
+    )
+    (end,) = (end for end in look(topic(row)) if end.node_name == row["node"])
+    said = entry(row["page"], "QoS")
+    reliable = end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    latched = end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert said.startswith("RELIABLE" if reliable else "BEST_EFFORT")
+    assert ("TRANSIENT_LOCAL" in said) == latched
+    deadline = end.qos_profile.deadline
+    assert ("deadline of" in said) == (deadline < Infinite)
+    if deadline < Infinite:
+        assert f"({deadline.nanoseconds * 1e-6:g} ms)" in said
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_parameters_are_those_of_the_page(running: Any, node: str) -> None:
+    listed = running.ask(ListParameters, f"/{node}/list_parameters", ListParameters.Request())
+    declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
+    rows, quality = parameter_rows(node), quality_rows(node)
+    assert bool(quality) == (node in OVERRIDABLE)
+    assert declared == set(rows) | set(quality)
+    request = GetParameters.Request(names=list(quality))
+    values = running.ask(GetParameters, f"/{node}/get_parameters", request).values
+    assert quality == {
+        name: str(parameter_value_to_python(value))
+        for name, value in zip(quality, values, strict=True)
+    }
+    request = DescribeParameters.Request(names=sorted(rows))
+    described = running.ask(DescribeParameters, f"/{node}/describe_parameters", request)
+    for descriptor in described.descriptors:
+        assert descriptor.description
+        changeable = "may change while running" in rows[descriptor.name]
+        assert descriptor.read_only != changeable, descriptor.name
+
+
+def test_the_yaml_file_holds_every_parameter_at_its_default(running: Any) -> None:
+    values = yaml_parameters("contact")
+    request = GetParameters.Request(names=list(values))
+    answer = running.ask(GetParameters, "/contact/get_parameters", request)
+    running_with = [parameter_value_to_python(value) for value in answer.values]
+    assert dict(zip(values, running_with, strict=True)) == values | ASKED
+    listed = running.ask(ListParameters, "/contact/list_parameters", ListParameters.Request())
+    declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
+    assert declared == set(values)

@@ -1,0 +1,308 @@
+"""Accuracy and time as the contact node promises, keeps and says them."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.framework import qos
+from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
+from avatar_ros.nodes.contact_reports import ShownModesLog
+from avatar_ros.prepare.budget_requests import BudgetRequests
+from avatar_ros.prepare.detail_chooser import DetailChooser
+from avatar_ros.prepare.requests import Change, PreparationRequest
+from avatar_ros.prepare.scenes import model_spec
+from avatar_ros.prepare.supplier import Answer
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
+
+from avatar_core.contact.model import prepare
+from avatar_core.errors import AccuracyError
+from avatar_core.vademecum.accuracy import Budget, Detail
+from avatar_ros.msg import ContactState, LoopStatistics
+from tests.helpers.slowness import Deadline
+from tests.ros.conftest import START_TIMEOUT, Probe
+from tests.ros.nodes.test_cell import Hand, felt
+
+pytestmark = pytest.mark.ros
+
+
+# --- Shedding, without a node ------------------------------------------------------------------
+
+
+def window(missed: int, step_p99: float) -> LoopStatistics:
+    return LoopStatistics(periods=1000, missed=missed, step_p99=step_p99)
+
+
+def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> None:
+    model = prepare(organ, halves=True)
+    accuracy = ShownModes(model, organ.certificate.curve.of("surface"), float("inf"))
+    report = accuracy.update(window(50, 30e-6))
+    assert report.shedding and report.changed
+    assert model.n_shown < model.n_modes
+    assert "5.0% of the periods missed" in report.text and "force keeps all modes" in report.text
+    for _ in range(5):
+        report = accuracy.update(window(0, 30e-6))
+    assert not report.shedding and model.n_shown == model.n_modes
+
+
+def test_nobody_looks_and_no_mode_is_left_out(organ: Any) -> None:
+    model = prepare(organ, halves=True)
+    accuracy = ShownModes(model, organ.certificate.curve.of("surface"), float("inf"))
+    accuracy.update(window(50, 30e-6), watched=True)
+    assert model.n_shown < model.n_modes
+    for _ in range(3):
+        report = accuracy.update(window(50, 30e-6), watched=False)
+        assert not report.shedding and model.n_shown == model.n_modes
+    assert accuracy.update(window(50, 30e-6), watched=True).shedding
+
+
+def test_the_log_names_modes_left_out_once_a_minute(probe: Probe) -> None:
+    """And taken back, at another severity, which rclpy does not let one line of code have."""
+    now, said = [0.0], []
+    logger = probe.node.get_logger()
+
+    class Heard:
+        def warning(self, text: str) -> None:
+            said.append((now[0], text))
+            logger.warning(text)
+
+        def info(self, text: str) -> None:
+            said.append((now[0], text))
+            logger.info(text)
+
+    log = ShownModesLog(SimpleNamespace(get_logger=Heard), lambda: now[0])
+    for second in range(130):
+        now[0] = float(second)
+        left_out = second % 4 < 2
+        log.note(ShownModesReport("left out" if left_out else "all", left_out, second % 2 == 0))
+    assert said == [
+        (0, "left out"),
+        (2, "all"),
+        (60, "left out"),
+        (62, "all"),
+        (120, "left out"),
+        (122, "all"),
+    ]
+
+
+def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> None:
+    model = prepare(organ, halves=True)
+    points = {p.detail.modes: p for p in organ.certificate.curve.like(_ordinary(model)).points}
+    accuracy = ShownModes(model, organ.certificate.curve.like(_ordinary(model)), float("inf"))
+    first, second = window(50, 30e-6), window(0, 30e-6)
+    accuracy.update(first)
+    accuracy.update(second)
+    assert first.modes_shown == first.modes == model.n_modes
+    assert first.promised_l2 == points[model.n_modes].l2
+    assert second.modes_shown == model.n_shown
+    assert second.promised_l2 == points[model.n_shown].l2 > first.promised_l2
+    assert second.promised_force == first.promised_force
+
+
+def test_a_budget_chooses_what_keeps_it(organ: Any) -> None:
+    order = PreparationRequest(
+        "vademecum", "handover", "/", ({"radius": 5e-3},), None, "surface", 1e-3
+    )
+    what, budgets = model_spec(organ, order, None), DetailChooser()
+    exact = budgets.detail(what, order)
+    assert exact == Detail(organ.n_modes)
+    errors = {p.detail: p.l2 for p in organ.certificate.curve.points}
+    loose = replace(order, budget={"tolerance": 3.0 * errors[exact], "deadline": 1.0})
+    coarse = budgets.detail(what, loose)
+    assert coarse != exact and errors[coarse] <= 3.0 * errors[exact]
+    curve = budgets.curve(what, coarse)
+    assert curve is not None
+    assert max(curve["modes"]) == coarse.modes and set(curve["precision"]) == {coarse.precision}
+    assert all(0.0 < p50 <= p99 for p50, p99 in zip(curve["p50"], curve["p99"], strict=True))
+    tight = replace(order, budget={"tolerance": 1e-6, "deadline": 1.0})
+    with pytest.raises(AccuracyError, match="nearest: "):
+        budgets.detail(what, tight)
+
+
+def _ordinary(model: Any) -> Any:
+    return Detail(model.n_modes)
+
+
+class Waiting:
+    """In place of the supplier: keeps what is asked, for the test to answer."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Change, Answer]] = []
+        self.told: list[Any] = []
+        self.requests = BudgetRequests(
+            None,
+            lambda change, answer: self.asked.append((change, answer)),
+            self.told.append,
+            lambda kept, refusal: self.told.append((kept, refusal)),
+        )
+
+
+def test_a_budget_that_is_taken_back_before_it_was_answered_is_asked_for_again() -> None:
+    supplier = Waiting()
+    supplier.requests.ask(Budget(1.0, 1e-3))
+    supplier.requests.ask(None)  # which is still in force
+    (_, loose), (change, none) = supplier.asked
+    assert change == {"budget": {}}
+    loose(None, "")
+    none(None, "")
+    assert supplier.told == [Budget(1.0, 1e-3), None]
+    assert supplier.requests.in_force is None
+
+
+def test_a_refused_budget_gives_way_to_the_one_in_force_unless_a_newer_one_comes() -> None:
+    supplier = Waiting()
+    good, bad = Budget(1.0, 1e-3), Budget(1e-6, 1e-3)
+    supplier.requests.ask(good)
+    supplier.asked[0][1](None, "")
+    supplier.requests.ask(bad)
+    supplier.asked[1][1](None, "infeasible")
+    assert supplier.told == [good, (good, "infeasible")]
+    supplier.requests.ask(good)  # as its parameters are put back
+    assert len(supplier.asked) == 2
+    supplier.requests.ask(bad)
+    supplier.requests.ask(None)
+    supplier.asked[2][1](None, "infeasible")
+    supplier.asked[3][1](None, "")
+    assert supplier.told[2:] == [None]
+
+
+# --- In the cell -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def probe(lasting_probe: Any) -> Any:
+    return lasting_probe
+
+
+@pytest.fixture
+def hand(cell: dict[str, Any], probe: Any, touch: tuple[np.ndarray, np.ndarray]) -> Hand:
+    probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
+    return Hand(probe, touch[0])
+
+
+def set_budget(probe: Any, **values: Any) -> Any:
+    """Set parameters below ``accuracy``; the first answer."""
+    kinds = {float: ("double", ParameterType.PARAMETER_DOUBLE)}
+    kinds[str] = ("string", ParameterType.PARAMETER_STRING)
+    named = []
+    for name, value in values.items():
+        field, kind = kinds[type(value)]
+        given = ParameterValue(type=kind, **{f"{field}_value": value})
+        named.append(Parameter(name=f"accuracy.{name}", value=given))
+    request = SetParameters.Request(parameters=named)
+    return probe.call(SetParameters, "/contact/set_parameters", request).results[0]
+
+
+def statistics(probe: Any, hand: Hand, wanted: Any) -> LoopStatistics:
+    return probe.next(LoopStatistics, "statistics", qos.STATISTICS, wanted, 2 * START_TIMEOUT, hand)
+
+
+def test_force_comes_with_its_error(probe: Any, hand: Hand) -> None:
+    state = probe.next(
+        ContactState,
+        "contact_state",
+        qos.state(1),
+        lambda state: state.contacts and state.status == ContactState.STATUS_OK,
+        meanwhile=hand,
+    )
+    force = state.contacts[0].force
+    size = np.linalg.norm([force.x, force.y, force.z])
+    assert 1e-4 * size < state.force_error < size
+
+
+def test_a_tolerance_shows_fewer_modes_and_leaves_the_force(
+    probe: Any, hand: Hand, organ: Any
+) -> None:
+    """However noisy the machine, the fastest of all details is none with all modes."""
+    rank = organ.n_modes
+    before = statistics(probe, hand, lambda s: s.modes == rank and s.step_p99 > 0.0)
+    assert before.modes_shown == rank or before.missed > 0
+    _, force = felt(probe, hand)
+    assert set_budget(probe, tolerance=1.0).successful
+    update = statistics(probe, hand, lambda s: 0 < s.modes < rank)
+    assert organ.certificate.curve.like(Detail(rank)).points[-1].l2 < update.promised_l2 <= 1.0
+    np.testing.assert_allclose(felt(probe, hand)[1], force, rtol=1e-6)
+    assert set_budget(probe, tolerance=0.0).successful
+    statistics(probe, hand, lambda s: s.modes == rank)
+
+
+def test_a_tolerance_beyond_every_detail_is_refused_in_the_answer(
+    probe: Any, hand: Hand, organ: Any
+) -> None:
+    statistics(probe, hand, lambda s: s.modes > 0)  # a vademecum is in use
+    answer = set_budget(probe, tolerance=1e-6)
+    best = min(p.l2 for p in organ.certificate.curve.of("surface").points)
+    assert not answer.successful
+    assert f"within 1e-06 of l2; the most exact is within {best:.3g}" in answer.reason
+    request = GetParameters.Request(names=["accuracy.tolerance"])
+    kept = probe.ask(GetParameters, "/contact/get_parameters", request)
+    assert kept.values[0].double_value == 0.0
+
+
+def test_an_infeasible_deadline_gives_way_to_the_one_before(probe: Any, hand: Hand) -> None:
+    assert set_budget(probe, deadline=1e-7).successful  # known when steps have been timed
+
+    def deadline() -> float:
+        request = GetParameters.Request(names=["accuracy.deadline"])
+        answer = probe.ask(GetParameters, "/contact/get_parameters", request)
+        return float(answer.values[0].double_value)
+
+    passed = Deadline(2 * START_TIMEOUT)
+    while deadline() != 0.0:
+        assert not passed
+        hand()
+        probe.spin(0.1)
+    statistics(probe, hand, lambda s: s.modes_shown > 0)  # it goes on
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"), [({"quantity": "taste"}, "l2 or force"), ({"tolerance": -1.0}, "range")]
+)
+def test_a_budget_without_meaning_is_refused_at_once(
+    probe: Any, hand: Hand, values: dict[str, Any], reason: str
+) -> None:
+    answer = set_budget(probe, **values)
+    assert not answer.successful and reason in answer.reason
+
+
+def diagnostics(probe: Any, hand: Hand, wanted: Any) -> dict[str, DiagnosticStatus]:
+    """The statuses of the contact node by name, once they are ``wanted``."""
+    named = lambda array: {status.name: status for status in array.status}  # noqa: E731
+    array = probe.next(
+        DiagnosticArray, "/diagnostics", qos.STATISTICS, lambda a: wanted(named(a)), 60.0, hand
+    )
+    return named(array)
+
+
+def test_diagnostics_say_what_is_shown_and_how_the_loop_is(probe: Any, hand: Hand) -> None:
+    state, _ = felt(probe, hand)
+    found = diagnostics(probe, hand, lambda named: "/contact: accuracy" in named)
+    accuracy = found["/contact: accuracy"]
+    assert accuracy.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
+    assert "modes shown" in accuracy.message
+    assert {v.key: v.value for v in found["/contact: vademecum"].values}["id"] == state.vademecum_id
+    loop = {v.key: float(v.value) for v in found["/contact: loop"].values}
+    assert loop["rate [Hz]"] == pytest.approx(1e6 / loop["period mean [us]"], rel=1e-3)
+    assert loop["execution mean [us]"] <= loop["execution max [us]"]
+
+
+def test_diagnostics_name_a_fault_its_remedy_and_its_end(probe: Any, hand: Hand) -> None:
+    hand.pose.header.frame_id = "world"
+    fault = diagnostics(probe, hand, lambda n: "another frame" in n["/contact: tool"].message)
+    assert fault["/contact: tool"].level == DiagnosticStatus.WARN
+    assert "tool_transform" in fault["/contact: tool"].message
+    hand.pose.header.frame_id = "organ"
+    sound = diagnostics(probe, hand, lambda n: n["/contact: tool"].level == DiagnosticStatus.OK)
+    assert sound["/contact: tool"].message == "poses sound, force sent whole"
+    assert sound["/contact: tool"].hardware_id == "/tool"  # as its driver is called
+    assert sound["/contact: loop"].hardware_id == socket.gethostname()

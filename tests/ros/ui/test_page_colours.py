@@ -1,0 +1,141 @@
+"""Bands, tone and smoothness of the organ on the planning page: arithmetic, no browser."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
+pytest.importorskip("avatar_ros.ui.bands", reason="avatar_ros is not installed")
+
+from avatar_ros.ui import tone
+from avatar_ros.ui.bands import cut
+from avatar_ros.ui.colours import N_BANDS, band_colours, tissue_colours
+from avatar_ros.ui.refined import finer, refined
+
+from avatar_core.contact.fine_surface import _LEVELS, FineSurface, _split
+from tests.helpers.small_files import ball
+
+pytestmark = pytest.mark.ros
+
+RADIUS = 0.05
+
+
+def field(points: np.ndarray) -> np.ndarray:
+    return 5e-3 * np.exp(-((points - [0.0, RADIUS, 0.0]) ** 2).sum(axis=1) / 0.03**2)
+
+
+def areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    corners = points[faces]
+    return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+@pytest.mark.parametrize("noise", [None, 0.0, 1e-18])
+def test_no_triangle_crosses_the_edge_of_a_band_and_none_is_lost(noise: float | None) -> None:
+    """Corners lie anywhere, on the levels, or beside them by as much as rounding."""
+    points, faces = ball(1200, RADIUS)
+    step, values = 5e-3 / N_BANDS, field(points)
+    if noise is not None:
+        near = step * np.round(values / step)
+        values = near + noise * np.random.default_rng(0).integers(-1, 2, len(near))
+    data = np.column_stack([points, values])
+    found = cut(data, values, faces, step, N_BANDS)
+    inner = found.points[found.faces, 3] / step
+    assert (inner.min(axis=1) >= found.band - 1e-9).all()
+    assert (inner.max(axis=1) <= found.band + 1.0 + 1e-9).all()
+    vectors = areas(found.points[:, :3], found.faces)
+    given = areas(points, faces)
+    together = np.zeros_like(given)
+    np.add.at(together, found.parent, vectors)  # turned round or missing, they would not add up
+    np.testing.assert_allclose(together, given, atol=1e-12)
+    turned = (vectors * given[found.parent]).sum(axis=1)
+    assert (turned > -1e-20).all()  # but for slivers as thin as rounding
+
+
+def test_a_field_beyond_the_scale_is_in_the_last_band() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    for values in ([50.0, 60.0, 70.0], [-1.0, -2.0, -3.0]):
+        found = cut(points, np.array(values), np.array([[0, 1, 2]]), 1.0, 4)
+        assert found.band.tolist() == [3 if values[0] > 0 else 0]
+    assert len(cut(points, np.zeros(3), np.empty((0, 3), int), 1.0, 4).faces) == 0
+
+
+def test_the_browsers_tone_mapping_is_undone() -> None:
+    """Within rounding of 8 bits; of a few bright yellows, the nearest is known."""
+    seen = np.vstack([band_colours(), tissue_colours()]).astype(float)
+    np.testing.assert_allclose(tone.shown(tone.material(seen)), seen, atol=4.0)
+    grey = np.repeat(np.arange(20.0, 230.0, 10.0)[:, None], 3, axis=1)
+    np.testing.assert_allclose(tone.shown(tone.material(grey)), grey, atol=1.5)
+
+
+def test_a_refined_ball_is_rounder_and_keeps_its_points() -> None:
+    points, faces = ball(400, RADIUS)
+    shape = refined(len(points), faces)
+    moved = shape.blend @ points
+    np.testing.assert_array_equal(moved[: len(points)], points)
+    middles = moved[len(points) :]
+    flat = points[shape.ends].mean(axis=1)
+    miss = [np.abs(np.linalg.norm(p, axis=1) - RADIUS).mean() for p in (middles, flat)]
+    assert miss[0] < 0.25 * miss[1]
+    np.testing.assert_allclose(shape.blend @ np.ones(len(points)), 1.0)
+    given, fine = areas(points, faces), areas(moved, shape.faces)
+    assert ((given.repeat(4, axis=0) * fine).sum(axis=1) > 0.0).all()
+
+
+def test_what_is_finer_under_a_tip_stays_and_no_gap_opens_beside_it() -> None:
+    points, faces = ball(400, RADIUS)
+    n, split = len(points), faces[:1]
+    a, b, c = split[0]
+    extra = np.array([points[[i, k]].mean(axis=0) for i, k in ((a, b), (b, c), (c, a))])
+    ab, bc, ca = n, n + 1, n + 2
+    four = np.array([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])
+    shown = FineSurface(
+        np.concatenate([points, extra]),
+        np.zeros((n + 3, 3)),
+        np.concatenate([faces[1:], four]),
+        np.concatenate([np.arange(1, len(faces)), np.zeros(4, int)]),
+    )
+    smooth = finer(refined(n, faces), shown)
+    require_closed(smooth)
+
+
+def require_closed(shown: FineSurface) -> None:
+    """Every edge has two sides, which use the same two points."""
+    edges = shown.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, times = np.unique(_ends(shown.positions[edges]), axis=0, return_counts=True)
+    assert (times == 2).all()
+
+
+@pytest.mark.parametrize("size", [1, 2, 6, 40])
+def test_no_point_of_a_finer_part_lies_on_a_side_that_does_not_have_it(size: int) -> None:
+    """Single pixels would stay open there: neighbours of a part are split as it is."""
+    points, faces = ball(400, RADIUS)
+    middle = points[faces].mean(axis=1)
+    chosen = np.argsort(np.linalg.norm(middle - middle[0], axis=1))[:size]
+    is_split = np.isin(np.arange(len(faces)), chosen)
+    blend, finest = _split(faces[is_split], len(points))
+    positions = blend @ points
+    shown = FineSurface(
+        positions,
+        np.zeros_like(positions),
+        np.concatenate([faces[~is_split], finest]),
+        np.concatenate([np.flatnonzero(~is_split), np.tile(np.flatnonzero(is_split), 4**_LEVELS)]),
+    )
+    shape = refined(len(points), faces)
+    smooth = finer(shape, shown)
+    require_closed(smooth)
+    vectors = areas(smooth.positions, smooth.faces)
+    together = np.zeros((len(faces), 3))
+    np.add.at(together, smooth.parents // 4, vectors)
+    beside = ~is_split & (np.linalg.norm(together, axis=1) > 0.0)
+    assert beside.sum() == len(faces) - size
+    outward = (vectors * smooth.positions[smooth.faces].mean(axis=1)).sum(axis=1)
+    assert (outward > 0.0).all()  # none is turned round
+
+
+def _ends(places: np.ndarray) -> np.ndarray:
+    """Both ends of edges (n, 2, 3) in one order, as whole numbers."""
+    whole = np.round(places / 1e-8).astype(np.int64)
+    swap = np.array([tuple(p) > tuple(q) for p, q in whole])
+    whole[swap] = whole[swap][:, ::-1]
+    return whole.reshape(-1, 6)

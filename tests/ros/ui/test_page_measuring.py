@@ -1,0 +1,68 @@
+"""Lengths, depths, gaps and margins of the planning page, on bodies whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("avatar_ros.ui.measuring", reason="avatar_ros is not installed")
+
+from avatar_ros.ui.measuring import Place, depth, gap, hit, is_plane, margin
+
+from tests.helpers.small_files import ball
+
+pytestmark = pytest.mark.ros
+
+RADIUS = 0.05
+POINTS, FACES = ball(2000, RADIUS)
+FACETS = 4e-4  # between the ball and its facets, at most [m]
+
+
+def test_a_click_finds_the_near_side() -> None:
+    for way in np.eye(3):
+        place = hit(0.3 * way, -way, POINTS, FACES)
+        assert place is not None
+        np.testing.assert_allclose(place.at(POINTS), RADIUS * way, atol=FACETS)
+        assert place.weights.sum() == pytest.approx(1.0)
+    assert hit(np.array([0.3, 0, 0]), np.array([1.0, 0, 0]), POINTS, FACES) is None
+    assert hit(np.array([0.3, 0.06, 0]), np.array([-1.0, 0, 0]), POINTS, FACES) is None
+
+
+def test_a_place_moves_with_the_tissue() -> None:
+    place = hit(np.array([0.3, 0, 0]), np.array([-1.0, 0, 0]), POINTS, FACES)
+    assert isinstance(place, Place)
+    moved = 1.1 * POINTS + [0.0, 0.0, 0.01]
+    np.testing.assert_allclose(place.at(moved), 1.1 * place.at(POINTS) + [0, 0, 0.01], atol=1e-12)
+
+
+def test_a_gap_is_the_shortest_way() -> None:
+    body = np.array([[0.08, 0.0, 0.0], [0.0, 0.07, 0.0], [0.0, 0.0, 0.09]])
+    found = gap(body, POINTS, FACES)
+    assert found.length == pytest.approx(0.02, abs=FACETS)
+    np.testing.assert_array_equal(found.begin, body[1])
+    assert np.linalg.norm(found.end - found.begin) == pytest.approx(found.length)
+
+
+@pytest.mark.parametrize("height", [0.06, 0.052, 0.047])
+def test_a_depth_is_that_of_the_deepest_point(height: float) -> None:
+    tip = np.array([0.0, height, 0.0]) + ball(200, 4e-3)[0]
+    assert depth(tip, POINTS, FACES) == pytest.approx(RADIUS + 4e-3 - height, abs=FACETS)
+
+
+def test_far_from_the_surface_there_is_no_depth() -> None:
+    assert depth(np.array([[0.0, 0.3, 0.0]]), POINTS, FACES) == -np.inf
+
+
+@pytest.mark.parametrize(("height", "expected"), [(0.06, 0.01), (-0.07, 0.02), (0.045, -0.005)])
+def test_a_margin_is_that_of_the_plane_and_negative_if_it_cuts(
+    height: float, expected: float
+) -> None:
+    plane = np.array([[0.0, 0.0, height], [0.1, 0.0, height], [0.0, 0.1, height]])
+    assert margin(plane, POINTS) == pytest.approx(expected, abs=FACETS)
+    assert margin(plane[::-1], POINTS) == pytest.approx(expected, abs=FACETS)
+
+
+def test_three_points_on_a_line_are_no_plane() -> None:
+    assert not is_plane(np.outer([0.0, 1.0, 2.0], [0.01, 0.0, 0.0]))
+    assert not is_plane(np.zeros((3, 3)))
+    assert is_plane(0.05 * np.eye(3))

@@ -1,0 +1,149 @@
+"""Requests of the planning page, which its users make in threads of the page's own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from threading import Thread
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
+
+import rclpy
+from avatar_ros.ui.actions import Wanted
+from avatar_ros.ui.requests import Requests
+from rclpy.action import ActionServer
+from rclpy.executors import SingleThreadedExecutor
+
+from avatar_ros.action import BuildPatient
+from tests.helpers.slowness import Deadline
+
+pytestmark = pytest.mark.ros
+
+AWAY = 0.5  # of a thread, right after it sent a goal: the answer comes meanwhile [s]
+
+
+class Slow:
+    """The middleware's client of an action, which keeps its caller after a goal is sent."""
+
+    def __init__(self, handle: Any) -> None:
+        self._handle = handle
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._handle, name)
+
+    def __enter__(self) -> Any:
+        return self._handle.__enter__()
+
+    def __exit__(self, *given: Any) -> Any:
+        return self._handle.__exit__(*given)
+
+    def send_goal_request(self, request: Any) -> int:
+        number = int(self._handle.send_goal_request(request))
+        time.sleep(AWAY)
+        return number
+
+
+def build_at_once(goal: Any) -> BuildPatient.Result:
+    goal.succeed()
+    return BuildPatient.Result(success=True, file="case.h5")
+
+
+@pytest.fixture
+def until_built(own_domain: dict[str, str]) -> Iterator[Callable[[list[Any]], None]]:
+    """Asks for a patient in a thread of its own, and spins until there is a result."""
+    context = rclpy.Context()
+    context.init()
+    server, page = (rclpy.create_node(n, context=context) for n in ("server", "page"))
+    action = ActionServer(server, BuildPatient, "build_patient", build_at_once)
+    other, own = (SingleThreadedExecutor(context=context) for _ in range(2))
+    other.add_node(server)
+    own.add_node(page)
+    thread = Thread(target=other.spin, daemon=True)
+    thread.start()
+    requests = Requests(page)
+
+    def ask(results: list[Any]) -> None:
+        passed = Deadline(60.0)
+        while "patient_interpolation" in requests.missing:
+            assert not passed, "the action is not found"
+            own.spin_once(timeout_sec=0.05)
+        requests._build._client_handle = Slow(requests._build._client_handle)
+        given = (Wanted("case.stl"), lambda *stage: None, lambda text: None, results.append)
+        Thread(target=requests.build_patient, args=given).start()
+        passed = Deadline(20.0)
+        while not results and not passed:
+            own.spin_once(timeout_sec=0.05)
+
+    yield ask
+    requests.close()
+    other.shutdown()
+    thread.join()
+    action.destroy()
+    own.shutdown()
+    for node in (server, page):
+        node.destroy_node()
+    context.try_shutdown()
+
+
+def test_the_end_of_a_build_is_heard_however_early_the_goal_is_accepted(until_built: Any) -> None:
+    results: list[Any] = []
+    until_built(results)
+    assert [result.file for result in results] == ["case.h5"]
+
+
+class Silent:
+    """A client of a node that ends before it answers."""
+
+    def __init__(self) -> None:
+        self.asked: list[float] = []
+
+    def service_is_ready(self) -> bool:
+        return True
+
+    def call_async(self, request: Any) -> Any:
+        self.asked.append(request.parameters[0].value.double_value)
+        return SimpleNamespace(add_done_callback=lambda answered: None)
+
+
+def test_a_contact_node_that_starts_again_is_asked_again() -> None:
+    silent, requests = Silent(), Requests.__new__(Requests)  # without a node
+    requests.__dict__ |= {"_set": silent, "_waiting": {}, "_setting": False}
+    for young in (1e3, 2e3, 3e3):
+        requests.set_material({"young": young}, print)
+    assert silent.asked == [1e3]  # the others wait for its answer
+    requests.contact_started()
+    requests.set_material({"young": 4e3}, print)
+    assert silent.asked == [1e3, 4e3]
+
+
+def building() -> tuple[Requests, list[Any], list[str]]:
+    """A build that is under way; its results, and what was said."""
+    requests, results, said = Requests.__new__(Requests), [], []
+    ready = SimpleNamespace(
+        server_is_ready=lambda: True,
+        send_goal_async=lambda *given: SimpleNamespace(add_done_callback=lambda accepted: None),
+    )
+    at_once = SimpleNamespace(executor=SimpleNamespace(create_task=lambda do: do()))
+    requests.__dict__ |= {"_build": ready, "_pending": None, "_goal": None, "_node": at_once}
+    requests.build_patient(Wanted("a.obj"), lambda *stage: None, said.append, results.append)
+    return requests, results, said
+
+
+def test_a_build_whose_node_ends_comes_to_nothing() -> None:
+    requests, results, said = building()
+    requests.builder_is_missing()
+    requests.builder_is_missing()  # once a second
+    assert results == [None]
+    assert len(said) == 1 and "ended; the node that builds patients is not running" in said[0]
+
+
+def test_a_second_build_is_refused_and_the_first_one_goes_on() -> None:
+    requests, results, said = building()
+    requests.build_patient(Wanted("b.obj"), lambda *stage: None, said.append, results.append)
+    assert results == [] and said == ["a patient is being built already; cancel it first"]
