@@ -6,6 +6,7 @@ import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 # Before numpy: where tests run side by side, one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -13,9 +14,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("RAYON_NUM_THREADS", "1")
 
 import pytest
+from numba.core.dispatcher import Dispatcher
 
 from avatar_core.atlas import patient
-from avatar_core.contact import ball_shift, layout
+from avatar_core.contact import layout
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry import mesh
 from avatar_core.geometry.phantom import phantom_liver
@@ -25,9 +28,16 @@ from avatar_core.offline.large_deformation import hyperelastic_problem, with_lar
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
-from tests.helpers import cached_fields, cached_meshes, examples
-from tests.helpers.cached_responses import cached, of_cloud
-from tests.helpers.disk_cache import cached_on_disk
+from avatar_core.vademecum.tip_field import make_tip_field
+from tests.helpers import examples
+from tests.helpers.disk_cache import (
+    cached_on_disk,
+    compiled_once,
+    copied,
+    in_memory,
+    of_all,
+    on_disk,
+)
 from tests.helpers.paths import SHARED
 from tests.helpers.slowest_files import SlowestFiles
 from tests.helpers.timing_turns import Turns
@@ -49,31 +59,26 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture(scope="session", autouse=True)
-def same_meshes() -> Iterator[None]:
-    """A surface is filled once, whatever is built of it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mesh, "_fill", cached_meshes.fill)
-        yield
+def made_once() -> Iterator[None]:
+    """Compiled code, meshes, contact geometry and responses of one organ, whatever asks for them.
 
-
-@pytest.fixture(scope="session", autouse=True)
-def same_fields() -> Iterator[None]:
-    """The contact geometry of one organ is sampled once, whatever is built around it."""
+    Imports never run back (tests/core/test_rooms.py): contact geometry comes from no later room.
+    Models of an organ get copies of their own of its response and of the modes of its cloud.
+    """
+    rooms = ("common", "geometry", "fem", "reduction", "shapes", "vademecum", "contact")
+    felt = on_disk(make_felt_field, rooms=rooms)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Dispatcher, "compile", compiled_once(Dispatcher.compile))
+        patch.setattr(mesh, "_fill", in_memory(on_disk(mesh._fill, _of_surface), _of_surface))
         for builder in (linear, parametric, patient):
-            patch.setattr(builder, "make_felt_field", cached_fields.felt)
-        patch.setattr(ball_shift, "make_tip_field", cached_fields.smooth)
-        patch.setattr(patient, "make_tip_field", cached_fields.smooth)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def same_responses() -> Iterator[None]:
-    """The response of one organ to a tip, and the modes of its cloud, are computed once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(layout, "tip_carriers", cached(layout.tip_carriers))
-        patch.setattr(layout, "make_tip_response", cached(layout.make_tip_response))
-        patch.setattr(layout, "cloud_arrays", cached(layout.cloud_arrays, of_cloud))
+            patch.setattr(builder, "make_felt_field", felt)
+        patch.setattr(patient, "make_tip_field", on_disk(make_tip_field, rooms=rooms))
+        for name, told in (
+            ("tip_carriers", of_all),
+            ("make_tip_response", of_all),
+            ("cloud_arrays", _of_cloud),
+        ):
+            patch.setattr(layout, name, copied(in_memory(getattr(layout, name), told, kept=24)))
         yield
 
 
@@ -121,6 +126,18 @@ def _straight() -> Vademecum:
 def _bent() -> Vademecum:
     problem = hyperelastic_problem(_straight(), "neo-hookean")
     return with_large_deformation(_straight(), problem, "neo-hookean")
+
+
+def _of_surface(surface: SurfaceMesh, edge: float) -> tuple[Any, ...]:
+    """What a mesh is made of."""
+    return surface.vertices, surface.faces, edge
+
+
+def _of_cloud(vademecum: Vademecum, *others: Any) -> tuple[Any, ...]:
+    """What the modes of a cloud are made of."""
+    v, display = vademecum, vademecum.display
+    corners = None if display is None else display.corners
+    return v.mesh, v.surface.n_positions, v.far, v.regional, corners, *others
 
 
 def _data(name: str) -> Path:

@@ -1,11 +1,13 @@
-"""What tests compute from the code under test, computed once for all workers and runs.
+"""What tests compute from the code under test, computed once for all that ask for it.
 
-A result is found by the content of everything that it may follow from: the core, the file of the
-function that computes it, its arguments, Python and all installed packages.
+A result is found by the content of everything that it may follow from: its arguments, the file of
+the function that computes it, the core, Python and all installed packages. Only one worker computes
+a result; the others wait for it.
 """
 
 from __future__ import annotations
 
+import copy
 import fcntl
 import functools
 import hashlib
@@ -14,44 +16,55 @@ import os
 import pickle
 import sys
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+from numba.core.compiler_lock import global_compiler_lock
 
 import avatar_core
+from avatar_core.common.compiled_cache import ContentCache, content
 
 P, T = ParamSpec("P"), TypeVar("T")
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avatar" / "tests"
 UNUSED = 14 * 86400.0  # after which a result is removed [s]
-_LATE_ROOMS = ("studies", "cli")  # nothing that is stored comes from them
+_CORE = Path(avatar_core.__file__).parent
+_LATE_ROOMS = {"studies", "cli"}  # nothing that is stored comes from them
+
+
+def of_all(*values: Any) -> tuple[Any, ...]:
+    """All arguments of a function, of which its result is made."""
+    return values
 
 
 def cached_on_disk(compute: Callable[P, T]) -> Callable[P, T]:
-    """Decorator: keep what a function gives; its arguments tell themselves by ``repr``, files
-    by their content. It is the same object for all tests of a worker."""
-    return functools.cache(disk_copy(compute))
+    """Decorator: keep what a function gives; it is the same object for all tests of a worker."""
+    return in_memory(on_disk(compute))
 
 
-def disk_copy(compute: Callable[P, T], rooms: tuple[str, ...] | None = None) -> Callable[P, T]:
-    """The same, each time as another object.
+def on_disk(
+    compute: Callable[P, T], told: Callable[..., Any] = of_all, rooms: tuple[str, ...] | None = None
+) -> Callable[P, T]:
+    """What a function gives, kept for all workers and runs, each time as another object.
 
-    rooms : of the core, which the result may follow from; by default all but the last
+    Parameters
+    ----------
+    told : gives the values of the arguments that the result may follow from
+    rooms : rooms of the core that the result may follow from; by default all but the last
     """
 
     @functools.wraps(compute)
     def found(*arguments: P.args, **named: P.kwargs) -> T:
-        key = hashlib.sha256(_of_all(rooms).encode())
-        key.update(Path(inspect.getfile(compute)).read_bytes() + compute.__name__.encode())
-        for value in (*arguments, *sorted(named.items())):
-            text = repr(value)
-            assert "..." not in text and " at 0x" not in text, "give what tells itself by repr"
-            key.update(value.read_bytes() if isinstance(value, Path) else text.encode())
-        file = CACHE / f"{compute.__name__}-{key.hexdigest()[:24]}.pickle"
-        CACHE.mkdir(parents=True, exist_ok=True)
-        with _locked(file.with_suffix(".lock")):
+        source = Path(inspect.getfile(compute))
+        key = digest(_environment(rooms), source, told(*arguments), sorted(named.items()))
+        file = CACHE / f"{compute.__name__}-{key[:24]}.pickle"
+        with locked(file.with_suffix(".lock")):
             if not file.is_file():
                 _drop_unused()
                 part = file.with_suffix(".part")
@@ -63,25 +76,92 @@ def disk_copy(compute: Callable[P, T], rooms: tuple[str, ...] | None = None) -> 
     return found
 
 
+def in_memory(
+    compute: Callable[P, T], told: Callable[..., Any] = of_all, kept: int = sys.maxsize
+) -> Callable[P, T]:
+    """What a function gives, the same object for all tests of a worker.
+
+    Parameters
+    ----------
+    told : gives the values of the arguments that the result may follow from
+    kept : number of results that are kept
+    """
+    results: OrderedDict[str, T] = OrderedDict()
+
+    @functools.wraps(compute)
+    def found(*arguments: P.args, **named: P.kwargs) -> T:
+        key = digest(told(*arguments), sorted(named.items()))
+        if key not in results:
+            results[key] = compute(*arguments, **named)
+            if len(results) > kept:
+                results.popitem(last=False)
+        results.move_to_end(key)
+        return results[key]
+
+    return found
+
+
+def copied(compute: Callable[P, T]) -> Callable[P, T]:
+    """What a function gives, each time as an object of its own."""
+    return lambda *arguments, **named: copy.deepcopy(compute(*arguments, **named))
+
+
+def compiled_once(compile_function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """In the place of ``Dispatcher.compile``: what another worker compiles is waited for."""
+
+    def compile_locked(dispatcher: Any, signature: Any) -> Any:
+        if not isinstance(dispatcher._cache, ContentCache):
+            return compile_function(dispatcher, signature)
+        function = dispatcher.py_func
+        key = digest(content(), function.__module__, function.__qualname__, str(signature))
+        with global_compiler_lock, locked(CACHE / f"compiled-{key[:24]}.lock"):
+            return compile_function(dispatcher, signature)
+
+    return compile_locked
+
+
+def digest(*values: Any) -> str:
+    """The same text for the same content only: arrays, files, numbers, texts and collections."""
+    total = hashlib.blake2b(digest_size=32)
+
+    def take(value: Any) -> None:
+        if isinstance(value, np.ndarray):
+            total.update(f"{value.dtype} {value.shape} {value.flags.c_contiguous}".encode())
+            total.update(np.ascontiguousarray(value))
+        elif isinstance(value, Path):
+            total.update(value.read_bytes())
+        elif isinstance(value, np.generic):
+            take(value.item())
+        elif value is None or isinstance(value, (int, float, str)):
+            total.update(f"{value!r} ".encode())
+        elif isinstance(value, (tuple, list)):
+            total.update(f"{len(value)} ".encode())
+            for one in value:
+                take(one)
+        else:
+            take([getattr(value, field.name) for field in fields(value)])
+
+    take(values)
+    return total.hexdigest()
+
+
 @functools.cache
-def _of_all(rooms: tuple[str, ...] | None) -> str:
-    """Hash of what every result may follow from, where it is made in some rooms of the core."""
-    found = hashlib.sha256(sys.version.encode())
-    found.update(repr(sorted((d.name, d.version) for d in distributions())).encode())
-    core = Path(avatar_core.__file__).parent
-    late = _LATE_ROOMS if rooms is None else _rooms(core) - {*rooms}
-    files = [f for f in core.rglob("*.py") if f.relative_to(core).parts[0] not in late]
-    for file in sorted(files, key=lambda f: f.relative_to(core).as_posix()):
-        found.update(file.read_bytes())
-    return found.hexdigest()
+def _environment(rooms: tuple[str, ...] | None) -> str:
+    """Hash of Python, all packages and some rooms of the core."""
+    late = _LATE_ROOMS if rooms is None else _all_rooms() - {*rooms}
+    files = [f for f in _CORE.rglob("*.py") if f.relative_to(_CORE).parts[0] not in late]
+    packages = sorted((d.name, d.version) for d in distributions())
+    return digest(sys.version, packages, sorted(files, key=lambda f: f.relative_to(_CORE).parts))
 
 
-def _rooms(core: Path) -> set[str]:
-    return {path.name for path in core.iterdir() if path.is_dir()}
+def _all_rooms() -> set[str]:
+    return {path.name for path in _CORE.iterdir() if path.is_dir()}
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
+    """No other process is in here with the same file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -16,12 +16,11 @@ import numpy as np
 import pytest
 
 from avatar_core.errors import MeshError
-from avatar_core.geometry import tetwild
+from avatar_core.geometry import mesh, tetwild
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.vademecum.model import Vademecum
-from tests.helpers import cached_meshes
 from tests.helpers.mesh_mutations import encode, pristine
 from tests.helpers.slowness import Deadline
 
@@ -53,7 +52,7 @@ def test_a_mesh_that_lacks_a_part_of_the_organ_is_refused() -> None:
 def test_the_same_surface_gives_the_same_mesh() -> None:
     """Left to itself, fTetWild inserts the faces in another order each time."""
     liver = phantom_liver(12e-3)
-    one, other = (cached_meshes.plain(liver, 0.03) for _ in range(2))
+    one, other = (mesh._fill.__wrapped__.__wrapped__(liver, 0.03) for _ in range(2))
     np.testing.assert_array_equal(one.tets, other.tets)
     np.testing.assert_array_equal(one.vertices, other.vertices)
 
