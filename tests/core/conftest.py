@@ -5,51 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from avatar_core.fem.elasticity import Elasticity, Material
-from avatar_core.geometry.mesh import Regions, TetMesh, make_mesh, regions_by_rule, tetrahedralize
+from avatar_core.geometry.mesh import Regions, TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import read_surface
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.disk_cache import cached_on_disk
+from tests.helpers.elastic_shapes import box_mesh, box_regions
 
 _FIGURE = "figure"  # property of a test's report: those cross from a worker's process
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
-
-
-def box_mesh(n: int, size: tuple[float, float, float] = (0.1, 0.1, 0.1)) -> TetMesh:
-    """A box of n^3 cubes, six tetrahedra each, all sharing the cube's diagonal."""
-    grid = np.stack(np.meshgrid(*(3 * [np.arange(n + 1)]), indexing="ij"), -1).reshape(-1, 3)
-    number = np.arange((n + 1) ** 3).reshape(3 * [n + 1])
-    tets = []
-    for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]):
-        corner = np.zeros((4, 3), int)
-        for k, axis in enumerate(order):
-            corner[k + 1] = corner[k]
-            corner[k + 1, axis] += 1
-        if np.linalg.det(np.diff(corner, axis=0)) < 0:
-            corner[[2, 3]] = corner[[3, 2]]
-        cells = np.stack(np.meshgrid(*(3 * [np.arange(n)]), indexing="ij"), -1).reshape(-1, 1, 3)
-        tets.append(number[tuple((cells + corner).transpose(2, 0, 1))])
-    return make_mesh(grid * np.array(size) / n, _oriented(grid, np.concatenate(tets)))
-
-
-def _oriented(grid: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    edges = grid[tets[:, 1:]] - grid[tets[:, :1]]
-    turned = np.linalg.det(edges.astype(float)) < 0
-    tets[turned] = tets[turned][:, [0, 2, 1, 3]]
-    return tets
-
-
-def box_regions(mesh: TetMesh) -> Regions:
-    """Clamped at y = 0, accessible at the opposite side."""
-    y = mesh.vertices[mesh.boundary_faces][:, :, 1]
-    return Regions((y < 1e-9).all(axis=1), (y > y.max() - 1e-9).all(axis=1))
 
 
 @pytest.fixture(scope="session")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from itertools import permutations
-
 import numpy as np
 
-from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.elasticity import Elasticity, Element, Material
+from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import Regions, TetMesh, make_mesh
 
@@ -15,29 +14,39 @@ TOP = np.array([[0.05, 0.1, 0.05], [0.03, 0.1, 0.06]])  # of a cube
 
 def block(*lines: np.ndarray) -> TetMesh:
     """A box of cells between the grid lines of the three axes, six tetrahedra each."""
-    number = np.arange(np.prod([len(line) for line in lines])).reshape([len(x) for x in lines])
-    steps = np.meshgrid(*(np.arange(len(line) - 1) for line in lines), indexing="ij")
+    size = [len(line) for line in lines]
+    number = np.arange(np.prod(size)).reshape(size)
+    steps = np.meshgrid(*(np.arange(n - 1) for n in size), indexing="ij")
     cells = np.stack(steps, -1).reshape(-1, 1, 3)
     tets = []
-    for order in permutations(range(3)):
-        path = np.eye(3, dtype=int)[list(order)]
+    for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]):
+        path = np.eye(3, dtype=int)[order]
         corner = np.vstack([np.zeros(3, int), np.cumsum(path, axis=0)])
         if np.linalg.det(path) < 0:
-            corner = corner[[0, 2, 1, 3]]
+            corner = corner[[0, 1, 3, 2]]
         tets.append(number[tuple((cells + corner).transpose(2, 0, 1))])
     points = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3)
     return make_mesh(points, np.concatenate(tets))
 
 
-def cube(n: int, size: float = 0.1) -> TetMesh:
-    """n^3 equal cells."""
-    return block(*3 * [np.linspace(0.0, size, n + 1)])
+def box_mesh(n: int, size: tuple[float, float, float] = (0.1, 0.1, 0.1)) -> TetMesh:
+    """A box of n^3 equal cells."""
+    return block(*(np.arange(n + 1) * length / n for length in size))
 
 
-def regions_of(mesh: TetMesh) -> Regions:
+def box_regions(mesh: TetMesh) -> Regions:
     """Clamped at y = 0, accessible at the opposite side."""
     y = mesh.vertices[mesh.boundary_faces][..., 1]
     return Regions((y < 1e-9).all(axis=1), (y > y.max() - 1e-9).all(axis=1))
+
+
+cube, regions_of = box_mesh, box_regions
+
+
+def clamped_cube(n: int, nu: float = 0.48, element: Element | None = None) -> Elasticity:
+    """A cube of 0.1 m on its clamped side, of n^3 cells."""
+    mesh = box_mesh(n)
+    return Elasticity(mesh, Material(poisson_ratio=nu), box_regions(mesh).clamped, element)
 
 
 def shell_octant(n: int, radii: np.ndarray) -> TetMesh:
@@ -73,12 +82,30 @@ def shell_octant(n: int, radii: np.ndarray) -> TetMesh:
     return make_mesh(points, tets)
 
 
-def nodes_of(problem: Elasticity) -> np.ndarray:
+def nodes_of(problem: Elasticity | Hyperelasticity) -> np.ndarray:
     """Node positions: vertices, then (P2, Taylor-Hood) edge midpoints, shape (n_nodes, 3) [m]."""
-    vertices = problem.mesh.vertices
-    if problem.element == "P1":
+    linear = problem.linear if isinstance(problem, Hyperelasticity) else problem
+    vertices = linear.mesh.vertices
+    if linear.element == "P1":
         return vertices
-    return np.concatenate([vertices, vertices[problem._skfem_mesh.edges.T].mean(axis=1)])
+    return np.concatenate([vertices, vertices[linear._skfem_mesh.edges.T].mean(axis=1)])
+
+
+def force_on(problem: Elasticity, faces: np.ndarray, traction: np.ndarray) -> np.ndarray:
+    """Nodal forces of a traction that is constant on each face, (3 n_nodes, 1) [N].
+
+    Parameters
+    ----------
+    faces : ndarray of int, numbers of boundary faces
+    traction : ndarray, shape (3,) or (n_faces, 3) [Pa]
+    """
+    nodes = problem.face_nodes[faces]
+    # a linear face hands its load to its corners, a quadratic one to the midpoints of its edges
+    carriers = nodes if nodes.shape[1] == 3 else nodes[:, 3:]
+    each = problem.mesh.face_areas[faces, None] / 3.0 * traction
+    force = np.zeros((problem.n_nodes, 3))
+    np.add.at(force, carriers, each[:, None])
+    return force.reshape(-1, 1)
 
 
 def compliance(problem: Elasticity, centers: np.ndarray = TOP, radius: float = 0.04) -> np.ndarray:

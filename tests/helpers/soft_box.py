@@ -13,12 +13,16 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from avatar_core.errors import EquilibriumError
+from avatar_core.fem.elasticity import Material
 from avatar_core.fem.hyperelastic_materials import HyperelasticMaterial
 from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.newton import NewtonRule, State, _DepthControl, _march, _Newton
-from tests.core.conftest import box_mesh, box_regions
+from tests.helpers.elastic_shapes import box_mesh, box_regions, nodes_of
 
 LENGTH = 0.1  # [m]
+YOUNG = 1000.0  # [Pa]
+SOFT = Material(YOUNG, 0.4)
+ROTATION = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 
 
 def box(material: HyperelasticMaterial, n: int = 2) -> Hyperelasticity:
@@ -26,15 +30,15 @@ def box(material: HyperelasticMaterial, n: int = 2) -> Hyperelasticity:
     return Hyperelasticity(mesh, material, box_regions(mesh).clamped)
 
 
-def nodes_of(problem: Hyperelasticity) -> np.ndarray:
-    """Node positions, shape (n_nodes, 3) [m]."""
-    vertices, edges = problem.mesh.vertices, problem.linear._skfem_mesh.edges.T
-    return np.concatenate([vertices, vertices[edges].mean(axis=1)])
-
-
 def stretched(problem: Hyperelasticity, s: float) -> np.ndarray:
     """Displacement of y -> s y."""
     return (nodes_of(problem) * [0.0, s - 1.0, 0.0]).ravel()
+
+
+def bent(problem: Hyperelasticity) -> np.ndarray:
+    """A displacement of up to 40 mm, zero at the clamp y = 0."""
+    x, y, z = 10.0 * nodes_of(problem).T
+    return (0.03 * np.stack([y**2, 0.5 * y * (1.0 - x), y * z], axis=1)).ravel()
 
 
 def held(problem: Hyperelasticity, dofs: np.ndarray) -> np.ndarray:

@@ -6,13 +6,18 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from avatar_core.errors import MeshError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import load_surface, patch_loads, patch_normals
 from avatar_core.geometry.mesh import Regions, TetMesh, make_mesh, regions_by_rule
+from avatar_core.offline.pipeline import OrganOptions
+from tests.helpers.elastic_shapes import TOP, block, box_mesh, box_regions, clamped_cube
+from tests.helpers.examples import examples
 
-Box = Callable[[int], tuple[TetMesh, Regions]]
+Figure = Callable[[str], None]
 
 
 def test_total_force_is_exact(phantom_elasticity: Elasticity, phantom_mesh: TetMesh) -> None:
@@ -21,25 +26,6 @@ def test_total_force_is_exact(phantom_elasticity: Elasticity, phantom_mesh: TetM
     total = loads.T.reshape((-1, loads.shape[0])).dot(np.tile(np.eye(3), (loads.shape[0] // 3, 1)))
     expected = np.tile(np.eye(3), (surface.n_positions, 1))
     np.testing.assert_allclose(total, expected, atol=1e-12)
-
-
-def test_compliance_is_symmetric(phantom_elasticity: Elasticity, phantom_mesh: TetMesh) -> None:
-    """Maxwell-Betti: the displacement at a due to a force at b is that at b due to a."""
-    surface = load_surface(phantom_mesh, regions_by_rule(phantom_mesh))
-    some = np.random.default_rng(0).permutation(surface.n_positions)[:12]
-    loads = patch_loads(phantom_elasticity, surface.centers[some], surface.patch_radius)
-    compliance = loads.T @ phantom_elasticity.solve(loads)
-    assert np.abs(compliance - compliance.T).max() < 1e-10 * np.abs(compliance).max()
-    assert np.linalg.eigvalsh(compliance).min() > 0
-
-
-def test_response_is_linear(phantom_elasticity: Elasticity) -> None:
-    rng = np.random.default_rng(1)
-    f = rng.standard_normal((3 * phantom_elasticity.n_nodes, 2))
-    one, two, both = (
-        phantom_elasticity.solve(g) for g in (f[:, :1], f[:, 1:], 2 * f[:, :1] - 3 * f[:, 1:])
-    )
-    np.testing.assert_allclose(both, 2 * one - 3 * two, atol=1e-9 * np.abs(both).max())
 
 
 def test_patch_is_local_and_faces_its_side(phantom_elasticity: Elasticity) -> None:
@@ -57,12 +43,6 @@ def test_patch_is_local_and_faces_its_side(phantom_elasticity: Elasticity) -> No
         distance = np.linalg.norm(mesh.vertices[nodes] - surface.centers[j], axis=1)
         assert distance.max() < surface.patch_radius + longest
         assert (mesh.vertex_normals[nodes] @ surface.normals[j] > -0.9).all()
-
-
-@pytest.mark.parametrize("radius", [1e-12, 0.0, -1.0, float("nan"), float("inf")])
-def test_unresolvable_patch_is_refused(phantom_mesh: TetMesh, radius: float) -> None:
-    with pytest.raises(MeshError, match="radius"):
-        load_surface(phantom_mesh, regions_by_rule(phantom_mesh), radius)
 
 
 def test_interpolation_is_exact_at_positions_and_continuous(phantom_mesh: TetMesh) -> None:
@@ -110,9 +90,9 @@ def test_fine_surface_needs_no_midpoints(phantom_mesh: TetMesh) -> None:
     np.testing.assert_allclose(weights[0], [0.2, 0.3, 0.5])
 
 
-def test_patch_normals_turn_smoothly_over_an_edge(box: Box) -> None:
+def test_patch_normals_turn_smoothly_over_an_edge() -> None:
     """Along a line across the edge of a box, normals turn by 90 degrees, never at once."""
-    mesh, _ = box(6)
+    mesh = box_mesh(6)
     x = np.linspace(0.06, 0.1, 81)
     top = np.stack([x, np.full_like(x, 0.1), np.full_like(x, 0.05)], axis=1)
     side = np.stack([np.full_like(x, 0.1), x[::-1], np.full_like(x, 0.05)], axis=1)
@@ -124,9 +104,9 @@ def test_patch_normals_turn_smoothly_over_an_edge(box: Box) -> None:
 
 
 @pytest.mark.long
-def test_walls_of_a_narrow_fissure_carry_no_load(box: Box) -> None:
+def test_walls_of_a_narrow_fissure_carry_no_load() -> None:
     """A slot 5 mm wide in a box: a patch of 30 mm has no room on its walls, and has beside it."""
-    mesh, _ = box(20)
+    mesh = box_mesh(20)
     center = mesh.vertices[mesh.tets].mean(axis=1)
     slot = (abs(center[:, 0] - 0.0525) < 2.5e-3) & (center[:, 1] > 0.02)
     slotted = make_mesh(mesh.vertices, mesh.tets[~slot])
@@ -138,3 +118,66 @@ def test_walls_of_a_narrow_fissure_carry_no_load(box: Box) -> None:
     inside &= (surface.centroids[:, 1] > 0.04) & (abs(surface.centroids[:, 2] - 0.05) < 0.02)
     assert not inside.any()
     assert (surface.centroids[:, 1] > 0.0999).sum() > 100
+
+
+# --- patches that are refused ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("radius", [1e-12, 1e-6, 0.0, -1.0, float("nan")])
+def test_a_patch_of_no_size_is_refused(radius: float, figure: Figure) -> None:
+    """At every door, and at once: integrating it would take as many points as the ratio squared."""
+    problem = clamped_cube(2)
+    mesh = problem.mesh
+    with pytest.raises(MeshError, match=r"cannot be resolved.*refine the mesh") as refused:
+        patch_loads(problem, TOP, radius)
+    with pytest.raises(MeshError, match="cannot be resolved"):
+        load_surface(mesh, box_regions(mesh), radius)
+    with pytest.raises(MeshError, match="no tool's"):
+        OrganOptions(patch_radius=radius)
+    figure(f"refused: {refused.value}")
+
+
+@pytest.mark.examples
+def test_a_patch_larger_than_the_organ_is_refused(figure: Figure) -> None:
+    """Its pull would be no direction's; one that the organ can hold pulls with all its force."""
+    held = [0.0]
+
+    @examples(30)
+    @given(st.floats(0.04, 1e3))
+    @example(0.17)
+    @example(0.18)
+    @example(1e3)
+    def check(radius: float) -> None:
+        problem = clamped_cube(2)
+        mesh = problem.mesh
+        if radius >= np.linalg.norm(np.ptp(mesh.vertices, axis=0)):
+            with pytest.raises(MeshError, match=r"larger than the organ.*take a smaller"):
+                patch_loads(problem, TOP, radius)
+            with pytest.raises(MeshError, match=r"larger than the organ.*take a smaller"):
+                load_surface(mesh, box_regions(mesh), radius)
+            return
+        total = patch_loads(problem, TOP, radius).toarray().reshape(-1, 3, 6).sum(axis=0)
+        np.testing.assert_allclose(total, np.hstack([np.eye(3), np.eye(3)]), atol=1e-12)
+        surface = load_surface(mesh, box_regions(mesh), radius)
+        held.append(radius)
+        assert surface.n_positions > 0
+        np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1.0)
+        assert (surface.normals[:, 1] > 0.5).all()
+
+    check()
+    figure(f"refused from the diagonal of the organ on; the largest held is {max(held):.3f} m")
+
+
+@pytest.mark.parametrize("thickness", [2e-3, 30e-3])
+def test_a_patch_around_a_leaf_is_refused(thickness: float, figure: Figure) -> None:
+    """Much thinner than the patch, its two sides cancel; as thick as that, a side has a normal."""
+    line = np.linspace(0.0, 0.1, 6)
+    leaf = block(line, np.linspace(0.0, thickness, 2), line)
+    if thickness > 0.02:
+        normals = load_surface(leaf, box_regions(leaf), 0.03).normals
+        figure(f"turned by {np.degrees(np.arccos(normals[:, 1].min())):.0f} deg at the rim")
+        assert (normals[:, 1] > 0.5).all()
+        return
+    with pytest.raises(MeshError, match=r"reaches around the organ.*take a smaller") as refused:
+        load_surface(leaf, box_regions(leaf), 0.03)
+    figure(f"refused: {refused.value}")

@@ -158,18 +158,6 @@ def test_a_compliance_that_is_none_is_refused() -> None:
 
 
 @pytest.mark.long
-def test_halving_the_elements_changes_the_force_by_less_than_a_percent() -> None:
-    forces = []
-    for scale in (1.0, 0.5):
-        elasticity = _cube(scale * 0.55e-3, scale * 0.2, 0.5)
-        condensed = CondensedContact(elasticity, [Push(SPHERE, TOP, UP)], 2e-3)
-        forces.append([condensed.solve([0], [depth]).forces[0] for depth in (1e-3, 2e-3)])
-    exact = [_sphere_force(SPHERE.radius, depth) for depth in (1e-3, 2e-3)]
-    np.testing.assert_allclose(forces[0], exact, rtol=0.02)
-    np.testing.assert_allclose(forces[1], forces[0], rtol=0.01)
-
-
-@pytest.mark.long
 def test_two_tips_soften_each_other_as_two_point_forces() -> None:
     """On a half-space the force F of one lowers the surface by F / (pi E* D) at the other."""
     apart, depth = 25e-3, 2e-3

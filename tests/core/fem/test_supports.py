@@ -1,18 +1,25 @@
-"""Supports: springs on parts of the surface, against closed forms, the clamp and rigid bodies."""
+"""What holds an organ: clamps and springs, against closed forms and rigid bodies."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
+from hypothesis import example, given
+from hypothesis import strategies as st
 
-from avatar_core.errors import MaterialError
+from avatar_core.errors import MaterialError, MeshError
 from avatar_core.fem.elasticity import Elasticity, Element, Material
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.fem.supports import Support, least_resisted
 from avatar_core.geometry.mesh import IN_FACE, TetMesh, make_mesh
-from tests.core.conftest import Box, box_mesh
+from tests.helpers.elastic_shapes import TOP, box_mesh, clamped_cube, compliance, force_on, nodes_of
+from tests.helpers.examples import examples
+
+Figure = Callable[[str], None]
 
 SIDE = 0.1  # of the box [m]
 ELEMENTS: tuple[Element, ...] = ("P1", "P2", "Taylor-Hood")
@@ -31,17 +38,11 @@ def on_springs(
     return Elasticity(mesh, Material(1e5, ratio), nobody, element, supports=(support,))
 
 
-def pressure_on_top(problem: Elasticity, direction: tuple[float, float, float]) -> np.ndarray:
-    """Consistent nodal forces of 1 N spread evenly over y = SIDE, shape (3 n_nodes, 1)."""
-    mesh = problem.mesh
-    faces = mesh.boundary_faces
-    top = (mesh.vertices[faces][:, :, 1] > SIDE - 1e-9).all(axis=1)
-    nodes = problem.face_nodes[top]
-    # a constant is integrated by the corners (P1), by the midpoints of the edges (P2)
-    carriers = nodes if nodes.shape[1] == 3 else nodes[:, 3:]
-    each = np.repeat(mesh.face_areas[top] / 3.0, 3) / SIDE**2
-    force = np.bincount(carriers.ravel(), each, minlength=problem.n_nodes)
-    return (force[:, None] * np.array(direction)).reshape(-1, 1)
+def push_on_top(problem: Elasticity, direction: tuple[float, float, float]) -> np.ndarray:
+    """Nodal forces of 1 N spread evenly over y = SIDE, shape (3 n_nodes, 1)."""
+    height = problem.mesh.vertices[problem.mesh.boundary_faces][:, :, 1]
+    top = np.flatnonzero((height > SIDE - 1e-9).all(axis=1))
+    return force_on(problem, top, np.array(direction) / SIDE**2)
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
@@ -79,7 +80,7 @@ def test_a_column_on_springs_gives_way_like_springs_in_series(
     problem = on_springs(
         box_mesh(2), stiffness, element, ratio=0.0 if element != "Taylor-Hood" else 1e-9
     )
-    found = problem.solve(pressure_on_top(problem, (0.0, -1.0, 0.0))).reshape(-1, 3)
+    found = problem.solve(push_on_top(problem, (0.0, -1.0, 0.0))).reshape(-1, 3)
     top = nodes_of(problem)[:, 1] > SIDE - 1e-9
     expected = -(1.0 / stiffness + SIDE / 1e5) / SIDE**2
     np.testing.assert_allclose(found[top, 1], expected, rtol=1e-6)
@@ -92,7 +93,7 @@ def test_a_block_on_weak_springs_moves_as_a_rigid_body(element: Element) -> None
     # tilts by M / (k I), I = A L^2 / 12
     stiffness = 1e2  # k L / E = 1e-4
     problem = on_springs(box_mesh(3), stiffness, element)
-    found = problem.solve(pressure_on_top(problem, (1.0, 0.0, 0.0))).reshape(-1, 3)
+    found = problem.solve(push_on_top(problem, (1.0, 0.0, 0.0))).reshape(-1, 3)
     area = SIDE**2
     points = nodes_of(problem)
     tilt = SIDE / (stiffness * area * SIDE**2 / 12.0)
@@ -104,9 +105,9 @@ def test_a_block_on_weak_springs_moves_as_a_rigid_body(element: Element) -> None
 
 
 @pytest.mark.parametrize("element", ["P2", "Taylor-Hood"])
-def test_stiff_springs_are_the_clamp(box: Box, element: Element) -> None:
-    mesh, regions = box(4)
-    clamped = Elasticity(mesh, Material(1e5), regions.clamped, element)
+def test_stiff_springs_are_the_clamp(element: Element) -> None:
+    mesh = box_mesh(4)
+    clamped = Elasticity(mesh, Material(1e5), bottom(mesh), element)
     load = patch_loads(clamped, np.array([[0.05, 0.1, 0.05], [0.08, 0.1, 0.06]]), 0.02)
     exact = clamped.solve(load)
 
@@ -139,13 +140,6 @@ def test_solutions_balance_over_ten_decades_in_either_precision(
         assert stiffness <= 1e4  # rigid motions, nearly free, drown in single precision
 
 
-def test_the_compliance_on_supports_is_symmetric() -> None:
-    problem = on_springs(box_mesh(3), 1e5)
-    load = patch_loads(problem, np.array([[0.04, 0.1, 0.06], [0.1, 0.05, 0.03]]), 0.02)
-    compliance = load.T @ problem.solve(load)
-    np.testing.assert_allclose(compliance, compliance.T, rtol=1e-9)
-
-
 def test_terms_and_factors_make_the_stiffness() -> None:
     problem = on_springs(box_mesh(2), 1e4)
     problem = replace_stiffness(problem, 3e6)
@@ -157,8 +151,9 @@ def test_terms_and_factors_make_the_stiffness() -> None:
 def test_a_problem_at_another_stiffness_is_the_problem_built_there() -> None:
     mesh = box_mesh(3)
     problem = on_springs(mesh, 1e4)
-    load = patch_loads(problem, np.array([[0.04, 0.1, 0.06]]), 0.02)
+    load = patch_loads(problem, np.array([[0.04, 0.1, 0.06], [0.1, 0.05, 0.03]]), 0.02)
     before = problem.solve(load)
+    np.testing.assert_allclose(load.T @ before, (load.T @ before).T, rtol=1e-9)
     moved = replace_stiffness(problem, 1e7)
     np.testing.assert_allclose(
         moved.solve(load), on_springs(mesh, 1e7).solve(load), rtol=1e-9, atol=1e-15
@@ -170,11 +165,9 @@ def test_a_refined_mesh_keeps_its_supports() -> None:
     fine = on_springs(box_mesh(2), 1e5).refined()
     (support,) = fine.supports
     np.testing.assert_array_equal(support.faces, bottom(fine.mesh))
-    load = patch_loads(fine, np.array([[0.05, 0.1, 0.05]]), 0.03)
     coarse = on_springs(box_mesh(2), 1e5)
-    before = patch_loads(coarse, np.array([[0.05, 0.1, 0.05]]), 0.03)
-    energy = [float((f.T @ p.solve(f))[1, 1]) for p, f in ((fine, load), (coarse, before))]
-    assert energy[0] == pytest.approx(energy[1], rel=0.02)
+    after, before = (compliance(problem, TOP[:1], 0.03)[1, 1] for problem in (fine, coarse))
+    assert after == pytest.approx(before, rel=0.02)
 
 
 # --- what holds an organ --------------------------------------------------------------------------
@@ -219,20 +212,89 @@ def test_no_motion_of_the_boundary_costs_less_than_the_least_resisted_one() -> N
     assert float(couple.ravel() @ turned.ravel()) < 1.5 * least.resistance * square
 
 
-def test_a_piece_without_clamp_or_support_is_refused() -> None:
+@pytest.mark.examples
+def test_a_single_clamped_triangle_holds_the_organ(figure: Figure) -> None:
+    """Positive definite; the reaction takes the whole force and its moment."""
+    worst = [0.0]
+
+    @examples(20)
+    @given(st.integers(0, 47), st.sampled_from(["P1", "P2", "Taylor-Hood"]))
+    @example(0, "P1")
+    def check(face: int, element: Element) -> None:
+        mesh = box_mesh(2)
+        clamped = np.arange(len(mesh.boundary_faces)) == face
+        problem = Elasticity(mesh, Material(1e5, 0.45), clamped, element)
+        loads = patch_loads(problem, np.array([[0.05, 0.1, 0.05]]), 0.06)
+        solution = problem.solve(loads)
+        applied = loads.toarray().reshape(-1, 3, 3)  # also on the triangle itself, if it is near
+        reaction = problem.apply(solution).reshape(-1, 3, 3) - applied
+        held, nodes = problem.clamped_nodes, nodes_of(problem)
+        assert len(held) == (3 if element == "P1" else 6)
+        worst.append(np.abs(reaction[held].sum(axis=0) + np.eye(3)).max())
+        assert worst[-1] < 1e-9
+        for k in range(3):
+            moment = np.cross(nodes[held], reaction[held][..., k]).sum(axis=0)
+            wanted = -np.cross(nodes, applied[..., k]).sum(axis=0)
+            np.testing.assert_allclose(moment, wanted, atol=1e-7 * 0.1)
+        if element != "Taylor-Hood":
+            stiffness = problem.stiffness[problem._free][:, problem._free].toarray()
+            assert np.abs(stiffness - stiffness.T).max() < 1e-12 * np.abs(stiffness).max()
+            assert np.linalg.eigvalsh(stiffness).min() > 0.0
+        answer = loads.T @ solution
+        np.testing.assert_allclose(answer, answer.T, atol=1e-9 * np.abs(answer).max())
+        assert np.linalg.eigvalsh(answer).min() > 0.0
+
+    check()
+    figure(f"reactions {max(worst):.1e} off on any of 48 triangles")
+
+
+TOUCHING = {"apart": [0.5, 0.0, 0.0], "by an edge": [0.1, 0.0, 0.1], "by a vertex": 3 * [0.1]}
+
+
+def two_cubes(offset: list[float]) -> TetMesh:
+    """Two cubes, with the vertices where they touch in common."""
     one = box_mesh(2)
-    both = make_mesh(
-        np.vstack([one.vertices, one.vertices + np.array([1.0, 0.0, 0.0])]),
-        np.vstack([one.tets, one.tets + len(one.vertices)]),
-    )
-    first = both.vertices[both.boundary_faces][:, :, 0].max(axis=1) < 0.5
-    clamp, spring = bottom(both) & first, bottom(both) & ~first
-    load = np.zeros((3 * Elasticity(both, Material(), clamp).n_nodes, 1))
-    held = Elasticity(both, Material(), clamp, supports=(Support("other", spring, 1e5),))
-    assert not held.solve(load).any()
-    loose = Elasticity(both, Material(), clamp, supports=(Support("same", clamp, 1e5),))
+    points = np.vstack([one.vertices, one.vertices + offset])
+    vertices, number = np.unique(points.round(9), axis=0, return_inverse=True)
+    tets = np.vstack([one.tets, one.tets + len(one.vertices)])
+    return make_mesh(vertices, number.ravel()[tets])
+
+
+@pytest.mark.parametrize("touching", TOUCHING)
+@pytest.mark.parametrize("element", ["P2", "Taylor-Hood"])
+def test_a_piece_without_a_clamp_is_refused(
+    touching: str, element: Element, figure: Figure
+) -> None:
+    """Also under a load on the clamped piece alone, whose balance tells nothing."""
+    mesh = two_cubes(TOUCHING[touching])
+    corners = mesh.vertices[mesh.boundary_faces]
+    only_first = (corners[..., 1] < 1e-9).all(axis=1) & (corners[..., 0] < 0.1001).all(axis=1)
+    problem = Elasticity(mesh, Material(), only_first, element)
+    loads = patch_loads(problem, np.array([[0.02, 0.1, 0.02]]), 0.04)
+    with pytest.raises(MeshError, match=r"1 of 2 pieces .* not clamped; clamp") as refused:
+        problem.solve(loads)
+    assert "\n" not in str(refused.value)
+    figure(f"refused: {refused.value}")
+    on_the_first = (Support("same", only_first, 1e5),)
     with pytest.raises(MaterialError, match="nothing holds"):
-        loose.solve(load)
+        Elasticity(mesh, Material(), only_first, element, None, on_the_first).solve(loads)
+
+
+@pytest.mark.parametrize("element", ["P2", "Taylor-Hood"])
+@pytest.mark.parametrize("springs", [False, True])
+def test_two_held_pieces_answer_each_for_itself(element: Element, springs: bool) -> None:
+    """The second by a clamp, or by springs so stiff that they are one."""
+    mesh = two_cubes(TOUCHING["apart"])
+    alone = compliance(clamped_cube(2, element=element))
+    first = mesh.vertices[mesh.boundary_faces][:, :, 0].max(axis=1) < 0.5
+    clamp, spring = bottom(mesh), bottom(mesh) & ~first
+    supports = (Support("other", spring, 1e12),) if springs else ()
+    problem = Elasticity(mesh, Material(), clamp & (first | (not springs)), element, None, supports)
+    pair = compliance(problem, np.vstack([TOP, TOP + TOUCHING["apart"]]))
+    off = 1e-4 if springs else 1e-10
+    np.testing.assert_allclose(
+        pair, scipy.linalg.block_diag(alone, alone), atol=off * alone.max(), rtol=0
+    )
 
 
 @pytest.mark.parametrize(
@@ -258,12 +320,3 @@ def replace_stiffness(problem: Elasticity, stiffness: float) -> Elasticity:
 
 def replace_young(problem: Elasticity, young: float) -> Elasticity:
     return problem.at(replace(problem.material, young_modulus=young))
-
-
-def nodes_of(problem: Elasticity) -> np.ndarray:
-    """Positions of all nodes, shape (n_nodes, 3); midpoints in scikit-fem's order of edges."""
-    vertices = problem.mesh.vertices
-    if problem.element == "P1":
-        return vertices
-    edges = problem._skfem_mesh.edges.T
-    return np.vstack([vertices, vertices[edges].mean(axis=1)])
