@@ -1,22 +1,38 @@
-"""Runs mutants in processes that may die of them, and says what became of each."""
+"""Mutants at the doors, in processes that may die of them, and what became of each.
+
+    python tests/helpers/fuzzing.py DOOR FIRST LAST [FOLDER]
+
+Opens mutants one after another, as a node does: confined to another process. A line of JSON for
+each seed, begun before the file is opened: should this process die all the same, that is seen. With
+a folder, the mutants stay in it.
+"""
 
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
+import tempfile
+import time
+import warnings
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-CHILD = Path(__file__).with_name("fuzz_child.py")
 OUTCOMES = ("loaded", "refused")
+SECONDS = 4.0  # to read, as in a node
+PATIENCE = 90.0  # for the process that reads to be started again on a busy machine, too
+MEMORY = 2 << 30  # of it
+LONGEST_LINE = 600
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """door : of fuzz_child.py; results : by seed, what it says of each mutant."""
+    """door : of DOORS; results : by seed, what it says of each mutant."""
 
     door: str
     results: dict[int, dict[str, Any]]
@@ -29,7 +45,7 @@ class Campaign:
     def failures(self) -> list[str]:
         """What is neither loaded nor refused as it should be, with the command that repeats it."""
         return [
-            f"{result['outcome']} ({result['message'][:100]}): python tests/hard/{CHILD.name} "
+            f"{result['outcome']} ({result['message'][:100]}): python tests/helpers/fuzzing.py "
             f"{self.door} {seed} {seed + 1} FOLDER"
             for seed, result in self.results.items()
             if result["outcome"] not in OUTCOMES
@@ -52,7 +68,7 @@ def campaign(door: str, seeds: range) -> Campaign:
     while len(results) < len(seeds):
         first = seeds.start + len(results)
         child = subprocess.run(
-            [sys.executable, str(CHILD), door, str(first), str(seeds.stop)],
+            [sys.executable, __file__, door, str(first), str(seeds.stop)],
             capture_output=True,
             text=True,
         )
@@ -60,9 +76,7 @@ def campaign(door: str, seeds: range) -> Campaign:
             result = _result(line, f"ended with {child.returncode}: {child.stderr[-300:]}")
             results[result["seed"]] = result
         if seeds.start + len(results) == first:
-            raise AssertionError(
-                f"{CHILD.name} {door} {first} did not start: {child.stderr[-500:]}"
-            )
+            raise AssertionError(f"{door} {first} did not start: {child.stderr[-500:]}")
     return Campaign(door, results)
 
 
@@ -72,3 +86,232 @@ def _result(line: str, end: str) -> dict[str, Any]:
     except ValueError:  # the last one, that the process died of
         seed = int(line.split(":")[1].split(",")[0])
         return {"seed": seed, "outcome": "died", "message": end, "seconds": 0.0, "peak": 0}
+
+
+@dataclass(frozen=True)
+class Door:
+    """make : suffix and bytes of a mutant; read : what opens it; check : what was read.
+
+    reader : pid of the process that opens it, if there is one
+    """
+
+    make: Callable[[int], tuple[str, bytes]]
+    read: Callable[[Path], Any]
+    check: Callable[[Any], None]
+    reader: Callable[[], int | None]
+
+
+def _confined(function: Callable[[Path], Any], make: Any, check: Callable[[Any], None]) -> Door:
+    """A door behind which another process reads."""
+    from avatar_core.common.confined import Confined
+
+    confined = Confined(MEMORY)
+    return Door(make, partial(confined.call, SECONDS, function), check, lambda: confined.pid)
+
+
+def _vademecum_bytes(seed: int) -> tuple[str, bytes]:
+    from tests.helpers.file_mutations import mutant
+
+    return "h5", mutant("vademecum", seed)
+
+
+def _require_vademecum(vademecum: Any) -> None:
+    import numpy as np
+
+    assert all(np.isfinite(a).all() for a in (vademecum.far.space, vademecum.regional.load))
+    assert vademecum.surface_faces.max() < len(vademecum.surface_vertices)
+    assert vademecum.info().name.isprintable()
+
+
+def _vademecum() -> Door:
+    from avatar_core.vademecum.storage import load_vademecum
+
+    return _confined(load_vademecum, _vademecum_bytes, _require_vademecum)
+
+
+def _step() -> Door:
+    """A vademecum that loads is also touched, by compiled code."""
+    import numpy as np
+
+    from avatar_core.contact.model import prepare, step
+    from avatar_core.geometry.tip import Tip
+    from avatar_core.vademecum.storage import load_vademecum
+    from tests.helpers.small_files import RADIUS, small_vademecum
+
+    directions = small_vademecum().surface.normals
+    for large in (False, True):  # compiled before the clock starts
+        step(
+            prepare(small_vademecum(False, large), (Tip("sphere", 5e-3),), cloud="volume"),
+            directions[:1],
+        )
+
+    def touch(vademecum: Any) -> None:
+        _require_vademecum(vademecum)
+        with np.errstate(all="ignore"):
+            try:
+                model = prepare(vademecum, (Tip("sphere", 5e-3),), cloud="volume")
+            except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError):
+                return  # a contact node refuses it with what this says
+        for direction in directions:
+            for height in (4e-3, 2e-3, -50e-3):
+                step(model, (direction * (RADIUS + height))[None])
+
+    return _confined(load_vademecum, _vademecum_bytes, touch)
+
+
+def _atlas() -> Door:
+    import numpy as np
+
+    from avatar_core.atlas.storage import load_atlas
+    from tests.helpers.file_mutations import mutant
+
+    def check(atlas: Any) -> None:
+        for anatomy in atlas.anatomies:
+            assert np.isfinite(anatomy.registered).all() and anatomy.name.isprintable()
+
+    return _confined(load_atlas, lambda seed: ("h5", mutant("atlas", seed)), check)
+
+
+def _require_surface(surface: Any) -> None:
+    import numpy as np
+
+    assert np.isfinite(surface.vertices).all() and surface.faces.max() < len(surface.vertices)
+    assert 0.05 <= surface.extent.max() <= 0.5
+
+
+def _surface() -> Door:
+    from avatar_core.geometry.surface import read_surface
+    from tests.helpers.mesh_mutations import mutant
+
+    return _confined(read_surface, mutant, _require_surface)
+
+
+def _loader() -> Door:
+    """As load_vademecum answers a request."""
+    from avatar_ros.framework import conversions
+    from avatar_ros.framework.library import read_in_library
+    from avatar_ros.framework.reader import Reader
+    from std_msgs.msg import Header
+
+    from avatar_core.vademecum.storage import parse_vademecum
+
+    reader = Reader(MEMORY // 8)
+
+    def read(path: Path) -> Any:
+        data = read_in_library(path.name, str(path.parent), 10**9)
+        return reader.read(path.name, len(data), parse_vademecum, data, path.name)
+
+    def check(vademecum: Any) -> None:
+        _require_vademecum(vademecum)
+        conversions.vademecum_info(asdict(vademecum.info()), Header())
+        conversions.surface_mesh(vademecum.surface_vertices, vademecum.surface_faces)
+
+    return Door(_vademecum_bytes, read, check, lambda: reader.pid)
+
+
+def _patient() -> Door:
+    """As the process of interpolate_patient takes a file; every fifth as an inline mesh."""
+    from types import SimpleNamespace
+
+    from avatar_ros.framework import conversions
+    from avatar_ros.framework.reader import Reader
+    from avatar_ros.nodes.patient_interpolation import patient_request
+    from avatar_ros.patients.surface import read_confined
+
+    from avatar_ros.srv import InterpolatePatient
+    from tests.helpers.mesh_mutations import altered_soup, mutant
+
+    reader = Reader(MEMORY // 8)
+
+    def read(path: Path) -> Any:
+        settings = SimpleNamespace(library_dir=str(path.parent), max_bytes=10**6)
+        request = InterpolatePatient.Request(surface=path.name, name="patient")
+        seed = int(path.name.partition(".")[0])
+        if seed % 5 == 0:
+            soup = altered_soup(seed)
+            request = InterpolatePatient.Request(name="patient")
+            request.mesh = conversions.surface_mesh(soup.vertices * 1e-3, soup.faces % 2**32)
+        return read_confined(patient_request(request, settings), reader)  # type: ignore[arg-type]
+
+    return Door(mutant, read, _require_surface, lambda: reader.pid)
+
+
+def _every() -> Door:
+    """The doors of the core in turn, so that they share what takes longest, the imports."""
+    doors = (_vademecum(), _atlas(), _surface())
+    turn = 0
+
+    def make(seed: int) -> tuple[str, bytes]:
+        nonlocal turn
+        turn = seed % len(doors)
+        return doors[turn].make(seed // len(doors))
+
+    return Door(
+        make,
+        lambda path: doors[turn].read(path),
+        lambda made: doors[turn].check(made),
+        lambda: doors[turn].reader(),
+    )
+
+
+DOORS: dict[str, Callable[[], Door]] = {
+    "every": _every,
+    "vademecum": _vademecum,
+    "step": _step,
+    "atlas": _atlas,
+    "surface": _surface,
+    "loader": _loader,
+    "patient": _patient,
+}
+
+
+def open_one(door: Door, seed: int, folder: Path) -> dict[str, Any]:
+    """What became of a mutant: ``outcome`` refused, loaded, or what is wrong."""
+    from avatar_core.errors import AvatarError
+
+    suffix, content = door.make(seed)
+    path = folder / f"{seed}.{suffix}"
+    path.write_bytes(content)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE)  # nobody handles it: it ends the process
+    begin = time.perf_counter()
+    outcome, message = "loaded", ""
+    try:
+        door.check(door.read(path))
+    except AvatarError as error:
+        outcome, message = "refused", str(error)
+        if not message.isprintable() or not 10 < len(message) < LONGEST_LINE:
+            outcome = "refused in other than one short line"
+    except Exception as error:
+        outcome, message = f"raised {type(error).__name__}", str(error)
+    seconds = time.perf_counter() - begin
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    return {"outcome": outcome, "message": message[:LONGEST_LINE], "seconds": seconds}
+
+
+def _peak(pid: int | None) -> int:
+    """Largest resident memory of a process so far [bytes]."""
+    try:
+        status = Path(f"/proc/{pid or 'self'}/status").read_text()
+    except FileNotFoundError:
+        return 0
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+
+
+def main(name: str, first: int, last: int, keep: str = "") -> int:
+    warnings.simplefilter("ignore")
+    door = DOORS[name]()
+    with tempfile.TemporaryDirectory() as own:
+        folder = Path(keep or own)
+        for seed in range(first, last):
+            print(f'{{"seed": {seed}, ', end="", flush=True)
+            found = open_one(door, seed, folder)
+            found["peak"] = max(_peak(None), _peak(door.reader()))
+            print(json.dumps(found)[1:], flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    # modules are named from the top, and an installed package comes before the sources
+    sys.path[:1] = []
+    sys.path.append(str(Path(__file__).resolve().parents[2]))
+    raise SystemExit(main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), *sys.argv[4:]))
