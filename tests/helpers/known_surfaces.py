@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import igl
 import numpy as np
@@ -95,13 +96,16 @@ def soup(surface: SurfaceMesh, crack: float = 2e-5) -> SurfaceMesh:
     return SurfaceMesh(corners, np.arange(len(corners)).reshape(-1, 3))
 
 
-def written(folder: Path, surface: SurfaceMesh) -> Path:
-    """As an OBJ file in millimetres."""
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in (1e3 * surface.vertices).tolist()]
-    lines += ["f " + " ".join(str(i + 1) for i in face) for face in surface.faces.tolist()]
-    path = folder / "organ.obj"
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in np.asarray(vertices, float).tolist()]
+    lines += ["f " + " ".join(str(i + 1) for i in face) for face in np.asarray(faces).tolist()]
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def written(folder: Path, surface: SurfaceMesh, scale: float = 1e3) -> Path:
+    """As an OBJ file, by default in millimetres."""
+    return write_obj(folder / "organ.obj", scale * surface.vertices, surface.faces)
 
 
 # --- what is asked ----------------------------------------------------------------------------
@@ -136,9 +140,12 @@ def gradient_length(points: np.ndarray, surface: SurfaceMesh, step: float = 1e-6
     return np.linalg.norm((phi[:, 0] - phi[:, 1]) / (2 * step), axis=1)
 
 
-def refusal(surface: SurfaceMesh, folder: Path) -> str:
-    """What the door says of a file that it refuses: one line."""
+def refused(path: Path, *words: str, **options: Any) -> str:
+    """What the door says of a file that it refuses: one line that holds all the words."""
     with pytest.raises(SurfaceError) as caught:
-        read_surface(written(folder, surface))
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+        read_surface(path, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+    return message

@@ -17,19 +17,6 @@ from tests.helpers.byte_mutations import OF_BYTES, pick, some
 from tests.helpers.small_files import ball
 from tests.helpers.vtp_writer import VtpFile
 
-SUFFIXES = (
-    "obj",
-    "stl",
-    "stl-text",
-    "ply",
-    "ply-text",
-    "off",
-    "vtk",
-    "vtk-polydata",
-    "vtp",
-    "vtp-raw",
-    "nii.gz",
-)
 RADIUS = 60.0  # [mm]
 _NUMBERS = ("nan", "inf", "-inf", "1e300", "-1e300", "1e-320", "0", "99999999999", "-1", "1.5", "x")
 _COUNTS = (-1, 0, 1, 3, 2**31 - 1, 2**31, 2**32 - 1, 10**9, 10**12, 2**62, 2**63, 10**30)
@@ -77,73 +64,74 @@ def _altered(rng: np.random.Generator) -> Soup:
     return soup
 
 
-def encode(soup: Soup, kind: str) -> bytes:
-    """A surface in a file format."""
-    return _ENCODERS[kind](soup)
+def encode(soup: Soup, kind: str, words: str = "ball") -> bytes:
+    """A surface in a file format, with some words where the format has a comment."""
+    return _ENCODERS[kind](soup, words)
 
 
 # --- formats ----------------------------------------------------------------------------------
 
 
-def _obj(soup: Soup) -> bytes:
+def _obj(soup: Soup, words: str) -> bytes:
     lines = [f"v {x} {y} {z}" for x, y, z in soup.vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (soup.faces + 1).tolist()]
-    return "\n".join(["# a ball", *lines, ""]).encode()
+    return "\n".join([f"# a {words}", *lines, ""]).encode()
 
 
 def _corners(soup: Soup) -> np.ndarray:
     return soup.vertices[np.clip(soup.faces, 0, len(soup.vertices) - 1)]
 
 
-def _stl(soup: Soup) -> bytes:
+def _stl(soup: Soup, words: str) -> bytes:
     record = np.zeros(len(soup.faces), [("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
     with np.errstate(over="ignore"):
         record["v"] = _corners(soup)
-    return b"binary".ljust(80) + struct.pack("<I", len(record)) + record.tobytes()
+    return f"binary {words}".encode().ljust(80) + struct.pack("<I", len(record)) + record.tobytes()
 
 
-def _stl_text(soup: Soup) -> bytes:
-    lines = ["solid ball"]
+def _stl_text(soup: Soup, words: str) -> bytes:
+    lines = [f"solid {words}"]
     for triangle in _corners(soup).tolist():
         lines += ["facet normal 0 0 0", "outer loop"]
         lines += [f"vertex {x} {y} {z}" for x, y, z in triangle] + ["endloop", "endfacet"]
     return "\n".join([*lines, "endsolid", ""]).encode()
 
 
-def _ply_head(soup: Soup, form: str) -> bytes:
+def _ply_head(soup: Soup, form: str, words: str) -> bytes:
     return (
-        f"ply\nformat {form} 1.0\nelement vertex {len(soup.vertices)}\nproperty double x\n"
-        f"property double y\nproperty double z\nelement face {len(soup.faces)}\n"
+        f"ply\nformat {form} 1.0\ncomment {words}\nelement vertex {len(soup.vertices)}\n"
+        f"property double x\nproperty double y\nproperty double z\nelement face {len(soup.faces)}\n"
         "property list uchar int vertex_indices\nend_header\n"
     ).encode()
 
 
-def _ply(soup: Soup) -> bytes:
+def _ply(soup: Soup, words: str) -> bytes:
     record = np.zeros(len(soup.faces), [("n", "u1"), ("f", "<i4", 3)])
     record["n"], record["f"] = 3, soup.faces
     vertices = soup.vertices.astype("<f8").tobytes()
-    return _ply_head(soup, "binary_little_endian") + vertices + record.tobytes()
+    return _ply_head(soup, "binary_little_endian", words) + vertices + record.tobytes()
 
 
-def _ply_text(soup: Soup) -> bytes:
+def _ply_text(soup: Soup, words: str) -> bytes:
     lines = [f"{x} {y} {z}" for x, y, z in soup.vertices.tolist()]
     lines += [f"3 {a} {b} {c}" for a, b, c in soup.faces.tolist()]
-    return _ply_head(soup, "ascii") + "\n".join([*lines, ""]).encode()
+    return _ply_head(soup, "ascii", words) + "\n".join([*lines, ""]).encode()
 
 
-def _off(soup: Soup) -> bytes:
+def _off(soup: Soup, words: str) -> bytes:
     lines = ["OFF", f"{len(soup.vertices)} {len(soup.faces)} 0"]
     lines += [f"{x} {y} {z}" for x, y, z in soup.vertices.tolist()]
     lines += [f"3 {a} {b} {c}" for a, b, c in soup.faces.tolist()]
     return "\n".join([*lines, ""]).encode()
 
 
-def _vtk(soup: Soup) -> bytes:
+def _vtk(soup: Soup, words: str) -> bytes:
     n, m = len(soup.vertices), len(soup.faces)
     cells = np.column_stack([np.full(m, 3), soup.faces]).astype(">i4")
     return b"".join(
         (
-            b"# vtk DataFile Version 4.2\nball\nBINARY\nDATASET UNSTRUCTURED_GRID\n",
+            f"# vtk DataFile Version 4.2\n{words}\n".encode(),
+            b"BINARY\nDATASET UNSTRUCTURED_GRID\n",
             f"POINTS {n} double\n".encode(),
             soup.vertices.astype(">f8").tobytes(),
             f"\nCELLS {m} {4 * m}\n".encode(),
@@ -155,24 +143,24 @@ def _vtk(soup: Soup) -> bytes:
     )
 
 
-def _vtk_polydata(soup: Soup) -> bytes:
+def _vtk_polydata(soup: Soup, words: str) -> bytes:
     n, m = len(soup.vertices), len(soup.faces)
-    lines = ["# vtk DataFile Version 3.0", "ball", "ASCII", "DATASET POLYDATA", f"POINTS {n} float"]
+    lines = ["# vtk DataFile Version 3.0", words, "ASCII", "DATASET POLYDATA", f"POINTS {n} float"]
     lines += [f"{x} {y} {z}" for x, y, z in soup.vertices.tolist()]
     lines += [f"POLYGONS {m} {4 * m}"] + [f"3 {a} {b} {c}" for a, b, c in soup.faces.tolist()]
     return "\n".join([*lines, ""]).encode()
 
 
-def _vtp(soup: Soup) -> bytes:
+def _vtp(soup: Soup, words: str) -> bytes:
     file = VtpFile("binary", "vtkZLibDataCompressor")
     return file.piece(soup.vertices, soup.faces.tolist()).content()
 
 
-def _vtp_raw(soup: Soup) -> bytes:
+def _vtp_raw(soup: Soup, words: str) -> bytes:
     return VtpFile("raw").piece(soup.vertices, soup.faces.tolist()).content()
 
 
-def _nifti(_: Soup) -> bytes:
+def _nifti(_: Soup, words: str) -> bytes:
     """A label map of a ball; it has no surface that something could have happened to."""
     import nibabel
 
@@ -184,7 +172,7 @@ def _nifti(_: Soup) -> bytes:
     return gzip.compress(nibabel.Nifti1Image(inside, affine).to_bytes(), 1)
 
 
-_ENCODERS: dict[str, Callable[[Soup], bytes]] = {
+_ENCODERS: dict[str, Callable[[Soup, str], bytes]] = {
     "obj": _obj,
     "stl": _stl,
     "stl-text": _stl_text,
@@ -197,6 +185,7 @@ _ENCODERS: dict[str, Callable[[Soup], bytes]] = {
     "vtp-raw": _vtp_raw,
     "nii.gz": _nifti,
 }
+SUFFIXES = tuple(_ENCODERS)
 
 # --- what happens to surfaces -------------------------------------------------------------------
 

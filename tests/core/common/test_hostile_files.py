@@ -19,8 +19,6 @@ from avatar_core.errors import AvatarError, StorageError
 from avatar_core.geometry.surface import read_surface
 from avatar_core.vademecum.storage import is_vademecum, load_vademecum, parse_vademecum
 from tests.helpers.file_mutations import pristine, sealed
-from tests.helpers.mesh_mutations import SUFFIXES, encode
-from tests.helpers.mesh_mutations import pristine as ball
 
 LARGEST = 20e6  # allocated for files of 60 kB [bytes]
 
@@ -139,13 +137,3 @@ def test_a_file_that_grows_while_it_is_read_is_refused(tmp_path: Path) -> None:
         with pytest.MonkeyPatch.context() as patch, pytest.raises(FileError, match="grows"):
             patch.setattr(os, "fstat", lambda number: size)
             content_of(source)
-
-
-@pytest.mark.parametrize("kind", SUFFIXES)
-def test_every_reader_gives_the_same_ball(tmp_path: Path, kind: str) -> None:
-    path = tmp_path / f"ball.{kind.partition('-')[0]}"
-    path.write_bytes(encode(ball(), kind))
-    surface = read_surface(path)
-    if kind != "nii.gz":  # whose voxels are 10 mm
-        assert surface.volume == pytest.approx(0.000819385, rel=1e-5)
-        assert len(surface.faces) == len(ball().faces)

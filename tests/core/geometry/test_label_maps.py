@@ -16,7 +16,9 @@ from avatar_core.geometry import label_files, surface_files
 from avatar_core.geometry.label_maps import labels_of
 from avatar_core.geometry.surface import read_surface
 from avatar_core.geometry.tumour import read_tumour
-from tests.core.geometry.test_surface import refused
+from tests.helpers.known_surfaces import refused
+
+WHOLE = 4 / 3 * np.pi * 0.04 * 0.05 * 0.06  # of the ellipsoid [m^3]
 
 
 def label_map(path: Path, affine: np.ndarray, labels: tuple[int, ...] = (1,)) -> Path:
@@ -33,17 +35,20 @@ def label_map(path: Path, affine: np.ndarray, labels: tuple[int, ...] = (1,)) ->
     return path
 
 
+@pytest.mark.parametrize("turn", [0.0, 25.0])
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
 @pytest.mark.parametrize("size", [(2.0, 2.0, 2.0), (0.8, 0.8, 5.0)])
-def test_label_map_honours_its_affine(tmp_path, mirror, size):
-    affine = np.diag([mirror * size[0], size[1], size[2], 1.0])
-    affine[:3, 3] = [10 - mirror * 80, -100, -50]
+def test_label_map_honours_its_affine(tmp_path, turn, mirror, size):
+    affine = np.eye(4)
+    turned = Rotation.from_euler("xyz", [turn, -0.6 * turn, 1.6 * turn], degrees=True).as_matrix()
+    affine[:3, :3] = turned * size * [mirror, 1.0, 1.0]
+    affine[:3, 3] = [10, -20, 30] - affine[:3, :3] @ (80 / np.array(size))
     surface = read_surface(label_map(tmp_path / "organ.nii.gz", affine))
     low, high = surface.bounding_box
     # half a coarsest voxel
     assert np.allclose(low, [-0.03, -0.07, -0.03], atol=size[2] * 0.5e-3)
     assert np.allclose(high, [0.05, 0.03, 0.09], atol=size[2] * 0.5e-3)
-    assert surface.volume == pytest.approx(4 / 3 * np.pi * 0.04 * 0.05 * 0.06, rel=0.02)
+    assert surface.volume == pytest.approx(WHOLE, rel=0.02)
     assert surface.notices == ()
 
 
@@ -53,7 +58,7 @@ def test_label_map_asks_which_label(tmp_path):
     path = label_map(tmp_path / "organs.nii", affine, labels=(3, 7))
     refused(path, "3, 7", "--label")
     refused(path, "3, 7", "--label", label=5)
-    assert read_surface(path, label=3).volume == pytest.approx(5.03e-4, rel=0.02)
+    assert read_surface(path, label=3).volume == pytest.approx(WHOLE, rel=0.02)
 
 
 def segmentation(path: Path, names: dict[str, int], layers: int = 1, **header: Any) -> Path:
@@ -101,9 +106,8 @@ def test_a_segmentation_of_slicer_is_read_by_its_names(tmp_path, layers, encodin
     refused(path, "Liver (1), lesion 1 (2)", "--label")
     refused(path, "Liver (1)", label="spleen")
     liver = read_surface(path, label="liver")
-    whole = 4 / 3 * np.pi * 0.04 * 0.05 * 0.06
     cut_out = 0.0 if layers > 1 else 4 / 3 * np.pi * 0.015**3  # one layer holds one label a voxel
-    assert liver.volume == pytest.approx(whole - cut_out, rel=0.01)
+    assert liver.volume == pytest.approx(WHOLE - cut_out, rel=0.01)
     low, high = liver.bounding_box
     np.testing.assert_allclose(low, [-0.03, -0.07, -0.03], atol=1.5e-3)
     np.testing.assert_allclose(high, [0.05, 0.03, 0.09], atol=1.5e-3)
@@ -249,7 +253,7 @@ def test_a_dicom_segmentation_lies_in_the_patient(tmp_path):
     low, high = liver.bounding_box
     np.testing.assert_allclose(0.5e3 * (low + high), [10, -20, 30], atol=2.0)
     np.testing.assert_allclose(1e3 * (high - low), [80, 100, 120], atol=5.0)
-    assert liver.volume == pytest.approx(4 / 3 * np.pi * 0.04 * 0.05 * 0.06, rel=0.02)
+    assert liver.volume == pytest.approx(WHOLE, rel=0.02)
     assert liver.notices == ()  # one body, in known axes
     lesion = read_tumour(path, label="lesion")
     np.testing.assert_allclose(1e3 * lesion.vertices.mean(axis=0), [10, 0, 30], atol=1.0)
@@ -277,10 +281,9 @@ def test_what_was_cut_out_of_the_organ_is_filled_by_its_labels(tmp_path):
     """In one layer a lesion's voxels are no longer the liver's."""
     path = segmentation(tmp_path / "a.seg.nrrd", {"Liver": 1, "lesion": 2})
     assert labels_of(path) == ("Liver", "lesion")
-    whole = 4 / 3 * np.pi * 0.04 * 0.05 * 0.06
     hollow, filled = (read_surface(path, label="Liver", inside=i) for i in ((), ("lesion",)))
-    assert hollow.volume == pytest.approx(whole - 4 / 3 * np.pi * 0.015**3, rel=0.01)
-    assert filled.volume == pytest.approx(whole, rel=0.01)
+    assert hollow.volume == pytest.approx(WHOLE - 4 / 3 * np.pi * 0.015**3, rel=0.01)
+    assert filled.volume == pytest.approx(WHOLE, rel=0.01)
     refused(path, "Liver (1), lesion (2)", label="Liver", inside=("vein",))
 
 

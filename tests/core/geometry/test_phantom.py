@@ -13,7 +13,6 @@ from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.phantom import (
     VISCERAL_NORMAL,
     Ellipsoid,
-    half_space,
     liver_level_set,
     phantom_liver,
     project,
@@ -100,9 +99,9 @@ def test_phantom_is_always_the_same_and_fast(phantom):
 
 
 def test_spacing_sets_the_edge_and_keeps_the_organ(phantom):
-    fine = phantom_liver(spacing=4e-3)
+    fine = phantom_liver(spacing=5e-3)
     assert fine.is_watertight
-    assert fine.mean_edge == pytest.approx(phantom.mean_edge * 4 / 7, rel=0.1)
+    assert fine.mean_edge == pytest.approx(phantom.mean_edge * 5 / 7, rel=0.1)
     assert fine.volume == pytest.approx(phantom.volume, rel=0.02)
 
 
@@ -112,13 +111,6 @@ def test_senseless_spacing_is_refused(spacing):
         phantom_liver(spacing=spacing)
 
 
-def test_ellipsoid_of_equal_radii_is_the_distance_to_a_sphere():
-    points = np.random.default_rng(4).uniform(-2, 2, (500, 3))
-    sphere = Ellipsoid((0.1, 0.2, 0.3), (0.7, 0.7, 0.7))
-    exact = np.linalg.norm(points - [0.1, 0.2, 0.3], axis=1) - 0.7
-    assert np.allclose(sphere(points), exact, atol=1e-12)
-
-
 def test_smooth_union_is_the_minimum_away_from_the_seam_and_smooth_on_it():
     a = np.linspace(-1, 1, 2001)
     union = smooth_union(a, -a, width=0.5)
@@ -126,11 +118,6 @@ def test_smooth_union_is_the_minimum_away_from_the_seam_and_smooth_on_it():
     assert np.array_equal(union[far], np.minimum(a, -a)[far])
     assert np.max(np.abs(np.diff(union, 2))) < 2.01 * np.diff(a)[0] ** 2 / 0.5  # bounded curvature
     assert union.max() == pytest.approx(-0.125)
-
-
-def test_half_space_is_positive_along_its_normal():
-    points = np.array([[0.0, 0, 5], [0, 0, -5]])
-    assert np.allclose(half_space(points, (0, 0, 1), (0, 0, 2)), [4, -6])
 
 
 def test_projection_lands_on_the_zero_surface():

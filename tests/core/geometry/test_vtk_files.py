@@ -1,17 +1,20 @@
-"""Polygonal data in legacy VTK files: every layout gives the same surface, or one line says why."""
+"""Polygonal data in legacy and XML files of VTK: each layout gives the same surface, or why not."""
 
 from __future__ import annotations
 
+import base64
 import struct
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from avatar_core.errors import SurfaceError
 from avatar_core.geometry.surface import read_surface
-from avatar_core.geometry.surface_files import parse
+from avatar_core.geometry.surface_files import parse, stated_axes
+from tests.helpers.known_surfaces import ball, refused
+from tests.helpers.vtp_writer import COMPRESSORS, ENCODINGS, VtpFile
 
 CUBE = np.array([(x, y, z) for z in (0, 100) for y in (0, 100) for x in (0, 100)])
 QUADS = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
@@ -53,16 +56,6 @@ class VtkFile:
         path = folder / "cube.vtk"
         path.write_bytes(self.content)
         return path
-
-
-def refused(path: Path, *words: str) -> None:
-    """The file is refused by one line that holds all the words."""
-    with pytest.raises(SurfaceError) as caught:
-        read_surface(path)
-    message = str(caught.value)
-    assert "\n" not in message
-    for word in ("cube.vtk", *words):
-        assert word in message
 
 
 @pytest.mark.parametrize(("form", "version"), FORMS)
@@ -132,7 +125,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path: Path, form: str, version: floa
     path = tmp_path / "cube.vtk"
     for n_bytes in range(len(whole) - last_number + 1):
         path.write_bytes(whole[:n_bytes])
-        refused(path)
+        refused(path, "cube.vtk")
     refused(path, "it ends")
 
 
@@ -200,3 +193,89 @@ def test_the_header_is_checked(tmp_path: Path) -> None:
     ):
         path.write_bytes(whole.replace(old, new))
         refused(path, why)
+
+
+# --- XML files -------------------------------------------------------------------------------
+
+SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+XML_FORMS = [
+    (encoding, compressor)
+    for encoding in ENCODINGS
+    for compressor in COMPRESSORS
+    if encoding != "ascii" or not compressor
+]
+
+
+def at(folder: Path, content: bytes) -> Path:
+    path = folder / "organ.vtp"
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(("encoding", "compressor"), XML_FORMS)
+def test_every_encoding_gives_the_same_organ(
+    tmp_path: Path, encoding: str, compressor: str
+) -> None:
+    organ = ball(level=2)
+    for big, header in ((False, "u4"), (True, "u8")):
+        file = VtpFile(encoding, compressor, big, header)
+        file.axes("LPS").piece(1e3 * organ.vertices * [-1, -1, 1], organ.faces.tolist())
+        path = at(tmp_path, file.content())
+        found = read_surface(path)
+        np.testing.assert_allclose(found.vertices, organ.vertices, atol=1e-12)
+        np.testing.assert_array_equal(found.faces, organ.faces)
+        assert (found.axes_name, found.notices) == ("LPS", ())
+
+
+def test_pieces_polygons_and_strips_come_in_their_order(tmp_path: Path) -> None:
+    file = VtpFile("binary").piece(SQUARE, [(0, 1, 2, 3)], [(0, 1, 3, 2)], "f4")
+    points, triangles = parse(at(tmp_path, file.piece(SQUARE + 1, [(0, 1, 2)]).content()), None)
+    np.testing.assert_array_equal(points, np.vstack([SQUARE, SQUARE + 1]))
+    expected = [[0, 1, 2], [0, 2, 3], [0, 1, 3], [1, 2, 3], [4, 5, 6]]
+    assert sorted(map(sorted, triangles.tolist())) == sorted(expected)
+
+
+def test_a_file_without_the_field_states_no_axes(tmp_path: Path) -> None:
+    content = VtpFile().piece(SQUARE, [(0, 1, 2)]).content()
+    assert stated_axes(at(tmp_path, content)) is None
+    assert stated_axes(at(tmp_path, b"<VTKFile>")) is None
+
+
+def test_a_field_behind_the_points_is_found(tmp_path: Path) -> None:
+    organ = ball(level=2)
+    file = VtpFile("appended").piece(1e3 * organ.vertices, organ.faces.tolist()).axes("LPS")
+    assert stated_axes(at(tmp_path, file.content())) == "LPS"
+
+
+GOOD = VtpFile("binary", "vtkZLibDataCompressor").piece(SQUARE, [(0, 1, 2)]).content()
+RAW = VtpFile("raw").piece(SQUARE, []).content()
+BAD = {
+    "no PolyData": b"<VTKFile type='ImageData'><ImageData/></VTKFile>",
+    "document type": b"<!DOCTYPE a [<!ENTITY b 'c'>]>" + GOOD,
+    "vtkLZ4DataCompressor": GOOD.replace(b"vtkZLibData", b"vtkLZ4Data"),
+    "do not exist": VtpFile().piece(SQUARE, [(0, 1, 4)]).content(),
+    "do not divide": VtpFile().piece(SQUARE, [(0, 1, 2)]).content().replace(b"\n3\n", b"\n2\n"),
+    "before what it announces": RAW[: RAW.index(b"   _") + 50],
+}
+
+
+@pytest.mark.parametrize("words", BAD)
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, words: str) -> None:
+    refused(at(tmp_path, BAD[words]), words)
+
+
+@pytest.mark.parametrize(
+    ("claim", "words"), [(2**31, "more than it can hold"), (0, "claims to hold nothing")]
+)
+def test_a_block_that_claims_what_it_cannot_hold_is_not_unpacked(
+    tmp_path: Path, claim: int, words: str
+) -> None:
+    packed = zlib.compress(bytes(24))
+    sizes = np.array([1, claim, 0, len(packed)], "<u4").tobytes()
+    data = base64.b64encode(sizes) + base64.b64encode(packed)
+    text = f'<DataArray type="Float64" Name="Points" format="binary">{data.decode()}</DataArray>'
+    content = (
+        '<VTKFile type="PolyData" compressor="vtkZLibDataCompressor"><PolyData><Piece>'
+        f"<Points>{text}</Points></Piece></PolyData></VTKFile>"
+    )
+    refused(at(tmp_path, content.encode()), words)
