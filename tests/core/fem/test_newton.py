@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -224,6 +225,16 @@ def test_newton_alone_converges_to_an_inside_out_organ(overload: float, figure: 
     figure(f"residual {left:.0e} at det F {det:.2f}: refused")
 
 
+@both
+def test_no_accepted_step_holds_an_inverted_element(kind: type) -> None:
+    """Under this dead load an element once turned inside out at a corner."""
+    problem = box(kind(SOFT))
+    with accepted_steps() as states, suppress(EquilibriumError):
+        solve(problem, 2.0 * push_on(problem))
+    assert len(states) > 1
+    assert all(least_det(problem, state.displacement) > 0.0 for state in states)
+
+
 # --- pull and push to 60 mm -------------------------------------------------------------------
 
 
@@ -315,7 +326,7 @@ def test_push_release_pull_release(kind: type, figure: Figure) -> None:
 @both
 def test_weight_first_or_push_first(kind: type, figure: Figure) -> None:
     """The state does not depend on the order in which its loads came."""
-    problem = box(kind(SOFT), 3)
+    problem = box(kind(SOFT))
     push = -push_on(problem)
     side = patch_loads(problem.linear, np.array([[LENGTH, 0.07, 0.05]]), 0.04).toarray()[:, 0]
     side = 0.2 * side
