@@ -13,6 +13,7 @@ import typer
 
 from avatar_core.cli.output import require_output
 from avatar_core.errors import AvatarError
+from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES, SUFFIXES
 
 if TYPE_CHECKING:
     from avatar_core.atlas.growth import Growth, Source
@@ -31,8 +32,8 @@ Surfaces = Annotated[
     list[str],
     typer.Argument(
         metavar="SURFACE...",
-        help="surface files (OBJ, STL, PLY, VTK, VTP, OFF), label maps (.nii, .nii.gz, .nrrd, "
-        ".dcm), folders of these, or 'phantom', the built-in liver",
+        help=f"surface files ({MESH_NAMES}), label maps ({LABEL_MAP_NAMES}), folders of these, or "
+        "'phantom', the built-in liver",
     ),
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the files: mm, cm or m")]
@@ -253,8 +254,6 @@ def _sources(
 def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
-    from avatar_core.geometry.surface_files import SUFFIXES
-
     found = sorted(one for one in path.iterdir() if one.name.lower().endswith(SUFFIXES))
     if not found:
         raise AvatarError(f"no surface in {path}; it should hold files of {', '.join(SUFFIXES)}")

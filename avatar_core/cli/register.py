@@ -13,6 +13,7 @@ import typer
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import require_output
 from avatar_core.cli.vademecum import Axes, Unit, finite, parsed_axes
+from avatar_core.geometry.surface_formats import MESH_NAMES
 
 if TYPE_CHECKING:
     from avatar_core.registration.register import Estimate, Registered
@@ -24,8 +25,8 @@ def register(
     points: Annotated[
         Path,
         typer.Option(
-            help="points on the deformed surface, in any order: .ply, .obj, .vtk, .vtp, .stl, or "
-            "x, y, z in each line of .xyz, .csv, .txt; aligned to about 10 mm and 10 degrees"
+            help=f"points on the deformed surface, in any order: {MESH_NAMES}, or x, y, z in each "
+            "line of .xyz, .csv, .txt; aligned to about 10 mm and 10 degrees"
         ),
     ],
     output: Annotated[

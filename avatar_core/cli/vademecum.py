@@ -15,6 +15,7 @@ from avatar_core.cli.build_bar import BuildBar
 from avatar_core.cli.output import Overwrite, require_output
 from avatar_core.cli.timings import StageClock, Timings, require_timings, show_timings
 from avatar_core.errors import AvatarError
+from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES
 
 if TYPE_CHECKING:
     from avatar_core.fem.supports import Support
@@ -29,8 +30,8 @@ EXIT_NOT_CONVERGED = 3
 Surface = Annotated[
     str,
     typer.Argument(
-        help="surface file (OBJ, STL, PLY, VTK, VTP, OFF) or label map (.nii, .nii.gz, .nrrd, "
-        "DICOM SEG as .dcm); 'phantom': the built-in liver"
+        help=f"surface file ({MESH_NAMES}) or label map ({LABEL_MAP_NAMES}, which is DICOM SEG); "
+        "'phantom': the built-in liver"
     ),
 ]
 Unit = Annotated[str, typer.Option(help="unit of length in the file: mm, cm or m")]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avatar_core.errors import SurfaceError
+from avatar_core.geometry.surface_formats import LABEL_MAPS
 
 FloatArray = NDArray[np.float64]
 
@@ -65,7 +66,7 @@ class LabelMap:
 
 def is_label_map(path: Path) -> bool:
     """Whether a file's name is that of a label map."""
-    return path.name.lower().endswith(LABEL_SUFFIXES)
+    return path.name.lower().endswith(LABEL_MAPS)
 
 
 def read_label_map(path: Path) -> LabelMap:
@@ -202,4 +203,3 @@ _READERS: dict[str, Callable[[Path], LabelMap]] = {
     ".nrrd": _read_nrrd,
     ".dcm": _read_dicom,
 }
-LABEL_SUFFIXES = tuple(_READERS)

@@ -139,7 +139,9 @@ def read_surface(
     check_size: bool = True,
     one_body: bool = True,
 ) -> SurfaceMesh:
-    """Read OBJ, STL, PLY, VTK, OFF or a label map (NIfTI, NRRD) as one closed organ surface.
+    """Read a mesh or a label map, e.g. ``liver.obj`` or ``liver.nii.gz``, as one organ's surface.
+
+    :mod:`avatar_core.geometry.surface_formats` lists the formats.
 
     unit : "m", "cm" or "mm", of the file's coordinates
     axes : where the file's +x, +y, +z point ("RAS", "LPS", "RIA", ...), or a rigid (4, 4) matrix

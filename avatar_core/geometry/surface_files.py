@@ -1,6 +1,6 @@
 """Surface file formats: each reader returns vertices and triangles, unconnected and unchecked.
 
-OBJ, STL, PLY, VTK (legacy and .vtp) and OFF give triangles in the file's coordinates; of label maps
+Meshes give triangles in the file's coordinates. Of label maps
 (:mod:`avatar_core.geometry.label_maps`) the surface of one label is made.
 Nothing is checked here but that the file can be read; :mod:`avatar_core.geometry.surface` decides.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,8 +19,9 @@ from numpy.typing import NDArray
 
 from avatar_core.common import files
 from avatar_core.errors import SurfaceError, one_line
-from avatar_core.geometry.label_files import LABEL_SUFFIXES, is_label_map
+from avatar_core.geometry.label_files import is_label_map
 from avatar_core.geometry.label_maps import surface_of_label
+from avatar_core.geometry.surface_formats import MESHES, SUFFIXES
 from avatar_core.geometry.vtk_files import read_polydata
 from avatar_core.geometry.vtk_xml_files import read_vtp, stated_axes_of
 
@@ -29,6 +31,18 @@ Soup = tuple[FloatArray, IntArray]
 
 MAX_FILE_BYTES = 4 << 30
 HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for
+
+
+@dataclass(frozen=True)
+class Format:
+    """How one format of meshes is read.
+
+    read : vertices (n, 3) and triangles (m, 3) of a file
+    comments : the part of a file's head that may state its axes; None if the format has none
+    """
+
+    read: Callable[[Path], Soup]
+    comments: Callable[[bytes], bytes] | None = None
 
 
 def content_of(path: Path) -> bytes:
@@ -54,12 +68,13 @@ def stated_axes(path: Path) -> str | None:
     """
     if is_label_map(path):
         return "RAS"
-    comments_of = _COMMENTS.get(path.suffix.lower())
+    kind = path.suffix.lower()
+    comments_of = _FORMATS[kind].comments if kind in MESHES else None
     if comments_of is None:
         return None
     try:
         with files.opened(path, MAX_FILE_BYTES) as source:
-            head = source.read(-1 if path.suffix.lower() == ".vtp" else HEADER_BYTES)
+            head = source.read(-1 if kind == ".vtp" else HEADER_BYTES)
     except (files.FileError, OSError) as error:
         raise SurfaceError(
             f"cannot read {path}: {error}; check the path and its permissions"
@@ -95,33 +110,21 @@ def _vtp_comments(content: bytes) -> bytes:
     return b""
 
 
-_COMMENTS: dict[str, Callable[[bytes], bytes]] = {
-    ".obj": _obj_comments,
-    ".ply": _ply_comments,
-    ".stl": _stl_comments,
-    ".vtk": _vtk_comments,
-    ".vtp": _vtp_comments,
-}
-
-
 def parse(path: Path, label: int | str | None, inside: Sequence[str] = ()) -> Soup:
     """Vertices (n, 3) in the file's unit and axes, and triangles (m, 3).
 
     label, inside : as of :func:`avatar_core.geometry.label_maps.surface_of_label`
     """
     kind = ".nii" if path.name.lower().endswith(".nii.gz") else path.suffix.lower()
-    if kind not in _READERS and not is_label_map(path):
-        raise SurfaceError(
-            f"{path.name}: format not supported; use {', '.join(_READERS)}, .nii (.gz), "
-            ".nrrd or .dcm"
-        )
+    if kind not in SUFFIXES:
+        raise SurfaceError(f"{path.name}: format not supported; use {', '.join(SUFFIXES)}")
     try:
         if is_label_map(path):
             return surface_of_label(path, label, inside)
-        return _READERS[kind](path)
+        return _FORMATS[kind].read(path)
     except SurfaceError:
         raise
-    except Exception as error:  # parsers of eight formats, each with errors of its own
+    except Exception as error:  # of parsers, each with errors of its own
         raise SurfaceError(
             f"{path.name}: not a readable {kind[1:].upper()} file ({one_line(error, 80)}); "
             "export it again"
@@ -178,12 +181,11 @@ def _read_vtk(path: Path) -> Soup:
     return _by_meshio("vtk")(path)
 
 
-_READERS: dict[str, Callable[..., Soup]] = {
-    ".obj": _read_obj,
-    ".stl": _by_meshio("stl"),
-    ".ply": _by_meshio("ply"),
-    ".off": _by_meshio("off"),
-    ".vtk": _read_vtk,
-    ".vtp": lambda path: read_vtp(path.read_bytes()),
+_FORMATS = {
+    ".obj": Format(_read_obj, _obj_comments),
+    ".stl": Format(_by_meshio("stl"), _stl_comments),
+    ".ply": Format(_by_meshio("ply"), _ply_comments),
+    ".vtk": Format(_read_vtk, _vtk_comments),
+    ".vtp": Format(lambda path: read_vtp(path.read_bytes()), _vtp_comments),
+    ".off": Format(_by_meshio("off")),
 }
-SUFFIXES = (*_READERS, *LABEL_SUFFIXES)  # of all files that hold a surface or labels

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,9 +13,10 @@ from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import RegistrationError, one_line
 from avatar_core.geometry.point_location import closest_points
 from avatar_core.geometry.surface import METRES, axes_matrix
-from avatar_core.geometry.surface_files import stated_axes
+from avatar_core.geometry.surface_files import parse, stated_axes
+from avatar_core.geometry.surface_formats import MESHES
 
-SUFFIXES = (".ply", ".obj", ".xyz", ".csv", ".txt", ".vtk", ".vtp", ".stl")
+COLUMNS = (".xyz", ".csv", ".txt")  # x, y, z in each line
 LEAST_POINTS = 50
 MOST_POINTS = 3000  # that are used; of more a random part, always the same
 FARTHEST = 0.03  # of the middle point of a cloud from the organ's surface [m]
@@ -87,8 +87,9 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
     path = Path(path)
     if unit not in METRES:
         raise RegistrationError(f"unit '{unit}' is unknown; use one of {', '.join(METRES)}")
-    if path.suffix.lower() not in SUFFIXES:
-        raise RegistrationError(f"{path.name}: not a cloud; use {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in (*MESHES, *COLUMNS):
+        known = ", ".join((*MESHES, *COLUMNS))
+        raise RegistrationError(f"{path.name}: not a cloud; use {known}")
     matrix = axes_matrix((_stated(path) or "RAS") if axes is None else axes)
     points = _points(path) @ matrix[:3, :3].T + matrix[:3, 3]
     return Cloud(METRES[unit] * points, path.name, unit)
@@ -158,18 +159,7 @@ def _points(path: Path) -> FloatArray:
 
 
 def _read(path: Path) -> FloatArray:
-    suffix = path.suffix.lower()
-    if suffix in (".xyz", ".csv", ".txt"):
-        return _columns(path)
-    if suffix in (".obj", ".vtp"):
-        from avatar_core.geometry.surface_files import parse
-
-        return parse(path, None)[0]
-    import meshio
-
-    reader: Any = getattr(meshio, suffix[1:])
-    with np.errstate(over="ignore"):  # its test for binary STL overflows on text
-        return np.asarray(reader.read(str(path)).points, dtype=np.float64)
+    return _columns(path) if path.suffix.lower() in COLUMNS else parse(path, None)[0]
 
 
 def _columns(path: Path) -> FloatArray:

@@ -13,13 +13,13 @@ from avatar_core.errors import SurfaceError
 from avatar_core.geometry.level_set import DistanceGrid, GridBox, distance_grid, distance_in_box
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.surface_formats import MESHES
 from avatar_core.studies.study import follow
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 DEFAULT_FOLDER = Path("../shared/data/livers")
-SUFFIXES = (".obj", ".stl", ".ply", ".vtk", ".off")
 
 PAPER_GRID = (43, 31, 37)  # 49,321 values
 PADDING = 0.02  # of the common box beyond all organs [m]
@@ -66,7 +66,7 @@ def read_livers(folder: Path | None, n: int | None, phantoms: int) -> Livers:
     folder = folder or DEFAULT_FOLDER
     if not folder.is_dir():
         raise SurfaceError(f"{folder} is no folder; give one with surfaces of livers")
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in MESHES)
     if n is not None and len(files) > n:
         files = [files[i] for i in np.linspace(0, len(files) - 1, n).astype(int)]
     surfaces, notices = [], []

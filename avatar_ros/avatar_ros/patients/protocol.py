@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar_core.errors import AvatarError
-from avatar_core.geometry.label_files import LABEL_SUFFIXES
+from avatar_core.geometry.surface_formats import LABEL_MAPS
 
 # Regions of a face of a preview, as in BuildPatient.action; springs are numbered from the last on.
 FREE, CLAMPED, ACCESSIBLE, FIRST_SPRING = range(4)
@@ -136,6 +136,6 @@ def stem(name: str) -> str:
 
     Two studies called 1.2.840.17.nii.gz and 1.2.840.18.nii.gz are not one patient.
     """
-    ends = sorted((*LABEL_SUFFIXES, *(f".seg{end}" for end in LABEL_SUFFIXES)), key=len)
+    ends = sorted((*LABEL_MAPS, *(f".seg{end}" for end in LABEL_MAPS)), key=len)
     found = [end for end in ends if name.lower().endswith(end)]
     return name[: -len(found[-1])] if found else Path(name).stem

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 
-from avatar_core.geometry.label_files import MAX_LABEL_BYTES
+from avatar_core.geometry.label_files import MAX_LABEL_BYTES, is_label_map
 from avatar_core.geometry.surface import (
     SurfaceMesh,
     keep_organ,
@@ -29,7 +30,7 @@ def read_confined(request: PatientRequest, reader: Reader) -> SurfaceMesh:
             "mesh", request.vertices.nbytes + request.faces.nbytes, surface_of, request
         )
     # these may unpack to MAX_LABEL_BYTES
-    packed = request.surface.endswith((".gz", ".nii", ".nrrd", ".dcm"))
+    packed = is_label_map(Path(request.surface))
     n_bytes = MAX_LABEL_BYTES if packed else os.path.getsize(request.surface)
     return reader.read(os.path.basename(request.surface), n_bytes, surface_of, request)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from avatar_core.geometry.surface_files import SUFFIXES
+from avatar_core.geometry.surface_formats import SUFFIXES
 from avatar_core.vademecum.storage import is_vademecum
 from avatar_ros.ui.scan_dicom import is_series
 

@@ -14,6 +14,7 @@ from avatar_core.geometry import surface as door
 from avatar_core.geometry import surface_files
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule
 from avatar_core.geometry.surface import SurfaceMesh, ambiguous_fraction, axes_matrix, read_surface
+from avatar_core.geometry.surface_formats import MESHES, SUFFIXES
 from tests.helpers.known_surfaces import (
     RADIUS,
     ball,
@@ -25,7 +26,8 @@ from tests.helpers.known_surfaces import (
     write_obj,
     written,
 )
-from tests.helpers.mesh_mutations import SUFFIXES, Soup, encode, pristine
+from tests.helpers.mesh_mutations import SUFFIXES as KINDS
+from tests.helpers.mesh_mutations import Soup, encode, pristine
 
 BALL = ball(level=3)
 CENTRE = np.array([0.01, 0.02, 0.03])
@@ -42,7 +44,7 @@ def encoded(folder: Path, surface: SurfaceMesh, kind: str, words: str) -> Path:
 # --- formats ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", SUFFIXES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_format_gives_the_same_ball_in_metres(tmp_path, kind):
     path = tmp_path / f"ball.{kind.partition('-')[0]}"
     path.write_bytes(encode(pristine(), kind))
@@ -82,6 +84,10 @@ def test_legacy_vtk_polydata(tumour_dir):
     liver = read_surface(tumour_dir / "liver.vtk")
     assert 1e-3 < liver.volume < 3e-3
     assert read_surface(tumour_dir / "liver_tumours.vtk").volume < 2e-4
+
+
+def test_the_ball_is_written_in_every_format_of_meshes():
+    assert {f".{kind.partition('-')[0]}" for kind in KINDS} >= set(MESHES)
 
 
 # --- unit and axes ----------------------------------------------------------------------------
@@ -214,9 +220,9 @@ def test_missing_file_and_unknown_format(tmp_path):
     refused(tmp_path / "organ.xyz", "not supported", ".obj")
 
 
-@pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "vtk", "off", "nii", "nii.gz"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_garbage_is_refused_in_one_line(tmp_path, suffix):
-    path = tmp_path / f"organ.{suffix}"
+    path = tmp_path / f"organ{suffix}"
     path.write_bytes(b"\x8b\xffv garbage\nDATASET POLYDATA\n" + bytes(range(256)))
     refused(path, "organ.")
 
