@@ -19,7 +19,7 @@ from avatar_core.common.quantities import check_numbers, quantity
 from avatar_core.errors import SceneError
 
 Shape = Literal["sphere", "flat", "cone", "rounded_cone", "patch"]
-_USED_BY = {"half_angle": ("cone", "rounded_cone"), "rounding": ("rounded_cone",)}
+USED_BY = {"half_angle": ("cone", "rounded_cone"), "rounding": ("rounded_cone",)}
 ANGLES = (10.0, 85.0)  # of a cone [degrees]
 
 
@@ -48,7 +48,7 @@ class Tip:
             known = ", ".join(get_args(Shape))
             raise SceneError(f"tip shape '{self.shape}' is unknown; choose {known}")
         check_numbers(self, "tip: ")
-        for name, shapes in _USED_BY.items():
+        for name, shapes in USED_BY.items():
             given, used = getattr(self, name) is not None, self.shape in shapes
             if given != used:
                 verb, remedy = ("needs", "give one") if used else ("does not use", "leave it out")
