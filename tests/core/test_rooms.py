@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -140,3 +141,11 @@ def test_studies_serve_the_command_alone() -> None:
     assert users <= {"studies", "cli"}
     for file in NODES.rglob("*.py"):
         assert not any(name.startswith("avatar_core.studies") for name in imported(file)), file
+
+
+def test_the_page_of_the_architecture_has_the_order(package: str) -> None:
+    page = (ROOT / "msg_docs" / "architecture.md").read_text()
+    (line,) = re.findall(rf"^- `{package}`: (.*)$", page, re.MULTILINE)
+    named = [name.removesuffix(".py") for name in re.findall(r"`([\w.]+)`", line)]
+    assert named == [name for name in ORDER[package] if name in named]
+    assert set(ORDER[package]) - set(named) <= {"__init__"}

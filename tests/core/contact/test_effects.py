@@ -56,7 +56,7 @@ def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -
         signature = tuple(numba.typeof(argument) for argument in arguments)
         *others, law, dent, display = map(str, effects.numba_type.members.values())
         assert display == "none" and phantom_vademecum.display is None
-        assert others == ["none"] * 8
+        assert set(others) == {"none"}
         assert (law == "none") == (dent == "none") == (tip is PATCH)
         assert signature in kernels.contact_step.overloads
 
