@@ -12,9 +12,7 @@
 All lengths are in metres, forces in newtons. What users can cause and cure raises
 :class:`AvatarError` with one line that names cause and remedy.
 
-The rooms, in the order in which data flows and imports may run: common, geometry, fem, reduction,
-shapes, vademecum, registration, contact, scene, offline, atlas; then studies and cli, which use all
-of them.
+``msg_docs/architecture.md`` has the rooms, in the order in which data flows and imports may run.
 """
 
 from __future__ import annotations
