@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,12 +21,11 @@ from avatar_core.contact.effects import (
     Viscoelasticity,
 )
 from avatar_core.errors import SceneError
-from avatar_core.geometry.tip import Shape, Tip
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import parse_scene, read_scene, write_scene
 from avatar_core.scene.model import CONFLICTS, Scene, Tool
 from tests.helpers.examples import examples
 from tests.helpers.scene_cases import SHIPPED
-from tests.helpers.tips import used_by
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -101,12 +100,11 @@ def made(kind: type[Effect]) -> st.SearchStrategy[Effect]:
 
 LINES = st.text(max_size=40).filter(str.isprintable)
 RADII = st.floats(1e-3, 20e-3)
-NUMBERS = {"half_angle": st.floats(10.0, 85.0), "rounding": st.floats(2e-4, 1e-3)}
+ANGLES = st.floats(10.0, 85.0)
 TIPS = st.one_of(
-    [
-        st.builds(Tip, st.just(shape), RADII, **{name: NUMBERS[name] for name in used_by(shape)})
-        for shape in get_args(Shape)
-    ]
+    st.builds(Tip, st.sampled_from(["sphere", "flat", "patch"]), RADII),
+    st.builds(Tip, st.just("cone"), RADII, ANGLES),
+    st.builds(Tip, st.just("rounded_cone"), RADII, ANGLES, st.floats(2e-4, 1e-3)),
 )
 TOOL_NAMES = st.from_regex(r"[a-z][a-z0-9]{0,5}(/[A-Z][a-z]_[0-9])?", fullmatch=True)
 

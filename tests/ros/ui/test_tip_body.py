@@ -10,11 +10,16 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from avatar_ros.ui.tip_body import tip_body, turn_to
 
 from avatar_core.geometry.tip import Tip
-from tests.helpers.tips import one_of_each
 
 pytestmark = pytest.mark.ros
 
-TIPS = one_of_each()
+TIPS = [
+    Tip("sphere", 5e-3),
+    Tip("flat", 3e-3),
+    Tip("cone", 4e-3, 60.0),
+    Tip("rounded_cone", 4e-3, 30.0, 1.5e-3),
+    Tip("patch", 5e-3),
+]
 
 
 @pytest.mark.parametrize("tip", TIPS, ids=lambda tip: tip.shape)
