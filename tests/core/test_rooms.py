@@ -12,6 +12,7 @@ import pytest
 
 from tests.helpers.paths import ROOT
 
+PAGE = ROOT / "msg_docs" / "architecture.md"
 CORE, NODES = ROOT / "avatar_core", ROOT / "avatar_ros" / "avatar_ros"
 
 ORDER = {
@@ -144,8 +145,15 @@ def test_studies_serve_the_command_alone() -> None:
 
 
 def test_the_page_of_the_architecture_has_the_order(package: str) -> None:
-    page = (ROOT / "msg_docs" / "architecture.md").read_text()
-    (line,) = re.findall(rf"^- `{package}`: (.*)$", page, re.MULTILINE)
+    (line,) = re.findall(rf"^- `{package}`: (.*)$", PAGE.read_text(), re.MULTILINE)
     named = [name.removesuffix(".py") for name in re.findall(r"`([\w.]+)`", line)]
     assert named == [name for name in ORDER[package] if name in named]
     assert set(ORDER[package]) - set(named) <= {"__init__"}
+
+
+def test_the_page_of_the_architecture_names_files_that_are_there() -> None:
+    named = re.findall(r"`(\w+/(?:\w+/)*(?:\w+\.py)?)`", PAGE.read_text())
+    assert len(named) > 10
+    assert not [
+        name for name in named if not any((at / name).exists() for at in (ROOT, CORE, NODES))
+    ]
