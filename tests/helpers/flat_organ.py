@@ -6,7 +6,7 @@ that contact, friction and relaxation have closed forms.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from avatar_core.contact.effects.tip_law import PATCH, tip_law_arrays
 from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
 from avatar_core.contact.kernels import ModelArrays
 from avatar_core.contact.layout import LANES, Layout
-from avatar_core.contact.model import ContactModel, make_model
+from avatar_core.contact.model import ContactModel, make_model, step
 from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.near_field import LocalBlocks, hash_rows
@@ -35,10 +35,8 @@ PATCH_TIP = Tip("patch", RADIUS)
 MATERIAL = Material(0.17e6, 0.48)
 E_STAR = MATERIAL.young_modulus / (1.0 - MATERIAL.poisson_ratio**2)  # [Pa]
 PATCH_RADIUS = 12e-3
-
-
 BALL = 40e-3  # radius of the ball [m]
-ORIGIN = np.zeros((1, 3))
+ORIGIN, UP = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
 
 
 def flat_organ(
@@ -48,44 +46,19 @@ def flat_organ(
     tip: Tip = PATCH_TIP,
     points: np.ndarray = ORIGIN,
     neo_hookean: float | None = None,
+    is_ball: bool = False,
 ) -> ContactModel:
     """The contact model of the flat organ, one tool.
 
     points : ndarray, shape (n, 3), whose displacement is shown: of the patch's nothing [m]
     neo_hookean : Poisson's ratio of an organ of large strain, whose patches respond linearly
+    is_ball : whether the organ is the ball
     """
-    return _organ(
-        (41, 41, 21),
-        lambda x, y, z: z + 0 * x + 0 * y,
-        effects,
-        period,
-        compliance,
-        tip,
-        points,
-        neo_hookean,
-    )
-
-
-def ball_organ(compliance: float = COMPLIANCE) -> ContactModel:
-    """The contact model of the ball, one tool."""
-    return _organ(
-        (41, 41, 41), lambda x, y, z: np.sqrt(x**2 + y**2 + z**2) - BALL, (), 1e-3, compliance
-    )
-
-
-def _organ(
-    shape: tuple[int, int, int],
-    phi: Callable[..., np.ndarray],
-    effects: Sequence[Effect],
-    period: float,
-    compliance: float,
-    tip: Tip = PATCH_TIP,
-    points: np.ndarray = ORIGIN,
-    neo_hookean: float | None = None,
-) -> ContactModel:
-    spacing, single = 3e-3, np.float32
+    spacing, single, shape = 3e-3, np.float32, (41, 41, 41 if is_ball else 21)
     origin = -0.5 * spacing * (np.array(shape) - 1)
-    grid = [o + spacing * np.arange(n) for o, n in zip(origin, shape, strict=True)]
+    axes = [o + spacing * np.arange(n) for o, n in zip(origin, shape, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"))
+    distance = np.linalg.norm(grid, axis=0) - BALL if is_ball else grid[2]
     far, near = compliance * FAR / COMPLIANCE, compliance * NEAR / COMPLIANCE
     # weights are sums of splines: a row for every grid point, all carried by the one position
     load = np.zeros((1, 3, LANES), single)
@@ -97,7 +70,7 @@ def _organ(
     gamma = float((load[0, 2] ** 2).sum()) + float(single(near))
     shift = no_shift(spacing * max(shape), np.zeros(1))
     arrays = ModelArrays(
-        distance=phi(*np.meshgrid(*grid, indexing="ij")).astype(single),
+        distance=distance.astype(single),
         access=np.ones(shape, single),
         origin=origin,
         spacing=np.array([spacing]),
@@ -144,6 +117,12 @@ def _organ(
     return make_model(Layout(arrays, constants))
 
 
-def at_depth(depth: float, x: float = 0.0, y: float = 0.0) -> np.ndarray:
-    """Centre of a tip that presses this deep into the flat organ at rest, (1, 3)."""
-    return np.array([[x, y, RADIUS - depth]])
+def at_depth(depth: float, x: float = 0.0, y: float = 0.0, offset: float = RADIUS) -> np.ndarray:
+    """Centre of a tip that presses this deep into the flat organ at rest, shape (1, 3)."""
+    return np.array([[x, y, offset - depth]])
+
+
+def force_at_depth(model: ContactModel, depth: float, x: float = 0.0) -> float:
+    """Normal force on the tip in a period at this depth [N]."""
+    step(model, at_depth(depth, x, offset=float(model.arrays.tip_offset[0])))
+    return float(model.out.force[0, 2])

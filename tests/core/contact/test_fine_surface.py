@@ -12,8 +12,9 @@ from avatar_core.contact.fine_surface import FineSurface, find_touch, fine_surfa
 from avatar_core.contact.model import prepare
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
-from tests.core.contact.test_dent import DEPTH, END, SPHERE, pressed, sneddon_dent
 from tests.helpers.box_organ import UP, organ, top
+from tests.helpers.shown_dent import DEPTH, END, SPHERE, sneddon_dent
+from tests.helpers.tool_motion import press
 
 ASIDE = ((0.0, 0.0), (3e-3, 2e-3), (6e-3, 0.0), (-9e-3, 7e-3))  # of the middle [m]
 
@@ -36,7 +37,7 @@ def clouds(cube: Vademecum) -> list[np.ndarray]:
     """Under the sphere at each of the places."""
     model, found = prepare(cube, (SPHERE,), effects=()), []
     for aside in ASIDE:
-        pressed(model, (SPHERE,), place(aside)[None], UP[None], DEPTH)
+        press(model, (SPHERE,), place(aside)[None], UP[None], DEPTH)
         found.append(model.out.cloud.copy())
     return found
 
@@ -48,9 +49,12 @@ def at_rest(shown: FineSurface) -> np.ndarray:
 def test_between_the_points_of_a_cloud_the_dent_is_sneddons(
     cube: Vademecum, clouds: list[np.ndarray]
 ) -> None:
+    """And those points stay where they are."""
     errors = []
     for aside, cloud in zip(ASIDE, clouds, strict=True):
         shown = fine_surface(cube, cloud, [SPHERE], pose(aside)[None])
+        np.testing.assert_array_equal(shown.positions[: len(cloud)], cloud[:, :3])
+        np.testing.assert_array_equal(shown.displacements[: len(cloud)], cloud[:, 3:])
         rest = at_rest(shown)
         distance = np.linalg.norm(rest - place(aside), axis=1)
         near = np.flatnonzero((distance < END) & (np.abs(rest[:, 1] - place(aside)[1]) < 1e-6))
@@ -60,15 +64,6 @@ def test_between_the_points_of_a_cloud_the_dent_is_sneddons(
     rms, worst = np.sqrt((found**2).mean()), np.abs(found).max()
     print(f"rms {1e3 * rms:.3f} mm, worst {1e3 * worst:.3f} mm at {len(found)} vertices")
     assert rms < 0.04e-3 and worst < 0.15e-3
-
-
-def test_the_points_of_a_cloud_stay_where_they_are(
-    cube: Vademecum, clouds: list[np.ndarray]
-) -> None:
-    shown = fine_surface(cube, clouds[1], [SPHERE], pose(ASIDE[1])[None])
-    n = len(clouds[1])
-    np.testing.assert_array_equal(shown.positions[:n], clouds[1][:, :3])
-    np.testing.assert_array_equal(shown.displacements[:n], clouds[1][:, 3:])
 
 
 def test_the_fine_triangles_are_the_coarse_ones(cube: Vademecum, clouds: list[np.ndarray]) -> None:
@@ -103,7 +98,7 @@ def vector_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("tip", [SPHERE, Tip("flat", 4e-3), Tip("cone", 8e-3, 60.0)])
 def test_the_dent_of_a_cloud_is_found_again(cube: Vademecum, tip: Tip) -> None:
     model = prepare(cube, (tip,), effects=())
-    pressed(model, (tip,), place(ASIDE[1])[None], UP[None], DEPTH)
+    press(model, (tip,), place(ASIDE[1])[None], UP[None], DEPTH)
     touch = find_touch(cube, tip, pose(ASIDE[1], tip))
     assert touch is not None
     delta, _, _, a = dent(model.effects.tip_law, 0)
@@ -116,7 +111,7 @@ def test_two_dents_are_both_drawn(cube: Vademecum) -> None:
     """Far from one another, each as if it were alone; those between them meet in the cloud."""
     far = ((-20e-3, 0.0), (20e-3, 0.0))
     model = prepare(cube, (SPHERE, SPHERE), effects=(SeveralTools(),))
-    pressed(model, (SPHERE, SPHERE), np.array([*map(place, far)]), np.array([UP, UP]), DEPTH)
+    press(model, (SPHERE, SPHERE), np.array([*map(place, far)]), np.array([UP, UP]), DEPTH)
     cloud, poses = model.out.cloud, np.array([*map(pose, far)])
     both = fine_surface(cube, cloud, [SPHERE, SPHERE], poses)
     for k, aside in enumerate(far):

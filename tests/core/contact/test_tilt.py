@@ -15,27 +15,28 @@ from avatar_core.geometry.tip import Tip
 from avatar_core.offline.resolved_contact import Resolution, refined_organ
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.vademecum.model import Vademecum
-from tests.helpers.box_organ import MATERIAL, UP, body_mesh, organ, top
-from tests.helpers.flat_organ import E_STAR, flat_organ
+from tests.helpers import box_organ
+from tests.helpers.box_organ import MATERIAL, body_mesh, organ, top
+from tests.helpers.flat_organ import E_STAR, ORIGIN, UP, at_depth, flat_organ
+from tests.helpers.tool_motion import energy_slope, press
 
 PUNCH = Tip("flat", 5e-3)
 
 
-def leaning(angle: float, about: float = 0.0) -> np.ndarray:
-    """The axis of a tool that leans off the flat organ's normal, in a direction [rad]."""
-    s = np.sin(angle)
-    return np.array([s * np.cos(about), s * np.sin(about), np.cos(angle)])
-
-
-def pressed(
-    angle: float, depth: float, about: float = 0.0, effects: tuple[Effect, ...] = ()
-) -> ContactModel:
-    """The flat organ's model after an approach of the face's centre to a depth."""
+def leaning_model(angle: float, about: float = 0.0, *effects: Effect) -> ContactModel:
+    """The flat organ and a tool that leans off its normal, in a direction [rad]."""
     model = flat_organ((Tilt(), *effects), tip=PUNCH)
     assert model.axes is not None
-    model.axes[:] = leaning(angle, about)
+    s = np.sin(angle)
+    model.axes[:] = (s * np.cos(about), s * np.sin(about), np.cos(angle))
+    return model
+
+
+def pressed(angle: float, depth: float, about: float = 0.0, *effects: Effect) -> ContactModel:
+    """The same after an approach of the face's centre to a depth."""
+    model = leaning_model(angle, about, *effects)
     for at in np.linspace(-3e-3, depth, 50):
-        step(model, np.array([[0.0, 0.0, -at]]))
+        step(model, at_depth(at, offset=0.0))
     return model
 
 
@@ -44,8 +45,9 @@ def test_a_punch_that_touches_all_over_is_righted_by_its_closed_form(about: floa
     """M = 4/3 E* a^3 sin cos about e x n, and the force of an upright punch."""
     angle, depth = 0.02, 2e-3
     upright, model = pressed(0.0, depth), pressed(angle, depth, about)
+    assert model.axes is not None
     exact = 4.0 / 3.0 * E_STAR * PUNCH.radius**3 * np.sin(angle) * np.cos(angle)
-    axis = np.cross(leaning(angle, about), [0.0, 0.0, 1.0]) / np.sin(angle)
+    axis = np.cross(model.axes[0], [0.0, 0.0, 1.0]) / np.sin(angle)
     np.testing.assert_allclose(model.out.torque[0], exact * axis, atol=1e-5 * exact)
     np.testing.assert_allclose(model.out.force[0], upright.out.force[0], rtol=1e-9, atol=1e-9)
     assert not upright.out.torque.any()
@@ -53,13 +55,11 @@ def test_a_punch_that_touches_all_over_is_righted_by_its_closed_form(about: floa
 
 def test_an_edge_touches_before_the_centre_and_no_force_jumps() -> None:
     """From the first touch of the edge, past the depth where the whole face touches."""
-    model = flat_organ((Tilt(),), tip=PUNCH)
-    assert model.axes is not None
-    model.axes[:] = leaning(0.2)
+    model = leaning_model(0.2)
     edge, force, torque = PUNCH.radius * np.sin(0.2), [], []
     depths = np.arange(-edge - 1e-4, 6e-3, 1e-5)
     for depth in depths:
-        step(model, np.array([[0.0, 0.0, -depth]]))
+        step(model, at_depth(depth, offset=0.0))
         force.append(float(model.out.force[0, 2]))
         torque.append(float(np.linalg.norm(model.out.torque[0])))
     touched = np.array(force) > 0.0
@@ -77,50 +77,44 @@ def test_force_and_torque_are_the_derivatives_of_the_energy(
 ) -> None:
     """On a curved organ, by the place of the tool and by the direction of its axis."""
     model = prepare(straight, (PUNCH,), cloud="off", effects=(Tilt(),))
-    axes = model.axes
-    assert axes is not None
+    assert model.axes is not None
     rng = np.random.default_rng(2)
     for j in rng.choice(inner_positions(straight), 4):
         centre, normal = straight.surface.centers[j], straight.surface.normals[j]
         aside = np.cross(normal, rng.normal(size=3))
         aside /= np.linalg.norm(aside)
-        place = centre - 3e-3 * normal + rng.uniform(-1e-3, 1e-3, 3)
+        place = (centre - 3e-3 * normal + rng.uniform(-1e-3, 1e-3, 3))[None]
         model.reset()
-        axes[:] = np.cos(angle) * normal + np.sin(angle) * aside
+        model.axes[:] = np.cos(angle) * normal + np.sin(angle) * aside
         step(model, (centre - 0.5e-3 * normal)[None])
-        assert step(model, place[None]) == Status.OK
-        force, torque = model.out.force[0].copy(), model.out.torque[0].copy()
-        by_place, by_turn = slopes(model, place, axes[0].copy())
-        np.testing.assert_allclose(force, -by_place, atol=1e-4 * np.linalg.norm(force))
-        np.testing.assert_allclose(torque, -by_turn, atol=1e-3 * np.linalg.norm(torque))
+        assert step(model, place) == Status.OK
+        force, torque = model.out.force.copy(), model.out.torque[0].copy()
+        slope, turn = energy_slope(model, place), energy_turn(model, place)
+        np.testing.assert_allclose(force, -slope, atol=1e-4 * np.linalg.norm(force))
+        np.testing.assert_allclose(torque, -turn, atol=1e-3 * np.linalg.norm(torque))
 
 
-def slopes(model: ContactModel, place: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Derivatives of the stored energy by the place [N] and by a rotation [N m]."""
+def energy_turn(model: ContactModel, place: np.ndarray, h: float = 1e-4) -> np.ndarray:
+    """Derivative of the stored energy by a rotation of the tool, shape (3,) [N m]."""
     assert model.axes is not None
-    out = np.empty((2, 3))
-    for kind, h in enumerate((1e-6, 1e-4)):
-        for d in range(3):
-            energy = []
-            for sign in (1.0, -1.0):
-                change = sign * h * np.eye(3)[d]
-                turned = axis + np.cross(change, axis) * kind
-                model.axes[:] = turned / np.linalg.norm(turned)
-                step(model, (place + change * (1 - kind))[None])
-                energy.append(stored_energy(model))
-            out[kind, d] = (energy[0] - energy[1]) / (2.0 * h)
+    axis, energy = model.axes[0].copy(), []
+    for change in h * np.concatenate([np.eye(3), -np.eye(3)]):
+        turned = axis + np.cross(change, axis)
+        model.axes[:] = turned / np.linalg.norm(turned)
+        step(model, place)
+        energy.append(stored_energy(model))
     model.axes[:] = axis
-    return out[0], out[1]
+    return (np.array(energy[:3]) - np.array(energy[3:])) / (2.0 * h)
 
 
 @pytest.mark.long
 def test_torque_relaxes_and_friction_leaves_it() -> None:
     """In the end that of the relaxed modulus; on the face itself friction has no arm."""
     soft = Viscoelasticity((0.6,), (0.02,))
-    model, elastic = pressed(0.02, 2e-3, effects=(soft,)), pressed(0.02, 2e-3)
+    model, elastic = pressed(0.02, 2e-3, 0.0, soft), pressed(0.02, 2e-3)
     for _ in range(400):
-        step(model, np.array([[0.0, 0.0, -2e-3]]))
-    rough = pressed(0.02, 2e-3, effects=(Friction(),))
+        step(model, at_depth(2e-3, offset=0.0))
+    rough = pressed(0.02, 2e-3, 0.0, Friction())
     np.testing.assert_allclose(model.out.torque, 0.4 * elastic.out.torque, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(rough.out.torque, elastic.out.torque, rtol=1e-6, atol=1e-12)
 
@@ -133,20 +127,20 @@ def test_force_and_torque_are_those_of_resolved_contact(angle: float, bound: flo
     The reference presses along the tool's axis on elements that make both 1.6 % too large; small
     angles are the theory's.
     """
-    depth, axis = 1e-3, np.array([np.sin(angle), np.cos(angle), 0.0])
+    up, depth, axis = box_organ.UP, 1e-3, np.array([np.sin(angle), np.cos(angle), 0.0])
     mesh, regions = body_mesh("cube")
     elasticity = refined_organ(
-        *(None, mesh, regions, MATERIAL, [top("cube")], [UP], (PUNCH,), (depth,)),
+        *(None, mesh, regions, MATERIAL, [top("cube")], [up], (PUNCH,), (depth,)),
         Resolution(core=0.15, inner=0.08),
     )
-    centre = top("cube") - depth * UP
+    centre = top("cube") - depth * up
     push = Push(PUNCH, centre + depth * axis, axis)
     contact = CondensedContact(elasticity, [push], depth, reach=2.0).solve([0], [depth])
     model = prepare(organ("cube"), (PUNCH,), cloud="off", effects=(Tilt(),))
     assert model.axes is not None
     model.axes[:] = axis
     for at in np.linspace(-4e-3, depth, 20):
-        step(model, (top("cube") - at * UP)[None])
+        step(model, (top("cube") - at * up)[None])
     torque = torque_on_tip(elasticity, contact.loads, centre)
     assert np.linalg.norm(model.out.force[0]) == pytest.approx(contact.forces[0], rel=0.03)
     assert model.out.torque[0, 2] == pytest.approx(torque[2], rel=bound)
@@ -164,15 +158,11 @@ def torque_on_tip(elasticity: Elasticity, loads: np.ndarray, centre: np.ndarray)
 def test_a_tool_on_its_side_or_without_an_axis_has_no_torque() -> None:
     for angle in (np.pi / 2.0 + 0.1, np.pi):
         assert not pressed(angle, 2e-3).out.torque.any()
-    model = flat_organ((Tilt(),), tip=PUNCH)
-    step(model, np.array([[0.0, 0.0, -2e-3]]))
-    assert model.out.force[0, 2] > 0.0 and not model.out.torque.any()
-
-
-def test_a_reset_forgets_how_the_tool_leant() -> None:
     model = pressed(0.2, 2e-3)
-    model.reset()
+    assert model.out.torque.any()
+    model.reset()  # forgets the axis
     assert model.axes is not None and not model.axes.any()
+    assert press(model, (PUNCH,), ORIGIN, UP, 2e-3) > 0.0 and not model.out.torque.any()
 
 
 def test_only_flat_tips_lean() -> None:

@@ -9,14 +9,13 @@ plus the force times what the patch sinks more than on a half-space, on fine ele
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
-from scipy.optimize import brentq
 
 from avatar_core.contact.effects import LargeDeformationEffect, SeveralTools
-from avatar_core.contact.model import ContactModel, Status, prepare, step
+from avatar_core.contact.model import ContactModel, prepare
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.signorini import CondensedContact, Push
 from avatar_core.fem.sphere_indentation import Domain, SphereIndentation
@@ -43,6 +42,8 @@ from tests.helpers.box_organ import (
     top,
 )
 from tests.helpers.disk_cache import cached_on_disk
+from tests.helpers.half_space import on_soft_base, sneddon
+from tests.helpers.tool_motion import press
 
 RADII = (1e-3, 3e-3, 5e-3, 10e-3)
 DEPTHS = (0.5e-3, 1e-3, 2e-3, 5e-3)
@@ -66,84 +67,38 @@ LIGHT = 0.1
 APART, LEAST_COSINE = 25e-3, np.cos(np.radians(30.0))
 
 
-def sneddon(tip: Tip, depth: float) -> float:
-    """Force on a half-space (Sneddon 1965), by Abel's integrals over the profile's slope [N]."""
-    if tip.shape == "flat":
-        return 2.0 * MODULUS * tip.radius * depth
-
-    def integral(a: float, power: int) -> float:
-        """int_0^a r^power f'(r) / sqrt(a^2 - r^2) dr."""
-
-        def inner(angle: float) -> float:
-            r = a * np.sin(angle)
-            return float(r**power * slope(tip, r))
-
-        return float(quad(inner, 0.0, 0.5 * np.pi, limit=400)[0])
-
-    a = brentq(lambda a: a * integral(a, 0) - depth, 0.0, (1.0 - 1e-9) * tip.radius)
-    return 2.0 * MODULUS * integral(a, 2)
-
-
-def slope(tip: Tip, r: float) -> float:
-    """f'(r) of a sphere or a cone, rounded or not."""
-    ball, cotangent = tip.radius, np.inf
-    if tip.half_angle is not None:
-        ball, cotangent = tip.rounding or 0.0, 1.0 / np.tan(np.radians(tip.half_angle))
-    steepness = r / np.sqrt(ball**2 - r**2) if r < ball else np.inf
-    return float(min(steepness, cotangent))
-
-
 def depths_of(tip: Tip) -> list[float]:
     """Those at which the contact does not reach the rim of a cone."""
     rimless = tip.shape in ("sphere", "flat")
     return [depth for depth in DEPTHS if rimless or depth <= tip.radius]
 
 
-def pressed(
-    model: ContactModel,
-    tips: Sequence[Tip],
-    points: np.ndarray,
-    normals: np.ndarray,
-    depths: Sequence[float],
-) -> np.ndarray:
-    """Forces along the normals at some depths, after an approach from outside [N]."""
-    model.reset()
-    height = np.array([tip.offset for tip in tips])
-    for part in np.linspace(-0.2, 1.0, 13):
-        lowest = height - part * np.array(depths)
-        status = step(model, points + lowest[:, None] * normals)
-    assert status == Status.OK
-    return np.asarray((model.out.force * normals).sum(axis=1))
-
-
 def on_top(body: Body, tip: Tip, aside: tuple[float, float]) -> Callable[[float], float]:
     """The step's force on a tip at a depth in the top of a box."""
     model = prepare(organ(body), (tip,), cloud="off", effects=())
     point = top(body) + np.array([aside[0], 0.0, aside[1]])
-    return lambda depth: float(pressed(model, (tip,), point[None], UP[None], (depth,))[0])
+    return lambda depth: float(press(model, (tip,), point[None], UP[None], (depth,))[0])
 
 
 @pytest.mark.parametrize("tip", TIPS)
 def test_a_tip_feels_sneddons_force_on_a_cube(tip: Tip) -> None:
-    exact = [sneddon(tip, depth) for depth in depths_of(tip)]
+    exact = [sneddon(tip, depth, MODULUS) for depth in depths_of(tip)]
     for aside in ASIDE:
         force = on_top("cube", tip, aside)
         np.testing.assert_allclose([force(depth) for depth in depths_of(tip)], exact, rtol=0.03)
 
 
-def on_a_soft_base(tip: Tip, depth: float, base: float) -> float:
-    """Sneddon's force where the half-space gives way besides, by ``base`` [m/N]."""
-    return float(
-        brentq(lambda f: sneddon(tip, depth - base * f) - f, 0.0, sneddon(tip, depth), xtol=1e-9)
-    )
+def exact_on_column(tip: Tip, depth: float) -> float:
+    """Sneddon's force where the half-space gives way besides, as much as the column [N]."""
+    base = patch_compliance("column") - HALF_SPACE
+    return on_soft_base(partial(sneddon, tip, modulus=MODULUS), depth, base)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("tip", TIPS)
 def test_a_tip_on_a_column_feels_it_give_way(tip: Tip) -> None:
     """The wider a tip, the more it feels that the coarse mesh is stiff: 5.5 % at 10 mm."""
-    base = patch_compliance("column") - HALF_SPACE
-    exact = [on_a_soft_base(tip, depth, base) for depth in depths_of(tip)]
+    exact = [exact_on_column(tip, depth) for depth in depths_of(tip)]
     force = on_top("column", tip, ASIDE[0])
     limit = 0.01 + 5.0 * tip.radius
     np.testing.assert_allclose([force(depth) for depth in depths_of(tip)], exact, rtol=limit)
@@ -161,7 +116,7 @@ def test_a_sphere_feels_the_large_strain_of_a_neo_hookean_cube(radius: float) ->
     place = (top("cube")[None], UP[None])
     elements = SphereIndentation(MATERIAL.poisson_ratio, domain=Domain(0.2))
     for each in elements.press([0.25, 0.5, 1.0]):
-        force = pressed(model, (tip,), *place, (each.depth * radius,))[0]
+        force = press(model, (tip,), *place, (each.depth * radius,))[0]
         truth = each.force * MATERIAL.young_modulus * radius**2
         assert force == pytest.approx(truth, rel=0.04)
 
@@ -169,19 +124,6 @@ def test_a_sphere_feels_the_large_strain_of_a_neo_hookean_cube(radius: float) ->
 @pytest.mark.long
 def test_a_patch_sinks_into_the_cube_as_into_a_half_space() -> None:
     assert patch_compliance("cube") == pytest.approx(HALF_SPACE, rel=2e-3)
-
-
-@pytest.mark.long
-def test_tips_on_a_column_feel_resolved_contacts() -> None:
-    """As Sneddon's solution says on a soft base, to which the step is compared above."""
-    tips, depths, body = [make(5e-3) for make in SHAPES.values()], (2e-3, 5e-3), organ("column")
-    place = (top("column"), UP, tips, depths)
-    truth = contacts_at(None, body.mesh, body.regions, MATERIAL, *place).forces
-    base = patch_compliance("column") - HALF_SPACE
-    exact = [[on_a_soft_base(tip, depth, base) for depth in depths] for tip in tips]
-    np.testing.assert_allclose(exact, truth, rtol=0.02)
-    force = [[on_top("column", tip, ASIDE[0])(depth) for depth in depths] for tip in tips]
-    np.testing.assert_allclose(force, truth, rtol=0.04)
 
 
 @cached_on_disk
@@ -201,7 +143,7 @@ def test_a_tip_on_an_organ_feels_a_resolved_contact(straight: Vademecum) -> None
     tip, depth = Tip("sphere", 5e-3), 2e-3
     site = draw_sites(straight, phantom_liver(12e-3), 8, 1)[2]
     model = prepare(straight, (tip,), cloud="off", effects=())
-    force = pressed(model, (tip,), site.point[None], site.normal[None], (depth,))[0]
+    force = press(model, (tip,), site.point[None], site.normal[None], (depth,))[0]
     truth = true_force(tuple(site.point.tolist()), tuple(site.normal.tolist()), tip.radius, depth)
     assert force == pytest.approx(truth, rel=0.05)
 
@@ -240,7 +182,7 @@ def errors_at(
     pushes = [Push(*each) for each in zip(PAIR, points, normals, strict=True)]
     both = CondensedContact(fine, pushes, np.max(PAIR_DEPTHS), reach=2.0)
     truth = np.array([both.solve((0, 1), depths).forces for depths in PAIR_DEPTHS])
-    force = [pressed(model, PAIR, points, normals, depths) for depths in PAIR_DEPTHS]
+    force = [press(model, PAIR, points, normals, depths) for depths in PAIR_DEPTHS]
     off = np.array(force) - truth
     return off / np.maximum(truth, LIGHT * truth.max(axis=1, keepdims=True))
 

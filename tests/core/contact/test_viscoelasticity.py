@@ -7,11 +7,11 @@ import pytest
 
 from avatar_core.contact.effects import Viscoelasticity
 from avatar_core.contact.model import prepare, step
-from avatar_core.contact.tool_path import middle_of_access, slide
+from avatar_core.contact.tool_path import slide
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
-from tests.helpers.effect_cases import SPHERE, push_and_drag
-from tests.helpers.flat_organ import COMPLIANCE, at_depth, flat_organ
+from tests.helpers.flat_organ import COMPLIANCE, at_depth, flat_organ, force_at_depth
+from tests.helpers.tool_motion import AWAY
 
 PRONY = Viscoelasticity((0.3, 0.2), (0.05, 0.7))
 
@@ -30,7 +30,7 @@ def relaxed_force(times: np.ndarray, depths: np.ndarray, t: float) -> float:
     return force
 
 
-@pytest.mark.parametrize("period", [0.1e-3, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3])
+@pytest.mark.parametrize("period", [0.1e-3, 1e-3, 10e-3])
 def test_relaxation_is_exact_for_motion_in_straight_lines(period: float) -> None:
     """Down, hold, further down, half back: the closed form to 1e-6 whatever the step."""
     times = np.array([0.0, 0.1, 0.5, 0.6, 0.9, 1.0])
@@ -39,9 +39,9 @@ def test_relaxation_is_exact_for_motion_in_straight_lines(period: float) -> None
     worst, peak = 0.0, 0.0
     for k in range(1, round(1.0 / period) + 1):
         t = k * period
-        step(model, at_depth(float(np.interp(t, times, depths))))
+        force = force_at_depth(model, float(np.interp(t, times, depths)))
         exact = relaxed_force(times, depths, t)
-        worst, peak = max(worst, abs(model.out.force[0, 2] - exact)), max(peak, exact)
+        worst, peak = max(worst, abs(force - exact)), max(peak, exact)
     assert worst < 1e-6 * peak
 
 
@@ -74,11 +74,10 @@ def crept(period: float, force: float, end: float) -> float:
         # the next step is affine in the depth: two trials, of which the memory knows nothing
         found = []
         for trial in (depth + 1e-3, depth + 2e-3):
-            kept = [array.copy() for array in model.effects.viscoelasticity]
-            step(model, at_depth(trial))
-            found.append(model.out.force[0, 2])
-            for array, before in zip(model.effects.viscoelasticity, kept, strict=True):
-                array[...] = before
+            before = [array.copy() for array in model.effects.viscoelasticity]
+            found.append(force_at_depth(model, trial))
+            for array, earlier in zip(model.effects.viscoelasticity, before, strict=True):
+                array[...] = earlier
         depth += 1e-3 + 1e-3 * (wanted - found[0]) / (found[1] - found[0])
         step(model, at_depth(depth))
     return depth
@@ -94,26 +93,36 @@ def test_creep_under_a_held_force_is_of_second_order() -> None:
     assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.15)
 
 
-def test_tissue_comes_back_slowly_where_a_tool_has_been(phantom_vademecum: Vademecum) -> None:
-    """The cloud keeps a dent after release, which fades with the relaxation times."""
-    v = phantom_vademecum
-    model = prepare(v, (SPHERE,), cloud="surface", effects=(Viscoelasticity((0.5,), (0.1,)),))
-    path = push_and_drag(v)
-    for _ in range(5):
-        for tip in path:
-            step(model, tip[None])
-    deep = np.abs(model.out.cloud[:, 3:]).max()
-    away = path[-1] + 50e-3 * v.surface.normals[middle_of_access(v)]
-    dents = []
-    for _ in range(3):
-        step(model, away[None])
-        dents.append(np.abs(model.out.cloud[:, 3:]).max())
-        for _ in range(299):
-            step(model, away[None])
-    assert model.out.force[0].any() == False  # noqa: E712
-    assert 0.1 * deep < dents[0] < deep
-    assert dents[1] < 0.5 * dents[0]
-    assert dents[2] < 0.5 * dents[1]
+def test_an_organ_that_is_let_go_creeps_back() -> None:
+    """Held until relaxed, then let go: e = g e_0 exp(- g_inf t / tau)."""
+    g, tau, period, depth = 0.6, 0.1, 1e-3, 4e-3
+    model = flat_organ((Viscoelasticity((g,), (tau,)),))
+    first = force_at_depth(model, depth)
+    for _ in range(2999):
+        force = force_at_depth(model, depth)
+    assert force == pytest.approx((1.0 - g) * depth / COMPLIANCE, rel=1e-6)
+    elastic = model.effects.viscoelasticity.elastic
+    held, left = elastic[2], []
+    for _ in range(8200):
+        step(model, AWAY[None])
+        assert not model.out.force.any()
+        left.append(elastic[2] / held)
+    expected = g * np.exp(-(1.0 - g) * np.arange(200) * period / tau)
+    # exact for any period but for the first, in which the load goes
+    np.testing.assert_allclose(np.array(left[:200]) / left[0] * g, expected, atol=1e-6)
+    assert left[0] == pytest.approx(g, rel=period / tau)
+    assert abs(left[-1]) < 1e-10
+    assert force_at_depth(model, depth) == pytest.approx(first, rel=1e-7)
+
+
+def test_a_sphere_relaxes_as_the_tissue_does() -> None:
+    """In the end the force is that on elastic tissue of the relaxed modulus (Lee & Radok)."""
+    soft, sphere = Viscoelasticity((0.6,), (0.02,)), Tip("sphere", 5e-3)
+    model = flat_organ((soft,), tip=sphere)
+    elastic = force_at_depth(flat_organ(tip=sphere), 3e-3)
+    forces = [force_at_depth(model, 3e-3) for _ in range(401)]
+    assert forces[0] == pytest.approx(elastic, rel=0.03)  # a period has relaxed a little
+    assert forces[-1] == pytest.approx(0.4 * elastic, rel=1e-6)
 
 
 def test_a_history_moves_the_cloud_as_its_loads_do(phantom_vademecum: Vademecum) -> None:
@@ -132,16 +141,3 @@ def test_a_history_moves_the_cloud_as_its_loads_do(phantom_vademecum: Vademecum)
             wrong = model.out.cloud[:, 3:].ravel() - exact
             errors.append(np.sqrt((mass * wrong**2).sum() / (mass * exact**2).sum()))
     assert np.mean(errors) < 1e-2
-
-
-def test_fresh_tissue_is_stiffer_than_tissue_that_was_held(phantom_vademecum: Vademecum) -> None:
-    """A long hold relaxes the force to the part that is left, 1 - sum g."""
-    v = phantom_vademecum
-    model = prepare(v, (SPHERE,), cloud="off", effects=(Viscoelasticity((0.4,), (0.02,)),))
-    bare = prepare(v, (SPHERE,), cloud="off", effects=())
-    tip = push_and_drag(v)[20]
-    step(bare, tip[None])
-    elastic = np.linalg.norm(bare.out.force[0])
-    for _ in range(400):
-        step(model, tip[None])
-    assert np.linalg.norm(model.out.force[0]) == pytest.approx(0.6 * elastic, rel=1e-4)

@@ -22,14 +22,9 @@ from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.display import boundary, display_of, outline, structure
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import _arrays, _attributes, load_vademecum, save_vademecum
-from tests.core.contact.test_dent import ASIDE, DEPTH, END, SPHERE, pressed, sneddon_dent, without
 from tests.helpers.box_organ import PATCH_RADIUS, UP, organ, top
+from tests.helpers.shown_dent import ASIDE, DEPTH, SPHERE, displaced, finer
 from tests.helpers.small_files import ball
-
-
-def finer(v: Vademecum, times: int = 2) -> Vademecum:
-    """The same with every triangle of the boundary split into four, so many times."""
-    return replace(v, display=display_of(v.mesh, igl.upsample(*boundary(v.mesh), times)))
 
 
 def lesion_at(centre: np.ndarray, radius: float) -> SurfaceMesh:
@@ -78,36 +73,11 @@ def test_the_meshs_own_vertices_are_shown_as_without() -> None:
     for aside in ASIDE:
         place = top("cube") + np.array([aside[0], 0.0, aside[1]])
         clouds = [
-            pressed(prepare(v, (SPHERE,), effects=()), (SPHERE,), place[None], UP[None], DEPTH)
+            displaced(prepare(v, (SPHERE,), effects=()), (SPHERE,), place[None], UP[None], DEPTH)
             for v in (own, hung)
         ]
         np.testing.assert_allclose(clouds[1], clouds[0], atol=2e-7)
     np.testing.assert_array_equal(hung.clamped_faces, own.clamped_faces)
-
-
-def test_a_fine_cube_shows_sneddons_dent() -> None:
-    """Between the vertices of the mesh too, where linear interpolation misses the dent."""
-    model = prepare(finer(organ("cube")), (SPHERE,), effects=())
-    patch, rest = without(model), model.arrays.rest[:, :3].astype(float)
-    coarse = organ("cube")
-    errors = []
-    for aside in ASIDE:
-        place = top("cube") + np.array([aside[0], 0.0, aside[1]])
-        at = (place[None], UP[None], DEPTH)
-        shown, plain = (pressed(each, (SPHERE,), *at)[:, 1] for each in (model, patch))
-        cloud = pressed(prepare(coarse, (SPHERE,), effects=()), (SPHERE,), *at)
-        display = display_of(coarse.mesh, igl.upsample(*boundary(coarse.mesh), 2))
-        index = np.searchsorted(coarse.mesh.surface_vertices, display.corners)
-        linear = np.einsum("vk,vkd->vd", display.weights, cloud[index])[:, 1]
-        distance = np.linalg.norm(rest - place, axis=1)
-        near = (distance < END) & (np.abs(rest[:, 1] - place[1]) < 1e-6)
-        exact = sneddon_dent(distance[near])
-        errors.append([-u[near] - exact for u in (shown, linear, plain)])
-    found, linear, plain = np.concatenate(errors, axis=1)
-    rms = [1e3 * np.sqrt((e**2).mean()) for e in (found, linear, plain)]
-    print(f"rms {rms[0]:.3f} mm (linear: {rms[1]:.3f}, patch: {rms[2]:.3f}), {len(found)} vertices")
-    print(f"worst {1e3 * np.abs(found).max():.3f} mm (linear: {1e3 * np.abs(linear).max():.3f})")
-    assert rms[0] < 0.03 < 0.1 < min(rms[1:])
 
 
 def test_a_patch_is_shown_by_interpolation_alone() -> None:
@@ -115,7 +85,7 @@ def test_a_patch_is_shown_by_interpolation_alone() -> None:
     coarse, fine = organ("cube"), finer(organ("cube"))
     assert fine.display is not None
     at = (top("cube")[None], UP[None], DEPTH)
-    cloud, shown = (pressed(prepare(v, (tip,), effects=()), (tip,), *at) for v in (coarse, fine))
+    cloud, shown = (displaced(prepare(v, (tip,), effects=()), (tip,), *at) for v in (coarse, fine))
     index = np.searchsorted(coarse.mesh.surface_vertices, fine.display.corners)
     exact = np.einsum("vk,vkd->vd", fine.display.weights, cloud[index])
     np.testing.assert_allclose(shown, exact, atol=1e-7)
@@ -136,9 +106,9 @@ def test_a_structure_moves_with_the_organ() -> None:
     with_lesion = replace(cube, display=display)
     tip = Tip("patch", SPHERE.radius)  # whose field the modes hold as a whole
     at = (top("cube")[None], UP[None], DEPTH)
-    cloud = pressed(prepare(with_lesion, (tip,), effects=()), (tip,), *at)
+    cloud = displaced(prepare(with_lesion, (tip,), effects=()), (tip,), *at)
     n, volume = len(cube.surface_vertices), prepare(cube, (tip,), cloud="volume", effects=())
-    whole = pressed(volume, (tip,), *at)
+    whole = displaced(volume, (tip,), *at)
     inside = np.unique(with_lesion.structures["lesion"])
     np.testing.assert_array_equal(inside, np.arange(n, len(cloud)))
     exact = np.einsum("vk,vkd->vd", display.weights[inside], whole[display.corners[inside]])
@@ -176,15 +146,16 @@ def test_a_tumour_is_stored_with_its_organ_and_stays_there(tmp_path: Path) -> No
     assert len(sick.organ_faces) == len(sick.mesh.boundary_faces)
 
 
-def with_both(v: Vademecum) -> Vademecum:
+@pytest.fixture(scope="module")
+def fine(phantom_vademecum: Vademecum) -> Vademecum:
     """A phantom with a finer surface and a lesion."""
+    v = phantom_vademecum
     lesion = structure(lesion_at(v.mesh.vertices.mean(axis=0), 9e-3))
     organ_surface = outline(v.mesh, phantom_liver(), 3000)
     return replace(v, display=display_of(v.mesh, organ_surface, [("lesion", lesion)]))
 
 
-def test_a_display_is_stored(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
-    fine = with_both(phantom_vademecum)
+def test_a_display_is_stored(phantom_vademecum: Vademecum, fine: Vademecum, tmp_path: Path) -> None:
     before = save_vademecum(phantom_vademecum, tmp_path / "plain.h5")
     assert save_vademecum(fine, tmp_path / "fine.h5") != before
     read = load_vademecum(tmp_path / "fine.h5").display
@@ -216,10 +187,9 @@ def test_a_spoilt_display_is_refused(
     key: str,
     spoil,  # type: ignore[no-untyped-def]
     message: str,
-    phantom_vademecum: Vademecum,
+    fine: Vademecum,
     tmp_path: Path,
 ) -> None:
-    fine = with_both(phantom_vademecum)
     arrays, attributes = _arrays(fine), _attributes(fine)
     arrays[f"display/{key}"] = spoil(arrays[f"display/{key}"])
     replace_file(tmp_path / "spoilt.h5", arrays, attributes, packed=True)

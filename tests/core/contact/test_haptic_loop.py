@@ -23,7 +23,6 @@ fade at b = K (T / 2 + delay). That they fade is no claim of passivity.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -43,14 +42,13 @@ from avatar_core.contact.layout import PERIOD
 from avatar_core.contact.model import ContactModel, Status, step
 from avatar_core.studies.passivity import HANDS, hand_push
 from tests.helpers.examples import examples
-from tests.helpers.flat_organ import BALL, RADIUS, ball_organ, flat_organ
+from tests.helpers.flat_organ import BALL, RADIUS, flat_organ
 
 RESOLUTION = 1e-5  # [m]
 ACCELERATION = 100.0  # what the controller is told [m/s^2]
 STIFFNESSES = (400.0, 1000.0, 2500.0)  # [N/m]
 MASSES, DAMPINGS, GRIPS = (0.1, 0.3, 1.0), (0.1, 0.5, 5.0), (0.0, 100.0, 1000.0)
 DELAYS = (1, 2)  # periods
-Figure = Callable[[str], None]
 
 
 class Run(NamedTuple):
@@ -128,73 +126,36 @@ def controller(delay: int, q: float = RESOLUTION) -> Passivity:
 
 
 @pytest.mark.parametrize("delay", DELAYS)
-def test_port_is_passive_for_every_tool_and_grip(delay: int, figure: Figure) -> None:
-    start, n = np.array([0.0, 0.0, RADIUS + 1e-3]), 700
-    worst = free = quantised = account = 0.0
-    for stiffness in STIFFNESSES:
-        organ = flat_organ(compliance=1.0 / stiffness)
-        for mass, damping, grip in itertools.product(MASSES, DAMPINGS, GRIPS):
-            for hand in ("press", "tremor"):
-                push = np.zeros((n, 3))
-                push[:, 2] = hand_push(hand, grip, n) - 1e-3 * grip  # the grip is at rest at start
-                passivity = controller(delay)
-                run = closed_loop(organ, Device(mass, damping, grip), delay, push, start, passivity)
-                assert run.acceleration < ACCELERATION
-                q = run.quantisation(RESOLUTION)
-                case = f"K {stiffness}, m {mass}, b {damping}, k {grip}, {hand}"
-                assert run.given <= passivity.bound + q, case
-                assert run.given <= passivity.bound, case
-                # what it keeps account of is what went through the port
-                off = abs(passivity.energy[0] - run.energy[-2])
-                assert off <= q, case
-                worst, quantised = max(worst, run.given), max(quantised, q)
-                account = max(account, off)
-    device = Device(MASSES[0], DAMPINGS[0], GRIPS[1])
-    push[:, 2] = hand_push("press", GRIPS[1], n) - 1e-3 * GRIPS[1]
-    free = closed_loop(organ, device, delay, push, start, None).given
-    assert free > 10.0 * passivity.bound
-    figure(
-        f"gives {1e3 * worst:.3f} mJ, bound {1e3 * passivity.bound:.2f} mJ; quantisation up to "
-        f"{1e3 * quantised:.2f} mJ, found {1e3 * account:.3f} mJ; without {1e3 * free:.0f} mJ"
-    )
-
-
-@pytest.mark.parametrize("delay", DELAYS)
-def test_port_is_passive_over_the_grid_of_the_map(delay: int, figure: Figure) -> None:
-    """More hands, longer: with the spring of the study, equal to the organ's step (below)."""
-    worst = free = 0.0
-    bound = controller(delay).bound
+def test_port_is_passive_for_every_tool_and_grip(delay: int) -> None:
+    """With the spring of the study, whose forces are those of the organ's step (below)."""
+    free, bound = 0.0, controller(delay).bound
     cases = itertools.product(HANDS, MASSES, DAMPINGS, GRIPS, STIFFNESSES)
     for hand, mass, damping, grip, stiffness in cases:
         loop = Loop(Device(mass, damping, grip), stiffness, delay, RESOLUTION)
         push = hand_push(hand, grip, 3000)
         given_ = -run_loop(loop, push, 1e-3, controller(delay)).energy.min()
         assert given_ <= bound, f"K {stiffness}, m {mass}, b {damping}, k {grip}, {hand}"
-        worst = max(worst, given_)
         free = max(free, -run_loop(loop, push, 1e-3).energy.min())
     assert free > 1.0
-    figure(f"gives {1e3 * worst:.3f} mJ at worst, bound {1e3 * bound:.2f} mJ; without {free:.0f} J")
 
 
-def test_the_loop_of_the_study_is_that_of_the_step(figure: Figure) -> None:
+def test_the_loop_of_the_study_is_that_of_the_step() -> None:
     stiffness, start, n = 1000.0, 1e-3, 600
     organ, device = flat_organ(compliance=1.0 / stiffness), Device(0.3, 2.0)
     push = np.zeros((n, 3))
     push[:, 2] = -1.0
-    off = 0.0
     for passivity, again in ((None, None), (controller(2, 0.0), controller(2, 0.0))):
         at = np.array([0.0, 0.0, RADIUS + start])
         mine = closed_loop(organ, device, 2, push, at, passivity, q=0.0)
         other = run_loop(Loop(device, stiffness, 2), push[:, 2], start, again)
-        off = max(off, float(np.abs(mine.held[:, 2] - other.held).max()))
-    assert off < 1e-5  # the organ's fields are single precision: 1e-2 m to 1e-9 m, times K
-    figure(f"forces differ by {1e6 * off:.2f} uN")
+        # the organ's fields are single precision: 1e-2 m to 1e-9 m, times K
+        assert np.abs(mine.held[:, 2] - other.held).max() < 1e-5
 
 
 @pytest.mark.parametrize("delay", DELAYS)
-def test_port_is_passive_on_a_ball(delay: int, figure: Figure) -> None:
+def test_port_is_passive_on_a_ball(delay: int) -> None:
     """Pushed in beside its top, the tool slides off: the force turns with the surface."""
-    organ, n = ball_organ(1.0 / 1500.0), 1200
+    organ, n = flat_organ(compliance=1.0 / 1500.0, is_ball=True), 1200
     start = np.array([4e-3, 1e-3, BALL + RADIUS + 1e-3])
     push = np.tile([0.0, 0.3, -2.0], (n, 1))
     device = Device(0.1, 0.2, 150.0)
@@ -203,7 +164,9 @@ def test_port_is_passive_on_a_ball(delay: int, figure: Figure) -> None:
     free = closed_loop(organ, device, delay, push, start, None)
     assert np.ptp(run.position[:, 0]) > 2e-3
     assert run.given <= passivity.bound < free.given
-    figure(f"gives {1e3 * run.given:.3f} mJ; without control {1e3 * free.given:.1f} mJ")
+    assert run.acceleration < ACCELERATION
+    # what the controller keeps account of is what went through the port
+    assert abs(passivity.energy[0] - run.energy[-2]) <= run.quantisation(RESOLUTION)
 
 
 # --- Whatever hand and organ do -----------------------------------------------------------------
@@ -243,9 +206,6 @@ def shaken(seed: int, active: str, delay: int, q: float, n: int = 300) -> tuple[
     return run._replace(held=sent[:n]), passivity
 
 
-WORST: dict[str, float] = {}
-
-
 @examples(60)
 @given(
     seed=st.integers(0, 10**6),
@@ -254,48 +214,32 @@ WORST: dict[str, float] = {}
     q=st.sampled_from([0.0, RESOLUTION]),
 )
 @example(seed=0, active="along", delay=2, q=0.0)
-def check_bound(seed: int, active: str, delay: int, q: float) -> None:
+def test_bound_holds_for_any_force_and_any_motion(
+    seed: int, active: str, delay: int, q: float
+) -> None:
+    """An active organ spends what the bound allows, and no more."""
     run, passivity = shaken(seed, active, delay, q)
     exact = passivity.bound * (1.0 + 1e-9)  # sums of 300 terms
-    assert run.given <= exact + run.quantisation(q)
-    if q == 0.0:
-        assert run.given <= exact
-        WORST[active] = max(WORST.get(active, 0.0), run.given / passivity.bound)
-
-
-@pytest.mark.examples
-def test_bound_holds_for_any_force_and_any_motion(figure: Figure) -> None:
-    """An active organ spends what the bound allows, to the last, and no more."""
-    check_bound()
-    assert WORST["along"] > 0.5
-    figure(", ".join(f"{k} {v:.3f}" for k, v in sorted(WORST.items())) + " of the bound spent")
+    assert run.given <= exact + (run.quantisation(q) if q > 0.0 else 0.0)
+    if seed == 0 and active == "along" and delay == 2:
+        assert run.given > 0.5 * passivity.bound
 
 
 # --- Without control ----------------------------------------------------------------------------
-
-
-BORDER: list[float] = []
 
 
 @examples(12)
 @given(stiffness=st.floats(100.0, 2500.0), delay=st.integers(0, 2), mass=st.floats(0.7, 1.0))
 @example(stiffness=2500.0, delay=2, mass=0.7)
 @example(stiffness=100.0, delay=0, mass=1.0)
-def check_border(stiffness: float, delay: int, mass: float) -> None:
-    found = stability_border(stiffness, delay, mass)
-    BORDER.append(found / expected_border(stiffness, delay) - 1.0)
-    # K sin(w tau) sinc(w T / 2) / w for K tau: (w tau)^2 / 6 of it at w tau = 0.15, and bisection
-    assert abs(BORDER[-1]) < 0.01
-
-
-@pytest.mark.examples
-def test_border_of_stability_without_grip(figure: Figure) -> None:
+def test_border_of_stability_without_grip(stiffness: float, delay: int, mass: float) -> None:
     """Within 20 % is what was asked; at these masses it is a matter of 1 %."""
-    check_border()
-    figure(f"b / K (T/2 + delay) - 1 in {100 * min(BORDER):+.2f} to {100 * max(BORDER):+.2f} %")
+    found = stability_border(stiffness, delay, mass)
+    # K sin(w tau) sinc(w T / 2) / w for K tau: (w tau)^2 / 6 of it at w tau = 0.15, and bisection
+    assert abs(found / expected_border(stiffness, delay) - 1.0) < 0.01
 
 
-def test_control_takes_what_the_loop_made_and_no_more(figure: Figure) -> None:
+def test_control_takes_what_the_loop_made_and_no_more() -> None:
     """Pressed into the organ, a tool that would swing up fades as on an organ without delay.
 
     Its swings have the envelope exp(- b t / 2 m) there, all energy being the tool's own to lose.
@@ -317,7 +261,3 @@ def test_control_takes_what_the_loop_made_and_no_more(figure: Figure) -> None:
     assert lasts["without"] > swing
     assert energy["with"] <= 0.5 * stiffness * ideal**2 + 2.0 * tolerance
     assert lasts["with"] == pytest.approx(ideal, rel=0.05)  # nor does it brake what is the tool's
-    figure(
-        f"swing of 2 mm after 1.3 s: {1e3 * lasts['without']:.1f} mm without, "
-        f"{1e3 * lasts['with']:.3f} mm with, {1e3 * ideal:.3f} mm ideal"
-    )

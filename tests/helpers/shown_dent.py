@@ -1,0 +1,62 @@
+"""The dent that a cloud shows near a tip, beside that of a half-space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import igl
+import numpy as np
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+from avatar_core.contact.dent import REACH
+from avatar_core.contact.model import ContactModel, make_model
+from avatar_core.geometry.tip import Tip
+from avatar_core.vademecum.display import boundary, display_of
+from avatar_core.vademecum.model import Vademecum
+from tests.helpers.box_organ import PATCH_RADIUS
+from tests.helpers.tool_motion import press
+
+SPHERE, DEPTH = Tip("sphere", 3e-3), 2e-3
+ASIDE = ((0.0, 0.0), (3e-3, 2e-3), (-9e-3, 7e-3), (5e-3, 5e-3))  # of the middle of a box [m]
+END = REACH * PATCH_RADIUS
+
+
+def displaced(
+    model: ContactModel, tips: Sequence[Tip], places: np.ndarray, up: np.ndarray, depth: float
+) -> np.ndarray:
+    """Displacements of the cloud under tips at some depth, after an approach, (n, 3) [m]."""
+    press(model, tips, places, up, depth)
+    return np.asarray(model.out.cloud[:, 3:], float)
+
+
+def with_patch_dents(model: ContactModel) -> ContactModel:
+    """The same model, showing the dents of patches: no point is near a tip."""
+    dents = model.layout.effects.dent
+    effects = model.layout.effects._replace(dent=dents._replace(start=0 * dents.start))
+    return make_model(replace(model.layout, effects=effects))
+
+
+def tip_dent(tip: Tip, depth: float, a: float, rho: float) -> float:
+    """u [m] of a half-space under a tip with a contact radius, by dimensionality reduction."""
+    end = min(a, rho)
+
+    def spring(angle: float) -> float:
+        x = end * np.sin(angle)
+        w = depth - float(tip.depth(np.array(x)))
+        return w * (end * np.cos(angle) / np.sqrt(rho * rho - x * x) if rho > end else 1.0)
+
+    return 2.0 / np.pi * float(quad(spring, 0.0, 0.5 * np.pi, limit=200)[0])
+
+
+def sneddon_dent(rho: np.ndarray) -> np.ndarray:
+    """Of the sphere at the depth, on a half-space (Segedin, Sneddon) [m]."""
+    radius = SPHERE.radius
+    a = brentq(lambda a: a * np.arctanh(a / radius) - DEPTH, 1e-6, radius * (1.0 - 1e-9))
+    return np.array([tip_dent(SPHERE, DEPTH, a, each) for each in rho])
+
+
+def finer(v: Vademecum, times: int = 2) -> Vademecum:
+    """The same with every triangle of the boundary split into four, so many times."""
+    return replace(v, display=display_of(v.mesh, igl.upsample(*boundary(v.mesh), times)))

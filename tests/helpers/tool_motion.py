@@ -1,0 +1,98 @@
+"""Tools that move over an organ: their forces, the work they do, and the energy stored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from avatar_core.contact.model import FAR_AWAY, ContactModel, Status, step, stored_energy
+from avatar_core.geometry.tip import Tip
+
+AWAY = np.full(3, FAR_AWAY)
+
+
+class Motion(NamedTuple):
+    """What happened along a path of n periods.
+
+    force : ndarray, shape (n, n_tools, 3), on the tools [N]
+    status : ndarray, shape (n, n_tools)
+    work : ndarray, shape (n,), done by the tools so far, by the trapezoidal rule [J]
+    energy : ndarray, shape (n,), stored in the organ [J]
+    """
+
+    force: np.ndarray
+    status: np.ndarray
+    work: np.ndarray
+    energy: np.ndarray
+
+
+def follow(model: ContactModel, path: np.ndarray) -> Motion:
+    """Move the tools along a path, shape (n, n_tools, 3), one period each."""
+    force, status = np.zeros(path.shape), np.zeros(path.shape[:2], int)
+    energy = np.zeros(len(path))
+    for k, tips in enumerate(path):
+        step(model, tips)
+        force[k], status[k] = model.out.force, model.out.status
+        if force[k].any() and model.effects.viscoelasticity is None:
+            energy[k] = stored_energy(model)
+    power = -0.5 * ((force[1:] + force[:-1]) * np.diff(path, axis=0)).sum(axis=(1, 2))
+    return Motion(force, status, np.concatenate([[0.0], np.cumsum(power)]), energy)
+
+
+def line(start: np.ndarray, end: np.ndarray, spacing: float) -> np.ndarray:
+    """A straight path of one tip, both ends included, shape (n, 1, 3)."""
+    n = max(2, int(np.ceil(np.linalg.norm(end - start) / spacing)) + 1)
+    return np.linspace(start, end, n)[:, None, :]
+
+
+def refined(corners: np.ndarray, n: int) -> np.ndarray:
+    """The path from corner to corner, every leg in n steps, shape (n_steps, 3)."""
+    legs = [np.linspace(a, b, n, endpoint=False) for a, b in pairwise(corners)]
+    return np.concatenate([*legs, corners[-1:]])
+
+
+def polygon(corners: Sequence[np.ndarray], spacing: float) -> np.ndarray:
+    """Straight lines of one tip from corner to corner, shape (n, 1, 3)."""
+    return np.concatenate([line(a, b, spacing) for a, b in pairwise(corners)])
+
+
+def press(
+    model: ContactModel,
+    tips: Sequence[Tip],
+    points: np.ndarray,
+    normals: np.ndarray,
+    depths: float | Sequence[float],
+) -> np.ndarray:
+    """Press tips into an organ at rest, coming from outside; the forces along the normals [N].
+
+    points, normals : of the surface, shape (n_tools, 3)
+    """
+    model.reset()
+    height = np.array([tip.offset for tip in tips])
+    for part in np.linspace(-0.2, 1.0, 13):
+        status = step(model, points + (height - part * np.array(depths))[:, None] * normals)
+    assert status == Status.OK
+    return np.asarray((model.out.force * normals).sum(axis=1))
+
+
+def energy_slope(model: ContactModel, tips: np.ndarray, h: float = 1e-6) -> np.ndarray:
+    """Gradient of the stored energy by the places of all tips, shape (n_tools, 3) [N]."""
+    slope = np.empty(tips.shape)
+    for t, d in np.ndindex(*tips.shape):
+        energy = []
+        for change in (h, -h):
+            moved = tips.copy()
+            moved[t, d] += change
+            step(model, moved)
+            energy.append(stored_energy(model))
+        slope[t, d] = (energy[0] - energy[1]) / (2.0 * h)
+    return slope
+
+
+def load_positions(model: ContactModel) -> tuple[np.ndarray, np.ndarray]:
+    """Load positions that carry the first tip, and their weights."""
+    n = model.state.n_nodes[0]
+    return model.state.nodes[0, :n], model.state.weight[0, :n, 0]
