@@ -12,26 +12,16 @@ CALM_WINDOW, BUSY = (0.0, 50e-6), (0.05, 50e-6)
 
 
 def test_missed_periods_shed_a_level_each_and_never_the_last() -> None:
+    """Rest takes all back at once, calm one by one."""
     shedder = Shedder(LEVELS)
     assert [shedder.update(*BUSY) for _ in range(5)] == [40, 20, 10, 10, 10]
     assert shedder.is_shedding
-
-
-def test_rest_takes_all_back_at_once() -> None:
-    shedder = Shedder(LEVELS)
-    for _ in range(3):
-        shedder.update(*BUSY)
-    assert shedder.rest() == 80 and not shedder.is_shedding
-
-
-def test_calm_takes_all_back_one_by_one() -> None:
-    shedder = Shedder(LEVELS)
-    for _ in range(3):
-        shedder.update(*BUSY)
     shown = [shedder.update(*CALM_WINDOW) for _ in range(3 * PATIENCE)]
     assert shown[PATIENCE - 2 : PATIENCE] == [10, 20]
     assert shown[-1] == 80 and not shedder.is_shedding
     assert shown == sorted(shown)
+    shedder.update(*BUSY)
+    assert shedder.rest() == 80 and not shedder.is_shedding
 
 
 def test_slow_steps_shed_without_a_missed_period() -> None:
