@@ -124,14 +124,14 @@ def test_two_tools_do_not_know_of_each_other() -> None:
     tips = np.cumsum(2e-4 * rng.standard_normal((300, 2, 3)), axis=0)
     meant = 2.0 * rng.standard_normal((300, 2, 3))
     both = make_passivity(2, 2, 1e-5)
-    alone = [make_passivity(1, 2, 1e-5) for _ in range(2)]
+    separate = [make_passivity(1, 2, 1e-5) for _ in range(2)]
     changed = np.zeros(2, bool)
     for k in range(300):
         force = meant[k].copy()
         limit(both, tips[k], force)
         for t in range(2):
             single = meant[k, t : t + 1].copy()
-            limit(alone[t], tips[k, t : t + 1], single)
+            limit(separate[t], tips[k, t : t + 1], single)
             assert np.array_equal(single[0], force[t])
             changed[t] |= not np.array_equal(single[0], meant[k, t])
     assert changed.all()

@@ -19,8 +19,8 @@ from tests.helpers.flat_organ import COMPLIANCE, E_STAR, PATCH_RADIUS, flat_orga
 from tests.helpers.half_space import on_soft_base, sneddon
 
 SPHERE, CONE = Tip("sphere", 5e-3), Tip("cone", 15e-3, 60.0)
-ALONE = PATCH / (E_STAR * PATCH_RADIUS)  # compliance of an organ that has but that of the dent
-REST = COMPLIANCE - ALONE  # of the organ beside the dent [m/N]
+DENT = PATCH / (E_STAR * PATCH_RADIUS)  # compliance of an organ that has but that of the dent
+BASE = COMPLIANCE - DENT  # of the organ beside the dent [m/N]
 
 
 def force_after_touch(model: ContactModel, depth: float) -> float:
@@ -34,7 +34,7 @@ def force_after_touch(model: ContactModel, depth: float) -> float:
 )
 @pytest.mark.parametrize("depth", [0.2e-3, 1e-3, 4e-3])
 def test_a_dent_and_the_organ_share_the_depth(tip: Tip, depth: float) -> None:
-    expected = on_soft_base(partial(sneddon, tip, modulus=E_STAR), depth, REST)
+    expected = on_soft_base(partial(sneddon, tip, modulus=E_STAR), depth, BASE)
     force = force_at_depth(flat_organ(tip=tip), depth)
     assert force == pytest.approx(expected, rel=2e-3 if tip.shape == "sphere" else 1e-6)
 
@@ -48,12 +48,12 @@ ELEMENTS = {
 
 @pytest.mark.parametrize("radius", [3e-3, 10e-3])
 @pytest.mark.parametrize("nu", ELEMENTS)
-@pytest.mark.parametrize("base", [0.0, REST])
+@pytest.mark.parametrize("base", [0.0, BASE])
 def test_a_sphere_in_a_neo_hookean_half_space_is_that_of_finite_elements(
     nu: float, radius: float, base: float
 ) -> None:
     """Where the organ gives way besides, too."""
-    model = flat_organ(compliance=ALONE + base, tip=Tip("sphere", radius), neo_hookean=nu)
+    model = flat_organ(compliance=DENT + base, tip=Tip("sphere", radius), neo_hookean=nu)
     for depth, force in ELEMENTS[nu].items():
         expected = force * (1.0 - nu**2) * E_STAR * radius**2
         found = force_after_touch(model, depth * radius + base * expected)
@@ -70,7 +70,7 @@ def test_another_tip_is_pressed_at_small_strain() -> None:
 
 def bent_organ(tip: Tip, kappa: float, tau: float = 0.0, anisotropy: float = 0.0) -> ContactModel:
     """A half-space whose surface falls away by kappa r + tau r^2 / 2 a distance."""
-    model = flat_organ(compliance=ALONE, tip=tip)
+    model = flat_organ(compliance=DENT, tip=tip)
     local = model.effects.tip_law.local
     local[KAPPA], local[TAU], local[ANISOTROPY] = kappa, tau, anisotropy
     return model
