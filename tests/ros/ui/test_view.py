@@ -1,26 +1,23 @@
-"""What the planning page draws of the organ; no browser is needed to see what it is sent."""
+"""What the planning page draws of organ and tools, as it is sent to the browser."""
 
 from __future__ import annotations
 
-import socket
-from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
-pytest.importorskip("avatar_ros.ui.view", reason="avatar_ros is not installed")
-
-import viser
 from avatar_ros.ui import tone
 from avatar_ros.ui.colours import HELD, N_BANDS, N_SHADES, TISSUE
+from avatar_ros.ui.cut_handle import CutHandle
 from avatar_ros.ui.legend import legend
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.patterns import GAP, HATCH_GAP
 from avatar_ros.ui.surface_view import N_TONES
+from avatar_ros.ui.tip_body import tip_body, turn_to
 from avatar_ros.ui.view import CUT, GLASS, WHOLE, OrganView
+from viser import ViserServer
 
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.fem.supports import Support
@@ -28,31 +25,36 @@ from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.box_organ import UP, organ, top
-
-pytestmark = pytest.mark.ros
+from tests.ros.helpers.page import NAMES, PLACES, Noted, face_area
 
 SPHERE, DEPTH = Tip("sphere", 3e-3), 2e-3
 POSE = top("cube") + np.array([3e-3, 0.0, 2e-3]) + (SPHERE.offset - DEPTH) * UP
+BODIES = [
+    Tip("sphere", 5e-3),
+    Tip("flat", 3e-3),
+    Tip("cone", 4e-3, 60.0),
+    Tip("rounded_cone", 4e-3, 30.0, 1.5e-3),
+    Tip("patch", 5e-3),
+]
 
 
 @pytest.fixture
-def view() -> Iterator[OrganView]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = viser.ViserServer("127.0.0.1", port, verbose=False)
+def view(server: ViserServer, cube: Organ) -> OrganView:
     view = OrganView(server, lambda tool, place, along_shaft: None)
-    view.show(Organ.of(organ("cube")), (SPHERE,))
-    yield view
-    server.stop()
+    view.show(cube, (SPHERE,))
+    return view
+
+
+def pressing(vademecum: Vademecum) -> ContactModel:
+    model = prepare(vademecum, (SPHERE,), effects=())
+    for height in np.linspace(DEPTH, 0.0, 9):
+        step(model, (POSE + height * UP)[None])
+    return model
 
 
 @pytest.fixture(scope="module")
 def pressed() -> ContactModel:
-    model = prepare(organ("cube"), (SPHERE,), effects=())
-    for height in np.linspace(DEPTH, 0.0, 9):
-        step(model, (POSE + height * UP)[None])
-    return model
+    return pressing(organ("cube"))
 
 
 def meshes(view: OrganView, group: str) -> list[Any]:
@@ -62,9 +64,10 @@ def meshes(view: OrganView, group: str) -> list[Any]:
 
 
 def area(found: list[Any]) -> float:
-    corners = [np.array(mesh.vertices)[np.array(mesh.faces)] for mesh in found]
-    a, b, c = np.concatenate(corners).transpose(1, 0, 2).astype(float)
-    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    return sum(face_area(np.array(mesh.vertices), np.array(mesh.faces)) for mesh in found)
+
+
+# --- The organ --------------------------------------------------------------------------------
 
 
 def test_under_a_tip_that_presses_the_page_draws_its_dent(
@@ -78,13 +81,10 @@ def test_under_a_tip_that_presses_the_page_draws_its_dent(
     assert view.move(0.5 * cloud, POSE[None], 0.0 * force[None]) == pytest.approx(0.5 * sizes.max())
 
 
-def test_at_rest_the_organ_is_tissue_whole_and_once(view: OrganView) -> None:
+def test_at_rest_the_organ_is_tissue_whole_and_once(view: OrganView, cube: Organ) -> None:
     """Cut into shades, smoothed, and nothing over it."""
     assert meshes(view, "bands") == []
-    cube = organ("cube")
-    corners = cube.surface_vertices[cube.organ_faces].astype(float)
-    a, b, c = corners.transpose(1, 0, 2)
-    exact = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    exact = face_area(cube.vertices, cube.faces)
     assert area(meshes(view, "tissue")) == pytest.approx(exact, rel=0.05)
 
 
@@ -140,21 +140,16 @@ def test_what_is_cut_away_is_not_clicked(view: OrganView) -> None:
     assert len(view.faces) == len(whole)
 
 
-def test_the_clamp_has_checks_and_access_has_stripes(view: OrganView) -> None:
+def test_the_clamp_has_checks_and_access_has_stripes(view: OrganView, cube: Organ) -> None:
     """Both kinds of checks together are the clamp; stripes lie where tools reach, if asked for."""
-    shown = Organ.of(organ("cube"))
     whole = area(meshes(view, "tissue"))
-    corners = shown.vertices[shown.faces[shown.clamped]].astype(float)
-    a, b, c = corners.transpose(1, 0, 2)
-    clamp = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    clamp = face_area(cube.vertices, cube.faces[cube.clamped])
     dark, light = shades(view, 0)
     assert area([dark, light]) == pytest.approx(clamp, rel=0.05)
     assert 0.4 < area([dark]) / clamp < 0.6
     view.mark_reach(True)
     *_, reached = shades(view, 0)
-    corners = shown.vertices[shown.faces[shown.accessible]].astype(float)
-    a, b, c = corners.transpose(1, 0, 2)
-    reach = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    reach = face_area(cube.vertices, cube.faces[cube.accessible])
     assert area([reached]) == pytest.approx(reach / GAP, rel=0.2)
     assert area(meshes(view, "tissue")) == pytest.approx(whole, rel=1e-6)
     view.mark_reach(False)
@@ -170,28 +165,23 @@ def test_what_springs_hold_is_hatched(view: OrganView) -> None:
     np.testing.assert_array_equal(shown.sprung, held)
     whole = area(meshes(view, "tissue"))
     view.show(shown, (SPHERE,))
-    corners = shown.vertices[shown.faces[held]].astype(float)
-    a, b, c = corners.transpose(1, 0, 2)
-    there = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    there = face_area(shown.vertices, shown.faces[held])
     _, _, hatching = shades(view, 0)
     assert area([hatching]) == pytest.approx(there / HATCH_GAP, rel=0.2)
     assert area(meshes(view, "tissue")) == pytest.approx(whole, rel=1e-6)
     assert "springs" in legend(1e-3, has_springs=True) and "springs" not in legend(1e-3)
 
 
-def test_little_error_looks_unlike_no_access(view: OrganView) -> None:
+def test_little_error_looks_unlike_no_access(view: OrganView, cube: Organ) -> None:
     """A face with an error is in a band, the first one too; one without stays tissue."""
-    shown = Organ.of(organ("cube"))
-    errors = np.full(len(shown.vertices), np.nan)
-    reached = shown.faces[shown.accessible]
+    errors = np.full(len(cube.vertices), np.nan)
+    reached = cube.faces[cube.accessible]
     errors[np.unique(reached)] = 0.5e-3  # half a band of a scale to 2 %
-    is_known = np.isfinite(errors)[shown.faces].all(axis=1)
+    is_known = np.isfinite(errors)[cube.faces].all(axis=1)
     view.paint(errors)
     (first,) = meshes(view, "bands")
     assert first is view._surface._nodes["bands", 0]
-    corners = shown.vertices[shown.faces[is_known]].astype(float)
-    a, b, c = corners.transpose(1, 0, 2)
-    known = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    known = face_area(cube.vertices, cube.faces[is_known])
     assert area([first]) == pytest.approx(known, rel=0.05)
     assert tuple(first.color) != tuple(tone.material(np.array(TISSUE)))
 
@@ -210,20 +200,18 @@ def with_lesion() -> Vademecum:
     return replace(cube, display=display_of(cube.mesh, boundary(cube.mesh), [("lesion", lesion)]))
 
 
-def test_a_structure_belongs_to_its_organ_and_moves_with_it(view: OrganView) -> None:
+def test_a_structure_belongs_to_its_organ_and_moves_with_it(view: OrganView, cube: Organ) -> None:
     sick = with_lesion()
     view.show(Organ.of(sick), (SPHERE,))
     parts = view._structures._parts
     before = [np.array(part.mesh.vertices) for part in parts]
     assert sum(len(part.mesh.faces) for part in parts) == 4
-    model = prepare(sick, (SPHERE,), effects=())
-    for height in np.linspace(DEPTH, 0.0, 9):
-        step(model, (POSE + height * UP)[None])
+    model = pressing(sick)
     view.move(model.out.cloud, POSE[None], model.out.force)
     for part, old in zip(parts, before, strict=True):
         np.testing.assert_array_equal(part.mesh.vertices, model.out.cloud[part.used, :3])
         assert np.abs(np.array(part.mesh.vertices) - old).max() > 0.05 * DEPTH
-    view.show(Organ.of(organ("cube")), (SPHERE,))
+    view.show(cube, (SPHERE,))
     assert view._structures._parts == []
 
 
@@ -246,10 +234,9 @@ def test_a_held_shape_is_grey_until_it_is_that_of_now(view: OrganView) -> None:
 
 
 @pytest.mark.parametrize("depth", [-5e-3, 4e-3, 25e-3])
-def test_a_tool_is_lifted_off_the_organ_however_deep_it_is(depth: float) -> None:
+def test_a_tool_is_lifted_off_the_organ_however_deep_it_is(cube: Organ, depth: float) -> None:
     """Of a cube of 200 mm, whose top is accessible."""
-    shown = Organ.of(organ("cube"))
-    lifted = shown.lifted(top("cube") - depth * UP, 0.03)
+    lifted = cube.lifted(top("cube") - depth * UP, 0.03)
     np.testing.assert_allclose(lifted, top("cube") + (0.03 + max(0.0, -depth)) * UP, atol=1e-6)
 
 
@@ -263,3 +250,78 @@ def test_the_scale_never_shrinks_during_a_touch_and_begins_anew_at_rest(view: Or
         view.move(cloud, np.ones((1, 3)), np.zeros((1, 3)))
         tops.append(view.top)
     assert tops == [1e-2, 1e-2, 1e-3, 1e-3]
+
+
+def test_the_plane_of_a_cut_follows_its_handle(server: ViserServer, cube: Organ) -> None:
+    parts: list[float] = []
+    handle = CutHandle(server, parts.append)
+    up = np.array([0.0, 1.0, 0.0])
+    plane = handle.show(cube, up, 0.25)
+    top, bottom = cube.vertices[:, 1].max(), cube.vertices[:, 1].min()
+    assert plane.point @ up == pytest.approx(top - 0.25 * (top - bottom), abs=1e-6)
+    assert handle._part() == pytest.approx(0.25, abs=1e-6)
+    node = handle._handle
+    node.position = tuple(np.array(node.position) - 0.25 * (top - bottom) * up)
+    handle._moved()
+    assert parts[-1] == pytest.approx(0.5, abs=1e-6)
+    handle.show(cube, up, 0.5)
+    assert handle._handle is node  # a handle that is held is not made anew
+    handle.show(cube, np.array([1.0, 0.0, 0.0]), 0.5)
+    assert handle._handle is not node
+    handle.hide()
+
+
+# --- Tools ------------------------------------------------------------------------------------
+
+
+def test_all_tools_are_drawn_with_their_names_and_forces(server: ViserServer, cube: Organ) -> None:
+    user = Noted()
+    view = OrganView(server, user.drag)
+    view.show(cube, (Tip(), Tip("flat", 2e-3)))
+    starts = cube.starts((Tip(), Tip("flat", 2e-3)))
+    np.testing.assert_allclose([tool.position for tool in view._tools], starts, atol=1e-6)
+    view.name_tools(NAMES, 1)
+    view.place_tools(PLACES, np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 0.0]]))
+    left, right = view._tools
+    assert (left._text.text, right._text.text) == ("left 2.0 N", "[right]")
+    assert left._arrow.visible and not right._arrow.visible
+    way: Any = SimpleNamespace(start_position=(0.0, 0.0, 0.0), end_position=(0.01, 0.0, 0.0))
+    right._dragged(way, False)
+    ((_, tool, place, _),) = user.calls
+    assert tool == 1 and np.allclose(place, PLACES[1] + [0.01, 0.0, 0.0])
+    view.show_tools((Tip(),), PLACES[:1])
+    view.name_tools(("",), 0)
+    view.place_tools(PLACES[:1], np.zeros((1, 3)))
+    assert len(view._tools) == 1 and not view._tools[0]._text.visible
+
+
+@pytest.mark.parametrize("tip", BODIES, ids=lambda tip: tip.shape)
+def test_a_body_is_as_wide_and_as_deep_as_its_tip(tip: Tip) -> None:
+    vertices, faces = tip_body(tip)
+    assert vertices[:, 2].min() == pytest.approx(-tip.offset)
+    assert np.hypot(*vertices.T[:2]).max() == pytest.approx(tip.radius, rel=3e-3)
+    assert faces.min() == 0 and faces.max() == len(vertices) - 1
+
+
+@pytest.mark.parametrize("tip", BODIES, ids=lambda tip: tip.shape)
+def test_the_faces_of_a_body_look_outwards(tip: Tip) -> None:
+    """Their volume is that of the tip under its shaft."""
+    vertices, faces = tip_body(tip)
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0
+    r = np.linspace(0.0, tip.radius, 2000)
+    if tip.shape in ("sphere", "patch"):
+        expected = 4.0 / 3.0 * np.pi * tip.radius**3
+    else:
+        height = tip.height(r)
+        top = height[-1] + 2.0 * tip.radius
+        expected = 2.0 * np.pi * np.trapezoid((top - height) * r, r)
+    assert volume == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.6, 0, -0.8), (0, 1, 0)])
+def test_the_shaft_turns_to_the_normal(direction: tuple[float, float, float]) -> None:
+    w, *v = turn_to(np.array(direction, float))
+    z = np.array([0.0, 0.0, 1.0])
+    turned = z + 2.0 * np.cross(v, np.cross(v, z) + w * z)
+    np.testing.assert_allclose(turned, direction, atol=1e-12)

@@ -1,56 +1,47 @@
-"""Images: DICOM lies in the patient, and lines show where planes cut the organ as it is now."""
+"""Images lie in the patient, and lines show where planes cut the organ as it is now."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-import nibabel
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
-
-import viser
 from avatar_ros.ui.library import Library
 from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.scan import read_scan
+from avatar_ros.ui.scan import read_scan, slice_of
 from avatar_ros.ui.scan_view import ScanView
 from avatar_ros.ui.surface_view import section
+from avatar_ros.ui.tabs.scan import NONE, ScanTab
 from scipy.spatial.transform import Rotation
+from viser import ViserServer
 
 from avatar_core.errors import SurfaceError
-from tests.helpers.box_organ import organ
-from tests.ros.helpers.browser import free_port
-
-pytestmark = pytest.mark.ros
+from tests.helpers.small_files import ball
+from tests.ros.helpers.page import AtOnce, Noted, image
 
 ORIGIN = np.array([-40.0, 12.0, 70.0])  # of the first slice of a series, LPS [mm]
 
 
-class Tab:
-    """Controls that nobody uses."""
-
-    def show_scan(self, scan: Any, file: str) -> None:
-        pass
-
-
-class AtOnce:
-    """A reader that needs no process."""
-
-    def read(self, name: str, n_bytes: int, function: Any, *given: Any) -> Any:
-        return function(*given)
+@pytest.fixture
+def user() -> Noted:
+    """What a user asks for, and what is said to him."""
+    return Noted()
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = viser.ViserServer("127.0.0.1", free_port(), verbose=False)
-    yield server
-    server.stop()
+@pytest.fixture
+def tab(server: ViserServer, user: Noted) -> ScanTab:
+    return ScanTab(server.gui, user)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def planes(server: ViserServer, tmp_path: Path, tab: ScanTab, user: Noted) -> ScanView:
+    return ScanView(server, tmp_path, AtOnce(), lambda: tab, user.say)  # type: ignore[arg-type]
+
+
+# --- Lines ------------------------------------------------------------------------------------
 
 
 def loops(segments: np.ndarray) -> set[int]:
@@ -69,32 +60,117 @@ def test_a_plane_through_corners_leaves_no_gap() -> None:
     assert len(found) == 4 and loops(found) == {2}
 
 
-def test_lines_on_an_image_follow_the_organ(server: viser.ViserServer, tmp_path: Path) -> None:
-    shown = Organ.of(organ("cube"))
-    low, high = shown.vertices.min(axis=0), shown.vertices.max(axis=0)
+def test_the_outline_of_a_cut_ball_is_its_circle() -> None:
+    points, faces = ball(1200, 0.05)
+    lines = section(points, points[:, 2] - 0.03, faces)
+    np.testing.assert_allclose(lines[..., 2], 0.03, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(lines[..., :2], axis=2), 0.04, rtol=0.03)
+    length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum()
+    assert length == pytest.approx(2 * np.pi * 0.04, rel=0.02)
+    assert len(section(points, points[:, 2] - 1.0, faces)) == 0
+
+
+def test_lines_on_an_image_follow_the_organ(planes: ScanView, cube: Organ, tmp_path: Path) -> None:
+    low, high = cube.vertices.min(axis=0), cube.vertices.max(axis=0)
     affine = np.diag([*(1e3 * (high - low) / 9.0), 1.0])  # [mm]
     affine[:3, 3] = 1e3 * low
     values = np.zeros((10, 10, 10), np.int16)
     values[5:] = 100
-    nibabel.save(nibabel.Nifti1Image(values, affine), tmp_path / "mr.nii")
-    reader, tab = cast(Any, AtOnce()), cast(Any, Tab())
-    planes = ScanView(server, tmp_path, reader, lambda: tab, lambda text: None)
-    planes.follow(shown, shown.vertices)
+    image(tmp_path / "mr.nii", values, affine)
+    planes.follow(cube, cube.vertices)
     assert planes._lines == {}  # no image
     planes.choose("mr.nii")
-    planes.follow(shown, shown.vertices)
+    planes.follow(cube, cube.vertices)
     rest = planes._lines[0].points.copy()
     assert len(rest) > 0
-    moved = shown.vertices + np.array([0.0, 0.0, 0.002])  # [m]
-    planes.follow(shown, moved)
+    moved = cube.vertices + np.array([0.0, 0.0, 0.002])  # [m]
+    planes.follow(cube, moved)
     upright = np.abs(rest[:, :, 2].max() - planes._lines[0].points[:, :, 2].max())
     assert upright == pytest.approx(0.002, abs=1e-6)
     planes.place(2, 0.0)
-    planes.follow(shown, moved)
+    planes.follow(cube, moved)
     assert len(planes._lines[0].points) < len(rest)  # the lowest plane is below the organ now
     planes.choose("")
-    planes.follow(shown, moved)
+    planes.follow(cube, moved)
     assert planes._lines == {}
+
+
+# --- Images -----------------------------------------------------------------------------------
+
+
+def test_planes_of_an_image_lie_where_its_voxels_do(tmp_path: Path) -> None:
+    """One bright voxel, in an image whose first axis runs from right to left."""
+    values = np.zeros((10, 12, 14), np.int16)
+    values[7, 3, 5] = 100
+    affine = np.array([[-2.0, 0, 0, 30], [0, 3, 0, -10], [0, 0, 4, 5], [0, 0, 0, 1]])
+    scan = read_scan(image(tmp_path / "mr.nii.gz", values, affine))
+    assert scan.planes == ("sagittal", "coronal", "axial")
+    place = 1e-3 * (affine @ [7, 3, 5, 1])[:3]
+    for axis, k in enumerate((7, 3, 5)):
+        n = values.shape[axis]
+        found = slice_of(scan, axis, (k + 0.5) / n, 50.0, 100.0)
+        (bright,) = np.argwhere(found.grey == 255)
+        rows, columns = found.grey.shape
+        right = (bright[1] + 0.5 - 0.5 * columns) * found.width / columns
+        down = (bright[0] + 0.5 - 0.5 * rows) * found.height / rows
+        seen = found.middle + right * found.turn[:, 0] + down * found.turn[:, 1]
+        np.testing.assert_allclose(seen, place, atol=1e-9)
+        assert np.linalg.det(found.turn) == pytest.approx(1.0)
+        beside = slice_of(scan, axis, (k + 1.5) / n, 50.0, 100.0)
+        assert beside.grey.max() == 0
+    assert slice_of(scan, 0, 0.75, 500.0, 100.0).grey.max() == 0  # level and window
+
+
+def test_large_values_of_an_image_stay_what_they_are(tmp_path: Path) -> None:
+    values = np.zeros((4, 4, 4), np.uint16)
+    values[1] = 60_000
+    scan = read_scan(image(tmp_path / "mr.nii", values))
+    assert (scan.low, scan.high) == (0.0, 60_000.0)
+
+
+def test_sheared_or_several_images_are_refused(tmp_path: Path) -> None:
+    affine = np.eye(4)
+    affine[0, 1] = 0.5
+    image(tmp_path / "a.nii", np.ones((3, 3, 3), np.int16), affine)
+    with pytest.raises(SurfaceError, match="not square"):
+        read_scan(tmp_path / "a.nii")
+
+
+def test_planes_have_their_controls(
+    planes: ScanView, tab: ScanTab, user: Noted, tmp_path: Path
+) -> None:
+    tab.offer(["mr.nii"])
+    image(tmp_path / "mr.nii", np.arange(1000, dtype=np.int16).reshape(10, 10, 10))
+    planes.choose("mr.nii")
+    assert user.of("say") == [] and len(planes._planes) == 3
+    assert tab._files.value == "mr.nii" and "mr.nii" in planes.alerts[0]
+    before = planes._planes[2].image.copy()
+    tab._sliders[2].value = 90
+    assert user.calls[-1] == ("place_scan", 2, 0.9)
+    planes.place(2, 0.9)
+    assert (planes._planes[2].image != before).any()
+    np.testing.assert_allclose(planes._planes[2].position[2], 9e-3)
+    planes.forget()
+    assert planes._planes == [] and not tab._controls.visible and tab._files.value == NONE
+    assert planes.alerts == []
+
+
+def test_an_image_that_comes_late_is_not_drawn_in_the_next_organ(
+    planes: ScanView, tab: ScanTab, tmp_path: Path
+) -> None:
+    tab.offer(["mr.nii"])
+    image(tmp_path / "mr.nii", np.ones((3, 3, 3), np.int16))
+
+    def read(name: str, n_bytes: int, function: Callable[..., Any], *given: Any) -> Any:
+        planes.forget()  # another organ has come
+        return function(*given)
+
+    planes._reader = Noted(read=read)  # type: ignore[assignment]
+    planes.choose("mr.nii")
+    assert planes._planes == [] and tab._files.value == NONE
+
+
+# --- DICOM ------------------------------------------------------------------------------------
 
 
 def dicom_series(folder: Path) -> np.ndarray:

@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-pytest.importorskip("avatar_ros.ui.measuring", reason="avatar_ros is not installed")
-
 from avatar_ros.ui.measuring import Place, depth, gap, hit, is_plane, margin
 
 from tests.helpers.small_files import ball
-
-pytestmark = pytest.mark.ros
 
 RADIUS = 0.05
 POINTS, FACES = ball(2000, RADIUS)

@@ -7,19 +7,12 @@ from collections.abc import Iterator
 from http.client import HTTPConnection, HTTPResponse
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
-
 import viser
 from avatar_ros.ui.guard import Guard, guarded
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from tests.ros.helpers.browser import TOKEN, free_port
-
-pytestmark = pytest.mark.ros
 
 ELSEWHERE = "http://127.0.0.1:1"  # the same site for cookies, another origin
 

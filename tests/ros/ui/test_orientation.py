@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
-
-pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
-pytest.importorskip("avatar_ros.ui.orientation", reason="avatar_ros is not installed")
-
-import meshio
-from avatar_ros.ui.orientation import AXES, FOV, basis, cube, label_places, scale_bar, standard_view
-from avatar_ros.ui.tabs.tool import KEYS, ToolTab
+from avatar_ros.ui.orientation import (
+    AXES,
+    FOV,
+    NAMES,
+    basis,
+    cube,
+    label_places,
+    scale_bar,
+    standard_view,
+)
 
 from avatar_core.geometry.surface import read_surface
 from tests.helpers.small_files import ball
 
-pytestmark = pytest.mark.ros
-
-# Where the axes of a file point, as a rotation from RAS; the last is oblique.
+# Where the axes of a file point, as a rotation from RAS.
 TURNS = {
     "RAS": np.diag([1.0, 1.0, 1.0]),
     "LPS": np.diag([-1.0, -1.0, 1.0]),
@@ -55,13 +57,7 @@ def test_a_standard_view_comes_from_its_side(side: str) -> None:
     on_top = {"S": "A", "I": "A"}.get(side, "S")
     assert right @ AXES[on_right[side]] > 0.99
     assert up @ AXES[on_top] > 0.99
-    assert f'data-facing="{cube_name(side)}"' in cube(pose)
-
-
-def cube_name(side: str) -> str:
-    from avatar_ros.ui.orientation import NAMES
-
-    return NAMES[side]
+    assert f'data-facing="{NAMES[side]}"' in cube(pose)
 
 
 def test_the_scale_is_as_long_as_it_says_in_the_plane_of_the_organs_middle() -> None:
@@ -71,50 +67,3 @@ def test_the_scale_is_as_long_as_it_says_in_the_plane_of_the_organs_middle() -> 
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(length)
     towards = basis(pose)[2]
     np.testing.assert_allclose((ends - pose.look_at) @ towards, 0.0, atol=1e-12)
-
-
-class _Gui:
-    """Keeps what is added to a page, by label."""
-
-    def __init__(self) -> None:
-        self.made: dict[str, _Gui] = {}
-        self.callback = None
-
-    def __getattr__(self, name: str):  # type: ignore[no-untyped-def]
-        if name.startswith("on_"):
-            return lambda callback: setattr(self, "callback", callback)
-
-        def add(label: str, *given: object, **named: object) -> _Gui:
-            made = self.made[str(label)] = _Gui()
-            made.label = label
-            return made
-
-        return add
-
-
-class _Event:
-    def __init__(self, value: str) -> None:
-        self.target = self
-        self.value = value
-
-
-def test_buttons_and_keys_move_the_tool_to_the_patients_side() -> None:
-    moves: list[tuple[object, float]] = []
-
-    class Recorded:
-        def nudge(self, axis: object, way: float) -> None:
-            moves.append((axis, way))
-
-    gui = _Gui()
-    ToolTab(gui, Recorded())  # type: ignore[arg-type]
-    group = gui.made["1 mm"]
-    for label, side in (("right", "R"), ("left", "L"), ("up", "S"), ("down", "I")):
-        group.callback(_Event(label))
-        assert moves.pop() == (AXES[side], 1e-3)
-    for label, side in KEYS.values():
-        gui.made[f"{label}, 1 mm"].callback(None)
-        axis, way = moves.pop()
-        assert axis == (AXES[side] if side else None)
-        assert (way < 0.0) == ("Press" in label)
-        for word, expected in (("right", "R"), ("left", "L")):
-            assert (word in label) == (side == expected)

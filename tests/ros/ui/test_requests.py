@@ -9,11 +9,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
-
 import rclpy
 from avatar_ros.ui.actions import Wanted
 from avatar_ros.ui.requests import Requests
@@ -22,8 +17,6 @@ from rclpy.executors import SingleThreadedExecutor
 
 from avatar_ros.action import BuildPatient
 from tests.helpers.slowness import Deadline
-
-pytestmark = pytest.mark.ros
 
 AWAY = 0.5  # of a thread, right after it sent a goal: the answer comes meanwhile [s]
 

@@ -1,0 +1,200 @@
+"""Choices on the planning page: each reaches the cell once, and is taken back as a whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from avatar_ros.loop.settings import MATERIAL
+from avatar_ros.ui.chosen import Chosen
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.recordings import Page, Recordings
+from avatar_ros.ui.tool_state import SharedToolState
+from avatar_ros.ui.view import CUT, GLASS, WHOLE
+
+from avatar_core.geometry.tip import Tip
+from avatar_core.scene.file import read_scene, shipped_scene
+from tests.ros.helpers.page import NAMES, PLACES, UP, Noted
+
+RANGES = {"young": (1e3, 1e6, 170e3), "poisson": (0.40, 0.49, 0.48)}  # least, most, as built
+OWN_TIPS = {  # of a contact node that was started without a scene
+    "scene": "",
+    "tip.shape": ["sphere", "flat"],
+    "tip.radius": [4e-3, 2e-3],
+    "tip.half_angle": 0.0,
+    "tip.rounding": 0.0,
+}
+
+
+def answer_material(values: dict[str, float], report: Any, refused: Any) -> None:
+    if values.get("young") == 13.0:
+        refused()
+
+
+def usable(material: dict[str, float]) -> dict[str, float]:
+    """Of all values, those that the organ holds."""
+    return {
+        name: material[name]
+        for name, (low, high, _) in RANGES.items()
+        if low <= material.get(name, -1.0) <= high
+    }
+
+
+@pytest.fixture
+def cell() -> Noted:
+    """What page and nodes were asked for; it refuses a scene and a value."""
+    there = {"material.young_modulus": 90e3}
+    return Noted(
+        set_material=answer_material,
+        parameters_of_contact=lambda names, then: then(dict.fromkeys(names, 0.0) | there),
+        load_scene=lambda name, report, yaml, then: then(name != "refused"),
+    )
+
+
+@pytest.fixture
+def chosen(cell: Noted, state: SharedToolState) -> Chosen:
+    made = Chosen(state, cell, cell)  # type: ignore[arg-type]
+    made.organ = SimpleNamespace(  # type: ignore[assignment]
+        ranges=RANGES,
+        outward=lambda place: UP,
+        lifted=lambda place, clearance: place + clearance * UP,
+        usable=usable,
+    )
+    return made
+
+
+def test_a_return_is_taken_back_as_a_whole(chosen: Chosen, cell: Noted) -> None:
+    chosen.tools.use(NAMES, PLACES)
+    chosen.choose_material({"young": 50e3})
+    kept = "bare", {"young": 90e3, "poisson": 0.6}, (GLASS, "R", 0.3), PLACES + 0.1
+    chosen.return_to(*kept)
+    within = {"young": 90e3, "poisson": 0.49}  # the organ's range
+    assert cell.of("set_material")[-1] == within
+    assert chosen.look == (GLASS, "R", 0.3) and np.allclose(chosen.tools.targets, PLACES + 0.1)
+    chosen.undo()
+    assert cell.of("set_material")[-1] == {"young": 50e3, "poisson": 0.48}
+    assert chosen.look == (WHOLE, "A", 0.5) and np.allclose(chosen.tools.targets, PLACES)
+    chosen.undo()
+    assert cell.of("set_material")[-1] == {"young": 170e3}
+    chosen.undo()
+    assert cell.of("say")[-1] == "nothing to undo"
+    chosen.return_to("", {}, chosen.look, PLACES[:1] + 0.1)  # of a cell of one tool
+    np.testing.assert_allclose(chosen.tools.targets, [PLACES[0] + 0.1, PLACES[1]])
+
+
+def test_what_is_in_force_is_not_sent_again(chosen: Chosen, cell: Noted) -> None:
+    chosen.return_to("", {"young": 170e3, "poisson": 0.48}, (WHOLE, "A", 0.5), np.zeros((1, 3)))
+    assert not {name for name, *_ in cell.calls} & {"set_material", "load_scene", "stop_recording"}
+
+
+def test_a_restarted_contact_node_hears_what_was_chosen(chosen: Chosen, cell: Noted) -> None:
+    chosen.send_again()
+    assert cell.of("set_material") == [] and cell.of("load_scene") == []
+    chosen.choose_material({"young": 50e3})
+    chosen.choose_material({"poisson": 0.45})
+    chosen.send_again()
+    assert cell.of("set_material")[-1] == {"young": 50e3, "poisson": 0.45}
+
+
+def test_values_are_those_of_coordinates_that_the_organ_has(chosen: Chosen) -> None:
+    """The contact node keeps the contrast of the last organ's tumour; this one has none."""
+    assert chosen.organ is not None
+    there = {"young": 300e3, "contrast": 15.0}
+    chosen.contact = {key: there.get(name, 0.0) for key, name in MATERIAL.items()}
+    assert chosen.values(chosen.organ) == {"young": 300e3, "poisson": 0.48}
+
+
+def test_a_material_that_is_refused_is_not_shown(chosen: Chosen) -> None:
+    chosen.choose_material({"young": 13.0})
+    assert chosen.organ is not None and chosen.values(chosen.organ)["young"] == 90e3
+
+
+def test_of_a_slider_the_last_look_is_drawn(chosen: Chosen, cell: Noted) -> None:
+    """A cut takes longer than a step of the slider, and controls call from several threads."""
+    for part in np.linspace(0.0, 1.0, 50):
+        chosen.choose_look(CUT, "A", float(part))
+    chosen.settle()
+    chosen.settle()
+    assert [call for call in cell.calls if call[0] == "show_look"] == [("show_look", CUT, "A", 1.0)]
+    chosen.choose_look(GLASS, "A", 0.5)
+    chosen.forget(WHOLE)  # another organ
+    chosen.settle()
+    assert len(cell.of("show_look")) == 1
+
+
+def test_the_first_switch_of_a_scene_is_taken_back(
+    chosen: Chosen, cell: Noted, cube: Organ
+) -> None:
+    """By the effects and the tip that the contact node had been started with."""
+    chosen.choose_scene("palpation")
+    chosen.undo()
+    assert chosen.scene == "palpation" and "does not say" in cell.of("say")[-2]
+    assert chosen.organ is not None
+    chosen.organ.vademecum = cube.vademecum  # type: ignore[misc]
+    chosen.contact = {"cloud": "surface", "cloud_divisor": 1, "tools": ["tool"], **OWN_TIPS}
+    chosen.contact |= {"tip.shape": "sphere", "tip.radius": 5e-3}
+    chosen.choose_scene("needle_probe")
+    for back in ("palpation", ""):
+        chosen.undo() if back else chosen.return_to("", {}, chosen.look, chosen.tools.targets)
+        assert chosen.scene == back
+    assert cell.of("load_scene") == [
+        "palpation",
+        "needle_probe",
+        "palpation",
+        "the scene of the contact node's start",
+    ]
+
+
+def test_a_contrast_is_that_of_the_scene_that_runs(chosen: Chosen) -> None:
+    organ: Any = chosen.organ
+    organ.ranges, organ.usable = RANGES | {"contrast": (0.5, 20.0, 4.0)}, dict
+    for scene, contrast in (("", 4.0), ("tumour", 5.0), ("palpation", 1.0)):
+        chosen.scene = scene
+        assert chosen.values(organ)["contrast"] == contrast
+
+
+def test_another_organ_comes_in_its_own_material(chosen: Chosen, cell: Noted) -> None:
+    chosen.choose_material({"young": 50e3})
+    chosen.forget(GLASS)
+    assert chosen.in_force == {} and chosen.look == (GLASS, "A", 0.5)
+    chosen.undo()
+    assert cell.of("say")[-1] == "nothing to undo"
+
+
+def test_the_scene_in_use_is_named_whoever_chose_it(chosen: Chosen, cell: Noted) -> None:
+    chosen.choose_scene("refused")
+    assert chosen.scene == "" and cell.of("change_tips") == []
+    assert cell.of("stop_recording") == ["the scene changed"]
+    assert chosen.scene_name == "natural effects"
+    chosen.note_contact({"scene": "hanging"})  # as the contact node was started
+    assert chosen.scene_name == "hanging"
+    chosen.choose_scene("breathing")
+    assert chosen.scene_name == "breathing"
+    chosen.choose_scene("refused")
+    assert chosen.scene_name == "breathing"
+
+
+def test_tips_are_those_of_the_scene_that_runs(chosen: Chosen) -> None:
+    assert chosen.tips == (Tip(),)
+    chosen.contact = {"tools": ["tool"], "scene": "leaning_punch"}
+    assert chosen.tips == tuple(t.tip for t in read_scene(shipped_scene("leaning_punch")).tools)
+    chosen.contact = {"tools": list(NAMES), **OWN_TIPS}
+    chosen.tools.use(NAMES, PLACES)
+    chosen.tools.choose("right")
+    assert chosen.tip == Tip("flat", 2e-3)
+
+
+def test_beside_a_device_the_page_has_a_tool_of_its_own(chosen: Chosen, cell: Noted) -> None:
+    chosen.only, chosen.contact = "page", {"tools": ["stylus", "page"], **OWN_TIPS}
+    assert chosen.moved == ("page",) and not chosen.moves_all
+    assert chosen.tips == (Tip("flat", 2e-3),)
+    page = Page(say=cell.say, show_recording=cell.show_recording, answers=lambda: True)
+    nothing: Any = Noted()
+    recordings = Recordings(Path(), nothing, nothing, nothing, chosen, nothing, page)
+    recordings.record(True)
+    assert "record a bag" in cell.of("say")[0]
+    chosen.only = "probe"
+    assert chosen.moved == ()

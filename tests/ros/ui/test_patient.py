@@ -1,0 +1,224 @@
+"""A new patient on the planning page: its labels, its painted clamp and springs, its tab."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from avatar_ros.framework.conversions import surface_mesh
+from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING, stem
+from avatar_ros.ui.actions import Wanted
+from avatar_ros.ui.new_patient import NewPatient
+from avatar_ros.ui.organ import Organ
+from avatar_ros.ui.preview_view import BRUSHES
+from avatar_ros.ui.structures_view import STRUCTURE
+from avatar_ros.ui.tabs.inside import InsideTab
+from avatar_ros.ui.tabs.patient import FREE, GUESS, SPRUNG, PatientTab
+from viser import ViserServer
+
+from avatar_core.common.supports import ATTACHMENTS
+from avatar_core.geometry.groups import faces_of_groups, read_groups, regions_of_groups
+from avatar_core.offline.supports import SupportOption
+from tests.helpers.slowness import Deadline
+from tests.ros.helpers.page import AtOnce, Noted, face_area, image
+
+
+class Cell(Noted):
+    """Builds a result at once; notes what is asked of it, and what tab and view show.
+
+    drawn : regions of the faces, of each time the preview was drawn
+    springs : areas that the tab shows [m^2]
+    """
+
+    def __init__(self, result: Any) -> None:
+        super().__init__(
+            build_patient=lambda wanted, progress, report, then: then(result),
+            show=lambda points, faces, regions: self.drawn.append(regions),
+            show_preview=self._show_preview,
+        )
+        self.result, self.drawn = result, list[np.ndarray]()
+        self.springs: dict[str, float] = {}
+
+    def _show_preview(self, is_shown: bool, springs: dict[str, float] | None = None) -> None:
+        self.springs = springs or {}
+
+    @property
+    def asked(self) -> Wanted:
+        """For the last build."""
+        return self.of("build_patient")[-1]
+
+
+@pytest.fixture
+def cell(cube: Organ) -> Cell:
+    """The surface of a cube's mesh, clamped and reached as its vademecum."""
+    at = cube.vademecum.regions
+    regions = np.where(at.accessible, ACCESSIBLE, 0)
+    regions[at.clamped] = CLAMPED
+    boundary = surface_mesh(cube.vertices, cube.faces)
+    return Cell(SimpleNamespace(boundary=boundary, regions=regions, file="x.h5"))
+
+
+@pytest.fixture
+def new(cell: Cell, tmp_path: Path) -> NewPatient:
+    parts: Any = (AtOnce(), cell, lambda: cell, cell, cell.use, cell.say)
+    return NewPatient(tmp_path, *parts)
+
+
+def towards(cube: Organ, face: int) -> tuple[np.ndarray, np.ndarray]:
+    """A ray from outside to the middle of a face of the cube."""
+    corners = cube.vertices[cube.faces[face]].astype(float)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    normal /= np.linalg.norm(normal)
+    return corners.mean(axis=0) + 0.05 * normal, -normal
+
+
+def test_painted_regions_reach_the_next_build_of_that_organ_alone(
+    new: NewPatient, cell: Cell, cube: Organ, tmp_path: Path
+) -> None:
+    wanted = Wanted("cube.stl", fidelity="reduced", preview=True)
+    new.build(wanted)
+    assert new.is_previewing and cell.of("show_preview") == [True]
+    assert "hidden" in new.alerts("liver")[0]
+    free = int(np.flatnonzero(cell.drawn[-1] == 0)[0])
+    ray = towards(cube, free)
+    new.paint(*ray)  # without a brush
+    assert len(cell.drawn) == 1
+    new.brush("clamp", 2e-3)
+    new.paint(*ray)
+    assert cell.drawn[-1][free] == CLAMPED
+    assert (cell.drawn[-1] == CLAMPED).sum() > (cell.drawn[0] == CLAMPED).sum()
+    new.build(Wanted("other.stl", fidelity="reduced"))
+    assert cell.asked.groups == ""
+    new.build(wanted._replace(preview=False))
+    assert cell.asked.groups == "cube-groups.npz"
+    painted = regions_of_groups(cube.vademecum.mesh, read_groups(tmp_path / "cube-groups.npz"))
+    np.testing.assert_array_equal(painted.clamped, cell.drawn[-1] == CLAMPED)
+    new.end_preview()
+    assert not new.is_previewing and len([call for call in cell.calls if call[0] == "hide"]) == 1
+    new.build(wanted._replace(preview=False))
+    assert cell.asked.groups == ""
+
+
+def test_springs_are_painted_by_name_and_kept_for_the_build(
+    new: NewPatient, cell: Cell, cube: Organ, tmp_path: Path
+) -> None:
+    free = np.flatnonzero(cell.result.regions == 0)
+    cell.result.regions[free[:2]] = FIRST_SPRING + 2  # by its place in the request
+    wanted = Wanted(
+        "cube.stl",
+        fidelity="reduced",
+        supports=("cava_groove", "bare_area=clamped", "falciform=1e6"),
+        preview=True,
+    )
+    new.build(wanted)
+    assert list(cell.springs) == ["cava_groove", "falciform"]  # what is clamped is no spring
+    assert cell.springs["cava_groove"] == 0.0
+    assert cell.springs["falciform"] == pytest.approx(
+        face_area(cube.vertices, cube.faces[free[:2]]), rel=1e-5
+    )
+    new.brush("cava_groove", 2e-3)
+    new.paint(*towards(cube, free[-1]))
+    assert cell.drawn[-1][free[-1]] == FIRST_SPRING and cell.springs["cava_groove"] > 0.0
+    new.build(wanted._replace(preview=False))
+    groups = read_groups(tmp_path / cell.asked.groups)
+    assert set(groups) == {"clamped", "accessible", "cava_groove", "bare_area", "falciform"}
+    # a clamp that was painted over must not come back from the template
+    np.testing.assert_array_equal(groups["bare_area"], groups["clamped"])
+    faces = faces_of_groups(cube.vademecum.mesh, groups)
+    painted = cell.drawn[-1] == FIRST_SPRING
+    assert faces["cava_groove"][painted].all() and not faces["falciform"][painted].all()
+    new.build(wanted._replace(supports=("falciform", "cava_groove")))
+    new.paint(*towards(cube, free[-1]))  # with the same brush, whose number is another now
+    assert cell.drawn[-1][free[-1]] == FIRST_SPRING + 1
+    new.build(wanted._replace(preview=False, supports=()))
+    assert cell.asked.groups == ""  # springs were painted, and a clamp is asked for
+
+
+def test_labels_are_offered_of_a_label_map_alone(
+    new: NewPatient, cell: Cell, tmp_path: Path
+) -> None:
+    labels = np.zeros((6, 6, 6), np.uint8)
+    labels[1:4, 1:4, 1:4], labels[4, 4, 4] = 1, 7
+    image(tmp_path / "case.nii.gz", labels)
+    for file, offered in (("case.nii.gz", ("1", "7")), ("liver.stl", ())):
+        before = len(cell.of("offer_labels"))
+        new.choose_surface(file)
+        passed = Deadline(60.0)
+        while len(cell.of("offer_labels")) == before and not passed:
+            time.sleep(0.01)
+        assert cell.of("offer_labels")[-1] == offered
+
+
+# --- The tab ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def user() -> Noted:
+    return Noted()
+
+
+@pytest.fixture
+def tab(server: ViserServer, user: Noted) -> PatientTab:
+    return PatientTab(server.gui, user, tuple(BRUSHES))  # type: ignore[arg-type]
+
+
+def test_labels_and_boxes_of_a_file_reach_the_build(tab: PatientTab) -> None:
+    tab.offer(["case.nii.gz", "liver.stl"])
+    tab.offer_labels(("liver", "lesion", "vein"))
+    assert list(tab._boxes) == ["lesion", "vein"]
+    tab._boxes["vein"].value = True
+    wanted = tab._wanted(preview=True)
+    assert (wanted.surface, wanted.label, wanted.inside) == ("case.nii.gz", "liver", ("vein",))
+    assert wanted.preview
+    tab._label.value = "lesion"
+    assert list(tab._boxes) == ["liver", "vein"]
+    tab.offer_labels(())
+    assert tab._wanted().label == "" and tab._wanted().inside == ()
+
+
+def test_springs_are_asked_for_by_stiffness(tab: PatientTab, user: Noted) -> None:
+    assert tab._wanted().supports == () and not tab._stiffness.visible
+    tab._held.value = SPRUNG
+    assert tab._stiffness.visible
+    for name in ATTACHMENTS:
+        tab._springs[name].value = FREE
+    tab._springs["bare_area"].value, tab._springs["falciform"].value = "1e6", GUESS
+    tab._springs["cava_groove"].value = "clamped"
+    assert tab._wanted().supports == ("cava_groove=clamped", "bare_area=1e6", "falciform")
+    for text in tab._wanted().supports:
+        SupportOption.parse(text)
+    tab.show_preview(True, {"bare_area": 50e-4})
+    assert "bare_area 50 cm" in tab._areas.content and tab._areas.visible
+    tab._brush.value = "bare_area"
+    assert user.calls[-1][:2] == ("brush", "bare_area")
+    tab.show_preview(True, {"bare_area": 60e-4})
+    assert tab._brush.value == "bare_area"  # painting goes on
+    tab.show_preview(False)
+    assert not tab._areas.visible and "bare_area" not in tab._brush.options
+
+
+def test_structures_have_their_controls(server: ViserServer, user: Noted) -> None:
+    inside = InsideTab(server.gui, user)  # type: ignore[arg-type]
+    inside.show(("lesion", "vein"))
+    inside._rows[2].value = 50
+    assert user.calls[-1] == ("style", "lesion", True, STRUCTURE, 0.5)
+    inside.show(())
+    assert not inside._folder.visible
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("1.2.840.17.nii.gz", "1.2.840.17"),
+        ("ct.seg.nrrd", "ct"),
+        ("a.b.OBJ", "a.b"),
+        ("organs.dcm", "organs"),
+        ("liver", "liver"),
+    ],
+)
+def test_files_of_two_patients_have_two_names(file: str, name: str) -> None:
+    assert stem(file) == name
