@@ -57,36 +57,50 @@ def nodes_of_a_page(
 
 
 @contextmanager
-def opened(port: int, shots: Path) -> Iterator[Any]:
-    """The page, with an organ and all nodes there; it may ask nothing of any other machine."""
+def browsing(address: str, size: tuple[int, int] = WINDOW) -> Iterator[Any]:
+    """A browser at an address of this machine; it may ask nothing of any other."""
     from playwright.sync_api import Error, sync_playwright
 
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
-        context = browser.new_context(viewport={"width": WINDOW[0], "height": WINDOW[1]})
+        context = browser.new_context(viewport={"width": size[0], "height": size[1]})
         page = context.new_page()
         page.set_default_timeout(SLOW)  # screenshots too, of a busy machine
         foreign: list[str] = []
         page.on("request", lambda asked: foreign.append(asked.url))
         for _ in range(60):
             try:
-                page.goto(f"http://127.0.0.1:{port}/?token={TOKEN}")
+                page.goto(address)
                 break
             except Error:  # not there yet
                 page.wait_for_timeout(1000)
+        yield page
+        browser.close()
+        local = ("http://127.0.0.1", "ws://127.0.0.1", "data:", "blob:")
+        assert not [url for url in foreign if not url.startswith(local)]
+
+
+def close_notices(page: Any) -> None:
+    """Software rendering takes its time, and says so."""
+    from playwright.sync_api import Error
+
+    page.wait_for_timeout(3000)
+    for close in page.locator(".mantine-Notification-closeButton").all():
+        with suppress(Error):  # it closed by itself
+            close.click(timeout=2000)
+
+
+@contextmanager
+def opened(port: int, shots: Path) -> Iterator[Any]:
+    """The page, with an organ and all nodes there."""
+    with browsing(f"http://127.0.0.1:{port}/?token={TOKEN}") as page:
         try:
             page.get_by_text("is shown").wait_for(timeout=SLOW)
             page.get_by_text("All nodes answer").wait_for(timeout=SLOW)
         finally:
             page.screenshot(path=shots / "first.png")
-        page.wait_for_timeout(3000)  # software rendering takes its time, and says so
-        for close in page.locator(".mantine-Notification-closeButton").all():
-            with suppress(Error):  # it closed by itself
-                close.click(timeout=2000)
+        close_notices(page)
         yield page
-        browser.close()
-        local = ("http://127.0.0.1", "ws://127.0.0.1", "data:", "blob:")
-        assert not [url for url in foreign if not url.startswith(local)]
 
 
 def browse_in_idle_time() -> None:
@@ -144,19 +158,17 @@ def look_beside(page: Any) -> None:
 def drag(page: Any, shown: Organ, begin: float, end: float) -> None:
     """The tool from one height over the organ to another, with the mouse; the button stays down."""
     look_beside(page)
-    drag_there(page, shown, begin, end)
+    drag_there(page, beside_pose(shown), shown.above(begin), shown.above(end))
 
 
-def drag_there(page: Any, shown: Organ, begin: float, end: float) -> None:
-    """The same, seen from there already."""
-    pose = beside_pose(shown)
-    x0, y0 = screen_of(page, pose, shown.above(begin))
-    x1, y1 = screen_of(page, pose, shown.above(end))
-    page.mouse.move(x0, y0)
+def drag_there(page: Any, pose: Pose, begin: np.ndarray, end: np.ndarray) -> None:
+    """From a point to another [m], seen by a camera that is there already."""
+    way = np.linspace(screen_of(page, pose, begin), screen_of(page, pose, end), 20)
+    page.mouse.move(*way[0])
     page.wait_for_timeout(500)
     page.mouse.down()
-    for share in np.linspace(0.0, 1.0, 20):
-        page.mouse.move(x0 + share * (x1 - x0), y0 + share * (y1 - y0))
+    for x, y in way:
+        page.mouse.move(x, y)
         page.wait_for_timeout(60)
 
 
@@ -176,7 +188,7 @@ def input_of(page: Any, label: str) -> Any:
 
 def open_tab(page: Any, name: str) -> None:
     page.get_by_role("tab", name=name, exact=True).click()
-    page.wait_for_timeout(500)
+    page.get_by_role("tab", name=name, exact=True, selected=True).wait_for()
 
 
 def news(page: Any, text: str) -> None:
@@ -186,6 +198,12 @@ def news(page: Any, text: str) -> None:
 
 def press(page: Any, button: str) -> None:
     page.get_by_role("button", name=button, exact=True).click()
+
+
+def lift(page: Any) -> None:
+    open_tab(page, "Tool")
+    press(page, "Lift off the organ")
+    until(page, lambda: force_of(page) == 0.0, "the organ left")
 
 
 def pressed(page: Any, least: float = 0.5, tool: str = "") -> None:

@@ -24,9 +24,11 @@ from avatar_core.vademecum.storage import load_vademecum
 from tests.ros.helpers.browser import (
     SLOW,
     choose,
+    drag_there,
     first_pose,
     force_of,
     input_of,
+    lift,
     news,
     open_tab,
     press,
@@ -187,13 +189,7 @@ def put_beside(page: Any, shown: Organ) -> None:
     pose, start = first_pose(shown), shown.above(Tip().offset + 0.015)
     goal = start.copy()
     goal[[0, 2]] = (CENTRE + BESIDE)[[0, 2]]
-    way = np.linspace(screen_of(page, pose, start), screen_of(page, pose, goal), 12)
-    page.mouse.move(*way[0])
-    page.wait_for_timeout(500)
-    page.mouse.down()
-    for x, y in way:
-        page.mouse.move(x, y)
-        page.wait_for_timeout(100)
+    drag_there(page, pose, start, goal)
     page.mouse.up()
 
 
@@ -203,12 +199,6 @@ def press_in(page: Any) -> None:
     for _ in range(steps):
         press(page, "press 1 mm")
     until(page, lambda: force_of(page) > 0.1, "a force")
-
-
-def lift(page: Any) -> None:
-    open_tab(page, "Tool")
-    press(page, "Lift off the organ")
-    until(page, lambda: force_of(page) == 0.0, "the organ left")
 
 
 def click_at(page: Any, session: Session, shown: Organ, mode: str, places: np.ndarray) -> None:

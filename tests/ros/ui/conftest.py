@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import pytest
 
 from tests.helpers.box_organ import organ as box
+from tests.ros.conftest import PATIENT
 
 _NEEDED = {
     "rclpy": "ROS 2 is not installed",
@@ -33,7 +35,7 @@ def pytest_pycollect_makemodule(module_path: Path, parent: Any) -> PageModule:
 
 
 @pytest.fixture(scope="session")
-def _server() -> Iterator[Any]:
+def viser_server() -> Iterator[Any]:
     import viser
 
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
@@ -42,11 +44,11 @@ def _server() -> Iterator[Any]:
 
 
 @pytest.fixture
-def server(_server: Any) -> Any:
+def server(viser_server: Any) -> Any:
     """An empty page: viser's own, as no stand-in refuses what viser would refuse."""
-    _server.scene.reset()
-    _server.gui.reset()
-    return _server
+    viser_server.scene.reset()
+    viser_server.gui.reset()
+    return viser_server
 
 
 @pytest.fixture(scope="session")
@@ -67,3 +69,86 @@ def state() -> Any:
     made = SharedToolState.make()
     made.use(PLACES)
     return made
+
+
+# --- In a browser -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def chromium() -> str:
+    from tests.ros.helpers.browser import CHROMIUM
+
+    pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+    return CHROMIUM or pytest.skip("no Chromium here: apt install chromium")
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from tests.ros.helpers.browser import shots_in
+
+    return shots_in(tmp_path_factory.mktemp("shots"))
+
+
+@pytest.fixture(scope="module")
+def folder(folder: Path, organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A library of the module's own: what the page writes is found there by its kind."""
+    from avatar_core.vademecum.storage import save_vademecum
+
+    own = tmp_path_factory.mktemp("library")
+    copytree(folder, own, symlinks=True, dirs_exist_ok=True)
+    save_vademecum(organ, own / "liver.h5")
+    return own
+
+
+@pytest.fixture(scope="module")
+def contact() -> list[str]:
+    """Parameters of the contact node; a module may have its own."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def port() -> int:
+    from tests.ros.helpers.browser import free_port
+
+    return free_port()
+
+
+@pytest.fixture(scope="module")
+def nodes(
+    chromium: str, own_domain: dict[str, str], folder: Path, contact: list[str], port: int
+) -> Iterator[dict[str, Any]]:
+    """All nodes of the page's cell, by name."""
+    from tests.ros.helpers.browser import TOKEN, nodes_of_a_page
+
+    library = ["-p", f"library_dir:={folder}"]
+    patients = ["-p", f"atlas:={folder / 'atlas.h5'}", "-p", "vertices:=350"]
+    arguments = {
+        "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
+        "contact": [*PATIENT[1:], *contact],
+        "patient_interpolation": [*library, *patients],
+        "planning_ui": [*library, "-p", f"port:={port}", "-p", f"token:={TOKEN}"],
+    }
+    with nodes_of_a_page(arguments, own_domain) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def page(nodes: Any, port: int, shots: Path) -> Iterator[Any]:
+    """A browser on the page."""
+    from tests.ros.helpers.browser import opened
+
+    with opened(port, shots) as page:
+        try:
+            yield page
+        finally:
+            page.screenshot(path=shots / "last.png")
+
+
+@pytest.fixture(scope="module")
+def shown(folder: Path, nodes: Any) -> Any:
+    """The organ that the page shows first."""
+    from avatar_ros.ui.organ import Organ
+
+    from avatar_core.vademecum.storage import load_vademecum
+
+    return Organ.of(load_vademecum(folder / "liver.h5"))

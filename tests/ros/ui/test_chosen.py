@@ -177,7 +177,7 @@ def test_the_scene_in_use_is_named_whoever_chose_it(chosen: Chosen, cell: Noted)
     assert chosen.scene_name == "breathing"
 
 
-def test_tips_are_those_of_the_scene_that_runs(chosen: Chosen) -> None:
+def test_tips_are_those_of_the_scene_that_runs(chosen: Chosen, cube: Organ) -> None:
     assert chosen.tips == (Tip(),)
     chosen.contact = {"tools": ["tool"], "scene": "leaning_punch"}
     assert chosen.tips == tuple(t.tip for t in read_scene(shipped_scene("leaning_punch")).tools)
@@ -185,6 +185,8 @@ def test_tips_are_those_of_the_scene_that_runs(chosen: Chosen) -> None:
     chosen.tools.use(NAMES, PLACES)
     chosen.tools.choose("right")
     assert chosen.tip == Tip("flat", 2e-3)
+    chosen.contact |= {"scene": "two_tools", "cloud": "surface", "cloud_divisor": 1}
+    assert chosen.scene_in_force(cube).name == "two tools"  # as a recording of both has it
 
 
 def test_beside_a_device_the_page_has_a_tool_of_its_own(chosen: Chosen, cell: Noted) -> None:

@@ -29,8 +29,10 @@ from avatar_ros.ui.shown_period import (
     PeriodChooser,
     ShownPeriod,
 )
+from avatar_ros.ui.tabs.scene import SceneTab
 from avatar_ros.ui.texts import BAND, frame_text, other_scenes, scene_texts, warnings
 from avatar_ros.ui.tool_state import N_RECENT, SharedToolState, organ_number
+from viser import ViserServer
 
 from avatar_core.vademecum.model import VademecumInfo
 from avatar_ros.msg import ContactState
@@ -288,12 +290,17 @@ def test_a_fault_of_one_tool_is_said_with_its_name() -> None:
     assert warnings((), True, (OK, OK), NAMES) == "All nodes answer."
 
 
-def test_scenes_are_those_of_as_many_tools_and_how_to_come_to_the_others_is_said() -> None:
+def test_scenes_are_those_of_as_many_tools_and_how_to_come_to_the_others_is_said(
+    server: ViserServer,
+) -> None:
     one, two = scene_texts(1), scene_texts(2)
     assert "two_tools" in two and "two_tools" not in one
     assert "palpation" in one and "palpation" not in two
     assert "`avatar cell --tools left,right`" in other_scenes(1) and "two_tools" in other_scenes(1)
     assert "palpation" in other_scenes(2) and "two_tools" not in other_scenes(2)
+    tab = SceneTab(server.gui, Noted())  # type: ignore[arg-type]
+    tab.offer(2)
+    assert tab._scenes.options == tuple(two) and tab._others.content == other_scenes(2)
 
 
 # --- Foreign text -----------------------------------------------------------------------------

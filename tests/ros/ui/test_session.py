@@ -3,35 +3,26 @@
 One session for all tests: a patient is built from a label map with a tumour, pressed beside it,
 measured, kept, recorded, replayed, reported and exported. Each test looks at one thing of it. It
 takes ten minutes where no graphics card draws, and is held only if it is asked for:
-``AVATAR_SESSION_MINUTES=1 pytest -m long tests/ros/test_planning_session.py -s``.
+``AVATAR_SESSION_MINUTES=1 pytest -m long tests/ros/ui/test_session.py -s``.
 """
 
 from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import igl
-import numpy as np
-import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-pytest.importorskip("viser", reason="viser is not installed: pip install '.[ui]'")
-pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
-
 import meshio
 import nibabel
+import numpy as np
+import pytest
+from avatar_ros.bench.cell import Module
 
 from avatar_core.geometry.tip import Tip
-from avatar_core.vademecum.storage import save_vademecum
 from tests.helpers.slowness import slowness
-from tests.ros.conftest import PATIENT
-from tests.ros.helpers.browser import CHROMIUM, TOKEN, free_port, nodes_of_a_page, opened, shots_in
 from tests.ros.helpers.planner import (
     ASKED,
     CENTRE,
@@ -45,11 +36,9 @@ from tests.ros.helpers.planner import (
 )
 
 pytestmark = [
-    pytest.mark.ros,
     pytest.mark.long,
     pytest.mark.timing,  # a browser that draws without a graphics card takes both cores
     pytest.mark.skipif(not ASKED, reason="takes ten minutes: set AVATAR_SESSION_MINUTES"),
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt install chromium"),
 ]
 
 AGREE = 0.1  # numbers of the page and of files [mm]
@@ -59,29 +48,16 @@ GROWN_PAGE = 5.0  # the same of the browser's page [MB]
 
 
 @pytest.fixture(scope="module")
-def session(
-    own_domain: dict[str, str], folder: Path, organ: Any, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Session]:
-    save_vademecum(organ, folder / "liver.h5")
+def folder(folder: Path) -> Path:
     nibabel.save(labels(), folder / "case.nii.gz")
-    library, port, made = ["-p", f"library_dir:={folder}"], free_port(), Session(folder)
-    shots = shots_in(tmp_path_factory.mktemp("shots"))
-    arguments = {
-        "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
-        "contact": PATIENT[1:],
-        "patient_interpolation": [
-            *library,
-            *("-p", f"atlas:={folder / 'atlas.h5'}", "-p", "vertices:=350"),
-        ],
-        "planning_ui": [*library, "-p", f"port:={port}", "-p", f"token:={TOKEN}"],
-    }
-    with nodes_of_a_page(arguments, own_domain) as nodes, opened(port, shots) as page:
-        pids = {name: node.pid for name, node in nodes.items()}
-        try:
-            hold(page, made, pids, shots)
-        finally:
-            page.screenshot(path=shots / "session.png")
-        yield made
+    return folder
+
+
+@pytest.fixture(scope="module")
+def session(page: Any, nodes: dict[str, Module], folder: Path, shots: Path) -> Session:
+    made = Session(folder)
+    hold(page, made, {name: node.pid for name, node in nodes.items()}, shots)
+    return made
 
 
 # --- What it shows ----------------------------------------------------------------------------
