@@ -17,6 +17,8 @@ from avatar_ros.bench.cell import Module
 from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.orientation import FOV, Pose, basis, standard_view, view_beside
 
+from tests.helpers.slowness import Deadline, end_of
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 TOKEN = "a-token-for-tests"  # of the page
 WINDOW = (1280, 800)  # [px]
@@ -52,7 +54,7 @@ def nodes_of_a_page(
         for process in running.values():
             process.send_signal(signal.SIGINT)
         # `finish` is impatient where a browser shares the cores with all of them
-        codes = {name: process.wait(60.0) for name, process in running.items()}
+        codes = {name: end_of(process, 60.0) for name, process in running.items()}
     assert codes == dict.fromkeys(running, 0)
 
 
@@ -123,11 +125,10 @@ def force_of(page: Any, tool: str = "") -> float:
 
 
 def until(page: Any, reached: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
-    for _ in range(round(4 * seconds)):
-        if reached():
-            return
+    passed = Deadline(seconds)
+    while not reached():
+        assert not passed, f"{what}: not within {seconds:g} s; {page.inner_text('body')[:400]}"
         page.wait_for_timeout(250)
-    raise AssertionError(f"{what}: not within {seconds:g} s; {page.inner_text('body')[:400]}")
 
 
 def first_pose(shown: Organ) -> Pose:

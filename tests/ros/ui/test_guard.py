@@ -26,7 +26,7 @@ def port() -> Iterator[int]:
 
 
 def asked(port: int, path: str, **headers: str) -> HTTPResponse:
-    connection = HTTPConnection("127.0.0.1", port, timeout=10.0)
+    connection = HTTPConnection("127.0.0.1", port, timeout=60.0)
     connection.request("GET", path, headers=headers)
     return connection.getresponse()
 

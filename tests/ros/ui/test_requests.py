@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from threading import Thread
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import rclpy
 from avatar_ros.ui.actions import Wanted
 from avatar_ros.ui.requests import Requests
 from rclpy.action import ActionServer
-from rclpy.executors import SingleThreadedExecutor
 
 from avatar_ros.action import BuildPatient
-from tests.helpers.slowness import Deadline
+from tests.ros.conftest import Probe
 
 AWAY = 0.5  # of a thread, right after it sent a goal: the answer comes meanwhile [s]
 
@@ -48,40 +47,26 @@ def build_at_once(goal: Any) -> BuildPatient.Result:
 
 
 @pytest.fixture
-def until_built(own_domain: dict[str, str]) -> Iterator[Callable[[list[Any]], None]]:
+def until_built(probe: Probe) -> Iterator[Callable[[list[Any]], None]]:
     """Asks for a patient in a thread of its own, and spins until there is a result."""
-    context = rclpy.Context()
-    context.init()
-    server, page = (rclpy.create_node(n, context=context) for n in ("server", "page"))
-    action = ActionServer(server, BuildPatient, "build_patient", build_at_once)
-    other, own = (SingleThreadedExecutor(context=context) for _ in range(2))
-    other.add_node(server)
-    own.add_node(page)
-    thread = Thread(target=other.spin, daemon=True)
-    thread.start()
-    requests = Requests(page)
+    requests = Requests(probe.node)
 
     def ask(results: list[Any]) -> None:
-        passed = Deadline(60.0)
-        while "patient_interpolation" in requests.missing:
-            assert not passed, "the action is not found"
-            own.spin_once(timeout_sec=0.05)
+        probe.until(lambda: "patient_interpolation" not in requests.missing, 60.0)
         requests._build._client_handle = Slow(requests._build._client_handle)
         given = (Wanted("case.stl"), lambda *stage: None, lambda text: None, results.append)
         Thread(target=requests.build_patient, args=given).start()
-        passed = Deadline(20.0)
-        while not results and not passed:
-            own.spin_once(timeout_sec=0.05)
+        probe.until(lambda: bool(results), 20.0)
 
-    yield ask
-    requests.close()
-    other.shutdown()
-    thread.join()
-    action.destroy()
-    own.shutdown()
-    for node in (server, page):
-        node.destroy_node()
-    context.try_shutdown()
+    with closing(Probe()) as builder:
+        action = ActionServer(builder.node, BuildPatient, "build_patient", build_at_once)
+        thread = Thread(target=builder._executor.spin, daemon=True)
+        thread.start()
+        yield ask
+        requests.close()
+        builder._executor.shutdown()
+        thread.join()
+        action.destroy()
 
 
 def test_the_end_of_a_build_is_heard_however_early_the_goal_is_accepted(until_built: Any) -> None:

@@ -10,10 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.ui.recorder import Recorder
@@ -27,25 +23,13 @@ from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_core.scene.recording import load_recording
 from avatar_core.scene.replay import replay
 from avatar_core.vademecum.storage import load_vademecum
-from avatar_ros.msg import ContactState
 from avatar_ros.srv import LoadScene
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import PATIENT, START_TIMEOUT, Probe
+from tests.ros.helpers.page import NAMES, OK, PLACES
 
-pytestmark = pytest.mark.ros
-
-NAMES = ("left", "right")
-OK = ContactState.STATUS_OK
-PLACES = np.array([[0.0, 0.1, 0.0], [0.05, 0.1, 0.0]])
 APART = 0.02  # of two tips on the organ [m]
 DEPTH = 0.003  # to which they press [m]
-
-
-@pytest.fixture
-def state() -> SharedToolState:
-    made = SharedToolState.make()
-    made.use(PLACES)
-    return made
 
 
 # --- The driver -------------------------------------------------------------------------------
