@@ -89,15 +89,6 @@ def bench_effects(
     label: Label = None,
     vertices: Vertices = 2850,
     modes: Annotated[int, typer.Option(help="modes at a place at most")] = 100,
-    fused: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True,
-            dir_okay=False,
-            help="Python file with a function fused_step, the linear step written by hand as one "
-            "function, to compare the bare step with",
-        ),
-    ] = None,
     output: Json = None,
 ) -> None:
     """Time the step without effects, with each one, and with all (building takes minutes)."""
@@ -105,7 +96,7 @@ def bench_effects(
     from avatar_core.studies.bench.methods import load_average
 
     require(modes >= 36, f"--modes is {modes}; inertia and self_weight need at least 36")
-    _require_json(output, surface, fused)
+    _require_json(output, surface)
     organ = read_organ(surface, unit, axes, label)
     with BuildBar(large=True) as progress:
         vademecum = build_for_effects(organ, vertices, modes, progress)
@@ -113,7 +104,7 @@ def bench_effects(
     def announce(scene: str) -> None:
         print(f"compiling and timing: {scene}", file=sys.stderr, flush=True)
 
-    rows, summary = run_effects_bench(vademecum, fused, announce)
+    rows, summary = run_effects_bench(vademecum, announce)
     print(
         f"load average {load_average():.2f}; {vertices} vertices, {modes} modes; 10 mm spheres "
         "sliding 5 mm deep, field at all vertices at every step"

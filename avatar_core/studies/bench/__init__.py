@@ -1,3 +1,3 @@
-"""Benchmarks of the step. Vademecums and scenes come in; step times go out, beside a dense table, a
-direct solve and a hand-written linear step in the same run.
+"""Benchmarks of the step. Vademecums and scenes come in; step times go out, beside a dense table
+and a direct solve in the same run.
 """

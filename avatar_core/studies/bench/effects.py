@@ -1,15 +1,13 @@
 """``avatar bench effects``: time of a step with each effect of a scene, all in one run.
 
 Each effect is compared with the bare scene in alternating slides, so that both see the same load of
-the machine. The bare scene can be compared with a linear step written by hand as one function
-(:mod:`avatar_core.studies.bench.fused`).
+the machine.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -39,7 +37,6 @@ from avatar_core.offline.large_deformation import (
 )
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule, Progress
-from avatar_core.studies.bench.fused import fused_ratios
 from avatar_core.studies.bench.methods import SPHERE, one_pass, tool_paths
 from avatar_core.vademecum.model import Provenance, Vademecum
 
@@ -101,26 +98,15 @@ def build_for_effects(
 
 
 def run_effects_bench(
-    vademecum: Vademecum, fused: Path | None, progress: Callable[[str], None]
+    vademecum: Vademecum, progress: Callable[[str], None]
 ) -> tuple[list[EffectRow], dict[str, float]]:
-    """Rows and summary.
-
-    Parameters
-    ----------
-    fused : file with the step written by hand; None leaves ``bare_ratio`` out
-    """
+    """Rows and summary."""
     cases = (*cases_on(vademecum), ("everything", 2, EVERYTHING))
     rows = effect_rows(vademecum, cases, progress)
     summary = {
         "worst_single_ratio": max(row.ratio for row in rows[1:-1]),
         "everything_p99_us": rows[-1].p99_us,
     }
-    if fused is not None:
-        progress("fused by hand")
-        linear = replace(vademecum, large=None)
-        ratios = fused_ratios(linear, tool_paths(linear, 1, N_STEPS), fused)
-        spread = {"bare_ratio_least": min(ratios), "bare_ratio_most": max(ratios)}
-        summary = {"bare_ratio": float(np.median(ratios)), **spread, **summary}
     return rows, summary
 
 
