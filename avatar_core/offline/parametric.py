@@ -8,10 +8,8 @@
    separated by regions, for all nodes together, and what the basis leaves of the contact compliance
    is kept near the patch at every node.
 
-The space basis serves every value in the range by a small Galerkin system. A canonical separated
-form in all coordinates (:mod:`avatar_core.reduction.pgd_parametric`) needs several times as many
-modes and stagnates towards incompressibility, where the energy norm sees nothing but the change of
-volume.
+The space basis serves every value in the range by a small Galerkin system.
+:mod:`avatar_core.reduction.coordinates` says why it is no canonical separated form.
 """
 
 from __future__ import annotations

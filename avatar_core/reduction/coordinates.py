@@ -8,6 +8,10 @@ those of (multi)linear interpolation in
     poisson   -log(1 - 2 nu), in which the response varies evenly towards incompressibility
     contrast   log c
     support.NAME    log k, of the stiffness per area of a support
+
+Canonical PGD, one product of functions of place, load and each coordinate, is not used. It needs
+several times as many modes and stagnates at 13 % of the displacement towards incompressibility,
+where the energy norm sees nothing but the change of volume.
 """
 
 from __future__ import annotations

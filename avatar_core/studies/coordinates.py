@@ -1,9 +1,7 @@
 """Cost and error of each extra coordinate: Poisson's ratio, tumour, large deformation.
 
 All errors are on loads at face centroids and on values that no build has seen, against full finite
-elements on the same mesh. Beside the default (one space basis and a small Galerkin system for every
-value) stands the canonical PGD in all coordinates at once, by Galerkin's and by the minimal
-residual's weak form, both of one level, as the default has two.
+elements on the same mesh.
 """
 
 from __future__ import annotations
@@ -17,8 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
-from avatar_core.fem.norms import l2_norm
-from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
+from avatar_core.fem.patch_loads import LoadSurface, load_surface
 from avatar_core.geometry.mesh import Regions, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.geometry.tumour import read_tumour, volume_fraction_inside
@@ -32,18 +29,10 @@ from avatar_core.offline.large_deformation import (
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.parametric import build_parametric_vademecum, certify_range
 from avatar_core.offline.rule import BuildRule, Progress
-from avatar_core.reduction.affine import AffineProblem, Samples
-from avatar_core.reduction.affine_elasticity import affine_problem
-from avatar_core.reduction.coordinates import Coordinate, problem_at
-from avatar_core.reduction.pgd_parametric import (
-    CanonicalPGDRule,
-    minimal_residual,
-    solve_canonical_pgd,
-)
+from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.studies.bench.methods import time_steps
 from avatar_core.studies.shapes import DEFAULT_FOLDER, read_liver
 from avatar_core.studies.study import ProgressBar, Study, Value
-from avatar_core.studies.unseen import canonical_at, errors, unseen
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
 
@@ -58,23 +47,21 @@ RANKS = (40, 60, 100)  # modes at a place at most
 
 @dataclass(frozen=True)
 class CoordinatesSettings:
-    """Vertices of the meshes and of those that the canonical forms are compared on; unseen loads.
+    """Vertices of the meshes, unseen loads.
 
-    n_canonical : products at most; n_pushed : sites of large pushes; n_combined : of combinations
+    n_pushed : sites of large pushes; n_combined : of combinations
     patch_radius : of the loads, by default the organ's own [m]
     """
 
     n_vertices: int = 2850
-    n_vertices_canonical: int = 700
     n_loads: int = 80
-    n_canonical: int = 40
     n_pushed: int = 6
     n_combined: int = 2
     patch_radius: float | None = None
 
 
 FULL = CoordinatesSettings()
-QUICK = CoordinatesSettings(1000, 700, 48, 20, 3, 1)
+QUICK = CoordinatesSettings(1000, 48, 3, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +85,7 @@ def study(one: SurfaceMesh, other: SurfaceMesh, settings: CoordinatesSettings) -
     poisson = (Coordinate("poisson", 0.40, 0.49),)
     incompressible = (Coordinate("poisson", 0.40, 0.499),)
     rows: list[dict[str, Value]] = []
-    coarse = replace(settings, n_vertices=settings.n_vertices_canonical)
-    with ProgressBar(8) as bar:
+    with ProgressBar(6) as bar:
         for surface in (one, other) if one.name != other.name else (one,):
             progress = bar.begin(f"Poisson's ratio, {surface.name}")
             organ = _organ(surface, settings)
@@ -108,13 +94,6 @@ def study(one: SurfaceMesh, other: SurfaceMesh, settings: CoordinatesSettings) -
         organ = _organ(one, settings, "Taylor-Hood")
         rows += _parametric(organ, "incompressible", incompressible, settings, progress)
         rows += _tumour_rows(settings, bar.begin("tumour"))
-        for name, coordinates, element in (
-            ("poisson", poisson, "P2"),
-            ("incompressible", incompressible, "Taylor-Hood"),
-        ):
-            progress = bar.begin(f"canonical PGD, {name}")
-            small = _organ(one, coarse, element)  # type: ignore[arg-type]
-            rows += _canonical(small, name, coordinates, settings, progress)
         large = _organ(one, settings)
         rows += _large(large, "neo-hookean", settings, bar.begin("neo-Hookean"))
         rows += _large(large, "st-venant-kirchhoff", settings, bar.begin("St Venant-Kirchhoff"))
@@ -212,65 +191,6 @@ def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[dict
     return _parametric(organ, "tumour", coordinates, settings, progress)
 
 
-def _canonical(
-    organ: Organ,
-    name: str,
-    coordinates: tuple[Coordinate, ...],
-    settings: CoordinatesSettings,
-    progress: Progress,
-) -> list[dict[str, Value]]:
-    """The canonical forms and the default on one small mesh."""
-    elasticity, surface = organ.elasticity, organ.loads
-    middle = problem_at(elasticity, {c.name: c.value_at(0.5) for c in coordinates})
-    loads = patch_loads(middle, surface.centers, surface.patch_radius)
-    norm = _norms(middle, loads)
-    problem = affine_problem(middle, loads, coordinates, 1.0 / norm**2)
-    cases = unseen(elasticity, surface, coordinates, 4, max(4, settings.n_loads // 8))
-    rows = _parametric(organ, f"{name}, small mesh", coordinates, settings, progress)
-    for method, form in (("canonical, Galerkin", problem), ("canonical, minimal residual", None)):
-        start = time.process_time()
-        rule = CanonicalPGDRule(
-            settings.n_canonical, 1e-4, max_sweeps=4, sweep_tolerance=0.1, solve_tolerance=1e-2
-        )
-
-        def enriched(rank: int, residual: float, method: str = method) -> None:
-            progress(method, rank / settings.n_canonical, residual)
-
-        affine = minimal_residual(problem) if form is None else form
-        found = solve_canonical_pgd(affine, rule, progress=enriched)
-        seconds = time.process_time() - start
-        for rank in sorted({r for r in RANKS if r < found.field.rank} | {found.field.rank}):
-            some = canonical_at(found.field.truncate(rank), coordinates)
-            row = _row(f"{name}, small mesh", organ, method, rank, errors(cases, some), seconds)
-            rows.append({**row, "outcome": found.outcome.value, **_estimates(problem, found, rank)})
-    return rows
-
-
-def _estimates(problem: AffineProblem, found, rank: int) -> dict[str, float]:  # type: ignore[no-untyped-def]
-    """The residual-based estimates, of the whole field only."""
-    if rank < found.field.rank:
-        return {}
-    reference = np.ones(len(problem.terms))
-    for factors in problem.factors:
-        reference = reference * factors[:, factors.shape[1] // 2]
-    estimate = Samples(problem, 24, seed=2).estimate(found.field, reference)
-    return {
-        "estimated_residual": estimate.residual,
-        "estimated_contact": estimate.contact,
-        "bound_contact": estimate.contact_bound,
-    }
-
-
-def _norms(elasticity: Elasticity, loads) -> np.ndarray:  # type: ignore[no-untyped-def]
-    out = np.empty(loads.shape[1])
-    by_column = loads.tocsc()
-    for first in range(0, loads.shape[1], 300):
-        block = slice(first, min(first + 300, loads.shape[1]))
-        solution = elasticity.at_vertices(elasticity.solve(by_column[:, block]))
-        out[block] = l2_norm(solution, elasticity.mesh.lumped_mass)
-    return out
-
-
 def _row(
     name: str, organ: Organ, method: str, modes: int, found: dict[str, float], seconds: float
 ) -> dict[str, Value]:
@@ -351,7 +271,6 @@ def _summary(rows: Sequence[dict[str, Value]]) -> dict[str, float]:
             summary[f"{name}_{key}"] = max(values, default=float("nan"))
         seconds = [float(row["build_cpu_seconds"]) for row in best]  # type: ignore[arg-type]
         summary[f"{name}_build_cpu_seconds"] = max(seconds, default=float("nan"))
-    summary |= _canonical_summary(rows)
     for name, key in (("neo-hookean", "large"), ("st-venant-kirchhoff", "stvk")):
         (row,) = (row for row in rows if row["coordinate"] == f"large, {name}")
         for ours, theirs in (
@@ -382,43 +301,20 @@ def _summary(rows: Sequence[dict[str, Value]]) -> dict[str, float]:
     return summary
 
 
-def _canonical_summary(rows: Sequence[dict[str, Value]]) -> dict[str, float]:
-    out = {}
-    for name in ("poisson", "incompressible"):
-        for method, key in (
-            ("default", "default"),
-            ("canonical, Galerkin", "canonical"),
-            ("canonical, minimal residual", "minimal_residual"),
-        ):
-            found = [
-                row
-                for row in rows
-                if row["coordinate"] == f"{name}, small mesh" and row["method"] == method
-            ]
-            most = max(found, key=lambda row: int(row["modes"]))  # type: ignore[arg-type]
-            out[f"{name}_{key}_small_mesh_mean"] = float(most["l2_mean"])  # type: ignore[arg-type]
-    return out
-
-
 def _sentence(summary: dict[str, float]) -> str:
     return (
         f"Unseen loads and values: Poisson's ratio 0.40 to 0.49 {summary['poisson_mean']:.1%}, to "
         f"0.499 {summary['incompressible_mean']:.1%}, with a tumour's contrast "
         f"{summary['tumour_mean']:.1%}; neo-Hookean pushes {summary['large_mean']:.1%} (linear "
-        f"{summary['linear_over_large_15mm']:.1f} times as wrong at 15 mm). Canonical PGD "
-        f"on a small mesh: {summary['poisson_canonical_small_mesh_mean']:.0%} and "
-        f"{summary['incompressible_canonical_small_mesh_mean']:.0%}."
+        f"{summary['linear_over_large_15mm']:.1f} times as wrong at 15 mm)."
     )
 
 
 def _draw(figure: Figure, rows: Sequence[dict[str, Value]]) -> None:
-    left, middle, right = figure.subplots(1, 3)
+    left, right = figure.subplots(1, 2)
     _draw_modes(
         left, [row for row in rows if row["coordinate"] in ("poisson", "incompressible", "tumour")]
     )
-    _draw_modes(middle, [row for row in rows if "small mesh" in str(row["coordinate"])])
-    left.set_title("default, paper size", fontsize=9)
-    middle.set_title("canonical PGD beside the default, small mesh", fontsize=9)
     pushes = [row for row in rows if row["coordinate"] == "push, neo-hookean"]
     for key, text, colour in (
         ("linear_l2", "linear", "tab:gray"),
@@ -433,15 +329,15 @@ def _draw(figure: Figure, rows: Sequence[dict[str, Value]]) -> None:
 
 
 def _draw_modes(axis, rows: Sequence[dict[str, Value]]) -> None:  # type: ignore[no-untyped-def]
-    series = sorted({(str(r["coordinate"]), str(r["organ"]), str(r["method"])) for r in rows})
-    for name, organ, method in series:
-        some = [
-            r for r in rows if (r["coordinate"], r["organ"], r["method"]) == (name, organ, method)
-        ]
-        label = f"{name.removesuffix(', small mesh')}, {organ}: {method}"
+    for name, organ in sorted({(str(row["coordinate"]), str(row["organ"])) for row in rows}):
+        some = [row for row in rows if (row["coordinate"], row["organ"]) == (name, organ)]
         axis.semilogy(
-            [r["modes"] for r in some], [r["l2_mean"] for r in some], "o-", ms=3, label=label
+            [row["modes"] for row in some],
+            [row["l2_mean"] for row in some],
+            "o-",
+            ms=3,
+            label=f"{name}, {organ}",
         )
-    axis.set(xlabel="modes", ylabel="mean relative L2 error [-]")
+    axis.set(xlabel="modes", ylabel="mean relative L2 error [-]", title="unseen loads and values")
     axis.grid(which="both", alpha=0.3)
     axis.legend(fontsize=6, loc="best")

@@ -5,7 +5,7 @@ relative mass-weighted L2 norm of displacement for each load, mean and worst, fo
 and on single nodes, against full finite elements; beside it that of the displacement in contact,
 f . u of the load. The methods:
 
-    paper     greedy enrichment, one pair at a time, in the energy norm; the vector (Hadamard) form
+    paper     greedy enrichment, one pair at a time, in the energy norm
     SVD       the best that any n modes can do, relative errors counted
     default   two levels: modes of all loads, by blocks of pairs in the norm of relative errors, and
               those of four regions for what is left; modes are counted at a place
@@ -29,7 +29,6 @@ from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.pgd import LoadProblem, PGDRule, solve_pgd
-from avatar_core.reduction.pgd_hadamard import solve_hadamard
 from avatar_core.reduction.regional import RegionalRule, regions_of, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.studies.shapes import read_liver
@@ -45,15 +44,14 @@ _REGIONS = 4  # of so few loads
 
 @dataclass(frozen=True)
 class PGDSettings:
-    """Vertices of the mesh, load nodes, modes of the vector form (slow)."""
+    """Vertices of the mesh, load nodes."""
 
     n_vertices: int = 2850
     n_loads: int = 66
-    n_hadamard: int = 12
 
 
 FULL = PGDSettings()
-QUICK = PGDSettings(n_vertices=900, n_loads=40, n_hadamard=6)
+QUICK = PGDSettings(n_vertices=900, n_loads=40)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +94,7 @@ def study(surface: SurfaceMesh, settings: PGDSettings) -> Study:
     rows: list[dict[str, Value]] = []
     for kind in ("patch", "point"):
         case = make_case(elasticity, positions, nodes, kind)
-        rows += _rows(case, kind, settings)
+        rows += _rows(case, kind)
     summary = _summary(rows)
     return Study(
         name="pgd",
@@ -140,7 +138,7 @@ def make_case(elasticity: Elasticity, positions: LoadSurface, nodes: IntArray, k
     )
 
 
-def _rows(case: Case, kind: str, settings: PGDSettings) -> list[dict[str, Value]]:
+def _rows(case: Case, kind: str) -> list[dict[str, Value]]:
     """Errors against modes for every method."""
     n = case.loads.shape[1]
     ranks = sorted({*range(1, 12), *range(12, min(61, n), 3), min(n, 60)})
@@ -175,18 +173,6 @@ def _rows(case: Case, kind: str, settings: PGDSettings) -> list[dict[str, Value]
         basis = left_vectors[:, :rank]
         best = basis @ (basis.T @ (scaled * case.size)) / root
         add("SVD optimum", rank, case.exact - best, np.full(n, np.nan))
-    vectors = solve_hadamard(case.elasticity, case.loads, min(settings.n_hadamard, n), max_sweeps=5)
-    for rank in (r for r in ranks if r <= settings.n_hadamard):
-        field = vectors.evaluate(rank)
-        contact = np.abs(
-            1.0 - np.asarray(case.loads.multiply(field).sum(axis=0)).ravel() / case.work
-        )
-        add(
-            "PGD, paper's vector form",
-            rank,
-            case.exact - case.elasticity.at_vertices(field),
-            contact,
-        )
     return found
 
 
@@ -274,12 +260,7 @@ def _draw(figure: Figure, rows: list[dict[str, Value]]) -> None:
         ("point", "l2", "single nodes: displacement, L2"),
         ("patch", "contact", "patches: displacement in contact"),
     )
-    colours = {
-        "PGD, paper's norm": "tab:blue",
-        "PGD, paper's vector form": "tab:purple",
-        "SVD optimum": "tab:gray",
-        "default": "crimson",
-    }
+    colours = {"PGD, paper's norm": "tab:blue", "SVD optimum": "tab:gray", "default": "crimson"}
     for axis, (kind, error, title) in zip(axes, panels, strict=True):
         for method, colour in colours.items():
             some = [row for row in rows if row["method"] == method and row["loads"] == kind]

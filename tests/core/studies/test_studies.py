@@ -165,17 +165,11 @@ def test_samples(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_pgd(tmp_path: Path) -> None:
-    found = pgd.study(phantom_liver(12e-3), pgd.PGDSettings(300, 24, 5))
+    found = pgd.study(phantom_liver(12e-3), pgd.PGDSettings(300, 24))
     summary = checked_files(found, tmp_path)
     # no modes are better than the best; the default is exact near the patch
     assert summary["svd_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
     assert summary["default_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
-    rows = {
-        r["method"]: r["l2_mean"] for r in found.rows if r["loads"] == "patch" and r["modes"] == 5
-    }
-    # which of the paper's two forms is better depends on where its sweeps stop, from mesh to mesh
-    for name in ("norm", "vector form"):
-        assert rows["SVD optimum"] < rows[f"PGD, paper's {name}"] < 1.0
 
 
 @pytest.mark.long
@@ -183,10 +177,10 @@ def test_coordinates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the real tumours, whose two coordinates alone take minutes."""
     monkeypatch.setattr(coordinates, "TUMOUR_FOLDER", tmp_path)
     organ = phantom_liver(12e-3)
-    settings = coordinates.CoordinatesSettings(300, 300, 4, 6, 2, 1, 30e-3)
+    settings = coordinates.CoordinatesSettings(300, 4, 2, 1, 30e-3)
     found = coordinates.study(organ, organ, settings)
     summary = checked_files(found, tmp_path)
-    assert summary["poisson_mean"] < summary["poisson_canonical_small_mesh_mean"]
+    assert summary["poisson_mean"] < 0.05
     assert summary["linear_over_large_15mm"] > 1.0
     # An oblique push bends both less and otherwise: at one site in six the linear one is nearer.
     assert summary["gravity_contact_mean"] < summary["gravity_linear_contact_mean"]
