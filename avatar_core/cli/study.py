@@ -4,35 +4,19 @@ from __future__ import annotations
 
 import sys
 import time
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from avatar_core.errors import StorageError
+from avatar_core.studies import NAMES, load_study
 
-STUDIES = {
-    "meshes": "avatar_core.studies.meshes",
-    "grid": "avatar_core.studies.grid",
-    "in-silico": "avatar_core.studies.in_silico",
-    "samples": "avatar_core.studies.samples",
-    "leave-one-out": "avatar_core.studies.leave_one_out",
-    "transport": "avatar_core.studies.transport",
-    "pgd": "avatar_core.studies.pgd",
-    "coordinates": "avatar_core.studies.coordinates",
-    "certainty": "avatar_core.studies.certainty",
-    "accuracy-time": "avatar_core.studies.accuracy_time",
-    "passivity": "avatar_core.studies.passivity",
-    "contact": "avatar_core.studies.contact",
-    "indentation": "avatar_core.studies.indentation",
-    "registration": "avatar_core.studies.registration",
-}
 USAGE = 2
 
 
 def study(
-    name: Annotated[str, typer.Argument(help=f"one of {', '.join(STUDIES)}")],
+    name: Annotated[str, typer.Argument(help=f"one of {', '.join(NAMES)}")],
     output: Annotated[
         Path, typer.Option("-o", "--output", help="folder to write NAME.json and NAME.png to")
     ],
@@ -51,23 +35,21 @@ def study(
     ] = False,
 ) -> None:
     """Measure what avatar claims, or repeat an experiment of the paper beside its figures."""
-    from avatar_core.studies.study import write_study
-
-    if name not in STUDIES:
-        print(f"avatar: no study '{name}'; choose one of {', '.join(STUDIES)}", file=sys.stderr)
+    if name not in NAMES:
+        print(f"avatar: no study '{name}'; choose one of {', '.join(NAMES)}", file=sys.stderr)
         raise typer.Exit(USAGE)
     _require_folder(output)
     if not resume:
         (output / f"{name}.rows.jsonl").unlink(missing_ok=True)
-    run = import_module(STUDIES[name]).run
+    chosen = load_study(name)
     start = time.perf_counter()
-    found = run(surfaces, quick, output)
+    run = chosen.conduct(chosen.quick if quick else chosen.full, output, surfaces)
     seconds = time.perf_counter() - start
-    for notice in found.notices:
+    for notice in run.notices:
         print(f"notice: {notice}", file=sys.stderr)
-    print(found.table())
-    print(found.sentence)
-    record, picture = write_study(found, output, seconds)
+    print(run.table())
+    print(run.sentence)
+    record, picture = run.write(seconds)
     print(f"{record}\n{picture}  ({seconds:.0f} s)")
 
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from avatar_core.studies.offline_cost import (
     shape_rows,
 )
 from avatar_core.studies.online_cost import (
+    Promises,
     budget_rows,
     cost_of_effects,
     curve_rows,
@@ -37,7 +37,7 @@ from avatar_core.studies.online_cost import (
 )
 from avatar_core.studies.report import Panel, write_report
 from avatar_core.studies.shapes import read_liver
-from avatar_core.studies.study import ProgressBar, Study, Value
+from avatar_core.studies.study import ProgressBar, Row, Run, Study, column, where
 from avatar_core.vademecum.model import Vademecum
 
 if TYPE_CHECKING:
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 JND = 0.07  # of force, that a hand just notices (Jones, Brain 2000; Pang et al. 1991)
 _NOTICED = "7 %: just noticed of a force"
 PERIOD_US = 1000.0
-PAPER: dict[str, Value] = {"modes_for_10_percent": "11", "rate_hz": "1000, without a table"}
 FRESH = 1001  # seed of loads that no certificate draws
 
 
@@ -67,73 +66,87 @@ class AccuracyTimeSettings:
     n_patient: int = 600
 
 
-FULL = AccuracyTimeSettings()
-QUICK = AccuracyTimeSettings(1200, 60, 40, 150, (1200,), (20e-3, 10e-3), (5e-3,), 16, 3, 350)
+class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
+    """All sweeps and the promises on LiTS-4, or the first liver of a folder, and a page."""
+
+    name = "accuracy-time"
+    full = AccuracyTimeSettings()
+    quick = AccuracyTimeSettings(1200, 60, 40, 150, (1200,), (20e-3, 10e-3), (5e-3,), 16, 3, 350)
+    paper: ClassVar = {"modes_for_10_percent": "11", "rate_hz": "1000, without a table"}
+
+    def measure(self, run: Run[AccuracyTimeSettings]) -> None:
+        settings, surface = run.settings, read_liver(run.surfaces, "LiTS-4")
+        with ProgressBar(6) as bar:
+            options = OrganOptions(n_vertices=settings.n_vertices, n_certified=settings.n_certified)
+            v = build(surface, options, bar.begin("build"))
+            assert v.certificate is not None and v.certificate.curve is not None
+            elasticity = Elasticity(v.mesh, v.material, v.regions.clamped, v.element)
+            bar.begin("timing")
+            curve, again = (timed(v, v.certificate.curve) for _ in range(2))
+            bar.begin("fresh loads")
+            fresh = measured(v, elasticity, settings.n_fresh, FRESH)
+            run.kept |= {"organ": v, "promises": promises(curve, fresh, again)}
+            run.kept["contacts"] = force_errors(v, elasticity, settings.n_contacts, FRESH)
+            bar.begin("rivals")
+            run.rows += curve_rows(curve) + budget_rows(curve)
+            run.rows += rival_rows(v, elasticity, curve, settings.n_fresh // 2, FRESH)
+            run.rows += cost_of_effects(v)
+            bar.begin("mesh, loads and grid")
+            run.rows += mesh_rows(surface, settings.meshes)
+            run.rows += load_rows(elasticity, v.surface, settings.projections)
+            run.rows += grid_rows(surface, settings.spacings)
+            bar.begin("shapes and patients")
+            run.rows += shape_rows(run.surfaces, settings.n_livers)
+            run.rows += patient_rows(settings.n_base, settings.n_patient)
+
+    def summary(self, run: Run[AccuracyTimeSettings]) -> dict[str, float]:
+        rows, v = run.rows, run.kept["organ"]
+        kept: Promises = run.kept["promises"]
+        contacts: ForceErrors = run.kept["contacts"]
+        best = _best(rows)
+        return {
+            "promise_kept_fraction": kept.errors_kept,
+            "points_kept_fraction": kept.points_kept,
+            "time_promise_kept_fraction": kept.times_kept,
+            "force_error_coverage": contacts.coverage,
+            "force_error_overestimate": contacts.overestimate,
+            "budgets_as_enumerated": float(column(_of(rows, "choose"), "as_enumerated").mean()),
+            "front_points": sum(bool(row.get("front")) for row in rows),
+            "l2_95": best["error"],
+            **_beside_table(rows, v),
+            "force_95": float(np.quantile(contacts.error / contacts.force, 0.95)),
+            "step_p50_us": best["p50_us"],
+            "step_p99_us": best["p99_us"],
+            "vertices": len(v.mesh.vertices),
+        }
+
+    def sentence(self, run: Run[AccuracyTimeSettings]) -> str:
+        summary = run.summary
+        return (
+            f"{run.kept['organ'].name}: a step that shows all {summary['vertices']:.0f} vertices "
+            f"takes {summary['step_p50_us']:.0f} us and is within {summary['l2_95']:.1%} for 95 % "
+            f"of unseen touches, its force within {summary['force_95']:.1%}; promised errors held "
+            f"for {summary['promise_kept_fraction']:.1%} of fresh loads, the error said with a "
+            f"force covered {summary['force_error_coverage']:.1%} of contacts"
+        )
+
+    def report(self, run: Run[AccuracyTimeSettings]) -> None:
+        """Write the page."""
+        panels = run.kept["panels"] = _panels(run.rows, run.kept["contacts"], run.summary)
+        page = write_report(run.folder, self.name, run.sentence, run.summary, panels, run.rows)
+        run.notices += [*short_table(run.rows), f"the page with all plots: {page}"]
+
+    def draw(self, figure: Figure, run: Run[AccuracyTimeSettings]) -> None:
+        panels = run.kept["panels"]
+        shown = (panels[0], panels[2], panels[3])
+        for axes, panel in zip(figure.subplots(1, 3, width_ratios=(5, 3, 3)), shown, strict=True):
+            panel.draw(axes)
 
 
-def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
-    """The study on LiTS-4, or the first liver of a folder; the report goes into ``folder``."""
-    return study(surfaces, QUICK if quick else FULL, folder)
+STUDY = AccuracyTimeStudy()
 
 
-def study(surfaces: Path | None, settings: AccuracyTimeSettings, folder: Path) -> Study:
-    """All sweeps, the promises, and the page."""
-    surface = read_liver(surfaces, "LiTS-4")
-    with ProgressBar(6) as bar:
-        options = OrganOptions(n_vertices=settings.n_vertices, n_certified=settings.n_certified)
-        vademecum = build(surface, options, bar.begin("build"))
-        certificate = vademecum.certificate
-        assert certificate is not None and certificate.curve is not None
-        v = vademecum
-        elasticity = Elasticity(v.mesh, v.material, v.regions.clamped, v.element)
-        bar.begin("timing")
-        curve = timed(vademecum, certificate.curve)
-        again = timed(vademecum, certificate.curve)
-        bar.begin("fresh loads")
-        fresh = measured(vademecum, elasticity, settings.n_fresh, FRESH)
-        kept = promises(curve, fresh, again)
-        contacts = force_errors(vademecum, elasticity, settings.n_contacts, FRESH)
-        bar.begin("rivals")
-        rows = curve_rows(curve) + budget_rows(curve)
-        rows += rival_rows(vademecum, elasticity, curve, settings.n_fresh // 2, FRESH)
-        rows += cost_of_effects(vademecum)
-        bar.begin("mesh, loads and grid")
-        rows += mesh_rows(surface, settings.meshes)
-        rows += load_rows(elasticity, v.surface, settings.projections)
-        rows += grid_rows(surface, settings.spacings)
-        bar.begin("shapes and patients")
-        rows += shape_rows(surfaces, settings.n_livers)
-        rows += patient_rows(settings.n_base, settings.n_patient)
-    summary: dict[str, float] = {
-        "promise_kept_fraction": kept.errors_kept,
-        "points_kept_fraction": kept.points_kept,
-        "time_promise_kept_fraction": kept.times_kept,
-        "force_error_coverage": contacts.coverage,
-        "force_error_overestimate": contacts.overestimate,
-        "budgets_as_enumerated": float(np.mean([r["as_enumerated"] for r in _of(rows, "choose")])),
-        "front_points": sum(bool(row.get("front")) for row in rows),
-        "l2_95": _best(rows)["error"],
-        **_beside_table(rows, v),
-        "force_95": float(np.quantile(contacts.error / contacts.force, 0.95)),
-        "step_p50_us": _best(rows)["p50_us"],
-        "step_p99_us": _best(rows)["p99_us"],
-        "vertices": len(v.mesh.vertices),
-    }
-    panels = _panels(rows, contacts, summary)
-    sentence = _sentence(rows, summary, surface.name)
-    write_report(folder, "accuracy-time", sentence, summary, panels, rows)
-    return Study(
-        name="accuracy-time",
-        sentence=sentence,
-        summary=summary,
-        rows=tuple(rows),
-        paper=PAPER,
-        draw=partial(_overview, panels),
-        notices=(*short_table(rows), f"the page with all plots: {folder / 'accuracy-time.html'}"),
-    )
-
-
-def short_table(rows: list[dict[str, Value]]) -> tuple[str, ...]:
+def short_table(rows: list[Row]) -> tuple[str, ...]:
     """The README's table: fastest steps within some errors, rivals, budgets; all vertices shown."""
     volume = [row for row in rows if row.get("cloud") == "volume"]
     lines = ["| 95 % of loads within | step p50 / p99 [us] | by | MB |", "|---|---|---|---|"]
@@ -159,13 +172,13 @@ def _line(error: str, row: dict[str, Any], by: str) -> str:
     )
 
 
-def _best(rows: list[dict[str, Value]]) -> dict[str, Any]:
+def _best(rows: list[Row]) -> dict[str, Any]:
     """All modes in 16 bits, all vertices: what a scene shows unless told otherwise."""
     found = [r for r in rows if r.get("cloud") == "volume" and r.get("precision") == "int16"]
     return min((r for r in found if r["method"] == "vademecum"), key=lambda r: r["error"])
 
 
-def _beside_table(rows: list[dict[str, Value]], vademecum: Vademecum) -> dict[str, float]:
+def _beside_table(rows: list[Row], vademecum: Vademecum) -> dict[str, float]:
     """The best error in the dense table's time, all vertices shown, and the memory over its own.
 
     Both hold what shows the displacement and what contact needs, without the tip field.
@@ -182,25 +195,13 @@ def _beside_table(rows: list[dict[str, Value]], vademecum: Vademecum) -> dict[st
     }
 
 
-def _sentence(rows: list[dict[str, Value]], summary: dict[str, float], name: str) -> str:
-    return (
-        f"{name}: a step that shows all {summary['vertices']:.0f} vertices takes "
-        f"{summary['step_p50_us']:.0f} us and is within {summary['l2_95']:.1%} for 95 % of unseen "
-        f"touches, its force within {summary['force_95']:.1%}; promised errors held for "
-        f"{summary['promise_kept_fraction']:.1%} of fresh loads, the error said with a force "
-        f"covered {summary['force_error_coverage']:.1%} of contacts"
-    )
-
-
 # --- Plots -----------------------------------------------------------------------------------
 
 _COLOURS = {"int8": "#0072B2", "int16": "#009E73", "float32": "#CC79A7"}  # Okabe and Ito
 _QUANTITIES = {"mesh": "mesh, when refined (time of a build)", "grid": "grid (time of a level set)"}
 
 
-def _panels(
-    rows: list[dict[str, Value]], contacts: ForceErrors, summary: dict[str, float]
-) -> tuple[Panel, ...]:
+def _panels(rows: list[Row], contacts: ForceErrors, summary: dict[str, float]) -> tuple[Panel, ...]:
     return (
         Panel("online", _online_sentence(rows), partial(_online, rows, "volume")),
         Panel(
@@ -227,7 +228,7 @@ def _panels(
     )
 
 
-def _online_sentence(rows: list[dict[str, Value]]) -> str:
+def _online_sentence(rows: list[Row]) -> str:
     volume = [row for row in rows if row.get("cloud") == "volume"]
     front = [row for row in volume if row["front"]]
     of_bytes = sum(row.get("precision") == "int8" for row in front)
@@ -242,7 +243,7 @@ def _online_sentence(rows: list[dict[str, Value]]) -> str:
     )
 
 
-def _offline_sentence(rows: list[dict[str, Value]]) -> str:
+def _offline_sentence(rows: list[Row]) -> str:
     meshes = [row for row in rows if row["stage"] == "mesh"]
     finest = min((row for row in rows if row["stage"] == "grid"), key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
     least, most = _ends([float(row["error"]) for row in meshes])  # type: ignore[arg-type]
@@ -255,7 +256,7 @@ def _offline_sentence(rows: list[dict[str, Value]]) -> str:
     )
 
 
-def _load_sentence(rows: list[dict[str, Value]]) -> str:
+def _load_sentence(rows: list[Row]) -> str:
     mine = [row for row in rows if row["stage"] == "loads"]
     (solved,), projected = _of(mine, "all solved"), _of(mine, "projected")
     last = min(projected, key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
@@ -266,7 +267,7 @@ def _load_sentence(rows: list[dict[str, Value]]) -> str:
     )
 
 
-def _shape_sentence(rows: list[dict[str, Value]]) -> str:
+def _shape_sentence(rows: list[Row]) -> str:
     shapes = sorted((r for r in rows if r["stage"] == "shape"), key=lambda r: r["error"])  # type: ignore[arg-type,return-value]
     (nearest,) = _of(shapes, "nearest neighbour")
     return (
@@ -276,7 +277,7 @@ def _shape_sentence(rows: list[dict[str, Value]]) -> str:
     )
 
 
-def _patient_sentence(rows: list[dict[str, Value]]) -> str:
+def _patient_sentence(rows: list[Row]) -> str:
     patients = [row for row in rows if row["stage"] == "patient"]
     least, most = _ends([float(r["error"]) for r in _of(patients, "interpolated")])  # type: ignore[arg-type]
     (reduced,), (solved,) = _of(patients, "reduced"), _of(patients, "solved")
@@ -296,15 +297,15 @@ def _ratio(one: dict[str, Any], other: dict[str, Any], key: str) -> float:
     return float(one[key]) / float(other[key])
 
 
-def _online(rows: list[dict[str, Value]], cloud: str, axes: Axes) -> None:
+def _online(rows: list[Row], cloud: str, axes: Axes) -> None:
     mine = [r for r in rows if r.get("cloud") == cloud]
     for precision, colour in _COLOURS.items():
         some = [r for r in _of(mine, "vademecum") if r["precision"] == precision]
         _scatter(axes, some, "p50_us", precision, s=22, c=colour, alpha=0.8)
     front = sorted((r for r in mine if r["front"]), key=lambda r: r["p50_us"])  # type: ignore[arg-type,return-value]
-    axes.plot(_numbers(front, "p50_us"), _numbers(front, "error"), "k-", lw=1, label="front")
+    axes.plot(column(front, "p50_us"), column(front, "error"), "k-", lw=1, label="front")
     best = [r for r in mine if r["method"] == "SVD optimum"]
-    axes.plot(_numbers(best, "p50_us"), _numbers(best, "error"), "x--", c="#D55E00", lw=1)
+    axes.plot(column(best, "p50_us"), column(best, "error"), "x--", c="#D55E00", lw=1)
     if best:
         axes.plot([], [], "x--", c="#D55E00", label="SVD optimum, one basis for all places")
     _scatter(axes, _of(mine, "dense table"), "p50_us", "dense table", marker="D", s=60, c="#E69F00")
@@ -332,18 +333,18 @@ def _force(contacts: ForceErrors, axes: Axes) -> None:
     axes.set_title("error said with a force")
 
 
-def _effects(rows: list[dict[str, Value]], axes: Axes) -> None:
+def _effects(rows: list[Row], axes: Axes) -> None:
     mine = [r for r in rows if r["stage"] == "effects"]
     names = [str(r["method"]) for r in mine]
-    axes.barh(names, _numbers(mine, "p99_us"), color="#56B4E9", label="p99")
-    axes.barh(names, _numbers(mine, "p50_us"), color="#0072B2", label="median")
+    axes.barh(names, column(mine, "p99_us"), color="#56B4E9", label="p99")
+    axes.barh(names, column(mine, "p50_us"), color="#0072B2", label="median")
     axes.invert_yaxis()
     axes.set_xlabel("time of a step [us]")
     axes.legend(loc="upper right", fontsize=8)
     axes.set_title("cost of effects")
 
 
-def _offline(rows: list[dict[str, Value]], stages: tuple[str, ...], axes: Axes) -> None:
+def _offline(rows: list[Row], stages: tuple[str, ...], axes: Axes) -> None:
     colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
     mine = [r for r in rows if r["stage"] in stages]
     for colour, (stage, method) in zip(
@@ -351,7 +352,7 @@ def _offline(rows: list[dict[str, Value]], stages: tuple[str, ...], axes: Axes) 
     ):
         some = [r for r in mine if (r["stage"], r["method"]) == (stage, method)]
         some.sort(key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
-        seconds, errors = _numbers(some, "cpu_seconds"), _numbers(some, "error")
+        seconds, errors = column(some, "cpu_seconds"), column(some, "error")
         label = method if len(stages) == 1 else _QUANTITIES[str(stage)]
         axes.plot(seconds, errors, "o-" if len(some) > 1 else "o", c=colour, label=label)
         for k, row in enumerate(some):
@@ -364,26 +365,20 @@ def _offline(rows: list[dict[str, Value]], stages: tuple[str, ...], axes: Axes) 
                 fontsize=7,
             )
         if stage == "mesh":
-            own = _numbers(some, "vademecum_error")
+            own = column(some, "vademecum_error")
             axes.plot(seconds, own, "s--", c=colour, label="vademecum, on the same mesh")
     axes.margins(x=0.15)
     _logarithmic(axes, "CPU time [s]", "error [-]")
     axes.set_title(" and ".join(stages))
 
 
-def _numbers(rows: list[dict[str, Value]], key: str) -> list[float]:
-    return [float(row[key]) for row in rows]  # type: ignore[arg-type]
+def _of(rows: list[Row], method: str) -> list[Row]:
+    return where(rows, method=method)
 
 
-def _of(rows: list[dict[str, Value]], method: str) -> list[dict[str, Value]]:
-    return [row for row in rows if row["method"] == method]
-
-
-def _scatter(
-    axes: Axes, rows: list[dict[str, Value]], key: str, label: str | None, **style: Any
-) -> None:
+def _scatter(axes: Axes, rows: list[Row], key: str, label: str | None, **style: Any) -> None:
     if rows:
-        axes.scatter(_numbers(rows, key), _numbers(rows, "error"), label=label, **style)
+        axes.scatter(column(rows, key), column(rows, "error"), label=label, **style)
 
 
 def _logarithmic(axes: Axes, x: str, y: str) -> None:
@@ -393,9 +388,3 @@ def _logarithmic(axes: Axes, x: str, y: str) -> None:
     axes.set_ylabel(y)
     axes.grid(True, which="both", lw=0.3)
     axes.legend(fontsize=7)
-
-
-def _overview(panels: tuple[Panel, ...], figure: Figure) -> None:
-    shown = (panels[0], panels[2], panels[3])
-    for axes, panel in zip(figure.subplots(1, 3, width_ratios=(5, 3, 3)), shown, strict=True):
-        panel.draw(axes)

@@ -8,18 +8,17 @@ the organ and the sizes and returns a :class:`Section`; the study puts them side
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.studies.certainty_bands import bands_section
 from avatar_core.studies.certainty_calibration import calibration_section
 from avatar_core.studies.certainty_registration import registration_section
-from avatar_core.studies.certainty_section import FULL, QUICK, CertaintySettings, Section
+from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.certainty_supports import supports_section
 from avatar_core.studies.report import Panel, write_report
 from avatar_core.studies.shapes import read_liver
-from avatar_core.studies.study import ProgressBar, Study
+from avatar_core.studies.study import ProgressBar, Run, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,34 +33,54 @@ _IN_ROW = 3  # panels of the picture
 N_STAGES = 7  # of the progress bar, over all sections
 
 
-def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
-    """The study of LiTS-4, and its page."""
-    return study(read_liver(surfaces, "LiTS-4"), QUICK if quick else FULL, folder)
+class CertaintyStudy(Study[CertaintySettings]):
+    """All sections on LiTS-4, on one page."""
 
-
-def study(surface: SurfaceMesh, settings: CertaintySettings, folder: Path) -> Study:
-    """All sections; writes ``certainty.html`` and its pictures."""
-    with ProgressBar(N_STAGES) as bar:
-        sections = [section(surface, settings, bar) for section in SECTIONS]
-    summary = {key: value for section in sections for key, value in section.summary.items()}
-    rows = tuple({"section": s.name, **row} for s in sections for row in s.rows)
-    panels = [panel for section in sections for panel in section.panels]
-    folder.mkdir(parents=True, exist_ok=True)
-    page = write_report(folder, "certainty", f"Certainty: {surface.name}", summary, panels, rows)
-    return Study(
-        name="certainty",
-        sentence=" ".join(section.sentence for section in sections),
-        summary=summary,
-        rows=rows,
-        paper={},
-        draw=lambda figure: _draw(figure, panels),
-        notices=(*(n for section in sections for n in section.notices), f"page: {page}"),
+    name = "certainty"
+    full = CertaintySettings()
+    quick = CertaintySettings(
+        n_vertices=700,
+        n_values=4,
+        n_loads=6,
+        n_draws=40,
+        n_places=2,
+        n_trials=12,
+        n_registrations=1,
     )
 
+    def measure(self, run: Run[CertaintySettings]) -> None:
+        surface = read_liver(run.surfaces, "LiTS-4")
+        with ProgressBar(N_STAGES) as bar:
+            sections = [section(surface, run.settings, bar) for section in SECTIONS]
+        run.kept |= {"organ": surface.name, "sections": sections}
+        for section in sections:
+            run.rows += [{"section": section.name, **row} for row in section.rows]
+            run.notices += section.notices
 
-def _draw(figure: Figure, panels: list[Panel]) -> None:
-    """Panels in rows of three; the sentence above them takes two inches."""
-    n_rows = -(-len(panels) // _IN_ROW)
-    figure.set_size_inches(15.0, 2.0 + 4.5 * n_rows)
-    for k, panel in enumerate(panels):
-        panel.draw(figure.add_subplot(n_rows, _IN_ROW, k + 1))
+    def summary(self, run: Run[CertaintySettings]) -> dict[str, float]:
+        sections: list[Section] = run.kept["sections"]
+        return {key: value for section in sections for key, value in section.summary.items()}
+
+    def sentence(self, run: Run[CertaintySettings]) -> str:
+        return " ".join(section.sentence for section in run.kept["sections"])
+
+    def report(self, run: Run[CertaintySettings]) -> None:
+        """Write ``certainty.html`` and its pictures."""
+        title = f"Certainty: {run.kept['organ']}"
+        page = write_report(run.folder, self.name, title, run.summary, _panels(run), run.rows)
+        run.notices.append(f"page: {page}")
+
+    def draw(self, figure: Figure, run: Run[CertaintySettings]) -> None:
+        """Panels in rows of three; the sentence above them takes two inches."""
+        panels = _panels(run)
+        n_rows = -(-len(panels) // _IN_ROW)
+        figure.set_size_inches(15.0, 2.0 + 4.5 * n_rows)
+        for k, panel in enumerate(panels):
+            panel.draw(figure.add_subplot(n_rows, _IN_ROW, k + 1))
+
+
+STUDY = CertaintyStudy()
+
+
+def _panels(run: Run[CertaintySettings]) -> list[Panel]:
+    return [panel for section in run.kept["sections"] for panel in section.panels]

@@ -33,19 +33,13 @@ class CertaintySettings:
     n_registrations: int = 4
 
 
-FULL = CertaintySettings()
-QUICK = CertaintySettings(
-    n_vertices=700, n_values=4, n_loads=6, n_draws=40, n_places=2, n_trials=12, n_registrations=1
-)
-
-
 @dataclass(frozen=True, eq=False)
 class Section:
     """One question of the study and its answer.
 
     name : of its rows; the keys of its summary begin with it
     sentence : the finding, in one sentence
-    summary, rows : as of :class:`avatar_core.studies.study.Study`
+    summary, rows : as of :class:`avatar_core.studies.study.Run`
     panels : plots, each with its own sentence
     notices : what was done differently, or found on the way, one line each
     """

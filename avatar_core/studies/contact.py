@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,14 +30,13 @@ from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, contacts_at
 from avatar_core.offline.rule import BuildRule
 from avatar_core.studies.shapes import DEFAULT_FOLDER
-from avatar_core.studies.study import Study, Value, follow
+from avatar_core.studies.study import Row, Run, Study, follow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 LIVERS = ("LiTS-1", "LiTS-50", "Amos-052", "Amos-086")  # not those of the calibration
-_SHOWN = ("drawn", "ridge", "hollow")
 
 
 @dataclass(frozen=True)
@@ -52,31 +50,58 @@ class ContactSettings:
     options: OrganOptions = field(default_factory=OrganOptions)
 
 
-QUICK = ContactSettings(
-    livers=LIVERS[:1],
-    n_places=3,
-    options=OrganOptions(rule=BuildRule(max_modes=60), n_certified=40),
-)
+class ContactStudy(Study[ContactSettings]):
+    """One row for each contact; the folder must hold the livers by their names."""
 
-
-def run(surfaces: Path | None, quick: bool, output: Path) -> Study:
-    """The study; ``surfaces`` is the folder of the livers."""
-    settings = QUICK if quick else ContactSettings()
-    folder = surfaces or DEFAULT_FOLDER
-    livers = [read_surface(folder / f"{name}.obj") for name in settings.livers]
-    notices: list[str] = []
-    found = {liver.name: contacts_of(liver, settings, notices) for liver in livers}
-    contacts = [contact for several in found.values() for contact in several]
-    summary = {**summary_of(contacts), "reference_vs_sneddon": reference_error()}
-    return Study(
-        "contact",
-        _sentence(summary, contacts),
-        summary,
-        tuple(_row(name, contact) for name, several in found.items() for contact in several),
-        {},
-        lambda figure: _draw(figure, found),
-        tuple(notices),
+    name = "contact"
+    full = ContactSettings()
+    quick = ContactSettings(
+        livers=LIVERS[:1],
+        n_places=3,
+        options=OrganOptions(rule=BuildRule(max_modes=60), n_certified=40),
     )
+
+    def measure(self, run: Run[ContactSettings]) -> None:
+        folder = run.surfaces or DEFAULT_FOLDER
+        livers = [read_surface(folder / f"{name}.obj") for name in run.settings.livers]
+        contacts: list[SiteContact] = []
+        for liver in livers:
+            found = contacts_of(liver, run.settings, run.notices)
+            contacts += found
+            for contact in found:
+                run.add(_row(liver.name, contact))
+        run.kept["contacts"] = contacts
+
+    def summary(self, run: Run[ContactSettings]) -> dict[str, float]:
+        return {**summary_of(run.kept["contacts"]), "reference_vs_sneddon": reference_error()}
+
+    def sentence(self, run: Run[ContactSettings]) -> str:
+        summary = run.summary
+        return (
+            f"Of {len(run.rows)} resolved contacts the force misses {summary['force_mean']:.1%} in "
+            f"the mean, 95 % of them by less than {summary['force_p95']:.1%}, the worst by "
+            f"{summary['force_worst']:.1%}; the patch alone misses {summary['patch_mean']:.0%}, "
+            f"Hertz on a half-space {summary['hertz_mean']:.0%}. The error that is said covers "
+            f"{summary['coverage']:.0%}."
+        )
+
+    def draw(self, figure: Figure, run: Run[ContactSettings]) -> None:
+        left, right = figure.subplots(1, 2)
+        contacts: list[SiteContact] = run.kept["contacts"]
+        _draw_depths(left, contacts)
+        colours = {"drawn": "steelblue", "ridge": "crimson", "hollow": "seagreen"}
+        for kind, colour in colours.items():
+            own = [contact for contact in contacts if contact.site.kind == kind]
+            truth = [contact.truth for contact in own]
+            ratio = [contact.force / contact.truth for contact in own]
+            right.semilogx(truth, ratio, "o", ms=3, color=colour, label=kind)
+        right.axhspan(0.9, 1.1, color="gray", alpha=0.15)
+        right.set(xlabel="resolved force [N]", ylabel="force / resolved force")
+        right.set_title("all contacts; grey: within 10 %")
+        right.legend()
+
+
+STUDY = ContactStudy()
 
 
 def contacts_of(
@@ -137,7 +162,7 @@ def summary_of(contacts: Sequence[SiteContact]) -> dict[str, float]:
     }
 
 
-def _row(name: str, contact: SiteContact) -> dict[str, Value]:
+def _row(name: str, contact: SiteContact) -> Row:
     site = contact.site
     return {
         "liver": name,
@@ -154,32 +179,6 @@ def _row(name: str, contact: SiteContact) -> dict[str, Value]:
         "hertz_n": contact.hertz,
         "far_l2": contact.far_l2,
     }
-
-
-def _sentence(summary: dict[str, float], contacts: Sequence[SiteContact]) -> str:
-    return (
-        f"Of {len(contacts)} resolved contacts the force misses {summary['force_mean']:.1%} in the "
-        f"mean, 95 % of them by less than {summary['force_p95']:.1%}, the worst by "
-        f"{summary['force_worst']:.1%}; the patch alone misses {summary['patch_mean']:.0%}, Hertz "
-        f"on a half-space {summary['hertz_mean']:.0%}. The error that is said covers "
-        f"{summary['coverage']:.0%}."
-    )
-
-
-def _draw(figure: Figure, found: dict[str, list[SiteContact]]) -> None:
-    left, right = figure.subplots(1, 2)
-    contacts = [contact for several in found.values() for contact in several]
-    _draw_depths(left, contacts)
-    colours = {"drawn": "steelblue", "ridge": "crimson", "hollow": "seagreen"}
-    for kind in _SHOWN:
-        own = [contact for contact in contacts if contact.site.kind == kind]
-        truth = [contact.truth for contact in own]
-        ratio = [contact.force / contact.truth for contact in own]
-        right.semilogx(truth, ratio, "o", ms=3, color=colours[kind], label=kind)
-    right.axhspan(0.9, 1.1, color="gray", alpha=0.15)
-    right.set(xlabel="resolved force [N]", ylabel="force / resolved force")
-    right.set_title("all contacts; grey: within 10 %")
-    right.legend()
 
 
 def _draw_depths(axes: Axes, contacts: Sequence[SiteContact]) -> None:

@@ -7,10 +7,9 @@ elements on the same mesh.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -32,14 +31,13 @@ from avatar_core.offline.rule import BuildRule, Progress
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.studies.bench.methods import time_steps
 from avatar_core.studies.shapes import DEFAULT_FOLDER, read_liver
-from avatar_core.studies.study import ProgressBar, Study, Value
+from avatar_core.studies.study import ProgressBar, Row, Run, Study, column, label, where
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PAPER: dict[str, Value] = {"large_build_cpu_seconds": "3 to 4 days"}
 TUMOUR_FOLDER = DEFAULT_FOLDER.parent / "tumour"
 TUMOUR_AXES = "LPS"  # as they lie against the phantom; the files do not say
 RANKS = (40, 60, 100)  # modes at a place at most
@@ -60,10 +58,6 @@ class CoordinatesSettings:
     patch_radius: float | None = None
 
 
-FULL = CoordinatesSettings()
-QUICK = CoordinatesSettings(1000, 48, 3, 1)
-
-
 @dataclass(frozen=True, eq=False)
 class Organ:
     """A meshed organ, ready for a build."""
@@ -74,39 +68,100 @@ class Organ:
     elasticity: Elasticity
 
 
-def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
-    """The study: LiTS-4 and LiTS-23, and the liver with real tumours if it is there."""
-    one, other = read_liver(surfaces, "LiTS-4"), read_liver(surfaces, "LiTS-23")
-    return study(one, other, QUICK if quick else FULL)
+class CoordinatesStudy(Study[CoordinatesSettings]):
+    """All coordinates on LiTS-4, Poisson's ratio on LiTS-23 too, real tumours if they are there."""
+
+    name = "coordinates"
+    full = CoordinatesSettings()
+    quick = CoordinatesSettings(1000, 48, 3, 1)
+    paper: ClassVar = {"large_build_cpu_seconds": "3 to 4 days"}
+
+    def measure(self, run: Run[CoordinatesSettings]) -> None:
+        settings = run.settings
+        one, other = (read_liver(run.surfaces, name) for name in ("LiTS-4", "LiTS-23"))
+        run.notices.append(f"{one.name} and {other.name}")
+        poisson, incompressible = ((Coordinate("poisson", 0.40, most),) for most in (0.49, 0.499))
+        with ProgressBar(6) as bar:
+            for surface in (one, other) if one.name != other.name else (one,):
+                progress = bar.begin(f"Poisson's ratio, {surface.name}")
+                organ = _organ(surface, settings)
+                run.rows += _parametric(organ, "poisson", poisson, settings, progress)
+            progress = bar.begin("towards incompressibility")
+            organ = _organ(one, settings, "Taylor-Hood")
+            run.rows += _parametric(organ, "incompressible", incompressible, settings, progress)
+            run.rows += _tumour_rows(settings, bar.begin("tumour"))
+            large = _organ(one, settings)
+            run.rows += _large(large, "neo-hookean", settings, bar.begin("neo-Hookean"))
+            progress = bar.begin("St Venant-Kirchhoff")
+            run.rows += _large(large, "st-venant-kirchhoff", settings, progress)
+
+    def summary(self, run: Run[CoordinatesSettings]) -> dict[str, float]:
+        """Worst of both livers where there are two."""
+        summary: dict[str, float] = {}
+        for name in ("poisson", "incompressible", "tumour"):
+            best = where(run.rows, coordinate=name, modes=RANKS[-1])
+            for key, source in (
+                ("mean", "l2_mean"),
+                ("worst", "l2_worst"),
+                ("contact_mean", "contact_mean"),
+                ("build_cpu_seconds", "build_cpu_seconds"),
+            ):
+                summary[f"{name}_{key}"] = float(max(column(best, source), default=np.nan))
+        for name, key in (("neo-hookean", "large"), ("st-venant-kirchhoff", "stvk")):
+            (row,) = where(run.rows, coordinate=f"large, {name}")
+            for ours, theirs in (
+                ("mean", "l2_mean"),
+                ("worst", "l2_worst"),
+                ("contact_mean", "contact_mean"),
+                ("depth", "depth"),
+                ("build_cpu_seconds", "build_cpu_seconds"),
+            ):
+                summary[f"{key}_{ours}"] = float(row[theirs])  # type: ignore[arg-type]
+            if "step_over_linear" in row:
+                summary["large_step_over_linear"] = float(row["step_over_linear"])  # type: ignore[arg-type]
+        within = where(run.rows, coordinate="push, neo-hookean", within=True)
+        depth = column(within, "depth")
+        deep = (depth > 0.0125) & (depth < 0.0175)
+        ratio = (column(within, "linear_l2") / column(within, "l2"))[deep]
+        summary["linear_over_large_15mm"] = _mean(ratio)
+        for name in COMBINATIONS:
+            found = where(run.rows, combination=name)
+            for key in ("contact", "linear_contact"):
+                summary[f"{name.replace(' ', '_')}_{key}_mean"] = _mean(column(found, key))
+        return summary
+
+    def sentence(self, run: Run[CoordinatesSettings]) -> str:
+        summary = run.summary
+        return (
+            f"Unseen loads and values: Poisson's ratio 0.40 to 0.49 {summary['poisson_mean']:.1%}, "
+            f"to 0.499 {summary['incompressible_mean']:.1%}, with a tumour's contrast "
+            f"{summary['tumour_mean']:.1%}; neo-Hookean pushes {summary['large_mean']:.1%} (linear "
+            f"{summary['linear_over_large_15mm']:.1f} times as wrong at 15 mm)."
+        )
+
+    def draw(self, figure: Figure, run: Run[CoordinatesSettings]) -> None:
+        left, right = figure.subplots(1, 2)
+        for name, organ in sorted(
+            (kind, str(row["organ"]))
+            for kind in ("poisson", "incompressible", "tumour")
+            for row in where(run.rows, coordinate=kind, modes=RANKS[0])
+        ):
+            some = where(run.rows, coordinate=name, organ=organ)
+            modes, error = column(some, "modes"), column(some, "l2_mean")
+            left.semilogy(modes, error, "o-", ms=3, label=f"{name}, {organ}")
+        label(left, "modes", "mean relative L2 error [-]", "unseen loads and values")
+        pushes = where(run.rows, coordinate="push, neo-hookean")
+        for key, text, colour in (
+            ("linear_l2", "linear", "tab:gray"),
+            ("l2", "with magnitude", "crimson"),
+        ):
+            depth, error = 1e3 * column(pushes, "depth"), column(pushes, key)
+            right.semilogy(depth, error, ".", color=colour, label=text)
+        y = "relative L2 error of displacement [-]"
+        label(right, "depth of the push [mm]", y, "neo-Hookean pushes, unseen")
 
 
-def study(one: SurfaceMesh, other: SurfaceMesh, settings: CoordinatesSettings) -> Study:
-    """All coordinates on the first organ, Poisson's ratio on both."""
-    poisson = (Coordinate("poisson", 0.40, 0.49),)
-    incompressible = (Coordinate("poisson", 0.40, 0.499),)
-    rows: list[dict[str, Value]] = []
-    with ProgressBar(6) as bar:
-        for surface in (one, other) if one.name != other.name else (one,):
-            progress = bar.begin(f"Poisson's ratio, {surface.name}")
-            organ = _organ(surface, settings)
-            rows += _parametric(organ, "poisson", poisson, settings, progress)
-        progress = bar.begin("towards incompressibility")
-        organ = _organ(one, settings, "Taylor-Hood")
-        rows += _parametric(organ, "incompressible", incompressible, settings, progress)
-        rows += _tumour_rows(settings, bar.begin("tumour"))
-        large = _organ(one, settings)
-        rows += _large(large, "neo-hookean", settings, bar.begin("neo-Hookean"))
-        rows += _large(large, "st-venant-kirchhoff", settings, bar.begin("St Venant-Kirchhoff"))
-    summary = _summary(rows)
-    return Study(
-        name="coordinates",
-        sentence=_sentence(summary),
-        summary=summary,
-        rows=tuple(rows),
-        paper=PAPER,
-        draw=lambda figure: _draw(figure, rows),
-        notices=(f"{one.name} and {other.name}",),
-    )
+STUDY = CoordinatesStudy()
 
 
 def _organ(
@@ -136,7 +191,7 @@ def _parametric(
     coordinates: tuple[Coordinate, ...],
     settings: CoordinatesSettings,
     progress: Progress,
-) -> list[dict[str, Value]]:
+) -> list[Row]:
     """Errors of the default against modes, and the time of its build."""
     start = time.process_time()
     vademecum = build_parametric_vademecum(
@@ -181,7 +236,7 @@ def _with_modes(vademecum: Vademecum, modes: int) -> Vademecum:
     return replace(vademecum, regional=regional.truncated(most), parametric=fewer)
 
 
-def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[dict[str, Value]]:
+def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[Row]:
     """Poisson's ratio and the contrast of real tumours together."""
     liver, tumour = TUMOUR_FOLDER / "liver.vtk", TUMOUR_FOLDER / "liver_tumours.vtk"
     if not liver.is_file():
@@ -193,7 +248,7 @@ def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[dict
 
 def _row(
     name: str, organ: Organ, method: str, modes: int, found: dict[str, float], seconds: float
-) -> dict[str, Value]:
+) -> Row:
     return {
         "coordinate": name,
         "organ": organ.outline.name,
@@ -209,7 +264,7 @@ def _row(
 
 def _large(
     organ: Organ, material: LargeMaterial, settings: CoordinatesSettings, progress: Progress
-) -> list[dict[str, Value]]:
+) -> list[Row]:
     """One material: its summary, every push, and combinations of neo-Hookean ones."""
     start = time.process_time()
     linear = build_vademecum(
@@ -230,7 +285,7 @@ def _large(
         progress("push", fraction, error)
 
     certificate, found = certify_large(bent, problem, settings.n_pushed, seed=1, progress=pushed)
-    summary: dict[str, Value] = {
+    summary: Row = {
         "coordinate": f"large, {material}",
         "organ": organ.outline.name,
         "method": "default",
@@ -238,7 +293,7 @@ def _large(
         "build_cpu_seconds": seconds,
         **vars(certificate),
     }
-    rows: list[dict[str, Value]] = [summary]
+    rows: list[Row] = [summary]
     rows += [{"coordinate": f"push, {material}", **vars(row)} for row in found]
     if material == "neo-hookean":
         summary["step_over_linear"] = _pace(linear, bent)
@@ -258,86 +313,5 @@ def _pace(linear: Vademecum, bent: Vademecum) -> float:
     return times[1] / times[0]
 
 
-# --- summary ------------------------------------------------------------------------------------
-
-
-def _summary(rows: Sequence[dict[str, Value]]) -> dict[str, float]:
-    """The study's keys; worst of both livers where there are two."""
-    summary: dict[str, float] = {}
-    for name in ("poisson", "incompressible", "tumour"):
-        best = [row for row in rows if (row["coordinate"], row.get("modes")) == (name, RANKS[-1])]
-        for key, source in (("mean", "l2_mean"), ("worst", "l2_worst"), ("contact_mean",) * 2):
-            values = [float(row[source]) for row in best]  # type: ignore[arg-type]
-            summary[f"{name}_{key}"] = max(values, default=float("nan"))
-        seconds = [float(row["build_cpu_seconds"]) for row in best]  # type: ignore[arg-type]
-        summary[f"{name}_build_cpu_seconds"] = max(seconds, default=float("nan"))
-    for name, key in (("neo-hookean", "large"), ("st-venant-kirchhoff", "stvk")):
-        (row,) = (row for row in rows if row["coordinate"] == f"large, {name}")
-        for ours, theirs in (
-            ("mean", "l2_mean"),
-            ("worst", "l2_worst"),
-            ("contact_mean", "contact_mean"),
-            ("depth", "depth"),
-            ("build_cpu_seconds", "build_cpu_seconds"),
-        ):
-            summary[f"{key}_{ours}"] = float(row[theirs])  # type: ignore[arg-type]
-        if "step_over_linear" in row:
-            summary["large_step_over_linear"] = float(row["step_over_linear"])  # type: ignore[arg-type]
-    deep = [
-        row
-        for row in rows
-        if row["coordinate"] == "push, neo-hookean"
-        and row["within"]
-        and 0.0125 < float(row["depth"]) < 0.0175  # type: ignore[arg-type]
-    ]
-    ratio = [float(row["linear_l2"]) / float(row["l2"]) for row in deep]  # type: ignore[arg-type]
-    summary["linear_over_large_15mm"] = float(np.mean(ratio)) if ratio else float("nan")
-    for name in COMBINATIONS:
-        found = [row for row in rows if row.get("combination") == name]
-        for key in ("contact", "linear_contact"):
-            values = [float(row[key]) for row in found]  # type: ignore[arg-type]
-            mean = float(np.mean(values)) if values else float("nan")
-            summary[f"{name.replace(' ', '_')}_{key}_mean"] = mean
-    return summary
-
-
-def _sentence(summary: dict[str, float]) -> str:
-    return (
-        f"Unseen loads and values: Poisson's ratio 0.40 to 0.49 {summary['poisson_mean']:.1%}, to "
-        f"0.499 {summary['incompressible_mean']:.1%}, with a tumour's contrast "
-        f"{summary['tumour_mean']:.1%}; neo-Hookean pushes {summary['large_mean']:.1%} (linear "
-        f"{summary['linear_over_large_15mm']:.1f} times as wrong at 15 mm)."
-    )
-
-
-def _draw(figure: Figure, rows: Sequence[dict[str, Value]]) -> None:
-    left, right = figure.subplots(1, 2)
-    _draw_modes(
-        left, [row for row in rows if row["coordinate"] in ("poisson", "incompressible", "tumour")]
-    )
-    pushes = [row for row in rows if row["coordinate"] == "push, neo-hookean"]
-    for key, text, colour in (
-        ("linear_l2", "linear", "tab:gray"),
-        ("l2", "with magnitude", "crimson"),
-    ):
-        depth = [1e3 * float(row["depth"]) for row in pushes]  # type: ignore[arg-type]
-        right.semilogy(depth, [float(row[key]) for row in pushes], ".", color=colour, label=text)  # type: ignore[arg-type]
-    right.set(xlabel="depth of the push [mm]", ylabel="relative L2 error of displacement [-]")
-    right.set_title("neo-Hookean pushes, unseen", fontsize=9)
-    right.legend(fontsize=7)
-    right.grid(which="both", alpha=0.3)
-
-
-def _draw_modes(axis, rows: Sequence[dict[str, Value]]) -> None:  # type: ignore[no-untyped-def]
-    for name, organ in sorted({(str(row["coordinate"]), str(row["organ"])) for row in rows}):
-        some = [row for row in rows if (row["coordinate"], row["organ"]) == (name, organ)]
-        axis.semilogy(
-            [row["modes"] for row in some],
-            [row["l2_mean"] for row in some],
-            "o-",
-            ms=3,
-            label=f"{name}, {organ}",
-        )
-    axis.set(xlabel="modes", ylabel="mean relative L2 error [-]", title="unseen loads and values")
-    axis.grid(which="both", alpha=0.3)
-    axis.legend(fontsize=6, loc="best")
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else float("nan")

@@ -17,11 +17,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avatar_core.common.processes import repeatable
 from avatar_core.fem.patch_loads import load_surface
@@ -31,19 +29,16 @@ from avatar_core.geometry.point_location import closest_points
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
-from avatar_core.studies.shapes import Livers, read_livers
-from avatar_core.studies.study import Study, Value, follow, mean_and_worst
+from avatar_core.studies.shapes import FloatArray, read_livers
+from avatar_core.studies.study import Row, Run, Study, column, follow, label, mean_and_worst
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-FloatArray = NDArray[np.float64]
 
 SPACINGS = (10e-3, 5e-3, 2.5e-3, 1e-3)  # [m]
 FINEST_REMESHED = 2e-3  # fTetWild needs minutes for a marching-cubes surface finer than this [m]
 BAND = 3.0  # spacings
 OTHER_MESH = 0.85  # vertices of the second mesh of the same surface, relative
-PAPER: dict[str, Value] = {"displacement_error_1mm": 0.09}
 
 
 @dataclass(frozen=True)
@@ -62,10 +57,6 @@ class GridSettings:
     seed: int = 0
 
 
-FULL = GridSettings()
-QUICK = GridSettings(n_livers=6, n_fine=1, n_displaced=1, n_vertices=800, n_loads=6, remeshed=False)
-
-
 @dataclass(frozen=True, eq=False)
 class Reference:
     """A liver on its own mesh: regions, load centres and radius [m], responses at its vertices."""
@@ -77,47 +68,100 @@ class Reference:
     responses: FloatArray
 
 
-def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
-    """The study on a folder of surfaces; None for the default one."""
-    return study(surfaces, QUICK if quick else FULL)
-
-
-@repeatable
-def study(folder: Path | None, settings: GridSettings) -> Study:
+class GridStudy(Study[GridSettings]):
     """One row for each liver and spacing, and one with h = 0 for the second mesh."""
-    livers = read_livers(folder, settings.n_livers, settings.phantoms)
-    step = max(1, len(livers.surfaces) // max(settings.n_fine, settings.n_displaced, 1))
-    rows: list[dict[str, Value]] = []
-    for i, surface in enumerate(follow(livers.surfaces, "livers")):
-        rank = i // step if i % step == 0 else len(livers.surfaces)
-        reference = reference_of(surface, settings) if rank < settings.n_displaced else None
-        if reference is not None and settings.remeshed:
-            rows.append(other_mesh_row(surface, reference, settings))
-        fine = rank < settings.n_fine
-        chosen = [h for h in settings.spacings if h > FINEST_REMESHED or fine]
-        rows += [grid_row(surface, h, reference, settings) for h in chosen]
-    return Study(
-        name="grid",
-        sentence=_sentence(summary := summarize(rows, settings), livers),
-        summary=summary,
-        rows=tuple(rows),
-        paper=PAPER,
-        draw=lambda figure: _draw(figure, rows),
-        notices=(
+
+    name = "grid"
+    full = GridSettings()
+    quick = GridSettings(
+        n_livers=6, n_fine=1, n_displaced=1, n_vertices=800, n_loads=6, remeshed=False
+    )
+    paper: ClassVar = {"displacement_error_1mm": 0.09}
+
+    @repeatable
+    def measure(self, run: Run[GridSettings]) -> None:
+        settings = run.settings
+        livers = read_livers(run.surfaces, settings.n_livers, settings.phantoms)
+        step = max(1, len(livers.surfaces) // max(settings.n_fine, settings.n_displaced, 1))
+        for i, surface in enumerate(follow(livers.surfaces, "livers")):
+            rank = i // step if i % step == 0 else len(livers.surfaces)
+            reference = reference_of(surface, settings) if rank < settings.n_displaced else None
+            if reference is not None and settings.remeshed:
+                run.add(other_mesh_row(surface, reference, settings))
+            fine = rank < settings.n_fine
+            for h in settings.spacings:
+                if h > FINEST_REMESHED or fine:
+                    run.add(grid_row(surface, h, reference, settings))
+        run.notices += [
             *livers.notices,
             "displacement_error: the field kept at grid points and read back, one mesh; "
             "remeshed_error: finite elements on a mesh of the marching-cubes surface",
-        ),
-    )
+        ]
+
+    def summary(self, run: Run[GridSettings]) -> dict[str, float]:
+        """Mean and worst of each error over the livers, for each spacing; the order."""
+        rows, spacings = run.rows, run.settings.spacings
+        summary: dict[str, float] = {}
+        for h in spacings:
+            for key in ("volume_error", "displacement_error", "distance_error", "remeshed_error"):
+                found = _values(rows, key, 1e3 * h)
+                if len(found):
+                    summary |= mean_and_worst(f"{key}_{_millimetres(h)}", found)
+        floor = _values(rows, "remeshed_error", 0.0)
+        if len(floor):
+            summary |= mean_and_worst("remeshed_error_same_surface", floor)
+        first, last = (_mean(rows, "volume_error", 1e3 * h) for h in (spacings[0], spacings[-1]))
+        summary["volume_order"] = math.log(first / last) / math.log(spacings[0] / spacings[-1])
+        return summary
+
+    def sentence(self, run: Run[GridSettings]) -> str:
+        parts = [
+            f"{run.summary[f'volume_error_{name}']:.2%} at "
+            f"{name.replace('_', '.').replace('mm', ' mm')}"
+            for name in ("5mm", "2_5mm")
+            if f"volume_error_{name}" in run.summary
+        ]
+        moved = run.summary.get("displacement_error_1mm", math.nan)
+        return (
+            f"{len({row['liver'] for row in run.rows})} livers through a level set: volume wrong "
+            f"by {', '.join(parts)}; displacements kept on a grid of 1 mm and read back wrong by "
+            f"{moved:.2%} (paper 9 %)."
+        )
+
+    def draw(self, figure: Figure, run: Run[GridSettings]) -> None:
+        left, right = figure.subplots(1, 2)
+        spacings = sorted(set(column(run.rows, "spacing_mm")) - {0.0})
+        for axes, key, text, style in (
+            (left, "volume_error", "level set", "o-"),
+            (left, "isosurface_volume_error", "marching-cubes surface", "s--"),
+            (left, "distance_error", "distance within the organ (L2)", "d:"),
+            (right, "displacement_error", "kept on the grid, read back", "o-"),
+            (right, "displacement_error_worst", "the same, worst load", "^--"),
+            (right, "remeshed_error", "on a mesh of the level set's surface", "s-"),
+        ):
+            means = [100 * _mean(run.rows, key, h) for h in spacings]
+            axes.loglog(spacings, means, style, label=text)
+        floor = 100 * _mean(run.rows, "remeshed_error", 0.0)
+        if math.isfinite(floor):
+            right.axhline(floor, color="gray", ls=":", label="on another mesh of the same surface")
+        right.plot([1.0], [9.0], "k*", ms=12, label="paper, 1 mm: 9 %")
+        for axes in (left, right):
+            axes.set_xticks(spacings, [f"{h:g}" for h in spacings])
+            axes.minorticks_off()
+        label(left, "spacing h [mm]", "relative error [%]", "shape (paper, Fig. 9d)")
+        label(right, "spacing h [mm]", "relative L2 error [%]", "displacement")
+
+
+STUDY = GridStudy()
 
 
 def grid_row(
     surface: SurfaceMesh, h: float, reference: Reference | None, settings: GridSettings
-) -> dict[str, Value]:
+) -> Row:
     """Errors of one liver at one spacing; displacements only with a reference."""
     grid = distance_grid(surface, h, padding=BAND * h, band=BAND * h)
     marched = isosurface(grid)
-    row: dict[str, Value] = {
+    row: Row = {
         "liver": surface.name,
         "spacing_mm": 1e3 * h,
         "volume_error": abs(grid.volume / surface.volume - 1.0),
@@ -133,9 +177,7 @@ def grid_row(
     return row
 
 
-def other_mesh_row(
-    surface: SurfaceMesh, reference: Reference, settings: GridSettings
-) -> dict[str, Value]:
+def other_mesh_row(surface: SurfaceMesh, reference: Reference, settings: GridSettings) -> Row:
     """Change of the displacement with another mesh of the same surface."""
     found = remeshed_errors(surface, reference, round(OTHER_MESH * settings.n_vertices))
     return {
@@ -190,76 +232,14 @@ def distance_error(
     return float(np.linalg.norm(found - exact[inside]) / np.linalg.norm(exact[inside]))
 
 
-def summarize(rows: list[dict[str, Value]], settings: GridSettings) -> dict[str, float]:
-    """Mean and worst of each error over the livers, for each spacing; the order of convergence."""
-    summary: dict[str, float] = {}
-    for h in settings.spacings:
-        for key in ("volume_error", "displacement_error", "distance_error", "remeshed_error"):
-            found = _values(rows, key, 1e3 * h)
-            if found:
-                summary |= mean_and_worst(f"{key}_{_millimetres(h)}", found)
-    if floor := _values(rows, "remeshed_error", 0.0):
-        summary |= mean_and_worst("remeshed_error_same_surface", floor)
-    ends = [
-        _mean(rows, "volume_error", 1e3 * h) for h in (settings.spacings[0], settings.spacings[-1])
-    ]
-    ratio = settings.spacings[0] / settings.spacings[-1]
-    summary["volume_order"] = math.log(ends[0] / ends[1]) / math.log(ratio)
-    return summary
-
-
 def _millimetres(h: float) -> str:
     return f"{1e3 * h:g}mm".replace(".", "_")
 
 
-def _values(rows: list[dict[str, Value]], key: str, spacing: float) -> list[float]:
-    return [
-        float(row[key])  # type: ignore[arg-type]
-        for row in rows
-        if key in row and math.isclose(float(row["spacing_mm"]), spacing)  # type: ignore[arg-type]
-    ]
+def _values(rows: list[Row], key: str, spacing: float) -> FloatArray:
+    return column([row for row in rows if math.isclose(row["spacing_mm"], spacing)], key)  # type: ignore[arg-type]
 
 
-def _mean(rows: list[dict[str, Value]], key: str, spacing: float) -> float:
+def _mean(rows: list[Row], key: str, spacing: float) -> float:
     found = _values(rows, key, spacing)
-    return float(np.mean(found)) if found else math.nan
-
-
-def _sentence(summary: dict[str, float], livers: Livers) -> str:
-    parts = [
-        f"{summary[f'volume_error_{name}']:.2%} at {name.replace('_', '.').replace('mm', ' mm')}"
-        for name in ("5mm", "2_5mm")
-        if f"volume_error_{name}" in summary
-    ]
-    moved = summary.get("displacement_error_1mm", math.nan)
-    return (
-        f"{len(livers.surfaces)} livers through a level set: volume wrong by "
-        f"{', '.join(parts)}; displacements kept on a grid of 1 mm and read back wrong by "
-        f"{moved:.2%} (paper 9 %)."
-    )
-
-
-def _draw(figure: Figure, rows: list[dict[str, Value]]) -> None:
-    left, right = figure.subplots(1, 2)
-    spacings = sorted({float(row["spacing_mm"]) for row in rows} - {0.0})  # type: ignore[arg-type]
-    for axes, key, text, style in (
-        (left, "volume_error", "level set", "o-"),
-        (left, "isosurface_volume_error", "marching-cubes surface", "s--"),
-        (left, "distance_error", "distance within the organ (L2)", "d:"),
-        (right, "displacement_error", "kept on the grid, read back", "o-"),
-        (right, "displacement_error_worst", "the same, worst load", "^--"),
-        (right, "remeshed_error", "on a mesh of the level set's surface", "s-"),
-    ):
-        means = [100 * _mean(rows, key, h) for h in spacings]
-        axes.loglog(spacings, means, style, label=text)
-    floor = 100 * _mean(rows, "remeshed_error", 0.0)
-    if math.isfinite(floor):
-        right.axhline(floor, color="gray", ls=":", label="on another mesh of the same surface")
-    right.plot([1.0], [9.0], "k*", ms=12, label="paper, 1 mm: 9 %")
-    left.set(xlabel="spacing h [mm]", ylabel="relative error [%]", title="shape (paper, Fig. 9d)")
-    right.set(xlabel="spacing h [mm]", ylabel="relative L2 error [%]", title="displacement")
-    for axes in (left, right):
-        axes.set_xticks(spacings, [f"{h:g}" for h in spacings])
-        axes.minorticks_off()
-        axes.grid(which="both", alpha=0.3)
-        axes.legend(fontsize=8)
+    return float(np.mean(found)) if len(found) else math.nan

@@ -8,11 +8,9 @@ evaluated nodewise and, as in the paper, at the points of the common grid.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avatar_core.common.processes import repeatable
 from avatar_core.fem.patch_loads import default_patch_radius, load_surface
@@ -23,13 +21,11 @@ from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.shapes.lle import CLEAR_GAP, estimate_dimension, fit, locally_linear_embedding
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
-from avatar_core.studies.shapes import PAPER_GRID, as_grid, distance_vectors, paper_box
-from avatar_core.studies.study import Study, Value, follow, mean_and_worst
+from avatar_core.studies.shapes import PAPER_GRID, FloatArray, as_grid, distance_vectors, paper_box
+from avatar_core.studies.study import Row, Run, Study, column, follow, mean_and_worst, where
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-FloatArray = NDArray[np.float64]
 
 PARAMETERS = 6
 NEIGHBORS = 12
@@ -43,7 +39,6 @@ SPECTRA: tuple[tuple[int, float], ...] = (
     (12, 1e-9),
 )
 SPECTRA += ((15, 1e-6), (20, 1e-6))
-PAPER = {"volume_error": 0.05, "displacement_grid": 0.0903, "from_gap_k12": PARAMETERS}
 
 
 @dataclass(frozen=True)
@@ -59,10 +54,6 @@ class InSilicoSettings:
     seed: int = 0
 
 
-FULL = InSilicoSettings()
-QUICK = InSilicoSettings(n_vertices=600, n_loads=8, phantom_spacing=10e-3)
-
-
 @dataclass(frozen=True, eq=False)
 class Population:
     """Livers of one mesh: distance vectors (n, D), moved meshes, responses at their vertices."""
@@ -74,40 +65,88 @@ class Population:
     responses: tuple[FloatArray, ...]
 
 
-def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
-    """The study; the livers are generated, a folder of surfaces is not used."""
-    return study(QUICK if quick else FULL)
+class InSilicoStudy(Study[InSilicoSettings]):
+    """Errors of the livers held out, then the spectrum of all; the livers are generated."""
 
-
-@repeatable
-def study(settings: InSilicoSettings) -> Study:
-    """Spectrum of all livers, then errors of those held out."""
-    livers = populate(settings)
-    spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < settings.n_base]
-    rows = held_out_rows(livers, settings)
-    base, embedding = locally_linear_embedding(livers.vectors, NEIGHBORS, 2)
-    eigenvalues = estimate_dimension(base).eigenvalues
-    flat = embedding.coordinates
-    summary = {
-        **mean_and_worst("volume_error", [row["volume_error"] for row in rows]),
-        **mean_and_worst("displacement_nodewise", [row["nodewise"] for row in rows]),
-        **mean_and_worst("displacement_grid", [row["grid"] for row in rows]),
-        "displacement_nodewise_all": float(np.mean([row["nodewise_all"] for row in rows])),
+    name = "in-silico"
+    full = InSilicoSettings()
+    quick = InSilicoSettings(n_vertices=600, n_loads=8, phantom_spacing=10e-3)
+    paper: ClassVar = {
+        "volume_error": 0.05,
+        "displacement_grid": 0.0903,
+        "from_gap_k12": PARAMETERS,
     }
-    summary["displacement_passage"] = float(np.mean([row["passage"] for row in rows]))
-    for k in (10, 12):
-        (at,) = [row for row in spectra if (row["k"], row["regularization"]) == (k, 1e-6)]
-        for key in ("gap", "from_gap", "six_stand_out"):
-            summary[f"{key}_k{k}"] = float(at[key] or 0)
-    return Study(
-        name="in-silico",
-        sentence=_sentence(summary, settings),
-        summary=summary,
-        rows=(*rows, *spectra),
-        paper=PAPER,
-        draw=lambda figure: _draw(figure, eigenvalues, flat, rows, settings),
-        notices=tuple(_spectrum_notices(spectra)),
-    )
+
+    @repeatable
+    def measure(self, run: Run[InSilicoSettings]) -> None:
+        """The embedding of all livers is kept for the picture."""
+        livers = populate(run.settings)
+        n = run.settings.n_base
+        spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < n]
+        for row in (*held_out_rows(livers, run.settings), *spectra):
+            run.add(row)
+        base, embedding = locally_linear_embedding(livers.vectors, NEIGHBORS, 2)
+        run.kept["eigenvalues"] = estimate_dimension(base).eigenvalues
+        run.kept["flat"] = embedding.coordinates
+        run.notices += _spectrum_notices(spectra)
+
+    def summary(self, run: Run[InSilicoSettings]) -> dict[str, float]:
+        def of(key: str) -> FloatArray:
+            return column(run.rows, key)
+
+        summary = {
+            **mean_and_worst("volume_error", of("volume_error")),
+            **mean_and_worst("displacement_nodewise", of("nodewise")),
+            **mean_and_worst("displacement_grid", of("grid")),
+            "displacement_nodewise_all": float(of("nodewise_all").mean()),
+            "displacement_passage": float(of("passage").mean()),
+        }
+        for k in (10, 12):
+            (at,) = where(run.rows, kind="spectrum", k=k, regularization=1e-6)
+            for key in ("gap", "from_gap", "six_stand_out"):
+                summary[f"{key}_k{k}"] = float(at[key] or 0)
+        return summary
+
+    def sentence(self, run: Run[InSilicoSettings]) -> str:
+        summary, settings = run.summary, run.settings
+        verdict = "stand out" if summary["six_stand_out_k12"] else "do not stand out"
+        other = "stand out" if summary["six_stand_out_k10"] else "do not"
+        volume, grid = summary["volume_error"], summary["displacement_grid"]
+        twelve, every = summary["displacement_nodewise"], summary["displacement_nodewise_all"]
+        return (
+            f"{settings.n_base} + {settings.n_held_out} livers by Eq. 17: volume {volume:.2%} "
+            f"wrong (paper < 5 %), displacement {twelve:.2%} nodewise ({every:.2%} with all "
+            f"neighbours) and {grid:.2%} on the grid (paper 9.03 %); six eigenvalues {verdict} for "
+            f"k = 12, {other} for k = 10."
+        )
+
+    def draw(self, figure: Figure, run: Run[InSilicoSettings]) -> None:
+        left, middle, right = figure.subplots(1, 3)
+        eigenvalues, flat = run.kept["eigenvalues"], run.kept["flat"]
+        numbers = np.arange(1, len(eigenvalues) + 1)
+        first = numbers <= PARAMETERS
+        left.semilogy(numbers[first], eigenvalues[first], "o", color="crimson", label="first six")
+        left.semilogy(numbers[~first], eigenvalues[~first], "o", color="gray", label="others")
+        left.set(xlabel="number of the eigenvalue", ylabel="eigenvalue of M [-]")
+        left.set_title(f"spectrum, k = {NEIGHBORS} (paper, Fig. 5a)")
+        left.legend()
+        n = run.settings.n_base
+        middle.plot(*flat[:n].T, "o", color="steelblue", label="base")
+        middle.plot(*flat[n:].T, "o", color="crimson", label="held out")
+        middle.set(xlabel="first coordinate [-]", ylabel="second coordinate [-]", title="embedding")
+        middle.legend()
+        place = np.arange(run.settings.n_held_out)
+        for k, (key, text) in enumerate(
+            (("volume_error", "volume"), ("nodewise", "u nodewise"), ("grid", "u on the grid"))
+        ):
+            right.bar(place + 0.27 * (k - 1), 100 * column(run.rows, key), 0.25, label=text)
+        right.set_yscale("log")
+        right.axhline(9.03, color="black", ls="--", lw=1, label="paper, displacement 9.03 %")
+        right.set(xlabel="held-out liver", ylabel="relative error [%]", title="interpolated livers")
+        right.legend(fontsize=8)
+
+
+STUDY = InSilicoStudy()
 
 
 def populate(settings: InSilicoSettings) -> Population:
@@ -130,7 +169,7 @@ def populate(settings: InSilicoSettings) -> Population:
     return Population(box, distance_vectors(moved, box), volumes, tuple(meshes), tuple(responses))
 
 
-def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> dict[str, Value]:
+def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> Row:
     """Dimension by the largest ratio of neighbouring eigenvalues, and whether the sixth leads."""
     base = fit(vectors, k, regularization=regularization)
     found = estimate_dimension(base, n_values=PARAMETERS + 8)
@@ -147,12 +186,12 @@ def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> dict[str
     }
 
 
-def held_out_rows(livers: Population, settings: InSilicoSettings) -> list[dict[str, float]]:
+def held_out_rows(livers: Population, settings: InSilicoSettings) -> list[Row]:
     """Errors of each held-out liver, interpolated among the base."""
     base = fit(livers.vectors[: settings.n_base], NEIGHBORS)
     everyone = fit(livers.vectors[: settings.n_base], settings.n_base - 1)
     held_out = range(settings.n_base, settings.n_base + settings.n_held_out)
-    rows = []
+    rows: list[Row] = []
     for i in follow(held_out, "held-out livers"):
         point = base.barycenter(livers.vectors[i])
         blend = as_grid(point.combine(livers.vectors[: settings.n_base]), livers.box)
@@ -195,20 +234,7 @@ def _passage(livers: Population, i: int, mesh: TetMesh) -> FloatArray:
     return carried((back @ interpolation_matrix(mesh, corners)).tocsr(), livers.responses[i])
 
 
-def _sentence(summary: dict[str, float], settings: InSilicoSettings) -> str:
-    verdict = "stand out" if summary["six_stand_out_k12"] else "do not stand out"
-    other = "stand out" if summary["six_stand_out_k10"] else "do not"
-    volume, grid = summary["volume_error"], summary["displacement_grid"]
-    twelve, every = summary["displacement_nodewise"], summary["displacement_nodewise_all"]
-    return (
-        f"{settings.n_base} + {settings.n_held_out} livers by Eq. 17: volume {volume:.2%} wrong "
-        f"(paper < 5 %), displacement {twelve:.2%} nodewise ({every:.2%} with all neighbours) and "
-        f"{grid:.2%} on the grid (paper 9.03 %); six eigenvalues {verdict} for k = 12, {other} for "
-        "k = 10."
-    )
-
-
-def _spectrum_notices(spectra: list[dict[str, Value]]) -> list[str]:
+def _spectrum_notices(spectra: list[Row]) -> list[str]:
     return [
         f"k = {row['k']}, regularisation {row['regularization']:g}: six eigenvalues "
         f"{'stand out' if row['six_stand_out'] else 'do NOT stand out'} (the largest step, "
@@ -216,34 +242,3 @@ def _spectrum_notices(spectra: list[dict[str, Value]]) -> list[str]:
         f"{row['from_local_pca']}"
         for row in spectra
     ]
-
-
-def _draw(
-    figure: Figure,
-    eigenvalues: FloatArray,
-    flat: FloatArray,
-    rows: list[dict[str, float]],
-    settings: InSilicoSettings,
-) -> None:
-    left, middle, right = figure.subplots(1, 3)
-    numbers = np.arange(1, len(eigenvalues) + 1)
-    first = numbers <= PARAMETERS
-    left.semilogy(numbers[first], eigenvalues[first], "o", color="crimson", label="first six")
-    left.semilogy(numbers[~first], eigenvalues[~first], "o", color="gray", label="others")
-    left.set(xlabel="number of the eigenvalue", ylabel="eigenvalue of M [-]")
-    left.set_title(f"spectrum, k = {NEIGHBORS} (paper, Fig. 5a)")
-    left.legend()
-    held = slice(settings.n_base, None)
-    middle.plot(*flat[: settings.n_base].T, "o", color="steelblue", label="base")
-    middle.plot(*flat[held].T, "o", color="crimson", label="held out")
-    middle.set(xlabel="first coordinate [-]", ylabel="second coordinate [-]", title="embedding")
-    middle.legend()
-    place = np.arange(len(rows))
-    for k, (key, text) in enumerate(
-        (("volume_error", "volume"), ("nodewise", "u nodewise"), ("grid", "u on the grid"))
-    ):
-        right.bar(place + 0.27 * (k - 1), [100 * row[key] for row in rows], 0.25, label=text)
-    right.set_yscale("log")
-    right.axhline(9.03, color="black", ls="--", lw=1, label="paper, displacement 9.03 %")
-    right.set(xlabel="held-out liver", ylabel="relative error [%]", title="interpolated livers")
-    right.legend(fontsize=8)

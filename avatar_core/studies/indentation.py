@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +22,7 @@ from avatar_core.fem.elasticity import Material
 from avatar_core.fem.sphere_indentation import Domain, Indentation, SphereIndentation
 from avatar_core.geometry.tip import Tip
 from avatar_core.studies.contact import sneddon
-from avatar_core.studies.study import Study, Value, follow
+from avatar_core.studies.study import Row, Run, Study, column, follow, where
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,45 +44,85 @@ class IndentationSettings:
     element: float = 0.1
 
 
-QUICK = IndentationSettings(ratios=_SHOWN, halved=(0.45,), depths=_COMPARED, element=0.2)
+class IndentationStudy(Study[IndentationSettings]):
+    """All curves, the fit and its errors; a folder of surfaces is not used."""
+
+    name = "indentation"
+    full = IndentationSettings()
+    quick = IndentationSettings(ratios=_SHOWN, halved=(0.45,), depths=_COMPARED, element=0.2)
+
+    def measure(self, run: Run[IndentationSettings]) -> None:
+        """The coefficients fitted anew are kept as a table, too."""
+        settings = run.settings
+        domain, half = Domain(settings.element), Domain(0.5 * settings.element)
+        for nu in follow(settings.ratios, "neo-Hookean"):
+            pressed = SphereIndentation(nu, domain=domain).press(settings.depths)
+            run.rows += _rows("curve", nu, pressed)
+        for nu in follow(settings.halved, "half the elements"):
+            run.rows += _rows("halved", nu, SphereIndentation(nu, domain=half).press(_COMPARED))
+        nearest = max(settings.ratios)  # to incompressible: where elements would lock
+        small = SphereIndentation(nearest, False, domain)
+        run.rows += _rows("small strain", nearest, small.press(_COMPARED[:3]))
+        fitted = run.kept["fitted"] = fit(run.rows)
+        names = ("nu", "c_0", "c_1", "c_2", "c_3", "largest")
+        for row in fitted.tolist():
+            run.add({"kind": "coefficients", **dict(zip(names, row, strict=True))})
+        run.notices.append(
+            "the paper has linear contact only: there is no figure of its own beside ours"
+        )
+
+    def summary(self, run: Run[IndentationSettings]) -> dict[str, float]:
+        curve = where(run.rows, kind="curve")
+        ratio = {(row["nu"], row["depth"]): float(str(row["ratio"])) for row in curve}
+        halving = [
+            abs(float(str(row["ratio"])) - ratio[row["nu"], row["depth"]])
+            for row in where(run.rows, kind="halved")
+            if (row["nu"], row["depth"]) in ratio
+        ]
+        small = column(where(run.rows, kind="small strain"), "ratio")
+        return {
+            **{
+                f"ratio_nu_{nu:g}_depth_{depth:g}": ratio[nu, depth]
+                for nu in _SHOWN
+                for depth in _COMPARED
+                if (nu, depth) in ratio
+            },
+            "small_strain_vs_sneddon": float(np.abs(small - 1.0).max()),
+            "halving_worst": max(halving, default=float("nan")),
+            "stored_law_worst": _misses(curve, COEFFICIENTS),
+            "new_fit_worst": _misses(curve, run.kept["fitted"]),
+        }
+
+    def sentence(self, run: Run[IndentationSettings]) -> str:
+        summary = run.summary
+        return (
+            "A sphere pressed into neo-Hookean tissue of nu 0.49 feels "
+            f"{summary['ratio_nu_0.49_depth_0.5']:.3f} of the small-strain force at half its "
+            f"radius, {summary['ratio_nu_0.49_depth_1']:.3f} at its radius, "
+            f"{summary['ratio_nu_0.49_depth_1.5']:.3f} at 1.5. The law misses the elements by "
+            f"{summary['stored_law_worst']:.1%} at most, halved elements change "
+            f"{summary['halving_worst']:.1%}; at small strain they miss Sneddon by "
+            f"{summary['small_strain_vs_sneddon']:.1%}."
+        )
+
+    def draw(self, figure: Figure, run: Run[IndentationSettings]) -> None:
+        left, right = figure.subplots(1, 2)
+        curve = where(run.rows, kind="curve")
+        for k, nu in enumerate(sorted(set(column(curve, "nu")))):
+            _draw_curve(left, right, where(curve, nu=nu), nu, f"C{k}")
+        left.plot([], [], "k--", lw=0.8, label="Sneddon, small strain")
+        left.plot([], [], "k:", lw=0.8, label="Hertz")
+        left.set(xlabel="depth / R", ylabel="F / (E R²)", title="force; dots: finite elements")
+        right.set(
+            xlabel="depth / R",
+            ylabel="F / F of Sneddon",
+            title="over small strain, by nu; lines: law",
+        )
+        right.axhline(1.0, color="k", ls="--", lw=0.8)
+        left.legend(fontsize=8)
 
 
-def run(_surfaces: Path | None, quick: bool, _folder: Path) -> Study:
-    """The study; a folder of surfaces is not used."""
-    return study(QUICK if quick else IndentationSettings())
-
-
-def study(settings: IndentationSettings) -> Study:
-    """All curves, the fit and its errors."""
-    domain, half = Domain(settings.element), Domain(0.5 * settings.element)
-    rows = [
-        row
-        for nu in follow(settings.ratios, "neo-Hookean")
-        for row in _rows("curve", nu, SphereIndentation(nu, domain=domain).press(settings.depths))
-    ]
-    rows += [
-        row
-        for nu in follow(settings.halved, "half the elements")
-        for row in _rows("halved", nu, SphereIndentation(nu, domain=half).press(_COMPARED))
-    ]
-    nearest = max(settings.ratios)  # to incompressible: where elements would lock
-    small = SphereIndentation(nearest, False, domain)
-    rows += _rows("small strain", nearest, small.press(_COMPARED[:3]))
-    fitted = fit(rows)
-    names = ("nu", "c_0", "c_1", "c_2", "c_3", "largest")
-    rows += [
-        {"kind": "coefficients", **dict(zip(names, row, strict=True))} for row in fitted.tolist()
-    ]
-    summary = _summary(rows, fitted)
-    return Study(
-        "indentation",
-        _sentence(summary),
-        summary,
-        tuple(rows),
-        {},
-        lambda figure: _draw(figure, rows),
-        ("the paper has linear contact only: there is no figure of its own beside ours",),
-    )
+STUDY = IndentationStudy()
 
 
 def small_strain_depth(load: float) -> float:
@@ -112,13 +151,13 @@ def law_force(depth: float, nu: float, table: np.ndarray = COEFFICIENTS) -> floa
     return float(load / (1.0 - nu**2))
 
 
-def fit(rows: Sequence[dict[str, Value]]) -> np.ndarray:
+def fit(rows: Sequence[Row]) -> np.ndarray:
     """A table like ``COEFFICIENTS``, by least squares of the relative depth at each nu."""
-    curve = [row for row in rows if row["kind"] == "curve"]
+    curve = where(rows, kind="curve")
     found = []
-    for ratio in sorted({float(str(row["nu"])) for row in curve}):
-        own = [row for row in curve if row["nu"] == ratio]
-        depth, load = _column(own, "depth"), _column(own, "force") * (1.0 - ratio**2)
+    for ratio in sorted(set(column(curve, "nu").tolist())):
+        own = where(curve, nu=ratio)
+        depth, load = column(own, "depth"), column(own, "force") * (1.0 - ratio**2)
         added = depth - np.array([small_strain_depth(each) for each in load])
         s = np.cbrt(0.75 * load)
         powers = s[:, None] ** np.arange(3, 7)
@@ -127,7 +166,7 @@ def fit(rows: Sequence[dict[str, Value]]) -> np.ndarray:
     return np.array(found)
 
 
-def _rows(kind: str, nu: float, found: Sequence[Indentation]) -> list[dict[str, Value]]:
+def _rows(kind: str, nu: float, found: Sequence[Indentation]) -> list[Row]:
     return [
         {
             "kind": kind,
@@ -150,78 +189,21 @@ def _sneddon(nu: float, depth: float) -> float:
     return sneddon(_TIP, Material(1.0, nu), depth * radius) / radius**2
 
 
-def _column(rows: Sequence[dict[str, Value]], key: str) -> np.ndarray:
-    return np.array([row[key] for row in rows], float)
-
-
-def _summary(rows: list[dict[str, Value]], fitted: np.ndarray) -> dict[str, float]:
-    kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in ("curve", "halved")}
-    ratio = {(row["nu"], row["depth"]): row["ratio"] for row in kinds["curve"]}
-    halving = [
-        abs(float(str(row["ratio"])) - float(str(ratio[row["nu"], row["depth"]])))
-        for row in kinds["halved"]
-        if (row["nu"], row["depth"]) in ratio
-    ]
-    small = _column([row for row in rows if row["kind"] == "small strain"], "ratio")
-    summary = {
-        f"ratio_nu_{nu:g}_depth_{depth:g}": float(str(ratio[nu, depth]))
-        for nu in _SHOWN
-        for depth in _COMPARED
-        if (nu, depth) in ratio
-    }
-    summary["small_strain_vs_sneddon"] = float(np.abs(small - 1.0).max())
-    summary["halving_worst"] = max(halving, default=float("nan"))
-    summary["stored_law_worst"] = _misses(kinds["curve"], COEFFICIENTS)
-    summary["new_fit_worst"] = _misses(kinds["curve"], fitted)
-    return summary
-
-
-def _misses(curve: list[dict[str, Value]], table: np.ndarray) -> float:
+def _misses(curve: list[Row], table: np.ndarray) -> float:
     """Worst error of the law's force, relative."""
-    nu, depth, force = (_column(curve, key) for key in ("nu", "depth", "force"))
+    nu, depth, force = (column(curve, key) for key in ("nu", "depth", "force"))
     found = [law_force(d, ratio, table) for d, ratio in zip(depth, nu, strict=True)]
     return float(np.abs(np.array(found) / force - 1.0).max())
 
 
-def _sentence(summary: dict[str, float]) -> str:
-    return (
-        "A sphere pressed into neo-Hookean tissue of nu 0.49 feels "
-        f"{summary['ratio_nu_0.49_depth_0.5']:.3f} of the small-strain force at half its radius, "
-        f"{summary['ratio_nu_0.49_depth_1']:.3f} at its radius, "
-        f"{summary['ratio_nu_0.49_depth_1.5']:.3f} at 1.5. The law misses the elements by "
-        f"{summary['stored_law_worst']:.1%} at most, halved elements change "
-        f"{summary['halving_worst']:.1%}; at small strain they miss Sneddon by "
-        f"{summary['small_strain_vs_sneddon']:.1%}."
-    )
-
-
-def _draw(figure: Figure, rows: list[dict[str, Value]]) -> None:
-    left, right = figure.subplots(1, 2)
-    curve = [row for row in rows if row["kind"] == "curve"]
-    ratios = sorted({float(str(row["nu"])) for row in curve})
-    for k, nu in enumerate(ratios):
-        own = [row for row in curve if row["nu"] == nu]
-        _draw_curve(left, right, own, nu, f"C{k}")
-    left.plot([], [], "k--", lw=0.8, label="Sneddon, small strain")
-    left.plot([], [], "k:", lw=0.8, label="Hertz")
-    left.set(xlabel="depth / R", ylabel="F / (E R²)", title="force; dots: finite elements")
-    right.set(
-        xlabel="depth / R", ylabel="F / F of Sneddon", title="over small strain, by nu; lines: law"
-    )
-    right.axhline(1.0, color="k", ls="--", lw=0.8)
-    left.legend(fontsize=8)
-
-
-def _draw_curve(
-    left: Axes, right: Axes, own: list[dict[str, Value]], nu: float, colour: str
-) -> None:
-    depth, force, small = (_column(own, key) for key in ("depth", "force", "sneddon"))
+def _draw_curve(left: Axes, right: Axes, own: list[Row], nu: float, colour: str) -> None:
+    depth, force, small = (column(own, key) for key in ("depth", "force", "sneddon"))
     law = np.array([law_force(each, nu) for each in depth])
     if nu in _SHOWN:
         left.plot(depth, force, "o", ms=3, color=colour, label=f"neo-Hookean, nu {nu:g}")
         left.plot(depth, law, "-", color=colour)
         left.plot(depth, small, "--", lw=0.8, color=colour)
-        left.plot(depth, _column(own, "hertz"), ":", lw=0.8, color=colour)
+        left.plot(depth, column(own, "hertz"), ":", lw=0.8, color=colour)
     right.plot(depth, force / small, "o", ms=3, color=colour)
     right.plot(depth, law / small, "-", color=colour)
     end = (depth[-1], force[-1] / small[-1])

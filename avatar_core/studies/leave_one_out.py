@@ -12,12 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import igl
 import numpy as np
-from numpy.typing import NDArray
 
 from avatar_core.common.processes import repeatable
 from avatar_core.geometry.level_set import DistanceGrid, GridBox, dice, isosurface
@@ -27,6 +25,8 @@ from avatar_core.shapes.lle import Gram
 from avatar_core.studies.alignment import align
 from avatar_core.studies.shapes import (
     PAPER_GRID,
+    FloatArray,
+    IntArray,
     Livers,
     as_grid,
     centred,
@@ -34,17 +34,14 @@ from avatar_core.studies.shapes import (
     paper_box,
     read_livers,
 )
-from avatar_core.studies.study import Study, Value, follow
+from avatar_core.studies.study import Row, Run, Study, column, follow, label, where
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 K_PAPER = 10
 NEAR = 3.0  # distances are made exact this many spacings around the blended surface
-PAPER: dict[str, Value] = {"sdf_max_mm_k10": 4.0}
 ALIGNMENTS = ("centred", "similarity")
 
 
@@ -66,12 +63,6 @@ class LeaveOneOutSettings:
     components: tuple[int, ...] = (5, 10, 20, 40, 60, 80, 100, 120, 0)
     shape: tuple[int, int, int] = PAPER_GRID
     phantoms: int = 40
-
-
-FULL = LeaveOneOutSettings()
-QUICK = LeaveOneOutSettings(
-    n_livers=24, neighbors=(5, 10, 0), components=(5, 10, 0), shape=(29, 21, 25), phantoms=16
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,39 +96,87 @@ class Method:
     weights: Callable[[int, IntArray], FloatArray]
 
 
-def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
-    """The study on a folder of surfaces; None for the default one."""
-    return study(surfaces, QUICK if quick else FULL)
-
-
-@repeatable
-def study(folder: Path | None, settings: LeaveOneOutSettings) -> Study:
+class LeaveOneOutStudy(Study[LeaveOneOutSettings]):
     """One row for each alignment and method."""
-    livers = read_livers(folder, settings.n_livers, settings.phantoms)
-    rows: list[dict[str, Value]] = []
-    notices: tuple[str, ...] = ()
-    for alignment in ALIGNMENTS:
-        base = placed(livers, alignment, settings)
-        notices = (*notices, *base.notices)
-        tried = follow(methods(base, settings), f"leave one out, {alignment}")
-        rows += [{"alignment": alignment, **judged(base, method)} for method in tried]
-    summary = summarize(rows)
-    best = max(_of(rows, "LLE"), key=lambda row: row["dice"])  # type: ignore[arg-type,return-value]
-    n, persons = len(livers.surfaces), len(np.unique(livers.subjects))
-    return Study(
-        name="leave-one-out",
-        sentence=_sentence(summary, best, n, persons),
-        summary={**summary, "livers": n, "subjects": persons},
-        rows=tuple(rows),
-        paper=PAPER,
-        draw=lambda figure: _draw(figure, rows),
-        notices=(
-            *livers.notices,
-            *notices,
-            "LLE with all neighbours and little regularisation is the projection on all principal "
-            "components: the same affine hull",
-        ),
+
+    name = "leave-one-out"
+    full = LeaveOneOutSettings()
+    quick = LeaveOneOutSettings(
+        n_livers=24, neighbors=(5, 10, 0), components=(5, 10, 0), shape=(29, 21, 25), phantoms=16
     )
+    paper: ClassVar = {"sdf_max_mm_k10": 4.0}
+
+    @repeatable
+    def measure(self, run: Run[LeaveOneOutSettings]) -> None:
+        settings = run.settings
+        livers = read_livers(run.surfaces, settings.n_livers, settings.phantoms)
+        run.kept |= {"livers": len(livers.surfaces), "subjects": len(np.unique(livers.subjects))}
+        run.notices += livers.notices
+        for alignment in ALIGNMENTS:
+            base = placed(livers, alignment, settings)
+            run.notices += base.notices
+            for method in follow(methods(base, settings), f"leave one out, {alignment}"):
+                run.add({"alignment": alignment, **judged(base, method)})
+        run.notices.append(
+            "LLE with all neighbours and little regularisation is the projection on all principal "
+            "components: the same affine hull"
+        )
+
+    def summary(self, run: Run[LeaveOneOutSettings]) -> dict[str, float]:
+        """Best setting of each method; for k = 10 the best regularisation and alignment."""
+        lle = where(run.rows, method="LLE")
+        top, ten = _best(lle), _best(where(lle, k=K_PAPER) or lle)
+        summary = {
+            "dice_best": top["dice"],
+            "dice_best_worst": top["dice_worst"],
+            "dice_k10": ten["dice"],
+            "dice_k10_worst": ten["dice_worst"],
+            "sdf_max_mm_k10": ten["sdf_max_mm"],
+            "sdf_max_mm_k10_worst": ten["sdf_max_mm_worst"],
+            "sdf_max_mm_best": top["sdf_max_mm"],
+        }
+        for alignment in ALIGNMENTS:
+            summary[f"dice_best_{alignment}"] = _best_dice(where(lle, alignment=alignment))
+        for method in ("convex LLE", "nearest neighbour", "inverse distance", "PCA"):
+            found = where(run.rows, method=method)
+            summary[f"dice_{method.replace(' ', '_').lower()}"] = _best_dice(found)
+        return {**summary, **run.kept}
+
+    def sentence(self, run: Run[LeaveOneOutSettings]) -> str:
+        summary, best = run.summary, _best(where(run.rows, method="LLE"))
+        return (
+            f"{summary['livers']} livers of {summary['subjects']} persons, each written by the "
+            f"others: Dice {summary['dice_best']:.3f} at best (k = {best['k']}, regularisation "
+            f"{best['regularization']:g}, {best['alignment']}), {summary['dice_k10']:.3f} with "
+            f"k = 10; nearest neighbour {summary['dice_nearest_neighbour']:.3f}, inverse distance "
+            f"{summary['dice_inverse_distance']:.3f}, PCA {summary['dice_pca']:.3f}."
+        )
+
+    def draw(self, figure: Figure, run: Run[LeaveOneOutSettings]) -> None:
+        left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+        regularizations = sorted(set(column(where(run.rows, method="LLE"), "regularization")))
+        for alignment, style in zip(ALIGNMENTS, ("--", "-"), strict=True):
+            rows = where(run.rows, alignment=alignment)
+            for color, r in enumerate(regularizations):
+                text = f"LLE, {alignment}, r = {r:g}"
+                some = where(rows, method="LLE", regularization=r)
+                _draw_dice(left, some, f"{style}o", f"C{color}", text)
+            _draw_dice(left, where(rows, method="PCA"), f"{style}x", "gray", f"PCA, {alignment}")
+        x = "neighbours k, or principal components"
+        title = "livers left out, scans of one person together"
+        label(left, x, "mean Dice [-]", title, legend=7)
+        names = ("nearest neighbour", "inverse distance", "convex LLE", "PCA", "LLE")
+        for k, alignment in enumerate(ALIGNMENTS):
+            rows = where(run.rows, alignment=alignment)
+            best = [_best_dice(where(rows, method=name)) for name in names]
+            right.bar(np.arange(len(names)) + 0.4 * (k - 0.5), best, 0.38, label=alignment)
+        right.set_xticks(range(len(names)), [name.replace(" ", "\n") for name in names])
+        right.set_ylim(bottom=0.5, top=1.0)
+        right.set(ylabel="mean Dice [-], best setting", title="beside its rivals")
+        right.legend(fontsize=8)
+
+
+STUDY = LeaveOneOutStudy()
 
 
 def placed(livers: Livers, alignment: str, settings: LeaveOneOutSettings) -> Base:
@@ -179,7 +218,7 @@ def methods(base: Base, settings: LeaveOneOutSettings) -> list[Method]:
     return found
 
 
-def judged(base: Base, method: Method) -> dict[str, Value]:
+def judged(base: Base, method: Method) -> Row:
     """Mean and worst over all livers: Dice, largest distance error inside [mm], sum |w|."""
     n = len(base.vectors)
     weights = np.zeros((n, n))
@@ -271,81 +310,13 @@ def _local(gram: Gram, i: int, near: IntArray) -> FloatArray:
     return gram.products[np.ix_(near, near)] - cross - cross[:, None] + gram.squared_lengths[i]
 
 
-def summarize(rows: list[dict[str, Value]]) -> dict[str, float]:
-    """Best setting of each method; for k = 10 the best regularisation and alignment."""
-
-    def best(key: str, found: list[dict[str, Value]]) -> float:
-        values = [float(row[key]) for row in found]  # type: ignore[arg-type]
-        return max(values, default=float("nan"))
-
-    lle = _of(rows, "LLE")
-    top = max(lle, key=lambda row: row["dice"])  # type: ignore[arg-type,return-value]
-    at_ten = [row for row in lle if row["k"] == K_PAPER]
-    ten = max(at_ten or lle, key=lambda row: row["dice"])  # type: ignore[arg-type,return-value]
-    summary = {"dice_best": top["dice"], "dice_best_worst": top["dice_worst"]}
-    summary |= {"dice_k10": ten["dice"], "dice_k10_worst": ten["dice_worst"]}
-    summary |= {"sdf_max_mm_k10": ten["sdf_max_mm"]}
-    summary |= {"sdf_max_mm_k10_worst": ten["sdf_max_mm_worst"]}
-    summary |= {"sdf_max_mm_best": top["sdf_max_mm"]}
-    for alignment in ALIGNMENTS:
-        rest = [row for row in lle if row["alignment"] == alignment]
-        summary[f"dice_best_{alignment}"] = best("dice", rest)
-    for method in ("convex LLE", "nearest neighbour", "inverse distance", "PCA"):
-        summary[f"dice_{method.replace(' ', '_').lower()}"] = best("dice", _of(rows, method))
-    return summary  # type: ignore[return-value]
+def _best(rows: list[Row]) -> Row:
+    return rows[int(column(rows, "dice").argmax())]
 
 
-def _of(rows: list[dict[str, Value]], method: str) -> list[dict[str, Value]]:
-    return [row for row in rows if row["method"] == method]
+def _best_dice(rows: list[Row]) -> float:
+    return float(max(column(rows, "dice"), default=np.nan))
 
 
-def _sentence(summary: dict[str, float], best: dict[str, Value], n: int, persons: int) -> str:
-    return (
-        f"{n} livers of {persons} persons, each written by the others: Dice "
-        f"{summary['dice_best']:.3f} at best (k = {best['k']}, regularisation "
-        f"{best['regularization']:g}, {best['alignment']}), {summary['dice_k10']:.3f} with k = 10; "
-        f"nearest neighbour {summary['dice_nearest_neighbour']:.3f}, inverse distance "
-        f"{summary['dice_inverse_distance']:.3f}, PCA {summary['dice_pca']:.3f}."
-    )
-
-
-def _draw(figure: Figure, rows: list[dict[str, Value]]) -> None:
-    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    lle = _of(rows, "LLE")
-    for alignment, style in zip(ALIGNMENTS, ("--", "-"), strict=True):
-        for color, r in enumerate(sorted({row["regularization"] for row in lle})):  # type: ignore[type-var]
-            chosen = [
-                row for row in lle if (row["alignment"], row["regularization"]) == (alignment, r)
-            ]
-            left.plot(
-                [row["k"] for row in chosen],
-                [row["dice"] for row in chosen],
-                style,
-                marker="o",
-                color=f"C{color}",
-                label=f"LLE, {alignment}, r = {r:g}",
-            )
-        pca = [row for row in _of(rows, "PCA") if row["alignment"] == alignment]
-        left.plot(
-            [row["k"] for row in pca],
-            [row["dice"] for row in pca],
-            style,
-            marker="x",
-            color="gray",
-            label=f"PCA, {alignment}",
-        )
-    left.set(xlabel="neighbours k, or principal components", ylabel="mean Dice [-]")
-    left.set_title("livers left out, scans of one person together")
-    left.grid(alpha=0.3)
-    left.legend(fontsize=7)
-    names = ("nearest neighbour", "inverse distance", "convex LLE", "PCA", "LLE")
-    for k, alignment in enumerate(ALIGNMENTS):
-        best = [
-            max(float(row["dice"]) for row in _of(rows, name) if row["alignment"] == alignment)  # type: ignore[arg-type]
-            for name in names
-        ]
-        right.bar(np.arange(len(names)) + 0.4 * (k - 0.5), best, 0.38, label=alignment)
-    right.set_xticks(range(len(names)), [name.replace(" ", "\n") for name in names])
-    right.set_ylim(bottom=0.5, top=1.0)
-    right.set(ylabel="mean Dice [-], best setting", title="beside its rivals")
-    right.legend(fontsize=8)
+def _draw_dice(axes: Axes, rows: list[Row], style: str, colour: str, text: str) -> None:
+    axes.plot(column(rows, "k"), column(rows, "dice"), style, color=colour, label=text)

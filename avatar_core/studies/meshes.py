@@ -16,10 +16,7 @@ error of the mesh itself, by one refinement.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import igl
@@ -31,7 +28,7 @@ from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahe
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.studies.shapes import read_livers
-from avatar_core.studies.study import RowFile, Study, Value, follow
+from avatar_core.studies.study import Row, Run, Study, column, follow, label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,59 +52,84 @@ class MeshesSettings:
     phantoms: int = 3
 
 
-FULL = MeshesSettings()
-QUICK = MeshesSettings(n_livers=6, n_built=0, n_refined=0, n_again=1)
+class MeshesStudy(Study[MeshesSettings]):
+    """One row for each surface."""
+
+    name = "meshes"
+    full = MeshesSettings()
+    quick = MeshesSettings(n_livers=6, n_built=0, n_refined=0, n_again=1)
+    key = "liver"
+
+    def measure(self, run: Run[MeshesSettings]) -> None:
+        settings = run.settings
+        livers = read_livers(run.surfaces, settings.n_livers, settings.phantoms)
+        run.notices += livers.notices
+        n = len(livers.surfaces)
+        built, refined, again = (
+            set(np.linspace(0, n - 1, n if chosen is None else min(chosen, n)).astype(int).tolist())
+            for chosen in (settings.n_built, settings.n_refined, settings.n_again)
+        )
+        for i, surface in enumerate(follow(livers.surfaces, "livers")):
+            if run.is_known(surface.name):
+                continue
+            row, mesh = _meshed(surface, settings)
+            if i in again:
+                row["same_again"] = _same(mesh, tetrahedralize(surface, settings.n_vertices))
+            if i in built:
+                row |= _certified(surface, settings, i in refined)
+            run.add(row)
+
+    def summary(self, run: Run[MeshesSettings]) -> dict[str, float]:
+        def of(key: str) -> np.ndarray:
+            return column(run.rows, key)
+
+        found = {
+            "n_vertices_least": of("n_vertices").min(),
+            "n_vertices_most": of("n_vertices").max(),
+            "volume_error_worst": np.abs(of("volume_error")).max(),
+            "distance_rms_median_mm": np.median(of("distance_rms_mm")),
+            "distance_rms_worst_mm": of("distance_rms_mm").max(),
+            "min_dihedral_deg": of("min_dihedral_deg").min(),
+            "n_inverted": of("n_inverted").sum(),
+            "mesh_cpu_seconds_median": np.median(of("mesh_cpu_seconds")),
+            "mesh_cpu_seconds_worst": of("mesh_cpu_seconds").max(),
+            "same_again": of("same_again").mean(),
+        }
+        certified = ("l2_mean", "l2_worst", "contact_mean", "contact_worst")
+        for key in (*certified, "mesh_l2", "mesh_contact", "build_cpu_seconds"):
+            if len(values := of(key)):
+                found |= {f"{key}_median": np.median(values), f"{key}_worst": values.max()}
+        return {key: float(value) for key, value in found.items()}
+
+    def sentence(self, run: Run[MeshesSettings]) -> str:
+        summary = run.summary
+        again = "the same" if summary["same_again"] == 1.0 else "another"
+        return (
+            f"Meshes of {len(run.rows)} livers lie within {summary['distance_rms_worst_mm']:.2f} "
+            f"mm rms of the surface, hold its volume within {summary['volume_error_worst']:.1%}, "
+            f"have no dihedral angle below {summary['min_dihedral_deg']:.1f} degrees, take "
+            f"{summary['mesh_cpu_seconds_median']:.1f} s of processor time in the median, and "
+            f"meshed again a surface gives {again} mesh."
+        )
+
+    def draw(self, figure: Figure, run: Run[MeshesSettings]) -> None:
+        for axes, key, text, line in zip(
+            figure.subplots(1, 3),
+            ("distance_rms_mm", "min_dihedral_deg", "mesh_cpu_seconds"),
+            ("boundary to surface, rms [mm]", "least dihedral angle [deg]", "processor time [s]"),
+            (0.3, 5.0, 3.0),
+            strict=True,
+        ):
+            axes.plot(column(run.rows, "n_vertices"), column(run.rows, key), "o", ms=4)
+            axes.axhline(line, color="gray", ls=":", label=f"aim: {line:g}")
+            axes.set_ylim(0.0, None)
+            label(axes, "vertices of the mesh", text)
 
 
-def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
-    """The study on a folder of surfaces; None for the default one."""
-    file = RowFile(folder / "meshes.rows.jsonl", "liver")
-    return study(surfaces, QUICK if quick else FULL, file.add, file.rows)
+STUDY = MeshesStudy()
 
 
-def study(
-    folder: Path | None,
-    settings: MeshesSettings,
-    row_done: Callable[[Mapping[str, Value]], None] | None = None,
-    known: Mapping[str, dict[str, Value]] = MappingProxyType({}),
-) -> Study:
-    """One row for each surface.
-
-    row_done : called with each when it is measured
-    known : rows of surfaces that are not measured again, by their names
-    """
-    livers = read_livers(folder, settings.n_livers, settings.phantoms)
-    n = len(livers.surfaces)
-    built, refined, again = (
-        set(np.linspace(0, n - 1, n if chosen is None else min(chosen, n)).astype(int).tolist())
-        for chosen in (settings.n_built, settings.n_refined, settings.n_again)
-    )
-    rows: list[dict[str, Value]] = []
-    for i, surface in enumerate(follow(livers.surfaces, "livers")):
-        if surface.name in known:
-            rows.append(known[surface.name])
-            continue
-        row, mesh = _meshed(surface, settings)
-        if i in again:
-            row["same_again"] = _same(mesh, tetrahedralize(surface, settings.n_vertices))
-        if i in built:
-            row |= _certified(surface, settings, i in refined)
-        rows.append(row)
-        if row_done is not None:
-            row_done(row)
-    summary = _summary(rows)
-    return Study(
-        name="meshes",
-        sentence=_sentence(summary, n),
-        summary=summary,
-        rows=tuple(rows),
-        paper={},
-        draw=lambda figure: _draw(figure, rows),
-        notices=livers.notices,
-    )
-
-
-def _meshed(surface: SurfaceMesh, settings: MeshesSettings) -> tuple[dict[str, Value], TetMesh]:
+def _meshed(surface: SurfaceMesh, settings: MeshesSettings) -> tuple[Row, TetMesh]:
     """A row of the study, with units in its keys, and the mesh."""
     start = cpu_seconds()
     mesh = tetrahedralize(surface, settings.n_vertices)
@@ -117,7 +139,7 @@ def _meshed(surface: SurfaceMesh, settings: MeshesSettings) -> tuple[dict[str, V
     faces = mesh.boundary_faces.astype(np.int64)
     missed, _, _ = igl.point_mesh_squared_distance(surface.vertices, mesh.vertices, faces)
     shape = quality(mesh)
-    row: dict[str, Value] = {
+    row: Row = {
         "liver": surface.name,
         "n_vertices": len(mesh.vertices),
         "n_tets": len(mesh.tets),
@@ -145,7 +167,7 @@ def _same(one: TetMesh, other: TetMesh) -> bool:
     return np.array_equal(one.tets, other.tets) and np.array_equal(one.vertices, other.vertices)
 
 
-def _certified(surface: SurfaceMesh, settings: MeshesSettings, refined: bool) -> dict[str, Value]:
+def _certified(surface: SurfaceMesh, settings: MeshesSettings, refined: bool) -> Row:
     """Errors of the vademecum's certificate, relative, and processor time of its build [s].
 
     refined : measure the error of the mesh as well; the time then includes it and is left out
@@ -158,7 +180,7 @@ def _certified(surface: SurfaceMesh, settings: MeshesSettings, refined: bool) ->
     seconds = cpu_seconds() - start
     certificate = vademecum.certificate
     assert certificate is not None
-    row: dict[str, Value] = {
+    row: Row = {
         "modes": certificate.modes,
         "l2_mean": certificate.l2_mean,
         "l2_worst": certificate.l2_worst,
@@ -168,53 +190,3 @@ def _certified(surface: SurfaceMesh, settings: MeshesSettings, refined: bool) ->
     if refined:
         return row | {"mesh_l2": certificate.mesh_l2, "mesh_contact": certificate.mesh_contact}
     return row | {"build_cpu_seconds": seconds}
-
-
-def _summary(rows: list[dict[str, Value]]) -> dict[str, float]:
-    def column(key: str) -> np.ndarray:
-        return np.array([row[key] for row in rows if key in row], dtype=float)
-
-    found = {
-        "n_vertices_least": column("n_vertices").min(),
-        "n_vertices_most": column("n_vertices").max(),
-        "volume_error_worst": np.abs(column("volume_error")).max(),
-        "distance_rms_median_mm": np.median(column("distance_rms_mm")),
-        "distance_rms_worst_mm": column("distance_rms_mm").max(),
-        "min_dihedral_deg": column("min_dihedral_deg").min(),
-        "n_inverted": column("n_inverted").sum(),
-        "mesh_cpu_seconds_median": np.median(column("mesh_cpu_seconds")),
-        "mesh_cpu_seconds_worst": column("mesh_cpu_seconds").max(),
-        "same_again": column("same_again").mean(),
-    }
-    certified = ("l2_mean", "l2_worst", "contact_mean", "contact_worst")
-    for key in (*certified, "mesh_l2", "mesh_contact", "build_cpu_seconds"):
-        if len(values := column(key)):
-            found |= {f"{key}_median": np.median(values), f"{key}_worst": values.max()}
-    return {key: float(value) for key, value in found.items()}
-
-
-def _sentence(summary: dict[str, float], n: int) -> str:
-    again = "the same" if summary["same_again"] == 1.0 else "another"
-    return (
-        f"Meshes of {n} livers lie within {summary['distance_rms_worst_mm']:.2f} mm rms of the "
-        f"surface, hold its volume within {summary['volume_error_worst']:.1%}, have no dihedral "
-        f"angle below {summary['min_dihedral_deg']:.1f} degrees, take "
-        f"{summary['mesh_cpu_seconds_median']:.1f} s of processor time in the median, and meshed "
-        f"again a surface gives {again} mesh."
-    )
-
-
-def _draw(figure: Figure, rows: list[dict[str, Value]]) -> None:
-    panels = figure.subplots(1, 3)
-    for axes, key, label, line in zip(
-        panels,
-        ("distance_rms_mm", "min_dihedral_deg", "mesh_cpu_seconds"),
-        ("boundary to surface, rms [mm]", "least dihedral angle [deg]", "processor time [s]"),
-        (0.3, 5.0, 3.0),
-        strict=True,
-    ):
-        axes.plot([row["n_vertices"] for row in rows], [row[key] for row in rows], "o", ms=4)
-        axes.axhline(line, color="gray", ls=":", label=f"aim: {line:g}")
-        axes.set(xlabel="vertices of the mesh", ylabel=label, ylim=(0.0, None))
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)

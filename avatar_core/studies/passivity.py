@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,7 +30,7 @@ from avatar_core.contact.haptics.haptic_loop import (
 )
 from avatar_core.contact.haptics.passivity import Passivity, make_passivity
 from avatar_core.contact.layout import PERIOD
-from avatar_core.studies.study import Study, Value, follow
+from avatar_core.studies.study import Row, Run, Study, column, follow, where
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,32 +57,89 @@ class PassivitySettings:
     n_periods: int = 2000
 
 
-FULL = PassivitySettings()
-QUICK = PassivitySettings(n_cells=12, n_borders=3, n_periods=1500)
+class PassivityStudy(Study[PassivitySettings]):
+    """The map, its borders, and all tools in all hands; the organ is a flat spring."""
+
+    name = "passivity"
+    full = PassivitySettings()
+    quick = PassivitySettings(n_cells=12, n_borders=3, n_periods=1500)
+
+    def measure(self, run: Run[PassivitySettings]) -> None:
+        n = run.settings.n_periods
+        for cell in follow(_cells(run.settings), "map"):
+            run.add(map_row(*cell, n))
+        for at in follow(_borders(run.settings), "borders"):
+            run.add(border_row(*at))
+        for case in follow(_hands(), "hands"):
+            run.add(hand_row(*case, n))
+        run.notices.append(
+            "the paper does not speak of passivity: there is no figure of its own beside ours"
+        )
+
+    def summary(self, run: Run[PassivitySettings]) -> dict[str, float]:
+        cells, borders = where(run.rows, kind="map"), where(run.rows, kind="border")
+        hands = [row for row in run.rows if row["kind"] in HANDS]
+        border = expected_border(1.0, 0) * (1.0 + 2.0 * column(hands, "delay"))
+        stable = column(hands, "damping") > 1.2 * border * column(hands, "stiffness")
+        error = np.abs(column(borders, "damping") / column(borders, "expected") - 1.0)
+        return {
+            "map_given_without_mJ": column(cells, "given_without_mJ").max(),
+            "map_given_with_mJ": column(cells, "given_with_mJ").max(),
+            "map_share_giving_without": float((column(cells, "given_without_mJ") > SEEN).mean()),
+            "map_share_giving_with": float((column(cells, "given_with_mJ") > SEEN).mean()),
+            "border_error_worst": float(error.max()),
+            "hands_given_without_mJ": column(hands, "given_without_mJ").max(),
+            "hands_given_with_mJ": column(hands, "given_with_mJ").max(),
+            "force_changed_stable_median": float(np.median(column(hands, "force_changed")[stable])),
+            **{f"bound_mJ_delay_{delay}": 1e3 * controller(delay).bound for delay in DELAYS},
+        }
+
+    def sentence(self, run: Run[PassivitySettings]) -> str:
+        summary = run.summary
+        return (
+            "Sampled, late and held, an organ's force gives a tool energy that nobody put in: over "
+            f"{SEEN:g} mJ in {summary['map_share_giving_without']:.0%} of the map, ever more "
+            f"beyond b = K (T/2 + delay), met within {summary['border_error_worst']:.1%}. "
+            f"Passivity control leaves {summary['map_given_with_mJ']:.2f} mJ at worst."
+        )
+
+    def draw(self, figure: Figure, run: Run[PassivitySettings]) -> None:
+        from matplotlib.colors import LogNorm
+
+        axes = figure.subplots(2, len(DELAYS), sharex=True, sharey=True)
+        n = run.settings.n_cells
+        stiffness, damping = np.geomspace(*STIFFNESS, n), np.geomspace(*DAMPING, n)
+        for i, key in enumerate(("given_without_mJ", "given_with_mJ")):
+            for delay, axis in zip(DELAYS, axes[i], strict=True):
+                given = column(where(run.rows, kind="map", delay=delay), key).reshape(n, n)
+                shown = axis.pcolormesh(
+                    stiffness,
+                    damping,
+                    np.maximum(given, SEEN),
+                    norm=LogNorm(SEEN, 1e3),
+                    cmap="magma_r",
+                    rasterized=True,
+                )
+                _draw_border(axis, delay, where(run.rows, kind="border", delay=delay))
+                axis.set(xscale="log", yscale="log", xlim=STIFFNESS, ylim=DAMPING)
+        for delay, (upper, lower) in zip(DELAYS, axes.T, strict=True):
+            late = 1e3 * PERIOD * delay
+            upper.set_title(f"delay {late:g} ms: without control", fontsize=9)
+            bound = 1e3 * controller(delay).bound
+            lower.set_title(f"delay {late:g} ms: with it, bound {bound:.2g} mJ", fontsize=9)
+        axes[0, 0].text(*_at(0.4, 0.32), "swings fade", fontsize=8, rotation=17)
+        axes[0, 0].text(*_at(0.4, 0.11), "swings grow", fontsize=8, rotation=17, color="white")
+        axes[1, 0].legend(fontsize=7, loc="upper left")
+        for axis in axes[:, 0]:
+            axis.set_ylabel("damping b [N s/m]", fontsize=9)
+        for axis in axes[1]:
+            axis.set_xlabel("stiffness of the organ K [N/m]", fontsize=9)
+        figure.colorbar(
+            shown, ax=axes, label="energy given to the tool at worst [mJ]", extend="both", pad=0.01
+        )
 
 
-def run(_surfaces: Path | None, quick: bool, _folder: Path) -> Study:
-    """The study; the organ is a flat spring, a folder of surfaces is not used."""
-    return study(QUICK if quick else FULL)
-
-
-def study(settings: PassivitySettings) -> Study:
-    """The map, its borders, and all tools in all hands."""
-    rows = [map_row(*cell, settings.n_periods) for cell in follow(_cells(settings), "map")]
-    borders = [border_row(*at) for at in follow(_borders(settings), "borders")]
-    grips = [hand_row(*case, settings.n_periods) for case in follow(_hands(), "hands")]
-    summary = _summary(rows, borders, grips)
-    return Study(
-        name="passivity",
-        sentence=_sentence(summary),
-        summary=summary,
-        rows=(*rows, *borders, *grips),
-        paper={},
-        draw=lambda figure: _draw(figure, rows, borders, settings),
-        notices=(
-            "the paper does not speak of passivity: there is no figure of its own beside ours",
-        ),
-    )
+STUDY = PassivityStudy()
 
 
 def _cells(settings: PassivitySettings) -> list[tuple[int, float, float]]:
@@ -104,15 +160,15 @@ def _hands() -> list[tuple[str, float, float, float, float, int]]:
     return list(itertools.product(HANDS, MASSES, DAMPINGS, GRIPS, STIFFNESSES, DELAYS))
 
 
-def map_row(delay: int, damping: float, stiffness: float, n: int) -> dict[str, Value]:
+def map_row(delay: int, damping: float, stiffness: float, n: int) -> Row:
     """One cell of the map."""
     loop = Loop(Device(MAP_MASS, damping), stiffness, delay, RESOLUTION)
-    row: dict[str, Value] = {"kind": "map", "delay": delay, "damping": damping}
+    row: Row = {"kind": "map", "delay": delay, "damping": damping}
     row |= {"stiffness": stiffness, "mass": MAP_MASS, "grip": 0.0}
     return row | _with_and_without(loop, np.full(n, -MAP_PUSH))
 
 
-def border_row(delay: int, stiffness: float) -> dict[str, Value]:
+def border_row(delay: int, stiffness: float) -> Row:
     """Damping at the border of stability, found and expected [N s/m]."""
     return {
         "kind": "border",
@@ -125,10 +181,10 @@ def border_row(delay: int, stiffness: float) -> dict[str, Value]:
 
 def hand_row(
     hand: str, mass: float, damping: float, grip: float, stiffness: float, delay: int, n: int
-) -> dict[str, Value]:
+) -> Row:
     """One tool in one hand."""
     loop = Loop(Device(mass, damping, grip), stiffness, delay, RESOLUTION)
-    row: dict[str, Value] = {"kind": hand, "delay": delay, "damping": damping}
+    row: Row = {"kind": hand, "delay": delay, "damping": damping}
     row |= {"stiffness": stiffness, "mass": mass, "grip": grip}
     return row | _with_and_without(loop, hand_push(hand, grip, n))
 
@@ -162,7 +218,7 @@ def controller(delay: int) -> Passivity:
     return make_passivity(1, delay, RESOLUTION, stiffness=STIFFNESS[1])
 
 
-def _with_and_without(loop: Loop, push: FloatArray) -> dict[str, Value]:
+def _with_and_without(loop: Loop, push: FloatArray) -> Row:
     """Energy given by the port [mJ] and what control changes of the force, relative."""
     free = run_loop(loop, push, START)
     limited = run_loop(loop, push, START, controller(loop.delay))
@@ -175,88 +231,18 @@ def _with_and_without(loop: Loop, push: FloatArray) -> dict[str, Value]:
     }
 
 
-def _summary(
-    rows: list[dict[str, Value]], borders: list[dict[str, Value]], hands: list[dict[str, Value]]
-) -> dict[str, float]:
-    border = expected_border(1.0, 0) * (1.0 + 2.0 * _column(hands, "delay"))
-    stable = _column(hands, "damping") > 1.2 * border * _column(hands, "stiffness")
-    error = np.abs(_column(borders, "damping") / _column(borders, "expected") - 1.0)
-    return {
-        "map_given_without_mJ": _column(rows, "given_without_mJ").max(),
-        "map_given_with_mJ": _column(rows, "given_with_mJ").max(),
-        "map_share_giving_without": float((_column(rows, "given_without_mJ") > SEEN).mean()),
-        "map_share_giving_with": float((_column(rows, "given_with_mJ") > SEEN).mean()),
-        "border_error_worst": float(error.max()),
-        "hands_given_without_mJ": _column(hands, "given_without_mJ").max(),
-        "hands_given_with_mJ": _column(hands, "given_with_mJ").max(),
-        "force_changed_stable_median": float(np.median(_column(hands, "force_changed")[stable])),
-        **{f"bound_mJ_delay_{delay}": 1e3 * controller(delay).bound for delay in DELAYS},
-    }
-
-
-def _column(rows: list[dict[str, Value]], key: str) -> FloatArray:
-    return np.array([row[key] for row in rows], float)
-
-
-def _sentence(summary: dict[str, float]) -> str:
-    return (
-        "Sampled, late and held, an organ's force gives a tool energy that nobody put in: over "
-        f"{SEEN:g} mJ in {summary['map_share_giving_without']:.0%} of the map, ever more beyond "
-        f"b = K (T/2 + delay), met within {summary['border_error_worst']:.1%}. Passivity control "
-        f"leaves {summary['map_given_with_mJ']:.2f} mJ at worst."
-    )
-
-
-def _draw(
-    figure: Figure,
-    rows: list[dict[str, Value]],
-    borders: list[dict[str, Value]],
-    settings: PassivitySettings,
-) -> None:
-    from matplotlib.colors import LogNorm
-
-    axes = figure.subplots(2, len(DELAYS), sharex=True, sharey=True)
-    stiffness = np.geomspace(*STIFFNESS, settings.n_cells)
-    damping = np.geomspace(*DAMPING, settings.n_cells)
-    for i, key in enumerate(("given_without_mJ", "given_with_mJ")):
-        for delay, axis in zip(DELAYS, axes[i], strict=True):
-            given = _column([row for row in rows if row["delay"] == delay], key)
-            grid = np.maximum(given.reshape(settings.n_cells, settings.n_cells), SEEN)
-            shown = axis.pcolormesh(
-                stiffness, damping, grid, norm=LogNorm(SEEN, 1e3), cmap="magma_r", rasterized=True
-            )
-            _draw_border(axis, delay, borders)
-            axis.set(xscale="log", yscale="log", xlim=STIFFNESS, ylim=DAMPING)
-    for delay, (upper, lower) in zip(DELAYS, axes.T, strict=True):
-        late = 1e3 * PERIOD * delay
-        upper.set_title(f"delay {late:g} ms: without control", fontsize=9)
-        bound = 1e3 * controller(delay).bound
-        lower.set_title(f"delay {late:g} ms: with it, bound {bound:.2g} mJ", fontsize=9)
-    axes[0, 0].text(*_at(0.4, 0.32), "swings fade", fontsize=8, rotation=17)
-    axes[0, 0].text(*_at(0.4, 0.11), "swings grow", fontsize=8, rotation=17, color="white")
-    axes[1, 0].legend(fontsize=7, loc="upper left")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("damping b [N s/m]", fontsize=9)
-    for axis in axes[1]:
-        axis.set_xlabel("stiffness of the organ K [N/m]", fontsize=9)
-    figure.colorbar(
-        shown, ax=axes, label="energy given to the tool at worst [mJ]", extend="both", pad=0.01
-    )
-
-
 def _at(across: float, up: float) -> tuple[float, float]:
     """A place in a panel, as fractions of its logarithmic axes."""
     (left, right), (low, high) = STIFFNESS, DAMPING
     return left * (right / left) ** across, low * (high / low) ** up
 
 
-def _draw_border(axis: Axes, delay: int, borders: list[dict[str, Value]]) -> None:
+def _draw_border(axis: Axes, delay: int, borders: list[Row]) -> None:
     at = np.array(STIFFNESS)
     axis.plot(at, expected_border(1.0, delay) * at, "k--", lw=1.2, label="b = K (T/2 + delay)")
-    mine = [row for row in borders if row["delay"] == delay]
     axis.plot(
-        _column(mine, "stiffness"),
-        _column(mine, "damping"),
+        column(borders, "stiffness"),
+        column(borders, "damping"),
         "o",
         ms=5,
         mfc="white",

@@ -13,10 +13,8 @@ f . u of the load. The methods:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -26,18 +24,16 @@ from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
-from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.pgd import LoadProblem, PGDRule, solve_pgd
 from avatar_core.reduction.regional import RegionalRule, regions_of, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.studies.shapes import read_liver
-from avatar_core.studies.study import Study, Value, follow
+from avatar_core.studies.study import Row, Run, Study, column, follow, label, where
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PAPER: dict[str, Value] = {"error_11_modes": "< 0.1"}
 ENOUGH = 0.10
 _REGIONS = 4  # of so few loads
 
@@ -48,10 +44,6 @@ class PGDSettings:
 
     n_vertices: int = 2850
     n_loads: int = 66
-
-
-FULL = PGDSettings()
-QUICK = PGDSettings(n_vertices=900, n_loads=40)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,32 +71,91 @@ class Case:
         return l2_norm(self.exact, self.mass)
 
 
-def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
-    """The study on LiTS-4, or the first liver of a folder."""
-    return study(read_liver(surfaces, "LiTS-4"), QUICK if quick else FULL)
+class PGDStudy(Study[PGDSettings]):
+    """Errors against modes on LiTS-4, or the first liver of a folder."""
+
+    name = "pgd"
+    full = PGDSettings()
+    quick = PGDSettings(n_vertices=900, n_loads=40)
+    paper: ClassVar = {"error_11_modes": "< 0.1"}
+
+    def measure(self, run: Run[PGDSettings]) -> None:
+        surface = read_liver(run.surfaces, "LiTS-4")
+        mesh = tetrahedralize(surface, run.settings.n_vertices)
+        regions = regions_by_rule(mesh)
+        elasticity = Elasticity(mesh, Material(), regions.clamped)
+        positions = load_surface(mesh, regions)
+        nodes = spread(positions, run.settings.n_loads)
+        for kind in ("patch", "point"):
+            for row in _rows(make_case(elasticity, positions, nodes, kind), kind):
+                run.add(row)
+        n = len(mesh.vertices)
+        run.notices.append(f"{surface.name}, {n} vertices, {len(nodes)} load nodes")
+
+    def summary(self, run: Run[PGDSettings]) -> dict[str, float]:
+        def at(method: str, key: str, kind: str = "patch") -> float:
+            """Of 11 modes."""
+            return float(column(where(run.rows, method=method, modes=11, loads=kind), key)[0])
+
+        def modes_for(method: str, kind: str) -> float:
+            """The least number that leaves less than ``ENOUGH``."""
+            found = where(run.rows, method=method, loads=kind)
+            modes = column(found, "modes")[column(found, "l2_mean") < ENOUGH]
+            return float(modes[0]) if len(modes) else float("nan")
+
+        return {
+            "modes_for_10_percent_mean": modes_for("default", "patch"),
+            "pgd_modes_for_10_percent_mean": modes_for("PGD, paper's norm", "patch"),
+            "svd_modes_for_10_percent_mean": modes_for("SVD optimum", "patch"),
+            "l2_mean_11_modes": at("PGD, paper's norm", "l2_mean"),
+            "l2_worst_11_modes": at("PGD, paper's norm", "l2_worst"),
+            "contact_mean_11_modes": at("PGD, paper's norm", "contact_mean"),
+            "svd_l2_mean_11_modes": at("SVD optimum", "l2_mean"),
+            "svd_l2_worst_11_modes": at("SVD optimum", "l2_worst"),
+            "default_l2_mean_11_modes": at("default", "l2_mean"),
+            "default_l2_worst_11_modes": at("default", "l2_worst"),
+            "point_l2_mean_11_modes": at("PGD, paper's norm", "l2_mean", "point"),
+            "point_modes_for_10_percent_mean": modes_for("default", "point"),
+        }
+
+    def sentence(self, run: Run[PGDSettings]) -> str:
+        summary = run.summary
+        return (
+            f"{run.settings.n_loads} loads in one direction, 11 modes: the paper's greedy PGD "
+            f"leaves {summary['l2_mean_11_modes']:.0%} of the displacement (worst load "
+            f"{summary['l2_worst_11_modes']:.0%}; paper: below 10 %), the best 11 modes "
+            f"{summary['svd_l2_mean_11_modes']:.0%}, the default "
+            f"{summary['default_l2_mean_11_modes']:.0%}; it needs "
+            f"{summary['modes_for_10_percent_mean']:.0f} modes for 10 %."
+        )
+
+    def draw(self, figure: Figure, run: Run[PGDSettings]) -> None:
+        axes = figure.subplots(1, 3)
+        panels = (
+            ("patch", "l2", "patches: displacement, L2"),
+            ("point", "l2", "single nodes: displacement, L2"),
+            ("patch", "contact", "patches: displacement in contact"),
+        )
+        colours = {"PGD, paper's norm": "tab:blue", "SVD optimum": "tab:gray", "default": "crimson"}
+        for axis, (kind, error, title) in zip(axes, panels, strict=True):
+            for method, colour in colours.items():
+                some = where(run.rows, method=method, loads=kind)
+                for statistic, style in (("mean", "-"), ("worst", ":")):
+                    values = column(some, f"{error}_{statistic}")
+                    if (values > 0.0).any():
+                        text = f"{method}, {statistic}" if axis is axes[0] else None
+                        modes = column(some, "modes")
+                        axis.semilogy(modes, values, style, color=colour, label=text)
+            text = "paper: 11 modes, below 10 %" if axis is axes[0] else None
+            axis.plot([11], [0.1], "k*", label=text)
+            axis.set_ylim(1e-3, 2.0)
+            label(axis, "modes", "relative error [-]" if axis is axes[0] else "", title, legend=0)
+        figure.legend(
+            *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8
+        )
 
 
-def study(surface: SurfaceMesh, settings: PGDSettings) -> Study:
-    """Errors against modes on one organ."""
-    mesh = tetrahedralize(surface, settings.n_vertices)
-    regions = regions_by_rule(mesh)
-    elasticity = Elasticity(mesh, Material(), regions.clamped)
-    positions = load_surface(mesh, regions)
-    nodes = spread(positions, settings.n_loads)
-    rows: list[dict[str, Value]] = []
-    for kind in ("patch", "point"):
-        case = make_case(elasticity, positions, nodes, kind)
-        rows += _rows(case, kind)
-    summary = _summary(rows)
-    return Study(
-        name="pgd",
-        sentence=_sentence(summary, settings),
-        summary=summary,
-        rows=tuple(rows),
-        paper=PAPER,
-        draw=lambda figure: _draw(figure, rows),
-        notices=(f"{surface.name}, {len(mesh.vertices)} vertices, {len(nodes)} load nodes",),
-    )
+STUDY = PGDStudy()
 
 
 def spread(positions: LoadSurface, n: int) -> IntArray:
@@ -138,11 +189,11 @@ def make_case(elasticity: Elasticity, positions: LoadSurface, nodes: IntArray, k
     )
 
 
-def _rows(case: Case, kind: str) -> list[dict[str, Value]]:
+def _rows(case: Case, kind: str) -> list[Row]:
     """Errors against modes for every method."""
     n = case.loads.shape[1]
     ranks = sorted({*range(1, 12), *range(12, min(61, n), 3), min(n, 60)})
-    found: list[dict[str, Value]] = []
+    found: list[Row] = []
 
     def add(method: str, rank: int, left: FloatArray, contact: FloatArray) -> None:
         l2 = l2_norm(left, case.mass) / case.size
@@ -207,75 +258,3 @@ def _two_levels_leave(case: Case, shared: SeparatedField, rank: int) -> FloatArr
         modes = regional.modes(r)
         left[:, at] -= modes @ regional.load[at, 0, : modes.shape[1]].T
     return left
-
-
-def _summary(rows: list[dict[str, Value]]) -> dict[str, float]:
-    def at(method: str, modes: int, kind: str = "patch") -> Mapping[str, Value]:
-        return next(
-            row
-            for row in rows
-            if (row["method"], row["modes"], row["loads"]) == (method, modes, kind)
-        )
-
-    def modes_for(method: str, kind: str) -> float:
-        for row in rows:
-            mine = row["method"] == method and row["loads"] == kind
-            if mine and float(row["l2_mean"]) < ENOUGH:  # type: ignore[arg-type]
-                return float(row["modes"])  # type: ignore[arg-type]
-        return float("nan")
-
-    greedy, svd = at("PGD, paper's norm", 11), at("SVD optimum", 11)
-    default = at("default", 11)
-    return {
-        "modes_for_10_percent_mean": modes_for("default", "patch"),
-        "pgd_modes_for_10_percent_mean": modes_for("PGD, paper's norm", "patch"),
-        "svd_modes_for_10_percent_mean": modes_for("SVD optimum", "patch"),
-        "l2_mean_11_modes": float(greedy["l2_mean"]),  # type: ignore[arg-type]
-        "l2_worst_11_modes": float(greedy["l2_worst"]),  # type: ignore[arg-type]
-        "contact_mean_11_modes": float(greedy["contact_mean"]),  # type: ignore[arg-type]
-        "svd_l2_mean_11_modes": float(svd["l2_mean"]),  # type: ignore[arg-type]
-        "svd_l2_worst_11_modes": float(svd["l2_worst"]),  # type: ignore[arg-type]
-        "default_l2_mean_11_modes": float(default["l2_mean"]),  # type: ignore[arg-type]
-        "default_l2_worst_11_modes": float(default["l2_worst"]),  # type: ignore[arg-type]
-        "point_l2_mean_11_modes": float(at("PGD, paper's norm", 11, "point")["l2_mean"]),  # type: ignore[arg-type]
-        "point_modes_for_10_percent_mean": modes_for("default", "point"),
-    }
-
-
-def _sentence(summary: dict[str, float], settings: PGDSettings) -> str:
-    return (
-        f"{settings.n_loads} loads in one direction, 11 modes: the paper's greedy PGD leaves "
-        f"{summary['l2_mean_11_modes']:.0%} of the displacement (worst load "
-        f"{summary['l2_worst_11_modes']:.0%}; paper: below 10 %), the best 11 modes "
-        f"{summary['svd_l2_mean_11_modes']:.0%}, the default "
-        f"{summary['default_l2_mean_11_modes']:.0%}; it needs "
-        f"{summary['modes_for_10_percent_mean']:.0f} modes for 10 %."
-    )
-
-
-def _draw(figure: Figure, rows: list[dict[str, Value]]) -> None:
-    axes = figure.subplots(1, 3)
-    panels = (
-        ("patch", "l2", "patches: displacement, L2"),
-        ("point", "l2", "single nodes: displacement, L2"),
-        ("patch", "contact", "patches: displacement in contact"),
-    )
-    colours = {"PGD, paper's norm": "tab:blue", "SVD optimum": "tab:gray", "default": "crimson"}
-    for axis, (kind, error, title) in zip(axes, panels, strict=True):
-        for method, colour in colours.items():
-            some = [row for row in rows if row["method"] == method and row["loads"] == kind]
-            modes = [row["modes"] for row in some]
-            for statistic, style in (("mean", "-"), ("worst", ":")):
-                values = [float(row[f"{error}_{statistic}"]) for row in some]  # type: ignore[arg-type]
-                if any(value > 0.0 for value in values):
-                    label = f"{method}, {statistic}" if axis is axes[0] else None
-                    axis.semilogy(modes, values, style, color=colour, label=label)
-        axis.plot(
-            [11], [0.1], "k*", label="paper: 11 modes, below 10 %" if axis is axes[0] else None
-        )
-        axis.set(xlabel="modes", title=title, ylim=(1e-3, 2.0))
-        axis.grid(which="both", alpha=0.3)
-    axes[0].set_ylabel("relative error [-]")
-    figure.legend(
-        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8
-    )

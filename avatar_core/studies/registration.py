@@ -8,8 +8,7 @@ weighted by their volumes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,14 +17,15 @@ from scipy.interpolate import RBFInterpolator
 from avatar_core.common.arrays import FloatArray
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.point_location import carriers, closest_points
-from avatar_core.geometry.surface import SurfaceMesh, read_surface
+from avatar_core.geometry.surface import read_surface
 from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.registration.cloud import Cloud
 from avatar_core.registration.fit import RegistrationRule, rigid_motion
 from avatar_core.registration.register import INTERVAL_90, register
 from avatar_core.registration.rigid import RigidMotion
 from avatar_core.studies.registration_truth import CLASSES, Case, RegistrationSettings, Truth
-from avatar_core.studies.study import Study, Value, follow
+from avatar_core.studies.shapes import DEFAULT_FOLDER
+from avatar_core.studies.study import Row, Run, Study, column, follow
 from avatar_core.vademecum.model import Vademecum
 
 if TYPE_CHECKING:
@@ -36,48 +36,54 @@ METHODS = ("vademecum", "rigid", "splines")
 _LIVER = "LiTS-4.obj"
 _N_SPLINE = 400  # points that splines go through; their equations are dense
 
-QUICK = RegistrationSettings(n_vertices=900, n_true=1400, n_cases=2, with_liver=False)
+
+class RegistrationStudy(Study[RegistrationSettings]):
+    """The phantom and, unless quick, a real liver of the folder; a row for each case."""
+
+    name = "registration"
+    full = RegistrationSettings()
+    quick = RegistrationSettings(n_vertices=900, n_true=1400, n_cases=2, with_liver=False)
+
+    def measure(self, run: Run[RegistrationSettings]) -> None:
+        settings, folder = run.settings, run.surfaces or DEFAULT_FOLDER
+        organs = [phantom_liver()]
+        if settings.with_liver and (folder / _LIVER).is_file():
+            organs.append(read_surface(folder / _LIVER))
+        elif settings.with_liver:
+            run.notices.append(f"no {_LIVER} in {folder}: the phantom alone")
+        for organ in organs:
+            options = OrganOptions(n_vertices=settings.n_vertices, n_certified=20)
+            vademecum = build(organ, options)
+            for row in case_rows(vademecum, Truth.of(organ, settings.n_true), settings):
+                run.add(row)
+        run.notices.append(
+            "the paper registers no clouds: there is no figure of its own beside ours"
+        )
+
+    def summary(self, run: Run[RegistrationSettings]) -> dict[str, float]:
+        return summarise(run.rows)
+
+    def sentence(self, run: Run[RegistrationSettings]) -> str:
+        settings, summary = run.settings, run.summary
+        return (
+            f"A vademecum registered to {settings.seen:.0%} of the surface, {settings.n_points} "
+            f"points of {1e3 * settings.noise:g} mm noise: {summary['registration_error']:.0%} of "
+            f"the mean displacement off ({summary['registration_rigid_error']:.0%} rigidly, "
+            f"{summary['registration_splines_error']:.0%} by splines), 90 % intervals hold "
+            f"{summary['registration_coverage']:.0%}, in "
+            f"{summary['registration_seconds']:.2f} s"
+        )
+
+    def draw(self, figure: Figure, run: Run[RegistrationSettings]) -> None:
+        left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+        draw_errors(left, run.rows)
+        draw_coverage(right, run.rows)
 
 
-def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
-    """The study of the phantom and, unless quick, of a real liver of the folder."""
-    settings = QUICK if quick else RegistrationSettings()
-    folder = surfaces or Path("../shared/data/livers")
-    organs, notices = [phantom_liver()], []
-    if settings.with_liver and (folder / _LIVER).is_file():
-        organs.append(read_surface(folder / _LIVER))
-    elif settings.with_liver:
-        notices.append(f"no {_LIVER} in {folder}: the phantom alone")
-    rows = [row for organ in organs for row in organ_rows(organ, settings)]
-    summary = summarise(rows)
-    sentence = (
-        f"A vademecum registered to {settings.seen:.0%} of the surface, {settings.n_points} points "
-        f"of {1e3 * settings.noise:g} mm noise: {summary['registration_error']:.0%} of the mean "
-        f"displacement off ({summary['registration_rigid_error']:.0%} rigidly, "
-        f"{summary['registration_splines_error']:.0%} by splines), 90 % intervals hold "
-        f"{summary['registration_coverage']:.0%}, in "
-        f"{summary['registration_seconds']:.2f} s"
-    )
-    return Study(
-        "registration",
-        sentence,
-        summary,
-        tuple(rows),
-        {},
-        lambda figure: _draw(figure, rows),
-        (*notices, "the paper registers no clouds: there is no figure of its own beside ours"),
-    )
+STUDY = RegistrationStudy()
 
 
-def organ_rows(organ: SurfaceMesh, settings: RegistrationSettings) -> list[dict[str, Value]]:
-    """All cases of one organ, a row each."""
-    vademecum = build(organ, OrganOptions(n_vertices=settings.n_vertices, n_certified=20))
-    return case_rows(vademecum, Truth.of(organ, settings.n_true), settings)
-
-
-def case_rows(
-    vademecum: Vademecum, truth: Truth, settings: RegistrationSettings
-) -> list[dict[str, Value]]:
+def case_rows(vademecum: Vademecum, truth: Truth, settings: RegistrationSettings) -> list[Row]:
     """All cases of one vademecum and the true mesh of its organ."""
     rows = []
     for kind in CLASSES:
@@ -88,18 +94,18 @@ def case_rows(
     return rows
 
 
-def summarise(rows: Sequence[Mapping[str, Value]]) -> dict[str, float]:
+def summarise(rows: Sequence[Row]) -> dict[str, float]:
     """Means over the cases, all and of each class; ``registration_seconds`` is the median."""
 
     def mean(key: str, kind: str | None = None) -> float:
-        return float(np.mean([row[key] for row in rows if kind in (None, row["class"])]))
+        return float(column(_of(rows, kind), key).mean())
 
     summary = {
         "registration_error": mean("vademecum_error"),
         "registration_coverage": mean("coverage"),
-        "registration_seconds": float(np.median([float(str(row["seconds"])) for row in rows])),
+        "registration_seconds": float(np.median(column(rows, "seconds"))),
         "registration_of_peak": mean("vademecum_of_peak"),
-        "registration_worst": float(np.max([row["vademecum_error"] for row in rows])),
+        "registration_worst": float(column(rows, "vademecum_error").max()),
         "registration_explained": mean("explained"),
         "registration_small_strains_off": mean("small_strains_off"),
         "registration_rigid_error": mean("rigid_error"),
@@ -112,7 +118,7 @@ def summarise(rows: Sequence[Mapping[str, Value]]) -> dict[str, float]:
     return summary
 
 
-def measured(vademecum: Vademecum, case: Case) -> dict[str, Value]:
+def measured(vademecum: Vademecum, case: Case) -> Row:
     """Errors of all methods, over the mean and the largest true displacement."""
     size = np.linalg.norm(case.displacement, axis=1)
     mean, peak = float(case.volume @ size), float(size.max())
@@ -131,7 +137,7 @@ def measured(vademecum: Vademecum, case: Case) -> dict[str, Value]:
         "splines": splines(vademecum, case.cloud, rigid)(case.rest),
     }
     small = case.volume @ np.linalg.norm(case.small_strains - case.displacement, axis=1)
-    row: dict[str, Value] = {"mean_mm": 1e3 * mean, "peak_mm": 1e3 * peak}
+    row: Row = {"mean_mm": 1e3 * mean, "peak_mm": 1e3 * peak}
     row |= {"small_strains_off": float(small) / mean}
     for name, place in places.items():
         error = float(case.volume @ np.linalg.norm(place - case.place, axis=1))
@@ -173,14 +179,7 @@ def splines(
 _SMOOTHINGS = (1e-5, 1e-4, 1e-3, 1e-2)
 
 
-def _draw(figure: Figure, rows: Sequence[Mapping[str, Value]]) -> None:
-    """Errors by class and method, and coverage by class."""
-    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    draw_errors(left, rows)
-    draw_coverage(right, rows)
-
-
-def draw_errors(axes: Axes, rows: Sequence[Mapping[str, Value]]) -> None:
+def draw_errors(axes: Axes, rows: Sequence[Row]) -> None:
     """Mean error over mean displacement, of each class and method."""
     for k, name in enumerate(METHODS):
         error = [100.0 * value for value in _by_class(rows, f"{name}_error")]
@@ -191,7 +190,7 @@ def draw_errors(axes: Axes, rows: Sequence[Mapping[str, Value]]) -> None:
     _name_classes(axes)
 
 
-def draw_coverage(axes: Axes, rows: Sequence[Mapping[str, Value]]) -> None:
+def draw_coverage(axes: Axes, rows: Sequence[Row]) -> None:
     """Part of the vertices that intervals of 90 % hold, of each class."""
     coverage = [100.0 * value for value in _by_class(rows, "coverage")]
     axes.bar(np.arange(len(CLASSES)), coverage, 0.6, color="grey")
@@ -200,9 +199,14 @@ def draw_coverage(axes: Axes, rows: Sequence[Mapping[str, Value]]) -> None:
     _name_classes(axes)
 
 
-def _by_class(rows: Sequence[Mapping[str, Value]], key: str) -> list[float]:
+def _by_class(rows: Sequence[Row], key: str) -> list[float]:
     """Means of each class."""
-    return [float(np.mean([row[key] for row in rows if row["class"] == k])) for k in CLASSES]
+    return [float(column(_of(rows, kind), key).mean()) for kind in CLASSES]
+
+
+def _of(rows: Sequence[Row], kind: str | None) -> Sequence[Row]:
+    """Rows of a class; None for all."""
+    return rows if kind is None else [row for row in rows if row["class"] == kind]
 
 
 def _name_classes(axes: Axes) -> None:

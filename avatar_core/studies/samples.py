@@ -12,28 +12,23 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avatar_core.common.processes import repeatable
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import barycenter
 from avatar_core.shapes.lle import LLE, locally_linear_embedding
-from avatar_core.studies.shapes import PAPER_GRID, distance_vectors, paper_box
-from avatar_core.studies.study import Study, Value, follow, mean_and_worst
+from avatar_core.studies.shapes import PAPER_GRID, FloatArray, distance_vectors, paper_box
+from avatar_core.studies.study import Row, Run, Study, column, follow, label, mean_and_worst, where
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
-
 NEIGHBORS = 12
 DIMENSION = 6
 TIMED_REGULARIZATION = 1e-3  # scikit-learn's default: both programs do the same
-PAPER: dict[str, Value] = {"lle_seconds_500": 1.4}
 NAN = math.nan
 
 
@@ -49,10 +44,6 @@ class SamplesSettings:
     seed: int = 0
 
 
-FULL = SamplesSettings()
-QUICK = SamplesSettings(sizes=(12, 50, 150, 500), n_targets=5, phantom_spacing=12e-3, repeats=2)
-
-
 @dataclass(frozen=True)
 class Timing:
     """Shortest of several runs [s] on n vectors; NaN without scikit-learn.
@@ -66,40 +57,91 @@ class Timing:
     weights_difference: float
 
 
-def run(surfaces: Path | None, quick: bool, _folder: Path) -> Study:
-    """The study; the livers are generated, a folder of surfaces is not used."""
-    return study(QUICK if quick else FULL)
+class SamplesStudy(Study[SamplesSettings]):
+    """Errors for each size of the base, then times for the largest; the livers are generated."""
+
+    name = "samples"
+    full = SamplesSettings()
+    quick = SamplesSettings(sizes=(12, 50, 150, 500), n_targets=5, phantom_spacing=12e-3, repeats=2)
+    paper: ClassVar = {"lle_seconds_500": 1.4}
+
+    @repeatable
+    def measure(self, run: Run[SamplesSettings]) -> None:
+        settings, largest = run.settings, run.settings.sizes[-1]
+        organ = phantom_liver(settings.phantom_spacing)
+        maps = population(largest + settings.n_targets, settings.seed)
+        moved = [shape.moved(organ) for shape in maps]
+        vectors = distance_vectors(moved, paper_box(moved, settings.shape))
+        base, targets = vectors[:largest], vectors[largest:]
+        for n in follow(settings.sizes, "errors"):
+            run.add(error_row(base[:n], targets))
+        timing = time_lle(base, settings.repeats)
+        run.add({"kind": "time", **vars(timing)})
+        if math.isnan(timing.sklearn_seconds):
+            run.notices.append("scikit-learn is not installed: no times beside ours")
+        run.notices.append("the paper's Fig. 7 prints no numbers: the error falls monotonically")
+
+    def summary(self, run: Run[SamplesSettings]) -> dict[str, float]:
+        """Errors at the ends, the rate p of error ~ n^-p, and the times."""
+        (timing,), rows = where(run.rows, kind="time"), where(run.rows, kind="error")
+        n, error, worst = (column(rows, key) for key in ("n_samples", "error", "error_worst"))
+        summary: dict[str, float] = {}
+        for k in (0, -1):
+            summary[f"error_{n[k]:.0f}"] = float(error[k])
+            summary[f"error_{n[k]:.0f}_worst"] = float(worst[k])
+        ours, theirs, off = (
+            float(timing[key])  # type: ignore[arg-type]
+            for key in ("seconds", "sklearn_seconds", "weights_difference")
+        )
+        return {
+            **summary,
+            "rate": float(-np.polyfit(np.log(n), np.log(error), 1)[0]),
+            f"lle_seconds_{timing['n_samples']}": ours,
+            f"sklearn_seconds_{timing['n_samples']}": theirs,
+            "sklearn_ratio": theirs / ours,
+            "weights_difference": off,
+        }
+
+    def sentence(self, run: Run[SamplesSettings]) -> str:
+        summary, n = run.summary, run.settings.sizes[-1]
+        return (
+            f"The error of a liver written by 12 of n livers falls like n^-{summary['rate']:.2f}, "
+            f"to {summary[f'error_{n}']:.2%} of the distance field at n = {n}; LLE takes "
+            f"{summary[f'lle_seconds_{n}']:.2f} s there (paper 1.4 s), scikit-learn "
+            f"{summary['sklearn_ratio']:.1f} times as long, one BLAS thread each."
+        )
+
+    def draw(self, figure: Figure, run: Run[SamplesSettings]) -> None:
+        left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+        rows, n = where(run.rows, kind="error"), run.settings.sizes[-1]
+        for key, text, style in (
+            ("nearest", "nearest neighbour", "s:"),
+            ("error", f"LLE, k = {NEIGHBORS}, mean of all targets", "o-"),
+            ("error_worst", "the same, worst target", "^--"),
+            ("error_first", "the same, one liver (as in the paper)", "x-"),
+            ("all", "LLE, k = n (at most 100)", "d-."),
+        ):
+            left.loglog(column(rows, "n_samples"), 100 * column(rows, key), style, label=text)
+        label(
+            left,
+            "livers in the base",
+            "relative L2 error of the distance field [%]",
+            "convergence with the number of samples (paper, Fig. 7)",
+        )
+        seconds = [run.summary[f"{name}_seconds_{n}"] for name in ("lle", "sklearn")]
+        bars = dict(zip(("here", "scikit-learn", "paper"), (*seconds, 1.4), strict=True))
+        shown = {text: value for text, value in bars.items() if not math.isnan(value)}
+        right.bar(list(shown), list(shown.values()), color=["crimson", "steelblue", "gray"])
+        right.set(ylabel="time [s]", title=f"LLE of {n} livers, one BLAS thread")
 
 
-@repeatable
-def study(settings: SamplesSettings) -> Study:
-    """Errors for each size of the base, then times for the largest."""
-    organ = phantom_liver(settings.phantom_spacing)
-    maps = population(settings.sizes[-1] + settings.n_targets, settings.seed)
-    moved = [shape.moved(organ) for shape in maps]
-    vectors = distance_vectors(moved, paper_box(moved, settings.shape))
-    base, targets = vectors[: settings.sizes[-1]], vectors[settings.sizes[-1] :]
-    rows = [error_row(base[:n], targets) for n in follow(settings.sizes, "errors")]
-    timing = time_lle(base, settings.repeats)
-    summary = _summary(rows, timing)
-    notices: tuple[str, ...] = ()
-    if math.isnan(timing.sklearn_seconds):
-        notices = ("scikit-learn is not installed: no times beside ours",)
-    return Study(
-        name="samples",
-        sentence=_sentence(summary, settings.sizes[-1]),
-        summary=summary,
-        rows=(*rows, {"kind": "time", **vars(timing)}),
-        paper=PAPER,
-        draw=lambda figure: _draw(figure, rows, timing),
-        notices=(*notices, "the paper's Fig. 7 prints no numbers: the error falls monotonically"),
-    )
+STUDY = SamplesStudy()
 
 
-def error_row(base: FloatArray, targets: FloatArray) -> dict[str, Value]:
+def error_row(base: FloatArray, targets: FloatArray) -> Row:
     """Error of the twelve nearest, of the nearest alone, and of LLE among all."""
     errors = {"error": NEIGHBORS, "nearest": 1, "all": min(len(base), 100)}
-    row: dict[str, Value] = {"kind": "error", "n_samples": len(base)}
+    row: Row = {"kind": "error", "n_samples": len(base)}
     for key, k in errors.items():
         found = [_field_error(base, target, k) for target in targets]
         row.update(mean_and_worst(key, found))
@@ -159,52 +201,3 @@ def _seconds(call: Callable[[], object]) -> float:
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
-
-
-def _summary(rows: list[dict[str, Value]], timing: Timing) -> dict[str, float]:
-    """Errors at the ends, the rate p of error ~ n^-p, and the times."""
-    n = np.array([row["n_samples"] for row in rows], float)
-    error = np.array([row["error"] for row in rows], float)
-    summary: dict[str, float] = {}
-    for row in (rows[0], rows[-1]):
-        size = row["n_samples"]
-        summary[f"error_{size}"] = float(row["error"])  # type: ignore[arg-type]
-        summary[f"error_{size}_worst"] = float(row["error_worst"])  # type: ignore[arg-type]
-    return {
-        **summary,
-        "rate": float(-np.polyfit(np.log(n), np.log(error), 1)[0]),
-        f"lle_seconds_{timing.n_samples}": timing.seconds,
-        f"sklearn_seconds_{timing.n_samples}": timing.sklearn_seconds,
-        "sklearn_ratio": timing.sklearn_seconds / timing.seconds,
-        "weights_difference": timing.weights_difference,
-    }
-
-
-def _sentence(summary: dict[str, float], n: int) -> str:
-    return (
-        f"The error of a liver written by 12 of n livers falls like n^-{summary['rate']:.2f}, to "
-        f"{summary[f'error_{n}']:.2%} of the distance field at n = {n}; LLE takes "
-        f"{summary[f'lle_seconds_{n}']:.2f} s there (paper 1.4 s), scikit-learn "
-        f"{summary['sklearn_ratio']:.1f} times as long, one BLAS thread each."
-    )
-
-
-def _draw(figure: Figure, rows: list[dict[str, Value]], timing: Timing) -> None:
-    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    n = [row["n_samples"] for row in rows]
-    for key, text, style in (
-        ("nearest", "nearest neighbour", "s:"),
-        ("error", f"LLE, k = {NEIGHBORS}, mean of all targets", "o-"),
-        ("error_worst", "the same, worst target", "^--"),
-        ("error_first", "the same, one liver (as in the paper)", "x-"),
-        ("all", "LLE, k = n (at most 100)", "d-."),
-    ):
-        left.loglog(n, [100 * float(row[key]) for row in rows], style, label=text)  # type: ignore[arg-type]
-    left.set(xlabel="livers in the base", ylabel="relative L2 error of the distance field [%]")
-    left.set_title("convergence with the number of samples (paper, Fig. 7)")
-    left.grid(which="both", alpha=0.3)
-    left.legend(fontsize=8)
-    bars = {"here": timing.seconds, "scikit-learn": timing.sklearn_seconds, "paper": 1.4}
-    shown = {text: value for text, value in bars.items() if not math.isnan(value)}
-    right.bar(list(shown), list(shown.values()), color=["crimson", "steelblue", "gray"])
-    right.set(ylabel="time [s]", title=f"LLE of {timing.n_samples} livers, one BLAS thread")

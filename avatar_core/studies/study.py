@@ -1,4 +1,8 @@
-"""Results of a study: what it prints and writes, with the paper's figures and the machine."""
+"""What all studies share: :class:`Study`, one :class:`Run` of it, its rows and the files it writes.
+
+A study is a module of this package with an instance of :class:`Study`, ``STUDY``. It says what to
+measure and how to sum it up; folders, row files, tables, JSON and pictures are made here.
+"""
 
 from __future__ import annotations
 
@@ -8,71 +12,161 @@ import os
 import platform
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from avatar_core.common.machine import processor
 from avatar_core.offline.rule import Progress
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Value = float | int | str | bool | None
+Row = dict[str, Value]
 Item = TypeVar("Item")
+S = TypeVar("S")
 
 PACKAGES = ("avatar", "numpy", "scipy", "libigl", "scikit-fem", "rslab", "scikit-learn")
 
 
-@dataclass(frozen=True, eq=False)
-class Study:
-    """Result of an experiment.
+class Study(ABC, Generic[S]):
+    """An experiment.
 
-    name : of the files it is written to
-    sentence : the finding, in one sentence, for the picture
-    summary : key figures; errors are fractions, times seconds, lengths have their unit in the key
-    rows : one mapping per measurement
+    name : of the command and of the files it writes
+    full, quick : its settings, and those of a smaller version that takes minutes
     paper : values of the paper, under the same keys as in the summary
-    draw : draws the picture
-    notices : what was skipped or done differently from the request, one line each
+    key : column that tells rows apart, by which an interrupted run goes on; empty: none does
     """
 
     name: str
-    sentence: str
-    summary: Mapping[str, float]
-    rows: tuple[Mapping[str, Value], ...]
-    paper: Mapping[str, Value]
-    draw: Callable[[Figure], None]
-    notices: tuple[str, ...] = ()
+    full: S
+    quick: S
+    paper: ClassVar[Mapping[str, Value]] = {}
+    key = ""
+
+    @abstractmethod
+    def measure(self, run: Run[S]) -> None:
+        """Add a row for each measurement."""
+
+    @abstractmethod
+    def summary(self, run: Run[S]) -> dict[str, float]:
+        """Key figures: errors are fractions, times seconds, lengths have their unit in the key."""
+
+    @abstractmethod
+    def sentence(self, run: Run[S]) -> str:
+        """The finding, in one sentence, for the picture."""
+
+    @abstractmethod
+    def draw(self, figure: Figure, run: Run[S]) -> None:
+        """Draw the picture."""
+
+    def report(self, run: Run[S]) -> None:
+        """Write further files, such as a page."""
+
+    def conduct(self, settings: S, folder: Path, surfaces: Path | None = None) -> Run[S]:
+        """Measure and sum up.
+
+        Parameters
+        ----------
+        settings : such as ``full``
+        folder : to write to; it is made if it does not exist
+        surfaces : folder of liver surfaces [mm]; None for the default one
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        run = Run(self, settings, folder, surfaces)
+        self.measure(run)
+        run.summary = self.summary(run)
+        self.report(run)
+        return run
+
+
+@dataclass(eq=False)
+class Run(Generic[S]):
+    """What a study was asked for and what it found.
+
+    settings, folder, surfaces : as given to :meth:`Study.conduct`
+    rows : one mapping per measurement
+    notices : what was skipped or done differently from the request, one line each
+    kept : what the summary or the picture needs beside the rows
+    summary : key figures
+    """
+
+    study: Study[S]
+    settings: S
+    folder: Path
+    surfaces: Path | None = None
+    rows: list[Row] = field(default_factory=list)
+    notices: list[str] = field(default_factory=list)
+    kept: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        path, key = self.folder / f"{self.study.name}.rows.jsonl", self.study.key
+        self._file = RowFile(path, key) if key else None
+
+    def add(self, row: Row) -> None:
+        """Keep a row, also in the row file if the study can go on after an interruption."""
+        self.rows.append(row)
+        if self._file is not None:
+            self._file.add(row)
+
+    def is_known(self, name: str) -> bool:
+        """Whether an interrupted run has measured this row, which is then taken from its file."""
+        row = self._file.rows.get(name) if self._file is not None else None
+        if row is not None:
+            self.rows.append(row)
+        return row is not None
+
+    @property
+    def sentence(self) -> str:
+        """The finding, in one sentence."""
+        return self.study.sentence(self)
 
     def table(self) -> str:
         """The summary beside the values of the paper."""
         width = max(len(key) for key in self.summary)
         lines = [f"{'':{width}s} {'paper':>24s} {'here':>12s}"]
         for key, value in self.summary.items():
-            lines.append(f"{key:{width}s} {_text(self.paper.get(key)):>24s} {_text(value):>12s}")
+            paper = _text(self.study.paper.get(key))
+            lines.append(f"{key:{width}s} {paper:>24s} {_text(value):>12s}")
         return "\n".join(lines)
 
+    def write(self, seconds: float) -> tuple[Path, Path]:
+        """Write ``NAME.json`` and ``NAME.png``, and return their paths."""
+        document = {
+            "name": self.study.name,
+            "sentence": self.sentence,
+            "summary": self.summary,
+            "rows": self.rows,
+            "paper": dict(self.study.paper),
+            "notices": self.notices,
+            "machine": machine(),
+            "seconds": seconds,
+        }
+        record, picture = (self.folder / f"{self.study.name}.{end}" for end in ("json", "png"))
+        record.write_text(json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+        self._draw(picture)
+        return record, picture
 
-def write_study(study: Study, folder: Path, seconds: float) -> tuple[Path, Path]:
-    """Write ``NAME.json`` and ``NAME.png``; the folder is made if it does not exist."""
-    folder.mkdir(parents=True, exist_ok=True)
-    document = {
-        "name": study.name,
-        "sentence": study.sentence,
-        "summary": dict(study.summary),
-        "rows": [dict(row) for row in study.rows],
-        "paper": dict(study.paper),
-        "notices": list(study.notices),
-        "machine": machine(),
-        "seconds": seconds,
-    }
-    record, picture = folder / f"{study.name}.json", folder / f"{study.name}.png"
-    record.write_text(json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
-    _draw(study, picture)
-    return record, picture
+    def _draw(self, path: Path) -> None:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        import matplotlib.pyplot as plt
+
+        figure = plt.figure(figsize=(11.0, 4.8), layout="constrained")
+        self.study.draw(figure, self)
+        figure.suptitle(textwrap.fill(self.sentence, 130), fontsize=10)
+        figure.savefig(path, dpi=110)
+        plt.close(figure)
 
 
 def machine() -> dict[str, Value]:
@@ -105,26 +199,44 @@ class RowFile:
         self._path = path
         lines = path.read_text().splitlines() if path.is_file() else []
         found = [row for row in map(_parsed, lines) if row is not None]
-        self.rows: dict[str, dict[str, Value]] = {str(row[key]): row for row in found}
+        self.rows: dict[str, Row] = {str(row[key]): row for row in found}
         path.write_text("".join(_line(row) for row in found))
 
-    def add(self, row: Mapping[str, Value]) -> None:
+    def add(self, row: Row) -> None:
         """Append a row."""
         with self._path.open("a") as file:
             file.write(_line(row))
 
 
-def _line(row: Mapping[str, Value]) -> str:
-    return json.dumps(_plain(dict(row)), allow_nan=False) + "\n"
+def _line(row: Row) -> str:
+    return json.dumps(_plain(row), allow_nan=False) + "\n"
 
 
-def _parsed(line: str) -> dict[str, Value] | None:
-    """A row; None for a line that was cut off."""
+def _parsed(line: str) -> Row | None:
+    """A row, with NaN for null; None for a line that was cut off."""
     try:
-        row: dict[str, Value] = json.loads(line)
+        row: Row = json.loads(line)
     except ValueError:
         return None
-    return row
+    return {key: math.nan if value is None else value for key, value in row.items()}
+
+
+def where(rows: Iterable[Row], **wanted: Value) -> list[Row]:
+    """Rows whose columns have these values, e.g. ``kind="map", delay=0``."""
+    return [row for row in rows if all(row.get(key) == value for key, value in wanted.items())]
+
+
+def column(rows: Iterable[Row], key: str) -> NDArray[np.float64]:
+    """The numbers of a column, in the rows that have it."""
+    return np.array([row[key] for row in rows if key in row], float)
+
+
+def label(axes: Axes, x: str, y: str, title: str = "", legend: float = 8.0) -> None:
+    """Name both axes, and add a grid and a legend of this font size (0: none)."""
+    axes.set(xlabel=x, ylabel=y, title=title)
+    axes.grid(which="both", alpha=0.3)
+    if legend:
+        axes.legend(fontsize=legend)
 
 
 def follow(items: Iterable[Item], text: str) -> Iterator[Item]:
@@ -168,19 +280,6 @@ def mean_and_worst(key: str, values: Iterable[float]) -> dict[str, float]:
     if not found:
         return {key: math.nan, f"{key}_worst": math.nan}
     return {key: sum(found) / len(found), f"{key}_worst": max(found)}
-
-
-def _draw(study: Study, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure = plt.figure(figsize=(11.0, 4.8), layout="constrained")
-    study.draw(figure)
-    figure.suptitle(textwrap.fill(study.sentence, 130), fontsize=10)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def _text(value: Value) -> str:

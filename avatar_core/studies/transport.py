@@ -9,15 +9,13 @@ construction; its time is that of all solutions, without their separation.
 
 from __future__ import annotations
 
-import math
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, ClassVar
 
 import igl
 import numpy as np
@@ -43,138 +41,141 @@ from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.shapes.registration import Registration, register
 from avatar_core.studies.shapes import SAME_SUBJECT, read_livers
-from avatar_core.studies.study import RowFile, Study, Value, follow
+from avatar_core.studies.study import Row, Run, Study, column, follow
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PAPER: dict[str, Value] = {"interpolated_lle_grid_mean": 0.19}  # "below 19 %", Sec. 3.3
-N_PATIENTS, N_QUICK, N_QUICK_BASE = 12, 3, 12
 _BATCH = 40  # load positions solved at once
 WEIGHTINGS: tuple[Weighting, ...] = ("lle-grid", "lle-template", "kriging")
 
 
 @dataclass(frozen=True)
-class TransportRow:
-    """One patient; errors are means over load positions unless they say worst.
+class TransportSettings:
+    """Sizes of the study.
 
-    interpolated : by weighting, in the order of :data:`WEIGHTINGS` (NaN: no distances in the base)
-    reduced_estimate : estimated mean error
-    clamp_rule : of solutions with the clamp of the anatomical rule, at the same load positions
-    reduced_solutions, solved_solutions : fine solutions
-    seconds : CPU of ``reduced`` after mesh and registration, and of its response alone, without
-        what contact needs around it; of everything from the surface to it, and from a file to a
-        file, both without a certificate; of all solutions with their factorization, to which the
-        response alone compares
+    n_livers : of the atlas, at most; None for all
+    n_patients : livers of the atlas that are left out, one after another
+    n_vertices : of a patient's mesh
+    template_vertices, rank : of the atlas
+    atlas : its file in the folder of the study, with which another run begins
     """
 
-    name: str
-    interpolated: tuple[float, ...]
-    reduced: float
-    reduced_worst: float
-    reduced_contact: float
-    reduced_contact_worst: float
-    reduced_estimate: float
-    clamp_rule: float
-    n_positions: int
-    reduced_solutions: int
-    solved_solutions: int
-    reduced_cpu_seconds: float
-    response_cpu_seconds: float
-    total_cpu_seconds: float
-    cpu_seconds_from_file: float
-    solved_cpu_seconds: float
-
-    @property
-    def within_2x(self) -> bool:
-        """Whether the estimate lies within a factor 2 of the true error."""
-        return 0.5 <= self.reduced_estimate / self.reduced <= 2.0
+    n_livers: int | None = None
+    n_patients: int = 12
+    n_vertices: int = 2850
+    template_vertices: int = 2500
+    rank: int = 120
+    atlas: str = "transport_atlas.h5"
 
 
-@dataclass(frozen=True)
-class Transport:
-    """The study: one row a patient and their summary."""
+class TransportStudy(Study[TransportSettings]):
+    """One row for each patient."""
 
-    rows: tuple[TransportRow, ...]
+    name = "transport"
+    full = TransportSettings()
+    quick = TransportSettings(12, 3, 700, 700, 60, "transport_quick_atlas.h5")
+    paper: ClassVar = {"interpolated_lle_grid_mean": 0.19}  # "below 19 %", Sec. 3.3
+    key = "name"
 
-    @property
-    def summary(self) -> dict[str, float]:
-        """Means (and the worst load of all patients) under the study's keys."""
+    def measure(self, run: Run[TransportSettings]) -> None:
+        livers = read_livers(run.surfaces, run.settings.n_livers, phantoms=6)
+        base = base_of(_atlas(livers.surfaces, run.folder / run.settings.atlas, run.settings))
+        run.kept["n_members"] = len(base.names)
+        run.notices += livers.notices
+        members = [surface for surface in livers.surfaces if surface.name in base.names]
+        run.notices += [
+            f"{surface.name}: not in the atlas"
+            for surface in livers.surfaces
+            if surface not in members
+        ]
+        options = PatientOptions(n_vertices=run.settings.n_vertices)
+        for surface in follow(_patients(members, run.settings.n_patients), "patients"):
+            if not run.is_known(surface.name):
+                run.add(transport_row(surface, base, options))
 
-        def mean(values: Sequence[float]) -> float:
-            return float(np.mean(values))
+    def summary(self, run: Run[TransportSettings]) -> dict[str, float]:
+        """Means, and the worst load of all patients."""
+        return summarized(run.rows)
 
-        grid, template, kriging = (
-            mean([row.interpolated[k] for row in self.rows]) for k in range(3)
+    def sentence(self, run: Run[TransportSettings]) -> str:
+        summary = run.summary
+        return (
+            f"{len(run.rows)} patients, each left out of {run.kept['n_members']} livers: "
+            f"interpolated {summary['interpolated_mean']:.1%} off (the paper's way "
+            f"{summary['interpolated_lle_grid_mean']:.1%}), reduced {summary['reduced_mean']:.1%} "
+            f"in {summary['reduced_cpu_seconds']:.0f} s of CPU time, its response "
+            f"{summary['solved_over_response']:.1f} times cheaper than all solutions; file to file "
+            f"{summary['cpu_seconds_from_file']:.0f} s."
         )
-        return {
-            "interpolated_mean": kriging,  # the default weighting
-            "interpolated_lle_grid_mean": grid,
-            "interpolated_lle_template_mean": template,
-            "interpolated_kriging_mean": kriging,
-            "reduced_mean": mean([row.reduced for row in self.rows]),
-            "reduced_worst": max(row.reduced_worst for row in self.rows),
-            "reduced_cpu_seconds": mean([row.reduced_cpu_seconds for row in self.rows]),
-            "response_cpu_seconds": mean([row.response_cpu_seconds for row in self.rows]),
-            "total_cpu_seconds": mean([row.total_cpu_seconds for row in self.rows]),
-            "cpu_seconds_from_file": mean([row.cpu_seconds_from_file for row in self.rows]),
-            "solved_cpu_seconds": mean([row.solved_cpu_seconds for row in self.rows]),
-            "solved_over_response": mean(
-                [row.solved_cpu_seconds / row.response_cpu_seconds for row in self.rows]
-            ),
-            "estimate_within_2x": mean([float(row.within_2x) for row in self.rows]),
-            "clamp_rule_mean": mean([row.clamp_rule for row in self.rows]),
-        }
+
+    def draw(self, figure: Figure, run: Run[TransportSettings]) -> None:
+        left, right = figure.subplots(1, 2)
+        place = np.arange(len(run.rows))
+        for kind in WEIGHTINGS:
+            left.plot(place, column(run.rows, _column_of(kind)), "o", label=f"interpolated, {kind}")
+        left.plot(place, column(run.rows, "reduced"), "s", label="reduced, mean")
+        left.plot(place, column(run.rows, "reduced_worst"), "v", label="reduced, worst load")
+        left.axhline(0.19, color="gray", linestyle="--", label="paper: below")
+        left.set_yscale("log")
+        left.set_ylim(bottom=4e-3)  # room for the legend
+        left.set_ylabel("relative displacement error, L2 [-]")
+        left.legend(fontsize=7, ncols=2, loc="lower left")
+        width = 0.27
+        for k, (key, text) in enumerate(
+            (
+                ("reduced_cpu_seconds", "reduced, all"),
+                ("response_cpu_seconds", "reduced, response"),
+                ("solved_cpu_seconds", "all solutions"),
+            )
+        ):
+            right.bar(place + (k - 1) * width, column(run.rows, key), width, label=text)
+        right.set_ylabel("CPU time after mesh and registration [s]")
+        right.legend(fontsize=8)
+        for axes in (left, right):
+            axes.set_xticks(place, [str(row["name"]) for row in run.rows], rotation=60, fontsize=7)
 
 
-def run(surfaces: Path | None, quick: bool, folder: Path) -> Study:
-    """The study; its atlas stays in the folder, so that a second run begins with the patients.
-
-    surfaces : folder of livers, None for the default; quick : a dozen livers on coarse meshes
-    """
-    livers = read_livers(surfaces, N_QUICK_BASE if quick else None, phantoms=6)
-    atlas = _atlas(
-        livers.surfaces, folder / f"transport{'_quick' if quick else ''}_atlas.h5", quick
-    )
-    base = base_of(atlas)
-    members = [surface for surface in livers.surfaces if surface.name in base.names]
-    skipped = tuple(
-        f"{surface.name}: not in the atlas" for surface in livers.surfaces if surface not in members
-    )
-    file = RowFile(folder / "transport.rows.jsonl", "name")
-    known = {name: _of_flat(row) for name, row in file.rows.items()}
-    found = transport(members, base, quick, row_done=lambda row: file.add(_flat(row)), known=known)
-    summary = found.summary
-    sentence = (
-        f"{len(found.rows)} patients, each left out of {len(base.names)} livers: interpolated "
-        f"{summary['interpolated_mean']:.1%} off (the paper's way "
-        f"{summary['interpolated_lle_grid_mean']:.1%}), reduced {summary['reduced_mean']:.1%} in "
-        f"{summary['reduced_cpu_seconds']:.0f} s of CPU time, its response "
-        f"{summary['solved_over_response']:.1f} times cheaper than all solutions; file to file "
-        f"{summary['cpu_seconds_from_file']:.0f} s."
-    )
-    rows = tuple(_flat(row) for row in found.rows)
-    return Study(
-        name="transport",
-        sentence=sentence,
-        summary=summary,
-        rows=rows,
-        paper=PAPER,
-        draw=lambda figure: _draw(figure, found.rows),
-        notices=livers.notices + skipped,
-    )
+STUDY = TransportStudy()
 
 
-def _atlas(surfaces: Sequence[SurfaceMesh], path: Path, quick: bool) -> Atlas:
+def summarized(rows: Sequence[Row]) -> dict[str, float]:
+    """The summary of the study."""
+
+    def mean(key: str) -> float:
+        return float(column(rows, key).mean())
+
+    ratio = column(rows, "solved_cpu_seconds") / column(rows, "response_cpu_seconds")
+    return {
+        "interpolated_mean": mean(_column_of("kriging")),  # the default weighting
+        **{f"{_column_of(kind)}_mean": mean(_column_of(kind)) for kind in WEIGHTINGS},
+        "reduced_mean": mean("reduced"),
+        "reduced_worst": float(column(rows, "reduced_worst").max()),
+        "reduced_cpu_seconds": mean("reduced_cpu_seconds"),
+        "response_cpu_seconds": mean("response_cpu_seconds"),
+        "total_cpu_seconds": mean("total_cpu_seconds"),
+        "cpu_seconds_from_file": mean("cpu_seconds_from_file"),
+        "solved_cpu_seconds": mean("solved_cpu_seconds"),
+        "solved_over_response": float(ratio.mean()),
+        "estimate_within_2x": mean("within_2x"),
+        "clamp_rule_mean": mean("clamp_rule"),
+    }
+
+
+def _column_of(kind: Weighting) -> str:
+    return f"interpolated_{kind.replace('-', '_')}"
+
+
+def _atlas(surfaces: Sequence[SurfaceMesh], path: Path, settings: TransportSettings) -> Atlas:
     """The atlas of a folder, or a new one; an interrupted one goes on."""
     if path.is_file():
         return load_atlas(path)
     from tqdm import tqdm
 
-    options = AtlasOptions(template_vertices=700 if quick else 2500)
-    solve_response = ResponseSolver(rank=60 if quick else 120)
+    options = AtlasOptions(template_vertices=settings.template_vertices)
+    solve_response = ResponseSolver(rank=settings.rank)
     with tqdm(total=len(surfaces), desc="atlas", file=sys.stderr, disable=None) as bar:
 
         def advance(done: int, _: int, name: str) -> None:
@@ -186,49 +187,25 @@ def _atlas(surfaces: Sequence[SurfaceMesh], path: Path, quick: bool) -> Atlas:
         ).atlas
 
 
-def transport(
-    surfaces: Sequence[SurfaceMesh],
-    base: PatientBase,
-    quick: bool = False,
-    same_person: Collection[Collection[str]] = SAME_SUBJECT,
-    options: PatientOptions | None = None,
-    row_done: Callable[[TransportRow], None] | None = None,
-    known: Mapping[str, TransportRow] = MappingProxyType({}),
-) -> Transport:
-    """Leave-one-out over livers that are members of the base, one scan of each person.
+def _patients(members: Sequence[SurfaceMesh], n: int) -> list[SurfaceMesh]:
+    """Members drawn evenly, one scan of each person."""
+    further = {name for scans in SAME_SUBJECT for name in sorted(scans)[1:]}
+    persons = [surface for surface in members if surface.name not in further]
+    chosen = np.linspace(0, len(persons) - 1, min(n, len(persons))).astype(int)
+    return [persons[i] for i in chosen]
 
-    Parameters
-    ----------
-    surfaces : of the members, ``surface.name`` in ``base.names``
-    quick : three patients on coarse meshes instead of twelve
-    row_done : called with each row when it is measured
-    known : rows of patients that are not measured again, by their names
+
+def transport_row(surface: SurfaceMesh, base: PatientBase, options: PatientOptions) -> Row:
+    """All fidelities of one patient against full finite elements.
+
+    Errors are means over load positions unless they say worst. CPU seconds are those of
+    ``reduced`` after mesh and registration, and of its response alone, without what contact needs
+    around it; of everything from the surface to it, and from a file to a file, both without a
+    certificate; of all solutions with their factorization, to which the response alone compares.
+    ``clamp_rule`` is the error of solutions with the clamp of the anatomical rule.
     """
-    options = options or PatientOptions(n_vertices=700 if quick else 2850)
-    further = {name for scans in same_person for name in sorted(scans)[1:]}
-    surfaces = [surface for surface in surfaces if surface.name not in further]
-    count = min(N_QUICK if quick else N_PATIENTS, len(surfaces))
-    chosen = np.linspace(0, len(surfaces) - 1, count).astype(int)
-    rows: list[TransportRow] = []
-    for i in follow(chosen, "patients"):
-        if surfaces[i].name in known:
-            rows.append(known[surfaces[i].name])
-            continue
-        rows.append(transport_row(surfaces[i], base, same_person, options))
-        if row_done is not None:
-            row_done(rows[-1])
-    return Transport(tuple(rows))
-
-
-def transport_row(
-    surface: SurfaceMesh,
-    base: PatientBase,
-    same_person: Collection[Collection[str]],
-    options: PatientOptions,
-) -> TransportRow:
-    """All fidelities of one patient against full finite elements."""
     name = surface.name
-    options = replace(options, leave_out=tuple(leave_one_out(base, name, same_person)))
+    options = replace(options, leave_out=tuple(leave_one_out(base, name, SAME_SUBJECT)))
     start = cpu_seconds()
     registration = register(base.template, surface, base.rule)
     mesh = tetrahedralize(surface, options.n_vertices)
@@ -246,27 +223,28 @@ def transport_row(
     # a fresh problem, so that no factorization is shared
     truth = _Truth(patient_problem(surface, base, registration, mesh))
     errors, contact = truth.of_vademecum(vademecum)
-    return TransportRow(
-        name=name,
-        interpolated=tuple(
-            float("nan") if guess is None else float(truth.of_response(guess).mean())
-            for guess in guesses
-        ),
-        reduced=float(errors.mean()),
-        reduced_worst=float(errors.max()),
-        reduced_contact=float(contact.mean()),
-        reduced_contact_worst=float(contact.max()),
-        reduced_estimate=found.history[-1].mean,
-        clamp_rule=truth.with_clamp_by_rule(registration),
-        n_positions=problem.loads.n_positions,
-        reduced_solutions=found.history[-1].solutions,
-        solved_solutions=3 * problem.loads.n_positions,
-        reduced_cpu_seconds=reduced_seconds,
-        response_cpu_seconds=response_seconds,
-        total_cpu_seconds=before + reduced_seconds,
-        cpu_seconds_from_file=before + reduced_seconds + _file_seconds(surface, vademecum),
-        solved_cpu_seconds=truth.seconds,
-    )
+    reduced, estimate = float(errors.mean()), found.history[-1].mean
+    row: Row = {
+        "name": name,
+        "reduced": reduced,
+        "reduced_worst": float(errors.max()),
+        "reduced_contact": float(contact.mean()),
+        "reduced_contact_worst": float(contact.max()),
+        "reduced_estimate": estimate,
+        "clamp_rule": truth.with_clamp_by_rule(registration),
+        "n_positions": problem.loads.n_positions,
+        "reduced_solutions": found.history[-1].solutions,
+        "solved_solutions": 3 * problem.loads.n_positions,
+        "reduced_cpu_seconds": reduced_seconds,
+        "response_cpu_seconds": response_seconds,
+        "total_cpu_seconds": before + reduced_seconds,
+        "cpu_seconds_from_file": before + reduced_seconds + _file_seconds(surface, vademecum),
+        "solved_cpu_seconds": truth.seconds,
+    }
+    for kind, guess in zip(WEIGHTINGS, guesses, strict=True):
+        off = np.nan if guess is None else float(truth.of_response(guess).mean())
+        row[_column_of(kind)] = off  # NaN: no distances in the base
+    return row | {"within_2x": bool(0.5 <= estimate / reduced <= 2.0)}
 
 
 def _file_seconds(surface: SurfaceMesh, vademecum: Vademecum) -> float:
@@ -361,45 +339,3 @@ def _solve(elasticity: Elasticity, problem: PatientProblem) -> tuple[np.ndarray,
         here = np.arange(last - first)
         compliance[first:last] = work[here, :, here, :]
     return columns, compliance
-
-
-def _flat(row: TransportRow) -> dict[str, Value]:
-    """A row of the JSON."""
-    record = asdict(row)
-    by_weighting = record.pop("interpolated")
-    names = [f"interpolated_{kind.replace('-', '_')}" for kind in WEIGHTINGS]
-    return {**record, **dict(zip(names, by_weighting, strict=True)), "within_2x": row.within_2x}
-
-
-def _of_flat(flat: dict[str, Any]) -> TransportRow:
-    """The inverse of :func:`_flat`; what is not a number was written as null."""
-    found: dict[str, Any] = {k: math.nan if value is None else value for k, value in flat.items()}
-    del found["within_2x"]
-    by_weighting = (found.pop(f"interpolated_{kind.replace('-', '_')}") for kind in WEIGHTINGS)
-    return TransportRow(interpolated=tuple(by_weighting), **found)
-
-
-def _draw(figure: Figure, rows: Sequence[TransportRow]) -> None:
-    left, right = figure.subplots(1, 2)
-    place = np.arange(len(rows))
-    for k, kind in enumerate(WEIGHTINGS):
-        left.plot(place, [row.interpolated[k] for row in rows], "o", label=f"interpolated, {kind}")
-    left.plot(place, [row.reduced for row in rows], "s", label="reduced, mean")
-    left.plot(place, [row.reduced_worst for row in rows], "v", label="reduced, worst load")
-    left.axhline(0.19, color="gray", linestyle="--", label="paper: below")
-    left.set_yscale("log")
-    left.set_ylim(bottom=4e-3)  # room for the legend
-    left.set_ylabel("relative displacement error, L2 [-]")
-    left.legend(fontsize=7, ncols=2, loc="lower left")
-    width = 0.27
-    bars = {
-        "reduced, all": [row.reduced_cpu_seconds for row in rows],
-        "reduced, response": [row.response_cpu_seconds for row in rows],
-        "all solutions": [row.solved_cpu_seconds for row in rows],
-    }
-    for k, (label, seconds) in enumerate(bars.items()):
-        right.bar(place + (k - 1) * width, seconds, width, label=label)
-    right.set_ylabel("CPU time after mesh and registration [s]")
-    right.legend(fontsize=8)
-    for axes in (left, right):
-        axes.set_xticks(place, [row.name for row in rows], rotation=60, fontsize=7)

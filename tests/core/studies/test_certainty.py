@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.studies import certainty
 from avatar_core.studies.certainty_bands import band_errors
-from avatar_core.studies.certainty_section import QUICK, CertaintySettings, Section
+from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.certainty_supports import (
     _clamp_rows,
     _free_rows,
@@ -61,21 +60,20 @@ def test_a_liver_that_little_holds_moves_rigidly_and_then_is_refused(held: _Held
     assert "N/m^3, nothing holds the organ against a rotation" in refusal
 
 
-def test_sections_share_one_page(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, phantom_mesh: TetMesh
-) -> None:
+def test_sections_share_one_page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def one(surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar) -> Section:
         bar.begin("one")
         panel = Panel("one-plot", "a caption", lambda axes: axes.plot([0, 1]))
         return Section("one", f"{surface.name}.", {"one_l2": 0.02}, ({"x": 1.0},), (panel,))
 
     monkeypatch.setattr(certainty, "SECTIONS", (one, one))
-    found = certainty.study(phantom_liver(12e-3), QUICK, tmp_path)
-    assert found.rows == ({"section": "one", "x": 1.0},) * 2
+    monkeypatch.chdir(tmp_path)  # no folder of livers: the phantom
+    found = certainty.STUDY.conduct(certainty.STUDY.quick, tmp_path)
+    assert found.rows == [{"section": "one", "x": 1.0}] * 2
     assert found.summary == {"one_l2": 0.02}
     assert "a caption" in (tmp_path / "certainty.html").read_text()
     figure = Figure()
-    found.draw(figure)
+    certainty.STUDY.draw(figure, found)
     assert len(figure.axes) == 2
 
 

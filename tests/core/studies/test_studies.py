@@ -5,28 +5,32 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from avatar_core.cli import main as cli
-from avatar_core.cli import study as cli_study
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.barycenter import barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.shapes.lle import Gram
 from avatar_core.studies import (
+    NAMES,
     accuracy_time,
     coordinates,
     grid,
     in_silico,
     indentation,
     leave_one_out,
+    load_study,
     meshes,
     passivity,
     pgd,
@@ -34,7 +38,9 @@ from avatar_core.studies import (
 )
 from avatar_core.studies.response import carried, relative_errors, trilinear
 from avatar_core.studies.shapes import paper_box, read_livers, subject_numbers
-from avatar_core.studies.study import RowFile, Study, Value, mean_and_worst, write_study
+from avatar_core.studies.study import Row, Run, Study, mean_and_worst
+
+Conduct = Callable[..., Run]
 
 COARSE = (16, 13, 14)
 
@@ -44,25 +50,30 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     return cli.main()
 
 
-def checked_files(study: Study, folder: Path) -> dict[str, object]:
-    """The JSON a study writes, after a look at its keys and at the picture's first bytes."""
-    record, picture = write_study(study, folder, seconds=1.0)
-    document = json.loads(record.read_text())
-    assert {"name", "summary", "rows", "paper", "machine", "seconds"} <= set(document)
-    assert document["name"] == study.name == record.stem == picture.stem
-    assert all(isinstance(v, int | float | None) for v in document["summary"].values())
-    flat = str | int | float | bool | None
-    assert document["rows"]
-    assert all(isinstance(v, flat) for row in document["rows"] for v in row.values())
-    assert document["machine"]["cores"] >= 1
-    assert picture.read_bytes()[:4] == b"\x89PNG"
-    return document["summary"]
-
-
 @pytest.fixture
-def no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Run where there is no default folder of livers: phantoms stand in."""
+def conduct(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Conduct:
+    """Conducts a study where there is no default folder of livers, and looks at its files.
+
+    The summary of the run is then that of its JSON.
+    """
     monkeypatch.chdir(tmp_path)
+
+    def conducted(study: Study, settings: object, surfaces: Path | None = None) -> Run:
+        run = study.conduct(settings, tmp_path, surfaces)
+        record, picture = run.write(seconds=1.0)
+        document = json.loads(record.read_text())
+        assert {"name", "summary", "rows", "paper", "machine", "seconds"} <= set(document)
+        assert document["name"] == study.name == record.stem == picture.stem
+        assert all(isinstance(v, int | float | None) for v in document["summary"].values())
+        flat = str | int | float | bool | None
+        assert document["rows"]
+        assert all(isinstance(v, flat) for row in document["rows"] for v in row.values())
+        assert document["machine"]["cores"] >= 1
+        assert picture.read_bytes()[:4] == b"\x89PNG"
+        run.summary = document["summary"]
+        return run
+
+    return conducted
 
 
 def write_phantoms(folder: Path, n: int) -> Path:
@@ -75,57 +86,61 @@ def write_phantoms(folder: Path, n: int) -> Path:
     return folder
 
 
-# --- the four studies -------------------------------------------------------------------------
+# --- the studies --------------------------------------------------------------------------------
+
+
+def test_every_name_is_a_study() -> None:
+    assert [load_study(name).name for name in NAMES] == list(NAMES)
 
 
 @pytest.mark.long
-def test_meshes(tmp_path: Path) -> None:
+def test_meshes(conduct: Conduct, tmp_path: Path) -> None:
     settings = meshes.MeshesSettings(n_built=0, n_again=1, n_vertices=300, n_points=2000)
-    found = meshes.study(write_phantoms(tmp_path, 3), settings)
-    summary = checked_files(found, tmp_path)
-    assert len(found.rows) == 3
-    assert summary["same_again"] == 1.0
-    assert summary["n_inverted"] == 0
-    assert summary["volume_error_worst"] < 0.02
-    assert 0.0 < summary["distance_rms_worst_mm"] < 2.0
-    assert summary["min_dihedral_deg"] > 5.0
+    run = conduct(meshes.STUDY, settings, write_phantoms(tmp_path, 3))
+    assert len(run.rows) == 3
+    assert run.summary["same_again"] == 1.0
+    assert run.summary["n_inverted"] == 0
+    assert run.summary["volume_error_worst"] < 0.02
+    assert 0.0 < run.summary["distance_rms_worst_mm"] < 2.0
+    assert run.summary["min_dihedral_deg"] > 5.0
 
 
 def test_an_interrupted_study_leaves_its_rows_and_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = meshes.MeshesSettings(n_built=0, n_again=0, n_vertices=300, n_points=200)
-    path = tmp_path / "meshes.rows.jsonl"
-    rows = RowFile(path, "liver")
+    path, livers = tmp_path / "meshes.rows.jsonl", write_phantoms(tmp_path, 3)
+    measured: list[str] = []
+    meshed = meshes._meshed
 
-    def then_stop(row: Mapping[str, Value]) -> None:
-        rows.add(row)
-        raise KeyboardInterrupt
+    def then_stop(surface: SurfaceMesh, *rest: object) -> tuple[Row, TetMesh]:
+        if len(measured) == 1:
+            raise KeyboardInterrupt
+        measured.append(surface.name)
+        return meshed(surface, *rest)  # type: ignore[arg-type]
 
-    with pytest.raises(KeyboardInterrupt):
-        meshes.study(write_phantoms(tmp_path, 3), settings, then_stop)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(meshes, "_meshed", then_stop)
+        meshes.STUDY.conduct(settings, tmp_path, livers)
     (line,) = path.read_text().splitlines()
     assert json.loads(line)["liver"] == "LiTS-5"
-    assert json.loads(line)["n_vertices"] > 100
+    count = json.loads(line)["n_vertices"]
+    assert count > 100
+    line = line.replace(str(count), "12345")
     path.write_text(line + "\n" + line[:40])  # the process died as it wrote the second row
-    again = RowFile(path, "liver")
-    measured: list[str] = []
-    known = {"LiTS-5": {**again.rows["LiTS-5"], "n_vertices": 12345}}
-    found = meshes.study(
-        tmp_path, settings, lambda row: measured.append(str(row["liver"])), known=known
-    )
-    assert "LiTS-5" not in measured and len(measured) == 2
-    assert len(found.rows) == 3 and found.rows[0]["n_vertices"] == 12345
-    assert path.read_text() == line + "\n"
+    found = meshes.STUDY.conduct(settings, tmp_path, livers)
+    assert [row["liver"] for row in found.rows] == ["LiTS-5", "LiTS-6", "LiTS-7"]
+    assert found.rows[0]["n_vertices"] == 12345  # it was not measured again
+    assert path.read_text().splitlines()[0] == line
+    assert len(path.read_text().splitlines()) == 3
 
 
-@pytest.mark.usefixtures("no_folder")
 @pytest.mark.long
-def test_grid(tmp_path: Path) -> None:
+def test_grid(conduct: Conduct) -> None:
     settings = grid.GridSettings(
         n_fine=1, n_displaced=1, n_vertices=300, n_loads=2, n_points=400, spacings=(10e-3, 5e-3)
     )
-    summary = checked_files(grid.study(None, settings), tmp_path)
+    summary = conduct(grid.STUDY, settings).summary
     # marching and quadrature are of second order; single organs scatter
     assert summary["volume_order"] > 1.0
     assert summary["volume_error_5mm"] < 0.005
@@ -136,26 +151,25 @@ def test_grid(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_in_silico(tmp_path: Path) -> None:
+def test_in_silico(conduct: Conduct) -> None:
     settings = in_silico.InSilicoSettings(
         n_base=24, n_held_out=2, n_vertices=150, n_loads=1, shape=COARSE, phantom_spacing=12e-3
     )
-    study = in_silico.study(settings)
-    summary = checked_files(study, tmp_path)
-    assert summary["volume_error"] < 0.02
+    run = conduct(in_silico.STUDY, settings)
+    assert run.summary["volume_error"] < 0.02
     # the grid adds its own error to that of the weights
-    assert 0 < summary["displacement_nodewise"] < summary["displacement_grid"] < 0.5
-    assert summary["from_gap_k12"] == 6  # 12 neighbours span the six parameters of Eq. 17
-    assert len(study.notices) == len(in_silico.SPECTRA)
-    assert all("stand out" in notice for notice in study.notices)
+    assert 0 < run.summary["displacement_nodewise"] < run.summary["displacement_grid"] < 0.5
+    assert run.summary["from_gap_k12"] == 6  # 12 neighbours span the six parameters of Eq. 17
+    assert len(run.notices) == len(in_silico.SPECTRA)
+    assert all("stand out" in notice for notice in run.notices)
 
 
 @pytest.mark.long
-def test_samples(tmp_path: Path) -> None:
+def test_samples(conduct: Conduct) -> None:
     settings = samples.SamplesSettings(
         sizes=(12, 40, 120), n_targets=4, shape=COARSE, phantom_spacing=12e-3, repeats=1
     )
-    summary = checked_files(samples.study(settings), tmp_path)
+    summary = conduct(samples.STUDY, settings).summary
     assert summary["error_120"] < summary["error_12"] / 2
     assert summary["rate"] > 0.2
     assert summary["lle_seconds_120"] > 0
@@ -164,41 +178,38 @@ def test_samples(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_pgd(tmp_path: Path) -> None:
-    found = pgd.study(phantom_liver(12e-3), pgd.PGDSettings(300, 24))
-    summary = checked_files(found, tmp_path)
+def test_pgd(conduct: Conduct, tmp_path: Path) -> None:
+    run = conduct(pgd.STUDY, pgd.PGDSettings(300, 24), write_phantoms(tmp_path, 1))
+    summary = run.summary
     # no modes are better than the best; the default is exact near the patch
-    assert summary["svd_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
+    assert summary["svd_l2_mean_11_modes"] < summary["l2_mean_11_modes"] < 1.0
     assert summary["default_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
 
 
 @pytest.mark.long
-def test_coordinates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_coordinates(conduct: Conduct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the real tumours, whose two coordinates alone take minutes."""
     monkeypatch.setattr(coordinates, "TUMOUR_FOLDER", tmp_path)
-    organ = phantom_liver(12e-3)
     settings = coordinates.CoordinatesSettings(300, 4, 2, 1, 30e-3)
-    found = coordinates.study(organ, organ, settings)
-    summary = checked_files(found, tmp_path)
-    assert summary["poisson_mean"] < 0.05
+    summary = conduct(coordinates.STUDY, settings, write_phantoms(tmp_path, 1)).summary
     assert summary["linear_over_large_15mm"] > 1.0
     # An oblique push bends both less and otherwise: at one site in six the linear one is nearer.
     assert summary["gravity_contact_mean"] < summary["gravity_linear_contact_mean"]
 
 
 @pytest.mark.long
-def test_indentation(tmp_path: Path) -> None:
-    settings = replace(indentation.QUICK, halved=(), ratios=(0.3, 0.49))
-    found = indentation.study(settings)
-    summary = checked_files(found, tmp_path)
+def test_indentation(conduct: Conduct) -> None:
+    settings = replace(indentation.STUDY.quick, halved=(), ratios=(0.3, 0.49))
+    run = conduct(indentation.STUDY, settings)
+    summary = run.summary
     assert summary["small_strain_vs_sneddon"] < 0.02  # on the wide elements of the quick version
     assert summary["stored_law_worst"] < 0.02
     assert summary["ratio_nu_0.49_depth_1"] < 0.95 < 1.04 < summary["ratio_nu_0.3_depth_1"]
-    assert sum(row["kind"] == "coefficients" for row in found.rows) == len(settings.ratios)
+    assert sum(row["kind"] == "coefficients" for row in run.rows) == len(settings.ratios)
 
 
-def test_passivity(tmp_path: Path) -> None:
-    summary = checked_files(passivity.study(passivity.PassivitySettings(5, 2, 700)), tmp_path)
+def test_passivity(conduct: Conduct) -> None:
+    summary = conduct(passivity.STUDY, passivity.PassivitySettings(5, 2, 700)).summary
     assert summary["border_error_worst"] < 0.01
     assert summary["map_given_with_mJ"] < summary["bound_mJ_delay_2"] < 2.0
     assert summary["hands_given_with_mJ"] < summary["bound_mJ_delay_2"]
@@ -214,21 +225,40 @@ def test_samples_without_scikit_learn(monkeypatch: pytest.MonkeyPatch) -> None:
     assert math.isnan(timing.sklearn_seconds)
 
 
-@pytest.mark.usefixtures("no_folder")
 @pytest.mark.long
-def test_leave_one_out(tmp_path: Path) -> None:
+def test_leave_one_out(conduct: Conduct) -> None:
     settings = leave_one_out.LeaveOneOutSettings(
         neighbors=(5, 10, 0), components=(5, 10, 0), shape=COARSE, phantoms=16
     )
-    study = leave_one_out.study(None, settings)
-    summary = checked_files(study, tmp_path)
-    assert "stand in" in study.notices[0]
+    run = conduct(leave_one_out.STUDY, settings)
+    assert "stand in" in run.notices[0]
+    summary = run.summary
     assert summary["dice_nearest_neighbour"] < summary["dice_k10"] <= summary["dice_best"] < 1
     assert summary["dice_convex_lle"] < summary["dice_best"]
-    rows = {(r["alignment"], r["method"], r["k"], r["regularization"]): r for r in study.rows}
+    rows = {(r["alignment"], r["method"], r["k"], r["regularization"]): r for r in run.rows}
     assert math.isclose(rows["similarity", "convex LLE", 15, None]["absolute_sum"], 1.0)
     # PCA has the freedom of LLE: with all components it projects on the same affine hull
     assert ("similarity", "PCA", 15, None) in rows
+
+
+@pytest.mark.long
+def test_accuracy_time(conduct: Conduct, tmp_path: Path) -> None:
+    settings = accuracy_time.AccuracyTimeSettings(
+        400, 40, 40, 150, (300,), (20e-3, 10e-3), (5e-3,), 6, 3, 250
+    )
+    run = conduct(accuracy_time.STUDY, settings)
+    summary = run.summary
+    assert summary["promise_kept_fraction"] >= 0.95
+    assert summary["force_error_coverage"] >= 0.85  # 150 contacts: 90 % less two deviations
+    assert summary["force_error_overestimate"] <= 3.0
+    assert summary["front_points"] >= 5
+    assert summary["budgets_as_enumerated"] == 1.0
+    page = (tmp_path / "accuracy-time.html").read_text()
+    assert page.count("<figure>") == 8 and 'src="http' not in page  # it stands alone
+    rows = (tmp_path / "accuracy-time.csv").read_text().splitlines()
+    assert len(rows) == len(run.rows) + 1
+    methods = {row["method"] for row in run.rows}
+    assert {"SVD optimum", "dense table", "direct solve", "PCA", "nearest neighbour"} <= methods
 
 
 # --- the parts --------------------------------------------------------------------------------
@@ -323,33 +353,27 @@ def test_mean_and_worst() -> None:
     assert math.isnan(mean_and_worst("e", [])["e"])
 
 
-def test_json_has_no_nan(tmp_path: Path) -> None:
-    study = Study("x", "Nothing.", {"a": math.nan}, ({"b": np.float64(2.0)},), {}, lambda f: None)
-    record, _ = write_study(study, tmp_path, 0.0)
-    document = json.loads(record.read_text())
-    assert document["summary"]["a"] is None
-    assert document["rows"][0]["b"] == 2.0
+class Tiny(Study[None]):
+    name = "samples"
+    full = quick = None
+    paper: ClassVar = {"rate": 1.0}
+
+    def measure(self, run: Run) -> None:
+        run.add({"n": np.float64(2.0)})
+
+    def summary(self, run: Run) -> dict[str, float]:
+        return {"rate": 0.5, "lost": math.nan}
+
+    def sentence(self, run: Run) -> str:
+        return "So."
+
+    def draw(self, figure: Figure, run: Run) -> None:
+        pass
 
 
-@pytest.mark.usefixtures("no_folder")
-@pytest.mark.long
-def test_accuracy_time(tmp_path: Path) -> None:
-    settings = accuracy_time.AccuracyTimeSettings(
-        400, 40, 40, 150, (300,), (20e-3, 10e-3), (5e-3,), 6, 3, 250
-    )
-    found = accuracy_time.study(None, settings, tmp_path)
-    summary = checked_files(found, tmp_path)
-    assert summary["promise_kept_fraction"] >= 0.95
-    assert summary["force_error_coverage"] >= 0.85  # 150 contacts: 90 % less two deviations
-    assert summary["force_error_overestimate"] <= 3.0
-    assert summary["front_points"] >= 5
-    assert summary["budgets_as_enumerated"] == 1.0
-    page = (tmp_path / "accuracy-time.html").read_text()
-    assert page.count("<figure>") == 8 and 'src="http' not in page  # it stands alone
-    rows = (tmp_path / "accuracy-time.csv").read_text().splitlines()
-    assert len(rows) == len(found.rows) + 1
-    methods = {row["method"] for row in found.rows}
-    assert {"SVD optimum", "dense table", "direct solve", "PCA", "nearest neighbour"} <= methods
+def test_json_has_no_nan(conduct: Conduct) -> None:
+    run = conduct(Tiny(), None)
+    assert run.summary == {"rate": 0.5, "lost": None}
 
 
 # --- the command ------------------------------------------------------------------------------
@@ -381,11 +405,9 @@ def test_bad_folders_are_one_line(
 def test_the_command_prints_and_writes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    found = Study("samples", "So.", {"rate": 0.5}, ({"n": 1},), {"rate": 1.0}, lambda f: None)
-    monkeypatch.setattr(samples, "run", lambda surfaces, quick, folder: found)
+    monkeypatch.setattr(samples, "STUDY", Tiny())
     assert run(monkeypatch, "study", "samples", "-o", tmp_path / "new", "--quick") == 0
     shown = capsys.readouterr().out
     assert "paper" in shown.splitlines()[0]
     assert shown.splitlines()[1].split() == ["rate", "1", "0.5"]
     assert {file.name for file in (tmp_path / "new").iterdir()} == {"samples.json", "samples.png"}
-    assert set(cli_study.STUDIES) >= {"grid", "in-silico", "samples", "leave-one-out", "transport"}
