@@ -26,7 +26,7 @@ from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.report import Panel
-from avatar_core.studies.study import ProgressBar, Value, follow
+from avatar_core.studies.study import ProgressBar, Row, column, follow
 from avatar_core.uncertainty.bands import HIGH, LOW, bands_of, drawn
 from avatar_core.uncertainty.distributions import Distribution, Lognormal, Uniform
 from avatar_core.uncertainty.force_table import force_table
@@ -89,16 +89,13 @@ _BANDS = (
 )
 
 
-def band_errors(rows: Sequence[dict[str, Value]]) -> tuple[float, float]:
+def band_errors(rows: Sequence[Row]) -> tuple[float, float]:
     """Worst relative error of the edges of all bands, and of their ratios to the medians.
 
     The first holds the error of the force itself at a place, which `avatar show` tells: at a thin
     edge it is large, as the felt surface is smoothed there. The second is that of the band alone.
     """
-    low, median, high = (
-        1.0 + np.array([row[f"{name}_error"] for row in rows], float)
-        for name in ("low", "median", "high")
-    )
+    low, median, high = (1.0 + column(rows, f"{name}_error") for name in ("low", "median", "high"))
     edges = np.concatenate([low, high])
     ratios = np.concatenate([low / median, high / median])
     return float(np.abs(edges - 1.0).max()), float(np.abs(ratios - 1.0).max())
@@ -137,23 +134,20 @@ def _full_forces(
     return force
 
 
-def _row(
-    vademecum: Vademecum, position: int, ours: FloatArray, truth: FloatArray
-) -> dict[str, Value]:
+def _row(vademecum: Vademecum, position: int, ours: FloatArray, truth: FloatArray) -> Row:
     x, y, z = 1e3 * vademecum.surface.centers[position]
-    row: dict[str, Value] = {"place": f"({x:.0f}, {y:.0f}, {z:.0f}) mm"}
+    row: Row = {"place": f"({x:.0f}, {y:.0f}, {z:.0f}) mm"}
     for name, own, full in zip(("low", "median", "high"), ours, truth, strict=True):
         row |= {f"{name}_N": float(own), f"{name}_full_N": float(full)}
         row[f"{name}_error"] = float(own / full - 1.0)
     return row
 
 
-def _draw(axes: Axes, rows: Sequence[dict[str, Value]]) -> None:
+def _draw(axes: Axes, rows: Sequence[Row]) -> None:
     at = np.arange(len(rows))
     for shift, suffix, text in ((-0.1, "", "vademecum"), (0.1, "_full", "full finite elements")):
         low, median, high = (
-            np.array([row[f"{name}{suffix}_N"] for row in rows], float)
-            for name in ("low", "median", "high")
+            column(rows, f"{name}{suffix}_N") for name in ("low", "median", "high")
         )
         bars = (median - low, high - median)
         axes.errorbar(at + shift, median, bars, fmt="o", capsize=4, label=text)

@@ -31,7 +31,7 @@ from avatar_core.offline.supports import SupportOption, held_by
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.report import Panel
-from avatar_core.studies.study import ProgressBar, Value, follow
+from avatar_core.studies.study import ProgressBar, Row, column, follow
 from avatar_core.uncertainty.calibration import Errors, TouchTable, calibrated, touch_table
 from avatar_core.uncertainty.distributions import Distribution, Fixed
 from avatar_core.uncertainty.palpation import Palpation
@@ -198,7 +198,7 @@ def _depths(outline: SurfaceMesh, table: TouchTable) -> FloatArray:
 
 def _trials(
     table: TouchTable, known: Mapping[str, Distribution], truth: Truth, depth: FloatArray, n: int
-) -> list[dict[str, Value]]:
+) -> list[Row]:
     rng, rows = np.random.default_rng(4), []
     without = {**known, "contrast": Fixed(1.0)}
     reference = truth.problem.material.young_modulus
@@ -212,7 +212,7 @@ def _trials(
         force = truth.stiffness(values)[chosen, None] * depth[chosen]
         measured = _measured(table.where(chosen), force, rng)
         found = calibrated(measured, known, ERRORS)
-        row: dict[str, Value] = {"explained": found.explained, "probability": found.probability}
+        row: Row = {"explained": found.explained, "probability": found.probability}
         for name, value in values.items():
             low, high = found.interval(name)
             row |= {f"{name}_true": value, f"{name}_found": found.value(name)}
@@ -241,8 +241,8 @@ def _measured(table: TouchTable, force: FloatArray, rng: np.random.Generator) ->
 _NAMES = ("young", "contrast", SUPPORTED)
 
 
-def _summary(rows: Sequence[dict[str, Value]]) -> dict[str, float]:
-    columns = {key: np.array([row[key] for row in rows], float) for key in rows[0]}
+def _summary(rows: Sequence[Row]) -> dict[str, float]:
+    columns = {key: column(rows, key) for key in rows[0]}
     ratio = {name: columns[f"{name}_found"] / columns[f"{name}_true"] for name in _NAMES}
     held = [
         (columns[f"{name}_low"] <= columns[f"{name}_true"])
@@ -276,11 +276,10 @@ def _sentence(summary: Mapping[str, float], n: int) -> str:
     )
 
 
-def _draw(axes: Axes, rows: Sequence[dict[str, Value]]) -> None:
+def _draw(axes: Axes, rows: Sequence[Row]) -> None:
     for k, name in enumerate(_NAMES):
         true, found, low, high = (
-            np.array([row[f"{name}_{which}"] for row in rows], float)
-            for which in ("true", "found", "low", "high")
+            column(rows, f"{name}_{which}") for which in ("true", "found", "low", "high")
         )
         order = np.argsort(true)
         at = k + np.linspace(-0.4, 0.4, len(rows))

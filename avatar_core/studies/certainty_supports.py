@@ -31,7 +31,7 @@ from avatar_core.offline.supports import SupportOption, held_by
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.report import Panel
-from avatar_core.studies.study import ProgressBar, Value, follow
+from avatar_core.studies.study import ProgressBar, Row, column, follow, where
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Provenance, Vademecum
 
@@ -106,13 +106,11 @@ def _build(held: _Held, settings: CertaintySettings, progress: Progress) -> Vade
     )
 
 
-def _unseen_rows(
-    vademecum: Vademecum, held: _Held, settings: CertaintySettings
-) -> list[dict[str, Value]]:
+def _unseen_rows(vademecum: Vademecum, held: _Held, settings: CertaintySettings) -> list[Row]:
     """Errors at the ends and at one value drawn from each nth part of the range, one row each."""
     rng, n = np.random.default_rng(1), settings.n_values
     drawn = [held.coordinate.value_at((part + rng.random()) / n) for part in range(n)]
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     for value in follow([LOW, *drawn, HIGH], "unseen values"):
         faces = rng.permutation(len(held.surface.corners))[: settings.n_loads]
         l2, contact = _errors(vademecum, held, value, faces)
@@ -158,13 +156,13 @@ def _limit_loads(held: _Held) -> tuple[Elasticity, sp.csr_matrix]:
     return elasticity, patch_loads(elasticity, surface.centroids[some], surface.patch_radius)
 
 
-def _clamp_rows(held: _Held) -> list[dict[str, Value]]:
+def _clamp_rows(held: _Held) -> list[Row]:
     """How far springs are from the clamp of the same faces."""
     elasticity, loads = _limit_loads(held)
     mesh, (support,) = elasticity.mesh, elasticity.supports
     clamped = Elasticity(mesh, elasticity.material, support.faces, elasticity.element)
     exact = clamped.at_vertices(clamped.solve(loads))
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     for stiffness in follow(CLAMP_LIMIT, "towards the clamp"):
         there = problem_at(elasticity, {SUPPORT + PLACE: stiffness})
         found = there.at_vertices(there.solve(loads))
@@ -180,11 +178,11 @@ def _clamp_rows(held: _Held) -> list[dict[str, Value]]:
     return rows
 
 
-def _free_rows(held: _Held) -> tuple[list[dict[str, Value]], str]:
+def _free_rows(held: _Held) -> tuple[list[Row], str]:
     """The rigid part of displacements, until nothing holds the organ; and what is said then."""
     elasticity, loads = _limit_loads(held)
     mass = elasticity.mesh.lumped_mass
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     for stiffness in follow(FREE_LIMIT, "towards free"):
         there = problem_at(elasticity, {SUPPORT + PLACE: stiffness})
         try:
@@ -219,13 +217,11 @@ def rigid_part(mesh: TetMesh, displacement: FloatArray) -> FloatArray:
 # --- summary --------------------------------------------------------------------------------------
 
 
-def _of(rows: Sequence[dict[str, Value]], kind: str, key: str) -> FloatArray:
-    return np.array([row[key] for row in rows if row["kind"] == kind], float)
+def _of(rows: Sequence[Row], kind: str, key: str) -> FloatArray:
+    return column(where(rows, kind=kind), key)
 
 
-def _summary(
-    rows: Sequence[dict[str, Value]], coordinate: Coordinate, seconds: float
-) -> dict[str, float]:
+def _summary(rows: Sequence[Row], coordinate: Coordinate, seconds: float) -> dict[str, float]:
     moved = _of(rows, "free", "displacement_mean")
     return {
         "support_l2_mean": float(_of(rows, "unseen", "l2_mean").mean()),
@@ -260,7 +256,7 @@ _LIMITS = (
 )
 
 
-def _draw_errors(axes: Axes, rows: Sequence[dict[str, Value]]) -> None:
+def _draw_errors(axes: Axes, rows: Sequence[Row]) -> None:
     stiffness = _of(rows, "unseen", "stiffness")
     for key, text in (
         ("l2_worst", "displacement, worst load"),
@@ -275,7 +271,7 @@ def _draw_errors(axes: Axes, rows: Sequence[dict[str, Value]]) -> None:
     axes.legend(fontsize=7)
 
 
-def _draw_limits(axes: Axes, rows: Sequence[dict[str, Value]]) -> None:
+def _draw_limits(axes: Axes, rows: Sequence[Row]) -> None:
     for kind, key, text in (
         ("clamp", "l2_worst", "difference from the clamp, worst load"),
         ("free", "not_rigid_worst", "part that is not rigid, worst load"),

@@ -33,7 +33,7 @@ from avatar_core.shapes.registration import RegistrationRule
 from avatar_core.studies.grid import GridSettings, grid_row, reference_of
 from avatar_core.studies.leave_one_out import LeaveOneOutSettings, judged, methods, placed
 from avatar_core.studies.shapes import read_livers
-from avatar_core.studies.study import Value, follow
+from avatar_core.studies.study import Row, follow
 
 FIDELITIES: tuple[Fidelity, ...] = get_args(Fidelity)
 _ROUGH = RegistrationRule(  # 1 s an anatomy
@@ -41,12 +41,12 @@ _ROUGH = RegistrationRule(  # 1 s an anatomy
 )
 
 
-def mesh_rows(surface: SurfaceMesh, sizes: tuple[int, ...]) -> list[dict[str, Value]]:
+def mesh_rows(surface: SurfaceMesh, sizes: tuple[int, ...]) -> list[Row]:
     """Vademecums on meshes of several sizes: the change when each is refined, and the whole build.
 
     The error is that of the mesh, not of the vademecum, which every size keeps alike.
     """
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     for n in follow(sizes, "mesh size"):
         start = time.process_time()
         built = build(surface, OrganOptions(n_vertices=n, n_certified=40))
@@ -68,7 +68,7 @@ def mesh_rows(surface: SurfaceMesh, sizes: tuple[int, ...]) -> list[dict[str, Va
 
 def load_rows(
     elasticity: Elasticity, surface: LoadSurface, tolerances: tuple[float, ...]
-) -> list[dict[str, Value]]:
+) -> list[Row]:
     """The response to every load: all solved, and some solved and the others projected on them.
 
     The error of projection is that from all solutions, that of these single precision's own, on
@@ -96,11 +96,11 @@ def load_rows(
     return rows
 
 
-def grid_rows(surface: SurfaceMesh, spacings: tuple[float, ...]) -> list[dict[str, Value]]:
+def grid_rows(surface: SurfaceMesh, spacings: tuple[float, ...]) -> list[Row]:
     """Displacements kept on a grid and read back, and the time of its level set and isosurface."""
     settings = GridSettings(n_vertices=1000, n_loads=4, n_points=1500, remeshed=False)
     reference = reference_of(surface, settings)
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     for h in follow(spacings, "grid spacing"):
         start = time.process_time()
         isosurface(distance_grid(surface, h, padding=3 * h, band=3 * h))
@@ -115,7 +115,7 @@ def grid_rows(surface: SurfaceMesh, spacings: tuple[float, ...]) -> list[dict[st
 
 
 @repeatable
-def shape_rows(folder: Path | None, n_livers: int) -> list[dict[str, Value]]:
+def shape_rows(folder: Path | None, n_livers: int) -> list[Row]:
     """Each liver interpolated from the others: LLE with several numbers of neighbours, and rivals.
 
     The error is 1 - Dice; the time is that of the weights of one liver.
@@ -123,7 +123,7 @@ def shape_rows(folder: Path | None, n_livers: int) -> list[dict[str, Value]]:
     settings = LeaveOneOutSettings(
         n_livers, (5, 10, 20, 0), (1e-3,), (), (5, 10, 20, 0), (29, 21, 25), 16
     )
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     livers = read_livers(folder, settings.n_livers, settings.phantoms)
     base = placed(livers, "similarity", settings)
     others = np.arange(1, len(base.vectors))
@@ -143,7 +143,7 @@ def shape_rows(folder: Path | None, n_livers: int) -> list[dict[str, Value]]:
     return rows
 
 
-def patient_rows(n_base: int, n_vertices: int) -> list[dict[str, Value]]:
+def patient_rows(n_base: int, n_vertices: int) -> list[Row]:
     """A bent phantom from others like it, at three fidelities and with more and fewer neighbours.
 
     Errors are those of the certificate, on unseen loads against the patient's own finite elements.
@@ -159,7 +159,7 @@ def patient_rows(n_base: int, n_vertices: int) -> list[dict[str, Value]]:
     patient = replace(livers[-1], name="patient")
     cases: list[tuple[Fidelity, int | None]] = [(fidelity, None) for fidelity in FIDELITIES]
     cases += [("interpolated", k) for k in (2, 4) if k < n_base]
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     for fidelity, k in follow(cases, "patient"):
         options = PatientOptions(n_vertices, n_neighbors=k, max_modes=40, n_certified=12)
         found = patient_vademecum(patient, base, fidelity, options)
@@ -173,7 +173,7 @@ def patient_rows(n_base: int, n_vertices: int) -> list[dict[str, Value]]:
     return rows
 
 
-def _row(stage: str, method: str, setting: str, error: float, seconds: float) -> dict[str, Value]:
+def _row(stage: str, method: str, setting: str, error: float, seconds: float) -> Row:
     return {
         "stage": stage,
         "method": method,

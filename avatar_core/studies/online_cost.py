@@ -29,7 +29,7 @@ from avatar_core.studies.bench.methods import (
     time_dense_table,
     time_direct,
 )
-from avatar_core.studies.study import Value
+from avatar_core.studies.study import Row
 from avatar_core.vademecum.accuracy import (
     CONTENT,
     AccuracyCurve,
@@ -75,16 +75,16 @@ def promises(curve: AccuracyCurve, fresh: UnseenErrors, again: AccuracyCurve) ->
     )
 
 
-def curve_rows(curve: AccuracyCurve) -> list[dict[str, Value]]:
+def curve_rows(curve: AccuracyCurve) -> list[Row]:
     """The points of a curve; on the front: none of the same cloud is both faster and better."""
     front = {id(p) for cloud in ("surface", "volume") for p in curve.of(cloud).front()}
     return [_row("vademecum", p, id(p) in front) for p in curve.points if p.detail.cloud != "off"]
 
 
-def budget_rows(curve: AccuracyCurve) -> list[dict[str, Value]]:
+def budget_rows(curve: AccuracyCurve) -> list[Row]:
     """What is chosen for some budgets, all vertices shown, and whether going through all agrees."""
     points = curve.of("volume")
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     for tolerance in TOLERANCES:
         for deadline in DEADLINES:
             found: CurvePoint | None = None
@@ -108,7 +108,7 @@ def budget_rows(curve: AccuracyCurve) -> list[dict[str, Value]]:
     return rows
 
 
-def _row(method: str, point: CurvePoint, front: bool = False) -> dict[str, Value]:
+def _row(method: str, point: CurvePoint, front: bool = False) -> Row:
     detail = point.detail
     return {
         "stage": "online",
@@ -128,7 +128,7 @@ def _row(method: str, point: CurvePoint, front: bool = False) -> dict[str, Value
 
 def rival_rows(
     vademecum: Vademecum, elasticity: Elasticity, curve: AccuracyCurve, n_loads: int, seed: int
-) -> list[dict[str, Value]]:
+) -> list[Row]:
     """The rivals with all vertices shown, on fresh loads, by the processor's time as the curve.
 
     The table's time is that of all modes on the curve, times the ratio of both in turns: the
@@ -163,7 +163,7 @@ def _table_time(vademecum: Vademecum, curve: AccuracyCurve) -> StepRow:
     return replace(row, p50_us=p50, p99_us=p50 * row.p99_us / row.p50_us)
 
 
-def _rival(method: str, error: float, timing: StepRow) -> dict[str, Value]:
+def _rival(method: str, error: float, timing: StepRow) -> Row:
     return {
         "stage": "online",
         "method": method,
@@ -207,7 +207,7 @@ def _table_errors(
 
 def _optimum_rows(
     curve: AccuracyCurve, snapshots: np.ndarray, truth: np.ndarray, mass: np.ndarray
-) -> list[dict[str, Value]]:
+) -> list[Row]:
     """The best n modes for the snapshots, on other loads; as fast as ours of one region."""
 
     def scaled_of(field: np.ndarray) -> np.ndarray:
@@ -231,7 +231,7 @@ def _optimum_rows(
     return rows
 
 
-def cost_of_effects(vademecum: Vademecum) -> list[dict[str, Value]]:
+def cost_of_effects(vademecum: Vademecum) -> list[Row]:
     """Times of a step with each effect alone that a linear vademecum serves, surface and volume."""
     every = cases_on(vademecum)
     cases = [case for case in every if not isinstance(case[2][0], LargeDeformationEffect)]
@@ -249,7 +249,7 @@ def cost_of_effects(vademecum: Vademecum) -> list[dict[str, Value]]:
     ]
 
 
-def fastest_within(rows: Sequence[dict[str, Value]], error: float) -> dict[str, Value] | None:
+def fastest_within(rows: Sequence[Row], error: float) -> Row | None:
     """The fastest row of a vademecum within an error."""
     found = [row for row in rows if row["method"] == "vademecum" and row["error"] <= error]  # type: ignore[operator]
     return min(found, key=lambda row: row["p50_us"], default=None)  # type: ignore[arg-type,return-value]
