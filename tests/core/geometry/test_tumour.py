@@ -20,10 +20,10 @@ from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Provenance, Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from avatar_core.vademecum.tip_field import with_tumour
-from tests.core.contact.test_true_contact import pressed
 from tests.core.offline.test_coordinates import ball
 from tests.helpers.box_organ import MATERIAL, PATCH_RADIUS, UP, body_mesh, organ, top
 from tests.helpers.disk_cache import cached_on_disk
+from tests.helpers.tool_motion import press
 
 CONTRAST, SIZE, GAP = 5.0, 10e-3, 2e-3  # of a ball under the middle of a cube's top
 RADIUS, REACH = 3e-3, 24e-3
@@ -109,12 +109,12 @@ def test_a_tip_over_a_tumour_feels_a_resolved_contact() -> None:
     ).forces
     force = [
         [
-            pressed(sphere_on(harder, tip.radius), (tip,), place[None], UP[None], (d,))[0]
+            press(sphere_on(harder, tip.radius), (tip,), place[None], UP[None], (d,))[0]
             for d in depths
         ]
         for tip in tips
     ]
     np.testing.assert_allclose(force, truth, rtol=0.15)
     plain = replace(harder, contrast=None)
-    without = pressed(sphere_on(plain, 3e-3), tips[:1], place[None], UP[None], depths[:1])[0]
+    without = press(sphere_on(plain, 3e-3), tips[:1], place[None], UP[None], depths[:1])[0]
     assert without < 0.7 * truth[0, 0]
