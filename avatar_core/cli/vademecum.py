@@ -20,7 +20,6 @@ from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES
 if TYPE_CHECKING:
     from avatar_core.fem.supports import Support
     from avatar_core.geometry.surface import SurfaceMesh
-    from avatar_core.offline.rule import Progress
     from avatar_core.vademecum.accuracy import AccuracyCurve, CurvePoint
     from avatar_core.vademecum.certificate import ContactSites
     from avatar_core.vademecum.model import Vademecum
@@ -219,7 +218,7 @@ def vademecum(
         print(f"warning: {warning}", file=sys.stderr)
     with BuildBar(material != "linear", contact_sites) as progress:
         report = clock.following(progress)
-        built = _timed(build(organ, options, report), report)
+        built = build(organ, options, report)
     for notice in built.provenance.notices[len(organ.notices) :]:
         print(f"notice: {notice}", file=sys.stderr)
     clock.begin("save")
@@ -237,16 +236,6 @@ def vademecum(
             file=sys.stderr,
         )
         raise typer.Exit(EXIT_NOT_CONVERGED)
-
-
-def _timed(built: Vademecum, progress: Progress) -> Vademecum:
-    """The vademecum with the steps of its accuracy curve timed on this machine."""
-    from avatar_core.contact.timing import timed
-
-    certificate = built.certificate
-    assert certificate is not None and certificate.curve is not None
-    curve = timed(built, certificate.curve, progress=lambda done: progress("time", done, math.nan))
-    return built.with_certificate(replace(certificate, curve=curve))
 
 
 def show(
@@ -418,9 +407,7 @@ def _show_contact_sites(found: ContactSites) -> None:
 
 def _show_curve(curve: AccuracyCurve) -> None:
     """Print the error of displacement by number of modes, and that of the force."""
-    from avatar_core.vademecum.accuracy import Detail
-
-    row = curve.like(Detail(1, "surface")).points
+    row = curve.of("surface").points
     where = f", timed on {curve.machine}" if curve.machine else ", not timed"
     print(f"  error that 95 % of touches keep, surface shown at every step{where}")
     for point in row[::2] if len(row) > 4 else row:

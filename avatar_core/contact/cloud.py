@@ -2,7 +2,7 @@
 
 The points are put in compact blocks, and the field of each region is separated once more in each of
 them (:mod:`avatar_core.reduction.block_modes`): a step reads the few modes that move a block, and
-sums them in the first-level cache. Their number and precision concern the display alone: the force
+sums them in the first-level cache. Their number and rounding concern the display alone: the force
 comes from the contact compliance, which keeps all its modes in single precision.
 """
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from avatar_core.reduction.block_modes import BlockModes, compact_order, load_sizes, separate_blocks
-from avatar_core.vademecum.accuracy import Cloud, Precision
+from avatar_core.vademecum.accuracy import Cloud
 
 if TYPE_CHECKING:
     from avatar_core.reduction.regional import RegionalField
@@ -25,7 +25,7 @@ TOLERANCE = 2e-3  # root mean square of the relative error that blocks add to a 
 PART = 1e-2  # the same of what is but a part of a displacement: added by large deformation, or
 # moved by the organ's history and weight
 
-_LARGEST = {"int16": 32767, "int8": 127}
+_LARGEST = np.float32(32767)  # of int16
 
 
 class CloudArrays(NamedTuple):
@@ -141,17 +141,14 @@ def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
     return np.asarray(shown[compact_order(mesh.vertices[shown], POINTS)])
 
 
-def rounded(arrays: CloudArrays, precision: Precision) -> CloudArrays:
-    """The same with modes in another precision.
+def rounded(arrays: CloudArrays) -> CloudArrays:
+    """The same with modes in 16 bits.
 
-    The time of the cloud is that of reading its modes; integers take a half or a quarter of single
-    precision. Rounding costs 1 / 65536 or 1 / 256 of each mode's peak, which is 1.
+    The time of the cloud is that of reading its modes; these take half as long as in single
+    precision. Rounding costs 1 / 65536 of each mode's peak, which is 1.
     """
-    if precision not in _LARGEST:
-        return arrays
-    largest = np.float32(_LARGEST[precision])
-    space = np.rint(arrays.space * largest).astype(precision)
-    return arrays._replace(space=space, core=arrays.core / largest)
+    space = np.rint(arrays.space * _LARGEST).astype(np.int16)
+    return arrays._replace(space=space, core=arrays.core / _LARGEST)
 
 
 def _joined(parts: list[BlockModes]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -45,7 +45,7 @@ from avatar_core.contact.tip_response import (
 from avatar_core.errors import ContactError, SceneError
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.near_field import hash_rows
-from avatar_core.vademecum.accuracy import Cloud, Detail, Precision
+from avatar_core.vademecum.accuracy import Cloud, Detail
 from avatar_core.vademecum.certificate import Certificate
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ def lay_out_details(
             clouds[detail.cloud] = cloud_arrays(
                 vademecum, detail.cloud, terms, own_motion(vademecum, effects)
             )
-        shown = rounded(clouds[detail.cloud], detail.precision)
+        shown = rounded(clouds[detail.cloud])
         display = vademecum.display if detail.cloud == "surface" else None
         points = display.vertices if display else vademecum.mesh.vertices[np.sort(shown.points)]
         arrays = ModelArrays(
@@ -315,7 +315,7 @@ def _check(vademecum: Vademecum, tips: Sequence[Tip], detail: Detail) -> None:
     modes, most = detail.modes, vademecum.n_modes
     if not 1 <= modes <= most:
         raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {most}")
-    for name, known in (("cloud", get_args(Cloud)), ("precision", get_args(Precision))):
-        value = getattr(detail, name)
-        if value not in known:
-            raise ContactError(f"{name} '{value}' is unknown; choose {', '.join(known)}")
+    if detail.cloud not in get_args(Cloud):
+        raise ContactError(
+            f"cloud '{detail.cloud}' is unknown; choose {', '.join(get_args(Cloud))}"
+        )

@@ -25,7 +25,7 @@ from avatar_core.contact.kernels import Out, State
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
 from avatar_core.contact.tip_response import MAX_STENCIL
 from avatar_core.geometry.tip import Tip
-from avatar_core.vademecum.accuracy import Cloud, Detail, Precision
+from avatar_core.vademecum.accuracy import Cloud, Detail
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
@@ -189,7 +189,6 @@ def prepare(
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
     halves: bool = False,
-    precision: Precision = "int16",
 ) -> ContactModel:
     """Lay out a vademecum for the step, and compile the step for the effects. Not real-time safe.
 
@@ -203,14 +202,13 @@ def prepare(
     effects : to simulate; by default those that the vademecum and the tools require
     period : of the steps [s], for effects that depend on time
     halves : compile :func:`solve` and :func:`deform` instead of :func:`step`
-    precision : of the displacement's modes
 
     Raises
     ------
     ContactError, SceneError
         For modes or clouds out of range; for effects that the vademecum cannot serve.
     """
-    detail = Detail(vademecum.n_modes if modes is None else modes, cloud, precision)
+    detail = Detail(vademecum.n_modes if modes is None else modes, cloud)
     return make_model(lay_out(vademecum, tips, detail, effects, period), halves)
 
 

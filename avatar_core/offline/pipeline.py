@@ -7,6 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from avatar_core.common.processes import cpu_seconds, repeatable
+from avatar_core.contact.timing import timed
 from avatar_core.errors import ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import load_surface
@@ -147,7 +148,7 @@ class OrganOptions:
 def build(
     surface: SurfaceMesh, options: OrganOptions | None = None, progress: Progress = silent
 ) -> Vademecum:
-    """Mesh, solve, separate and certify one organ.
+    """Mesh, solve, separate and certify one organ, and time its steps on this machine.
 
     The same surface and options give the same vademecum, bit for bit, but for what a clock says.
 
@@ -194,7 +195,10 @@ def build(
             vademecum, surface, options.n_contact_sites, options.seed, progress
         )
     certificate = vademecum.certificate or certificate
-    return vademecum.with_certificate(replace(certificate, build_cpu_seconds=cpu_seconds()))
+    certificate = replace(certificate, build_cpu_seconds=cpu_seconds())
+    assert certificate.curve is not None
+    curve = timed(vademecum, certificate.curve, lambda done: progress("time", done, NO_ERROR))
+    return vademecum.with_certificate(replace(certificate, curve=curve))
 
 
 def _display(mesh: TetMesh, surface: SurfaceMesh, options: OrganOptions) -> Display | None:

@@ -12,8 +12,6 @@ from avatar_core.contact.effects import Effect, Tumour
 from avatar_core.contact.effects.selection import default_effects
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
 from avatar_core.contact.model import ContactModel, make_model
-from avatar_core.contact.timing import timed
-from avatar_core.errors import AccuracyError
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.model import Scene
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget, Cloud, Detail, choose
@@ -48,27 +46,10 @@ class ModelSpec:
 
     @property
     def curve(self) -> AccuracyCurve | None:
-        """Errors of all details of this cloud, as certified; None if they were not measured."""
+        """All details of this cloud up to the finest; None if their errors were not measured."""
         certificate = self.vademecum.certificate
-        return certificate.curve.of(self.cloud) if certificate and certificate.curve else None
-
-    def timed_curve(self, period: float, halves: bool = False) -> AccuracyCurve:
-        """The curve with the times of steps on this machine.
-
-        Raises
-        ------
-        AccuracyError
-            If the errors were never measured.
-        """
-        if self.curve is None:
-            raise AccuracyError(
-                "this vademecum has no accuracy curve for a budget to choose from; build it again "
-                "with this version of 'avatar vademecum', or ask without a budget"
-            )
-        # Single precision shows nothing that 16 bits do not, and is slower.
-        usual = tuple(p for p in self.curve.points if p.detail.precision != "float32")
-        curve = replace(self.curve, points=usual)
-        return timed(self.vademecum, curve, self.tips, self.effects, period, halves)
+        curve = certificate.curve if certificate else None
+        return curve and curve.of(self.cloud).up_to(self.finest.modes)
 
     def layout(self, detail: Detail, period: float) -> Layout:
         """Constant arrays of a contact model that shows a detail."""
@@ -124,8 +105,8 @@ def prepare(
     ----------
     vademecum : Vademecum
     scene : Scene; None for one spherical tip of 5 mm and the effects the vademecum calls for
-    budget : Budget; the fastest detail of the displacement that keeps it is shown, timed on this
-        machine. None shows all modes. The force always keeps all of them.
+    budget : Budget; the fastest detail of the displacement that keeps it is shown, by the times in
+        the certificate. None shows all modes. The force always keeps all of them.
     period : of the steps [s]
 
     Raises
@@ -134,5 +115,5 @@ def prepare(
         What the vademecum cannot serve, or a budget that no detail meets, with the nearest two.
     """
     spec = scene_spec(vademecum, scene) if scene else default_spec(vademecum)
-    detail = choose(spec.timed_curve(period), budget).detail if budget else spec.finest
+    detail = choose(spec.curve, budget).detail if budget else spec.finest
     return make_model(spec.layout(detail, period))

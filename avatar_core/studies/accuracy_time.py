@@ -2,8 +2,8 @@
 
 Online: every level of detail of the displacement, timed on this machine, with errors on loads that
 neither the build nor the certificate used. Offline: mesh size, grid of a level set, interpolation
-of shapes, and fidelity of a patient. Also whether certified errors and times, and the estimated
-error of each force, hold.
+of shapes, and fidelity of a patient. Also whether certified errors, and the estimated error of each
+force, hold.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from avatar_core.contact.timing import timed
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.offline.certify.linear import measured
 from avatar_core.offline.pipeline import OrganOptions, build
@@ -76,16 +75,15 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
 
     def measure(self, run: Run[AccuracyTimeSettings]) -> None:
         settings, surface = run.settings, read_liver(run.surfaces, "LiTS-4")
-        with ProgressBar(6) as bar:
+        with ProgressBar(5) as bar:
             options = OrganOptions(n_vertices=settings.n_vertices, n_certified=settings.n_certified)
             v = build(surface, options, bar.begin("build"))
             assert v.certificate is not None and v.certificate.curve is not None
             elasticity = Elasticity(v.mesh, v.material, v.regions.clamped, v.element)
-            bar.begin("timing")
-            curve, again = (timed(v, v.certificate.curve) for _ in range(2))
+            curve = v.certificate.curve
             bar.begin("fresh loads")
             fresh = measured(v, elasticity, settings.n_fresh, FRESH)
-            run.kept |= {"organ": v, "promises": promises(curve, fresh, again)}
+            run.kept |= {"organ": v, "promises": promises(curve, fresh)}
             run.kept["contacts"] = force_errors(v, elasticity, settings.n_contacts, FRESH)
             bar.begin("rivals")
             run.rows += curve_rows(curve) + budget_rows(curve)
@@ -107,7 +105,6 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
         return {
             "promise_kept_fraction": kept.errors_kept,
             "points_kept_fraction": kept.points_kept,
-            "time_promise_kept_fraction": kept.times_kept,
             "force_error_coverage": contacts.coverage,
             "force_error_overestimate": contacts.overestimate,
             "budgets_as_enumerated": float(column(_of(rows, "choose"), "as_enumerated").mean()),
@@ -197,7 +194,6 @@ def _beside_table(rows: list[Row], vademecum: Vademecum) -> dict[str, float]:
 
 # --- Plots -----------------------------------------------------------------------------------
 
-_COLOURS = {"int8": "#0072B2", "int16": "#009E73", "float32": "#CC79A7"}  # Okabe and Ito
 _QUANTITIES = {"mesh": "mesh, when refined (time of a build)", "grid": "grid (time of a level set)"}
 
 
@@ -230,13 +226,10 @@ def _panels(rows: list[Row], contacts: ForceErrors, summary: dict[str, float]) -
 
 def _online_sentence(rows: list[Row]) -> str:
     volume = [row for row in rows if row.get("cloud") == "volume"]
-    front = [row for row in volume if row["front"]]
-    of_bytes = sum(row.get("precision") == "int8" for row in front)
     best, (table,) = _best(rows), _of(volume, "dense table")
     return (
         "Error of the displacement that a step shows against its time, all vertices: fewer modes "
-        f"are faster and worse. {of_bytes} of the {len(front)} points on the front (line) keep "
-        f"their modes in int8. The dense table is within {table['error']:.1%} instead of "
+        f"are faster and worse. The dense table is within {table['error']:.1%} instead of "
         f"{best['error']:.1%}, takes {_ratio(table, best, 'p50_us'):.1f} times as long and "
         f"{_ratio(table, best, 'bytes'):.0f} times the memory; one basis for all places, the best "
         "there is (SVD), stays behind."
@@ -299,9 +292,7 @@ def _ratio(one: dict[str, Any], other: dict[str, Any], key: str) -> float:
 
 def _online(rows: list[Row], cloud: str, axes: Axes) -> None:
     mine = [r for r in rows if r.get("cloud") == cloud]
-    for precision, colour in _COLOURS.items():
-        some = [r for r in _of(mine, "vademecum") if r["precision"] == precision]
-        _scatter(axes, some, "p50_us", precision, s=22, c=colour, alpha=0.8)
+    _scatter(axes, _of(mine, "vademecum"), "p50_us", "vademecum", s=22, c="#009E73", alpha=0.8)
     front = sorted((r for r in mine if r["front"]), key=lambda r: r["p50_us"])  # type: ignore[arg-type,return-value]
     axes.plot(column(front, "p50_us"), column(front, "error"), "k-", lw=1, label="front")
     best = [r for r in mine if r["method"] == "SVD optimum"]

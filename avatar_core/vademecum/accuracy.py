@@ -17,9 +17,8 @@ from avatar_core.errors import AccuracyError
 
 Quantity = Literal["l2", "force"]
 Cloud = Literal["surface", "volume", "off"]
-Precision = Literal["float32", "int16", "int8"]
 
-CONTENT = 0.95  # part of the loads that a promised error holds for
+CONTENT = 0.95  # part of the loads that a certified error holds for
 LEVELS = (1, 2, 3, 4, 5, 6, 8)  # numbers of modes that are measured, beside all of them
 _CONFIDENCE = 0.95  # that it does, over draws of the loads that were measured
 
@@ -31,15 +30,13 @@ class Detail:
     modes : that move a point, in the mean over the points of the cloud, of those that the place's
         region and its share of the global ones leave there; a vademecum's ``n_modes`` show all
     cloud : vertices that are shown
-    precision : in which the modes are stored
     """
 
     modes: int
     cloud: Cloud = "surface"
-    precision: Precision = "int16"
 
     def __str__(self) -> str:
-        return f"{self.modes} modes in {self.precision}, cloud {self.cloud}"
+        return f"{self.modes} modes, cloud {self.cloud}"
 
 
 def mode_levels(n_modes: int) -> tuple[int, ...]:
@@ -53,7 +50,7 @@ class CurvePoint:
 
     l2, force : relative error that 95 % of unseen loads stay below, of the displacement of the
         cloud and of the normal force; l2 is NaN where nothing is shown
-    p50, p99 : time that a step takes of the processor [s]; NaN before it was timed
+    p50, p99 : time that a step takes of the processor [s]; NaN where it was not timed
     nbytes : of all that is held to show the displacement; a step reads a part
     """
 
@@ -65,7 +62,7 @@ class CurvePoint:
     p99: float = float("nan")
 
     def error(self, quantity: Quantity) -> float:
-        """The promised error of a quantity."""
+        """The certified error of a quantity."""
         return self.l2 if quantity == "l2" else self.force
 
 
@@ -74,7 +71,8 @@ class Budget:
     """Limits on the error and the time of a step.
 
     tolerance : on the relative error of ``quantity``, which 95 % of the loads keep
-    deadline : on the time that a step takes of the processor, which 99 % keep [s]
+    deadline : on the measured time that a step takes of the processor, which 99 % keep [s]; a
+        detail that was not timed keeps any
 
     Raises
     ------
@@ -97,7 +95,7 @@ class Budget:
 
     def holds(self, point: CurvePoint) -> bool:
         """Whether a point meets both."""
-        return point.error(self.quantity) <= self.tolerance and point.p99 <= self.deadline
+        return point.error(self.quantity) <= self.tolerance and not point.p99 > self.deadline
 
 
 @dataclass(frozen=True)
@@ -112,13 +110,13 @@ class AccuracyCurve:
     machine: str = ""
 
     def of(self, cloud: Cloud) -> AccuracyCurve:
-        """The points of one cloud."""
-        return self._where(lambda point: point.detail.cloud == cloud)
+        """The points of one cloud, of fewest modes first."""
+        some = (point for point in self.points if point.detail.cloud == cloud)
+        return replace(self, points=tuple(sorted(some, key=lambda p: p.detail.modes)))
 
-    def like(self, detail: Detail) -> AccuracyCurve:
-        """The points that differ from a detail in the number of modes alone, fewest first."""
-        same = self._where(lambda p: replace(p.detail, modes=detail.modes) == detail)
-        return replace(same, points=tuple(sorted(same.points, key=lambda p: p.detail.modes)))
+    def up_to(self, modes: int) -> AccuracyCurve:
+        """The points of at most so many modes."""
+        return replace(self, points=tuple(p for p in self.points if p.detail.modes <= modes))
 
     def front(self, quantity: Quantity = "l2") -> tuple[CurvePoint, ...]:
         """Points that none other beats in time and error (Pareto), fastest first."""
@@ -128,9 +126,6 @@ class AccuracyCurve:
                 best = point.error(quantity)
                 front.append(point)
         return tuple(front)
-
-    def _where(self, condition: Callable[[CurvePoint], bool]) -> AccuracyCurve:
-        return replace(self, points=tuple(filter(condition, self.points)))
 
     def plain(self) -> dict[str, Any]:
         """As columns of numbers and text, for a file."""
@@ -157,21 +152,31 @@ def _names(kind: type) -> tuple[str, ...]:
     return tuple(field.name for field in fields(kind))
 
 
-def choose(curve: AccuracyCurve, budget: Budget) -> CurvePoint:
+def choose(curve: AccuracyCurve | None, budget: Budget) -> CurvePoint:
     """The fastest point that meets a budget; of equally fast ones the most accurate.
 
-    A looser tolerance is therefore never slower, and a longer deadline never changes what is
-    chosen, unless nothing met the shorter one.
+    On a curve that was not timed, the fewest modes are the fastest. A looser tolerance is therefore
+    never slower, and a longer deadline never changes what is chosen, unless nothing met the shorter
+    one.
 
     Raises
     ------
     AccuracyError
-        If none does; the message names the nearest point on either side.
+        If none does; the message names the nearest point on either side. Or if there is no curve.
     """
+    if curve is None:
+        raise AccuracyError(
+            "this vademecum has no accuracy curve for a budget to choose from; build it with "
+            "'avatar vademecum', or ask without a budget"
+        )
     feasible = [point for point in curve.points if budget.holds(point)]
     if feasible:
-        return min(feasible, key=lambda point: (point.p50, point.error(budget.quantity)))
+        return min(feasible, key=lambda p: (_cost(p), p.error(budget.quantity)))
     raise AccuracyError(_refusal(curve, budget))
+
+
+def _cost(point: CurvePoint) -> float:
+    return point.detail.modes if math.isnan(point.p50) else point.p50
 
 
 def _refusal(curve: AccuracyCurve, budget: Budget) -> str:
@@ -179,14 +184,16 @@ def _refusal(curve: AccuracyCurve, budget: Budget) -> str:
     asked += "any time" if np.isinf(budget.deadline) else f"{budget.deadline * 1e6:.0f} us"
     quantity = budget.quantity
     exact = [p for p in curve.points if p.error(quantity) <= budget.tolerance]
-    fast = [p for p in curve.points if p.p99 <= budget.deadline and not np.isnan(p.error(quantity))]
+    fast = [p for p in curve.points if not p.p99 > budget.deadline]
     near = [*_first(exact, lambda p: p.p99), *_first(fast, lambda p: p.error(quantity))] or list(
         _first(curve.points, lambda p: p.error(quantity))
     )
-    nearest = " or ".join(
-        f"{p.error(quantity):.3g} in {p.p99 * 1e6:.0f} us ({p.detail})" for p in near
-    )
+    nearest = " or ".join(f"{p.error(quantity):.3g}{_spent(p)} ({p.detail})" for p in near)
     return f"{asked}; nearest: {nearest or 'nothing was measured'}"
+
+
+def _spent(point: CurvePoint) -> str:
+    return "" if math.isnan(point.p99) else f" in {point.p99 * 1e6:.0f} us"
 
 
 def _first(

@@ -71,7 +71,7 @@ from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.reduction.near_field import LocalBlocks, Mirror
 from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
-from avatar_core.vademecum.accuracy import AccuracyCurve, Cloud, Precision
+from avatar_core.vademecum.accuracy import AccuracyCurve, Cloud
 from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.display import ORGAN, Display
 from avatar_core.vademecum.large_deformation import (
@@ -369,7 +369,6 @@ class _Curve:
 
     modes: tuple[int, ...]
     cloud: tuple[Cloud, ...]
-    precision: tuple[Precision, ...]
     l2: tuple[float, ...]
     force: tuple[float, ...]
     nbytes: tuple[int, ...]

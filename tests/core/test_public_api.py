@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 
 import avatar_core as av
-from avatar_core.contact import timing
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline import pipeline
-from avatar_core.vademecum.accuracy import Detail
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.paths import ROOT
@@ -44,22 +42,20 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         av.vademecum_of  # noqa: B018
 
 
-def test_a_budget_chooses_what_is_shown_and_leaves_the_force(
-    phantom_vademecum: Vademecum, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_budget_chooses_what_is_shown_and_leaves_the_force(phantom_vademecum: Vademecum) -> None:
     """The tolerance of a coarser point of the certified curve: fewer modes, the same force.
 
-    On a clock by which each mode takes a microsecond, whatever else this machine does.
+    By times of a microsecond for each mode, whatever else the machine did that took them.
     """
-    monkeypatch.setattr(
-        timing, "_step_times", lambda model, paths: np.full(len(paths), 1e-6 * model.state.shown[0])
-    )
     certificate = phantom_vademecum.certificate
     assert certificate is not None and certificate.curve is not None
-    usual = certificate.curve.like(Detail(1))  # few of its points: each of them is timed
-    vademecum = replace(phantom_vademecum, certificate=replace(certificate, curve=usual))
+    points = tuple(
+        replace(p, p50=1e-6 * p.detail.modes, p99=1e-6 * p.detail.modes)
+        for p in certificate.curve.of("surface").points
+    )
+    curve = replace(certificate.curve, points=points)
+    vademecum = phantom_vademecum.with_certificate(replace(certificate, curve=curve))
     scene = av.Scene(effects=())
-    points = usual.points
     loose = float(np.median([point.l2 for point in points]))
     coarse = av.prepare(vademecum, scene, av.Budget(tolerance=loose, deadline=np.inf))
     fine = av.prepare(vademecum, scene)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from avatar_core.vademecum.accuracy import (
     Cloud,
     CurvePoint,
     Detail,
-    Precision,
     mode_levels,
     upper_quantile,
 )
@@ -28,12 +27,7 @@ SHOWN: tuple[Cloud, ...] = ("surface", "volume")
 
 def details_of(n_modes: int) -> tuple[Detail, ...]:
     """The details that a curve is measured at: all combinations, and no cloud at all."""
-    shown = tuple(
-        Detail(modes, cloud, precision)
-        for cloud in SHOWN
-        for precision in get_args(Precision)
-        for modes in mode_levels(n_modes)
-    )
+    shown = tuple(Detail(modes, cloud) for cloud in SHOWN for modes in mode_levels(n_modes))
     return (*shown, Detail(n_modes, "off"))
 
 
@@ -46,11 +40,7 @@ class DisplayErrors:
     def __init__(self, vademecum: Vademecum) -> None:
         self._vademecum = vademecum
         self._levels = mode_levels(vademecum.n_modes)
-        self._shown = [
-            rounded(arrays, precision)
-            for arrays in (cloud_arrays(vademecum, cloud) for cloud in SHOWN)
-            for precision in get_args(Precision)
-        ]
+        self._shown = [rounded(cloud_arrays(vademecum, cloud)) for cloud in SHOWN]
         self.sizes = [_size(arrays, n) for arrays in self._shown for n in self._levels] + [0]
 
     def __call__(self, positions: np.ndarray, weights: np.ndarray, truth: np.ndarray) -> np.ndarray:

@@ -56,7 +56,7 @@ class ActiveModel:
     """A contact model with the message templates of its size; the loop exchanges them as one.
 
     effects : names of the effects that it simulates
-    shown_modes : which of its modes are shown, and the accuracy promised with them
+    shown_modes : which of its modes are shown, and how accurate these are
     band : of its forces; None without distributions of the material
     """
 

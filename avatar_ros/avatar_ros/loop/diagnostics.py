@@ -142,11 +142,11 @@ def tool_status(
     return _status(f"{name}: {tool_name}", level, text, values, hardware)
 
 
-def vademecum_status(name: str, identity: str, promise: str) -> DiagnosticStatus:
-    """Status of the loaded vademecum, with what it promises."""
+def vademecum_status(name: str, identity: str, accuracy: str) -> DiagnosticStatus:
+    """Status of the loaded vademecum, with its certified errors."""
     if not identity:
         return _status(f"{name}: vademecum", WARN, "none: no force; load one", {})
-    return _status(f"{name}: vademecum", OK, promise, {"id": identity})
+    return _status(f"{name}: vademecum", OK, accuracy, {"id": identity})
 
 
 def qos_status(name: str, mismatches: list[str]) -> DiagnosticStatus:
@@ -163,7 +163,7 @@ def qos_status(name: str, mismatches: list[str]) -> DiagnosticStatus:
 
 
 def accuracy_status(name: str, text: str, shedding: bool, window: LoopStatistics) -> Any:
-    """Status of the shown modes, and of the promised and measured times."""
+    """Status of the shown modes, their certified errors and measured times."""
     return _status(
         f"{name}: accuracy",
         WARN if shedding else OK,
@@ -171,10 +171,9 @@ def accuracy_status(name: str, text: str, shedding: bool, window: LoopStatistics
         {
             "modes shown": window.modes_shown,
             "modes": window.modes,
-            "displacement within, promised": window.promised_l2,
-            "force within, promised": window.promised_force,
-            "step p99 promised [us]": 1e6 * window.promised_step_p99,
-            "step p99 held [us]": 1e6 * window.step_p99,
+            "displacement within": window.promised_l2,
+            "force within": window.promised_force,
+            "step p99 [us]": 1e6 * window.step_p99,
         },
     )
 

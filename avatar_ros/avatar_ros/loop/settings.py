@@ -163,7 +163,7 @@ CONTACT = (
     Parameter(
         "accuracy.deadline",
         0.0,
-        "processor time that 99 % of steps must not exceed, with forces and cloud [s]; 0: no limit",
+        "time that 99 % of steps must not exceed, with forces and cloud [s]; 0: no limit",
         range=(0.0, 0.01),
         read_only=False,
     ),
@@ -307,14 +307,3 @@ def chosen_budget(value: dict[str, Any]) -> Budget | None:
     if tolerance == 0.0 and deadline == 0.0:
         return None
     return Budget(tolerance or math.inf, deadline or math.inf, value["accuracy.quantity"])
-
-
-def of_budget(budget: Budget | None) -> dict[str, Any]:
-    """The inverse of :func:`chosen_budget`."""
-    if budget is None:
-        return {"accuracy.tolerance": 0.0, "accuracy.deadline": 0.0}
-    finite = {"accuracy.tolerance": budget.tolerance, "accuracy.deadline": budget.deadline}
-    return {
-        "accuracy.quantity": budget.quantity,
-        **{name: 0.0 if math.isinf(value) else value for name, value in finite.items()},
-    }

@@ -1,4 +1,4 @@
-"""Errors and times promised for the model in use, and how many of its modes are shown."""
+"""How many modes of the model in use are shown, and the errors certified for them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from avatar_core.contact.haptics.shedding import Shedder
-from avatar_core.vademecum.accuracy import AccuracyCurve, CurvePoint, mode_levels
+from avatar_core.vademecum.accuracy import AccuracyCurve, Budget, choose, mode_levels
 from avatar_ros.msg import LoopStatistics
 
 LEAST_SHOWN = 3  # modes: with fewer, the organ under a tip no longer looks right
@@ -33,40 +33,41 @@ class ShownModes:
     Parameters
     ----------
     model : ContactModel
-    curve : points that differ in modes alone; None where none was measured
-    deadline : of a step [s]; infinity for none
+    curve : of its cloud; None where none was measured
     """
 
-    def __init__(self, model: Any, curve: AccuracyCurve | None, deadline: float) -> None:
-        self._model = model
-        self._points: dict[int, CurvePoint] = {}
-        if curve is not None:
-            self._points = {p.detail.modes: p for p in curve.points}
-        levels = list(self._points) or list(mode_levels(model.n_modes))
-        fewer = (n for n in levels if LEAST_SHOWN <= n < model.n_modes)
-        self._shedder = Shedder([*fewer, model.n_modes], deadline)
+    def __init__(self, model: Any, curve: AccuracyCurve | None) -> None:
+        self._model, self._curve = model, curve
+        self._points = {p.detail.modes: p for p in curve.points} if curve else {}
+        self.keep(None)
+
+    def keep(self, budget: Budget | None) -> None:
+        """Show the modes that a budget chooses, all for None, and fewer when steps are late.
+
+        Raises
+        ------
+        AccuracyError
+            If no number of modes meets the budget; everything then stays as it is.
+        """
+        most = self._model.n_modes
+        if budget is not None:
+            most = choose(self._curve, budget).detail.modes
+        self._most = most
+        fewer = (n for n in mode_levels(most) if LEAST_SHOWN <= n < most)
+        self._shedder = Shedder([*fewer, most], budget.deadline if budget else math.inf)
+        self._model.show(most)
 
     @property
-    def promise(self) -> str:
-        """The errors and times promised while all modes are shown, in words."""
-        point = self._points.get(self._model.n_modes)
-        text = f"{self._model.n_modes} modes"
+    def accuracy(self) -> str:
+        """The errors certified for the modes that are shown unless steps are late, in words."""
+        point = self._points.get(self._most)
+        text = f"{self._most} modes"
         if point is not None:
             text += (
                 f", displacement within {point.l2:.1%} and force within {point.force:.1%} for 95 % "
                 "of touches"
             )
-            if not math.isnan(point.p99):
-                text += f", steps of {point.p99 * 1e6:.0f} us"
         return text
-
-    def set_times(self, curve: AccuracyCurve) -> None:
-        """Promise the same errors with times that were measured on this machine."""
-        self._points = {p.detail.modes: p for p in curve.points}
-
-    def set_deadline(self, deadline: float) -> None:
-        """Leave out modes by another deadline from now on [s]."""
-        self._shedder.deadline = deadline
 
     def update(self, statistics: LoopStatistics, watched: bool = True) -> ShownModesReport:
         """Complete a window's statistics with its modes, and choose those of the next window.
@@ -81,7 +82,7 @@ class ShownModes:
         shedder = self._shedder
         modes = shedder.update(missed, statistics.step_p99) if watched else shedder.rest()
         self._model.show(modes)
-        text = f"{modes} of {self._model.n_modes} modes shown"
+        text = f"{modes} of {self._most} modes shown"
         if shedder.is_shedding:
             text += (
                 f": {missed:.1%} of the periods missed, 99 % of steps within "
@@ -92,8 +93,7 @@ class ShownModes:
     def _describe(self, statistics: LoopStatistics, shown: int) -> None:
         measured = [n for n in self._points if n <= shown]
         point = self._points[max(measured)] if measured else None  # more modes are no less accurate
-        statistics.modes_shown, statistics.modes = shown, self._model.n_modes
+        statistics.modes_shown, statistics.modes = shown, self._most
         statistics.promised_l2 = point.l2 if point else _NAN
         statistics.promised_force = point.force if point else _NAN
-        exact = self._points.get(shown)
-        statistics.promised_step_p99 = exact.p99 if exact else _NAN
+        statistics.promised_step_p99 = _NAN

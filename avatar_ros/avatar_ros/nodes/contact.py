@@ -10,7 +10,6 @@ Three threads of control:
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from dataclasses import asdict, replace
@@ -34,7 +33,7 @@ from avatar_core.errors import AccuracyError, CoordinateError, SceneError, one_l
 from avatar_core.reduction.coordinates import option_of
 from avatar_core.uncertainty.distributions import Distribution, mappings
 from avatar_core.uncertainty.known import Held
-from avatar_core.vademecum.accuracy import AccuracyCurve, Budget
+from avatar_core.vademecum.accuracy import AccuracyCurve
 from avatar_ros.framework import promises, qos, realtime
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
@@ -49,7 +48,6 @@ from avatar_ros.loop.settings import (
     ContactSettings,
     chosen_budget,
     chosen_known,
-    of_budget,
 )
 from avatar_ros.loop.shown_modes import ShownModes
 from avatar_ros.loop.statistics import TimingRecord
@@ -59,7 +57,6 @@ from avatar_ros.nodes import contact_frames
 from avatar_ros.nodes.contact_parameters import read_contact
 from avatar_ros.nodes.contact_reports import REPORT_PERIOD, ContactReports
 from avatar_ros.prepare import scenes
-from avatar_ros.prepare.budget_requests import BudgetRequests
 from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedModel
 from avatar_ros.prepare.supplier import SUPERSEDED, ModelSupplier
 from avatar_ros.srv import LoadScene
@@ -74,14 +71,12 @@ class ContactNode(ManagedNode):
     def __init__(self) -> None:
         self._loop: ContactLoop | None = None
         self._supplier: ModelSupplier | None = None
-        self._budget: BudgetRequests | None = None
         self._tools: list[ToolChannel] = []
         self._devices: list[Device] = []
         self._outputs: Publishers | None = None
         self._frames: Any = None  # publisher of the static transforms
         self._reports: ContactReports | None = None  # while the node is active
         self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
-        self._least_error: dict[str, float] = {}  # of any detail of it, by quantity
         self._held: Held | None = None  # parameters of it, of which distributions may be given
         self._told: tuple[str, ...] = ()  # of the material that it has no place for
         self._n_awaited = 0
@@ -131,15 +126,9 @@ class ContactNode(ManagedNode):
             period=period,
             material=settings.material,
             scene=settings.scene,
-            budget=asdict(settings.budget) if settings.budget else {},
             uncertainty=mappings(settings.known),
         )
-        self._supplier = ModelSupplier(
-            request, self._take_model, self._take_times, self.get_logger().error
-        )
-        self._budget = BudgetRequests(
-            settings.budget, self._supplier.ask, self._grant_budget, self._refuse_budget
-        )
+        self._supplier = ModelSupplier(request, self._take_model, self.get_logger().error)
         load_compiler()  # while the worker starts
         if settings.safety.passivity != "off":
             passivity.warm_up()
@@ -189,7 +178,7 @@ class ContactNode(ManagedNode):
     def clean_up(self) -> None:
         if self._supplier is not None:
             self._supplier.stop()
-            self._supplier = self._budget = None
+            self._supplier = None
             self._scene = ""
         self._loop = None
         ends: list[Any] = [*self._tools, *self._devices]
@@ -212,11 +201,13 @@ class ContactNode(ManagedNode):
             return
         model = contact.make_model(Layout.of(prepared.arrays), halves=True)
         replaced = loop.active
-        self._ranges, self._least_error = prepared.ranges, prepared.least_error
-        self._held = Held.of_plain(prepared.held)
+        self._ranges, self._held = prepared.ranges, Held.of_plain(prepared.held)
         curve = AccuracyCurve.of_plain(prepared.curve) if prepared.curve else None
-        kept = self._budget.in_force if self._budget is not None else None
-        shown_modes = ShownModes(model, curve, _deadline(kept))
+        shown_modes = ShownModes(model, curve)
+        try:
+            shown_modes.keep(loop.settings.budget)
+        except AccuracyError as error:
+            self.get_logger().error(f"accuracy.*: {error}; all modes are shown")
         band = ForceBand.of(model, prepared.arrays)
         loop.active = ActiveModel(
             prepared.id, model, loop.settings, prepared.effects, shown_modes, band
@@ -225,7 +216,7 @@ class ContactNode(ManagedNode):
         what = ", ".join(prepared.effects) or "no effects"
         self.get_logger().info(
             f"vademecum {prepared.name!r} ({prepared.id[:12]}) in use, with {what}; "
-            f"{shown_modes.promise}"
+            f"{shown_modes.accuracy}"
         )
         self._tell(prepared.notices)
         while loop.is_changing:
@@ -239,13 +230,6 @@ class ContactNode(ManagedNode):
             if notice not in self._told:
                 self.get_logger().warning(f"{notice}; it stays as built")
         self._told = notices
-
-    def _take_times(self, curve: dict[str, Any]) -> None:
-        """Promise the measured times of the model in use; called in the supplier's thread."""
-        loop = self._loop
-        if loop is not None and loop.active.shown_modes is not None:
-            loop.active.shown_modes.set_times(AccuracyCurve.of_plain(curve))
-            self.get_logger().info(f"timed here: {loop.active.shown_modes.promise}")
 
     async def _load_scene(
         self, request: LoadScene.Request, response: LoadScene.Response
@@ -284,12 +268,11 @@ class ContactNode(ManagedNode):
         return scene
 
     def _save_state(self) -> None:
-        """Save what is in force for the next start; of the budget, the one that was granted."""
+        """Save what is in force for the next start."""
         with self._changing:
-            if self._budget is None:
+            if self._supplier is None:
                 return
             now = self._values(CHANGEABLE, [])
-            now |= of_budget(self._budget.in_force)
             now["scene"] = self._scene or self.get_parameter("scene").value
             self._state.save(now)
 
@@ -327,8 +310,7 @@ class ContactNode(ManagedNode):
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         """Apply changes whose type and range were checked, from the next step on.
 
-        A change of the material takes some tenths of a second, in the worker process. Called by
-        the executor, and in the supplier's thread when a refused budget is reset.
+        A change of the material takes some tenths of a second, in the worker process.
         """
         with self._changing:
             return self._change(changes)
@@ -347,7 +329,7 @@ class ContactNode(ManagedNode):
                     known = chosen_known(change.value)
         except (AccuracyError, ParameterError) as error:
             return SetParametersResult(successful=False, reason=str(error))
-        refusal = self._refusal_of_budget(budget) or self._refusal_of_known(known, settings.known)
+        refusal = self._refusal_of_known(known, settings.known)
         if refusal:
             return SetParametersResult(successful=False, reason=refusal)
         material = dict(settings.material)
@@ -361,31 +343,25 @@ class ContactNode(ManagedNode):
             material.pop(name, None)
             if change.value != 0.0:
                 material[name] = change.value
+        try:
+            if budget != settings.budget and loop.active.shown_modes is not None:
+                loop.active.shown_modes.keep(budget)
+        except AccuracyError as error:
+            return SetParametersResult(successful=False, reason=one_line(error))
         changed = {p.name: p.value for p in changes if hasattr(loop.settings, p.name)}
         if material != settings.material and self._supplier is not None:
             self._supplier.ask({"material": material}, self._log_refused_material)
         if known != settings.known and self._supplier is not None:
             self._supplier.ask({"uncertainty": mappings(known)}, self._log_refused_known)
-        if self._budget is not None:
-            self._budget.ask(budget)
-        loop.settings = replace(settings, **changed, material=material, known=known, safety=safety)
+        loop.settings = replace(
+            settings, **changed, material=material, budget=budget, known=known, safety=safety
+        )
         return SetParametersResult(successful=True)
 
     def _values(self, names: tuple[str, ...], changes: list[Parameter]) -> dict[str, Any]:
         """Values of some parameters after changes."""
         value = {name: self.get_parameter(name).value for name in names}
         return value | {p.name: p.value for p in changes if p.name in value}
-
-    def _grant_budget(self, budget: Budget | None) -> None:
-        loop = self._loop
-        if loop is not None and loop.active.shown_modes is not None:
-            loop.active.shown_modes.set_deadline(_deadline(budget))
-        self._save_state()
-
-    def _refuse_budget(self, kept: Budget | None, refusal: str) -> None:
-        self.get_logger().error(f"budget refused: {refusal}")
-        values = of_budget(kept)
-        self.set_parameters([Parameter(name, value=value) for name, value in values.items()])
 
     def _log_refused_material(self, prepared: PreparedModel | None, refusal: str) -> None:
         if refusal and refusal != SUPERSEDED:
@@ -408,19 +384,6 @@ class ContactNode(ManagedNode):
             return one_line(error)
         return ""
 
-    def _refusal_of_budget(self, budget: Budget | None) -> str:
-        """Why no detail of the vademecum in use is so exact; empty if one is, or if none is known.
-
-        Whether it is fast enough as well is found out later, in the worker process.
-        """
-        least = self._least_error.get(budget.quantity) if budget is not None else None
-        if budget is None or least is None or budget.tolerance >= least:
-            return ""
-        return (
-            f"no detail of this vademecum is within {budget.tolerance:.3g} of {budget.quantity}; "
-            f"the most exact is within {least:.3g}"
-        )
-
     def _refusal_of(self, name: str, value: float, material: dict[str, float]) -> str:
         """Why a value of the material lies outside the vademecum in use; empty if it does not.
 
@@ -440,10 +403,6 @@ class ContactNode(ManagedNode):
         if low <= value <= high:
             return ""
         return f"{name} is {value:g}; the vademecum holds {low:g} to {high:g}"
-
-
-def _deadline(budget: Budget | None) -> float:
-    return budget.deadline if budget else math.inf
 
 
 def main() -> int:

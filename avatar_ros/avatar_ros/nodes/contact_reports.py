@@ -112,12 +112,12 @@ class ContactReports:
         node, loop, active = self._node, self._loop, self._loop.active
         name = node.get_fully_qualified_name()
         limits = {p.name: node.get_parameter(p.name).value for p in THRESHOLDS}
-        promise = active.shown_modes.promise if active.shown_modes is not None else ""
+        accuracy = active.shown_modes.accuracy if active.shown_modes is not None else ""
         mismatches = self._ports.mismatches()
         time.sleep(_PAUSE)
         statuses = [
             diagnostics.loop_status(name, window, nominal, limits),
-            diagnostics.vademecum_status(name, active.id, promise),
+            diagnostics.vademecum_status(name, active.id, accuracy),
             diagnostics.qos_status(name, mismatches),
         ]
         if report is not None:

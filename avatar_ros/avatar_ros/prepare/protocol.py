@@ -11,7 +11,6 @@ node, then            ChangeRequest       change the request; numbered from 1
 worker                ModelReady          a model, with its descriptor; number 0: of a new vademecum
 worker                Accepted            the change is in force as soon as a vademecum comes
 worker                Refused             why a change, or with number 0 a vademecum, is not used
-worker                Timed               the curve of the last model, with times measured since
 ====================  ==================  =====================================================
 """
 
@@ -47,7 +46,6 @@ class ModelReady:
     effects: tuple[str, ...]
     cloud_divisor: int | None
     curve: dict[str, Any] | None
-    least_error: dict[str, float]
     notices: tuple[str, ...] = ()
     held: dict[str, Any] = field(default_factory=dict)
 
@@ -61,7 +59,6 @@ class ModelReady:
             tuple(self.effects),
             self.cloud_divisor,
             self.curve,
-            self.least_error,
             tuple(self.notices),
             self.held,
         )
@@ -79,15 +76,10 @@ class Refused:
     reason: str
 
 
-@dataclass(frozen=True)
-class Timed:
-    curve: dict[str, Any]
-
-
-Packet = PreparationRequest | ChangeRequest | ModelReady | Accepted | Refused | Timed
+Packet = PreparationRequest | ChangeRequest | ModelReady | Accepted | Refused
 _KINDS: dict[str, Any] = {
     kind.__name__: kind
-    for kind in (PreparationRequest, ChangeRequest, ModelReady, Accepted, Refused, Timed)
+    for kind in (PreparationRequest, ChangeRequest, ModelReady, Accepted, Refused)
 }
 
 

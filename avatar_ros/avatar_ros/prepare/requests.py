@@ -22,8 +22,6 @@ class PreparationRequest:
     period : of a step [s]
     material : values by name of the coordinate; they override those of the scene
     scene : YAML; empty for the natural effects of the vademecum
-    budget : fields of an avatar_core.vademecum.accuracy.Budget; empty for all modes in ordinary
-        precision
     uncertainty : what is known of the material, as of
         :func:`avatar_core.uncertainty.distributions.mappings`; empty for no bands
     """
@@ -37,7 +35,6 @@ class PreparationRequest:
     period: float
     material: dict[str, float] = field(default_factory=dict)
     scene: str = ""
-    budget: dict[str, Any] = field(default_factory=dict)
     uncertainty: dict[str, Any] = field(default_factory=dict)
 
 
@@ -54,9 +51,7 @@ class PreparedModel:
     ranges : lowest and highest value of each coordinate of the vademecum
     effects : names of the simulated effects
     cloud_divisor : that of the scene; None without a scene
-    curve : plain form of the AccuracyCurve for the modes in use and fewer; times that were not
-        measured yet are NaN; None if no errors were measured
-    least_error : of any detail of the cloud, by quantity; empty if no errors were measured
+    curve : plain form of the AccuracyCurve of the cloud; None if no errors were measured
     notices : values of the material that this vademecum has no place for, one line each
     held : plain form of the avatar_core.uncertainty.known.Held at the values in use
     """
@@ -68,6 +63,5 @@ class PreparedModel:
     effects: tuple[str, ...] = ()
     cloud_divisor: int | None = None
     curve: dict[str, Any] | None = None
-    least_error: dict[str, float] = field(default_factory=dict)
     notices: tuple[str, ...] = ()
     held: dict[str, Any] = field(default_factory=dict)

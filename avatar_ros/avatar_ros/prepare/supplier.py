@@ -5,9 +5,6 @@ global lock for tens of milliseconds; compiling the step for a new selection of 
 seconds. A worker process (:mod:`avatar_ros.prepare.worker`) does all that: it subscribes to
 `vademecum` and puts the prepared arrays into sealed shared memory. This process only maps that
 memory, and reads the compiled step from numba's cache.
-
-A model is sent as soon as it is prepared. The worker then measures how long its steps take, and
-sends the times separately.
 """
 
 from __future__ import annotations
@@ -17,17 +14,16 @@ import socket
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 from avatar_core.common.processes import ModuleProcess
 from avatar_core.errors import one_line
-from avatar_ros.prepare.protocol import Accepted, ChangeRequest, Channel, ModelReady, Refused, Timed
+from avatar_ros.prepare.protocol import Accepted, ChangeRequest, Channel, ModelReady, Refused
 from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedModel
 
 _WORKER = "avatar_ros.prepare.worker"
 _RESTART_DELAY = 1.0  # [s]
 _STOP_TIMEOUT = 1.0  # [s]
-_KINDS = ("material", "budget", "uncertainty")  # of changes, besides scenes
+_KINDS = ("material", "uncertainty")  # of changes, besides scenes
 
 # Called with the model now in use and "", or with None and the reason of a refusal. None and "":
 # there is no vademecum yet, and the change applies to the next one.
@@ -41,10 +37,9 @@ class ModelSupplier:
 
     Callbacks run in a thread of this object, one at a time. Changes are sent one by one, each
     after the last one was answered. Of the changes that wait, only the newest of each kind (scene,
-    material, budget, uncertainty) is kept, so dragging a slider fills neither time nor memory.
+    material, uncertainty) is kept, so dragging a slider fills neither time nor memory.
 
     on_model : called with each model that was verified and prepared; puts it into use
-    on_times : called with the curve of the model in use once its times are measured
     on_refusal : called with one line when a vademecum is refused or the worker ends
     """
 
@@ -52,12 +47,10 @@ class ModelSupplier:
         self,
         request: PreparationRequest,
         on_model: Callable[[PreparedModel], None],
-        on_times: Callable[[dict[str, Any]], None],
         on_refusal: Callable[[str], None],
     ) -> None:
         self._request = request  # in force; a restarted worker begins with it
         self._on_model = on_model
-        self._on_times = on_times
         self._on_refusal = on_refusal
         self._stop = threading.Event()
         self._lock = threading.Lock()  # guards the next four
@@ -144,28 +137,24 @@ class ModelSupplier:
         self._process.finish(_STOP_TIMEOUT)
 
     def _receive(self, channel: Channel) -> None:
-        in_use = False  # the model that came last
         while received := channel.receive():
             match received:
                 case ModelReady() as ready, [handle]:
-                    in_use = self._use(ready, handle)
-                case Timed(curve), _ if in_use:
-                    self._on_times(curve)
+                    self._use(ready, handle)
                 case Accepted(number, change), _:
                     self._conclude(number, change, None)
                 case Refused(number, reason), _:
                     self._conclude(number, {}, None, reason)
 
-    def _use(self, ready: ModelReady, handle: int) -> bool:
-        """Have a model put into use; false if that failed and the last one stays."""
+    def _use(self, ready: ModelReady, handle: int) -> None:
+        """Have a model put into use; if that fails, the last one stays."""
         try:
             model = ready.map(handle)
             self._on_model(model)
         except Exception as error:
             self._conclude(ready.number, {}, None, one_line(error))
-            return False
-        self._conclude(ready.number, ready.change, model)
-        return True
+        else:
+            self._conclude(ready.number, ready.change, model)
 
     def _conclude(
         self, number: int, change: Change, model: PreparedModel | None, reason: str = ""

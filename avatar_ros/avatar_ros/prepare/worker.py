@@ -12,9 +12,8 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from avatar_core.common.confined import Imported
 from avatar_core.common.processes import return_memory
@@ -22,7 +21,6 @@ from avatar_core.errors import one_line
 from avatar_ros.framework import realtime
 from avatar_ros.framework.reader import Reader
 from avatar_ros.prepare.bands import BandPreparer
-from avatar_ros.prepare.detail_chooser import DetailChooser, SupersededError
 from avatar_ros.prepare.protocol import (
     Accepted,
     ChangeRequest,
@@ -30,7 +28,6 @@ from avatar_ros.prepare.protocol import (
     ModelReady,
     Packet,
     Refused,
-    Timed,
 )
 from avatar_ros.prepare.requests import Change, PreparationRequest
 from avatar_ros.prepare.shared_arrays import map_shared, write_shared
@@ -40,46 +37,19 @@ _MAX_BYTES = 1 << 30  # of a vademecum that can be received
 _PARSE = Imported("avatar_core.vademecum.storage", "parse_vademecum")
 
 
-class SentModel(NamedTuple):
-    """A model that was sent, its specification and the detail that it shows."""
-
-    spec: Any
-    detail: Any
-    model: Any
-
-
 class ModelPreparer:
     """Verifies and prepares what comes in, and reports through a socket.
 
-    Vademecums come in the thread of the node, changes of the request in that of :meth:`listen`. A
-    model is timed after it was sent; whatever comes in meanwhile interrupts the timing.
-
-    stop : true when the process is to end
+    Vademecums come in the thread of the node, changes of the request in that of :meth:`listen`.
     """
 
-    def __init__(
-        self,
-        request: PreparationRequest,
-        channel: Channel,
-        stop: Callable[[], bool] = lambda: False,
-    ) -> None:
+    def __init__(self, request: PreparationRequest, channel: Channel) -> None:
         self._request = request
         self._channel = channel
         self._vademecum: Any = None
         self._reader = Reader(_MAX_BYTES)
-        self._chooser = DetailChooser()
         self._bands = BandPreparer()
         self._lock = threading.Lock()
-        self._stop = stop
-        self._waiting: set[int] = set()  # threads that interrupt the timing
-
-    @contextlib.contextmanager
-    def _exclusive(self) -> Iterator[None]:
-        """Hold the lock; interrupt a timing that holds it."""
-        self._waiting.add(threading.get_ident())
-        with self._lock:
-            self._waiting.discard(threading.get_ident())
-            yield
 
     def expect(self) -> None:
         """Have the process that verifies started before a vademecum comes; returns at once."""
@@ -88,20 +58,18 @@ class ModelPreparer:
 
     def receive(self, message: Any) -> None:
         """Take a VademecumFile."""
-        with self._exclusive():
+        with self._lock:
             if self._vademecum is not None and message.id == self._vademecum.id:
                 return  # announced again by a restarted loader
             threading.Thread(target=_import_libraries, name="imports", daemon=True).start()
             try:
                 vademecum = _verified(message.id, bytes(message.data), self._reader)
-                sent = self._prepare(vademecum, self._request, 0, {})
+                self._prepare(vademecum, self._request, 0, {})
             except Exception as error:  # whatever an untrusted file provokes
                 name = message.name[:_MAX_NAME]
                 self._send(Refused(0, f"vademecum {name!r} refused: {one_line(error)}"))
                 return
             self._vademecum = vademecum
-            self._time(sent)
-            del sent
             return_memory()
 
     def listen(self) -> None:
@@ -109,49 +77,42 @@ class ModelPreparer:
         while received := self._channel.receive():
             asked, _ = received
             assert isinstance(asked, ChangeRequest)
-            with self._exclusive():
+            with self._lock:
                 try:
-                    sent = self._change(asked.number, asked.change)
+                    self._change(asked.number, asked.change)
                 except Exception as error:  # as above
                     self._send(Refused(asked.number, one_line(error)))
-                    continue
-                if sent is not None:
-                    self._time(sent)
 
-    def _change(self, number: int, change: Change) -> SentModel | None:
-        """The model that was sent for a change; None without a vademecum."""
+    def _change(self, number: int, change: Change) -> None:
+        """Send the model for a change; without a vademecum, that it is accepted."""
         from avatar_core.errors import SceneError
 
         change = _with_scene_text(change)
         request = replace(self._request, **change)
-        sent = None
         if self._vademecum is not None:
-            sent = self._prepare(self._vademecum, request, number, change)
+            self._prepare(self._vademecum, request, number, change)
         elif "scene" in change:
             raise SceneError("there is no vademecum yet; load one, then the scene")
         else:
             self._send(Accepted(number, change))
         self._request = request
-        return sent
 
     def _prepare(
         self, vademecum: Any, request: PreparationRequest, number: int, change: Change
-    ) -> SentModel:
+    ) -> None:
         """Prepare the model of a vademecum that a request asks for, and send it."""
         from avatar_core.contact.force_band import ForceBand
         from avatar_core.contact.layout import Layout
         from avatar_core.contact.model import make_model
         from avatar_core.scene.file import parse_scene
         from avatar_core.vademecum.at_values import ranges
-        from avatar_ros.prepare.detail_chooser import least_error
         from avatar_ros.prepare.scenes import model_spec, usable_material
 
         scene = parse_scene(request.scene, "scene") if request.scene else None
         material, notices = usable_material(vademecum, request.material)
         spec = model_spec(vademecum, replace(request, material=material), scene)
-        detail = self._chooser.detail(spec, request)
         held, bands, unused = self._bands.prepare(spec, request.uncertainty)
-        handle, contents = write_shared(spec.layout(detail, request.period).flat() | bands)
+        handle, contents = write_shared(spec.layout(spec.finest, request.period).flat() | bands)
         try:
             # Compiles the step for these effects, if that was never done on this machine, from
             # arrays as the node will map them: it then finds the same types in numba's cache.
@@ -167,24 +128,13 @@ class ModelPreparer:
                 ranges=ranges(vademecum),
                 effects=spec.effect_names,
                 cloud_divisor=scene.cloud_divisor if scene else None,
-                curve=self._chooser.curve(spec, detail),
-                least_error=least_error(spec),
+                curve=spec.curve.plain() if spec.curve else None,
                 notices=notices + unused,
                 held=held,
             )
             self._send(ready, handle)
         finally:
             os.close(handle)
-        return SentModel(spec, detail, model)
-
-    def _time(self, sent: SentModel) -> None:
-        """Measure the times of a model that was sent and send them, unless they were known."""
-        with contextlib.suppress(SupersededError):
-            curve = self._chooser.times(
-                *sent, superseded=lambda: bool(self._waiting) or self._stop()
-            )
-            if curve is not None:
-                self._send(Timed(curve))
 
     def _send(self, packet: Packet, *handles: int) -> None:
         self._channel.send(packet, *handles)
@@ -242,7 +192,7 @@ def main() -> int:
         return 0
     request, _ = received
     assert isinstance(request, PreparationRequest)
-    preparer = ModelPreparer(request, channel, lambda: bool(stop))
+    preparer = ModelPreparer(request, channel)
     preparer.expect()
     threading.Thread(target=_listen, args=[preparer], name="changes", daemon=True).start()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)

@@ -159,7 +159,7 @@ def test_what_is_started_again_goes_on_as_before(
 
 
 def wait_until_kept(file: Path, name: str) -> None:
-    """A budget is granted, and kept, once the model before is out of use, 0.1 s after it shows."""
+    """A parameter that changed is written after it is in force."""
     passed = Deadline(START_TIMEOUT)
     while name not in json.loads(file.read_text())["changed"]:
         assert not passed, f"{name} is not kept in {file}"
@@ -167,7 +167,7 @@ def wait_until_kept(file: Path, name: str) -> None:
 
 
 @pytest.mark.long
-def test_a_budget_that_was_granted_is_in_force_again(
+def test_a_budget_is_in_force_again(
     cell: FaultCell, state: tuple[State, str], organ: Any, state_dir: Path
 ) -> None:
     seen, identity = state

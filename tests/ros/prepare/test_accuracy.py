@@ -1,9 +1,8 @@
-"""Accuracy and time as the contact node promises, keeps and says them."""
+"""Accuracy and time as the contact node keeps and says them."""
 
 from __future__ import annotations
 
 import socket
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,20 +15,14 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from avatar_ros.framework import qos
 from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
 from avatar_ros.nodes.contact_reports import ShownModesLog
-from avatar_ros.prepare.budget_requests import BudgetRequests
-from avatar_ros.prepare.detail_chooser import DetailChooser
-from avatar_ros.prepare.requests import Change, PreparationRequest
-from avatar_ros.prepare.scenes import model_spec
-from avatar_ros.prepare.supplier import Answer
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 
 from avatar_core.contact.model import prepare
 from avatar_core.errors import AccuracyError
-from avatar_core.vademecum.accuracy import Budget, Detail
+from avatar_core.vademecum.accuracy import Budget
 from avatar_ros.msg import ContactState, LoopStatistics
-from tests.helpers.slowness import Deadline
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.nodes.test_cell import Hand, felt
 
@@ -45,7 +38,7 @@ def window(missed: int, step_p99: float) -> LoopStatistics:
 
 def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> None:
     model = prepare(organ, halves=True)
-    accuracy = ShownModes(model, organ.certificate.curve.of("surface"), float("inf"))
+    accuracy = ShownModes(model, organ.certificate.curve.of("surface"))
     report = accuracy.update(window(50, 30e-6))
     assert report.shedding and report.changed
     assert model.n_shown < model.n_modes
@@ -57,7 +50,7 @@ def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> 
 
 def test_nobody_looks_and_no_mode_is_left_out(organ: Any) -> None:
     model = prepare(organ, halves=True)
-    accuracy = ShownModes(model, organ.certificate.curve.of("surface"), float("inf"))
+    accuracy = ShownModes(model, organ.certificate.curve.of("surface"))
     accuracy.update(window(50, 30e-6), watched=True)
     assert model.n_shown < model.n_modes
     for _ in range(3):
@@ -95,10 +88,10 @@ def test_the_log_names_modes_left_out_once_a_minute(probe: Probe) -> None:
     ]
 
 
-def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> None:
+def test_statistics_say_how_accurate_the_modes_that_were_shown_are(organ: Any) -> None:
     model = prepare(organ, halves=True)
-    points = {p.detail.modes: p for p in organ.certificate.curve.like(_ordinary(model)).points}
-    accuracy = ShownModes(model, organ.certificate.curve.like(_ordinary(model)), float("inf"))
+    curve = organ.certificate.curve.of("surface")
+    points, accuracy = {p.detail.modes: p for p in curve.points}, ShownModes(model, curve)
     first, second = window(50, 30e-6), window(0, 30e-6)
     accuracy.update(first)
     accuracy.update(second)
@@ -110,70 +103,22 @@ def test_statistics_say_what_the_modes_that_were_shown_promise(organ: Any) -> No
 
 
 def test_a_budget_chooses_what_keeps_it(organ: Any) -> None:
-    order = PreparationRequest(
-        "vademecum", "handover", "/", ({"radius": 5e-3},), None, "surface", 1e-3
-    )
-    what, budgets = model_spec(organ, order, None), DetailChooser()
-    exact = budgets.detail(what, order)
-    assert exact == Detail(organ.n_modes)
-    errors = {p.detail: p.l2 for p in organ.certificate.curve.points}
-    loose = replace(order, budget={"tolerance": 3.0 * errors[exact], "deadline": 1.0})
-    coarse = budgets.detail(what, loose)
-    assert coarse != exact and errors[coarse] <= 3.0 * errors[exact]
-    curve = budgets.curve(what, coarse)
-    assert curve is not None
-    assert max(curve["modes"]) == coarse.modes and set(curve["precision"]) == {coarse.precision}
-    assert all(0.0 < p50 <= p99 for p50, p99 in zip(curve["p50"], curve["p99"], strict=True))
-    tight = replace(order, budget={"tolerance": 1e-6, "deadline": 1.0})
+    model, curve = prepare(organ, halves=True), organ.certificate.curve.of("surface")
+    shown, most = ShownModes(model, curve), model.n_modes
+    loose = 3.0 * curve.points[-1].l2
+    shown.keep(Budget(loose, 1.0))
+    assert model.n_shown < most
+    point = next(p for p in curve.points if p.detail.modes == model.n_shown)
+    assert point.l2 <= loose and f"within {point.l2:.1%}" in shown.accuracy
+    before = model.n_shown
     with pytest.raises(AccuracyError, match="nearest: "):
-        budgets.detail(what, tight)
-
-
-def _ordinary(model: Any) -> Any:
-    return Detail(model.n_modes)
-
-
-class Waiting:
-    """In place of the supplier: keeps what is asked, for the test to answer."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[Change, Answer]] = []
-        self.told: list[Any] = []
-        self.requests = BudgetRequests(
-            None,
-            lambda change, answer: self.asked.append((change, answer)),
-            self.told.append,
-            lambda kept, refusal: self.told.append((kept, refusal)),
-        )
-
-
-def test_a_budget_that_is_taken_back_before_it_was_answered_is_asked_for_again() -> None:
-    supplier = Waiting()
-    supplier.requests.ask(Budget(1.0, 1e-3))
-    supplier.requests.ask(None)  # which is still in force
-    (_, loose), (change, none) = supplier.asked
-    assert change == {"budget": {}}
-    loose(None, "")
-    none(None, "")
-    assert supplier.told == [Budget(1.0, 1e-3), None]
-    assert supplier.requests.in_force is None
-
-
-def test_a_refused_budget_gives_way_to_the_one_in_force_unless_a_newer_one_comes() -> None:
-    supplier = Waiting()
-    good, bad = Budget(1.0, 1e-3), Budget(1e-6, 1e-3)
-    supplier.requests.ask(good)
-    supplier.asked[0][1](None, "")
-    supplier.requests.ask(bad)
-    supplier.asked[1][1](None, "infeasible")
-    assert supplier.told == [good, (good, "infeasible")]
-    supplier.requests.ask(good)  # as its parameters are put back
-    assert len(supplier.asked) == 2
-    supplier.requests.ask(bad)
-    supplier.requests.ask(None)
-    supplier.asked[2][1](None, "infeasible")
-    supplier.asked[3][1](None, "")
-    assert supplier.told[2:] == [None]
+        shown.keep(Budget(1e-6, 1.0))
+    assert model.n_shown == before
+    shown.keep(None)
+    assert model.n_shown == most
+    shown.keep(Budget(1.0, 1.0))
+    with pytest.raises(AccuracyError, match="no accuracy curve"):
+        ShownModes(model, None).keep(Budget(1.0, 1.0))
 
 
 # --- In the cell -------------------------------------------------------------------------------
@@ -230,7 +175,7 @@ def test_a_tolerance_shows_fewer_modes_and_leaves_the_force(
     _, force = felt(probe, hand)
     assert set_budget(probe, tolerance=1.0).successful
     update = statistics(probe, hand, lambda s: 0 < s.modes < rank)
-    assert organ.certificate.curve.like(Detail(rank)).points[-1].l2 < update.promised_l2 <= 1.0
+    assert organ.certificate.curve.of("surface").points[-1].l2 < update.promised_l2 <= 1.0
     np.testing.assert_allclose(felt(probe, hand)[1], force, rtol=1e-6)
     assert set_budget(probe, tolerance=0.0).successful
     statistics(probe, hand, lambda s: s.modes == rank)
@@ -243,25 +188,15 @@ def test_a_tolerance_beyond_every_detail_is_refused_in_the_answer(
     answer = set_budget(probe, tolerance=1e-6)
     best = min(p.l2 for p in organ.certificate.curve.of("surface").points)
     assert not answer.successful
-    assert f"within 1e-06 of l2; the most exact is within {best:.3g}" in answer.reason
+    assert f"within 1e-06 of l2 in any time; nearest: {best:.3g}" in answer.reason
     request = GetParameters.Request(names=["accuracy.tolerance"])
     kept = probe.ask(GetParameters, "/contact/get_parameters", request)
     assert kept.values[0].double_value == 0.0
 
 
-def test_an_infeasible_deadline_gives_way_to_the_one_before(probe: Any, hand: Hand) -> None:
-    assert set_budget(probe, deadline=1e-7).successful  # known when steps have been timed
-
-    def deadline() -> float:
-        request = GetParameters.Request(names=["accuracy.deadline"])
-        answer = probe.ask(GetParameters, "/contact/get_parameters", request)
-        return float(answer.values[0].double_value)
-
-    passed = Deadline(2 * START_TIMEOUT)
-    while deadline() != 0.0:
-        assert not passed
-        hand()
-        probe.spin(0.1)
+def test_a_deadline_below_all_measured_times_is_refused(probe: Any, hand: Hand) -> None:
+    answer = set_budget(probe, deadline=1e-7)
+    assert not answer.successful and "nearest: " in answer.reason
     statistics(probe, hand, lambda s: s.modes_shown > 0)  # it goes on
 
 

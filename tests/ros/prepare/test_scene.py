@@ -18,7 +18,6 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
-from avatar_ros.prepare.detail_chooser import DetailChooser
 from avatar_ros.prepare.requests import PreparationRequest
 from avatar_ros.prepare.scenes import model_spec
 from geometry_msgs.msg import Quaternion, WrenchStamped
@@ -129,7 +128,7 @@ def _refusal(path: Path, organ: Any) -> str:
     """Why the organ of the tests cannot serve a scene; empty if it can."""
     try:
         what = model_spec(organ, ORDER, read_scene(path))
-        what.layout(DetailChooser().detail(what, ORDER), ORDER.period)
+        what.layout(what.finest, ORDER.period)
     except AvatarError as error:
         return str(error)
     return ""
