@@ -30,7 +30,7 @@ class LoadError(AvatarError):
 
 
 class StorageError(AvatarError):
-    """A file is truncated, altered, from a future schema, or cannot be written."""
+    """A file is truncated, altered, of another schema, or cannot be written."""
 
 
 class ContactError(AvatarError):

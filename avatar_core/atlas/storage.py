@@ -149,7 +149,7 @@ def load_atlas(path: str | Path) -> Atlas:
     Raises
     ------
     StorageError
-        For a missing, truncated, altered, foreign or newer file.
+        For a missing, truncated, altered or foreign file, and for one of another schema.
     """
     return _read(Path(path), ATLAS_FORMAT, _atlas)
 
@@ -327,7 +327,7 @@ def _read(path: Path, kind: str, assemble: Callable[[Arrays, Any], Made]) -> Mad
 
 
 def _attributes_of(kind: str) -> Callable[[dict[str, str], str], dict[str, str]]:
-    """Those that count, of a file of this kind that is not too new."""
+    """Those that count, of a file of this kind and the present schema."""
 
     def choose(held: dict[str, str], origin: str) -> dict[str, str]:
         if held.get("format") != kind:
@@ -335,7 +335,7 @@ def _attributes_of(kind: str) -> Callable[[dict[str, str], str], dict[str, str]]
                 f"{origin} is HDF5 but no {kind.removeprefix('avatar ')}; make one with 'avatar "
                 "atlas create'"
             )
-        require_schema(held, ATLAS_SCHEMA, origin)
+        require_schema(held, ATLAS_SCHEMA, origin, "make it again with 'avatar atlas create'")
         return {key: held[key] for key in ("format", "schema", "about")}
 
     return choose

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from avatar_core.cli.output import require_output
+from avatar_core.cli.output import EXIT_STOPPED, require_output
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES, SUFFIXES
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from avatar_core.atlas.growth import Growth, Source
     from avatar_core.atlas.model import Atlas
 
-EXIT_STOPPED = 130
 
 atlas = typer.Typer(
     help="Build and inspect atlases: known organs from which patients are made.",

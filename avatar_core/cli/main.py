@@ -14,7 +14,7 @@ from avatar_core.cli.build_bar import BuildBar
 from avatar_core.cli.calibrate import calibrate
 from avatar_core.cli.cell import Host, Port, cell, require_ui, run_page
 from avatar_core.cli.export import export
-from avatar_core.cli.output import require_output
+from avatar_core.cli.output import EXIT_STOPPED, require_output
 from avatar_core.cli.patient import patient
 from avatar_core.cli.register import register
 from avatar_core.cli.replay import replay
@@ -23,8 +23,6 @@ from avatar_core.cli.study import study
 from avatar_core.cli.uncertainty import uncertainty
 from avatar_core.cli.vademecum import Vertices, show, show_text, vademecum
 from avatar_core.errors import AvatarError
-
-EXIT_STOPPED = 130  # by Ctrl-C, as shells count it
 
 app = typer.Typer(
     help="Computational patient avatars: compute the mechanical response of an organ once, and "

@@ -11,6 +11,8 @@ import typer
 
 from avatar_core.errors import StorageError
 
+EXIT_STOPPED = 130  # by Ctrl-C, as shells count it
+
 Overwrite = Annotated[
     bool,
     typer.Option("--overwrite", help="replace a file that is there, even if it is no vademecum"),

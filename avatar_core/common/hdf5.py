@@ -192,13 +192,18 @@ def _array(key: str, dataset: h5py.Dataset) -> np.ndarray:
     return array
 
 
-def require_schema(attributes: Attributes, newest: str, origin: str) -> None:
-    """Raise StorageError unless this version of the project reads a file's schema."""
+def require_schema(attributes: Attributes, present: str, origin: str, remedy: str) -> None:
+    """Raise StorageError unless this version of the project reads a file's schema.
+
+    remedy : what makes an older file anew
+    """
     schema = attributes["schema"]
     major, _, minor = schema.partition(".")
     if not (major.isdecimal() and minor.isdecimal() and len(schema) < 10):
-        raise StorageError(f"{origin} has no schema; build it again")
-    if int(major) > int(newest.partition(".")[0]):
+        raise StorageError(f"{origin} has no schema; {remedy}")
+    read = int(present.partition(".")[0])
+    if int(major) != read:
         raise StorageError(
-            f"{origin} has schema {schema}, this version reads up to {newest}; upgrade avatar"
+            f"{origin} has schema {schema}, this version reads {present}; "
+            f"{'upgrade avatar' if int(major) > read else remedy}"
         )

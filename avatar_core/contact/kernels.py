@@ -178,25 +178,17 @@ Out = namedtuple(
 
 
 @entry
-def contact_step(model, space, state, out, tips, effects):  # type: ignore[no-untyped-def]
-    """One period: forces, then the deformed cloud. Returns the worst status.
+def contact_solve(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
+    """First half of a period: forces and contacts. Returns the worst status.
 
     Real-time safe: allocates nothing, raises nothing, bounded iterations.
     """
-    status = _solve_period(model, state, out, tips, effects)
-    deform(model, space, state, out, effects)
-    return status
-
-
-@entry
-def contact_solve(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
-    """First half of a period: forces and contacts. Real-time safe, as :func:`contact_step`."""
     return _solve_period(model, state, out, tips, effects)
 
 
 @entry
 def contact_deform(model, space, state, out, effects):  # type: ignore[no-untyped-def]
-    """Second half: the cloud under these forces. Real-time safe, as :func:`contact_step`."""
+    """Second half: the cloud under these forces. Real-time safe, as :func:`contact_solve`."""
     deform(model, space, state, out, effects)
 
 
@@ -205,7 +197,7 @@ def force_error(model, state, out, tips, tip_law):  # type: ignore[no-untyped-de
     """Expected error of the forces: the relative error at the tip, times the force.
 
     Of a real tip, the patch's error counts with the part of the depth that is the patch's, and that
-    of the law is added. Real-time safe, as :func:`contact_step`.
+    of the law is added. Real-time safe, as :func:`contact_solve`.
     """
     for t in range(tips.shape[0]):
         force = out.force[t]

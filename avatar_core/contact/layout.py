@@ -265,9 +265,7 @@ def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
     stiffness = vademecum.material.plane_strain_modulus
     radius = vademecum.surface.patch_radius
     field, local = vademecum.tip_field, np.zeros((5, *self_compliance.shape), np.float32)
-    if field.curvature is not None:  # as in files since schema 2.3
-        local[KAPPA], local[TAU] = field.curvature, field.growth
-        local[ANISOTROPY] = field.anisotropy
+    local[KAPPA], local[TAU], local[ANISOTROPY] = field.curvature, field.growth, field.anisotropy
     local[STIFFNESS] = stiffness
     if field.tumour is not None and vademecum.contrast is not None:
         local[STIFFNESS] /= 1.0 - field.tumour + field.tumour / vademecum.contrast

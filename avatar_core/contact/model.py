@@ -49,12 +49,11 @@ class Status(IntEnum):
 
 
 class Compiled(NamedTuple):
-    """The halves of a step or the whole, compiled for the types of one model; and the error of its
-    forces, with its arguments."""
+    """Both halves of a step, compiled for the types of one model; and the error of its forces, with
+    its arguments."""
 
-    solve: Callable[..., int] | None
-    deform: Callable[..., None] | None
-    step: Callable[..., int] | None
+    solve: Callable[..., int]
+    deform: Callable[..., None]
     error: Callable[..., None]
 
 
@@ -188,7 +187,6 @@ def prepare(
     cloud: Cloud = "surface",
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
-    halves: bool = False,
 ) -> ContactModel:
     """Lay out a vademecum for the step, and compile the step for the effects. Not real-time safe.
 
@@ -201,7 +199,6 @@ def prepare(
     cloud : "surface" or "volume" vertices, or "off"
     effects : to simulate; by default those that the vademecum and the tools require
     period : of the steps [s], for effects that depend on time
-    halves : compile :func:`solve` and :func:`deform` instead of :func:`step`
 
     Raises
     ------
@@ -209,14 +206,11 @@ def prepare(
         For modes or clouds out of range; for effects that the vademecum cannot serve.
     """
     detail = Detail(vademecum.n_modes if modes is None else modes, cloud)
-    return make_model(lay_out(vademecum, tips, detail, effects, period), halves)
+    return make_model(lay_out(vademecum, tips, detail, effects, period))
 
 
-def make_model(layout: Layout, halves: bool = False) -> ContactModel:
-    """Allocate state and outputs, and compile and run the step once. Not real-time safe.
-
-    halves : compile :func:`solve` and :func:`deform` instead of :func:`step`
-    """
+def make_model(layout: Layout) -> ContactModel:
+    """Allocate state and outputs, and compile and run the step once. Not real-time safe."""
     arrays, state, out, effects = layout.arrays, _state(layout), _out(layout), _effects(layout)
     far_away = np.full((len(arrays.tip_offset), 3), FAR_AWAY)
     tables = Tables(
@@ -227,14 +221,8 @@ def make_model(layout: Layout, halves: bool = False) -> ContactModel:
     around = (tables.arrays, tables.state, tables.out, far_away)
     law = None if effects.tip_law is None else ArrayTable(effects.tip_law)
     error = partial(compiled_for(kernels.force_error, *around, law), *around, law)
-    if halves:
-        first = compiled_for(kernels.contact_solve, *around, tables.effects)
-        second = compiled_for(kernels.contact_deform, *tables)
-        compiled = Compiled(first, second, None, error)
-    else:
-        *before, last = tables
-        whole = compiled_for(kernels.contact_step, *before, far_away, last)
-        compiled = Compiled(None, None, whole, error)
+    first = compiled_for(kernels.contact_solve, *around, tables.effects)
+    compiled = Compiled(first, compiled_for(kernels.contact_deform, *tables), error)
     model = ContactModel(layout, state, effects, out, far_away, tables, compiled)
     model.reset()
     return model
@@ -334,23 +322,20 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
         surface; these tools have no force or a fading one. NOT_CONVERGED: the contact forces are
         those of the last iteration. EXTRAPOLATED: deeper than the computed large deformation.
     """
-    model.tips[:] = tips
-    assert model.compiled.step is not None
-    arrays, space, state, out, effects = model.tables
-    return model.compiled.step(arrays, space, state, out, model.tips, effects)
+    status = solve(model, tips)
+    deform(model)
+    return status
 
 
 def solve(model: ContactModel, tips: np.ndarray) -> int:
     """The first half of :func:`step`: forces and contacts. Real-time safe, as :func:`step`."""
     model.tips[:] = tips
-    assert model.compiled.solve is not None
     arrays, _, state, out, effects = model.tables
     return model.compiled.solve(arrays, state, out, model.tips, effects)
 
 
 def deform(model: ContactModel) -> None:
     """The second half of :func:`step`: the cloud. Real-time safe, as :func:`step`."""
-    assert model.compiled.deform is not None
     model.compiled.deform(*model.tables)
 
 

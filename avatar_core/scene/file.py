@@ -43,7 +43,6 @@ SECTIONS = {
     "outputs": ("cloud", "cloud_divisor", "modes"),
 }
 SHIPPED = "scenes"  # folder of those that come with the project
-_OLD_TIP = "tip_radius"  # a key of earlier versions
 _KEYS = ("name", "text", "organ", "material", "tools", "outputs", "effects")
 
 
@@ -226,11 +225,7 @@ def _tools(node: Node) -> tuple[Tool, ...]:
 
 
 def _tool(node: Node, path: str, known: Sequence[str]) -> Tool:
-    entries = entries_of(node, path, (*known, _OLD_TIP))
-    if _OLD_TIP in entries:
-        key, radius = entries[_OLD_TIP]
-        instead = f"tip: {{shape: sphere, radius: {shown(radius)}}}"
-        raise refused(key, f"{below(path, _OLD_TIP)} is of an earlier version; write {instead}")
+    entries = entries_of(node, path, known)
     _, tip = entries.pop("tip", (None, None))
     values = _fields(Tool, entries, path)
     if tip is not None and not is_nothing(tip):

@@ -225,8 +225,8 @@ def combinations(scene: Scene, vademecum: Vademecum | None) -> tuple[Combination
 
 
 def _figure(certificate: Any, key: str | None) -> float | None:
-    """A figure of a certificate; None if it was not measured, as in files of older versions."""
-    value = getattr(certificate, key, None) if key else None
+    """A figure of a certificate; None if it was not measured."""
+    value = getattr(certificate, key) if certificate and key else None
     return None if value is None or math.isnan(value) else float(value)
 
 

@@ -155,7 +155,7 @@ def load_recording(path: str | Path) -> Recording:
 def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:
     if held.get("format") != FORMAT:
         raise StorageError(f"{origin} is HDF5 but no recording; give one of the planning page")
-    require_schema(held, SCHEMA_VERSION, origin)
+    require_schema(held, SCHEMA_VERSION, origin, "record it again")
     return {key: held[key] for key in _TEXTS}
 
 

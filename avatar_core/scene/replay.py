@@ -81,7 +81,7 @@ def replay(
             "record again"
         )
     spec = scene_spec(vademecum, replace(scene, cloud="off"))
-    model = make_model(spec.layout(spec.finest, 1.0 / recording.rate), halves=True)
+    model = make_model(spec.layout(spec.finest, 1.0 / recording.rate))
     force = np.empty(periods.force.shape)
     friction = model.effects.friction
     for k in range(len(periods)):

@@ -170,9 +170,9 @@ def _line(error: str, row: dict[str, Any], by: str) -> str:
 
 
 def _best(rows: list[Row]) -> dict[str, Any]:
-    """All modes in 16 bits, all vertices: what a scene shows unless told otherwise."""
-    found = [r for r in rows if r.get("cloud") == "volume" and r.get("precision") == "int16"]
-    return min((r for r in found if r["method"] == "vademecum"), key=lambda r: r["error"])
+    """All modes, all vertices."""
+    found = [r for r in _of(rows, "vademecum") if r["cloud"] == "volume"]
+    return min(found, key=lambda r: r["error"])
 
 
 def _beside_table(rows: list[Row], vademecum: Vademecum) -> dict[str, float]:

@@ -44,6 +44,9 @@ _LINEAR: Shapes = {
     "tip_field/access": "f: nx ny nz",
     "tip_field/origin": "f: 3",
     "tip_field/spacing": "f: 1",
+    "tip_field/curvature": "f: nx ny nz",
+    "tip_field/growth": "f: nx ny nz",
+    "tip_field/anisotropy": "f: nx ny nz",
 }
 _PARAMETRIC: Shapes = {
     "parametric/basis/space": "f: 3*vertices basis",
@@ -60,9 +63,6 @@ _BODY: Shapes = {"body/mass": "f: rank rank", "body/weight": "f: rank 3"}
 _PARAMETRIC_BODY: Shapes = {
     "parametric/body/mass": "f: basis basis",
     "parametric/body/weight": "f: basis 3",
-}
-_PROFILE: Shapes = {
-    f"tip_field/{name}": "f: nx ny nz" for name in ("curvature", "growth", "anisotropy")
 }
 _TUMOUR: Shapes = {"tip_field/tumour": "f: nx ny nz"}
 _SHIFT: Shapes = {
@@ -91,24 +91,13 @@ BODY_KEYS = tuple(_BODY)
 PARAMETRIC_KEYS = tuple(_PARAMETRIC)
 PARAMETRIC_BODY_KEYS = tuple(_PARAMETRIC_BODY)
 LARGE_KEYS = tuple(_LARGE)
-PROFILE_KEYS = tuple(_PROFILE)
 TUMOUR_KEYS = tuple(_TUMOUR)
 SHIFT_KEYS = tuple(_SHIFT)
 DISPLAY_KEYS = tuple(_DISPLAY)
 SUPPORT_KEYS = tuple(_SUPPORTS)
 
 # Each is present or absent as a whole; its first key decides.
-_PARTS = (
-    _PARAMETRIC,
-    _BODY,
-    _PARAMETRIC_BODY,
-    _LARGE,
-    _PROFILE,
-    _TUMOUR,
-    _SHIFT,
-    _DISPLAY,
-    _SUPPORTS,
-)
+_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE, _TUMOUR, _SHIFT, _DISPLAY, _SUPPORTS)
 
 
 def shapes_of(held: Container[str]) -> dict[str, str]:

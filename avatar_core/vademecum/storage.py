@@ -1,9 +1,10 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 3.2), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 4.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
-``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve. Datasets:
+``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve; those of the parts
+below are null or empty without them. Datasets:
 
     mesh/vertices (n_v, 3) [m]          mesh/tets (n_t, 4)
     regions/clamped, regions/accessible over the boundary faces
@@ -88,7 +89,6 @@ from avatar_core.vademecum.schema import (
     LARGE_KEYS,
     PARAMETRIC_BODY_KEYS,
     PARAMETRIC_KEYS,
-    PROFILE_KEYS,
     SHIFT_KEYS,
     SUPPORT_KEYS,
     TUMOUR_KEYS,
@@ -100,10 +100,18 @@ from avatar_core.vademecum.tip_field import BallShift, TipField
 FORMAT = "avatar vademecum"
 MAX_FILE_BYTES = 4 << 30
 
-_JSON = ("material", "provenance", "convergence", "certificate")
-_JSON_LATER = ("coordinates", "contrast", "large", "accuracy", "parts", "supports")
-# What files call fields of the certificate.
-_STORED_AS = {"tip_force_mean": "felt_mean", "tip_force_worst": "felt_worst"}
+_JSON = (
+    "material",
+    "provenance",
+    "convergence",
+    "certificate",
+    "accuracy",
+    "coordinates",
+    "contrast",
+    "large",
+    "parts",
+    "supports",
+)
 
 
 def save_vademecum(vademecum: Vademecum, path: str | Path) -> str:
@@ -129,7 +137,7 @@ def load_vademecum(path: str | Path) -> Vademecum:
     Raises
     ------
     StorageError
-        For a missing, truncated, altered, foreign or newer file.
+        For a missing, truncated, altered or foreign file, and for one of another schema.
     """
     path = Path(path)
     try:
@@ -183,12 +191,11 @@ def id_of(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
 
 
 def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:
-    """The attributes that count, of a file that is a vademecum and not too new."""
+    """The attributes that count, of a file that is a vademecum of the present schema."""
     if held.get("format") != FORMAT:
         raise StorageError(f"{origin} is HDF5 but no vademecum; build one with 'avatar vademecum'")
-    require_schema(held, SCHEMA_VERSION, origin)
-    keys = ("format", "schema", "name", "element", *_JSON)
-    return {key: held[key] for key in (*keys, *_JSON_LATER) if key in held or key in keys}
+    require_schema(held, SCHEMA_VERSION, origin, "build it again with 'avatar vademecum'")
+    return {key: held[key] for key in ("format", "schema", "name", "element", *_JSON)}
 
 
 def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
@@ -196,7 +203,6 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
     arrays = {}
     held = PARAMETRIC_KEYS[:1] * bool(v.parametric) + LARGE_KEYS[:1] * bool(v.large)
     held += BODY_KEYS[:1] * bool(v.body)
-    held += PROFILE_KEYS[:1] * (v.tip_field.curvature is not None)
     held += TUMOUR_KEYS[:1] * (v.tip_field.tumour is not None)
     held += SHIFT_KEYS[:1] * (v.tip_field.shift is not None)
     held += DISPLAY_KEYS[:1] * bool(v.display)
@@ -232,7 +238,7 @@ def _attributes(v: Vademecum) -> dict[str, str]:
         report["status"] = report["status"].value
     coordinates = [asdict(c) for c in v.parametric.coordinates] if v.parametric else []
     supports = [{"name": s.name, "stiffness": s.stiffness} for s in v.supports]
-    attributes = {
+    return {
         "format": FORMAT,
         "schema": SCHEMA_VERSION,
         "name": v.name,
@@ -240,22 +246,21 @@ def _attributes(v: Vademecum) -> dict[str, str]:
         "material": json.dumps(asdict(v.material)),
         "provenance": json.dumps(asdict(v.provenance)),
         "convergence": json.dumps(convergence),
-        "certificate": json.dumps(_certificate_attribute(v.certificate)),
+        "certificate": json.dumps(v.certificate and asdict(replace(v.certificate, curve=None))),
         "accuracy": json.dumps(curve.plain() if curve else None),
         "coordinates": json.dumps(coordinates),
         "contrast": json.dumps(v.contrast),
         "large": json.dumps(_large_attribute(v.large)),
         "parts": json.dumps(v.display.names if v.display else None),
+        "supports": json.dumps(supports),
     }
-    # only where there are some: earlier versions read all other files
-    return attributes | ({"supports": json.dumps(supports)} if supports else {})
 
 
 def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vademecum:
     """The vademecum of arrays and attributes from elsewhere; all are checked first."""
     require_sound(arrays)
     mirror = Mirror.of(arrays["contact_near/start"], arrays["contact_near/target"])
-    plain = {key: parsed(attributes.get(key, "null"), key) for key in (*_JSON, *_JSON_LATER)}
+    plain = {key: parsed(attributes[key], key) for key in _JSON}
     supports = _supports(arrays, plain["supports"])
     return Vademecum(
         name=require_name(attributes["name"], "name"),
@@ -343,17 +348,7 @@ def _supports(arrays: dict[str, np.ndarray], stored: Any) -> tuple[Support, ...]
     )
 
 
-def _certificate_attribute(certificate: Certificate | None) -> dict[str, Any] | None:
-    if certificate is None:
-        return None
-    plain = asdict(replace(certificate, curve=None))
-    return {_STORED_AS.get(key, key): value for key, value in plain.items()}
-
-
 def _certificate(stored: Any, curve: Any) -> Certificate | None:
-    if isinstance(stored, dict):
-        fields = {key: name for name, key in _STORED_AS.items()}
-        stored = {fields.get(key, key): value for key, value in stored.items()}
     certificate = of_plain(Certificate | None, stored, "certificate")  # type: ignore[arg-type]
     if certificate is None or curve is None:
         return certificate

@@ -63,9 +63,8 @@ TUMOUR_REACH = 2.0  # and patch radii within which energy counts: they fit resol
 # spheres of 1.5 to 10 mm, 2 and 5 mm above a tumour, with the least error in the mean
 
 # distance [m], access, curvature [1/m], growth [1/m^2], anisotropy [1/m^2], tumour, each
-# (nx, ny, nz) float32: phi, chi, kappa, tau, D, f, the last four None in files before schema 2.3,
-# the last without a tumour; origin (3,) [m]; spacing (1,) [m]; shift, a BallShift, None in files
-# before schema 2.4
+# (nx, ny, nz) float32: phi, chi, kappa, tau, D, f, the last None without a tumour; origin (3,) [m];
+# spacing (1,) [m]; shift, a BallShift, None without one
 TipField = namedtuple(
     "TipField",
     [
@@ -79,7 +78,7 @@ TipField = namedtuple(
         "tumour",
         "shift",
     ],
-    defaults=(None, None, None, None, None),
+    defaults=(None, None),
 )
 
 # psi of :mod:`avatar_core.contact.ball_shift` in bricks (:mod:`avatar_core.common.splines`) from

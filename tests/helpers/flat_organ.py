@@ -110,7 +110,8 @@ def flat_organ(
             np.zeros((3, *shape), single), np.zeros((1, 2, 0), single), np.zeros(2, np.int64)
         )
     dent = dent_arrays((tip,), points, arrays.position, PATCH_RADIUS) if law else None
-    field = TipField(arrays.distance, arrays.access, origin, arrays.spacing)
+    flat = np.zeros_like(arrays.distance)
+    field = TipField(arrays.distance, arrays.access, origin, arrays.spacing, flat, flat, flat)
     leaning = find(effects, Tilt)
     tilt = tilt_arrays(leaning, (tip,), field) if leaning else None
     constants = selected_arrays(None, effects, None, large, 0.1, period, law, dent, tilt)  # type: ignore[arg-type]

@@ -166,9 +166,9 @@ def _tip_field() -> TipField:
     shift = BallShift(
         brick, value.astype(np.float32), np.array([0.9 * spacing]), np.array([3e-3, 8e-3])
     )
-    return TipField(
-        distance, np.ones_like(distance), np.full(3, axis[0]), np.array([spacing]), shift=shift
-    )
+    flat = np.zeros_like(distance)
+    place = (np.full(3, axis[0]), np.array([spacing]))
+    return TipField(distance, np.ones_like(distance), *place, flat, flat, flat, shift=shift)
 
 
 def _parametric(rng: np.random.Generator, vademecum: Vademecum) -> ParametricResponse:

@@ -251,7 +251,7 @@ def _compliance(vademecum: Vademecum) -> np.ndarray:
 
 @compiled(fastmath=True)
 def _dense_step(model, state, out, tips, effects, columns, compliance):  # type: ignore[no-untyped-def]
-    """:func:`avatar_core.contact.kernels.contact_step` with stored columns instead of modes."""
+    """:func:`avatar_core.contact.model.step` with stored columns instead of modes."""
     e = effects
     for t in range(tips.shape[0]):
         locate(model, state, t, tips[t], e.superposition, e.tip_law)

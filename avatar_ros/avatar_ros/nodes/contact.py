@@ -199,7 +199,7 @@ class ContactNode(ManagedNode):
         loop = self._loop
         if loop is None:
             return
-        model = contact.make_model(Layout.of(prepared.arrays), halves=True)
+        model = contact.make_model(Layout.of(prepared.arrays))
         replaced = loop.active
         self._ranges, self._held = prepared.ranges, Held.of_plain(prepared.held)
         curve = AccuracyCurve.of_plain(prepared.curve) if prepared.curve else None

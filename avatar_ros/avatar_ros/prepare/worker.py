@@ -117,7 +117,7 @@ class ModelPreparer:
             # Compiles the step for these effects, if that was never done on this machine, from
             # arrays as the node will map them: it then finds the same types in numba's cache.
             arrays = map_shared(os.dup(handle), contents)
-            model = make_model(Layout.of(arrays), halves=True)
+            model = make_model(Layout.of(arrays))
             ForceBand.of(model, arrays)
             ready = ModelReady(
                 number,

@@ -118,9 +118,7 @@ def simulated_cell(
     path = push_and_slide(vademecum, RADIUS, 4e-3, 3e-3, 500, 40)
     off = path[0] + 0.05 * (path[0] - path[len(path) // 2]) / np.linalg.norm(path[0] - path[250])
     tips = np.concatenate([np.repeat(off[None], 250, 0), path, np.repeat(off[None], 30, 0)])
-    model = prepare(
-        vademecum, (Tip("sphere", RADIUS),), cloud="off", effects=tuple(effects), halves=True
-    )
+    model = prepare(vademecum, (Tip("sphere", RADIUS),), cloud="off", effects=tuple(effects))
     guard, n = ForceGuard(limits), len(tips)
     force, sent, share = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
     status = np.zeros(n, int)

@@ -64,14 +64,14 @@ def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -
     """Its last argument is none, but for the law of a tip that is no patch, and for a display."""
     for tip in (PATCH, SPHERE):
         model = prepare(phantom_vademecum, (tip,), cloud="off", effects=())
-        *before, effects = model.tables
-        arguments = (*before, model.tips, effects)
+        arrays, _, state, out, effects = model.tables
+        arguments = (arrays, state, out, model.tips, effects)
         signature = tuple(numba.typeof(argument) for argument in arguments)
         *others, law, dent, display = map(str, effects.numba_type.members.values())
         assert display == "none" and phantom_vademecum.display is None
         assert set(others) == {"none"}
         assert (law == "none") == (dent == "none") == (tip is PATCH)
-        assert signature in kernels.contact_step.overloads
+        assert signature in kernels.contact_solve.overloads
 
 
 def test_the_list_of_effects_is_complete() -> None:

@@ -179,11 +179,6 @@ FRICTION = "name: a\neffects:\n  friction:\n    static: {}\n"
         (TIP.format("shape: flat, half_angle: 60"), 3, ["flat does not use half_angle; leave it"]),
         (TIP.format("shape: cone, angle: 60"), 3, ["tip.angle", "did you mean 'half_angle'?"]),
         ("tools:\n- name: a\n  tip: 5e-3\n", 3, ["tools[0].tip is 5e-3", "shape, radius"]),
-        (
-            "tools:\n- name: a\n  tip_radius: 5e-3\n",
-            3,
-            ["tip_radius is of an earlier version; write tip: {shape: sphere, radius: 5e-3}"],
-        ),
         # what contradicts itself
         (FRICTION.format("0.2"), 3, ["kinetic is 0.3, above static 0.2"]),
         ("name: a\ntools:\n- name: a\n- name: b\n", 2, ["2 tools without several_tools"]),

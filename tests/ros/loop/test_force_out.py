@@ -235,7 +235,7 @@ def test_a_swap_goes_from_old_to_new_within_the_slew(cell: Cell, organ: Any) -> 
     """To a model of half the modes in another organ's name, while the tool is held deep."""
     limits = ForceLimits(20.0, 30.0)
     cell.loop.settings = replace(cell.loop.settings, safety=replace(SAFETY, limits=limits))
-    model = prepare(organ, (Tip("sphere", 5e-3),), modes=3, cloud="off", halves=True)
+    model = prepare(organ, (Tip("sphere", 5e-3),), modes=3, cloud="off")
     cell.loop.active = ActiveModel("b", model, cell.loop.settings)
     found = np.vstack([cell.force, cell.hold(500)[:, 1:]])
     assert np.linalg.norm(np.diff(found, axis=0), axis=1).max() <= 30e-3 * (1 + 1e-9)

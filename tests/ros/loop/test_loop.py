@@ -98,7 +98,7 @@ class Bench:
         self.loop.guards = [UnlimitedGuard()]
 
     def use(self, *effects: Any, identity: str = "a", cloud: Any = "surface") -> None:
-        model = prepare(self.organ, effects=effects, cloud=cloud, period=1.0 / RATE, halves=True)
+        model = prepare(self.organ, effects=effects, cloud=cloud, period=1.0 / RATE)
         self.loop.active = ActiveModel(identity, model, SETTINGS)
 
     def step(self, n: int = 1) -> np.ndarray:

@@ -104,7 +104,7 @@ class Bench:
         )
         self.loop = ContactLoop(self.settings, self.tools, outlets, context)
         self.loop.guards = [UnlimitedGuard() for _ in names]
-        model = prepare(organ, (Tip("sphere", 5e-3),) * n_tools, cloud="off", halves=True)
+        model = prepare(organ, (Tip("sphere", 5e-3),) * n_tools, cloud="off")
         self.loop.active = ActiveModel("a", model, self.settings)
         self.loop._used = self.loop.active  # at once, not faded in
 

@@ -35,7 +35,7 @@ PUNCH = Tip("flat", 4e-3)
 def punch_bench(bench: Any, organ: Any) -> Bench:
     """A loop whose tool is a punch with its shaft along +x of its pose."""
     made: Bench = bench(20e-3)
-    model = prepare(organ, (PUNCH,), cloud="off", effects=(Tilt((1.0, 0.0, 0.0)),), halves=True)
+    model = prepare(organ, (PUNCH,), cloud="off", effects=(Tilt((1.0, 0.0, 0.0)),))
     made.loop.active = made.loop._used = ActiveModel("a", model, made.settings)
     return made
 
@@ -67,7 +67,7 @@ def test_a_punch_leans_as_its_pose_says(
         own = replace(own, frame="device", transform=(*shift, *frame.as_quat()))
         made.tools[0] = ToolChannel(made.poses[0], made.poses[0], "organ", own)
         made.loop._tools = made.tools
-    reference = prepare(organ, (PUNCH,), cloud="off", effects=(Tilt(),), halves=True)
+    reference = prepare(organ, (PUNCH,), cloud="off", effects=(Tilt(),))
     assert reference.axes is not None
     reference.axes[:] = lean.as_matrix()[:, 0]
     own_turn = (frame.inv() * lean).as_quat()

@@ -37,7 +37,7 @@ def window(missed: int, step_p99: float) -> LoopStatistics:
 
 
 def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> None:
-    model = prepare(organ, halves=True)
+    model = prepare(organ)
     accuracy = ShownModes(model, organ.certificate.curve.of("surface"))
     report = accuracy.update(window(50, 30e-6))
     assert report.shedding and report.changed
@@ -49,7 +49,7 @@ def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> 
 
 
 def test_nobody_looks_and_no_mode_is_left_out(organ: Any) -> None:
-    model = prepare(organ, halves=True)
+    model = prepare(organ)
     accuracy = ShownModes(model, organ.certificate.curve.of("surface"))
     accuracy.update(window(50, 30e-6), watched=True)
     assert model.n_shown < model.n_modes
@@ -89,7 +89,7 @@ def test_the_log_names_modes_left_out_once_a_minute(probe: Probe) -> None:
 
 
 def test_statistics_say_how_accurate_the_modes_that_were_shown_are(organ: Any) -> None:
-    model = prepare(organ, halves=True)
+    model = prepare(organ)
     curve = organ.certificate.curve.of("surface")
     points, accuracy = {p.detail.modes: p for p in curve.points}, ShownModes(model, curve)
     first, second = window(50, 30e-6), window(0, 30e-6)
@@ -103,7 +103,7 @@ def test_statistics_say_how_accurate_the_modes_that_were_shown_are(organ: Any) -
 
 
 def test_a_budget_chooses_what_keeps_it(organ: Any) -> None:
-    model, curve = prepare(organ, halves=True), organ.certificate.curve.of("surface")
+    model, curve = prepare(organ), organ.certificate.curve.of("surface")
     shown, most = ShownModes(model, curve), model.n_modes
     loose = 3.0 * curve.points[-1].l2
     shown.keep(Budget(loose, 1.0))

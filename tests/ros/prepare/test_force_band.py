@@ -69,7 +69,7 @@ class Banded:
 
     def use(self, organ: Any, identity: str, **band: float) -> None:
         """Another model, with a band if its ratios are given."""
-        model = prepare(organ, (TIP,), cloud="off", halves=True)
+        model = prepare(organ, (TIP,), cloud="off")
         found = ForceBand(model, ratios(model, **band), DEPTHS) if band else None
         self.loop.active = ActiveModel(identity, model, self.bench.settings, band=found)
 
