@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from avatar_core.geometry.surface import SurfaceMesh as SurfaceMesh
     from avatar_core.geometry.surface import read_surface as read_surface
     from avatar_core.geometry.tip import Tip as Tip
-    from avatar_core.offline.pipeline import OrganOptions as OrganOptions
-    from avatar_core.offline.pipeline import build as build
+    from avatar_core.pipeline import OrganOptions as OrganOptions
+    from avatar_core.pipeline import build as build
     from avatar_core.scene.export import export as export
     from avatar_core.scene.file import read_scene as read_scene
     from avatar_core.scene.model import Scene as Scene
@@ -60,7 +60,7 @@ _ORIGIN = {
     "Certificate": "vademecum.certificate",
     "ContactModel": "contact.model",
     "Material": "fem.elasticity",
-    "OrganOptions": "offline.pipeline",
+    "OrganOptions": "pipeline",
     "Patient": "atlas.patient",
     "PatientOptions": "atlas.patient",
     "Scene": "scene.model",
@@ -70,7 +70,7 @@ _ORIGIN = {
     "Tool": "scene.model",
     "Vademecum": "vademecum.model",
     "at_values": "vademecum.at_values",
-    "build": "offline.pipeline",
+    "build": "pipeline",
     "create_atlas": "atlas.growth",
     "export": "scene.export",
     "extend_atlas": "atlas.growth",

@@ -16,6 +16,7 @@ os.environ.setdefault("RAYON_NUM_THREADS", "1")
 import pytest
 from numba.core.dispatcher import Dispatcher
 
+from avatar_core import pipeline
 from avatar_core.atlas import patient
 from avatar_core.contact import layout
 from avatar_core.contact.ball_shift import make_felt_field
@@ -23,10 +24,9 @@ from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry import mesh
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline import linear, parametric
 from avatar_core.offline.large_deformation import hyperelastic_problem, with_large_deformation
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.tip_field import make_tip_field
 from tests.helpers import examples
@@ -70,7 +70,7 @@ def made_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Dispatcher, "compile", compiled_once(Dispatcher.compile))
         patch.setattr(mesh, "_fill", in_memory(on_disk(mesh._fill, _of_surface), _of_surface))
-        for builder in (linear, parametric, patient):
+        for builder in (pipeline, patient):
             patch.setattr(builder, "make_felt_field", felt)
         patch.setattr(patient, "make_tip_field", on_disk(make_tip_field, rooms=rooms))
         for name, told in (

@@ -27,12 +27,12 @@ from avatar_core.atlas.transfer import (
     combine,
     patient_weights,
 )
+from avatar_core.certify.linear import certify
 from avatar_core.common.processes import cpu_seconds, repeatable
 from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.certify.linear import certify
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
 from avatar_core.offline.supports import SupportOption
@@ -357,10 +357,10 @@ def solved(
         problem.elasticity,
         problem.regions,
         problem.loads,
+        make_felt_field(*surroundings(problem)),
         options.rule,
         provenance(problem),
         lambda stage, fraction, error: progress(f"response: {stage}", fraction, error),
-        problem.outline,
     )
 
 

@@ -143,7 +143,7 @@ def bench_cell(
     """
     import tempfile
 
-    from avatar_core.offline.pipeline import OrganOptions, build
+    from avatar_core.pipeline import OrganOptions, build
     from avatar_core.vademecum.storage import save_vademecum
 
     require_ros()

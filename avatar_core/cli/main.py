@@ -91,7 +91,7 @@ def demo(
 
     from avatar_core.cli.picture import palpation_picture
     from avatar_core.geometry.phantom import phantom_liver
-    from avatar_core.offline.pipeline import OrganOptions, build
+    from avatar_core.pipeline import OrganOptions, build
     from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 
     require_ros()

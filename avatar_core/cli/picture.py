@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from avatar_core.certify.contact_sites import Site, hertz_force, nearest_sites, pressed
 from avatar_core.contact.model import ContactModel, prepare
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import ContactError, ConvergenceError, MeshError
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline.certify.contact_sites import Site, hertz_force, nearest_sites, pressed
 from avatar_core.offline.resolved_contact import contacts_at
 from avatar_core.vademecum.model import Vademecum
 

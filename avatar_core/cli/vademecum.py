@@ -158,9 +158,9 @@ def vademecum(
     """Build the certified vademecum of an organ. Exit code 3: written, but not converged."""
     from avatar_core.fem.elasticity import Material
     from avatar_core.offline.large_deformation import LargeRule
-    from avatar_core.offline.pipeline import OrganOptions, build, orientation_warning
     from avatar_core.offline.rule import BuildRule
     from avatar_core.offline.supports import SupportOption
+    from avatar_core.pipeline import OrganOptions, build, orientation_warning
     from avatar_core.reduction.coordinates import Coordinate
     from avatar_core.vademecum.storage import is_vademecum, load_vademecum, save_vademecum
 

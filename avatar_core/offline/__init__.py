@@ -1,4 +1,5 @@
-"""The offline stage. An organ's surface comes in, a certified vademecum goes out: mesh,
-solutions, separation by global and regional modes, and the errors against full finite elements
-on unseen loads (:mod:`avatar_core.offline.certify`).
+"""The offline stage. A mesh, its elastic problem and the patches of its load surface come in, a
+vademecum goes out: solutions, separation by global and regional modes, over ranges of materials
+and large pushes too. It needs no step, and measures no error of its own
+(:mod:`avatar_core.certify`).
 """

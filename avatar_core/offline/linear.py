@@ -17,11 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
-from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.completion import completed_response
 from avatar_core.offline.full_response import FullResponse, contact_blocks, contact_near
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
@@ -30,6 +28,7 @@ from avatar_core.reduction.regional import RegionalField, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.modal_mass import LEAST_MODES, N_BODY, body_functions, body_response
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
+from avatar_core.vademecum.tip_field import TipField
 
 _ENERGY_TOLERANCE = 3e-3  # at which PGD stops: beyond, single precision has no more to say
 _DEPENDENT = 1e-6  # part of a mode's energy below which it depends on the body's functions
@@ -57,15 +56,12 @@ def build_vademecum(
     elasticity: Elasticity,
     regions: Regions,
     surface: LoadSurface,
+    tip_field: TipField,
     rule: BuildRule,
     provenance: Provenance,
     progress: Progress = silent,
-    outline: SurfaceMesh | None = None,
 ) -> Vademecum:
     """Compute the vademecum of one organ; see the module docstring for the stages.
-
-    ``outline`` is the surface of which the mesh was made, which tools touch; None for the mesh's
-    own boundary.
 
     A tolerance that is not met within ``max_modes`` still gives a complete vademecum, whose
     ``convergence.converged`` is False.
@@ -102,7 +98,7 @@ def build_vademecum(
             surface,
             support,
         ),
-        tip_field=make_felt_field(elasticity.mesh, regions, surface.patch_radius, outline),
+        tip_field=tip_field,
         body=body,
         convergence=Convergence(
             rule.is_met(last.mean, last.worst), rule.tolerance, modes.history, errors

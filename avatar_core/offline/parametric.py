@@ -14,7 +14,7 @@ The space basis serves every value in the range by a small Galerkin system.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,12 +22,9 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from avatar_core.common.supports import SUPPORT
-from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
-from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.certify.linear import certificate_of, measured
 from avatar_core.offline.full_response import (
     FullResponse,
     contact_blocks,
@@ -41,7 +38,6 @@ from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.reduction.regional import RegionalField, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.at_values import at_values
-from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.modal_mass import (
     LEAST_MODES,
     N_BODY,
@@ -57,8 +53,6 @@ from avatar_core.vademecum.parametric import (
     stiffness_root,
 )
 from avatar_core.vademecum.tip_field import TipField
-
-_DRAWN = 6  # random values that a certificate is made at
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +91,10 @@ def build_parametric_vademecum(
     regions: Regions,
     surface: LoadSurface,
     coordinates: Sequence[Coordinate],
+    tip_field: TipField,
     rule: BuildRule,
     provenance: Provenance,
     progress: Progress = silent,
-    outline: SurfaceMesh | None = None,
 ) -> Vademecum:
     """Compute the vademecum of one organ over a range of materials and supports.
 
@@ -110,7 +104,6 @@ def build_parametric_vademecum(
     ----------
     elasticity : with an element that serves the whole range, and the inclusion if the contrast
         is a coordinate
-    outline : of which the mesh was made, which tools touch; None for the mesh's own boundary
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     nodes = node_values(coordinates)
@@ -119,9 +112,8 @@ def build_parametric_vademecum(
         for k, values in enumerate(nodes)
     ]
     basis = _project(snapshots, _principal(snapshots, rule), loads, rule)
-    field = make_felt_field(elasticity.mesh, regions, surface.patch_radius, outline)
     vademecum = _assemble(
-        name, elasticity, regions, surface, tuple(coordinates), rule, snapshots, basis, field
+        name, elasticity, regions, surface, tuple(coordinates), rule, snapshots, basis, tip_field
     )
     vademecum = replace(vademecum, provenance=provenance)
     return at_values(vademecum, _inside(coordinates, elasticity))
@@ -322,36 +314,3 @@ def _inside(coordinates: Sequence[Coordinate], elasticity: Elasticity) -> dict[s
         **{SUPPORT + support.name: support.stiffness for support in elasticity.supports},
     }
     return {c.name: float(np.clip(here[c.name], c.low, c.high)) for c in coordinates}
-
-
-def certify_range(
-    vademecum: Vademecum,
-    elasticity: Elasticity,
-    n_loads: int = 200,
-    seed: int = 0,
-    progress: Callable[[int], None] = lambda done: None,
-) -> Certificate:
-    """Measure a vademecum on unseen loads at unseen values of its coordinates.
-
-    The loads are divided among some random values and the ends of the range.
-    """
-    assert vademecum.parametric is not None
-    values = _certified_values(vademecum.parametric.coordinates, seed)
-    n_each = max(1, n_loads // len(values))
-    found = []
-    for k, point in enumerate(values):
-        here = at_values(vademecum, point)
-        found.append(measured(here, problem_at(elasticity, point), n_each, seed + k))
-        progress((k + 1) * n_each)
-    return certificate_of(vademecum, found, seed)
-
-
-def _certified_values(coordinates: Sequence[Coordinate], seed: int) -> list[dict[str, float]]:
-    """Values drawn evenly in each coordinate's own scale, and both corners of the range."""
-    rng = np.random.default_rng(seed)
-    drawn = [{c.name: c.value_at(rng.random()) for c in coordinates} for _ in range(_DRAWN)]
-    corners = [
-        {c.name: end for c, end in zip(coordinates, ends, strict=True)}
-        for ends in ([c.low for c in coordinates], [c.high for c in coordinates])
-    ]
-    return drawn + corners

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from avatar_core.certify.linear import measured
 from avatar_core.fem.elasticity import Elasticity
-from avatar_core.offline.certify.linear import measured
-from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.studies.force_error import ForceErrors, force_errors
 from avatar_core.studies.offline_cost import (
     grid_rows,

@@ -22,7 +22,7 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.geometry.tumour import volume_fraction_inside
-from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.report import Panel

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.registration import case_rows, draw_coverage, draw_errors, summarise
 from avatar_core.studies.registration_truth import RegistrationSettings, Truth

@@ -19,6 +19,7 @@ import scipy.sparse as sp
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.common.supports import SUPPORT
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.errors import MaterialError
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.norms import l2_norm, relative_l2
@@ -99,10 +100,12 @@ def _build(held: _Held, settings: CertaintySettings, progress: Progress) -> Vade
         held.regions,
         held.surface,
         (held.coordinate,),
+        make_felt_field(
+            held.elasticity.mesh, held.regions, held.surface.patch_radius, held.outline
+        ),
         BuildRule(max_modes=settings.max_modes),
         Provenance(held.outline.name, ""),
         progress,
-        held.outline,
     )
 
 

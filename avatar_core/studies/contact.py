@@ -15,20 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from skfem import MeshTet
 
+from avatar_core.certify.contact_sites import SiteContact, contacts_at_sites, draw_sites, summarized
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.signorini import half_space_radius
 from avatar_core.geometry.mesh import Regions, make_mesh
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline.certify.contact_sites import (
-    SiteContact,
-    contacts_at_sites,
-    draw_sites,
-    summarized,
-)
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, contacts_at
 from avatar_core.offline.rule import BuildRule
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.studies.shapes import DEFAULT_FOLDER
 from avatar_core.studies.study import Row, Run, Study, follow
 

@@ -13,20 +13,22 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from avatar_core.certify.combinations import COMBINATIONS, push_errors
+from avatar_core.certify.large_deformation import certify_large
+from avatar_core.certify.parametric import certify_range
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import LoadSurface, load_surface
 from avatar_core.geometry.mesh import Regions, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.geometry.tumour import read_tumour, volume_fraction_inside
-from avatar_core.offline.certify.combinations import COMBINATIONS, push_errors
-from avatar_core.offline.certify.large_deformation import certify_large
 from avatar_core.offline.large_deformation import (
     LargeRule,
     hyperelastic_problem,
     with_large_deformation,
 )
 from avatar_core.offline.linear import build_vademecum
-from avatar_core.offline.parametric import build_parametric_vademecum, certify_range
+from avatar_core.offline.parametric import build_parametric_vademecum
 from avatar_core.offline.rule import BuildRule, Progress
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.studies.bench.methods import time_steps
@@ -34,6 +36,7 @@ from avatar_core.studies.shapes import DEFAULT_FOLDER, read_liver
 from avatar_core.studies.study import ProgressBar, Row, Run, Study, column, label, where
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.tip_field import TipField
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,6 +69,12 @@ class Organ:
     regions: Regions
     loads: LoadSurface
     elasticity: Elasticity
+
+    @property
+    def tip_field(self) -> TipField:
+        """Where tips touch it."""
+        mesh, radius = self.elasticity.mesh, self.loads.patch_radius
+        return make_felt_field(mesh, self.regions, radius, self.outline)
 
 
 class CoordinatesStudy(Study[CoordinatesSettings]):
@@ -200,10 +209,10 @@ def _parametric(
         organ.regions,
         organ.loads,
         coordinates,
+        organ.tip_field,
         BuildRule(),
         Provenance(organ.outline.name, ""),
         progress,
-        organ.outline,
     )
     seconds = time.process_time() - start
     assert vademecum.parametric is not None
@@ -272,10 +281,10 @@ def _large(
         organ.elasticity,
         organ.regions,
         organ.loads,
+        organ.tip_field,
         BuildRule(),
         Provenance("", ""),
         progress,
-        organ.outline,
     )
     problem = hyperelastic_problem(linear, material)
     bent = with_large_deformation(linear, problem, material, LargeRule(), progress)

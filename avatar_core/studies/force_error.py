@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avatar_core.certify.unseen_contacts import HEIGHTS, draw_contacts
 from avatar_core.contact.model import Status, estimate_error, prepare, step
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline.certify.unseen_contacts import HEIGHTS, draw_contacts
 from avatar_core.vademecum.model import Vademecum
 
 _RADIUS = 8e-3  # of the tip, larger than it is ever above the surface [m]

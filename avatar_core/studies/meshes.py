@@ -26,7 +26,7 @@ from avatar_core.common.processes import cpu_seconds
 from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.studies.shapes import read_livers
 from avatar_core.studies.study import Row, Run, Study, column, follow, label
 

@@ -17,6 +17,7 @@ from avatar_core.atlas.base import base_of
 from avatar_core.atlas.growth import AtlasOptions, build_anatomy, default_template, new_atlas
 from avatar_core.atlas.patient import Fidelity, PatientOptions, patient_vademecum
 from avatar_core.atlas.response import ResponseSolver
+from avatar_core.certify.linear import mesh_error
 from avatar_core.common.processes import repeatable
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_by_position
@@ -24,11 +25,10 @@ from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.level_set import distance_grid, isosurface
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.certify.linear import mesh_error
 from avatar_core.offline.completion import completed_response
 from avatar_core.offline.full_response import full_response
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import CompletionRule, silent
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.shapes.registration import RegistrationRule
 from avatar_core.studies.grid import GridSettings, grid_row, reference_of
 from avatar_core.studies.leave_one_out import LeaveOneOutSettings, judged, methods, placed

@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from avatar_core.certify.linear import UnseenErrors
 from avatar_core.contact.effects import LargeDeformationEffect
 from avatar_core.errors import AccuracyError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm, relative_l2
 from avatar_core.fem.patch_loads import patch_loads
-from avatar_core.offline.certify.linear import UnseenErrors
 from avatar_core.studies.bench.effects import cases_on, effect_rows
 from avatar_core.studies.bench.methods import (
     StepRow,

@@ -18,7 +18,7 @@ from avatar_core.common.arrays import FloatArray
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.point_location import carriers, closest_points
 from avatar_core.geometry.surface import read_surface
-from avatar_core.offline.pipeline import OrganOptions, build
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.registration.cloud import Cloud
 from avatar_core.registration.fit import RegistrationRule, rigid_motion
 from avatar_core.registration.register import INTERVAL_90, register

@@ -1,4 +1,4 @@
-"""The certificate of a vademecum's errors; :mod:`avatar_core.offline.certify` measures them."""
+"""The certificate of a vademecum's errors; :mod:`avatar_core.certify` measures them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class ContactSites:
     """Relative errors (fractions) of the force on real tips against resolved contacts.
 
     The contacts are those of spheres of several radii at several depths at some places of the
-    organ; :mod:`avatar_core.offline.certify.contact_sites`.
+    organ; :mod:`avatar_core.certify.contact_sites`.
 
     n_contacts, n_places : resolved; 0: not asked for
     mean, p95, worst : |F / F_resolved - 1| along the normal; p95 is that which 5 % exceed

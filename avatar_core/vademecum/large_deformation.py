@@ -12,7 +12,7 @@ region of the load surface. They hold up to a_max(s); beyond, both continue tang
 is proportional to Young's modulus, V_k and beta_k do not depend on it.
 
 Only the response of a patch to its own normal force is nonlinear; coupling between patches and
-forces along the surface stay linear. :mod:`avatar_core.offline.certify.combinations` measures the
+forces along the surface stay linear. :mod:`avatar_core.certify.combinations` measures the
 error of that.
 """
 
@@ -46,7 +46,7 @@ class LargeCertificate:
         the range ended
     depth : the deepest push compared [m]
     oblique_contact_mean, two_tools_contact_mean, gravity_contact_mean : of the force, where other
-        effects are added (:mod:`avatar_core.offline.certify.combinations`); NaN: not measured
+        effects are added (:mod:`avatar_core.certify.combinations`); NaN: not measured
     """
 
     l2_mean: float

@@ -11,8 +11,8 @@ from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.geometry.mesh import Regions, TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import read_surface
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.elastic_shapes import box_mesh, box_regions

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import avatar_core as av
+from avatar_core import pipeline
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline import pipeline
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.paths import ROOT

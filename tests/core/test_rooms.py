@@ -25,11 +25,13 @@ ORDER = {
         "shapes",
         "vademecum",
         "registration",
+        "offline",  # which knows no step
         "contact",
+        "certify",
+        "pipeline",
         "uncertainty",
         "scene",
         "bags",
-        "offline",
         "atlas",
         "__init__",  # the public API
         "studies",

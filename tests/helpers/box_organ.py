@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.patch_loads import load_surface, patch_loads
 from avatar_core.geometry.mesh import Regions, TetMesh
@@ -58,6 +59,7 @@ def organ(body: Body) -> Vademecum:
         Elasticity(mesh, MATERIAL, regions.clamped),
         regions,
         load_surface(mesh, regions, PATCH_RADIUS),
+        make_felt_field(mesh, regions, PATCH_RADIUS),
         BuildRule(),
         Provenance(body, ""),
     )

@@ -15,8 +15,8 @@ from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.contact.tool_path import access, inner_positions
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.tip import Shape, Tip
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.disk_cache import cached_on_disk
 

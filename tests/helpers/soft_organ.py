@@ -8,9 +8,9 @@ import pytest
 from avatar_core.fem import patch_loads
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
 from avatar_core.offline.supports import SupportOption
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.disk_cache import cached_on_disk

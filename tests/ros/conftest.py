@@ -208,8 +208,8 @@ def organ() -> Any:
 @cached_on_disk
 def _organ() -> Any:
     from avatar_core.geometry.phantom import phantom_liver
-    from avatar_core.offline.pipeline import OrganOptions, build
     from avatar_core.offline.rule import BuildRule
+    from avatar_core.pipeline import OrganOptions, build
 
     rule = BuildRule(max_modes=30)
     return build(phantom_liver(12e-3), OrganOptions(n_vertices=800, rule=rule, n_certified=10))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.contact.effects import (
     Effect,
     Friction,
@@ -90,8 +91,9 @@ def build_for_effects(
     elasticity = Elasticity(mesh, Material(), regions.clamped)
     loads = load_surface(mesh, regions)
     provenance = Provenance(surface.name, surface.source_sha256)
+    field = make_felt_field(mesh, regions, loads.patch_radius, surface)
     linear = build_vademecum(
-        surface.name, elasticity, regions, loads, rule, provenance, progress, surface
+        surface.name, elasticity, regions, loads, field, rule, provenance, progress
     )
     problem = hyperelastic_problem(linear, "neo-hookean")
     return with_large_deformation(linear, problem, "neo-hookean", LargeRule(), progress)

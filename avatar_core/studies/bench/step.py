@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
@@ -71,10 +72,11 @@ def _built(
     regions = regions_by_rule(mesh)
     elasticity = Elasticity(mesh, Material(), regions.clamped)
     loads = load_surface(mesh, regions)
+    field = make_felt_field(mesh, regions, loads.patch_radius, surface)
     provenance = Provenance(surface.name, surface.source_sha256)
     return (
         build_vademecum(
-            surface.name, elasticity, regions, loads, BuildRule(), provenance, progress, surface
+            surface.name, elasticity, regions, loads, field, BuildRule(), provenance, progress
         ),
         elasticity,
     )

@@ -249,7 +249,7 @@ def test_ctrl_c_is_said_and_leaves_nothing(
         time.sleep(10.0)
 
     source = phantom_file(tmp_path)
-    monkeypatch.setattr("avatar_core.offline.pipeline.build", meshed_then_stopped)
+    monkeypatch.setattr("avatar_core.pipeline.build", meshed_then_stopped)
     # a shell starts what runs in the background with the signal ignored
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -13,7 +13,7 @@ from avatar_core.cli import main as cli
 from avatar_core.errors import AvatarError
 
 BUILDS = (
-    "avatar_core.offline.pipeline.build",
+    "avatar_core.pipeline.build",
     "avatar_core.geometry.surface.read_surface",
     "avatar_core.geometry.tumour.read_tumour",
     "avatar_core.atlas.storage.load_atlas",

@@ -168,7 +168,7 @@ def test_a_tip_may_press_at_every_inner_position(real_vademecum: Vademecum) -> N
     assert not refused
 
 
-# --- Refusals, force before cloud, allocation -----------------------------------------------------------
+# --- Refusals, force before cloud, allocation -----------------------------------------------------
 
 
 def test_clamped_side_is_out_of_range(phantom_vademecum: Vademecum) -> None:

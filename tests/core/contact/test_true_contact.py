@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from avatar_core.certify.contact_sites import Site, draw_sites
 from avatar_core.contact.effects import LargeDeformationEffect, SeveralTools
 from avatar_core.contact.model import prepare
 from avatar_core.fem.elasticity import Material
@@ -22,7 +23,6 @@ from avatar_core.fem.sphere_indentation import Domain, SphereIndentation
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline.certify.contact_sites import Site, draw_sites
 from avatar_core.offline.large_deformation import (
     LargeRule,
     hyperelastic_problem,

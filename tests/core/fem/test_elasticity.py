@@ -12,16 +12,15 @@ import scipy.linalg
 from skfem import Basis, ElementTetP2, ElementVector, LinearForm, MeshTet
 from skfem.models.elasticity import linear_elasticity
 
+from avatar_core.certify import linear as certificate
+from avatar_core.certify import unseen_contacts
+from avatar_core.certify.linear import certify
 from avatar_core.errors import MaterialError
 from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.fem.stiffness import unit_stiffness
 from avatar_core.geometry.mesh import TetMesh, make_mesh, quality, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
-from avatar_core.offline import linear
-from avatar_core.offline.certify import linear as certificate
-from avatar_core.offline.certify import unseen_contacts
-from avatar_core.offline.certify.linear import certify
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum import tip_field
@@ -319,14 +318,13 @@ def _certificate(mesh: TetMesh, scale: float, patch: pytest.MonkeyPatch) -> Cert
     ):
         assert hasattr(module, name)
         patch.setattr(module, name, value * scale)
-    # a ball is no larger or smaller for the organ, and no part of the certificate
-    patch.setattr(linear, "make_felt_field", tip_field.make_tip_field)
     regions = box_regions(mesh)
     organ = TetMesh(scale * mesh.vertices, mesh.tets)
     problem = Elasticity(organ, Material(), regions.clamped)
     surface = load_surface(organ, regions, 0.03 * scale)
+    field = tip_field.make_tip_field(organ, regions, surface.patch_radius)
     rule = BuildRule(max_modes=24)
-    found = build_vademecum("organ", problem, regions, surface, rule, Provenance("", ""))
+    found = build_vademecum("organ", problem, regions, surface, field, rule, Provenance("", ""))
     return certify(found, problem, 12)
 
 

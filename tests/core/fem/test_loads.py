@@ -13,7 +13,7 @@ from avatar_core.errors import MeshError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import load_surface, patch_loads, patch_normals
 from avatar_core.geometry.mesh import Regions, TetMesh, make_mesh, regions_by_rule
-from avatar_core.offline.pipeline import OrganOptions
+from avatar_core.pipeline import OrganOptions
 from tests.helpers.elastic_shapes import TOP, block, box_mesh, box_regions, clamped_cube
 from tests.helpers.examples import examples
 

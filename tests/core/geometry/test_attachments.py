@@ -12,8 +12,8 @@ from avatar_core.errors import AvatarError, CoordinateError, MaterialError, Mesh
 from avatar_core.geometry.attachments import attachments_by_rule
 from avatar_core.geometry.groups import faces_of_groups, read_groups, regions_from_groups
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule, touching
-from avatar_core.offline.pipeline import OrganOptions
 from avatar_core.offline.supports import TYPICAL, SupportOption, held_by
+from avatar_core.pipeline import OrganOptions
 from avatar_core.reduction.coordinates import Coordinate
 
 

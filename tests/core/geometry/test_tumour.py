@@ -69,12 +69,11 @@ def _cube_with_tumour() -> Vademecum:
         Elasticity(mesh, MATERIAL, plain.regions.clamped, inclusion=inclusion),
         plain.regions,
         load_surface(mesh, plain.regions, PATCH_RADIUS),
+        with_tumour(plain.tip_field, tumour(), PATCH_RADIUS),
         BuildRule(tolerance=0.5, max_modes=20),
         Provenance("cube", ""),
     )
-    return replace(
-        built, contrast=CONTRAST, tip_field=with_tumour(built.tip_field, tumour(), PATCH_RADIUS)
-    )
+    return replace(built, contrast=CONTRAST)
 
 
 def sphere_on(vademecum: Vademecum, radius: float) -> ContactModel:

@@ -12,17 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from avatar_core.cli import picture
-from avatar_core.contact.effects.tip_law import LAW_ERROR, UNSHIFTED
-from avatar_core.contact.model import estimate_error, prepare, step
-from avatar_core.errors import ContactError, CoordinateError, MeshError, StorageError
-from avatar_core.fem.elasticity import Elasticity, Material
-from avatar_core.fem.patch_loads import load_surface
-from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.geometry.tip import Tip
-from avatar_core.offline import pipeline
-from avatar_core.offline.certify import contact_sites
-from avatar_core.offline.certify.contact_sites import (
+from avatar_core import pipeline
+from avatar_core.certify import contact_sites
+from avatar_core.certify.contact_sites import (
     LEAST_FACTOR,
     Site,
     SiteContact,
@@ -30,9 +22,18 @@ from avatar_core.offline.certify.contact_sites import (
     summarized,
     with_contact_sites,
 )
+from avatar_core.cli import picture
+from avatar_core.contact.ball_shift import make_felt_field
+from avatar_core.contact.effects.tip_law import LAW_ERROR, UNSHIFTED
+from avatar_core.contact.model import estimate_error, prepare, step
+from avatar_core.errors import ContactError, CoordinateError, MeshError, StorageError
+from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.patch_loads import load_surface
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
 from avatar_core.offline.linear import build_vademecum
-from avatar_core.offline.pipeline import OrganOptions
 from avatar_core.offline.rule import BuildRule
+from avatar_core.pipeline import OrganOptions
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum import storage
 from avatar_core.vademecum.certificate import Certificate, ContactSites
@@ -59,11 +60,13 @@ def box() -> Vademecum:
     mesh = box_mesh(4)
     regions = box_regions(mesh)
     elasticity = Elasticity(mesh, Material(), regions.clamped, "P1")
+    loads = load_surface(mesh, regions)
     vademecum = build_vademecum(
         "box",
         elasticity,
         regions,
-        load_surface(mesh, regions),
+        loads,
+        make_felt_field(mesh, regions, loads.patch_radius),
         BuildRule(tolerance=0.9, max_modes=10),
         Provenance("box", ""),
     )

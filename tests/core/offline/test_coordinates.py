@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from avatar_core.certify.linear import certify
 from avatar_core.contact.effects import Tumour
 from avatar_core.contact.model import Status, prepare, step
 from avatar_core.contact.tool_path import inner_positions, palpation
@@ -19,9 +20,8 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.geometry.tumour import volume_fraction_inside
-from avatar_core.offline.certify.linear import certify
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate, node_values, node_weights, problem_at
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum

@@ -10,6 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from avatar_core import pipeline as organ
+from avatar_core.certify.combinations import COMBINATIONS, CombinedRow, mean_error, push_errors
+from avatar_core.certify.large_deformation import (
+    certify_large,
+    push_rows,
+    summary,
+    with_combinations,
+)
 from avatar_core.cli.vademecum import show_text
 from avatar_core.contact.effects import Friction, LargeDeformationEffect
 from avatar_core.contact.model import ContactModel, Status, prepare, step
@@ -21,22 +29,9 @@ from avatar_core.fem.newton import NewtonRule, solve
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline import pipeline as organ
-from avatar_core.offline.certify.combinations import (
-    COMBINATIONS,
-    CombinedRow,
-    mean_error,
-    push_errors,
-)
-from avatar_core.offline.certify.large_deformation import (
-    certify_large,
-    push_rows,
-    summary,
-    with_combinations,
-)
 from avatar_core.offline.large_deformation import LargeRule, economised, hyperelastic_problem
-from avatar_core.offline.pipeline import OrganOptions
 from avatar_core.offline.rule import silent
+from avatar_core.pipeline import OrganOptions
 from avatar_core.reduction.asymptotic_series import path_series
 from avatar_core.scene.model import REFUSED, Scene, combinations
 from avatar_core.vademecum import storage

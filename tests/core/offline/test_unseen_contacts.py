@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from avatar_core.certify.unseen_contacts import draw_contacts
 from avatar_core.errors import ConvergenceError
 from avatar_core.fem.patch_loads import LoadSurface
-from avatar_core.offline.certify.unseen_contacts import draw_contacts
 from avatar_core.vademecum.tip_field import TipField
 
 RADIUS = 0.03  # of the ball that is touched [m]

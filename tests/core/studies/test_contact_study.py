@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.offline.certify.contact_sites import Site, SiteContact
+from avatar_core.certify.contact_sites import Site, SiteContact
 from avatar_core.studies.contact import reference_error, summary_of
 
 SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from avatar_core.certify.linear import measured
 from avatar_core.contact.effects import SelfWeight
 from avatar_core.contact.layout import lay_out
 from avatar_core.contact.model import estimate_error, make_model, prepare, step
@@ -18,7 +19,6 @@ from avatar_core.contact.timing import timed
 from avatar_core.contact.tool_path import palpation
 from avatar_core.errors import AccuracyError
 from avatar_core.fem.elasticity import Elasticity
-from avatar_core.offline.certify.linear import measured
 from avatar_core.studies.force_error import force_errors
 from avatar_core.vademecum.accuracy import (
     AccuracyCurve,

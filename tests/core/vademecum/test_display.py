@@ -17,8 +17,8 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.resampling import is_manifold, resampled, unified
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.vademecum.display import boundary, display_of, outline, structure
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import _arrays, _attributes, load_vademecum, save_vademecum

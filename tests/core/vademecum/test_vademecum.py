@@ -13,10 +13,10 @@ import h5py
 import numpy as np
 import pytest
 
+from avatar_core.certify.linear import certify
 from avatar_core.errors import StorageError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import relative_l2
-from avatar_core.offline.certify.linear import certify
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 

@@ -49,8 +49,8 @@ def main(prefix: Path) -> int:
 
 def _build(library: Path) -> None:
     from avatar_core.geometry.phantom import phantom_liver
-    from avatar_core.offline.pipeline import OrganOptions, build
     from avatar_core.offline.rule import BuildRule
+    from avatar_core.pipeline import OrganOptions, build
     from avatar_core.vademecum.storage import save_vademecum
 
     options = OrganOptions(n_vertices=600, rule=BuildRule(max_modes=10), n_certified=4)

@@ -11,8 +11,8 @@ import numpy as np
 
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.tumour import read_tumour
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.disk_cache import cached_on_disk

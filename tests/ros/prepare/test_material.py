@@ -24,8 +24,8 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.geometry.phantom import phantom_liver
-from avatar_core.offline.pipeline import OrganOptions, build
 from avatar_core.offline.rule import BuildRule
+from avatar_core.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState, LoopStatistics

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 import igl
 import numpy as np
 
+from avatar_core.certify.unseen_contacts import draw_contacts
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.effects.tip_law import law_error
 from avatar_core.contact.model import ContactModel, Status, estimate_error, prepare, step
 from avatar_core.errors import ContactError, ConvergenceError, MeshError
 from avatar_core.fem.norms import relative_l2
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline.certify.unseen_contacts import draw_contacts
 from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, ResolvedPlace, contacts_at
 from avatar_core.offline.rule import NO_ERROR, Progress, silent
 from avatar_core.vademecum.certificate import Certificate, ContactSites

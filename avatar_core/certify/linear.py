@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from avatar_core.certify.accuracy_curve import DisplayErrors, curve_of
+from avatar_core.certify.unseen_contacts import HEIGHTS, draw_contacts
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.tip_response import make_tip_response, tip_carriers
 from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
-from avatar_core.offline.certify.accuracy_curve import DisplayErrors, curve_of
-from avatar_core.offline.certify.unseen_contacts import HEIGHTS, draw_contacts
 from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.force_error import calibrated
 

@@ -6,7 +6,13 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from avatar_core.certify.combinations import COMBINATIONS, DEPTH_FRACTIONS, push_errors
+from avatar_core.certify.contact_sites import with_contact_sites
+from avatar_core.certify.large_deformation import certify_large, with_combinations
+from avatar_core.certify.linear import certify, mesh_error
+from avatar_core.certify.parametric import certify_range
 from avatar_core.common.processes import cpu_seconds, repeatable
+from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.contact.timing import timed
 from avatar_core.errors import ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
@@ -19,17 +25,13 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.resampling import require_displayable
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tumour import volume_fraction_inside
-from avatar_core.offline.certify.combinations import COMBINATIONS, DEPTH_FRACTIONS, push_errors
-from avatar_core.offline.certify.contact_sites import with_contact_sites
-from avatar_core.offline.certify.large_deformation import certify_large, with_combinations
-from avatar_core.offline.certify.linear import certify, mesh_error
 from avatar_core.offline.large_deformation import (
     LargeRule,
     hyperelastic_problem,
     with_large_deformation,
 )
 from avatar_core.offline.linear import build_vademecum
-from avatar_core.offline.parametric import build_parametric_vademecum, certify_range
+from avatar_core.offline.parametric import build_parametric_vademecum
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.offline.supports import SupportOption, held_by
 from avatar_core.reduction.coordinates import Coordinate
@@ -165,6 +167,7 @@ def build(
     elasticity = _elasticity(mesh, regions, supports, options)
     loads = load_surface(mesh, regions, options.patch_radius)
     common = (surface.name, elasticity, regions, loads)
+    tip_field = make_felt_field(mesh, regions, loads.patch_radius, surface)
     provenance = _provenance(surface, options)
 
     def count(done: int) -> None:
@@ -172,11 +175,11 @@ def build(
 
     if options.all_coordinates:
         vademecum = build_parametric_vademecum(
-            *common, options.all_coordinates, options.rule, provenance, progress, surface
+            *common, options.all_coordinates, tip_field, options.rule, provenance, progress
         )
         certificate = certify_range(vademecum, elasticity, options.n_certified, options.seed, count)
     else:
-        vademecum = build_vademecum(*common, options.rule, provenance, progress, surface)
+        vademecum = build_vademecum(*common, tip_field, options.rule, provenance, progress)
         certificate = certify(vademecum, elasticity, options.n_certified, options.seed, count)
     if options.tumour is not None:
         field = with_tumour(vademecum.tip_field, options.tumour, loads.patch_radius)

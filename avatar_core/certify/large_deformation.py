@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from avatar_core.certify.combinations import CombinedRow, mean_error
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import EquilibriumError
 from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.newton import NewtonRule, press
 from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
-from avatar_core.offline.certify.combinations import CombinedRow, mean_error
 from avatar_core.vademecum.large_deformation import LargeCertificate
 from avatar_core.vademecum.model import Vademecum
 
