@@ -47,6 +47,7 @@ from avatar_core.vademecum.modal_mass import (
 )
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.parametric import (
+    GalerkinBasis,
     ParametricResponse,
     galerkin_field,
     regional_load_of_basis,
@@ -67,22 +68,6 @@ class _Snapshot:
     response: FullResponse
     contact: LocalBlocks
     modes: Modes
-
-
-@dataclass(frozen=True, eq=False)
-class _Basis:
-    """A space basis and the terms of the stiffness in it.
-
-    field : V at the vertices (3 n_vertices, n), and V^T f (n_loads, n)
-    operators : ndarray, shape (n_terms, n, n), A_q
-    n_global : functions of the global modes, those of the body last among them
-    body : of all functions, or None
-    """
-
-    field: SeparatedField
-    operators: np.ndarray
-    n_global: int
-    body: BodyResponse | None
 
 
 def build_parametric_vademecum(
@@ -174,7 +159,7 @@ def _principal(snapshots: Sequence[_Snapshot], rule: BuildRule) -> np.ndarray:
 
 def _project(
     snapshots: Sequence[_Snapshot], space: np.ndarray, loads: sp.csr_matrix, rule: BuildRule
-) -> _Basis:
+) -> GalerkinBasis:
     """Galerkin projection of every term of the stiffness."""
     middle = snapshots[len(snapshots) // 2].elasticity
     space = space.astype(float)
@@ -187,8 +172,14 @@ def _project(
         body = body_response(middle, space)
         order, n_global = _body_among_first(body, n_global)
         space, operators, body = space @ order, order.T @ operators @ order, body.mixed(order)
-    field = SeparatedField(middle.at_vertices(space), loads.T @ space)
-    return _Basis(field, operators, n_global, body)
+    vertices, load = middle.at_vertices(space), loads.T @ space
+    return GalerkinBasis(
+        basis=SeparatedField(vertices.astype(np.float32), load.astype(np.float32)),
+        operators=operators,
+        n_global=n_global,
+        rank=load.shape[1],
+        body=body,
+    )
 
 
 def _body_among_first(body: BodyResponse, n_global: int) -> tuple[np.ndarray, int]:
@@ -217,34 +208,18 @@ def _assemble(
     coordinates: tuple[Coordinate, ...],
     rule: BuildRule,
     snapshots: Sequence[_Snapshot],
-    basis: _Basis,
+    basis: GalerkinBasis,
     tip_field: TipField,
 ) -> Vademecum:
     """Regional modes of all nodes, near fields at each; the own fields are those of the first."""
-    single = SeparatedField(
-        basis.field.space.astype(np.float32), basis.field.load.astype(np.float32)
-    )
-    parametric = ParametricResponse(
-        coordinates=coordinates,
-        basis=single,
-        operators=basis.operators,
-        projection=np.empty(0, np.float32),
-        regional_load=np.empty(0, np.float32),
-        contact_near=np.empty(0, np.float32),
-        n_global=basis.n_global,
-        rank=basis.field.rank,
-        young_modulus=elasticity.material.young_modulus,
-        body=basis.body,
-    )
-    roots = [stiffness_root(parametric, s.elasticity.factors) for s in snapshots]
-    fields = [galerkin_field(parametric, root) for root in roots]
+    roots = [stiffness_root(basis, s.elasticity.factors) for s in snapshots]
+    fields = [galerkin_field(basis, root) for root in roots]
     regional, load, errors = _regional(snapshots, [far for far, _, _ in fields], surface, rule)
     mass = elasticity.mesh.lumped_mass
-    projection = regional.coefficients(single.space, mass).astype(np.float32)
-    parametric = replace(parametric, projection=projection)
+    projection = regional.coefficients(basis.basis.space, mass).astype(np.float32)
     left = load.copy()
     for k, (root, (_, trailing, _)) in enumerate(zip(roots, fields, strict=True)):
-        left[k] -= regional_load_of_basis(parametric, root, trailing, regional)
+        left[k] -= regional_load_of_basis(basis, projection, root, trailing, regional)
     support = rule.contact_support * surface.patch_radius
     contact = [
         contact_near(s.contact, np.hstack([far.load, trailing]), surface, support)
@@ -269,10 +244,13 @@ def _assemble(
             rule.is_met(last.mean, last.worst), rule.tolerance, history, errors
         ),
         provenance=Provenance(name, ""),
-        parametric=replace(
-            parametric,
+        parametric=ParametricResponse(
+            **vars(basis),
+            coordinates=coordinates,
+            projection=projection,
             regional_load=left,
             contact_near=np.stack([blocks.block for blocks in contact]),
+            young_modulus=elasticity.material.young_modulus,
         ),
         contrast=first.inclusion.contrast if first.inclusion else None,
         supports=first.supports,

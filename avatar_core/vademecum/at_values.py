@@ -71,7 +71,9 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     reference = replace(material, young_modulus=parametric.young_modulus)
     root = stiffness_root(parametric, factors_at(reference, contrast, at_reference))
     far, trailing, body = galerkin_field(parametric, root)
-    regional_load = regional_load_of_basis(parametric, root, trailing, vademecum.regional)
+    regional_load = regional_load_of_basis(
+        parametric, parametric.projection, root, trailing, vademecum.regional
+    )
     regional_load += combined(parametric.regional_load, weights)
     found = replace(
         vademecum,

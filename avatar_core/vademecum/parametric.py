@@ -26,45 +26,53 @@ from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.modal_mass import BodyResponse
 
 
-@dataclass(frozen=True, eq=False)
-class ParametricResponse:
-    """The data of a vademecum's coordinates, beside its own fields.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GalerkinBasis:
+    """A space basis for the whole range, and the terms of the stiffness in it.
 
-    coordinates : at least one
     basis : SeparatedField, V at the vertices (3 n_vertices, n) and V^T f (3 n_positions, n), the
         functions of the body after those of the global modes
     operators : ndarray, shape (n_terms, n, n), A_q of :attr:`Elasticity.factors`
+    n_global : global modes of a vademecum at given values; rank : of its contact compliance, these
+        among them
+    body : BodyResponse of the basis, or None
+    """
+
+    basis: SeparatedField
+    operators: np.ndarray
+    n_global: int
+    rank: int
+    body: BodyResponse | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ParametricResponse(GalerkinBasis):
+    """The data of a vademecum's coordinates, beside its own fields.
+
+    coordinates : at least one
     projection : ndarray, shape (n_regional, n), the functions of the basis in the regional modes
     regional_load : ndarray, shape (n_nodes, n_positions, 3, most), what the basis leaves at the
         nodes, in the regional modes
     contact_near : ndarray, shape (n_nodes, n_blocks, 3, 3), blocks at the nodes in the pattern of
         the vademecum's own near field
-    n_global : global modes of a vademecum at given values; rank : of its contact compliance, these
-        among them
     young_modulus : that the blocks are computed for [Pa]
-    body : BodyResponse of the basis, or None
     """
 
     coordinates: tuple[Coordinate, ...]
-    basis: SeparatedField
-    operators: np.ndarray
     projection: np.ndarray
     regional_load: np.ndarray
     contact_near: np.ndarray
-    n_global: int
-    rank: int
     young_modulus: float
-    body: BodyResponse | None = None
 
 
-def stiffness_root(parametric: ParametricResponse, factors: np.ndarray) -> np.ndarray:
+def stiffness_root(basis: GalerkinBasis, factors: np.ndarray) -> np.ndarray:
     """L of A(p) = L L^T for the factors theta_q(p), lower triangular, shape (n, n)."""
-    stiffness = np.tensordot(factors, parametric.operators, axes=1)
+    stiffness = np.tensordot(factors, basis.operators, axes=1)
     return np.asarray(np.linalg.cholesky((stiffness + stiffness.T) / 2.0))
 
 
 def galerkin_field(
-    parametric: ParametricResponse, root: np.ndarray
+    found: GalerkinBasis, root: np.ndarray
 ) -> tuple[SeparatedField, np.ndarray, BodyResponse | None]:
     """The K(p)-orthonormal response in the space of the basis.
 
@@ -73,7 +81,7 @@ def galerkin_field(
 
     Parameters
     ----------
-    parametric : ParametricResponse
+    found : GalerkinBasis
     root : L, of :func:`stiffness_root`
 
     Returns
@@ -82,8 +90,8 @@ def galerkin_field(
     trailing : ndarray, shape (3 n_positions, rank - n_global), load functions of further modes
     body : of the global modes; None for modes of surface loads alone
     """
-    basis, body, n = parametric.basis, parametric.body, parametric.n_global
-    load = galerkin_load(parametric, root)
+    basis, body, n = found.basis, found.body, found.n_global
+    load = galerkin_load(found, root)
     first = root[:n, :n]
     space = scipy.linalg.solve_triangular(first, basis.space[:, :n].T, lower=True).T
     if body is not None:
@@ -92,22 +100,27 @@ def galerkin_field(
     return SeparatedField(space, load[:, :n]), load[:, n:], body
 
 
-def galerkin_load(parametric: ParametricResponse, root: np.ndarray) -> np.ndarray:
+def galerkin_load(found: GalerkinBasis, root: np.ndarray) -> np.ndarray:
     """Y(s) of the contact compliance, shape (3 n_positions, rank); ``root`` as above."""
-    load = scipy.linalg.solve_triangular(root, parametric.basis.load.T, lower=True)
-    return np.asarray(load[: parametric.rank].T)
+    load = scipy.linalg.solve_triangular(root, found.basis.load.T, lower=True)
+    return np.asarray(load[: found.rank].T)
 
 
 def regional_load_of_basis(
-    parametric: ParametricResponse, root: np.ndarray, trailing: np.ndarray, field: RegionalField
+    found: GalerkinBasis,
+    projection: np.ndarray,
+    root: np.ndarray,
+    trailing: np.ndarray,
+    field: RegionalField,
 ) -> np.ndarray:
     """The response beyond the global modes in the regional modes, (n_positions, 3, most) [m/N].
 
+    projection : of the functions of the basis in the regional modes
     root, trailing : of :func:`stiffness_root` and :func:`galerkin_field`
     field : of which the regions and modes are taken
     """
-    n, rank = parametric.n_global, parametric.rank
-    functions = parametric.projection[:, :rank].T
+    n, rank = found.n_global, found.rank
+    functions = projection[:, :rank].T
     modes = scipy.linalg.solve_triangular(root[:rank, :rank], functions, lower=True).T
     load = trailing.reshape(len(field.region), 3, rank - n).astype(np.float32)
     out = np.zeros((len(field.region), 3, field.rank), np.float32)

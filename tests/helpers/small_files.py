@@ -176,16 +176,17 @@ def _parametric(rng: np.random.Generator, vademecum: Vademecum) -> ParametricRes
     coordinate = Coordinate("poisson", 0.40, 0.48, 2)
     nodes = coordinate.n_nodes
     return ParametricResponse(
-        (coordinate,),
-        _field(rng, 3 * len(vademecum.mesh.vertices), 3 * n, rank),
-        np.tile(np.eye(rank), (2, 1, 1)),
-        1e-2 * rng.normal(size=(vademecum.regional.space.shape[1], rank)).astype(np.float32),
-        np.tile(vademecum.regional.load, (nodes, 1, 1, 1)),
-        np.tile(vademecum.contact_near.block, (nodes, 1, 1, 1)),
-        RANK,
-        rank,
-        vademecum.material.young_modulus,
-        _body(rng, rank),
+        coordinates=(coordinate,),
+        basis=_field(rng, 3 * len(vademecum.mesh.vertices), 3 * n, rank),
+        operators=np.tile(np.eye(rank), (2, 1, 1)),
+        projection=1e-2
+        * rng.normal(size=(vademecum.regional.space.shape[1], rank)).astype(np.float32),
+        regional_load=np.tile(vademecum.regional.load, (nodes, 1, 1, 1)),
+        contact_near=np.tile(vademecum.contact_near.block, (nodes, 1, 1, 1)),
+        n_global=RANK,
+        rank=rank,
+        young_modulus=vademecum.material.young_modulus,
+        body=_body(rng, rank),
     )
 
 
