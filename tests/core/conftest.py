@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from avatar_core.cli import main as cli
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.geometry.mesh import Regions, TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
@@ -20,6 +22,7 @@ from tests.helpers.elastic_shapes import box_mesh, box_regions
 _FIGURE = "figure"  # property of a test's report: those cross from a worker's process
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
+Command = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="session")
@@ -83,6 +86,18 @@ def figure(request: pytest.FixtureRequest) -> Callable[[str], None]:
         request.node.user_properties.append((_FIGURE, (name, value)))
 
     return report
+
+
+@pytest.fixture
+def avatar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs the command: exit code, output and errors."""
+
+    def call(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["avatar", *map(str, words)])
+        code = cli.main()
+        return code, *capsys.readouterr()
+
+    return call
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -1,4 +1,4 @@
-"""The command: bad input is one clear line and exit code 1, and leaves no file behind."""
+"""The command: bad input is one clear line and exit code 1, and nothing is lost or in vain."""
 
 from __future__ import annotations
 
@@ -6,22 +6,30 @@ import json
 import os
 import re
 import signal
+import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
 import nrrd
 import numpy as np
 import pytest
 import typer
 
+from avatar_core.atlas.patient import _timed
 from avatar_core.cli import main as cli
+from avatar_core.cli.timings import StageClock, require_timings, show_timings
 from avatar_core.cli.vademecum import _read_tumour, read_organ
+from avatar_core.common.processes import ModuleProcess
+from avatar_core.errors import AvatarError, StorageError
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.vademecum.storage import load_vademecum
+from tests.core.conftest import Command
 
 TRIANGLE = "v 0 0 0\nv 100 0 0\nv 0 100 0\n"
 
@@ -43,6 +51,20 @@ def phantom_file(folder: Path, scale: float = 1e3) -> Path:
     return write_obj(folder / "liver.obj", liver.vertices * scale, liver.faces)
 
 
+@pytest.fixture
+def refused(avatar: Command, tmp_path: Path) -> Callable[[list[object], str], None]:
+    """Builds with some arguments, which is refused in one line and leaves nothing behind."""
+
+    def check(arguments: list[object], remedy: str) -> None:
+        before = set(tmp_path.iterdir())
+        code, _, err = avatar("vademecum", *arguments, "-o", tmp_path / "v.h5")
+        (line,) = [line for line in err.splitlines() if line.startswith("avatar:")]
+        assert code == 1 and remedy in line
+        assert set(tmp_path.iterdir()) == before
+
+    return check
+
+
 @pytest.mark.parametrize(
     ("content", "remedy"),
     [
@@ -53,37 +75,24 @@ def phantom_file(folder: Path, scale: float = 1e3) -> Path:
     ],
     ids=["missing", "empty", "two triangles", "NaN"],
 )
-def test_bad_surface(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    content: str | None,
-    remedy: str,
-) -> None:
+def test_bad_surface(refused: Any, tmp_path: Path, content: str | None, remedy: str) -> None:
     source = tmp_path / "organ.obj"
     if content is not None:
         source.write_text(content)
-    refused(monkeypatch, capsys, tmp_path, [source], remedy)
+    refused([source], remedy)
 
 
-def test_open_surface(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_open_surface(refused: Any, tmp_path: Path) -> None:
     liver = phantom_liver(12e-3)
     middle = liver.vertices[liver.faces].mean(axis=1)[:, 0]
     half = liver.faces[middle > np.median(middle)]
     source = write_obj(tmp_path / "half.obj", liver.vertices * 1e3, half)
-    refused(monkeypatch, capsys, tmp_path, [source], "open")
+    refused([source], "open")
 
 
 @pytest.mark.parametrize("scale", [1e4, 10.0], ids=["too large", "too small"])
-def test_wrong_unit(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    scale: float,
-) -> None:
-    refused(monkeypatch, capsys, tmp_path, [phantom_file(tmp_path, scale)], "unit")
+def test_wrong_unit(refused: Any, tmp_path: Path, scale: float) -> None:
+    refused([phantom_file(tmp_path, scale)], "unit")
 
 
 @pytest.mark.parametrize(
@@ -113,16 +122,10 @@ def test_wrong_unit(
         (["--contact-sites", "3", "--material", "neo-hookean"], "one linear material"),
     ],
 )
-def test_bad_option(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    options: list[str],
-    remedy: str,
-) -> None:
+def test_bad_option(refused: Any, tmp_path: Path, options: list[str], remedy: str) -> None:
     source = phantom_file(tmp_path)
     small = [] if "--vertices" in options else ["--vertices", "800"]
-    refused(monkeypatch, capsys, tmp_path, [source, *small, *options], remedy)
+    refused([source, *small, *options], remedy)
 
 
 @pytest.mark.parametrize(
@@ -160,43 +163,37 @@ def test_a_tumour_in_a_label_map_lies_where_its_voxels_do(tmp_path: Path) -> Non
 
 @pytest.mark.long
 def test_tolerance_out_of_reach_is_written_and_marked(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    avatar: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(loads, "MIDPOINTS_FROM", 1.0)  # fewer load positions
     file = tmp_path / "v.h5"
     options = ["--vertices", "400", "--modes", "6", "--tolerance", "0.001", "--certify", "5"]
-    assert run(monkeypatch, "vademecum", phantom_file(tmp_path), "-o", file, *options) == 3
-    assert "not converged" in capsys.readouterr().err
-    assert run(monkeypatch, "show", file, "--json") == 0
-    shown = json.loads(capsys.readouterr().out)
+    code, _, err = avatar("vademecum", phantom_file(tmp_path), "-o", file, *options)
+    assert code == 3 and "not converged" in err
+    code, out, _ = avatar("show", file, "--json")
+    shown = json.loads(out)
     assert shown["converged"] is False
     wanted = {"l2_mean", "l2_worst", "contact_mean", "contact_worst"}
     assert wanted | {"modes", "build_cpu_seconds", "bytes"} <= set(shown["certificate"])
     assert shown["certificate"]["build_cpu_seconds"] > 0
 
 
-def test_show_refuses_what_is_no_vademecum(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_show_refuses_what_is_no_vademecum(avatar: Command, tmp_path: Path) -> None:
     (tmp_path / "x.h5").write_bytes(b"nothing")
-    assert run(monkeypatch, "show", tmp_path / "x.h5") == 1
-    assert run(monkeypatch, "show", tmp_path / "y.h5") == 1
-    assert len(capsys.readouterr().err.strip().splitlines()) == 2
+    for name in ("x.h5", "y.h5"):
+        code, _, err = avatar("show", tmp_path / name)
+        assert code == 1 and err.count("\n") == 1
 
 
-def test_unknown_option_is_a_usage_error(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, "show", "--colour") == 2
-    assert "--colour" in capsys.readouterr().err
+def test_unknown_option_is_a_usage_error(avatar: Command) -> None:
+    code, _, err = avatar("show", "--colour")
+    assert code == 2 and "--colour" in err
 
 
 @pytest.mark.parametrize("command", [[], ["vademecum"], ["show"], ["demo"], ["bench", "step"]])
-def test_help(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: list[str]
-) -> None:
-    assert run(monkeypatch, *command, "--help") == 0
-    assert "Usage" in capsys.readouterr().out
+def test_help(avatar: Command, command: list[str]) -> None:
+    code, out, _ = avatar(*command, "--help")
+    assert code == 0 and "Usage" in out
 
 
 def commands(group: Any, *words: str) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -208,13 +205,12 @@ def commands(group: Any, *words: str) -> Iterator[tuple[tuple[str, ...], Any]]:
             yield (*words, name), command
 
 
-def test_help_shows_every_unit(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_shows_every_unit(avatar: Command) -> None:
     n_metres = 0
     for words, command in commands(typer.main.get_command(cli.app)):
-        assert run(monkeypatch, *words, "--help") == 0
-        shown = " ".join(capsys.readouterr().out.split())
+        code, out, _ = avatar(*words, "--help")
+        assert code == 0
+        shown = " ".join(out.split())
         for parameter in command.params:
             units = re.findall(r"\[[^\]]+\]", parameter.help or "")
             n_metres += units.count("[m]")
@@ -224,24 +220,8 @@ def test_help_shows_every_unit(
     assert n_metres >= 5  # of vademecum, atlas create and export
 
 
-def refused(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    folder: Path,
-    arguments: list[object],
-    remedy: str,
-) -> None:
-    before = set(folder.iterdir())
-    code = run(monkeypatch, "vademecum", *arguments, "-o", folder / "v.h5")
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("avatar:")]
-    assert code == 1
-    assert len(lines) == 1
-    assert remedy in lines[0]
-    assert set(folder.iterdir()) == before
-
-
 def test_ctrl_c_is_said_and_leaves_nothing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    avatar: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def meshed_then_stopped(*_: object) -> None:
         tetrahedralize(phantom_liver(12e-3), 800)  # a library in there takes the signal for itself
@@ -253,8 +233,222 @@ def test_ctrl_c_is_said_and_leaves_nothing(
     # a shell starts what runs in the background with the signal ignored
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        assert run(monkeypatch, "vademecum", source, "-o", tmp_path / "liver.h5") == 130
+        code, _, err = avatar("vademecum", source, "-o", tmp_path / "liver.h5")
     finally:
         signal.signal(signal.SIGINT, before)
-    assert capsys.readouterr().err.splitlines()[-1].startswith("avatar: stopped")
+    assert code == 130 and err.splitlines()[-1].startswith("avatar: stopped")
     assert list(tmp_path.iterdir()) == [source]
+
+
+# --- Where commands write -------------------------------------------------------------------------
+
+
+BUILDS = (
+    "avatar_core.pipeline.build",
+    "avatar_core.geometry.surface.read_surface",
+    "avatar_core.geometry.tumour.read_tumour",
+    "avatar_core.atlas.storage.load_atlas",
+    "avatar_core.atlas.growth.create_atlas",
+    "avatar_core.scene.export.export",
+    "avatar_core.vademecum.storage.load_vademecum",
+    "avatar_core.studies.bench.step.run_step_bench",
+    "avatar_core.studies.bench.effects.build_for_effects",
+)
+
+
+@pytest.fixture
+def nothing_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def begun(*_: object, **__: object) -> None:
+        raise AvatarError("begun")
+
+    for name in BUILDS:
+        monkeypatch.setattr(name, begun)
+    monkeypatch.setattr(cli, "require_ros", lambda: None)
+
+
+@pytest.fixture
+def said(  # type: ignore[no-untyped-def]
+    nothing_is_computed: None, avatar: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Runs a command in a folder with one file of each kind, which stay as they are."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("liver.obj", "tumour.obj", "groups.npz", "text.h5"):
+        Path(name).write_text(name)
+    for name, format_ in (
+        ("v.h5", "avatar vademecum"),
+        ("atlas.h5", "avatar atlas"),
+        ("foreign.h5", "something else"),
+    ):
+        with h5py.File(name, "w") as file:
+            file.attrs["format"] = format_
+    Path("folder.h5").mkdir()
+    Path("link.h5").symlink_to("liver.obj")
+    os.link("tumour.obj", "hard.h5")
+    Path("link.json").symlink_to("liver.obj")
+    Path("link.vtu").symlink_to("v.h5")
+    Path("gone.h5").symlink_to("nowhere")
+    Path("old.vtu").write_text("<VTKFile/>")
+    Path("old.json").write_text("{}")
+    before = _contents(tmp_path)
+
+    def run(command: str) -> str:
+        code, _, err = avatar(*command.split())
+        assert code == 1 and _contents(tmp_path) == before
+        return err.splitlines()[-1].removeprefix("avatar: ")
+
+    return run
+
+
+def _contents(folder: Path) -> dict[str, bytes | None]:
+    return {path.name: path.read_bytes() if path.is_file() else None for path in folder.iterdir()}
+
+
+ORGAN = "vademecum liver.obj --tumour tumour.obj --groups groups.npz -o"
+PATIENT = "patient liver.obj --atlas atlas.h5 -o"
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        (f"{ORGAN} liver.obj", "choose .h5"),
+        (f"{ORGAN} out", "choose .h5"),
+        (f"{ORGAN} link.h5", "link.h5 is also read (liver.obj)"),
+        (f"{ORGAN} link.h5 --overwrite", "is also read"),
+        (f"{ORGAN} ../{{here}}/hard.h5", "is also read (tumour.obj)"),
+        (f"{ORGAN} folder.h5", "is a folder"),
+        (f"{ORGAN} folder.h5 --overwrite", "is a folder"),
+        (f"{ORGAN} no/v.h5", "create it first"),
+        (f"{ORGAN} text.h5", "--overwrite"),
+        (f"{ORGAN} foreign.h5", "--overwrite"),
+        (f"{ORGAN} gone.h5", "--overwrite"),
+        (f"{ORGAN} atlas.h5", "no vademecum"),
+        (f"{PATIENT} atlas.h5 --overwrite", "is also read (atlas.h5)"),
+        (f"{PATIENT} ./atlas.h5", "is also read (atlas.h5)"),
+        (f"{PATIENT} liver.obj", "choose .h5"),
+        (f"{PATIENT} link.h5", "is also read (liver.obj)"),
+        (f"{PATIENT} text.h5", "--overwrite"),
+        (f"{PATIENT} folder.h5", "is a folder"),
+        ("atlas create a.obj liver.obj", "choose .h5"),
+        ("atlas create no/a.h5 liver.obj", "create it first"),
+        ("atlas create folder.h5 liver.obj", "is a folder"),
+        ("atlas create link.h5 liver.obj", "is also read"),
+        ("export v.h5 -o v.h5", "choose .vtu or .xdmf"),
+        ("export v.h5 -o link.vtu", "is also read (v.h5)"),
+        ("export v.h5 -o no/v.vtu", "create it first"),
+        ("bench step liver.obj -o liver.obj", "choose .json"),
+        ("bench step liver.obj -o link.json", "is also read (liver.obj)"),
+        ("bench effects liver.obj -o no/e.json", "create it first"),
+        ("bench cell liver.obj -o liver.obj", "choose .json"),
+        ("demo -o demo", "choose .png"),
+        ("demo -o no/demo.png", "create it first"),
+    ],
+)
+def test_refused_before_anything_is_computed(said, tmp_path, command, reason):  # type: ignore[no-untyped-def]
+    assert reason in said(command.format(here=tmp_path.name))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        f"{ORGAN} new.h5",
+        f"{ORGAN} v.h5",
+        f"{ORGAN} text.h5 --overwrite",
+        f"{ORGAN} gone.h5 --overwrite",
+        f"{PATIENT} new.h5",
+        f"{PATIENT} v.h5",
+        f"{PATIENT} text.h5 --overwrite",
+        "atlas create new.h5 liver.obj",
+        "export v.h5 -o new.xdmf",
+        "export v.h5 -o old.vtu",
+        "bench step liver.obj -o old.json",
+        "demo -o new.png --vertices 500",
+    ],
+)
+def test_what_may_be_written_is_begun(said, command):  # type: ignore[no-untyped-def]
+    assert said(command) == "begun"
+
+
+@pytest.mark.parametrize(
+    "command", [f"{ORGAN} new.h5", f"{PATIENT} new.h5", "export v.h5 -o a.vtu"]
+)
+def test_a_read_only_folder_is_refused(said, monkeypatch, command):  # type: ignore[no-untyped-def]
+    # asked of os.access, because the superuser may write anywhere
+    monkeypatch.setattr(os, "access", lambda _, mode, **__: not mode & os.W_OK)
+    assert "cannot be written to" in said(command)
+
+
+# --- What a command says about its time -----------------------------------------------------------
+
+
+BUSY = "import time\nwhile time.process_time() < 0.4: pass"
+
+
+def test_each_second_goes_to_the_stage_it_was_spent_in(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = StageClock()
+    clock.begin("asleep")
+    time.sleep(0.3)
+    clock.begin("child")
+    subprocess.run([sys.executable, "-S", "-c", BUSY], check=True)
+    clock.begin("asleep")
+    file = tmp_path / "times.json"
+    show_timings(clock, file)
+    stages = {one.stage: one for one in clock.stages}
+    assert list(stages) == ["start", "asleep", "child"]
+    assert stages["asleep"].seconds > 0.29 > 0.2 > stages["asleep"].cpu_seconds
+    assert stages["child"].cpu_seconds > 0.35
+    assert json.loads(file.read_text()) == [vars(one) for one in clock.stages]
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5
+    assert lines[-1].split()[:2] == ["all", f"{sum(s.cpu_seconds for s in clock.stages):.2f}"]
+
+
+def test_stages_of_a_patient_count_their_processes() -> None:
+    clock: dict[str, float] = {}
+    with _timed(clock, "mesh"):
+        subprocess.run([sys.executable, "-S", "-c", BUSY], check=True)
+    assert clock["mesh"] > 0.35
+
+
+def test_reports_pass_through_and_set_the_stage() -> None:
+    heard: list[tuple[str, float, float]] = []
+    clock = StageClock()
+    report = clock.following(lambda *news: heard.append(news))
+    report("mesh", 0.0, 0.5)
+    report("mesh", 1.0, 0.5)
+    report("solve", 0.0, 0.5)
+    assert heard == [("mesh", 0.0, 0.5), ("mesh", 1.0, 0.5), ("solve", 0.0, 0.5)]
+    assert [one.stage for one in clock.stages] == ["start", "mesh"]
+
+
+def test_a_file_that_cannot_be_written_is_refused_first(tmp_path: Path) -> None:
+    require_timings(None)
+    for file in (tmp_path / "times.txt", tmp_path / "missing" / "times.json"):
+        with pytest.raises(StorageError, match=r"choose|create"):
+            require_timings(file)
+
+
+# --- The same file gives the same vademecum -------------------------------------------------------
+
+
+@pytest.mark.long
+def test_the_same_surface_gives_the_same_vademecum(livers_dir: Path, tmp_path: Path) -> None:
+    """On one thread and on two, each in a process of its own: bit for bit but for times."""
+    built = [tmp_path / f"{n}.h5" for n in (1, 2)]
+    processes = [
+        ModuleProcess(
+            "avatar_core.cli.main",
+            *("vademecum", str(livers_dir / "LiTS-4.obj"), "-o", str(path)),
+            *("--vertices", "600", "--certify", "10"),
+            n_threads=n,
+            environment={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        for n, path in enumerate(built, start=1)
+    ]
+    assert [process.wait() for process in processes] == [0, 0]
+    one, other = map(load_vademecum, built)
+    assert one.id == other.id
+    assert one.certificate is not None
+    assert other.certificate is not None
+    assert one.certificate.l2_mean == other.certificate.l2_mean

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from avatar_core.cli import main as cli
 from avatar_core.common import files
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.effects import Respiration
@@ -26,21 +25,16 @@ from avatar_core.studies.bench.scene import DEPTH, PUSH, StepCost, _prepared, ti
 from avatar_core.vademecum import storage
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
+from tests.core.conftest import Command
 from tests.helpers.paths import PARAMS
 
 SCENES = PARAMS / "scenes"
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+def run(avatar: Command) -> Any:
     """Runs ``avatar scene ...``: exit code, output, errors."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["avatar", "scene", *map(str, arguments)])
-        code = cli.main()
-        return code, *capsys.readouterr()
-
-    return call
+    return partial(avatar, "scene")
 
 
 @pytest.fixture(scope="module")

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from avatar_core.cli import main as cli
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import LoadError
 from avatar_core.fem.patch_loads import SurfacePoint
@@ -20,6 +20,7 @@ from avatar_core.geometry.tumour import read_tumour
 from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
+from tests.core.conftest import Command
 
 
 @pytest.fixture(scope="module")
@@ -29,18 +30,19 @@ def file(straight: Vademecum, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["avatar", "export", *map(str, arguments)])
-    return cli.main()
+@pytest.fixture
+def run(avatar: Command) -> Any:
+    """Runs ``avatar export ...``: exit code, output and errors."""
+    return partial(avatar, "export")
 
 
 @pytest.mark.parametrize("suffix", [".vtu", ".xdmf"])
 def test_the_file_holds_mesh_modes_and_displacement(
-    monkeypatch: pytest.MonkeyPatch, straight: Vademecum, file: Path, suffix: str
+    run: Any, straight: Vademecum, file: Path, suffix: str
 ) -> None:
     before = file.read_bytes()
     output = file.with_suffix(suffix)
-    assert run(monkeypatch, file, "-o", output, "--modes", 3, "--force", "0.5,-2,1") == 0
+    assert run(file, "-o", output, "--modes", 3, "--force", "0.5,-2,1")[0] == 0
     read = meshio.read(output)
     np.testing.assert_array_equal(read.points, straight.mesh.vertices)
     np.testing.assert_array_equal(read.cells_dict["tetra"], straight.mesh.tets)
@@ -125,48 +127,34 @@ def test_a_load_that_makes_no_sense_is_refused(
     ],
 )
 def test_bad_options_are_one_line(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    file: Path,
-    tmp_path: Path,
-    options: list[str],
-    reason: str,
+    run: Any, file: Path, tmp_path: Path, options: list[str], reason: str
 ) -> None:
-    assert run(monkeypatch, file, "-o", tmp_path / "out.vtu", *options) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert reason in line
+    code, _, err = run(file, "-o", tmp_path / "out.vtu", *options)
+    assert code == 1 and reason in err and err.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
 def test_point_and_force_are_written_alike(
-    monkeypatch: pytest.MonkeyPatch, straight: Vademecum, file: Path, tmp_path: Path
+    run: Any, straight: Vademecum, file: Path, tmp_path: Path
 ) -> None:
     place = straight.surface.centers[-1]
     point, output = ",".join(map(repr, place.tolist())), tmp_path / "out.vtu"
-    assert run(monkeypatch, file, "-o", output, "--at", point, "--force", "0,0,-2") == 0
+    assert run(file, "-o", output, "--at", point, "--force", "0,0,-2")[0] == 0
     expected = straight.displacement_at(place, [0.0, 0.0, -2.0])
     np.testing.assert_allclose(
         meshio.read(output).point_data["displacement [m]"], expected, atol=1e-12
     )
 
 
-def test_another_suffix_is_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], file: Path, tmp_path: Path
-) -> None:
-    assert run(monkeypatch, file, "-o", tmp_path / "out.ply") == 1
-    assert "choose .vtu or .xdmf or .stl or .obj or .vtp" in capsys.readouterr().err
+def test_another_suffix_is_refused(run: Any, file: Path, tmp_path: Path) -> None:
+    code, _, err = run(file, "-o", tmp_path / "out.ply")
+    assert code == 1 and "choose .vtu or .xdmf or .stl or .obj or .vtp" in err
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".obj", ".vtp"])
 @pytest.mark.parametrize(("unit", "axes"), [("mm", "LPS"), ("m", "RAS")])
 def test_a_surface_comes_back_to_its_place(
-    monkeypatch: pytest.MonkeyPatch,
-    straight: Vademecum,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    suffix: str,
-    unit: str,
-    axes: str,
+    run: Any, straight: Vademecum, tmp_path: Path, suffix: str, unit: str, axes: str
 ) -> None:
     """As Slicer writes it: the header states the axes, which our reader honours."""
     centre = straight.mesh.vertices.mean(axis=0)
@@ -177,9 +165,8 @@ def test_a_surface_comes_back_to_its_place(
     save_vademecum(sick, tmp_path / "sick.h5")
     output = tmp_path / f"liver{suffix}"
     options = ("--force", "3", "--unit", unit, "--axes", axes)
-    assert run(monkeypatch, tmp_path / "sick.h5", "-o", output, *options) == 0
-    said = capsys.readouterr().out
-    assert f"in {unit} and {axes}" in said and "off in the mean" in said
+    code, said, _ = run(tmp_path / "sick.h5", "-o", output, *options)
+    assert code == 0 and f"in {unit} and {axes}" in said and "off in the mean" in said
     read = read_surface(output, unit=unit)
     u = straight.displacement_at(middle(straight).point, 3.0)
     moved = mesh.vertices[mesh.surface_vertices] + u[mesh.surface_vertices]
@@ -193,26 +180,19 @@ def test_a_surface_comes_back_to_its_place(
     assert cKDTree(inside.vertices).query(exact)[0].max() < 2e-8
 
 
-def test_a_force_beyond_all_bounds_is_warned_of(
-    monkeypatch: pytest.MonkeyPatch, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, file, "-o", tmp_path / "far.stl", "--force", "2000") == 0
-    assert "farther than the 25 mm" in capsys.readouterr().err
-    assert run(monkeypatch, file, "-o", tmp_path / "near.stl", "--force", "0.1") == 0
-    assert capsys.readouterr().err == ""
+def test_a_force_beyond_all_bounds_is_warned_of(run: Any, file: Path, tmp_path: Path) -> None:
+    code, _, err = run(file, "-o", tmp_path / "far.stl", "--force", "2000")
+    assert code == 0 and "farther than the 25 mm" in err
+    code, _, err = run(file, "-o", tmp_path / "near.stl", "--force", "0.1")
+    assert code == 0 and err == ""
 
 
 @pytest.mark.parametrize(
     ("options", "reason"), [(["--unit", "inch"], "m, cm, mm"), (["--axes", "RSP"], "LPS or RAS")]
 )
 def test_units_and_axes_that_nobody_reads_are_refused(
-    monkeypatch: pytest.MonkeyPatch,
-    file: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    options: list[str],
-    reason: str,
+    run: Any, file: Path, tmp_path: Path, options: list[str], reason: str
 ) -> None:
-    assert run(monkeypatch, file, "-o", tmp_path / "liver.stl", *options) != 0
-    assert reason in capsys.readouterr().err
+    code, _, err = run(file, "-o", tmp_path / "liver.stl", *options)
+    assert code != 0 and reason in err
     assert not list(tmp_path.iterdir())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,6 @@ import h5py
 import numpy as np
 import pytest
 
-from avatar_core.cli import main as cli
 from avatar_core.contact import model as contact
 from avatar_core.contact.effects import Effect, Friction, Respiration, Viscoelasticity
 from avatar_core.contact.effects.selection import default_effects
@@ -25,6 +23,7 @@ from avatar_core.scene.recording import Clouds, Periods, Recording, load_recordi
 from avatar_core.scene.replay import replay
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.core.conftest import Command
 
 RADIUS = 5e-3
 SPHERE = Tip("sphere", RADIUS)
@@ -137,30 +136,22 @@ def test_breath_is_never_known(organ: Vademecum) -> None:
     assert not replay(recorded(organ, (Respiration(),)), organ).known.any()
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["avatar", "replay", *map(str, arguments)])
-    return cli.main()
-
-
 def test_the_command_says_how_far_forces_differ(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    straight: Vademecum,
-    tmp_path: Path,
+    avatar: Command, straight: Vademecum, tmp_path: Path
 ) -> None:
     organ = stored(straight, tmp_path)
     file, made = tmp_path / "push.h5", recorded(organ, ())
+    given = ("replay", file, "--vademecum", tmp_path / "liver.h5")
     save_recording(made, file)
-    given = (file, "--vademecum", tmp_path / "liver.h5")
-    assert run(monkeypatch, *given) == 0
-    assert "largest difference 0.00e+00 N" in capsys.readouterr().out
+    code, out, _ = avatar(*given)
+    assert code == 0 and "largest difference 0.00e+00 N" in out
     made.periods.force[500] += 1e-6
     save_recording(made, file)
-    assert run(monkeypatch, *given) == 1
-    assert "forces differ by 1.73e-06 N" in capsys.readouterr().err
+    code, _, err = avatar(*given)
+    assert code == 1 and "forces differ by 1.73e-06 N" in err
     save_recording(recorded(organ, (Respiration(),)), file)
-    assert run(monkeypatch, *given) == 1
-    assert "record without respiration" in capsys.readouterr().err
+    code, _, err = avatar(*given)
+    assert code == 1 and "record without respiration" in err
 
 
 def test_another_vademecum_is_refused(organ: Vademecum) -> None:

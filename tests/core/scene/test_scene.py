@@ -221,7 +221,6 @@ def test_a_combination_that_is_too_wrong_is_refused_with_its_figure(
 def test_what_was_not_measured_is_said_and_not_refused() -> None:
     scene = Scene(effects=(Friction(), LargeDeformationEffect()))
     for unmeasured in (
-        large_organ(),  # files of older versions
         large_organ(oblique_contact_mean=float("nan")),
         heavy_organ(large=SimpleNamespace(certificate=None)),
     ):

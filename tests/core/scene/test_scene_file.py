@@ -1,21 +1,38 @@
-"""YAML of scenes: what it means, what is refused and how it is said."""
+"""YAML of scenes: what it means, what is refused, what is written, and the page about it."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import fields
+import re
+from collections.abc import Iterator
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from avatar_core.contact.effects import EFFECTS, Friction, Inertia, SeveralTools, Tumour
+from avatar_core.contact.effects import (
+    EFFECTS,
+    Effect,
+    Friction,
+    Inertia,
+    SelfWeight,
+    SeveralTools,
+    Tilt,
+    Tumour,
+    Viscoelasticity,
+)
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
-from avatar_core.scene.file import parse_scene, read_scene
-from avatar_core.scene.model import Scene, Tool
+from avatar_core.scene.file import SECTIONS, parse_scene, read_scene, write_scene
+from avatar_core.scene.model import CONFLICTS, Scene, SupportStiffness, Tool
 from avatar_core.scene.yaml_lines import MAX_BYTES
-from tests.helpers.scene_cases import PRONY, refusal
+from tests.helpers.examples import examples
+from tests.helpers.paths import ROOT
+from tests.helpers.scene_cases import PRONY, SHIPPED, refusal
 from tests.helpers.slowness import within
 
 # --- YAML: what it means --------------------------------------------------------------------------
@@ -289,3 +306,274 @@ def test_a_file_in_another_encoding_is_refused_with_its_line(tmp_path: Path) -> 
         read_scene(path)
     path.write_bytes("name: Größe\n".encode("utf-8-sig"))
     assert read_scene(path).name == "Größe"
+
+
+# --- Prony terms from a table beside the scene ----------------------------------------------------
+
+
+def prony_scene(folder: Path, name: str = "prony.csv") -> Path:
+    path = folder / "scene.yaml"
+    path.write_text(f"name: a\neffects:\n  viscoelasticity:\n    file: {name}\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        "0.3,0.5\n0.25,8\n",
+        "g,tau\n0.3,0.5\n0.25,8\n",
+        "\ufeffG [-], tau [s]\r\n0.3 , 0.5\r\n\r\n2.5e-1, 8 # slow\r\n",
+        "# of the order found in literature\ng,tau\n0.3,0.5\n0.25,8",
+    ],
+)
+def test_prony_terms_come_from_a_file_beside_the_scene(tmp_path: Path, table: str) -> None:
+    (tmp_path / "prony.csv").write_bytes(table.encode())
+    scene = read_scene(prony_scene(tmp_path))
+    assert scene.effects == (PRONY,)
+    assert parse_scene(write_scene(scene), "service") == scene  # which has no folder
+
+
+@pytest.mark.parametrize(
+    ("table", "reason"),
+    [
+        ("", "prony.csv:1: holds no term"),
+        ("g,tau\n", "prony.csv:1: holds no term"),
+        ("tau,g\n0.5,0.3\n", "prony.csv:1: g is 'tau'"),
+        ("0.3,0.5\ng,tau\n", "prony.csv:2: g is 'g'"),
+        ("0.3\n", "prony.csv:1: 1 columns"),
+        ("0.3,0.5\n0.3,0.5,1\n", "prony.csv:2: 3 columns"),
+        ("g,tau\n-0.3,0.5\n", "prony.csv:2: g is '-0.3'; it must be a number in 0 to 0.999"),
+        ("g,tau\n0.3,0\n", "prony.csv:2: tau is '0'; it must be a number in 0.001 to 100000 s"),
+        ("0.3,nan\n", "tau is 'nan'"),
+        ("0.3,x\n", "tau is 'x'"),
+        ("0.1,1\n" * 7, "7 g and 7 tau"),
+        pytest.param("#" * MAX_BYTES + "#", "at most 65536", id="long"),
+    ],
+)
+def test_a_bad_table_is_one_line_with_both_places(tmp_path: Path, table: str, reason: str) -> None:
+    (tmp_path / "prony.csv").write_text(table)
+    with pytest.raises(SceneError) as caught:
+        read_scene(prony_scene(tmp_path))
+    assert reason in str(caught.value)
+    line = 3 if "7 g" in reason else 4  # of the effect, where the terms are good one by one
+    assert str(caught.value).startswith(f"{tmp_path}/scene.yaml:{line}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scene_reads_nothing_outside_its_folder(tmp_path: Path) -> None:
+    inside = tmp_path / "scenes"
+    inside.mkdir()
+    outside = tmp_path / "prony.csv"
+    outside.write_text("0.3,0.5\n")
+    (inside / "link.csv").symlink_to(outside)
+    (inside / "loop.csv").symlink_to(inside / "loop.csv")
+    for name in ("../prony.csv", str(outside), "link.csv", "../scenes2/x.csv"):
+        with pytest.raises(SceneError, match=r"scene\.yaml:4: .*in the folder of the scene"):
+            read_scene(prony_scene(inside, name))
+    for name in ("none.csv", "loop.csv"):
+        with pytest.raises(SceneError, match=r"scene\.yaml:4: .*cannot be read"):
+            read_scene(prony_scene(inside, name))
+    with pytest.raises(SceneError, match="is not a file"):
+        read_scene(prony_scene(inside, "."))
+
+
+def test_terms_come_from_one_place(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text("effects:\n  viscoelasticity:\n    g: [0.3]\n    tau: [1]\n    file: p.csv\n")
+    with pytest.raises(SceneError, match=r"scene\.yaml:5: viscoelasticity has file and g, tau"):
+        read_scene(path)
+
+
+# --- What is written reads back -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_a_shipped_scene_reads_and_writes(path: Path) -> None:
+    scene = read_scene(path)
+    assert scene.text
+    assert parse_scene(write_scene(scene), "written") == scene
+
+
+def test_the_shipped_scenes_are_those_and_show_every_effect() -> None:
+    scenes = {path.stem: read_scene(path) for path in SHIPPED}
+    names = {stem: {effect.name for effect in scene.effects} for stem, scene in scenes.items()}
+    assert names == {
+        "palpation": set(),
+        "palpation_large": {"large_deformation"},
+        "needle_probe": {"friction"},
+        "relaxation": {"viscoelasticity"},
+        "two_tools": {"several_tools"},
+        "breathing": {"respiration"},
+        "tumour": {"tumour"},
+        "hanging": {"self_weight"},
+        "release": {"inertia"},
+        "leaning_punch": {"tilt"},
+        # without what excludes large deformation, and what needs another tip
+        "everything": set(EFFECTS) - {"tumour", "tilt"},
+    }
+    assert set().union(*names.values()) == set(EFFECTS)
+    assert scenes["palpation"] == Scene(text=scenes["palpation"].text)
+    assert scenes["needle_probe"].tools[0].tip == Tip("rounded_cone", 4e-3, 30.0, 1.5e-3)
+    assert len({scene.name for scene in scenes.values()}) == len(scenes)
+
+
+def test_numbers_of_numpy_are_written_as_numbers() -> None:
+    scene = Scene(
+        young_modulus=np.float64(1e5), tools=(Tool("a", Tip("sphere", np.float64(5e-3))),)
+    )
+    assert parse_scene(write_scene(scene), "x") == scene
+
+
+def test_a_direction_becomes_a_unit_vector_once() -> None:
+    """What is one already does not change, not in its last digit either."""
+    effect = SelfWeight(direction=(1, 2, 3))
+    np.testing.assert_allclose(effect.direction, np.array([1, 2, 3]) / np.sqrt(14), rtol=1e-15)
+    assert SelfWeight(direction=effect.direction) == effect
+    assert SelfWeight(direction=(0.0, -5e-324, 0.0)).direction == (0.0, -1.0, 0.0)
+
+
+def numbers_of(kind: type[Effect], key: str) -> st.SearchStrategy[Any]:
+    """Numbers in the range of a field; directions of any length, None where it is a default."""
+    (field,) = (f for f in fields(kind) if f.name == key)
+    allowed = field.metadata["quantity"]
+    number = st.floats(allowed.low, allowed.high)
+    if key in ("axis", "direction"):
+        return st.tuples(number, number, number).filter(any)
+    if key == "dwell":
+        return st.integers(allowed.low, allowed.high)
+    return number | st.none() if field.default is None else number
+
+
+def made(kind: type[Effect]) -> st.SearchStrategy[Effect]:
+    if kind is Viscoelasticity:
+        terms = st.tuples(st.floats(0.0, 0.16), numbers_of(kind, "tau"))
+        columns = st.lists(terms, min_size=1, max_size=6).map(lambda rows: zip(*rows, strict=True))
+        return columns.map(lambda pair: Viscoelasticity(*pair))
+    settings_of = st.fixed_dictionaries(
+        {f.name: numbers_of(kind, f.name) for f in fields(kind) if f.name != "kinetic"}
+    )
+    if kind is Friction:
+        return settings_of.map(lambda one: Friction(**one, kinetic=one["static"]))
+    return settings_of.map(lambda one: kind(**one))
+
+
+LINES = st.text(max_size=40).filter(str.isprintable)
+RADII = st.floats(1e-3, 20e-3)
+ANGLES = st.floats(10.0, 85.0)
+TIPS = st.one_of(
+    st.builds(Tip, st.sampled_from(["sphere", "flat", "patch"]), RADII),
+    st.builds(Tip, st.just("cone"), RADII, ANGLES),
+    st.builds(Tip, st.just("rounded_cone"), RADII, ANGLES, st.floats(2e-4, 1e-3)),
+)
+TOOL_NAMES = st.from_regex(r"[a-z][a-z0-9]{0,5}(/[A-Z][a-z]_[0-9])?", fullmatch=True)
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Scene:
+    names = draw(st.lists(TOOL_NAMES, min_size=1, max_size=8, unique=True))
+    kinds = draw(st.lists(st.sampled_from(list(EFFECTS.values())), unique=True))
+    for one, other, _ in CONFLICTS:
+        if EFFECTS[one] in kinds and EFFECTS[other] in kinds:
+            kinds.remove(EFFECTS[draw(st.sampled_from([one, other]))])
+    if len(names) > 1 and SeveralTools not in kinds:
+        kinds.append(SeveralTools)
+    tips = [draw(TIPS) for _ in names]
+    if Tilt in kinds:
+        tips[0] = Tip("flat", draw(RADII))
+    return Scene(
+        name=draw(LINES.filter(bool)),
+        text=draw(LINES),
+        vademecum=draw(LINES),
+        young_modulus=draw(st.none() | st.floats(1.0, 1e8)),
+        poisson_ratio=draw(st.none() | st.floats(0.0, 0.4999)),
+        tools=tuple(Tool(name, tip) for name, tip in zip(names, tips, strict=True)),
+        cloud=draw(st.sampled_from(["surface", "volume", "off"])),
+        cloud_divisor=draw(st.integers(1, 1000)),
+        modes=draw(st.none() | st.integers(1, 100_000)),
+        effects=tuple(draw(made(kind)) for kind in kinds),
+    )
+
+
+@given(scenes())
+@examples(80)
+def test_any_scene_reads_back_equal(scene: Scene) -> None:
+    assert parse_scene(write_scene(scene), "written") == scene
+
+
+@given(st.text(alphabet="nametxtol: {}[],-&*!|>'\"#%\n\t0.5efriction_", max_size=80))
+@examples(150)
+def test_no_text_raises_anything_but_a_scene_error_of_one_line(text: str) -> None:
+    try:
+        parse_scene(text, "x")
+    except SceneError as error:
+        assert str(error).startswith("x:")
+        assert "\n" not in str(error)
+
+
+# --- The page has every key, with the unit, range and default of the code -------------------------
+
+
+PAGE = (ROOT / "msg_docs" / "scenes.md").read_text()
+WORDS = {"the vademecum's", "none", "all"}  # of a default that is None
+
+
+def rows() -> dict[str, list[str]]:
+    """Unit, range and default by key."""
+    found = {}
+    for line in PAGE.splitlines():
+        if line.startswith("| `"):
+            key, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+            found[key.strip("`")] = cells[:3]
+    return found
+
+
+def keys() -> Iterator[tuple[str, Field[Any] | None]]:
+    """All that a scene file may hold, by path."""
+    section = {name: group for group, names in SECTIONS.items() for name in names}
+    for each in fields(Scene):
+        if each.name not in ("tools", "effects"):
+            group = section.get(each.name)
+            yield f"{group}.{each.name}" if group else each.name, each
+    yield "tools", None
+    for each in fields(Tool):
+        if each.name != "tip":
+            yield f"tools.{each.name}", each
+    for each in fields(Tip):
+        yield f"tools.tip.{each.name}", each
+    for name, effect in EFFECTS.items():
+        yield name, None
+        for each in fields(effect):
+            yield f"{name}.{each.name}", each
+    yield "viscoelasticity.file", None
+
+
+@pytest.mark.parametrize(("key", "item"), [*keys()], ids=lambda value: value if value else "")
+def test_a_key_is_as_the_page_says(key: str, item: Field[Any] | None) -> None:
+    unit, span, default = rows()[key]
+    if item is None:
+        return
+    of_supports = next(f for f in fields(SupportStiffness) if f.name == "stiffness")
+    number = of_supports if key == "material.supports" else item
+    if "quantity" in number.metadata:
+        allowed = number.metadata["quantity"]
+        assert (unit, span) == (allowed.unit, f"{allowed.low:g} to {allowed.high:g}")
+    if item.default is MISSING:
+        assert default in ("required", "") or key.endswith(".name")
+    elif item.default is None or item.default == ():
+        assert default in WORDS
+    elif isinstance(item.default, tuple):
+        assert default == str([round(value) for value in item.default])
+    elif isinstance(item.default, float):
+        assert default == f"{item.default:g}"
+    else:
+        assert default == (str(item.default) or "(empty)")
+
+
+def test_there_is_no_other_key() -> None:
+    assert set(rows()) == {key for key, _ in keys()}
+
+
+def test_its_example_is_a_scene() -> None:
+    (text,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+    scene = parse_scene(text, "page")
+    assert {effect.name for effect in scene.effects} == {"friction", "respiration", "several_tools"}

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import sys
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from avatar_core.cli.main import main
 from avatar_core.errors import ContactError, CoordinateError, StorageError
 from avatar_core.scene.recording import save_recording
 from avatar_core.uncertainty import material_grid
@@ -31,11 +29,13 @@ from avatar_core.uncertainty.distributions import (
     Uniform,
     read_distributions,
 )
+from avatar_core.uncertainty.fit_check import chance, local_chance, normal_scores
 from avatar_core.uncertainty.palpation import N_SAMPLES, Palpation, palpation_of
 from avatar_core.uncertainty.priors import YOUNG, priors_of
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
+from tests.core.conftest import Command
 from tests.helpers.soft_organ import organ_on_springs, soft_organ
 from tests.helpers.touches import SPHERE, felt, path_over, recording_of
 
@@ -248,34 +248,24 @@ def liver(organ: Vademecum, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(
+    avatar: Command,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
     liver: Path,
     organ: Vademecum,
     tips: np.ndarray,
     forces: np.ndarray,
-) -> Callable[..., tuple[int, str]]:
-    """Runs ``avatar calibrate liver.h5 --recording push.h5 ...``: exit code and what was said."""
+) -> Command:
+    """Runs ``avatar calibrate liver.h5 --recording ...``: exit code, output and errors."""
     monkeypatch.setattr(material_grid, "N_POINTS", 3)
     os.link(liver, tmp_path / "liver.h5")
     save_recording(recording_of(organ, tips, forces), tmp_path / "push.h5")
-
-    def call(*arguments: str, recording: str = "push.h5") -> tuple[int, str]:
-        monkeypatch.chdir(tmp_path)
-        words = ["avatar", "calibrate", "liver.h5", "--recording", recording, *arguments]
-        monkeypatch.setattr(sys, "argv", words)
-        code = main()
-        said = capsys.readouterr()
-        return code, said.out + said.err
-
-    return call
+    monkeypatch.chdir(tmp_path)
+    return partial(avatar, "calibrate", "liver.h5", "--recording")
 
 
-def test_the_command_says_and_writes_what_was_found(
-    run: Callable[..., tuple[int, str]], tmp_path: Path
-) -> None:
-    code, said = run("-o", "found.yaml", "-o", "found.json", "-o", "found.png")
+def test_the_command_says_and_writes_what_was_found(run: Command, tmp_path: Path) -> None:
+    code, said, _ = run("push.h5", "-o", "found.yaml", "-o", "found.json", "-o", "found.png")
     assert code == 0
     assert "8 touches" in said and "the fit is good" in said
     assert "which the cell computed" in said or "that the cell computed" in said
@@ -290,17 +280,14 @@ def test_the_command_says_and_writes_what_was_found(
 
 
 def test_the_command_calls_a_wrong_model_wrong(
-    run: Callable[..., tuple[int, str]],
-    organ: Vademecum,
-    tips: np.ndarray,
-    forces: np.ndarray,
-    tmp_path: Path,
+    run: Command, organ: Vademecum, tips: np.ndarray, forces: np.ndarray, tmp_path: Path
 ) -> None:
     """Some places are four times as hard, which no material of one organ is."""
     hard = forces.copy()
     hard[: len(hard) // 3] *= 4.0
     save_recording(recording_of(organ, tips, hard), tmp_path / "hard.h5")
-    code, said = run("-o", "found.json", recording="hard.h5")
+    code, out, err = run("hard.h5", "-o", "found.json")
+    said = out + err
     assert code == 3
     assert "NOT EXPLAINED" in said and "do not use these values" in said
     assert json.loads((tmp_path / "found.json").read_text())["explained"] is False
@@ -319,11 +306,11 @@ def test_the_command_calls_a_wrong_model_wrong(
     ],
 )
 def test_the_command_refuses_in_a_line(
-    run: Callable[..., tuple[int, str]], arguments: tuple[str, ...], reason: str
+    run: Command, arguments: tuple[str, ...], reason: str
 ) -> None:
-    code, said = run(*arguments)
+    code, out, err = run("push.h5", *arguments)
     assert code == 1
-    assert reason in said and said.count("\n") == 1
+    assert reason in err and (out + err).count("\n") == 1
 
 
 def test_a_palpation_keeps_whole_touches(tips: np.ndarray, forces: np.ndarray) -> None:
@@ -333,3 +320,72 @@ def test_a_palpation_keeps_whole_touches(tips: np.ndarray, forces: np.ndarray) -
     some: Palpation = found.where(kept)
     assert some.n_touches == N_TOUCHES - 2
     np.testing.assert_array_equal(some.tip[some.touch == 0], found.tip[found.touch == 1])
+
+
+# --- The check of fit -----------------------------------------------------------------------------
+
+
+N = 25
+FREEDOM = 4.0
+SOFTER = np.ones((N, 1))  # what Young's modulus does: all touches alike
+
+
+@pytest.fixture(scope="module")
+def places() -> np.ndarray:
+    """A square of touches 20 mm apart."""
+    across = 20e-3 * np.arange(5)
+    flat = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
+    return np.c_[flat, np.zeros(N)]
+
+
+@pytest.fixture(scope="module")
+def bump(places: np.ndarray) -> np.ndarray:
+    """The middle touch and its four neighbours deviate to one side."""
+    over = np.linalg.norm(places - places[12], axis=1) < 25e-3
+    return np.where(over, 1.8, -0.45)
+
+
+def test_touches_that_deviate_alike_around_a_place_are_found_out(
+    places: np.ndarray, bump: np.ndarray
+) -> None:
+    """As over something hard that the model lacks; the same deviations elsewhere are chance."""
+    assert local_chance(bump, places, SOFTER) < LEAST_PROBABILITY / 2.0
+    mixed = [np.random.default_rng(k).permutation(bump) for k in range(20)]
+    assert np.median([local_chance(scores, places, SOFTER) for scores in mixed]) > 0.1
+
+
+def test_a_side_does_not_matter(places: np.ndarray, bump: np.ndarray) -> None:
+    """Something soft is found as something hard is."""
+    assert local_chance(-bump, places, SOFTER) == local_chance(bump, places, SOFTER)
+
+
+def test_what_a_parameter_can_imitate_is_its_own(places: np.ndarray, bump: np.ndarray) -> None:
+    """A model with a contrast has fitted away what deviates as the contrast does."""
+    assert local_chance(bump, places, np.c_[SOFTER, bump]) > 0.9
+
+
+def test_chance_is_called_so(places: np.ndarray) -> None:
+    """Drawn deviations fall below a probability as often as it says."""
+    rng = np.random.default_rng(1)
+    drawn = rng.standard_t(FREEDOM, (400, N))
+    scores = normal_scores(drawn, FREEDOM)
+    found = np.array([local_chance(one, places, SOFTER) for one in scores])
+    assert 0.02 < (found < 0.05).mean() < 0.09
+    assert 0.4 < found.mean() < 0.6
+
+
+def test_errors_larger_than_stated_are_found_out(places: np.ndarray) -> None:
+    """Wherever they are."""
+    rng = np.random.default_rng(2)
+    drawn = rng.standard_t(FREEDOM, (20, N))
+    stated = [chance(d, places, SOFTER, FREEDOM) for d in drawn]
+    twice = [chance(2.5 * d, places, SOFTER, FREEDOM) for d in drawn]
+    assert np.median(stated) > 0.2
+    assert np.median(twice) < LEAST_PROBABILITY
+
+
+def test_one_bad_place_is_no_wrong_model(places: np.ndarray) -> None:
+    """The vademecum's own error has long tails."""
+    scores = np.random.default_rng(3).standard_normal(N)
+    scores[7] = 5.0
+    assert chance(scores, places, SOFTER, FREEDOM) > LEAST_PROBABILITY

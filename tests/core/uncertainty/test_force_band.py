@@ -1,4 +1,4 @@
-"""Bands of a step's force: against tips pressed at every material, and what a step makes of it."""
+"""Bands of a step's force: against tips pressed at every material, and over the surface."""
 
 from __future__ import annotations
 
@@ -22,10 +22,13 @@ from avatar_core.uncertainty.force_ratios import DEPTHS, log_edges, log_forces
 from avatar_core.uncertainty.force_table import ForceTable
 from avatar_core.uncertainty.known import Held, known_of
 from avatar_core.uncertainty.material_grid import MaterialGrid
+from avatar_core.uncertainty.spread_map import force_spread_at
 from avatar_core.vademecum.accuracy import Detail
 from avatar_core.vademecum.at_values import at_values, own_compliance, own_compliance_at
 from avatar_core.vademecum.model import Vademecum
-from tests.helpers.soft_organ import organ_on_springs, soft_organ
+from tests.helpers import box_organ
+from tests.helpers.box_organ import UP, top
+from tests.helpers.soft_organ import organ_on_springs, soft_organ, soft_tumour
 
 SPHERE, PATCH = Tip("sphere", 5e-3), Tip("patch", 8e-3)
 KNOWN: dict[str, Distribution] = {
@@ -305,3 +308,36 @@ def test_a_tumour_of_the_scene_is_the_contrast_in_use(organ: Vademecum) -> None:
         for v in (at_contrast(organ, Tumour(c)) for c in (1.0, 9.0))
     ]
     np.testing.assert_array_equal(*found)
+
+
+# --- How far the force is not known over the surface ----------------------------------------------
+
+
+def test_a_spread_of_young_alone_is_the_same_everywhere() -> None:
+    """F ~ E: ln F has the quantiles of ln E; NaN below the organ."""
+    cube = box_organ.organ("cube")
+    aside = np.array([9e-3, 0.0, 4e-3])  # between load positions
+    places = np.stack([top("cube"), top("cube") + aside, top("cube") - 0.2 * UP])
+    known = known_of(cube, {"young": Lognormal(5e3, 1.4)})
+    found = force_spread_at(cube, SPHERE, known, places)
+    high, low = 1.4**1.6449, 1.4**-1.6449
+    np.testing.assert_allclose(found[:2], (high - low) / (high + low), rtol=0.02)
+    assert np.isnan(found[2])
+
+
+def test_what_is_known_has_no_spread() -> None:
+    cube = box_organ.organ("cube")
+    found = force_spread_at(cube, SPHERE, known_of(cube, {}), top("cube")[None])
+    assert found[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_unknown_tumour_shows_where_it_is() -> None:
+    """Of the contrast alone, the force over the tumour is less known than that far from it."""
+    soft = soft_organ()
+    known = known_of(soft, {"contrast": Lognormal(3.0, 1.5), "poisson": Fixed(0.45)})
+    spread = force_spread_at(soft, SPHERE, known, soft.surface.centers)
+    middle = soft_tumour().vertices.mean(axis=0)
+    way = np.linalg.norm(soft.surface.centers - middle, axis=1)
+    is_near, is_known = way < np.percentile(way, 10), np.isfinite(spread)
+    near, far = spread[is_known & is_near], spread[is_known & (way > 70e-3)]
+    assert np.median(near) > 3.0 * np.median(far)

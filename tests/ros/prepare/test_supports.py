@@ -23,7 +23,7 @@ from avatar_core.scene.model import SupportStiffness, Tool
 from avatar_core.scene.prepare import scene_spec
 from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum
-from tests.core.offline.test_support_coordinate import BARE, YOUNG
+from tests.core.offline.test_coordinates import BARE, YOUNG
 from tests.helpers.soft_organ import organ_on_springs
 
 pytestmark = pytest.mark.ros

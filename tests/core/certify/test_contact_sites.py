@@ -35,13 +35,12 @@ from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
 from avatar_core.pipeline import OrganOptions
 from avatar_core.reduction.coordinates import Coordinate
-from avatar_core.vademecum import storage
 from avatar_core.vademecum.certificate import Certificate, ContactSites
 from avatar_core.vademecum.force_error import PROMISED, ForceError
 from avatar_core.vademecum.model import Provenance, Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
-from tests.core.cli.test_cli import run, write_obj
-from tests.core.conftest import box_mesh, box_regions
+from tests.core.cli.test_cli import write_obj
+from tests.core.conftest import Command, box_mesh, box_regions
 from tests.helpers.box_organ import UP, organ
 
 SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
@@ -110,12 +109,11 @@ def test_the_factor_scales_the_laws_part_of_the_error_that_is_said(box: Vademecu
     assert thrice - once == pytest.approx(2.0 * law, rel=1e-5)
 
 
-def test_an_older_file_says_more_error(box: Vademecum) -> None:
-    """It does not know the surface around a ball."""
+def test_without_a_shift_of_balls_more_error_is_said(box: Vademecum) -> None:
     force, said, steeper = pressed(box)
-    older = replace(box, tip_field=box.tip_field._replace(shift=None))
+    without = replace(box, tip_field=box.tip_field._replace(shift=None))
     law = force * (LAW_ERROR + steeper)
-    assert pressed(older)[1] - said == pytest.approx((UNSHIFTED - 1.0) * law, rel=1e-3)
+    assert pressed(without)[1] - said == pytest.approx((UNSHIFTED - 1.0) * law, rel=1e-3)
 
 
 def test_an_organ_without_contact_sites_says_the_same_error_as_with_the_factor_one(
@@ -230,86 +228,44 @@ def test_a_file_gives_back_the_contact_sites(box: Vademecum, tmp_path: Path) -> 
     assert pressed(again) == pressed(certified(box, FOUND))
 
 
-def _stored_as(
-    monkeypatch: pytest.MonkeyPatch, changed: Callable[[dict[str, Any]], dict[str, Any]]
-) -> None:
-    whole = storage._certificate_attribute
-
-    def attribute(certificate: Certificate | None) -> dict[str, Any]:
-        return changed(whole(certificate) or {})
-
-    monkeypatch.setattr(storage, "_certificate_attribute", attribute)
-
-
-def test_a_file_without_contact_sites_still_loads(
-    box: Vademecum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As all files written before there were any."""
-    _stored_as(
-        monkeypatch,
-        lambda plain: {key: value for key, value in plain.items() if key != "contact_sites"},
-    )
-    save_vademecum(box, tmp_path / "a.h5")
-    again = load_vademecum(tmp_path / "a.h5")
-    assert again.certificate is not None
-    assert again.certificate.contact_sites.n_contacts == 0
-    assert pressed(again) == pressed(box)
-
-
 @pytest.mark.parametrize("factor", [-1.0, 0.0, float("nan"), float("inf")])
-def test_a_factor_that_is_none_is_refused(
-    box: Vademecum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float
-) -> None:
-    _stored_as(
-        monkeypatch,
-        lambda plain: plain | {"contact_sites": plain["contact_sites"] | {"factor": factor}},
-    )
-    save_vademecum(box, tmp_path / "a.h5")
+def test_a_factor_that_is_none_is_refused(factor: float) -> None:
     with pytest.raises(StorageError, match="build the file again"):
-        load_vademecum(tmp_path / "a.h5")
+        ContactSites(factor=factor)
 
 
 # --- The command ---------------------------------------------------------------------------------
 
 
 def test_the_command_resolves_contacts_and_says_what_it_left_out(
-    box: Vademecum,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
+    box: Vademecum, avatar: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(contact_sites, "compared", met(fails=["ridge"]))
     monkeypatch.setattr(pipeline, "tetrahedralize", lambda *_: box.mesh)
-    monkeypatch.setattr("avatar_core.contact.timing.timed", lambda _, curve, **__: curve)
+    monkeypatch.setattr(pipeline, "timed", lambda _, curve, __: curve)
     write_obj(tmp_path / "box.obj", outline(box).vertices, outline(box).faces)
     source, file = [tmp_path / "box.obj", "--unit", "m"], tmp_path / "v.h5"
     small = ["--modes", "10", "--certify", "5", "--element", "P1", "--tolerance", "0.9"]
     asked = ["--contact-sites", "4"]
-    assert run(monkeypatch, "vademecum", *source, "-o", file, *small, *asked) == 0
-    said = capsys.readouterr()
-    assert "notice: contact sites: left out 1 that could not be resolved" in said.err
-    assert "36 resolved contacts at 3 places" in said.out
-    assert run(monkeypatch, "show", file, "--json") == 0
-    stored = json.loads(capsys.readouterr().out)["certificate"]["contact_sites"]
+    code, out, err = avatar("vademecum", *source, "-o", file, *small, *asked)
+    assert code == 0
+    assert "notice: contact sites: left out 1 that could not be resolved" in err
+    assert "36 resolved contacts at 3 places" in out
+    stored = json.loads(avatar("show", file, "--json")[1])["certificate"]["contact_sites"]
     assert stored["n_contacts"] == 36
     assert stored["mean"] == pytest.approx(0.04)
 
 
 def test_show_prints_contact_sites_and_what_the_force_is_of(
-    box: Vademecum,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
+    box: Vademecum, avatar: Command, tmp_path: Path
 ) -> None:
     save_vademecum(certified(box, FOUND), tmp_path / "a.h5")
     save_vademecum(box, tmp_path / "b.h5")
-    assert run(monkeypatch, "show", tmp_path / "a.h5") == 0
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = " ".join(avatar("show", tmp_path / "a.h5")[1].split())
     assert "36 resolved contacts at 3 places" in shown and "covers 92%" in shown
     assert "4.00% 15.00% (95 % below 10.00%)" in shown
     assert "rigid, frictionless tip" in shown
-    assert run(monkeypatch, "show", tmp_path / "b.h5") == 0
-    assert "contact sites: none" in capsys.readouterr().out
+    assert "contact sites: none" in avatar("show", tmp_path / "b.h5")[1]
 
 
 # --- The picture ---------------------------------------------------------------------------------
