@@ -28,7 +28,7 @@ class Shedder:
 
     def __init__(self, levels: Sequence[int], deadline: float = float("inf")) -> None:
         self._levels = sorted(set(levels))
-        self.deadline = deadline
+        self._deadline = deadline
         self._level = len(self._levels) - 1
         self._calm = 0
         self._patience = PATIENCE
@@ -52,9 +52,9 @@ class Shedder:
         missed : fraction of its periods that were missed
         step_p99 : 99th percentile of its steps' times [s]; NaN of none
         """
-        if missed > OVERLOADED or step_p99 > self.deadline:
+        if missed > OVERLOADED or step_p99 > self._deadline:
             self._shed()
-        elif missed > CALM or step_p99 > ROOM * self.deadline:
+        elif missed > CALM or step_p99 > ROOM * self._deadline:
             self._calm = 0
         else:
             self._calm += 1

@@ -5,7 +5,7 @@ Three threads of control:
 - the loop (:mod:`avatar_ros.loop.contact_loop`, a thread) waits for a pose, steps, publishes.
 - the node (``ContactNode``, the main thread) handles parameters, transitions and statistics.
 - the supplier (:mod:`avatar_ros.prepare.supplier`, a thread with a worker process) prepares the
-  model of a vademecum, and prepares it again for another scene, material, budget or uncertainty.
+  model of a vademecum, and prepares it again for another scene, material or uncertainty.
 """
 
 from __future__ import annotations

@@ -34,11 +34,6 @@ from tests.core.conftest import Command
 TRIANGLE = "v 0 0 0\nv 100 0 0\nv 0 100 0\n"
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["avatar", *map(str, arguments)])
-    return cli.main()
-
-
 def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
     lines = [f"v {x} {y} {z}" for x, y, z in vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(faces) + 1]
