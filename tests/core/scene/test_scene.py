@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from avatar_core.contact.effects import (
@@ -22,8 +21,6 @@ from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.scene.model import REFUSED, Combination, Scene, Tool, combinations
-from avatar_core.vademecum.at_values import at_values
-from avatar_core.vademecum.model import Vademecum
 from tests.helpers.scene_cases import PRONY, TWO
 
 
@@ -132,16 +129,6 @@ def test_the_values_are_those_of_the_material() -> None:
     assert Scene().values == {}
     chosen = Scene(young_modulus=1e5, poisson_ratio=0.45, effects=(Tumour(3.0),))
     assert chosen.values == {"young": 1e5, "poisson": 0.45}
-
-
-def test_a_scene_with_half_the_modulus_is_twice_as_soft(phantom_vademecum: Vademecum) -> None:
-    young = phantom_vademecum.material.young_modulus
-    scene = Scene(young_modulus=young / 2)
-    scene.require(phantom_vademecum)
-    softer = at_values(phantom_vademecum, scene.values)
-    at, full = np.array([3]), np.ones(1)
-    ratio = softer.compliance(at, full) / phantom_vademecum.compliance(at, full)
-    np.testing.assert_allclose(ratio, 2.0, rtol=1e-5)  # fields are in single precision
 
 
 def test_poissons_ratio_has_to_be_a_coordinate() -> None:
