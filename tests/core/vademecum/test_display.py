@@ -9,20 +9,18 @@ import igl
 import numpy as np
 import pytest
 
-from avatar_core.common.hdf5 import replace_file
 from avatar_core.contact.cloud import TOLERANCE
 from avatar_core.contact.model import prepare
-from avatar_core.errors import StorageError, SurfaceError
+from avatar_core.errors import SurfaceError
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.resampling import is_manifold, resampled, unified
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.rule import BuildRule
 from avatar_core.pipeline import OrganOptions, build
-from avatar_core.vademecum.display import boundary, display_of, outline, structure
-from avatar_core.vademecum.model import Vademecum
-from avatar_core.vademecum.storage import _arrays, _attributes, load_vademecum, save_vademecum
-from tests.helpers.box_organ import PATCH_RADIUS, UP, organ, top
+from avatar_core.vademecum.display import boundary, display_of, structure
+from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.helpers.box_organ import UP, organ, top
 from tests.helpers.shown_dent import ASIDE, DEPTH, SPHERE, displaced, finer
 from tests.helpers.small_files import ball
 
@@ -144,57 +142,6 @@ def test_a_tumour_is_stored_with_its_organ_and_stays_there(tmp_path: Path) -> No
         0.02, abs=1e-4
     )
     assert len(sick.organ_faces) == len(sick.mesh.boundary_faces)
-
-
-@pytest.fixture(scope="module")
-def fine(phantom_vademecum: Vademecum) -> Vademecum:
-    """A phantom with a finer surface and a lesion."""
-    v = phantom_vademecum
-    lesion = structure(lesion_at(v.mesh.vertices.mean(axis=0), 9e-3))
-    organ_surface = outline(v.mesh, phantom_liver(), 3000)
-    return replace(v, display=display_of(v.mesh, organ_surface, [("lesion", lesion)]))
-
-
-def test_a_display_is_stored(phantom_vademecum: Vademecum, fine: Vademecum, tmp_path: Path) -> None:
-    before = save_vademecum(phantom_vademecum, tmp_path / "plain.h5")
-    assert save_vademecum(fine, tmp_path / "fine.h5") != before
-    read = load_vademecum(tmp_path / "fine.h5").display
-    assert read is not None
-    for name, value in vars(fine.display).items():
-        np.testing.assert_array_equal(getattr(read, name), value)
-    assert load_vademecum(tmp_path / "plain.h5").display is None
-    assert len(fine.clamped_faces) == len(fine.organ_faces)
-    held = fine.surface_vertices[fine.organ_faces[fine.clamped_faces]].mean(axis=(0, 1))
-    mesh = phantom_vademecum.mesh
-    clamp = mesh.boundary_faces[phantom_vademecum.regions.clamped]
-    assert np.linalg.norm(held - mesh.vertices[clamp].mean(axis=(0, 1))) < PATCH_RADIUS
-
-
-@pytest.mark.parametrize(
-    ("key", "spoil", "message"),
-    [
-        ("faces", lambda a: a + len(a), "points outside"),
-        ("corners", lambda a: a - 1, "points outside"),
-        ("first_face", lambda a: a[::-1], "first_face"),
-        ("first_face", lambda a: a[[0, -1]], "parts"),
-        ("weights", lambda a: 2.0 * a, "no parts of a whole"),
-        ("weights", lambda a: a * np.nan, "NaN"),
-        ("weights", lambda a: a[:-1], "does not fit"),
-        ("vertices", lambda a: a * 1e4, "lengths above"),
-    ],
-)
-def test_a_spoilt_display_is_refused(
-    key: str,
-    spoil,  # type: ignore[no-untyped-def]
-    message: str,
-    fine: Vademecum,
-    tmp_path: Path,
-) -> None:
-    arrays, attributes = _arrays(fine), _attributes(fine)
-    arrays[f"display/{key}"] = spoil(arrays[f"display/{key}"])
-    replace_file(tmp_path / "spoilt.h5", arrays, attributes, packed=True)
-    with pytest.raises(StorageError, match=message):
-        load_vademecum(tmp_path / "spoilt.h5")
 
 
 @pytest.mark.parametrize("n", [0, -5, 99, 2_000_000])

@@ -5,20 +5,25 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
 from avatar_core.certify.linear import certify
+from avatar_core.common.hdf5 import replace_file
 from avatar_core.errors import StorageError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import relative_l2
+from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.vademecum.display import display_of, outline, structure
 from avatar_core.vademecum.model import Vademecum
-from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from avatar_core.vademecum.storage import _arrays, _attributes, load_vademecum, save_vademecum
+from tests.core.vademecum.test_display import lesion_at
+from tests.helpers.box_organ import PATCH_RADIUS
 
 
 def test_certificate_meets_the_promise_on_the_phantom(phantom_vademecum: Vademecum) -> None:
@@ -77,35 +82,6 @@ def test_file_gives_back_the_same_vademecum(phantom_vademecum: Vademecum, tmp_pa
         np.testing.assert_array_equal(a, b)
     assert v.nbytes == (tmp_path / "a.h5").stat().st_size
     assert len(v.id) == 64
-
-
-def require_refused(damaged: Vademecum, file: Path, message: str) -> None:
-    save_vademecum(damaged, file)
-    with pytest.raises(StorageError, match=message):
-        load_vademecum(file)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("brick", lambda brick: brick + 1, "points outside"),
-        ("brick", lambda brick: brick[1:], "does not cover"),
-        ("brick", lambda brick: np.pad(brick, 3, constant_values=-1), "does not cover"),
-        ("spacing", lambda spacing: spacing / 10.0, "spacing' is"),
-        ("radius", lambda radius: radius[::-1].copy(), "does not rise"),
-    ],
-)
-def test_a_shift_of_balls_that_does_not_fit_is_refused(
-    phantom_vademecum: Vademecum,
-    tmp_path: Path,
-    name: str,
-    change: Callable[[np.ndarray], np.ndarray],
-    message: str,
-) -> None:
-    field = phantom_vademecum.tip_field
-    shift = field.shift._replace(**{name: change(getattr(field.shift, name))})
-    damaged = replace(phantom_vademecum, tip_field=field._replace(shift=shift))
-    require_refused(damaged, tmp_path / "a.h5", message)
 
 
 def test_the_summary_has_the_error_of_the_force_where_tips_press(
@@ -191,22 +167,57 @@ def test_full_disk_leaves_the_old_file(phantom_vademecum: Vademecum, tmp_path: P
     assert list(tmp_path.iterdir()) == [file]
 
 
+def with_both(v: Vademecum) -> Vademecum:
+    """A phantom with a finer surface and a lesion."""
+    lesion = structure(lesion_at(v.mesh.vertices.mean(axis=0), 9e-3))
+    organ_surface = outline(v.mesh, phantom_liver(), 3000)
+    return replace(v, display=display_of(v.mesh, organ_surface, [("lesion", lesion)]))
+
+
+def test_a_display_is_stored(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
+    fine = with_both(phantom_vademecum)
+    before = save_vademecum(phantom_vademecum, tmp_path / "plain.h5")
+    assert save_vademecum(fine, tmp_path / "fine.h5") != before
+    read = load_vademecum(tmp_path / "fine.h5").display
+    assert read is not None
+    for name, value in vars(fine.display).items():
+        np.testing.assert_array_equal(getattr(read, name), value)
+    assert load_vademecum(tmp_path / "plain.h5").display is None
+    assert len(fine.clamped_faces) == len(fine.organ_faces)
+    held = fine.surface_vertices[fine.organ_faces[fine.clamped_faces]].mean(axis=(0, 1))
+    mesh = phantom_vademecum.mesh
+    clamp = mesh.boundary_faces[phantom_vademecum.regions.clamped]
+    assert np.linalg.norm(held - mesh.vertices[clamp].mean(axis=(0, 1))) < PATCH_RADIUS
+
+
 @pytest.mark.parametrize(
-    ("name", "change", "message"),
+    ("key", "spoil", "message"),
     [
-        ("region", lambda region: region + 1, "points outside"),
-        ("start", lambda start: start[::-1].copy(), "does not fit"),
-        ("start", lambda start: start + 1, "points outside"),
-        ("load", lambda load: load[..., :1], "does not fit"),
+        ("regional/region", lambda a: a + 1, "points outside"),
+        ("regional/start", lambda a: a[::-1], "does not fit"),
+        ("regional/start", lambda a: a + 1, "points outside"),
+        ("regional/load", lambda a: a[..., :1], "does not fit"),
+        ("tip_field/shift/brick", lambda a: a + 1, "points outside"),
+        ("tip_field/shift/brick", lambda a: a[1:], "does not cover"),
+        ("tip_field/shift/brick", lambda a: np.pad(a, 3, constant_values=-1), "does not cover"),
+        ("tip_field/shift/spacing", lambda a: a / 10.0, "spacing' is"),
+        ("tip_field/shift/radius", lambda a: a[::-1], "does not rise"),
+        ("display/faces", lambda a: a + len(a), "points outside"),
+        ("display/corners", lambda a: a - 1, "points outside"),
+        ("display/first_face", lambda a: a[::-1], "first_face"),
+        ("display/first_face", lambda a: a[[0, -1]], "parts"),
+        ("display/weights", lambda a: 2.0 * a, "no parts of a whole"),
+        ("display/weights", lambda a: a * np.nan, "NaN"),
+        ("display/weights", lambda a: a[:-1], "does not fit"),
+        ("display/vertices", lambda a: a * 1e4, "lengths above"),
     ],
 )
-def test_regions_that_do_not_fit_are_refused(
-    phantom_vademecum: Vademecum,
-    tmp_path: Path,
-    name: str,
-    change: Callable[[np.ndarray], np.ndarray],
-    message: str,
+def test_arrays_that_do_not_fit_are_refused(
+    key: str, spoil: Any, message: str, phantom_vademecum: Vademecum, tmp_path: Path
 ) -> None:
-    regional = phantom_vademecum.regional
-    damaged = replace(regional, **{name: change(getattr(regional, name))})
-    require_refused(replace(phantom_vademecum, regional=damaged), tmp_path / "a.h5", message)
+    fine = with_both(phantom_vademecum)
+    arrays, attributes = _arrays(fine), _attributes(fine)
+    arrays[key] = spoil(arrays[key])
+    replace_file(tmp_path / "spoilt.h5", arrays, attributes, packed=True)
+    with pytest.raises(StorageError, match=message):
+        load_vademecum(tmp_path / "spoilt.h5")
