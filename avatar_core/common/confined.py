@@ -14,11 +14,9 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import os
 import pickle
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -28,7 +26,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from avatar_core.common.processes import ModuleProcess
+from avatar_core.common.child import Child, EndedError, line_to_starter
 from avatar_core.errors import AvatarError, one_line
 
 P = ParamSpec("P")
@@ -39,6 +37,7 @@ RETURNED, RAISED, FAILED = "returned", "raised", "failed"  # with a value, our e
 _START_SECONDS = 60.0  # to import what is called
 _WAITING = 10.0  # times what a call may compute, after which it waits for something in vain
 _LOOK = 0.2  # at the time it has computed [s]
+_STOP_SECONDS = 0.1  # to end before it is killed
 
 
 class ConfinedError(AvatarError):
@@ -75,15 +74,18 @@ class Confined:
     """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
-        self._max_bytes = max_bytes
         self._lock = threading.Lock()
-        self._process: ModuleProcess | None = None
-        self._line: Connection | None = None
+        self._child = Child(
+            "avatar_core.common.confined",
+            str(max_bytes),  # of which each thread would take some
+            stdout=subprocess.DEVNULL,  # libraries print there; the error that is raised counts
+            stderr=subprocess.DEVNULL,
+        )
 
     @property
     def pid(self) -> int | None:
         """Of the process, if there is one."""
-        return self._process.pid if self._process else None
+        return self._child.pid
 
     def call(
         self, seconds: float, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
@@ -106,13 +108,14 @@ class Confined:
         """
         with self._lock:
             try:
+                self._child.start()
                 self._exchange(_START_SECONDS, function)
                 outcome, value = self._exchange(seconds, (args, kwargs))
             except TimeoutError:
-                self._stop()
+                self._child.finish(_STOP_SECONDS)
                 raise ConfinedError(f"it takes longer than {seconds:.0f} s to read") from None
-            except (EOFError, OSError) as error:
-                raise ConfinedError(f"reading it ends the process ({self._stop()})") from error
+            except EndedError as error:
+                raise ConfinedError(f"reading it ends the process ({error})") from error
         if outcome == FAILED:
             raise ConfinedError(value)
         if outcome == RAISED:
@@ -131,58 +134,20 @@ class Confined:
 
     def kill(self) -> None:
         """End the process, whatever it does; a call that waits for it raises ConfinedError."""
-        if (process := self._process) is not None:
-            process.kill()
+        self._child.send_signal(signal.SIGKILL)
 
     def close(self) -> None:
         """End the process, if there is one, after the call that it is in."""
         with self._lock:
-            self._stop()
+            self._child.finish(_STOP_SECONDS)
 
     def _exchange(self, seconds: float, order: Any) -> Any:
-        if self._line is None:
-            self._start()
-        assert self._line is not None
-        self._line.send(order)
-        end, most = time.monotonic() + _WAITING * seconds, self._computed() + seconds
-        while not self._line.poll(_LOOK):
-            if time.monotonic() > end or self._computed() > most:
+        self._child.send(order)
+        end, most = time.monotonic() + _WAITING * seconds, self._child.computed + seconds
+        while not self._child.has_sent(_LOOK):
+            if time.monotonic() > end or self._child.computed > most:
                 raise TimeoutError
-        return self._line.recv()
-
-    def _computed(self) -> float:
-        """Processor time of the process since its start [s]."""
-        assert self._process is not None
-        stat = Path(f"/proc/{self._process.pid}/stat").read_text()
-        user, system = stat.rpartition(")")[2].split()[11:13]
-        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
-
-    def _start(self) -> None:
-        ours, theirs = socket.socketpair()
-        with theirs:
-            self._process = ModuleProcess(
-                "avatar_core.common.confined",
-                str(self._max_bytes),  # of which each thread would take some
-                stdin=theirs.fileno(),
-                stdout=subprocess.DEVNULL,  # libraries print there; the error that is raised counts
-                stderr=subprocess.DEVNULL,
-            )
-        self._line = Connection(ours.detach())
-
-    def _stop(self) -> str:
-        """End the process; returns how it ended."""
-        process, line = self._process, self._line
-        self._process = self._line = None
-        if process is None:
-            return "it was not started"
-        if line is not None:
-            with contextlib.suppress(OSError):
-                line.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(0.1)  # of itself, if a call ended it
-        process.kill()
-        code = process.wait()
-        return signal.strsignal(-code) or f"signal {-code}" if code < 0 else f"exit code {code}"
+        return self._child.receive()
 
 
 # --- the process ------------------------------------------------------------------------------
@@ -218,8 +183,7 @@ def main(max_bytes: int) -> int:
     limit = pages * resource.getpagesize() + max_bytes
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    line = Connection(os.dup(sys.stdin.fileno()))
-    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+    with line_to_starter() as line:
         _serve(line)
     return 0
 

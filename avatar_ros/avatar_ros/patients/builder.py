@@ -10,15 +10,13 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import socket
-import subprocess
+import signal
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from multiprocessing.connection import Connection
 
-from avatar_core.common.processes import ModuleProcess
+from avatar_core.common.child import Child, EndedError
 from avatar_ros.patients.protocol import (
     BuildError,
     BuildSettings,
@@ -47,11 +45,12 @@ class PatientBuilder:
     """
 
     def __init__(self, settings: BuildSettings, threads: int) -> None:
-        self._settings, self._threads = settings, threads
+        self._worker = Child(
+            "avatar_ros.patients.worker", json.dumps(asdict(settings)), n_threads=threads
+        )
         self._stop, self._cancel = threading.Event(), threading.Event()
         self._slot = threading.Lock()
         self._subject = ""
-        self._start()
         self.n_anatomies = self._wait_until_ready()
 
     def build(
@@ -98,7 +97,7 @@ class PatientBuilder:
         """End the worker; a build that is under way is cancelled."""
         self._stop.set()
         self.cancel()
-        self._end()
+        self._worker.finish(_STOP_TIMEOUT)
 
     def _busy(self) -> BusyError:
         return BusyError(
@@ -115,19 +114,18 @@ class PatientBuilder:
         ending = False
         stage, reported = Stage("loading", 0.0, float("nan")), time.monotonic()
         try:
-            if self._process.poll() is not None:
-                self._restart()
-            self._connection.send(request)
+            self._worker.start()  # unless it runs
+            self._worker.send(request)
             while True:
                 if not ending and (self._cancel.is_set() or cancelled()):
-                    self._process.terminate()
+                    self._worker.send_signal(signal.SIGTERM)
                     ending = True  # a file that it is writing is finished all the same
-                if not self._connection.poll(_LATENCY):
+                if not self._worker.has_sent(_LATENCY):
                     if time.monotonic() - reported > _REPEAT:
                         on_stage(stage)
                         reported = time.monotonic()
                     continue
-                note = self._connection.recv()
+                note = self._worker.receive()
                 if isinstance(note, Stage):
                     stage, reported = note, time.monotonic()
                     on_stage(stage)
@@ -135,52 +133,31 @@ class PatientBuilder:
                     return note
                 elif isinstance(note, Refused):
                     raise BuildError(note.reason)
-        except (EOFError, OSError) as error:  # the worker closed its end
+        except EndedError as error:
             if ending:
                 raise CancelledError("cancelled; no file was written") from error
             raise BuildError(
-                f"the building process ended ({self._code()}), perhaps for want of memory; no "
+                f"the building process ended ({error}), perhaps for want of memory; no "
                 "file was written: ask again, or for fewer vertices"
             ) from error
         finally:
-            if ending or self._process.poll() is not None:
+            if ending or not self._worker.is_running:
                 self._restart()
 
     def _wait_until_ready(self) -> int:
         try:
-            note = self._connection.recv()
-        except (EOFError, OSError) as error:
-            raise BuildError(f"the building process did not start ({self._code()})") from error
+            self._worker.start()
+            note = self._worker.receive()
+        except EndedError as error:
+            raise BuildError(f"the building process did not start ({error})") from error
         if isinstance(note, Ready):
             return note.n_anatomies
-        self._end()
+        self._worker.finish(_STOP_TIMEOUT)
         raise BuildError(note.reason)
 
     def _restart(self) -> None:
-        self._end()
+        """End the worker, and have another load the atlas for the next request."""
+        self._worker.finish(_STOP_TIMEOUT)
         if not self._stop.is_set():
-            self._start()
-
-    def _start(self) -> None:
-        ours, theirs = socket.socketpair()
-        with theirs:
-            self._process = ModuleProcess(
-                "avatar_ros.patients.worker",
-                json.dumps(asdict(self._settings)),
-                n_threads=self._threads,
-                stdin=theirs.fileno(),
-            )
-        self._connection = Connection(ours.detach())
-
-    def _end(self) -> None:
-        self._process.finish(_STOP_TIMEOUT)
-        with contextlib.suppress(OSError):
-            self._connection.close()
-
-    def _code(self) -> str:
-        """How the process ended."""
-        try:
-            code = self._process.wait(_STOP_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            return "it does not answer"
-        return f"signal {-code}" if code < 0 else f"exit code {code}"
+            with contextlib.suppress(EndedError):  # the next request says so
+                self._worker.start()

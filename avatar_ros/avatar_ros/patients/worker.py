@@ -29,6 +29,7 @@ from avatar_core.atlas.patient import (
 )
 from avatar_core.atlas.patient_problem import PatientProblem
 from avatar_core.atlas.storage import load_atlas
+from avatar_core.common.child import line_to_starter
 from avatar_core.errors import one_line
 from avatar_core.geometry.groups import read_groups
 from avatar_core.geometry.surface import SurfaceMesh
@@ -230,8 +231,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     realtime.die_with_parent(signal.SIGTERM)
     os.nice(_NICENESS)
-    connection = Connection(os.dup(sys.stdin.fileno()))
-    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the node is gone
+    with line_to_starter() as connection:
         serve(BuildSettings(**json.loads(sys.argv[1])), connection)
     return 0
 

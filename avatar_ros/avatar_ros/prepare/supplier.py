@@ -15,12 +15,11 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from avatar_core.common.processes import ModuleProcess
+from avatar_core.common.child import Child
 from avatar_core.errors import one_line
 from avatar_ros.prepare.protocol import Accepted, ChangeRequest, Channel, ModelReady, Refused
 from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedModel
 
-_WORKER = "avatar_ros.prepare.worker"
 _RESTART_DELAY = 1.0  # [s]
 _STOP_TIMEOUT = 1.0  # [s]
 _KINDS = ("material", "uncertainty")  # of changes, besides scenes
@@ -58,7 +57,7 @@ class ModelSupplier:
         self._waiting: dict[str, tuple[Change, Answer]] = {}  # by kind
         self._pending: Answer | None = None  # of the change that was sent last
         self._number = 0
-        self._process: ModuleProcess | None = None
+        self._worker = Child("avatar_ros.prepare.worker")
         self._thread = threading.Thread(target=self._supervise, name="model supplier", daemon=True)
         self._thread.start()
 
@@ -83,9 +82,7 @@ class ModelSupplier:
     def stop(self) -> None:
         """End the worker; returns when it has ended."""
         self._stop.set()
-        process = self._process
-        if process is not None:
-            process.finish(_STOP_TIMEOUT)
+        self._worker.finish(_STOP_TIMEOUT)
         self._thread.join(_STOP_TIMEOUT)
 
     def _send_next(self) -> None:
@@ -128,13 +125,13 @@ class ModelSupplier:
         """Start a worker and take its packets until it ends."""
         with theirs:
             channel.send(self._request)
-            self._process = ModuleProcess(_WORKER, stdin=theirs.fileno())
+            self._worker.start(stdin=theirs.fileno())
             with self._lock:
                 self._channel = channel
         self._send_next()
         with contextlib.suppress(ConnectionResetError):  # it ended with packets unread
             self._receive(channel)
-        self._process.finish(_STOP_TIMEOUT)
+        self._worker.finish(_STOP_TIMEOUT)
 
     def _receive(self, channel: Channel) -> None:
         while received := channel.receive():

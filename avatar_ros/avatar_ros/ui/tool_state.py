@@ -16,12 +16,13 @@ from functools import partial
 
 import numpy as np
 
-from avatar_core.common.processes import ModuleProcess
+from avatar_core.common.child import Child
 from avatar_core.contact.kernels import MAX_TOOLS
 from avatar_ros.framework import realtime
 
 SECONDS = 600  # of a recording, at most
 N_ROWS = SECONDS * 1000
+_STOP_TIMEOUT = 5.0  # for the driver [s]
 N_RECENT = 512  # periods that are kept to be shown with the cloud of the same period
 
 ALL = np.dtype(
@@ -151,27 +152,17 @@ class ToolDriverProcess:
 
     def __init__(self, state: SharedToolState) -> None:
         self._state = state
-        self._process: ModuleProcess | None = None
+        self._child = Child(
+            "avatar_ros.ui.tool_driver", preexec_fn=partial(realtime.die_with_parent, signal.SIGINT)
+        )
 
     def ensure_running(self, tools: Sequence[str], all_tools: Sequence[str], frame_id: str) -> None:
         """Start the driver unless it runs; it continues from the targets in the shared memory.
 
         tools : to be moved, some or all of the contact node's
         """
-        if self._process is not None and self._process.poll() is None:
-            return
-        self._process = ModuleProcess(
-            "avatar_ros.ui.tool_driver",
-            frame_id,
-            ",".join(all_tools),
-            *tools,
-            stdin=self._state.handle,
-            preexec_fn=partial(realtime.die_with_parent, signal.SIGINT),
-        )
+        self._child.start(frame_id, ",".join(all_tools), *tools, stdin=self._state.handle)
 
     def end(self) -> None:
         """End the driver; returns when it has ended."""
-        if self._process is not None:
-            self._process.send_signal(signal.SIGINT)
-            self._process.wait()
-            self._process = None
+        self._child.finish(_STOP_TIMEOUT, signal.SIGINT)

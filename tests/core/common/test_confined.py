@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from avatar_core.common.child import Child, EndedError
 from avatar_core.common.confined import Confined, ConfinedError, Imported
 from avatar_core.errors import StorageError
 from avatar_core.vademecum.storage import load_vademecum
@@ -98,10 +100,39 @@ def test_memory_has_a_limit(confined: Confined) -> None:
     assert confined.call(SECONDS, np.empty, 1 << 20, np.uint8).size == 1 << 20
 
 
-def test_the_process_ends_with_the_caller() -> None:
+@pytest.mark.parametrize("is_held", [False, True])
+def test_the_process_ends_with_the_caller(is_held: bool) -> None:
     confined = Confined()
     number = confined.call(SECONDS, os.getpid)
+    if is_held:  # it cannot take the signal to end
+        os.kill(number, signal.SIGSTOP)
     confined.close()
     with pytest.raises(ProcessLookupError):
         os.kill(number, 0)
     confined.close()
+
+
+def test_a_child_is_started_again_and_says_how_it_ended() -> None:
+    child = Child("avatar_core.common.confined", str(1 << 30))
+    assert child.finish(1.0) == "it was not started"
+    with pytest.raises(EndedError):
+        child.send(int)
+    for number, end in ((signal.SIGSEGV, "Segmentation fault"), (signal.SIGTERM, "Terminated")):
+        child.start()
+        child.send(os.getpid)
+        assert child.receive() is None  # it could be imported
+        first = child.pid
+        child.start()  # it runs
+        assert child.pid == first
+        child.send_signal(number)
+        with pytest.raises(EndedError, match=end):
+            child.receive()
+        assert child.pid is None and not child.is_running
+        assert child.finish(1.0) == end
+
+
+def test_a_child_without_its_module_says_its_exit_code() -> None:
+    child = Child("avatar_core.no_such_module", stderr=subprocess.DEVNULL)
+    child.start()
+    with pytest.raises(EndedError, match="exit code 1"):
+        child.receive()
