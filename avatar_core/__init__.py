@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from avatar_core.atlas.storage import load_atlas as load_atlas
     from avatar_core.atlas.storage import save_atlas as save_atlas
     from avatar_core.contact.model import ContactModel as ContactModel
-    from avatar_core.contact.model import Status as Status
     from avatar_core.contact.model import step as step
+    from avatar_core.contact.status import Status as Status
     from avatar_core.errors import AvatarError as AvatarError
     from avatar_core.fem.elasticity import Material as Material
     from avatar_core.geometry.phantom import phantom_liver as phantom_liver
@@ -64,7 +64,7 @@ _ORIGIN = {
     "Patient": "atlas.patient",
     "PatientOptions": "atlas.patient",
     "Scene": "scene.model",
-    "Status": "contact.model",
+    "Status": "contact.status",
     "SurfaceMesh": "geometry.surface",
     "Tip": "geometry.tip",
     "Tool": "scene.model",

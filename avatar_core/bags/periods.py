@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from avatar_core.bags.read import Bag
 from avatar_core.bags.table import Table
 from avatar_core.common.arrays import FloatArray
-from avatar_core.contact.model import FAR_AWAY, Status
+from avatar_core.contact.status import FAR_AWAY, PLACED, Status
 from avatar_core.errors import StorageError
 from avatar_core.scene.file import parse_scene
 from avatar_core.scene.recording import Clouds, Periods, Recording
@@ -31,16 +31,6 @@ from avatar_core.scene.replay import REMEMBER_FOR_EVER
 ORGAN = "organ"  # the frame that the nodes call the organ's unless told otherwise
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
-_ENGAGING = 13  # of avatar_ros/msg/ContactState
-# With these, the step used the pose of the stamp; with INVALID_POSE none; with others FAR_AWAY.
-PLACED = (
-    int(Status.OK),
-    int(Status.NOT_CONVERGED),
-    int(Status.TOO_MANY_CONTACTS),
-    int(Status.OUT_OF_RANGE),
-    int(Status.EXTRAPOLATED),
-    _ENGAGING,
-)
 _GAP = 1.5  # periods
 _REMEMBERING = {"friction", *REMEMBER_FOR_EVER}
 _HELD = 0.02  # for which a pose is held, by default; after it a zero is sent [s]

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from avatar_core.bags import types
-from avatar_core.bags.periods import ORGAN, PLACED
+from avatar_core.bags.periods import ORGAN
 from avatar_core.bags.read import ABOUT, POSES, STATES, About
 from avatar_core.common.arrays import FloatArray
+from avatar_core.contact.status import PLACED
 from avatar_core.errors import StorageError, one_line
 from avatar_core.scene.recording import Recording
 from avatar_core.scene.replay import scene_of

@@ -11,10 +11,12 @@ import numpy as np
 from avatar_core.common.jit import inlined
 from avatar_core.common.splines import add_in_bricks, cell_at, in_cell, on_grid
 from avatar_core.contact.effects.tip_law import edge_below
+from avatar_core.contact.status import Status
 from avatar_core.contact.tip_response import gather
 
-OK, NO_MODEL, NO_POSE, STALE_POSE, INVALID_POSE, NOT_CONVERGED, TOO_MANY, OUT_OF_RANGE = range(8)
-UNKNOWN_FRAME, EXTRAPOLATED = 8, 9
+OK, INVALID_POSE = int(Status.OK), int(Status.INVALID_POSE)  # numba takes plain numbers
+NOT_CONVERGED, OUT_OF_RANGE = int(Status.NOT_CONVERGED), int(Status.OUT_OF_RANGE)
+EXTRAPOLATED = int(Status.EXTRAPOLATED)
 
 # A tip that did not enter through the surface is barred until it is outside again: a contact that
 # began at depth would release energy that no tool has put in.

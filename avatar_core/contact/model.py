@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,29 +22,14 @@ from avatar_core.contact.effects.selection import Selection, allocate
 from avatar_core.contact.effects.tip_law import dent_energy
 from avatar_core.contact.kernels import Out, State
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
+from avatar_core.contact.status import FAR_AWAY as FAR_AWAY
+from avatar_core.contact.status import Status as Status
 from avatar_core.contact.tip_response import MAX_STENCIL
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.accuracy import Cloud, Detail
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
-
-FAR_AWAY = 1e3  # coordinate of a tool without a pose [m]
-
-
-class Status(IntEnum):
-    """Result of a step; the numbers of avatar_ros/msg/ContactState."""
-
-    OK = locate.OK
-    NO_MODEL = locate.NO_MODEL
-    NO_POSE = locate.NO_POSE
-    STALE_POSE = locate.STALE_POSE
-    INVALID_POSE = locate.INVALID_POSE
-    NOT_CONVERGED = locate.NOT_CONVERGED
-    TOO_MANY_CONTACTS = locate.TOO_MANY
-    OUT_OF_RANGE = locate.OUT_OF_RANGE
-    UNKNOWN_FRAME = locate.UNKNOWN_FRAME
-    EXTRAPOLATED = locate.EXTRAPOLATED
 
 
 class Compiled(NamedTuple):

@@ -31,18 +31,18 @@ from avatar_core.contact import model as contact
 from avatar_core.contact.force_band import ForceBand
 from avatar_core.contact.haptics import passivity
 from avatar_core.contact.haptics.force_guard import ForceGuard
+from avatar_core.contact.status import FAR_AWAY, Status
 from avatar_ros.framework import realtime
 from avatar_ros.framework.state_template import StateTemplate
 from avatar_ros.framework.templates import NO_STAMP, CloudTemplate, stamp_nanoseconds
 from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.loop.shown_modes import ShownModes
 from avatar_ros.loop.statistics import TimingRecord
-from avatar_ros.loop.tool_channel import FAR_AWAY, OK, ToolChannel
-from avatar_ros.msg import ContactState
+from avatar_ros.loop.tool_channel import OK, ToolChannel
 
-NO_MODEL = int(ContactState.STATUS_NO_MODEL)
-ENGAGING = int(ContactState.STATUS_ENGAGING)
-INACTIVE = int(ContactState.STATUS_INACTIVE)
+NO_MODEL = int(Status.NO_MODEL)
+ENGAGING = int(Status.ENGAGING)
+INACTIVE = int(Status.INACTIVE)
 
 BLEND = 0.1  # [s]
 _LONGEST_WAIT = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own

@@ -14,14 +14,14 @@ from builtin_interfaces.msg import Time
 from crtk_msgs.msg import OperatingState, StringStamped
 from rclpy.node import Node
 
+from avatar_core.contact.status import Status
 from avatar_ros.framework import qos
 from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.loop.tool_channel import OK, ToolChannel
-from avatar_ros.msg import ContactState
 
-NOTHING_SAID = int(ContactState.STATUS_NO_OPERATING_STATE)
-NOT_ENABLED = int(ContactState.STATUS_NOT_ENABLED)
-NOT_HOMED = int(ContactState.STATUS_NOT_HOMED)
+NOTHING_SAID = int(Status.NO_OPERATING_STATE)
+NOT_ENABLED = int(Status.NOT_ENABLED)
+NOT_HOMED = int(Status.NOT_HOMED)
 OF_DEVICE = (NOTHING_SAID, NOT_ENABLED, NOT_HOMED)
 
 _STATES = ("DISABLED", "ENABLED", "PAUSED", "FAULT")

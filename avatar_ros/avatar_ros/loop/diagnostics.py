@@ -15,10 +15,11 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from avatar_core.contact.haptics.force_guard import ForceGuard
 from avatar_core.contact.haptics.passivity import Passivity
+from avatar_core.contact.status import Status
 from avatar_ros.loop.device import OF_DEVICE
 from avatar_ros.loop.statuses import explanation
 from avatar_ros.loop.tool_channel import ToolChannel
-from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_ros.msg import LoopStatistics
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -38,9 +39,9 @@ class Faults:
     def text(self) -> str:
         """Cause and remedy in one line; empty without a fault."""
         status = self.status
-        if status == ContactState.STATUS_OK and self.counts:
+        if status == Status.OK and self.counts:
             status = max(self.counts, key=lambda key: self.counts[key])
-        if status == ContactState.STATUS_OK:
+        if status == Status.OK:
             return ""
         said = f" (it says {self.said})" if self.said and status in OF_DEVICE else ""
         return f"no force: {explanation(status)}{said}"

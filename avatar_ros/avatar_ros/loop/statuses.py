@@ -2,62 +2,56 @@
 
 from __future__ import annotations
 
-from avatar_ros.msg import ContactState
+from avatar_core.contact.status import Status
 
 # Cause and remedy of every status in which a tool's force is missing or doubtful.
 EXPLANATIONS: dict[int, tuple[str, str]] = {
-    ContactState.STATUS_NO_MODEL: ("no vademecum is loaded", "load one"),
-    ContactState.STATUS_NO_POSE: ("no pose of the tool has arrived yet", "start its driver"),
-    ContactState.STATUS_STALE_POSE: (
+    Status.NO_MODEL: ("no vademecum is loaded", "load one"),
+    Status.NO_POSE: ("no pose of the tool has arrived yet", "start its driver"),
+    Status.STALE_POSE: (
         "the tool's poses stopped",
         "check its driver, the network and the load of the machine",
     ),
-    ContactState.STATUS_SLOW_POSES: (
+    Status.SLOW_POSES: (
         "the tool's poses come more slowly than pose_timeout allows",
         "send them faster, or set pose_timeout to twice the time between them",
     ),
-    ContactState.STATUS_INVALID_POSE: (
+    Status.INVALID_POSE: (
         "a pose of the tool is not finite, has stamp 0, or is not a rotation",
         "check its driver",
     ),
-    ContactState.STATUS_NOT_CONVERGED: (
+    Status.NOT_CONVERGED: (
         "the contact solve reached its iteration limit",
         "lift the tool a little",
     ),
-    ContactState.STATUS_OUT_OF_RANGE: (
+    Status.OUT_OF_RANGE: (
         "the tool is too deep for the vademecum, or off the accessible surface",
         "lift it off the organ",
     ),
-    ContactState.STATUS_UNKNOWN_FRAME: (
+    Status.UNKNOWN_FRAME: (
         "the tool's poses are in another frame",
         "set tool_frame and tool_transform of the contact node, or publish in the organ's frame",
     ),
-    ContactState.STATUS_EXTRAPOLATED: (
+    Status.EXTRAPOLATED: (
         "the tool presses deeper than the vademecum was built for; the force is extrapolated",
         "press less deeply",
     ),
-    ContactState.STATUS_LEAP: ("the tool's pose jumped", "check its driver, or raise safety.leap"),
-    ContactState.STATUS_SEVERAL_PUBLISHERS: (
-        "several nodes send poses of the tool",
-        "stop all but one",
-    ),
-    ContactState.STATUS_LOST_TOOL: (
-        "no node sends poses of the tool any more",
-        "start its driver again",
-    ),
-    ContactState.STATUS_NO_OPERATING_STATE: (
+    Status.LEAP: ("the tool's pose jumped", "check its driver, or raise safety.leap"),
+    Status.SEVERAL_PUBLISHERS: ("several nodes send poses of the tool", "stop all but one"),
+    Status.LOST_TOOL: ("no node sends poses of the tool any more", "start its driver again"),
+    Status.NO_OPERATING_STATE: (
         "the tool's device has not said in what state it is",
         "start its driver, remap NAME/operating_state to it, or set tool_operating_state to false",
     ),
-    ContactState.STATUS_NOT_ENABLED: (
+    Status.NOT_ENABLED: (
         "the tool's device is not enabled",
         "enable it, or resume it if it was paused, at its console or by NAME/state_command",
     ),
-    ContactState.STATUS_NOT_HOMED: (
+    Status.NOT_HOMED: (
         "the tool's device is not homed",
         "home it at its console, by hand or by NAME/state_command, as its maker says",
     ),
-    ContactState.STATUS_INACTIVE: ("the contact node is being stopped", "activate it again"),
+    Status.INACTIVE: ("the contact node is being stopped", "activate it again"),
 }
 
 

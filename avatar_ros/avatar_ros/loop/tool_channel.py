@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
+from avatar_core.contact.status import FAR_AWAY, Status
 from avatar_ros.framework import qos
 from avatar_ros.framework.ports import PolledSubscriptions, Ports
 from avatar_ros.framework.templates import (
@@ -19,19 +20,17 @@ from avatar_ros.framework.templates import (
 )
 from avatar_ros.loop.safety import WRENCHES, Safety, band_topics
 from avatar_ros.loop.settings import ContactSettings
-from avatar_ros.msg import ContactState
 
-OK = int(ContactState.STATUS_OK)
-NO_POSE = int(ContactState.STATUS_NO_POSE)
-STALE_POSE = int(ContactState.STATUS_STALE_POSE)
-INVALID_POSE = int(ContactState.STATUS_INVALID_POSE)
-LEAP = int(ContactState.STATUS_LEAP)
-SEVERAL_PUBLISHERS = int(ContactState.STATUS_SEVERAL_PUBLISHERS)
-LOST_TOOL = int(ContactState.STATUS_LOST_TOOL)
-SLOW_POSES = int(ContactState.STATUS_SLOW_POSES)
-UNKNOWN_FRAME = int(ContactState.STATUS_UNKNOWN_FRAME)
+OK = int(Status.OK)
+NO_POSE = int(Status.NO_POSE)
+STALE_POSE = int(Status.STALE_POSE)
+INVALID_POSE = int(Status.INVALID_POSE)
+LEAP = int(Status.LEAP)
+SEVERAL_PUBLISHERS = int(Status.SEVERAL_PUBLISHERS)
+LOST_TOOL = int(Status.LOST_TOOL)
+SLOW_POSES = int(Status.SLOW_POSES)
+UNKNOWN_FRAME = int(Status.UNKNOWN_FRAME)
 
-FAR_AWAY = 1e3  # position of a tool without a pose, for the step [m]
 _UNKNOWN = float("nan")  # position of a tool whose last pose was invalid: it may not have moved
 _LEAP_INTERVAL = 2e-3  # between two poses, to which ``leap`` refers [s]
 _SLOW = 0.75  # of the timeout: poses that lie farther apart are slow

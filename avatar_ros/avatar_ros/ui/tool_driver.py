@@ -22,11 +22,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 
+from avatar_core.contact.status import FAR_AWAY, PLACED
 from avatar_ros.framework import qos, realtime
 from avatar_ros.framework.ports import PolledSubscriptions
 from avatar_ros.framework.stop_signal import StopSignal
 from avatar_ros.framework.templates import PoseTemplate, stamp_bytes
-from avatar_ros.loop.tool_channel import FAR_AWAY
 from avatar_ros.msg import ContactState
 from avatar_ros.ui.tool_state import N_RECENT, N_ROWS, ROW, SharedToolState, organ_number
 
@@ -35,21 +35,6 @@ _APPROACH = 0.04  # part of the remaining distance moved in a period: lags the m
 _MAX_STEP = 0.5e-3  # in a period [m]
 _N_SENT = 4096  # recent poses of each tool, one of which a state answers
 _LATE = 20 * PERIOD  # delay from which missed poses are skipped
-# With these, the step used the pose of the stamp; with INVALID_POSE none; with others FAR_AWAY.
-_PLACED = frozenset(
-    int(status)
-    for status in (
-        ContactState.STATUS_OK,
-        ContactState.STATUS_NOT_CONVERGED,
-        ContactState.STATUS_TOO_MANY_CONTACTS,
-        ContactState.STATUS_OUT_OF_RANGE,
-        ContactState.STATUS_EXTRAPOLATED,
-        ContactState.STATUS_ENGAGING,
-        ContactState.STATUS_NO_OPERATING_STATE,
-        ContactState.STATUS_NOT_ENABLED,
-        ContactState.STATUS_NOT_HOMED,
-    )
-)
 # Of each tool, deeper than the publisher's queue: a recording that lost periods is no path.
 _N_STATES = 200
 
@@ -121,7 +106,7 @@ class ToolDriver:
         """Position of a tip that the step used [m]."""
         if status == ContactState.STATUS_INVALID_POSE:
             return np.nan
-        if status not in _PLACED:
+        if status not in PLACED:
             return FAR_AWAY
         return self._sent[(stamp - self._first) // PERIOD % _N_SENT, tool]
 

@@ -1,0 +1,63 @@
+"""What a step, or the loop around it, found for a tool: the one list of status codes.
+
+avatar_ros/msg/ContactState.msg, msg_docs/contact_state.md and avatar_ros.loop.statuses are compared
+with it by tests/ros/loop/test_statuses.py.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+FAR_AWAY = 1e3  # coordinate of a tool without a pose [m]
+
+
+class Status(IntEnum):
+    """Number, name and ``meaning`` of each status.
+
+    ``step`` returns OK, INVALID_POSE, NOT_CONVERGED, TOO_MANY_CONTACTS, OUT_OF_RANGE or
+    EXTRAPOLATED; the loop of the contact node gives the others.
+    """
+
+    meaning: str
+
+    def __new__(cls, number: int, meaning: str) -> Status:
+        status = int.__new__(cls, number)
+        status._value_, status.meaning = number, meaning
+        return status
+
+    OK = 0, "solved: in contact, or free (contacts empty)"
+    NO_MODEL = 1, "no vademecum loaded yet"
+    NO_POSE = 2, "no pose of the tool received yet"
+    STALE_POSE = 3, "the last pose is too old to answer"
+    INVALID_POSE = 4, "pose not finite, stamp 0, or not a rotation"
+    NOT_CONVERGED = 5, "the contact solve reached its iteration limit"
+    TOO_MANY_CONTACTS = 6, "more contacts than the model was prepared for"
+    OUT_OF_RANGE = 7, "outside what the vademecum covers: depth, region or force"
+    UNKNOWN_FRAME = 8, "pose in another frame than tool_frame: refused, never used"
+    EXTRAPOLATED = (9, "pushed beyond the range of large deformation: force goes on tangentially")
+    LEAP = 10, "the pose leapt farther than a tool can move"
+    SEVERAL_PUBLISHERS = 11, "more than one node sends poses of this tool"
+    LOST_TOOL = 12, "no node sends poses of this tool any more"
+    ENGAGING = 13, "solved, but after a fault or at the start the force comes back softly"
+    INACTIVE = 14, "the node is being deactivated"
+    SLOW_POSES = 15, "sound poses come, but more slowly than pose_timeout allows"
+    NO_OPERATING_STATE = 16, "the tool's device has not said that it is enabled and homed"
+    NOT_ENABLED = 17, "the tool's device says that it is disabled, paused or in fault"
+    NOT_HOMED = 18, "the tool's device says that it is not homed"
+
+
+# With these, the step used the pose of the stamp; with INVALID_POSE none; with others FAR_AWAY.
+PLACED = tuple(
+    int(status)
+    for status in (
+        Status.OK,
+        Status.NOT_CONVERGED,
+        Status.TOO_MANY_CONTACTS,
+        Status.OUT_OF_RANGE,
+        Status.EXTRAPOLATED,
+        Status.ENGAGING,
+        Status.NO_OPERATING_STATE,
+        Status.NOT_ENABLED,
+        Status.NOT_HOMED,
+    )
+)

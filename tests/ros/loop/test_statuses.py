@@ -1,0 +1,44 @@
+"""Every place that lists the status codes lists those of ``avatar_core.contact.status``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+
+pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
+
+from avatar_ros.loop.statuses import EXPLANATIONS
+
+from avatar_core.contact.status import Status
+from avatar_ros.msg import ContactState
+from tests.helpers.paths import ROOT
+
+Row = tuple[int, str, str]  # number, name, meaning
+CODES = [(int(status), status.name, status.meaning) for status in Status]
+SOUND = {Status.OK, Status.TOO_MANY_CONTACTS, Status.ENGAGING}  # none of these needs a remedy
+
+
+def rows(path: str, pattern: str) -> Iterator[Row]:
+    for found in re.finditer(pattern, (ROOT / path).read_text(), re.MULTILINE):
+        yield int(found["number"]), found["name"], found["meaning"]
+
+
+def test_the_message_has_them() -> None:
+    pattern = r"^uint8 STATUS_(?P<name>\w+)=(?P<number>\d+) +# (?P<meaning>.+)$"
+    assert list(rows("avatar_ros/msg/ContactState.msg", pattern)) == CODES
+    for number, name, _ in CODES:  # as generated
+        assert getattr(ContactState, f"STATUS_{name}") == number
+
+
+def test_the_page_has_them() -> None:
+    pattern = r"^\| (?P<number>\d+) `STATUS_(?P<name>\w+)` \| (?P<meaning>[^|]+) \|"
+    listed = list(rows("msg_docs/contact_state.md", pattern))
+    assert [row[:2] for row in listed] == [code[:2] for code in CODES]
+    for (*_, said), (*_, meaning) in zip(listed, CODES, strict=True):
+        assert said.replace("`", "").startswith(meaning)  # and may go on with details
+
+
+def test_every_fault_has_a_cause_and_a_remedy() -> None:
+    assert set(EXPLANATIONS) == set(Status) - SOUND
