@@ -10,6 +10,7 @@ import os
 import signal
 import socket
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
@@ -90,7 +91,8 @@ class Child:
                 ours, theirs = socket.socketpair()
                 self._line, stdin = Connection(ours.detach()), theirs.fileno()
             words = (*self._arguments, *arguments)
-            self._process = ModuleProcess(self._module, *words, stdin=stdin, **self._options)
+            with deferred_signals():  # raised before it is known, one would leave it behind
+                self._process = ModuleProcess(self._module, *words, stdin=stdin, **self._options)
         except OSError as error:
             raise EndedError(f"it does not start, {error.strerror}") from error
         finally:
@@ -159,6 +161,24 @@ def computed_by(pid: int) -> float:
     """Processor time of a process since its start, without its children's [s]."""
     user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
     return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+@contextmanager
+def deferred_signals() -> Iterator[None]:
+    """In the main thread, what Python does at SIGINT or SIGTERM is done after the body."""
+    came: list[int] = []
+    before: dict[int, Any] = {}
+    try:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if callable(signal.getsignal(number)):
+                    before[number] = signal.signal(number, lambda number, _: came.append(number))
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came:
+            signal.raise_signal(number)
 
 
 @contextmanager

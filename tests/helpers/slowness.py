@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -51,10 +51,18 @@ def within(seconds: float) -> Iterator[None]:
     assert not passed, f"took longer than {seconds:g} s"
 
 
-def end_of(process: subprocess.Popen[Any], seconds: float) -> int:
-    """Exit code of a process that has to end within ``seconds`` of such a machine."""
+def wait_until(reached: Callable[[], bool], seconds: float, missed: str = "not reached") -> None:
+    """Wait for something that takes at most ``seconds`` of such a machine."""
     passed = Deadline(seconds)
-    while process.poll() is None:
-        assert not passed, f"did not end within {seconds:g} s"
+    while not reached():
+        assert not passed, f"{missed} within {seconds:g} s"
         time.sleep(0.01)
+
+
+def end_of(process: subprocess.Popen[Any], seconds: float) -> int:
+    """Exit code of a process that has to end within ``seconds`` of such a machine, or is killed."""
+    try:
+        wait_until(lambda: process.poll() is not None, seconds, "did not end")
+    finally:
+        process.kill()
     return int(process.returncode)

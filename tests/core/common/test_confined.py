@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from threading import Timer
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,10 @@ import pytest
 
 from avatar_core.common.child import Child, EndedError
 from avatar_core.common.confined import Confined, ConfinedError, Imported
+from avatar_core.common.processes import ModuleProcess
 from avatar_core.errors import StorageError
 from avatar_core.vademecum.storage import load_vademecum
+from tests.helpers.processes import state_of
 from tests.helpers.slowness import within
 
 SECONDS = 20.0
@@ -73,10 +75,16 @@ def test_a_crash_is_an_error_and_the_next_call_works(confined: Confined) -> None
 
 def test_a_call_is_given_up_by_another_thread(confined: Confined) -> None:
     first = confined.call(SECONDS, os.getpid)
-    giving_up = Timer(0.3, confined.kill)
+
+    def give_up() -> None:
+        while state_of(first) != "T":
+            time.sleep(0.01)
+        confined.kill()
+
+    giving_up = Thread(target=give_up)
     giving_up.start()
-    with within(15.0), pytest.raises(ConfinedError, match="Killed"):
-        confined.call(SECONDS, time.sleep, 60.0)
+    with pytest.raises(ConfinedError, match="Killed"):
+        confined.call(SECONDS, os.kill, first, signal.SIGSTOP)
     giving_up.join()
     assert confined.call(SECONDS, os.getpid) != first
     Confined().kill()  # which has no process
@@ -91,7 +99,7 @@ def test_a_hang_is_an_error_and_the_next_call_works(confined: Confined, hang: An
 
 
 def test_time_in_which_others_compute_does_not_count(confined: Confined) -> None:
-    confined.call(0.3, time.sleep, 1.0)
+    confined.call(1.0, time.sleep, 2.0)
 
 
 def test_memory_has_a_limit(confined: Confined) -> None:
@@ -136,3 +144,26 @@ def test_a_child_without_its_module_says_its_exit_code() -> None:
     child.start()
     with pytest.raises(EndedError, match="exit code 1"):
         child.receive()
+
+
+def test_a_signal_while_a_child_starts_leaves_none_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its handler raises only once the process is known to who has to end it."""
+
+    def stop(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    def started_as_a_signal_comes(*arguments: Any, **options: Any) -> ModuleProcess:
+        process = ModuleProcess(*arguments, **options)
+        signal.raise_signal(signal.SIGTERM)
+        return process
+
+    before = signal.signal(signal.SIGTERM, stop)
+    monkeypatch.setattr("avatar_core.common.child.ModuleProcess", started_as_a_signal_comes)
+    child = Child("avatar_core.common.confined", str(1 << 30))
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            child.start()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert child.is_running
+    child.finish(5.0)
