@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,8 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
 from avatar_ros.bench.cell import CellError
 from avatar_ros.bench.start import STAGES, run_start
+
+from tests.helpers.slowness import wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]
 
@@ -55,10 +56,7 @@ def test_a_start_is_measured_stage_by_stage(
             assert seconds <= following.cpu.get(name, seconds)
     data = json.loads((tmp_path / "start.json").read_text())
     assert data["summary"] == report.summary
-    deadline = time.monotonic() + 20.0
-    while marked(str(tmp_path)) and time.monotonic() < deadline:
-        time.sleep(0.2)
-    assert marked(str(tmp_path)) == set()  # nothing stays
+    wait_until(lambda: not marked(str(tmp_path)), 20.0, "something stays")
 
 
 def test_a_cell_that_does_not_start_is_named(library: Path) -> None:

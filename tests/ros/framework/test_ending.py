@@ -6,8 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +14,11 @@ import pytest
 pytest.importorskip("avatar_ros.framework.ending", reason="avatar_ros is not installed")
 
 from avatar_ros.bench.cell import Module
+from avatar_ros.bench.footprint import children
 
 from avatar_core.vademecum.storage import save_vademecum
-from tests.helpers.slowness import Deadline, end_of
+from tests.helpers.processes import has_ended
+from tests.helpers.slowness import end_of, wait_until
 
 pytestmark = pytest.mark.ros
 
@@ -46,8 +46,8 @@ def test_a_process_that_hangs_ends_with_its_code(code: int) -> None:
 
 def test_a_process_that_ends_by_itself_does_so_before() -> None:
     script = HANGS.format(seconds=3600, code=7, hangs=0)
-    process = subprocess.run([sys.executable, "-c", script], cwd="/", timeout=60.0)
-    assert process.returncode == 0
+    with subprocess.Popen([sys.executable, "-c", script], cwd="/") as process:
+        assert end_of(process, 60.0) == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -63,25 +63,17 @@ def test_a_node_that_still_reads_its_organ_ends(
         os.kill(reading, signal.SIGSTOP)
         node.send_signal(number)
         assert end_of(node, 5.0) == 0
-        late = Deadline(3.0)
-        while Path(f"/proc/{reading}").exists():  # killed, it takes a moment to vanish
-            assert not late, "the process that reads is left behind"
-            time.sleep(0.01)
+        wait_until(lambda: has_ended(reading), 3.0, "the process that reads did not end")
     finally:
         node.kill()
 
 
 def reader_of(node: Module) -> int:
     """The process that reads files for a node, once there is one."""
-    late = Deadline(60.0)
-    while not late:
-        for child in children(node.pid):
-            if b"confined" in Path(f"/proc/{child}/cmdline").read_bytes():
-                return child
-        time.sleep(0.01)
-    raise AssertionError("nothing is read")
 
+    def reading() -> list[int]:
+        words = {child: Path(f"/proc/{child}/cmdline").read_bytes() for child in children(node.pid)}
+        return [child for child, command in words.items() if b"confined" in command]
 
-def children(pid: int) -> Iterator[int]:
-    for thread in Path(f"/proc/{pid}/task").iterdir():
-        yield from map(int, (thread / "children").read_text().split())
+    wait_until(lambda: bool(reading()), 60.0, "nothing was read")
+    return reading()[0]

@@ -27,7 +27,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState
 from tests.helpers.paths import ROOT
-from tests.helpers.slowness import Deadline
+from tests.helpers.slowness import Deadline, end_of, slowness
 
 pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
 
@@ -38,11 +38,11 @@ from avatar_ros.srv import LoadVademecum
 rclpy.init()
 node = rclpy.create_node("far_planner", enable_rosout=False)
 client = node.create_client(LoadVademecum, "load_vademecum")
-assert client.wait_for_service(30.0)
+client.wait_for_service()
 time.sleep(0.5)
 begin = time.monotonic()
 answer = client.call_async(LoadVademecum.Request(name=sys.argv[1]))
-rclpy.spin_until_future_complete(node, answer, timeout_sec=30.0)
+rclpy.spin_until_future_complete(node, answer)
 print(begin, answer.result().info.id)
 """
 
@@ -182,11 +182,13 @@ def test_a_vademecum_crosses_and_a_dead_link_costs_no_more_than_itself(
 
     planner = hosts.run("planning", "-c", LOAD, "twin.h5")
     crossed = ear.until(lambda line: line["id"] not in ("", first), 60.0)
-    asked, identity = planner.communicate(timeout=30.0)[0].split()
+    assert end_of(planner, 60.0) == 0
+    asked, identity = planner.communicate()[0].split()
     assert crossed["id"] == identity
     assert all(line["finite"] for line in ear.lines)
     print(
         f"\ndead link for 5 s: zeros at {rate:.0f} Hz heard; force again {recovery:.2f} s after it "
         f"was up; another vademecum in use {crossed['at'] - float(asked):.2f} s after the request"
     )
-    assert recovery <= 3.0  # 0.2 s where nothing else runs; tells it from waiting for discovery
+    # 0.2 s where nothing else runs; tells it from waiting for discovery
+    assert recovery <= 3.0 * slowness()

@@ -24,6 +24,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from avatar_ros.msg import ContactState, LoopStatistics
+from tests.helpers.slowness import Deadline
 from tests.ros.helpers.steady_tool import SWING
 
 MOST = 5.0  # [N], the limit that the contact node is given
@@ -215,17 +216,18 @@ class FaultCell:
     def heard_from_tool(self, since: float, patience: float = _PATIENCE) -> float:
         """When a pose was answered for the first time after a moment."""
         answered = (ContactState.STATUS_ENGAGING, ContactState.STATUS_OK)
-        end = time.monotonic() + patience
+        passed = Deadline(patience)
         while True:
             for at, status, _ in list(self.ear.statuses):
                 if at > since and status in answered:
                     return at
-            assert time.monotonic() < end, "the tool did not start"
+            assert not passed, "the tool did not start"
             time.sleep(0.005)
 
     def wait_until_it_palpates(self, begin: float, patience: float = _PATIENCE) -> float:
         """How long after ``begin`` ordinary palpation starts [s]; infinity if it does not."""
-        while time.monotonic() < begin + patience:
+        passed = Deadline(patience)
+        while not passed:
             time.sleep(0.05)
             since = begin
             for at, status, _ in [s for s in self.ear.statuses if s[0] >= begin]:

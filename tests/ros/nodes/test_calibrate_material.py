@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +16,13 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from avatar_ros.bench.cell import Module
 from avatar_ros.bench.footprint import children
 
+from avatar_core.common.child import computed_by
 from avatar_core.scene.recording import load_recording, save_recording
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.srv import CalibrateMaterial, LoadVademecum
-from tests.helpers.slowness import Deadline
+from tests.helpers.processes import has_ended
+from tests.helpers.slowness import wait_until
 from tests.helpers.soft_organ import organ_on_springs
 from tests.helpers.touches import felt, path_over, recording_of
 
@@ -117,12 +117,6 @@ def test_the_loader_goes_on_to_serve(loader: Module, probe: Any) -> None:
     assert slow.result().success
 
 
-def computed(pid: int) -> float:
-    """Processor time of a process [s]."""
-    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
-    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
-
-
 def test_a_loader_that_ends_leaves_nothing_behind(
     own_domain: dict[str, str], library: Path, probe: Any
 ) -> None:
@@ -133,12 +127,9 @@ def test_a_loader_that_ends_leaves_nothing_behind(
     client.call_async(CalibrateMaterial.Request(recording="many_times.h5"))
     probe.until(lambda: bool(set(children(loader.pid)) - before), 30.0)
     (started,) = set(children(loader.pid)) - before
-    probe.until(lambda: computed(started) > IMPORTED, 120.0)
+    probe.until(lambda: computed_by(started) > IMPORTED, 120.0)
     assert loader.finish() == 0
-    passed = Deadline(3.0)
-    while Path(f"/proc/{started}").exists():
-        assert not passed, "the calibration goes on"
-        time.sleep(0.01)
+    wait_until(lambda: has_ended(started), 3.0, "the calibration did not end")
 
 
 @pytest.mark.parametrize(

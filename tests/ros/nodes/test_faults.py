@@ -24,14 +24,14 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
-from tests.helpers.slowness import Deadline, end_of
+from tests.helpers.slowness import end_of, slowness, wait_until
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.fault_cell import MOST, FaultCell, Harm, Silence
 
 pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
 
 STOPPED = 2.0  # [s]
-RECOVERY = 1.0  # [s]
+RECOVERY = 1.0  # on a machine that nothing else uses [s]
 JOINING = 30  # processes, two at a time
 SWAPS = 150
 JOIN = """
@@ -84,7 +84,7 @@ def accept(harm: Harm) -> None:
     print(f"\n{harm.row()}")
     assert harm.finite
     assert harm.largest <= MOST * (1 + 1e-9)
-    assert harm.recovery <= RECOVERY
+    assert harm.recovery <= RECOVERY * slowness()
 
 
 # --- Processes ----------------------------------------------------------------------------------
@@ -119,10 +119,8 @@ def test_the_contact_node_is_killed(tool: FaultCell) -> None:
         cell.end("contact")
         cell.ear.statuses.clear()
         cell.start("contact")
-        passed = Deadline(START_TIMEOUT)
-        while not (cell.ear.statuses and cell.ear.statuses[-1][2]):
-            assert not passed, "the contact node did not come back"
-            time.sleep(0.01)
+        back = lambda: bool(cell.ear.statuses and cell.ear.statuses[-1][2])  # noqa: E731
+        wait_until(back, START_TIMEOUT, "the contact node did not come back")
         assert identity in ("", cell.ear.statuses[-1][2])
 
     accept(tool.suffer("kill -9 of contact, from its first vademecum on", kill))

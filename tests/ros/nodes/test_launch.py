@@ -168,7 +168,7 @@ def test_launch_runs_a_cell_that_a_signal_ends(
 @FILES
 def test_launch_refuses_a_mistyped_argument(own_domain: dict[str, str], name: str) -> None:
     with launched(name, ["vademecums:=liver.h5"], own_domain) as process:
-        said = process.communicate(timeout=START_TIMEOUT)[0]
-    assert process.returncode == 1
+        assert end_of(process, START_TIMEOUT) == 1
+        said = process.communicate()[0]
     assert "there is no argument vademecums" in said
     assert "process started" not in said

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,8 @@ from avatar_ros.framework.reader import Reader
 from avatar_core.common.confined import Imported
 from avatar_ros.msg import ContactState
 from avatar_ros.srv import LoadVademecum
-from tests.helpers.slowness import Deadline
+from tests.helpers.processes import has_ended
+from tests.helpers.slowness import Deadline, wait_until
 from tests.ros.conftest import START_TIMEOUT
 
 pytestmark = pytest.mark.ros
@@ -44,10 +44,7 @@ def test_a_process_that_reads_ends_when_it_has_nothing_to_do() -> None:
     reader = Reader(1 << 20, idle=0.2)
     try:
         first = reader.read("a", 0, os.getpid)
-        passed = Deadline(30.0)
-        while Path(f"/proc/{first}").exists():
-            assert not passed
-            time.sleep(0.01)
+        wait_until(lambda: has_ended(first), 30.0)
         assert reader.read("b", 0, os.getpid) not in (first, os.getpid())
     finally:
         reader.close()
@@ -57,10 +54,7 @@ def test_a_process_that_was_loaded_for_nothing_ends_too() -> None:
     reader = Reader(1 << 20, idle=0.2)
     try:
         reader.load(os.getpid)
-        passed = Deadline(30.0)
-        while reader.pid is not None:
-            assert not passed
-            time.sleep(0.01)
+        wait_until(lambda: reader.pid is None, 30.0)
         reader.load(Imported("no_such_module", "f"))  # the first file says it as well
         assert reader.read("a", 0, os.getpid) != os.getpid()
     finally:

@@ -17,12 +17,13 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 
+from avatar_ros.bench.footprint import children
 from avatar_ros.framework import qos
 from avatar_ros.nodes.cell import node_arguments, wait_after
 
 from avatar_core.cli.cell import cell
 from avatar_ros.msg import ContactState
-from tests.helpers.slowness import end_of
+from tests.helpers.slowness import end_of, wait_until
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers.doc_pages import ROOT
 
@@ -70,8 +71,7 @@ def test_one_file_of_parameters_starts_a_cell_that_a_signal_ends(
 
 def child(process: subprocess.Popen[str], node: str) -> int | None:
     """Number of the cell's process of a node."""
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    for number in map(int, children):
+    for number in children(process.pid):
         if f"avatar_ros.nodes.{node}".encode() in Path(f"/proc/{number}/cmdline").read_bytes():
             return number
     return None
@@ -93,8 +93,7 @@ def test_a_node_that_dies_is_started_again_and_named(
         killed = child(process, "contact")
         assert killed is not None
         os.kill(killed, signal.SIGKILL)
-        while Path(f"/proc/{killed}").exists():  # until the cell has noticed
-            time.sleep(0.01)
+        wait_until(lambda: not Path(f"/proc/{killed}").exists(), 10.0, "the cell did not notice")
         model()
         assert child(process, "contact") not in (None, killed)
         process.send_signal(signal.SIGINT)
@@ -115,8 +114,9 @@ def test_a_node_that_refuses_to_start_ends_the_cell_and_is_named(
     file = tmp_path / "bad.yaml"
     file.write_text("contact:\n  ros__parameters: {rate: 5.0}\n")
     with started(["--params", str(file)], own_domain) as process:
-        _, said = process.communicate(timeout=START_TIMEOUT)
-    assert process.returncode == 1
+        assert end_of(process, START_TIMEOUT) == 1
+        assert process.stderr is not None
+        said = process.stderr.read()
     assert "contact ended with code 1; ending the cell" in said
     assert "parameter rate" in said
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from rclpy.parameter import parameter_value_to_python
 
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumInfo
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
-from tests.helpers.slowness import Deadline
+from tests.helpers.slowness import end_of, wait_until
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.fault_cell import FaultCell
 from tests.ros.nodes.test_cell import _force, _stamp
@@ -52,9 +51,8 @@ class State:
         assert scene.success, scene.message
         soft = np.linalg.norm(self.force(info.id))
         self.set(CHOSEN)
-        passed = Deadline(START_TIMEOUT)
-        while np.linalg.norm(self.force(info.id)) < 1.1 * soft:  # in use some tenths of a second on
-            assert not passed
+        stiffer = lambda: np.linalg.norm(self.force(info.id)) >= 1.1 * soft  # noqa: E731
+        wait_until(stiffer, START_TIMEOUT)  # in use some tenths of a second on
         return str(info.id)
 
     def set(self, values: dict[str, float]) -> None:
@@ -141,7 +139,7 @@ def test_what_is_started_again_goes_on_as_before(
     before = seen.force(identity)
     assert np.linalg.norm(before) > 0.1
     cell.processes[name].send_signal(HOW[how])
-    cell.processes.pop(name).wait(START_TIMEOUT)
+    end_of(cell.processes.pop(name), START_TIMEOUT)
     cell.start(name)
     if name == "patients":
         wrong = InterpolatePatient.Request(surface="nowhere.obj")
@@ -160,10 +158,8 @@ def test_what_is_started_again_goes_on_as_before(
 
 def wait_until_kept(file: Path, name: str) -> None:
     """A parameter that changed is written after it is in force."""
-    passed = Deadline(START_TIMEOUT)
-    while name not in json.loads(file.read_text())["changed"]:
-        assert not passed, f"{name} is not kept in {file}"
-        time.sleep(0.05)
+    kept = lambda: name in json.loads(file.read_text())["changed"]  # noqa: E731
+    wait_until(kept, START_TIMEOUT, f"{name} was not kept in {file}")
 
 
 @pytest.mark.long
