@@ -8,16 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import CellError, run_cell
 from avatar_ros.bench.report import CellMeasurement, CellReport
 
 from tests.helpers.slowness import slowness
-
-pytestmark = pytest.mark.ros
 
 
 def test_a_missing_vademecum_is_named(tmp_path: Path) -> None:

@@ -7,14 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import run_cell
 from avatar_ros.bench.footprint import Footprint, Growth
-
-pytestmark = pytest.mark.ros
 
 
 @pytest.mark.long

@@ -8,16 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import CellError
 from avatar_ros.bench.start import STAGES, run_start
 
 from tests.helpers.slowness import wait_until
 
-pytestmark = [pytest.mark.ros, pytest.mark.long]
+pytestmark = pytest.mark.long
 
 
 MARK = "AVATAR_MEASURED_START"  # in the environment of all that the measured start starts

@@ -5,10 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.bench.idle import ALL, run_idle
 from avatar_ros.framework import qos
@@ -16,7 +12,7 @@ from geometry_msgs.msg import WrenchStamped
 
 from avatar_ros.msg import ContactState
 
-pytestmark = [pytest.mark.ros, pytest.mark.long]
+pytestmark = pytest.mark.long
 
 # Wake-ups a second. A busy machine makes them fewer, never more; times would say nothing there.
 MOST_LOOP = 15.0  # ten steps

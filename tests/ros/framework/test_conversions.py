@@ -6,10 +6,6 @@ import math
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.framework.state_template import StateTemplate
 from avatar_ros.framework.templates import (
     CloudTemplate,
@@ -26,8 +22,6 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from avatar_ros.msg import ContactState
-
-pytestmark = pytest.mark.ros
 
 STAMP = 1_700_000_000_123_456_789
 FRAMES = ("o", "organ", "patient/organ_1")  # of lengths that pad differently

@@ -10,17 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("avatar_ros.framework.ending", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.bench.footprint import children
 
 from avatar_core.vademecum.storage import save_vademecum
 from tests.helpers.processes import has_ended
 from tests.helpers.slowness import end_of, wait_until
-
-pytestmark = pytest.mark.ros
 
 # PyDLL keeps the interpreter's lock, as rclpy does while it removes a participant.
 HANGS = """

@@ -9,16 +9,11 @@ import sys
 
 import numpy as np
 import pytest
-
-pytest.importorskip("avatar_ros.prepare.supplier", reason="avatar_ros is not installed")
-
 from avatar_ros.prepare.protocol import Channel
 from avatar_ros.prepare.requests import PreparationRequest
 from avatar_ros.prepare.shared_arrays import map_shared, write_shared
 
 from tests.helpers.slowness import end_of
-
-pytestmark = pytest.mark.ros
 
 
 def _arrays() -> dict[str, np.ndarray]:

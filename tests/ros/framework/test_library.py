@@ -9,10 +9,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.framework import conversions, library
 from avatar_ros.framework.library import RefusedError, file_name, find_in_library, read_in_library
 from avatar_ros.framework.reader import Reader
@@ -26,8 +22,6 @@ from avatar_ros.prepare.worker import ModelPreparer
 from avatar_core.errors import one_line
 from avatar_ros.msg import VademecumFile
 from avatar_ros.srv import InterpolatePatient
-
-pytestmark = pytest.mark.ros
 
 
 @pytest.fixture

@@ -12,10 +12,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -27,8 +23,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.helpers.slowness import slowness
 from tests.ros.helpers.refusals import refusal
-
-pytestmark = pytest.mark.ros
 
 POSES = "qos_overrides./tool/measured_cp.subscription"
 WRENCHES = "qos_overrides./tool/servo_cf.publisher"

@@ -13,10 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.framework.discovery import (
     BY_PROFILE,
     LOCAL,
@@ -30,8 +26,6 @@ from lifecycle_msgs.srv import GetState
 
 from tests.helpers.slowness import end_of
 from tests.ros.conftest import START_TIMEOUT
-
-pytestmark = pytest.mark.ros
 
 FAST_DDS = "rmw_fastrtps_cpp"
 NODE = [sys.executable, "-m", "avatar_ros.nodes.vademecum_loader"]

@@ -21,15 +21,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState
 from tests.helpers.paths import ROOT
 from tests.helpers.slowness import Deadline, end_of, slowness
 
-pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
+pytestmark = [pytest.mark.long, pytest.mark.timing]
 
 SCRIPTS = ROOT / "tests" / "ros" / "helpers"
 LOAD = """

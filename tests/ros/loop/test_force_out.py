@@ -13,10 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.loop.contact_loop import ActiveModel
 from avatar_ros.loop.device import Device
 from avatar_ros.loop.safety import Safety
@@ -32,7 +28,6 @@ from avatar_core.geometry.tip import Tip
 from avatar_ros.msg import ContactState
 from tests.ros.loop.test_poses import OK, Bench, bench, pose
 
-pytestmark = pytest.mark.ros
 __all__ = ["bench"]  # the fixture
 
 ENGAGING, BARRED = ContactState.STATUS_ENGAGING, ContactState.STATUS_OUT_OF_RANGE

@@ -10,10 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 import rclpy
 from avatar_ros.framework.templates import WrenchTemplate, rotation_between, stamp_bytes
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop
@@ -29,8 +25,6 @@ from avatar_core.contact.model import prepare
 from avatar_core.geometry.tip import Tip
 from tests.helpers.slowness import slowness
 from tests.ros.helpers.unlimited_guard import UnlimitedGuard
-
-pytestmark = pytest.mark.ros
 
 RATE = 1000.0  # [Hz]
 N_BLEND = round(BLEND * RATE)

@@ -5,10 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.loop.device import Device
 from avatar_ros.loop.diagnostics import FaultCounter
 from avatar_ros.loop.safety import COMMANDS
@@ -18,8 +14,6 @@ from crtk_msgs.msg import OperatingState
 
 from avatar_ros.msg import ContactState
 from tests.ros.helpers.refusals import refusal
-
-pytestmark = pytest.mark.ros
 
 NOTHING, NOT_ENABLED, NOT_HOMED = (
     ContactState.STATUS_NO_OPERATING_STATE,

@@ -13,12 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 import rclpy
 from avatar_ros.framework.state_template import StateTemplate
 from avatar_ros.framework.templates import PoseReader, stamp_bytes, stamp_nanoseconds
@@ -30,6 +24,8 @@ from avatar_ros.loop.settings import ContactSettings
 from avatar_ros.loop.statistics import statistics
 from avatar_ros.loop.tool_channel import ToolChannel
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
@@ -37,8 +33,6 @@ from avatar_core.contact.model import prepare
 from avatar_core.geometry.tip import Tip
 from avatar_ros.msg import ContactState
 from tests.ros.helpers.unlimited_guard import UnlimitedGuard
-
-pytestmark = pytest.mark.ros
 
 OK, INVALID = int(ContactState.STATUS_OK), int(ContactState.STATUS_INVALID_POSE)
 STALE, BARRED = int(ContactState.STATUS_STALE_POSE), int(ContactState.STATUS_OUT_OF_RANGE)

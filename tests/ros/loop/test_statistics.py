@@ -6,13 +6,7 @@ import math
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.loop.statistics import TimingRecord, statistics
-
-pytestmark = pytest.mark.ros
 
 PERIOD = 1_000_000  # [ns]
 

@@ -8,25 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.framework.templates import rotated
 from avatar_ros.loop.contact_loop import ActiveModel
 from avatar_ros.loop.safety import Safety
 from avatar_ros.loop.tool_channel import ToolChannel
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
 
 from avatar_core.contact.effects import Tilt
 from avatar_core.contact.model import prepare, solve
 from avatar_core.geometry.tip import Tip
 from tests.ros.conftest import TIP_RADIUS, TOUCH_DEPTH
 from tests.ros.loop.test_poses import Bench, bench, pose
-
-pytestmark = pytest.mark.ros
 
 __all__ = ["bench"]  # a fixture
 PUNCH = Tip("flat", 4e-3)

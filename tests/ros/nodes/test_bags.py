@@ -8,10 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.framework.ports import PolledSubscriptions
@@ -30,8 +26,6 @@ from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.msg import ContactState, VademecumInfo
 from tests.core.bags.bag_files import STORE
 from tests.helpers.slowness import Deadline
-
-pytestmark = pytest.mark.ros
 
 SECONDS = 4  # one touch
 _BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -9,10 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.bench.footprint import children
 
@@ -25,8 +21,6 @@ from tests.helpers.processes import has_ended
 from tests.helpers.slowness import wait_until
 from tests.helpers.soft_organ import organ_on_springs
 from tests.helpers.touches import felt, path_over, recording_of
-
-pytestmark = pytest.mark.ros
 
 SUPPORT = "support.bare_area"
 TRUE = {"young": 6e3, SUPPORT: 3e6}

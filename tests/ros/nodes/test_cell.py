@@ -9,10 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench import bare_loop
 from avatar_ros.framework import promises, qos
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -24,8 +20,6 @@ from avatar_ros.srv import LoadVademecum
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers.answers import ROUNDING, took
-
-pytestmark = pytest.mark.ros
 
 OK = ContactState.STATUS_OK
 

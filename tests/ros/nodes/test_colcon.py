@@ -9,9 +9,7 @@ import pytest
 
 from tests.helpers.paths import ROOT
 
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-
-pytestmark = [pytest.mark.ros, pytest.mark.long]
+pytestmark = pytest.mark.long
 
 SCRIPT = ROOT / "tests/ros/helpers/colcon_build.sh"
 NO_PYPI = 77

@@ -9,11 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.loop.safety import WRENCHES, Safety
 from avatar_ros.loop.tool_channel import ToolChannel
@@ -21,6 +16,7 @@ from crtk_msgs.msg import OperatingState
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
 
 from avatar_ros.msg import ContactState
 from tests.helpers.paths import PARAMS
@@ -28,7 +24,6 @@ from tests.ros.conftest import PATIENT
 from tests.ros.helpers.refusals import refusal
 from tests.ros.loop.test_poses import bench, pose
 
-pytestmark = pytest.mark.ros
 __all__ = ["bench"]  # a fixture
 
 DEVICES = PARAMS / "devices"

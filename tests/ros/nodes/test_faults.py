@@ -16,10 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
@@ -28,7 +24,7 @@ from tests.helpers.slowness import end_of, slowness, wait_until
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.fault_cell import MOST, FaultCell, Harm, Silence
 
-pytestmark = [pytest.mark.ros, pytest.mark.long, pytest.mark.timing]
+pytestmark = [pytest.mark.long, pytest.mark.timing]
 
 STOPPED = 2.0  # [s]
 RECOVERY = 1.0  # on a machine that nothing else uses [s]

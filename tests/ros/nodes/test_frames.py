@@ -9,11 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.framework.parameters import IDENTITY
@@ -23,12 +18,11 @@ from builtin_interfaces.msg import Time
 from crtk_msgs.msg import OperatingState, StringStamped
 from geometry_msgs.msg import TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage
 
 from avatar_ros.msg import ContactState
 from tests.ros.helpers.refusals import refusal
-
-pytestmark = pytest.mark.ros
 
 LISTENER = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # tf2's of tf_static
 # Of the originals, RIHS01 (REP 2016).

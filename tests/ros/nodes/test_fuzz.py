@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from tests.helpers.fuzzing import campaign
-
-pytestmark = pytest.mark.ros
 
 
 @pytest.mark.parametrize("door", ["loader", "patient"])

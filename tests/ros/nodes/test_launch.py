@@ -14,10 +14,6 @@ from typing import Any
 
 import pytest
 import yaml
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.framework import qos
 from avatar_ros.nodes import cell
 
@@ -27,8 +23,6 @@ from tests.helpers.slowness import end_of
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers import fake_launch
 from tests.ros.helpers.doc_pages import ROOT
-
-pytestmark = pytest.mark.ros
 
 FOLDER = ROOT / "avatar_ros" / "launch"
 PARAMS = ROOT / "params" / "planning_cell.yaml"

@@ -6,10 +6,6 @@ import signal
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.framework.conversions import vademecum_file
@@ -20,8 +16,6 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile
 from tests.helpers.slowness import end_of
 from tests.ros.helpers.refusals import refusal
-
-pytestmark = pytest.mark.ros
 
 NODES = ("vademecum_loader", "contact")
 

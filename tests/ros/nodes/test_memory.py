@@ -9,10 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.footprint import Footprint, children
 from avatar_ros.framework import qos
 from avatar_ros.framework.reader import Reader
@@ -23,8 +19,6 @@ from avatar_ros.srv import LoadVademecum
 from tests.helpers.processes import has_ended
 from tests.helpers.slowness import Deadline, wait_until
 from tests.ros.conftest import START_TIMEOUT
-
-pytestmark = pytest.mark.ros
 
 MOST = 60.0  # of a loader without what it announces [MB]
 # Those that only reading and preparing a vademecum need.

@@ -7,10 +7,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
@@ -30,8 +26,6 @@ from tests.ros.helpers.doc_pages import (
     topic,
     yaml_parameters,
 )
-
-pytestmark = pytest.mark.ros
 
 NODES = ("vademecum_loader", "contact", "organ_markers")
 # Some of the contact node's topics exist only with these.

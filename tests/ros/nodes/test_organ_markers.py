@@ -10,10 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.ui.colours import colours, table, top_for
@@ -23,8 +19,6 @@ from tests.helpers.paths import PARAMS
 from tests.helpers.slowness import within
 from tests.ros.helpers.doc_pages import entry, index, topic
 from tests.ros.nodes.test_cell import Hand, _wait_for_model
-
-pytestmark = pytest.mark.ros
 
 
 @pytest.fixture(scope="module")

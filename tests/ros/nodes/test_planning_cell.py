@@ -13,10 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.footprint import children
 from avatar_ros.framework import qos
 from avatar_ros.nodes.cell import node_arguments, wait_after
@@ -26,8 +22,6 @@ from avatar_ros.msg import ContactState
 from tests.helpers.slowness import end_of, wait_until
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers.doc_pages import ROOT
-
-pytestmark = pytest.mark.ros
 
 
 @contextmanager

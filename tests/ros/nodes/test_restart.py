@@ -10,10 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.framework import qos
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
@@ -28,8 +24,6 @@ from tests.helpers.slowness import end_of, wait_until
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.fault_cell import FaultCell
 from tests.ros.nodes.test_cell import _force, _stamp
-
-pytestmark = pytest.mark.ros
 
 CHOSEN = {"material.young_modulus": 0.25e6, "safety.max_force": 4.0}
 SCENE = "{name: blunt, tools: [{name: tool, tip: {shape: sphere, radius: 4e-3}}]}"

@@ -15,15 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from lifecycle_msgs.srv import GetState
 
 from tests.helpers.slowness import end_of
 
-pytestmark = [pytest.mark.ros, pytest.mark.long]
+pytestmark = pytest.mark.long
 
 END = 2.0  # from a signal to the end [s]
 PREFIX = Path(sys.prefix)

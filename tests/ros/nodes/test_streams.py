@@ -19,10 +19,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.loop.statuses import EXPLANATIONS
@@ -33,7 +29,7 @@ from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers.fault_cell import Ear
 from tests.ros.helpers.stream_tool import SPOIL
 
-pytestmark = [pytest.mark.ros, pytest.mark.long]
+pytestmark = pytest.mark.long
 
 RATES = (5, 20, 33, 100, 1000)  # [Hz]
 SECONDS = 2.5  # of each stream: two windows of the reports

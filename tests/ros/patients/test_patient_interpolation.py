@@ -13,10 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.action", reason="avatar_ros is not installed")
-
 from action_msgs.msg import GoalStatus
 from avatar_ros.bench.cell import Module
 from avatar_ros.bench.footprint import children
@@ -42,8 +38,6 @@ from tests.ros.conftest import newcomer
 from tests.ros.helpers.answers import took
 from tests.ros.helpers.doc_pages import index, offered, parameter_rows, yaml_parameters
 from tests.ros.helpers.refusals import refusal
-
-pytestmark = pytest.mark.ros
 
 NODE = "patient_interpolation"
 # A member of the atlas that does not count: registered already, meshed and combined anew.

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 pytest.importorskip("pyigtl", reason="the extra slicer is not installed")
 
 import pyigtl
@@ -32,8 +30,6 @@ from avatar_ros.msg import ContactState
 from tests.helpers.slowness import Deadline, end_of, wait_until, within
 from tests.ros.helpers.doc_pages import parameter_rows, yaml_parameters
 from tests.ros.nodes.test_cell import _wait_for_model
-
-pytestmark = pytest.mark.ros
 
 SECONDS = 30.0  # for an answer
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
