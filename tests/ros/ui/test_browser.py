@@ -147,7 +147,7 @@ def test_a_recording_replays(page: Any, shown: Organ, folder: Path) -> None:
     open_tab(page, "Tool")
     press(page, "Record")
     news(page, "natural effects runs")
-    pressed(page, 3.0)
+    pressed(page)
     page.wait_for_timeout(1000)
     lift(page)
     press(page, "Stop and save")
