@@ -265,7 +265,8 @@ def run(
 
 
 def test_the_command_says_and_writes_what_was_found(run: Command, tmp_path: Path) -> None:
-    code, said, _ = run("push.h5", "-o", "found.yaml", "-o", "found.json", "-o", "found.png")
+    code, out, err = run("push.h5", "-o", "found.yaml", "-o", "found.json", "-o", "found.png")
+    said = out + err
     assert code == 0
     assert "8 touches" in said and "the fit is good" in said
     assert "which the cell computed" in said or "that the cell computed" in said
