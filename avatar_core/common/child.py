@@ -170,9 +170,9 @@ def deferred_signals() -> Iterator[None]:
     before: dict[int, Any] = {}
     try:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                if callable(signal.getsignal(number)):
-                    before[number] = signal.signal(number, lambda number, _: came.append(number))
+            for each in (signal.SIGINT, signal.SIGTERM):
+                if callable(signal.getsignal(each)):
+                    before[each] = signal.signal(each, lambda number, _: came.append(number))
         yield
     finally:
         for number, handler in before.items():
