@@ -351,3 +351,12 @@ def touch(organ: Any) -> tuple[np.ndarray, np.ndarray]:
     j = middle_of_access(organ)
     normal = organ.surface.normals[j]
     return organ.surface.centers[j] + (TIP_RADIUS - TOUCH_DEPTH) * normal, normal
+
+
+@pytest.fixture
+def bench(organ: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Makes contact loops that the test steps, see ``SteppedLoop``."""
+    from tests.ros.helpers.stepped_loop import stepped_loops
+
+    with stepped_loops(organ, monkeypatch) as make:
+        yield make

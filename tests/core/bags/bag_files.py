@@ -18,6 +18,7 @@ from avatar_core.contact import model as contact
 from avatar_core.contact.effects import Effect
 from avatar_core.contact.haptics.force_guard import DEVICES, ForceGuard, ForceLimits
 from avatar_core.contact.model import prepare
+from avatar_core.contact.status import Status
 from avatar_core.contact.tool_path import push_and_slide
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
@@ -29,7 +30,6 @@ START = 1_700_000_000_000_000_000  # [ns]
 POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"
 STATE, INFO = "avatar_ros/msg/ContactState", "avatar_ros/msg/VademecumInfo"
 RADIUS = 5e-3
-_ENGAGING = 13
 
 
 def own_types() -> dict[str, Any]:
@@ -129,7 +129,7 @@ def simulated_cell(
         guard.update(k * 1e-3, True, sent[k], np.zeros(3))
         share[k] = guard.sent_fraction
         if status[k] == 0 and not guard.engaged:
-            status[k] = _ENGAGING
+            status[k] = Status.ENGAGING
     stamp = START + PERIOD * np.arange(n)
     return Cell(vademecum.id, stamp, tips, force, sent, share, status)
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from avatar_ros.bench.cell import Module
 from avatar_ros.bench.idle import ALL, run_idle
 from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 
 from avatar_ros.msg import ContactState
+from tests.ros.helpers.running import running
 
 pytestmark = pytest.mark.long
 
@@ -32,14 +32,10 @@ def test_idle_nodes_wake_up_for_little(own_domain: dict[str, str]) -> None:
 
 
 def test_who_only_listens_gets_its_zeros(own_domain: dict[str, str], probe: Any) -> None:
-    process = Module("contact", [], own_domain)
-    try:
+    with running("contact", own_domain):
         probe.next(ContactState, "contact_state", qos.state(1))
         probe.spin(1.0)  # so that the node counts seldom
         wrenches: list[Any] = []
         probe.node.create_subscription(WrenchStamped, "tool/servo_cf", wrenches.append, qos.COMMAND)
         probe.until(lambda: len(wrenches) > 20, 30.0)
-    finally:
-        code = process.finish()
-    assert code == 0
     assert not any(w.wrench.force.x or w.wrench.force.y or w.wrench.force.z for w in wrenches)

@@ -1,4 +1,4 @@
-"""Serialised templates say what message objects would say."""
+"""Serialised templates say what message objects would say, and read what may come as a pose."""
 
 from __future__ import annotations
 
@@ -16,59 +16,33 @@ from avatar_ros.framework.templates import (
     stamp_bytes,
     stamp_nanoseconds,
 )
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
-from rclpy.serialization import deserialize_message, serialize_message
+from avatar_ros.loop.tool_channel import OK
+from geometry_msgs.msg import WrenchStamped
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
 
 from avatar_ros.msg import ContactState
+from tests.ros.helpers.stepped_loop import NOW, pose
 
-STAMP = 1_700_000_000_123_456_789
+STAMP = NOW + 123_456_789  # [ns]
+PLACE = np.array([1.0, -2.0, 3.0])
 FRAMES = ("o", "organ", "patient/organ_1")  # of lengths that pad differently
-
-
-def _pose(frame: str = "organ", **changed: float) -> bytes:
-    numbers = {"x": 1.0, "y": -2.0, "z": 3.0, "qx": 0.0, "qy": 0.6, "qz": 0.0, "qw": 0.8}
-    numbers |= changed
-    header = Header(frame_id=frame)
-    header.stamp.sec, header.stamp.nanosec = divmod(STAMP, 1_000_000_000)
-    pose = Pose(
-        position=Point(x=numbers["x"], y=numbers["y"], z=numbers["z"]),
-        orientation=Quaternion(x=numbers["qx"], y=numbers["qy"], z=numbers["qz"], w=numbers["qw"]),
-    )
-    return serialize_message(PoseStamped(header=header, pose=pose))
 
 
 @pytest.mark.parametrize("frame", FRAMES)
 def test_a_pose_is_read(frame: str) -> None:
     reader = PoseReader(frame)
-    assert reader.read(_pose(frame)) == ContactState.STATUS_OK
+    assert reader.read(pose(PLACE, STAMP, frame=frame)) == OK
     assert reader.position == (1.0, -2.0, 3.0)
     assert stamp_nanoseconds(reader.stamp) == STAMP
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [{"x": math.nan}, {"z": math.inf}, {"qw": 0.9}, {"qy": math.nan}, {"qy": 0.0, "qw": 0.0}],
-)
-def test_an_impossible_pose_is_refused(changed: dict[str, float]) -> None:
-    assert PoseReader("organ").read(_pose(**changed)) == ContactState.STATUS_INVALID_POSE
-
-
-def test_a_pose_without_stamp_is_refused() -> None:
-    unstamped = serialize_message(PoseStamped(header=Header(frame_id="organ")))
-    assert PoseReader("organ").read(unstamped) == ContactState.STATUS_INVALID_POSE
-
-
-@pytest.mark.parametrize("frame", ["organ2", "orga", "", "world"])
-def test_a_pose_in_another_frame_is_refused(frame: str) -> None:
-    assert PoseReader("organ").read(_pose(frame)) == ContactState.STATUS_UNKNOWN_FRAME
-
-
 def test_a_pose_cut_anywhere_is_refused() -> None:
-    whole = _pose()
+    whole = pose(PLACE)
     reader = PoseReader("organ")
-    refused = [reader.read(whole[:n]) != ContactState.STATUS_OK for n in range(len(whole))]
+    refused = [reader.read(whole[:n]) != OK for n in range(len(whole))]
     assert all(refused)
 
 
@@ -87,7 +61,7 @@ def test_wrench(frame: str) -> None:
 def test_tool_and_contact_understand_each_other() -> None:
     template, reader = PoseTemplate("organ"), PoseReader("organ")
     template.position[:] = (0.1, 0.2, 0.3)
-    assert reader.read(template.serialise(stamp_bytes(STAMP))) == ContactState.STATUS_OK
+    assert reader.read(template.serialise(stamp_bytes(STAMP))) == OK
     assert reader.position == (0.1, 0.2, 0.3)
 
 
@@ -113,3 +87,81 @@ def test_state(n_contacts: int, identity: str) -> None:
     assert (state.tool, state.vademecum_id, state.status) == ("tool", identity, 7)
     assert [c.penetration for c in state.contacts] == [10.0 * i + 9 for i in range(n_contacts)]
     assert state.force_error == 0.125
+
+
+# --- Anything that a pose may be ------------------------------------------------------------------
+
+often = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+INVALID = int(ContactState.STATUS_INVALID_POSE)
+UNKNOWN_FRAME = int(ContactState.STATUS_UNKNOWN_FRAME)
+
+
+@often
+@given(norm=st.floats(0.0, 2.0), axis=st.tuples(*4 * [st.floats(-1.0, 1.0)]))
+@example(norm=0.0, axis=(0.0, 0.0, 0.0, 1.0))
+@example(norm=2.0, axis=(0.0, 0.0, 0.0, 1.0))
+@example(norm=1.0, axis=(1e-200, 0.0, 0.0, 0.0))
+def test_only_unit_quaternions_are_orientations(
+    norm: float, axis: tuple[float, float, float, float]
+) -> None:
+    size = np.linalg.norm(axis)
+    quaternion = norm * np.array(axis) / size if size > 1e-6 else np.zeros(4)
+    found = float(np.linalg.norm(quaternion))
+    if abs(abs(found - 1.0) - 1e-3) < 1e-5:
+        return  # at the tolerance itself
+    status = PoseReader("organ").read(pose(np.zeros(3), quaternion=quaternion))
+    assert status == (OK if abs(found - 1.0) < 1e-3 else INVALID)
+
+
+@often
+@given(st.tuples(*7 * [st.sampled_from([0.0, 1.0, math.nan, math.inf, -math.inf, 1e308, 1e200])]))
+def test_numbers_beyond_all_measure_are_refused(numbers: tuple[float, ...]) -> None:
+    reader = PoseReader("organ")
+    status = reader.read(pose(np.array(numbers[:3]), quaternion=np.array(numbers[3:])))
+    assert status in (OK, INVALID)
+    if status == OK:
+        assert np.isfinite(numbers).all()
+        assert sum(q * q for q in numbers[3:]) == pytest.approx(1.0, abs=3e-3)
+
+
+@often
+@given(st.data())
+def test_no_bytes_upset_the_reader(data: st.DataObject) -> None:
+    """Flipped, cut, continued or made up: a status, and nothing of it is kept if it is not OK."""
+    reader, whole = PoseReader("organ"), bytearray(pose(np.array([1.0, 2.0, 3.0])))
+    for place, value in data.draw(
+        st.lists(st.tuples(st.integers(0, len(whole) - 1), st.integers(0, 255)), max_size=8)
+    ):
+        whole[place] = value
+    cut = data.draw(st.integers(0, len(whole)))
+    raw = data.draw(
+        st.sampled_from([bytes(whole), bytes(whole[:cut]), bytes(whole[cut:]), bytes(whole) * 2])
+        | st.binary(max_size=200)
+    )
+    status = reader.read(raw)
+    assert status in (OK, INVALID, UNKNOWN_FRAME)
+    if status == OK:
+        assert np.isfinite(reader.position).all()
+        assert len(reader.stamp) == 8
+    else:
+        assert reader.position == (0.0, 0.0, 0.0)
+        assert stamp_nanoseconds(reader.stamp) == 0
+
+
+@often
+@given(
+    frame=st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1, max_size=40),
+    tool=st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=40),
+    capacity=st.integers(1, 8),
+)
+@example(frame="\x05\x03\x07\x02", tool="\x05\x03\x07\x02", capacity=5)
+@example(frame="Ω", tool="", capacity=1)
+def test_state_of_any_names(frame: str, tool: str, capacity: int) -> None:
+    template = StateTemplate(frame, tool, "", capacity)
+    template.contacts[:] = 0.5
+    raw = template.serialise(stamp_bytes(NOW), 9, capacity, 2.0)
+    state = deserialize_message(raw, ContactState)
+    assert (state.header.frame_id, state.tool, state.status) == (frame, tool, 9)
+    assert [c.penetration for c in state.contacts] == [0.5] * capacity
+    assert PoseReader(frame).read(pose(np.zeros(3), frame=frame)) == OK
+    assert PoseReader(frame).read(pose(np.zeros(3), frame=frame + "x")) == UNKNOWN_FRAME

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -23,22 +22,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.helpers.slowness import slowness
 from tests.ros.helpers.refusals import refusal
+from tests.ros.helpers.running import running, running_cell
 
 POSES = "qos_overrides./tool/measured_cp.subscription"
 WRENCHES = "qos_overrides./tool/servo_cf.publisher"
 RELIABLE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-
-
-@contextmanager
-def running(node: str, domain: dict[str, str], *values: str) -> Iterator[Module]:
-    """A node with some parameters, which has to end well."""
-    words = [word for value in values for word in ("-p", value)]
-    process = Module(node, ["--ros-args", *words] if words else [], domain)
-    try:
-        yield process
-    finally:
-        code = process.finish()
-    assert code == 0
 
 
 def diagnosis(probe: Any, wanted: Any) -> DiagnosticStatus:
@@ -101,9 +89,8 @@ rclpy.spin(node)
 def test_reliable_subscribers_that_stand_still_do_not_hold_up_the_loop(
     own_domain: dict[str, str], library: Any, probe: Any
 ) -> None:
-    files = [f"library_dir:={library}", "vademecum:=liver.h5"]
     reliable = "qos_overrides./deformation.publisher.reliability:=reliable"
-    with running("vademecum_loader", own_domain, *files), running("contact", own_domain, reliable):
+    with running_cell(own_domain, library, reliable):
         probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
         sleeper = subprocess.Popen(
             [sys.executable, "-c", LISTEN],

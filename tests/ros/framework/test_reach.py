@@ -5,10 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import textwrap
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +23,7 @@ from lifecycle_msgs.srv import GetState
 
 from tests.helpers.slowness import end_of
 from tests.ros.conftest import START_TIMEOUT
+from tests.ros.helpers.hosts import two_hosts
 
 FAST_DDS = "rmw_fastrtps_cpp"
 NODE = [sys.executable, "-m", "avatar_ros.nodes.vademecum_loader"]
@@ -151,43 +149,6 @@ def test_a_node_receives_on_the_loopback_alone(
         assert end_of(node, 10.0) == 0
 
 
-@dataclass(frozen=True)
-class Machines:
-    """Two network namespaces with a wire between them, each with shared memory of its own."""
-
-    names: tuple[str, str]
-    address: str
-
-    def start(self, machine: int, command: list[str], env: dict[str, str]) -> subprocess.Popen[str]:
-        inside = 'mount -t tmpfs tmpfs /dev/shm && exec "$@"'
-        there = f"ip netns exec {self.names[machine]} unshare -m sh -c".split()
-        return subprocess.Popen(
-            [*there, inside, "sh", *command], env=env, cwd="/", stdout=subprocess.PIPE, text=True
-        )
-
-
-@pytest.fixture
-def machines() -> Iterator[Machines]:
-    names = (f"avatar-a{os.getpid()}", f"avatar-b{os.getpid()}")
-    wires = (f"va{os.getpid()}", f"vb{os.getpid()}")
-    commands = [f"netns add {name}" for name in names]
-    commands += [f"link add {wires[0]} type veth peer name {wires[1]}"]
-    for k, (name, wire) in enumerate(zip(names, wires, strict=True)):
-        commands += [f"link set {wire} netns {name}"]
-        commands += [f"-n {name} addr add 10.231.7.{k + 1}/24 dev {wire}"]
-        commands += [f"-n {name} link set {wire} up multicast on", f"-n {name} link set lo up"]
-    try:
-        for command in commands:
-            try:
-                subprocess.run(["ip", *command.split()], check=True, capture_output=True)
-            except (OSError, subprocess.CalledProcessError) as error:
-                pytest.skip(f"no network namespaces here: ip {command}: {error}")
-        yield Machines(names, "10.231.7.1")
-    finally:
-        for name in names:
-            subprocess.run(["ip", "netns", "del", name], capture_output=True)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("said", "heard"),
@@ -195,21 +156,19 @@ def machines() -> Iterator[Machines]:
     ids=["default", "localhost", "subnet"],
 )
 def test_another_machine_reaches_a_node_only_if_told(
-    own_domain: dict[str, str], machines: Machines, said: dict[str, str], heard: str
+    own_domain: dict[str, str], tmp_path: Path, said: dict[str, str], heard: str
 ) -> None:
     """The other machine even knows the address, and looks there."""
-    node = machines.start(0, NODE, _plain(own_domain) | said)
-    try:
+    with two_hosts(tmp_path, _plain(own_domain)) as hosts:
+        node = hosts.run("planning", *NODE[1:], environment=_plain(own_domain) | said)
         time.sleep(2.0)
-        peer_environment = _plain(own_domain) | {RANGE: "SUBNET"}
-        peer_environment["ROS_STATIC_PEERS"] = machines.address
+        environment = _plain(own_domain) | {RANGE: "SUBNET", "ROS_STATIC_PEERS": hosts.ADDRESS}
         seconds = LISTENING if heard == "nothing" else START_TIMEOUT  # it ends when it hears
-        script = textwrap.dedent(HEARD.format(seconds=seconds))
-        peer = machines.start(1, [sys.executable, "-c", script], peer_environment)
+        script = HEARD.format(seconds=seconds)
+        peer = hosts.run("haptic", "-c", script, environment=environment)
         end_of(peer, 2 * START_TIMEOUT)
         assert peer.communicate()[0].strip() == heard
         assert node.poll() is None
-    finally:
         node.terminate()
         assert end_of(node, 10.0) == 0
 

@@ -7,13 +7,9 @@ Needs the right to make them, and skips where that is not given.
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +21,7 @@ from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.msg import ContactState
 from tests.helpers.paths import ROOT
 from tests.helpers.slowness import Deadline, end_of, slowness
+from tests.ros.helpers.hosts import Hosts, two_hosts
 
 pytestmark = [pytest.mark.long, pytest.mark.timing]
 
@@ -44,91 +41,15 @@ print(begin, answer.result().info.id)
 """
 
 
-class Hosts:
-    """``planning`` and ``haptic``, and the processes on them."""
-
-    def __init__(self, domain: dict[str, str], hidden: Path) -> None:
-        mark = f"{os.getpid() % 100000}"
-        self.names = {"planning": f"avp{mark}", "haptic": f"avh{mark}"}
-        self.environment = domain | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
-        self._hidden = hidden
-        self._shm = hidden.with_name("shm")  # no memory in common either
-        self._shm.mkdir()
-        self._processes: list[subprocess.Popen[str]] = []
-        for name in self.names.values():
-            _ip("netns", "add", name)
-            _ip("-n", name, "link", "set", "lo", "up")
-        planning, haptic = self.names.values()
-        _ip(
-            "link",
-            "add",
-            "far0",
-            "netns",
-            planning,
-            "type",
-            "veth",
-            "peer",
-            "far0",
-            "netns",
-            haptic,
-        )
-        for k, name in enumerate((planning, haptic), 1):
-            _ip("-n", name, "address", "add", f"10.77.0.{k}/24", "dev", "far0")
-            _ip("-n", name, "link", "set", "far0", "up")
-            _ip("-n", name, "route", "add", "224.0.0.0/4", "dev", "far0")
-
-    def run(self, host: str, *command: str) -> subprocess.Popen[str]:
-        """Start a Python command; on ``haptic`` the library is an empty folder."""
-        words = ["ip", "netns", "exec", self.names[host], sys.executable, *command]
-        if host == "haptic":
-            hide = f"mount -t tmpfs none {self._hidden} && mount --bind {self._shm} /dev/shm"
-            words = ["unshare", "-m", "sh", "-c", f'{hide} && exec "$@"', "sh", *words]
-        process = subprocess.Popen(
-            words, cwd="/", env=self.environment, stdout=subprocess.PIPE, text=True
-        )
-        self._processes.append(process)
-        return process
-
-    def link(self, state: str) -> None:
-        _ip("-n", self.names["planning"], "link", "set", "far0", state)
-        if state == "up":
-            with suppress(subprocess.CalledProcessError):
-                _ip("-n", self.names["planning"], "route", "add", "224.0.0.0/4", "dev", "far0")
-
-    def close(self) -> None:
-        for process in self._processes:
-            process.terminate()
-        for process in self._processes:
-            try:
-                process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-        for name in self.names.values():
-            subprocess.run(["ip", "netns", "del", name], check=False)
-
-
-def _ip(*words: str) -> None:
-    subprocess.run(["ip", *words], check=True, capture_output=True)
-
-
-def _may() -> bool:
-    if shutil.which("ip") is None or shutil.which("unshare") is None:
-        return False
-    tried = subprocess.run(["unshare", "-n", "-m", "true"], check=False, capture_output=True)
-    return tried.returncode == 0 and os.access("/run", os.W_OK)
-
-
 @pytest.fixture
 def hosts(own_domain: dict[str, str], organ: Any, tmp_path: Path) -> Iterator[Hosts]:
-    if not _may():
-        pytest.skip("no right to make network namespaces")
     library = tmp_path / "library"
     library.mkdir()
     save_vademecum(organ, library / "liver.h5")
     save_vademecum(replace(organ, name="twin"), library / "twin.h5")
-    found = Hosts(own_domain, library)
-    yield found
-    found.close()
+    environment = own_domain | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
+    with two_hosts(tmp_path, environment, hidden=library) as found:
+        yield found
 
 
 class Ear:

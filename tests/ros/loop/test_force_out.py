@@ -16,7 +16,7 @@ import pytest
 from avatar_ros.loop.contact_loop import ActiveModel
 from avatar_ros.loop.device import Device
 from avatar_ros.loop.safety import Safety
-from avatar_ros.loop.tool_channel import ToolChannel
+from avatar_ros.loop.tool_channel import OK, ToolChannel
 from builtin_interfaces.msg import Time
 from crtk_msgs.msg import OperatingState
 from geometry_msgs.msg import WrenchStamped
@@ -26,9 +26,7 @@ from avatar_core.contact.haptics.force_guard import ENGAGEMENT, SETTLING, ForceG
 from avatar_core.contact.model import prepare
 from avatar_core.geometry.tip import Tip
 from avatar_ros.msg import ContactState
-from tests.ros.loop.test_poses import OK, Bench, bench, pose
-
-__all__ = ["bench"]  # the fixture
+from tests.ros.helpers.stepped_loop import SteppedLoop, pose
 
 ENGAGING, BARRED = ContactState.STATUS_ENGAGING, ContactState.STATUS_OUT_OF_RANGE
 SOON = round(1e3 * SETTLING)  # periods
@@ -41,7 +39,7 @@ Fault = Callable[[Any, np.ndarray], Any]
 class Cell:
     """A bench whose force goes through a guard; the tool is held 3 mm deep, engaged."""
 
-    def __init__(self, bench: Bench, touch: Any, safety: Safety = SAFETY) -> None:
+    def __init__(self, bench: SteppedLoop, touch: Any, safety: Safety = SAFETY) -> None:
         self.bench, self.loop, self.tool = bench, bench.loop, bench.tools[0]
         self.normal, self.tip = touch[1], bench.press(touch, -1e-3)
         self.loop.guards = [ForceGuard(safety.limits)]

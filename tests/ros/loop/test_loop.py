@@ -18,6 +18,7 @@ from avatar_ros.loop.statistics import TimingRecord
 from avatar_ros.loop.tool_channel import OK
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
 
 from avatar_core.contact.effects import Friction, Viscoelasticity
@@ -295,22 +296,8 @@ def test_a_turn_drags_tissue_only_with_friction(
 def test_a_small_turn_is_the_rotation_vector() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
-        before = rng.normal(size=4)
-        before /= np.linalg.norm(before)
-        vector = rng.normal(size=3) * 0.01
-        now = _times(_quaternion(vector), before)
+        before, vector = Rotation.random(random_state=rng), rng.normal(size=3) * 0.01
+        now = (Rotation.from_rotvec(vector) * before).as_quat()
         for sign in (1.0, -1.0):  # both are the same orientation
-            turn = rotation_between(tuple(before), tuple(sign * now))
+            turn = rotation_between(tuple(before.as_quat()), tuple(sign * now))
             np.testing.assert_allclose(turn, vector, atol=2e-6)  # |v|^3 / 24
-
-
-def _quaternion(vector: np.ndarray) -> np.ndarray:
-    angle = np.linalg.norm(vector)
-    return np.append(np.sin(angle / 2) * vector / angle, np.cos(angle / 2))
-
-
-def _times(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Hamilton's product of quaternions (x, y, z, w): first q, then p."""
-    return np.append(
-        p[3] * q[:3] + q[3] * p[:3] + np.cross(p[:3], q[:3]), p[3] * q[3] - p[:3] @ q[:3]
-    )

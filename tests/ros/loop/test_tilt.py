@@ -20,21 +20,20 @@ from avatar_core.contact.effects import Tilt
 from avatar_core.contact.model import prepare, solve
 from avatar_core.geometry.tip import Tip
 from tests.ros.conftest import TIP_RADIUS, TOUCH_DEPTH
-from tests.ros.loop.test_poses import Bench, bench, pose
+from tests.ros.helpers.stepped_loop import SteppedLoop, pose
 
-__all__ = ["bench"]  # a fixture
 PUNCH = Tip("flat", 4e-3)
 
 
-def punch_bench(bench: Any, organ: Any) -> Bench:
+def punch_bench(bench: Any, organ: Any) -> SteppedLoop:
     """A loop whose tool is a punch with its shaft along +x of its pose."""
-    made: Bench = bench(20e-3)
+    made: SteppedLoop = bench(20e-3)
     model = prepare(organ, (PUNCH,), cloud="off", effects=(Tilt((1.0, 0.0, 0.0)),))
     made.loop.active = made.loop._used = ActiveModel("a", model, made.settings)
     return made
 
 
-def torque(bench: Bench) -> np.ndarray:
+def torque(bench: SteppedLoop) -> np.ndarray:
     sent = deserialize_message(bench.poses[0].sent[-1], WrenchStamped).wrench.torque
     return np.array([sent.x, sent.y, sent.z])
 

@@ -21,6 +21,7 @@ from tests.helpers.processes import has_ended
 from tests.helpers.slowness import wait_until
 from tests.helpers.soft_organ import organ_on_springs
 from tests.helpers.touches import felt, path_over, recording_of
+from tests.ros.helpers.running import running
 
 SUPPORT = "support.bare_area"
 TRUE = {"young": 6e3, SUPPORT: 3e6}
@@ -47,10 +48,9 @@ def probe(lasting_probe: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def loader(own_domain: dict[str, str], library: Path) -> Iterator[Module]:
-    options = ["--ros-args", "-p", f"library_dir:={library}", "-p", "vademecum:=springs.h5"]
-    process = Module("vademecum_loader", options, own_domain)
-    yield process
-    assert process.finish() == 0
+    files = [f"library_dir:={library}", "vademecum:=springs.h5"]
+    with running("vademecum_loader", own_domain, *files) as process:
+        yield process
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from avatar_ros.bench import bare_loop
 from avatar_ros.framework import promises, qos
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from avatar_ros.loop.statuses import EXPLANATIONS
+from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 
@@ -20,46 +21,14 @@ from avatar_ros.srv import LoadVademecum
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers.answers import ROUNDING, took
+from tests.ros.helpers.hand import Hand, felt, force_of, stamp_of, wait_for_model
 
-OK = ContactState.STATUS_OK
+OK, INVALID = ContactState.STATUS_OK, ContactState.STATUS_INVALID_POSE
 
 
 @pytest.fixture(scope="module")
 def probe(lasting_probe: Any) -> Any:
     return lasting_probe
-
-
-class Hand:
-    """Publishes one pose again and again, each time with a new stamp."""
-
-    def __init__(self, probe: Any, position: np.ndarray, frame: str = "organ") -> None:
-        self._clock = probe.node.get_clock()
-        self._publisher = probe.node.create_publisher(PoseStamped, "tool/measured_cp", qos.NEWEST)
-        self.pose = PoseStamped()
-        self.pose.header.frame_id = frame
-        self.pose.pose.orientation.w = 1.0
-        p = self.pose.pose.position
-        p.x, p.y, p.z = (float(x) for x in position)
-        self.stamps: set[tuple[int, int]] = set()
-
-    def __call__(self) -> None:
-        self.pose.header.stamp = self._clock.now().to_msg()
-        self.stamps.add(_stamp(self.pose))
-        self._publisher.publish(self.pose)
-
-
-def _stamp(message: Any) -> tuple[int, int]:
-    return message.header.stamp.sec, message.header.stamp.nanosec
-
-
-def _force(wrench: WrenchStamped) -> np.ndarray:
-    force = wrench.wrench.force
-    return np.array([force.x, force.y, force.z])
-
-
-def _wait_for_model(cell: Any, probe: Any) -> None:
-    assert all(process.poll() is None for process in cell.values())
-    probe.next(ContactState, "contact_state", qos.state(1), lambda s: s.vademecum_id)
 
 
 def _status(probe: Any, status: int, hand: Hand) -> ContactState:
@@ -68,44 +37,21 @@ def _status(probe: Any, status: int, hand: Hand) -> ContactState:
     )
 
 
-def felt(probe: Any, hand: Hand, timeout: float = 60.0) -> tuple[ContactState, np.ndarray]:
-    """What a tool in contact feels once its force is engaged, by state and by wrench."""
-    wrenches: dict[tuple[int, int], np.ndarray] = {}
-    listener = probe.node.create_subscription(
-        WrenchStamped,
-        "tool/servo_cf",
-        lambda w: wrenches.update({_stamp(w): _force(w)}),
-        qos.COMMAND,
-    )
-    engaged: list[tuple[int, int]] = []
-
-    def complete(s: ContactState) -> bool:
-        """Not of the first pose: its wrench may have been sent before the force was engaged."""
-        if s.status != OK or not s.contacts:
-            return False
-        engaged.append(_stamp(s))
-        return engaged[-1] != engaged[0] and engaged[-1] in wrenches
-
-    state = probe.next(ContactState, "contact_state", qos.state(1), complete, timeout, hand)
-    probe.node.destroy_subscription(listener)
-    return state, wrenches[_stamp(state)]
-
-
 def test_a_touch_is_felt(cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndarray]) -> None:
-    _wait_for_model(cell, probe)
+    wait_for_model(cell, probe)
     tip, normal = touch
     hand = Hand(probe, tip)
     wrench = probe.next(
         WrenchStamped,
         "tool/servo_cf",
         qos.COMMAND,
-        lambda w: np.linalg.norm(_force(w)) > 0.1,
+        lambda w: np.linalg.norm(force_of(w)) > 0.1,
         10.0,
         hand,
     )
     assert wrench.header.frame_id == "organ"
-    assert _stamp(wrench) in hand.stamps
-    force = _force(wrench)
+    assert stamp_of(wrench) in hand.stamps
+    force = force_of(wrench)
     # The organ pushes the tool out: along the normal, up to what its curved surface tilts.
     assert force @ normal > 0.8 * np.linalg.norm(force)
 
@@ -113,7 +59,7 @@ def test_a_touch_is_felt(cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndar
 def test_contacts_add_up_to_the_force(
     cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    _wait_for_model(cell, probe)
+    wait_for_model(cell, probe)
     hand = Hand(probe, touch[0])
     state, wrench = felt(probe, hand)
     assert (state.status, state.tool, state.header.frame_id) == (OK, "tool", "organ")
@@ -124,12 +70,12 @@ def test_contacts_add_up_to_the_force(
 def test_the_cloud_is_the_deformed_surface(
     cell: Any, probe: Any, organ: Any, touch: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    _wait_for_model(cell, probe)
+    wait_for_model(cell, probe)
     hand = Hand(probe, touch[0])
 
     def deformed(cloud: PointCloud2) -> bool:
         """By this hand: what an earlier one pressed may still be under way."""
-        of_hand = _stamp(cloud) in hand.stamps
+        of_hand = stamp_of(cloud) in hand.stamps
         return of_hand and bool(np.abs(_points(cloud)[:, 3:]).max() > 1e-3)
 
     cloud = probe.next(PointCloud2, "deformation", qos.NEWEST, deformed, 10.0, hand)
@@ -163,7 +109,7 @@ def test_the_rest_surface_is_announced(cell: Any, probe: Any, organ: Any) -> Non
 def test_a_bad_pose_gives_no_force(
     cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndarray], field: str, value: Any, status: int
 ) -> None:
-    _wait_for_model(cell, probe)
+    wait_for_model(cell, probe)
     hand = Hand(probe, touch[0])
     _status(probe, OK, hand)
     if field == "frame_id":
@@ -172,14 +118,26 @@ def test_a_bad_pose_gives_no_force(
         part, name = field.split(".")
         setattr(getattr(hand.pose.pose, part), name, value)
     assert not _status(probe, status, hand).contacts
-    gone = lambda wrench: not _force(wrench).any()  # noqa: E731
+    gone = lambda wrench: not force_of(wrench).any()  # noqa: E731
     probe.next(WrenchStamped, "tool/servo_cf", qos.COMMAND, gone, 10.0, hand)
+
+
+def test_a_fault_and_its_end_are_logged(
+    cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndarray]
+) -> None:
+    wait_for_model(cell, probe)
+    hand = Hand(probe, touch[0])
+    for w, said in ((0.5, f"no force: {EXPLANATIONS[INVALID][0]}"), (1.0, "the fault is over")):
+        hand.pose.pose.orientation.w = w
+        before = cell["contact"].said().count(f"tool: {said}")
+        logged = lambda text=f"tool: {said}", n=before: cell["contact"].said().count(text) > n  # noqa: E731
+        probe.until(lambda logged=logged: hand() or logged(), 30.0)
 
 
 def test_a_pose_that_stops_coming_is_stale(
     cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    _wait_for_model(cell, probe)
+    wait_for_model(cell, probe)
     hand = Hand(probe, touch[0])
     _status(probe, OK, hand)
     stale = probe.next(
@@ -189,10 +147,10 @@ def test_a_pose_that_stops_coming_is_stale(
         lambda s: s.status == ContactState.STATUS_STALE_POSE,
         5.0,
     )
-    gone = lambda wrench: not _force(wrench).any()  # noqa: E731
+    gone = lambda wrench: not force_of(wrench).any()  # noqa: E731
     wrench = probe.next(WrenchStamped, "tool/servo_cf", qos.COMMAND, gone, 5.0)
     assert not stale.contacts
-    assert _stamp(wrench) in hand.stamps  # of the last pose, not of some clock
+    assert stamp_of(wrench) in hand.stamps  # of the last pose, not of some clock
 
 
 def test_the_loop_keeps_its_rate_without_poses(cell: Any, probe: Any) -> None:
@@ -237,7 +195,7 @@ def test_a_bad_file_is_refused(cell: Any, probe: Any, name: str, reason: str) ->
     assert reason in answer.message
     assert "\n" not in answer.message
     after = probe.next(VademecumInfo, "vademecum_info", qos.LATCHED)
-    assert (after.id, _stamp(after)) == (before.id, _stamp(before))
+    assert (after.id, stamp_of(after)) == (before.id, stamp_of(before))
 
 
 def test_a_good_file_is_loaded(cell: Any, probe: Any, organ: Any, library: Path) -> None:
@@ -277,7 +235,7 @@ def test_an_inactive_loader_says_so(cell: Any, probe: Any) -> None:
 def test_another_vademecum_is_felt_soon(
     cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndarray], n_swaps: int
 ) -> None:
-    _wait_for_model(cell, probe)
+    wait_for_model(cell, probe)
     hand = Hand(probe, touch[0])
     seconds = []
     for k in range(n_swaps):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.paths import ROOT
+from tests.ros.helpers.running import EXECUTABLES
 
 pytestmark = pytest.mark.long
 
@@ -25,13 +26,6 @@ def test_colcon_builds_it_and_what_it_built_runs(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
     assert "contact has vademecum" in done.stdout
     installed = tmp_path / "workspace" / "install" / "avatar_ros"
-    assert {path.name for path in (installed / "lib" / "avatar_ros").iterdir()} == {
-        "contact",
-        "organ_markers",
-        "patient_interpolation",
-        "planning_ui",
-        "slicer_bridge",
-        "vademecum_loader",
-    }
+    assert {path.name for path in (installed / "lib" / "avatar_ros").iterdir()} == EXECUTABLES
     assert (installed / "bin" / "avatar").is_file()
     assert (installed / "share" / "avatar_ros" / "params" / "this_machine_only.xml").is_file()

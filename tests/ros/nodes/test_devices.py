@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.bench.cell import Module
 from avatar_ros.loop.safety import WRENCHES, Safety
 from avatar_ros.loop.tool_channel import ToolChannel
 from crtk_msgs.msg import OperatingState
@@ -22,9 +21,8 @@ from avatar_ros.msg import ContactState
 from tests.helpers.paths import PARAMS
 from tests.ros.conftest import PATIENT
 from tests.ros.helpers.refusals import refusal
-from tests.ros.loop.test_poses import bench, pose
-
-__all__ = ["bench"]  # a fixture
+from tests.ros.helpers.running import running_cell
+from tests.ros.helpers.stepped_loop import pose
 
 DEVICES = PARAMS / "devices"
 CRTK = QoSProfile(depth=10)  # of crtk_python_client: reliable, the last ten
@@ -92,15 +90,8 @@ def test_a_driver_feels_the_organ_by_its_file(
     own = "body/servo_cf" if name == "MTML" else "servo_cf"
     topics = {"measured_cp": "measured_cp", "operating_state": "operating_state", own: hears}
     remaps = [f"tool/{ours}:=/{name}/{theirs}" for ours, theirs in topics.items()]
-    arguments = ["--ros-args", "--params-file", str(DEVICES / file)]
-    for remap in remaps:
-        arguments += ["-r", remap]
-    loader = ["--ros-args", "-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
-    timeout = [part for part in PATIENT if part != "--ros-args"]  # of a busy machine
-    processes = [
-        Module("vademecum_loader", loader, own_domain),
-        Module("contact", arguments + timeout, own_domain),
-    ]
+    words = ["--params-file", str(DEVICES / file), *PATIENT[1:]]
+    words += [word for remap in remaps for word in ("-r", remap)]
     node, felt = probe.node, []
     poses = node.create_publisher(PoseStamped, f"/{name}/measured_cp", CRTK)
     states = node.create_publisher(OperatingState, f"/{name}/operating_state", LATCHED)
@@ -128,7 +119,7 @@ def test_a_driver_feels_the_organ_by_its_file(
     def reaches(status: int) -> None:
         probe.until(lambda: now["status"] == status, 60.0)
 
-    try:
+    with running_cell(own_domain, library, words=words):
         reaches(ContactState.STATUS_NO_OPERATING_STATE)
         for state, homed, status in (
             ("DISABLED", False, ContactState.STATUS_NOT_ENABLED),
@@ -145,8 +136,6 @@ def test_a_driver_feels_the_organ_by_its_file(
             reaches(ContactState.STATUS_NOT_ENABLED)
             says("ENABLED", True)
             probe.until(lambda: _size(felt[-1]) > 0.9 * min(limit, 3.0), 60.0)
-    finally:
-        assert [process.finish() for process in processes] == [0, 0]
     forces = np.array([_size(message) for message in felt])
     assert forces.max() <= limit * (1.0 + 1e-9)
     assert felt[-1].header.frame_id == frame
@@ -156,19 +145,9 @@ def test_beside_a_device_a_tool_of_software_speaks_in_the_organs_frame(
     own_domain: dict[str, str], library: Path, probe: Any, touch: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """As a planning page beside a Touch does, whose device has not been enabled yet."""
-    timeout = [part for part in PATIENT if part != "--ros-args"]
-    arguments = ["--ros-args", "--params-file", str(DEVICES / "touch.yaml"), *timeout]
+    words = ["--params-file", str(DEVICES / "touch.yaml"), *PATIENT[1:]]
     elsewhere = "tool_transform:=[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]"
-    for value in ("tools:=[stylus, page]", "software_tools:=page", elsewhere):
-        arguments += ["-p", value]
-    processes = [
-        Module(
-            "vademecum_loader",
-            ["--ros-args", "-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"],
-            own_domain,
-        ),
-        Module("contact", arguments, own_domain),
-    ]
+    values = ("tools:=[stylus, page]", "software_tools:=page", elsewhere)
     node, felt, states = probe.node, [], []
     poses = node.create_publisher(PoseStamped, "page/measured_cp", CRTK)
     node.create_subscription(WrenchStamped, "page/servo_cf", felt.append, CRTK)
@@ -183,11 +162,9 @@ def test_beside_a_device_a_tool_of_software_speaks_in_the_organs_frame(
         poses.publish(message)
 
     node.create_timer(2e-3, send)
-    try:
+    with running_cell(own_domain, library, *values, words=words):
         probe.until(lambda: bool(felt) and _size(felt[-1]) > 0.5, 60.0)
         of_device = {s.status for s in states if s.tool == "stylus"}
-    finally:
-        assert [process.finish() for process in processes] == [0, 0]
     assert felt[-1].header.frame_id == "organ"
     assert of_device and ContactState.STATUS_OK not in of_device
 

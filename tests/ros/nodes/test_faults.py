@@ -16,13 +16,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.helpers.slowness import end_of, slowness, wait_until
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.fault_cell import MOST, FaultCell, Harm, Silence
+from tests.ros.helpers.parameters import set_parameters
 
 pytestmark = [pytest.mark.long, pytest.mark.timing]
 
@@ -225,41 +224,19 @@ def test_malformed_requests(tool: FaultCell, lasting_probe: Probe) -> None:
 def test_a_storm_of_parameters(tool: FaultCell, lasting_probe: Probe) -> None:
     rng = np.random.default_rng(1)
 
-    def number(name: str, low: float, high: float) -> Parameter:
-        value = ParameterValue(
-            type=ParameterType.PARAMETER_DOUBLE, double_value=float(rng.uniform(low, high))
-        )
-        return Parameter(name=name, value=value)
-
     def storm(cell: FaultCell) -> None:
         for _ in range(1000):
-            many = [
-                number("material.young_modulus", 0.1e6, 0.2e6),
-                number("safety.max_force", 0.9 * MOST, MOST),
-                number("accuracy.tolerance", -1.0, 2.0),
-                number("no.such", 0.0, 1.0),
-            ]
-            lasting_probe.call(SetParameters, "/contact/set_parameters", _set(many))
-        still = [
-            Parameter(name=name, value=_double(value))
-            for name, value in (
-                ("material.young_modulus", 0.0),
-                ("safety.max_force", MOST),
-                ("accuracy.tolerance", 0.0),
-            )
-        ]
-        answers = lasting_probe.call(SetParameters, "/contact/set_parameters", _set(still)).results
-        assert all(answer.successful for answer in answers)
+            many = {
+                "material.young_modulus": rng.uniform(0.1e6, 0.2e6),
+                "safety.max_force": rng.uniform(0.9 * MOST, MOST),
+                "accuracy.tolerance": rng.uniform(-1.0, 2.0),
+                "no.such": rng.uniform(),
+            }
+            set_parameters(lasting_probe, "contact", many)
+        still = {"material.young_modulus": 0.0, "safety.max_force": MOST, "accuracy.tolerance": 0.0}
+        assert all(set_parameters(lasting_probe, "contact", still))
 
     accept(tool.suffer("4,000 parameters set, half of them wrong", storm))
-
-
-def _set(parameters: list[Parameter]) -> SetParameters.Request:
-    return SetParameters.Request(parameters=parameters)
-
-
-def _double(value: float) -> ParameterValue:
-    return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
 
 
 def test_a_flood_of_poses(tool: FaultCell) -> None:

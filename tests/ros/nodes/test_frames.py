@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.framework.parameters import IDENTITY
 from avatar_ros.loop.safety import Safety
@@ -23,6 +20,7 @@ from tf2_msgs.msg import TFMessage
 
 from avatar_ros.msg import ContactState
 from tests.ros.helpers.refusals import refusal
+from tests.ros.helpers.running import running
 
 LISTENER = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # tf2's of tf_static
 # Of the originals, RIHS01 (REP 2016).
@@ -31,17 +29,6 @@ HASHES = {
     StringStamped: ("83efb802e6596e03f69ac322e3231037329946f2bd13ed48874d97f5b8f5db1d"),
     TFMessage: "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
 }
-
-
-@contextmanager
-def contact(domain: dict[str, str], *values: str) -> Iterator[Module]:
-    words = [word for value in values for word in ("-p", value)]
-    process = Module("contact", ["--ros-args", *words] if words else [], domain)
-    try:
-        yield process
-    finally:
-        code = process.finish()
-    assert code == 0
 
 
 def heard(probe: Any) -> dict[tuple[str, str], tuple[np.ndarray, Rotation]]:
@@ -58,7 +45,7 @@ def _pose(transform: TransformStamped) -> tuple[np.ndarray, Rotation]:
 def test_a_late_listener_learns_where_the_organ_lies(
     own_domain: dict[str, str], probe: Any
 ) -> None:
-    with contact(own_domain):
+    with running("contact", own_domain):
         probe.next(ContactState, "contact_state", qos.state(1))  # it is active
         found = heard(probe)
     assert found.keys() == {("world", "organ")}
@@ -73,7 +60,7 @@ def test_a_point_of_the_tool_is_where_the_loop_has_it(
     place = [0.1, -0.2, 0.3, 0.5, 0.5, 0.5, 0.5]
     values = [f"parent_transform:={place}", "parent_frame:=room", "tool_frame:=base"]
     near = [1.0, 2.0, 3.0, 0.0, 0.0, 0.70711, 0.70711]
-    with contact(own_domain, *values, f"tool_transform:={near}"):
+    with running("contact", own_domain, *values, f"tool_transform:={near}"):
         found = heard(probe)
     assert found.keys() == {("room", "organ"), ("organ", "base")}
     (to, turn), (to_tool, turn_tool) = found["room", "organ"], found["organ", "base"]

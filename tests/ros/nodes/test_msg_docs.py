@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rcl_interfaces.srv import DescribeParameters
 from rclpy.duration import Infinite
-from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from avatar_ros.msg import ContactState
@@ -26,6 +25,7 @@ from tests.ros.helpers.doc_pages import (
     topic,
     yaml_parameters,
 )
+from tests.ros.helpers.parameters import parameter_names, parameter_values
 
 NODES = ("vademecum_loader", "contact", "organ_markers")
 # Some of the contact node's topics exist only with these.
@@ -115,17 +115,11 @@ def test_quality_of_service_is_that_of_the_page(graph: Any, row: dict[str, str])
 
 @pytest.mark.parametrize("node", NODES)
 def test_parameters_are_those_of_the_page(running: Any, node: str) -> None:
-    listed = running.ask(ListParameters, f"/{node}/list_parameters", ListParameters.Request())
-    declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
     rows, quality = parameter_rows(node), quality_rows(node)
     assert bool(quality) == (node in OVERRIDABLE)
-    assert declared == set(rows) | set(quality)
-    request = GetParameters.Request(names=list(quality))
-    values = running.ask(GetParameters, f"/{node}/get_parameters", request).values
-    assert quality == {
-        name: str(parameter_value_to_python(value))
-        for name, value in zip(quality, values, strict=True)
-    }
+    assert parameter_names(running, node) == set(rows) | set(quality)
+    found = parameter_values(running, node, quality)
+    assert quality == {name: str(value) for name, value in found.items()}
     request = DescribeParameters.Request(names=sorted(rows))
     described = running.ask(DescribeParameters, f"/{node}/describe_parameters", request)
     for descriptor in described.descriptors:
@@ -136,10 +130,5 @@ def test_parameters_are_those_of_the_page(running: Any, node: str) -> None:
 
 def test_the_yaml_file_holds_every_parameter_at_its_default(running: Any) -> None:
     values = yaml_parameters("contact")
-    request = GetParameters.Request(names=list(values))
-    answer = running.ask(GetParameters, "/contact/get_parameters", request)
-    running_with = [parameter_value_to_python(value) for value in answer.values]
-    assert dict(zip(values, running_with, strict=True)) == values | ASKED
-    listed = running.ask(ListParameters, "/contact/list_parameters", ListParameters.Request())
-    declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
-    assert declared == set(values)
+    assert parameter_values(running, "contact", values) == values | ASKED
+    assert parameter_names(running, "contact") == set(values)

@@ -18,7 +18,8 @@ from visualization_msgs.msg import Marker
 from tests.helpers.paths import PARAMS
 from tests.helpers.slowness import within
 from tests.ros.helpers.doc_pages import entry, index, topic
-from tests.ros.nodes.test_cell import Hand, _wait_for_model
+from tests.ros.helpers.hand import Hand, wait_for_model
+from tests.ros.helpers.running import running
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +29,8 @@ def probe(lasting_probe: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def markers(own_domain: dict[str, str]) -> Iterator[Module]:
-    process = Module("organ_markers", [], own_domain)
-    yield process
-    assert process.finish() == 0
+    with running("organ_markers", own_domain) as process:
+        yield process
 
 
 def corners(marker: Marker) -> np.ndarray:
@@ -52,7 +52,7 @@ def test_the_rest_shape_is_latched(markers: Any, cell: Any, probe: Any, organ: A
 def test_the_deformed_organ_is_coloured(
     markers: Any, cell: Any, probe: Any, organ: Any, touch: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    _wait_for_model(cell, probe)
+    wait_for_model(cell, probe)
     faces = organ.surface_faces.reshape(-1)
     rest = organ.surface_vertices[faces]
 

@@ -14,16 +14,14 @@ from avatar_ros.framework import qos
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
 from geometry_msgs.msg import WrenchStamped
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import GetParameters, SetParameters
-from rclpy.parameter import parameter_value_to_python
 
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumInfo
 from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.helpers.slowness import end_of, wait_until
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.fault_cell import FaultCell
-from tests.ros.nodes.test_cell import _force, _stamp
+from tests.ros.helpers.hand import force_of, stamp_of
+from tests.ros.helpers.parameters import parameter_values, set_parameters
 
 CHOSEN = {"material.young_modulus": 0.25e6, "safety.max_force": 4.0}
 SCENE = "{name: blunt, tools: [{name: tool, tip: {shape: sphere, radius: 4e-3}}]}"
@@ -50,14 +48,7 @@ class State:
         return str(info.id)
 
     def set(self, values: dict[str, float]) -> None:
-        double = ParameterType.PARAMETER_DOUBLE
-        named = [
-            Parameter(name=name, value=ParameterValue(type=double, double_value=value))
-            for name, value in values.items()
-        ]
-        request = SetParameters.Request(parameters=named)
-        results = self._probe.call(SetParameters, "/contact/set_parameters", request).results
-        assert all(result.successful for result in results)
+        assert all(set_parameters(self._probe, "contact", values))
 
     def shows_fewer_modes(self, rank: int) -> None:
         """A budget is in force: fewer modes than there are can be shown at all."""
@@ -71,7 +62,7 @@ class State:
         listener = self._probe.node.create_subscription(
             WrenchStamped,
             "tool/servo_cf",
-            lambda w: wrenches.update({_stamp(w): _force(w)}),
+            lambda w: wrenches.update({stamp_of(w): force_of(w)}),
             qos.COMMAND,
         )
         last: list[np.ndarray] = []
@@ -80,8 +71,8 @@ class State:
             sound = state.vademecum_id == identity and state.status == ContactState.STATUS_OK
             if not (sound and state.contacts and state.force_share == 1.0):
                 last.clear()
-            elif _stamp(state) in wrenches:
-                last.append(wrenches[_stamp(state)])
+            elif stamp_of(state) in wrenches:
+                last.append(wrenches[stamp_of(state)])
             return len(last) > 20 and bool(np.ptp(last[-20:], axis=0).max() < 1e-9)
 
         self._probe.next(ContactState, "contact_state", qos.state(1), still)
@@ -89,9 +80,7 @@ class State:
         return last[-1]
 
     def parameters(self) -> dict[str, Any]:
-        request = GetParameters.Request(names=list(CHOSEN))
-        values = self._probe.ask(GetParameters, "/contact/get_parameters", request).values
-        return dict(zip(CHOSEN, map(parameter_value_to_python, values), strict=True))
+        return parameter_values(self._probe, "contact", CHOSEN)
 
 
 @pytest.fixture(scope="module")

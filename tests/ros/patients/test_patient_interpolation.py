@@ -20,9 +20,8 @@ from avatar_ros.framework import promises, qos
 from avatar_ros.framework.conversions import surface_mesh
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rcl_interfaces.srv import DescribeParameters
 from rclpy.action import ActionClient, get_action_server_names_and_types_by_node
-from rclpy.parameter import parameter_value_to_python
 from shape_msgs.msg import Mesh
 
 from avatar_core.atlas.storage import load_atlas, save_atlas
@@ -37,6 +36,7 @@ from tests.helpers.slowness import end_of, within
 from tests.ros.conftest import newcomer
 from tests.ros.helpers.answers import took
 from tests.ros.helpers.doc_pages import index, offered, parameter_rows, yaml_parameters
+from tests.ros.helpers.parameters import parameter_names, parameter_values
 from tests.ros.helpers.refusals import refusal
 
 NODE = "patient_interpolation"
@@ -224,8 +224,7 @@ def test_services_and_actions_are_those_of_the_pages(node: Module) -> None:
 
 
 def test_parameters_are_those_of_page_and_yaml_file(node: Module, probe: Any) -> None:
-    listed = probe.ask(ListParameters, f"/{NODE}/list_parameters", ListParameters.Request())
-    declared = set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
+    declared = parameter_names(probe, NODE)
     assert declared == set(parameter_rows(NODE))
     request = DescribeParameters.Request(names=sorted(declared))
     described = probe.ask(DescribeParameters, f"/{NODE}/describe_parameters", request)
@@ -233,10 +232,8 @@ def test_parameters_are_those_of_page_and_yaml_file(node: Module, probe: Any) ->
     values = yaml_parameters(NODE)
     assert set(values) == declared
     given = {"atlas", "library_dir", "max_megabytes", "vertices", "certify"}  # by this test
-    names = sorted(declared - given)
-    answer = probe.ask(GetParameters, f"/{NODE}/get_parameters", GetParameters.Request(names=names))
-    running_with = [parameter_value_to_python(value) for value in answer.values]
-    assert running_with == [values[name] for name in names]
+    names = declared - given
+    assert parameter_values(probe, NODE, names) == {name: values[name] for name in names}
 
 
 # --- what is refused --------------------------------------------------------------------------

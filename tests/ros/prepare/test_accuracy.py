@@ -24,7 +24,7 @@ from avatar_core.errors import AccuracyError
 from avatar_core.vademecum.accuracy import Budget
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import START_TIMEOUT, Probe
-from tests.ros.nodes.test_cell import Hand, felt
+from tests.ros.helpers.hand import Hand, felt
 
 pytestmark = pytest.mark.ros
 

@@ -21,7 +21,7 @@ pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel
 from avatar_ros.loop.safety import Safety, band_topics
 from avatar_ros.loop.settings import CHANGEABLE, CONTACT
-from avatar_ros.loop.tool_channel import ToolChannel
+from avatar_ros.loop.tool_channel import OK, ToolChannel
 from avatar_ros.prepare.bands import BandPreparer, usable_known
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
@@ -38,10 +38,9 @@ from avatar_core.uncertainty.known import Held
 from avatar_core.vademecum.at_values import at_values
 from tests.helpers.soft_organ import soft_organ
 from tests.ros.helpers.refusals import refusal
-from tests.ros.loop.test_poses import OK, Bench, Queue, bench, pose
+from tests.ros.helpers.stepped_loop import Queue, SteppedLoop, pose
 
 pytestmark = pytest.mark.ros
-__all__ = ["bench"]  # the fixture
 
 TIP = Tip("sphere", 5e-3)
 LOW, HIGH = 0.6, 1.7
@@ -58,7 +57,7 @@ def ratios(model: Any, low: float = LOW, high: float = HIGH) -> np.ndarray:
 class Banded:
     """A bench whose tool has a band, 3 mm deep."""
 
-    def __init__(self, bench: Bench, touch: Any, safety: Safety | None = None) -> None:
+    def __init__(self, bench: SteppedLoop, touch: Any, safety: Safety | None = None) -> None:
         self.bench, self.loop, queue = bench, bench.loop, bench.poses[0]
         self.edges = [Queue(), Queue()]
         self.tool = ToolChannel(queue, queue, "organ", safety, tuple(self.edges))

@@ -33,7 +33,7 @@ from avatar_ros.srv import LoadVademecum
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import PATIENT
-from tests.ros.nodes.test_cell import Hand, felt
+from tests.ros.helpers.hand import Hand, felt
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]  # an organ with coordinates is solved first
 

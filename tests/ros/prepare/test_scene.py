@@ -35,7 +35,7 @@ from tests.helpers.paths import PARAMS
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import PATIENT, START_TIMEOUT, free_domain
 from tests.ros.helpers.answers import ROUNDING, took
-from tests.ros.nodes.test_cell import Hand, _force
+from tests.ros.helpers.hand import Hand, force_of
 from tests.ros.prepare.test_material import _set
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]  # a step is compiled for each scene
@@ -60,7 +60,7 @@ class Palpation:
         self.felt: list[np.ndarray] = []
         every = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
         self._listener = probe.node.create_subscription(
-            WrenchStamped, "tool/servo_cf", lambda w: self.felt.append(_force(w)), every
+            WrenchStamped, "tool/servo_cf", lambda w: self.felt.append(force_of(w)), every
         )
         self._timer = probe.node.create_timer(1e-3, self.hand)
 

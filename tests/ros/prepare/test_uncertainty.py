@@ -18,7 +18,7 @@ from rcl_interfaces.msg import Log, Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 
 from tests.helpers.slowness import Deadline
-from tests.ros.nodes.test_cell import Hand, _force, _stamp
+from tests.ros.helpers.hand import Hand, force_of, stamp_of
 from tests.ros.prepare.test_material import (
     _set,
     _set_back,
@@ -62,7 +62,7 @@ class Ears:
     def _listen(self, topic: str) -> Any:
         heard = self.heard[topic] = {}
         return self._probe.node.create_subscription(
-            WrenchStamped, f"tool/{topic}", lambda w: heard.update({_stamp(w): w}), qos.COMMAND
+            WrenchStamped, f"tool/{topic}", lambda w: heard.update({stamp_of(w): w}), qos.COMMAND
         )
 
     def band(self, wanted: Any = lambda force, band: True) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +74,7 @@ class Ears:
             stamps = set.intersection(*(set(heard) for heard in self.heard.values()))
             for stamp in sorted(stamps)[-1:]:
                 parts = [self.heard[topic][stamp] for topic in ("servo_cf", *EDGES)]
-                force, *band = (np.linalg.norm(_force(part)) for part in parts)
+                force, *band = (np.linalg.norm(force_of(part)) for part in parts)
                 if force > 0.0 and wanted(force, np.array(band)):
                     assert len({part.header.frame_id for part in parts}) == 1
                     return force, np.array(band)

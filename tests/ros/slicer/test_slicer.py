@@ -29,7 +29,8 @@ from avatar_ros.action import BuildPatient
 from avatar_ros.msg import ContactState
 from tests.helpers.slowness import Deadline, end_of, wait_until, within
 from tests.ros.helpers.doc_pages import parameter_rows, yaml_parameters
-from tests.ros.nodes.test_cell import _wait_for_model
+from tests.ros.helpers.hand import wait_for_model
+from tests.ros.helpers.running import running
 
 SECONDS = 30.0  # for an answer
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -69,9 +70,8 @@ def port() -> int:
 
 @pytest.fixture(scope="module")
 def bridge(own_domain: dict[str, str], port: int) -> Iterator[Module]:
-    process = Module("slicer_bridge", ["--ros-args", "-p", f"port:={port}"], own_domain)
-    yield process
-    assert process.finish() == 0
+    with running("slicer_bridge", own_domain, f"port:={port}") as process:
+        yield process
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def points_of(cloud: PointCloud2) -> np.ndarray:
 
 
 def test_the_organ_comes_in_millimetres(cell: Any, probe: Any, slicer: Any, organ: Any) -> None:
-    _wait_for_model(cell, probe)
+    wait_for_model(cell, probe)
     for device in (messages.ORGAN, messages.DEFORMED):
         surface = heard(slicer, probe, device)
         np.testing.assert_allclose(surface.points, 1e3 * organ.surface_vertices, atol=1e-3)
@@ -111,7 +111,7 @@ def test_a_tool_that_is_moved_there_presses_here(
     cell: Any, probe: Any, slicer: Any, organ: Any, touch: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """And the answer is seen there: the deformed organ, the force, the tool."""
-    _wait_for_model(cell, probe)
+    wait_for_model(cell, probe)
     tip, normal = touch
     rest = 1e3 * organ.surface_vertices
     for way in np.linspace(20e-3, 0.0, 21):  # as a hand would

@@ -1,0 +1,67 @@
+"""A tool that publishes one pose from the test's own process, and what it feels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from avatar_ros.framework import qos
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+
+from avatar_ros.msg import ContactState
+
+
+class Hand:
+    """Publishes one pose again and again, each time with a new stamp."""
+
+    def __init__(self, probe: Any, position: np.ndarray, frame: str = "organ") -> None:
+        self._clock = probe.node.get_clock()
+        self._publisher = probe.node.create_publisher(PoseStamped, "tool/measured_cp", qos.NEWEST)
+        self.pose = PoseStamped()
+        self.pose.header.frame_id = frame
+        self.pose.pose.orientation.w = 1.0
+        p = self.pose.pose.position
+        p.x, p.y, p.z = (float(x) for x in position)
+        self.stamps: set[tuple[int, int]] = set()
+
+    def __call__(self) -> None:
+        self.pose.header.stamp = self._clock.now().to_msg()
+        self.stamps.add(stamp_of(self.pose))
+        self._publisher.publish(self.pose)
+
+
+def stamp_of(message: Any) -> tuple[int, int]:
+    return message.header.stamp.sec, message.header.stamp.nanosec
+
+
+def force_of(wrench: WrenchStamped) -> np.ndarray:
+    force = wrench.wrench.force
+    return np.array([force.x, force.y, force.z])
+
+
+def wait_for_model(cell: Any, probe: Any) -> None:
+    assert all(process.poll() is None for process in cell.values())
+    probe.next(ContactState, "contact_state", qos.state(1), lambda s: s.vademecum_id)
+
+
+def felt(probe: Any, hand: Hand, timeout: float = 60.0) -> tuple[ContactState, np.ndarray]:
+    """What a tool in contact feels once its force is engaged, by state and by wrench."""
+    wrenches: dict[tuple[int, int], np.ndarray] = {}
+    listener = probe.node.create_subscription(
+        WrenchStamped,
+        "tool/servo_cf",
+        lambda w: wrenches.update({stamp_of(w): force_of(w)}),
+        qos.COMMAND,
+    )
+    engaged: list[tuple[int, int]] = []
+
+    def complete(s: ContactState) -> bool:
+        """Not of the first pose: its wrench may have been sent before the force was engaged."""
+        if s.status != ContactState.STATUS_OK or not s.contacts:
+            return False
+        engaged.append(stamp_of(s))
+        return engaged[-1] != engaged[0] and engaged[-1] in wrenches
+
+    state = probe.next(ContactState, "contact_state", qos.state(1), complete, timeout, hand)
+    probe.node.destroy_subscription(listener)
+    return state, wrenches[stamp_of(state)]

@@ -1,0 +1,30 @@
+"""Parameters of a running node, asked for and set by a probe."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rclpy.parameter import Parameter, parameter_value_to_python
+
+
+def parameter_names(probe: Any, node: str) -> set[str]:
+    """Those that a node declares itself."""
+    listed = probe.ask(ListParameters, f"/{node}/list_parameters", ListParameters.Request())
+    return set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
+
+
+def parameter_values(probe: Any, node: str, names: Iterable[str]) -> dict[str, Any]:
+    """Values by name."""
+    request = GetParameters.Request(names=list(names))
+    values = probe.ask(GetParameters, f"/{node}/get_parameters", request).values
+    return dict(zip(request.names, map(parameter_value_to_python, values), strict=True))
+
+
+def set_parameters(probe: Any, node: str, values: Mapping[str, Any]) -> list[bool]:
+    """Set one after the other; whether each was taken."""
+    messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    request = SetParameters.Request(parameters=messages)
+    results = probe.call(SetParameters, f"/{node}/set_parameters", request).results
+    return [result.successful for result in results]
