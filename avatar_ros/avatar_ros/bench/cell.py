@@ -31,7 +31,7 @@ from avatar_core.common.processes import ModuleProcess, thread_limits
 from avatar_core.errors import AvatarError
 from avatar_ros.bench import footprint
 from avatar_ros.bench.command import print_report
-from avatar_ros.bench.footprint import Growth, footprints
+from avatar_ros.bench.footprint import FootprintGrowth, footprints
 from avatar_ros.bench.report import CellMeasurement, CellReport, Times
 from avatar_ros.bench.scripted_tool import READY, RoundTrips
 
@@ -158,7 +158,7 @@ def _windows(round_trips: RoundTrips, view: dict[str, Any]) -> list[dict[str, An
     return found
 
 
-def _growths(seconds: float, processes: dict[str, Module]) -> tuple[Growth, ...]:
+def _growths(seconds: float, processes: dict[str, Module]) -> tuple[FootprintGrowth, ...]:
     """The growth of all processes over a run that begins now; returns shortly before its end."""
     begin = time.monotonic()
     pids = {name: process.pid for name, process in processes.items()}
@@ -180,7 +180,7 @@ def _evaluate(
     bare: tuple[np.ndarray, np.ndarray],
     load: float,
     accepted: int,
-    grown: tuple[Growth, ...],
+    grown: tuple[FootprintGrowth, ...],
 ) -> CellMeasurement:
     begin, end = float(round_trips.begin), float(round_trips.end)
     periods = sum(w["periods"] for w in windows)

@@ -39,7 +39,7 @@ class Footprint:
 
 
 @dataclass(frozen=True)
-class Growth:
+class FootprintGrowth:
     """The growth of one process over a run."""
 
     process: str
@@ -79,8 +79,8 @@ def footprints(pids: dict[str, int]) -> dict[str, Footprint]:
     return {name: Footprint.of(pid) for name, pid in pids.items()}
 
 
-def growths(begin: dict[str, Footprint], end: dict[str, Footprint]) -> tuple[Growth, ...]:
-    return tuple(Growth(name, begin[name], end[name]) for name in begin)
+def growths(begin: dict[str, Footprint], end: dict[str, Footprint]) -> tuple[FootprintGrowth, ...]:
+    return tuple(FootprintGrowth(name, begin[name], end[name]) for name in begin)
 
 
 def children(pid: int) -> Iterable[int]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from avatar_ros.bench import footprint
-from avatar_ros.bench.footprint import Growth
+from avatar_ros.bench.footprint import FootprintGrowth
 from avatar_ros.bench.scripted_tool import RoundTrips
 
 PROMISED_ON_TIME = 0.99  # of the contact loop's periods, on a quiet machine
@@ -69,7 +69,7 @@ class CellMeasurement:
     cloud_bytes: int
     material_changes: int
     force_max_n: float
-    growths: tuple[Growth, ...]
+    growths: tuple[FootprintGrowth, ...]
     round_trips: RoundTrips
 
     @property

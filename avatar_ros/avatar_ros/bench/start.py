@@ -49,7 +49,7 @@ _NAMES = {
 
 
 @dataclass(frozen=True)
-class Stage:
+class StartStage:
     """One stage of a start.
 
     seconds : since the launch [s]
@@ -67,7 +67,7 @@ class StartReport:
 
     vademecum: str
     load_average: float
-    stages: tuple[Stage, ...]
+    stages: tuple[StartStage, ...]
 
     @property
     def seconds(self) -> float:
@@ -168,13 +168,13 @@ class _Watcher:
         self._pose.position[:] = tip
         node.create_timer(_PERIOD, self._send)
 
-    def watch(self, process: subprocess.Popen[bytes], begin: float) -> list[Stage]:
+    def watch(self, process: subprocess.Popen[bytes], begin: float) -> list[StartStage]:
         """Serve until the last stage is reached; the stages in the order in which they were."""
-        stages: list[Stage] = []
+        stages: list[StartStage] = []
 
         def note(name: str) -> None:
             of_ended = stages[-1].cpu if stages else {}
-            stages.append(Stage(name, time.monotonic() - begin, of_ended | _cpu(process.pid)))
+            stages.append(StartStage(name, time.monotonic() - begin, of_ended | _cpu(process.pid)))
 
         self._on_reached = note
         while len(stages) < len(STAGES):

@@ -35,7 +35,7 @@ from avatar_core.contact.status import FAR_AWAY, Status
 from avatar_ros.framework import realtime
 from avatar_ros.framework.state_template import StateTemplate
 from avatar_ros.framework.templates import NO_STAMP, CloudTemplate, stamp_nanoseconds
-from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.settings import LoopSettings
 from avatar_ros.loop.shown_modes import ShownModes
 from avatar_ros.loop.statistics import TimingRecord
 from avatar_ros.loop.tool_channel import OK, ToolChannel
@@ -64,7 +64,7 @@ class ActiveModel:
         self,
         vademecum_id: str,
         model: Any,
-        settings: ContactSettings,
+        settings: LoopSettings,
         effects: tuple[str, ...] = (),
         shown_modes: ShownModes | None = None,
         band: ForceBand | None = None,
@@ -106,11 +106,7 @@ class ContactLoop:
     """
 
     def __init__(
-        self,
-        settings: ContactSettings,
-        tools: list[ToolChannel],
-        publishers: Publishers,
-        context: Any,
+        self, settings: LoopSettings, tools: list[ToolChannel], publishers: Publishers, context: Any
     ) -> None:
         self.settings = settings
         self.active = ActiveModel("", None, settings)

@@ -16,7 +16,7 @@ from rclpy.node import Node
 
 from avatar_core.contact.status import Status
 from avatar_ros.framework import qos
-from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.settings import LoopSettings
 from avatar_ros.loop.tool_channel import OK, ToolChannel
 
 NOTHING_SAID = int(Status.NO_OPERATING_STATE)
@@ -27,7 +27,7 @@ OF_DEVICE = (NOTHING_SAID, NOT_ENABLED, NOT_HOMED)
 _STATES = ("DISABLED", "ENABLED", "PAUSED", "FAULT")
 
 
-class Device:
+class ToolDevice:
     """Hears one device, tells its tool's channel, and sends it the commands that were asked for.
 
     A command is sent once after ``begin``, to a device that says it needs it: ``enable`` if it is
@@ -87,14 +87,14 @@ class Device:
         self._tool.device = status
 
 
-def devices(node: Node, settings: ContactSettings, tools: Sequence[ToolChannel]) -> list[Device]:
+def devices(node: Node, settings: LoopSettings, tools: Sequence[ToolChannel]) -> list[ToolDevice]:
     """The devices of all tools that have one, if ``tool_operating_state`` asks for them."""
     made = []
     for name, tool in zip(settings.tools, tools, strict=True):
         safety = settings.safety_of(name)
         if not safety.hears_state:
             continue
-        device = Device(tool, safety.commands, lambda: node.get_clock().now().to_msg())
+        device = ToolDevice(tool, safety.commands, lambda: node.get_clock().now().to_msg())
         device.subscription = node.create_subscription(
             OperatingState, f"{name}/operating_state", device.hear, qos.LATCHED
         )

@@ -192,7 +192,7 @@ MATERIAL = {
 
 
 @dataclass(frozen=True)
-class ContactSettings:
+class LoopSettings:
     """Parameters of the contact node; rates [Hz], times [s].
 
     scene : YAML, checked; empty for the natural effects of the vademecum

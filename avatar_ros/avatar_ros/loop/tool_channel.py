@@ -19,7 +19,7 @@ from avatar_ros.framework.templates import (
     rotation_between,
 )
 from avatar_ros.loop.safety import WRENCHES, Safety, band_topics
-from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.settings import LoopSettings
 
 OK = int(Status.OK)
 NO_POSE = int(Status.NO_POSE)
@@ -242,7 +242,7 @@ class ToolChannel:
         self._orientation = self._axes = self._reader.orientation
 
 
-def tool_channels(ports: Ports, settings: ContactSettings) -> list[ToolChannel]:
+def tool_channels(ports: Ports, settings: LoopSettings) -> list[ToolChannel]:
     """The channels of all tools, whose messages the loop takes itself.
 
     Raises
@@ -254,7 +254,7 @@ def tool_channels(ports: Ports, settings: ContactSettings) -> list[ToolChannel]:
 
 
 def _channel(
-    ports: Ports, settings: ContactSettings, name: str, polled: PolledSubscriptions
+    ports: Ports, settings: LoopSettings, name: str, polled: PolledSubscriptions
 ) -> ToolChannel:
     period, safety = 1.0 / settings.rate, settings.safety_of(name)
     return ToolChannel(

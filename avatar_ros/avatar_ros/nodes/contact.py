@@ -39,13 +39,13 @@ from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop, Publishers
-from avatar_ros.loop.device import Device, devices
+from avatar_ros.loop.device import ToolDevice, devices
 from avatar_ros.loop.safety import SAFETY, chosen_safety
 from avatar_ros.loop.settings import (
     CHANGEABLE,
     CONTACT,
     MATERIAL,
-    ContactSettings,
+    LoopSettings,
     chosen_budget,
     chosen_known,
 )
@@ -72,7 +72,7 @@ class ContactNode(ManagedNode):
         self._loop: ContactLoop | None = None
         self._supplier: ModelSupplier | None = None
         self._tools: list[ToolChannel] = []
-        self._devices: list[Device] = []
+        self._devices: list[ToolDevice] = []
         self._outputs: Publishers | None = None
         self._frames: Any = None  # publisher of the static transforms
         self._reports: ContactReports | None = None  # while the node is active
@@ -134,7 +134,7 @@ class ContactNode(ManagedNode):
             passivity.warm_up()
         self._save_state()
 
-    def _settings(self) -> ContactSettings:
+    def _settings(self) -> LoopSettings:
         """From the parameters and the saved scene, which is dropped if it does not fit any more."""
         try:
             return read_contact(self, self._scene)

@@ -8,12 +8,12 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
 
-from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.settings import LoopSettings
 
 TOPIC = "/tf_static"  # whatever the namespace of the node, as tf2 has it
 
 
-def static_transforms(settings: ContactSettings, stamp: Time) -> TFMessage:
+def static_transforms(settings: LoopSettings, stamp: Time) -> TFMessage:
     """Organ in ``parent_frame``, tools' frame in the organ's; each only if it is another frame."""
     organ, tools, parent = settings.frame_id, settings.safety.frame, settings.parent_frame
     found = []

@@ -16,7 +16,7 @@ from avatar_ros.framework.parameters import ParameterError, frame, pose, values
 from avatar_ros.loop.safety import chosen_safety
 from avatar_ros.loop.settings import (
     CONTACT,
-    ContactSettings,
+    LoopSettings,
     chosen_budget,
     chosen_known,
     chosen_material,
@@ -28,7 +28,7 @@ from avatar_ros.prepare import scenes
 CLOUDS = get_args(Cloud)
 
 
-def read_contact(node: Node, saved_scene: str = "") -> ContactSettings:
+def read_contact(node: Node, saved_scene: str = "") -> LoopSettings:
     """The contact node's parameters, checked against one another.
 
     saved_scene : YAML, which overrides the parameter ``scene``
@@ -50,7 +50,7 @@ def read_contact(node: Node, saved_scene: str = "") -> ContactSettings:
             ) from error
     if value["cloud"] not in CLOUDS:
         raise ParameterError(f"parameter cloud: give one of {', '.join(CLOUDS)}")
-    settings = ContactSettings(
+    settings = LoopSettings(
         tools=tools,
         tips=chosen_tips(value, len(tools)),
         scene="",
@@ -79,7 +79,7 @@ def read_contact(node: Node, saved_scene: str = "") -> ContactSettings:
     return settings
 
 
-def _with_scene(settings: ContactSettings, read: Callable[[], Scene]) -> ContactSettings:
+def _with_scene(settings: LoopSettings, read: Callable[[], Scene]) -> LoopSettings:
     """The settings with the tips and outputs of a scene."""
     try:
         scene = read()

@@ -17,7 +17,7 @@ from rclpy.timer import Timer
 from avatar_ros.framework.ports import Ports
 from avatar_ros.loop import diagnostics
 from avatar_ros.loop.contact_loop import ContactLoop, Publishers
-from avatar_ros.loop.device import Device
+from avatar_ros.loop.device import ToolDevice
 from avatar_ros.loop.settings import THRESHOLDS
 from avatar_ros.loop.shown_modes import ShownModesReport
 from avatar_ros.loop.statistics import TimingRecord, statistics
@@ -43,7 +43,7 @@ class ContactReports:
         node: Node,
         loop: ContactLoop,
         tools: Sequence[ToolChannel],
-        devices: Sequence[Device],
+        devices: Sequence[ToolDevice],
         publishers: Publishers,
         ports: Ports,
     ) -> None:

@@ -19,6 +19,7 @@ from dataclasses import asdict, replace
 from avatar_core.common.child import Child, EndedError
 from avatar_ros.patients.protocol import (
     BuildError,
+    BuildRefused,
     BuildSettings,
     Built,
     BusyError,
@@ -26,7 +27,6 @@ from avatar_ros.patients.protocol import (
     PatientRequest,
     Previewed,
     Ready,
-    Refused,
     Stage,
 )
 
@@ -131,7 +131,7 @@ class PatientBuilder:
                     on_stage(stage)
                 elif isinstance(note, Built | Previewed):
                     return note
-                elif isinstance(note, Refused):
+                elif isinstance(note, BuildRefused):
                     raise BuildError(note.reason)
         except EndedError as error:
             if ending:

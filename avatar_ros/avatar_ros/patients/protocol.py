@@ -93,7 +93,7 @@ class Ready:
 
 
 @dataclass(frozen=True)
-class Refused:
+class BuildRefused:
     """Nothing was written, for this reason."""
 
     reason: str

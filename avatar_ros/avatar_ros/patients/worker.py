@@ -45,12 +45,12 @@ from avatar_ros.patients.protocol import (
     FIRST_SPRING,
     FREE,
     BuildError,
+    BuildRefused,
     BuildSettings,
     Built,
     PatientRequest,
     Previewed,
     Ready,
-    Refused,
     Stage,
 )
 from avatar_ros.patients.surface import read_confined, read_inside
@@ -213,7 +213,7 @@ def serve(settings: BuildSettings, connection: Connection) -> None:
     try:
         atlas = LoadedAtlas.load(settings.atlas)
     except Exception as error:  # whatever a file provokes, the node reports it in one line
-        connection.send(Refused(one_line(error)))
+        connection.send(BuildRefused(one_line(error)))
         return
     connection.send(Ready(len(atlas.base.names)))
     reader = Reader(_MAX_BYTES)
@@ -224,7 +224,7 @@ def serve(settings: BuildSettings, connection: Connection) -> None:
         except (BrokenPipeError, EOFError):
             raise
         except Exception as error:  # as above
-            connection.send(Refused(one_line(error)))
+            connection.send(BuildRefused(one_line(error)))
 
 
 def main() -> int:

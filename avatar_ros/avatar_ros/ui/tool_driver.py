@@ -66,7 +66,7 @@ class ToolDriver:
         self._tips = self._each["target"].copy()
         self._sent = np.full((_N_SENT, len(tools), 3), np.nan)
         self._first = 0  # stamp of pose 0 [ns]
-        self._periods = Periods(tools, all_tools, state, self._used)
+        self._periods = PeriodCollector(tools, all_tools, state, self._used)
 
     def run(self, stop: StopSignal) -> None:
         """Run until the signal comes."""
@@ -111,7 +111,7 @@ class ToolDriver:
         return self._sent[(stamp - self._first) // PERIOD % _N_SENT, tool]
 
 
-class Periods:
+class PeriodCollector:
     """Collects the states of the tools of a period, and writes it once it is whole.
 
     The contact node sends the states of a step in the order of all its tools, from one publisher.

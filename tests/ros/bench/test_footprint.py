@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from avatar_ros.bench.cell import run_cell
-from avatar_ros.bench.footprint import Footprint, Growth
+from avatar_ros.bench.footprint import Footprint, FootprintGrowth
 
 
 @pytest.mark.long
@@ -49,7 +49,7 @@ def test_what_grows_is_complained_of(tmp_path: Path) -> None:
         process.stdout.readline()
         end = Footprint.of(process.pid)
         process.stdin.close()
-    growth = Growth("test", begin, end)
+    growth = FootprintGrowth("test", begin, end)
     assert growth.memory_mb == pytest.approx(8.0, abs=0.5)
     assert growth.complaint.endswith("MB and 1 files more")
-    assert Growth("test", end, begin).complaint == ""
+    assert FootprintGrowth("test", end, begin).complaint == ""

@@ -17,7 +17,7 @@ import rclpy
 from avatar_ros.loop import contact_loop
 from avatar_ros.loop.contact_loop import ActiveModel, ContactLoop
 from avatar_ros.loop.safety import Safety
-from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.settings import LoopSettings
 from avatar_ros.loop.tool_channel import OK, ToolChannel
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
 from rclpy.serialization import deserialize_message, serialize_message
@@ -68,7 +68,7 @@ class SteppedLoop:
 
     def __init__(self, organ: Any, context: Any, timeout: float, n_tools: int = 1) -> None:
         names = tuple(f"tool{i}" for i in range(n_tools))
-        base: dict[str, Any] = dict.fromkeys(ContactSettings.__dataclass_fields__)
+        base: dict[str, Any] = dict.fromkeys(LoopSettings.__dataclass_fields__)
         base |= {"tools": names, "tips": (Tip(),) * n_tools, "scene": "", "rate": 1000.0}
         base |= {
             "safety": Safety(leap=math.inf),
@@ -77,7 +77,7 @@ class SteppedLoop:
             "frame_id": "organ",
             "material": {},
         }
-        self.settings = ContactSettings(**(base | {"pose_timeout": timeout}))
+        self.settings = LoopSettings(**(base | {"pose_timeout": timeout}))
         self.now = 0.0
         self.poses = [Queue() for _ in names]
         self.tools = [ToolChannel(queue, queue, "organ") for queue in self.poses]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from avatar_ros.loop.contact_loop import ActiveModel
-from avatar_ros.loop.device import Device
+from avatar_ros.loop.device import ToolDevice
 from avatar_ros.loop.safety import Safety
 from avatar_ros.loop.tool_channel import OK, ToolChannel
 from builtin_interfaces.msg import Time
@@ -118,9 +118,9 @@ def lost(cell: Cell) -> tuple[int, np.ndarray]:
     return ContactState.STATUS_LOST_TOOL, found
 
 
-def heard(cell: Cell) -> Device:
+def heard(cell: Cell) -> ToolDevice:
     """The device of the cell's tool, which said that it is ready."""
-    device = Device(cell.tool, (), Time)
+    device = ToolDevice(cell.tool, (), Time)
     device.hear(READY)
     return device
 

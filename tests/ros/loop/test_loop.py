@@ -13,7 +13,7 @@ import pytest
 import rclpy
 from avatar_ros.framework.templates import WrenchTemplate, rotation_between, stamp_bytes
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop
-from avatar_ros.loop.settings import ContactSettings
+from avatar_ros.loop.settings import LoopSettings
 from avatar_ros.loop.statistics import TimingRecord
 from avatar_ros.loop.tool_channel import OK
 from geometry_msgs.msg import WrenchStamped
@@ -29,7 +29,7 @@ from tests.ros.helpers.unlimited_guard import UnlimitedGuard
 
 RATE = 1000.0  # [Hz]
 N_BLEND = round(BLEND * RATE)
-SETTINGS = ContactSettings(
+SETTINGS = LoopSettings(
     tools=("tool",),
     tips=(Tip(),),
     scene="",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from avatar_ros.loop.device import Device
+from avatar_ros.loop.device import ToolDevice
 from avatar_ros.loop.diagnostics import FaultCounter
 from avatar_ros.loop.safety import COMMANDS
 from avatar_ros.loop.tool_channel import ToolChannel
@@ -28,7 +28,7 @@ class Driver:
     def __init__(self, asked: str) -> None:
         self.there, self.asked_for = 1, list[str]()
         self.tool = ToolChannel(None, None, "organ")
-        self.device = Device(self.tool, COMMANDS[asked], lambda: Time(sec=1))
+        self.device = ToolDevice(self.tool, COMMANDS[asked], lambda: Time(sec=1))
         self.device.subscription = self.device.publisher = self
         self.device.begin()
 

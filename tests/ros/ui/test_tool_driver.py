@@ -13,7 +13,7 @@ import pytest
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.ui.recorder import Recorder
-from avatar_ros.ui.tool_driver import Periods
+from avatar_ros.ui.tool_driver import PeriodCollector
 from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess, organ_number
 from geometry_msgs.msg import PoseStamped
 
@@ -97,7 +97,7 @@ def used(tool: int, _status: int, stamp: int) -> np.ndarray:
 def test_a_period_has_the_states_of_one_step_or_is_lost(state: SharedToolState) -> None:
     """Of step 2 the first state is lost, of step 4 the last one; the count goes on."""
     state.all["recording"] = 1
-    periods = Periods(NAMES, NAMES, state, used)
+    periods = PeriodCollector(NAMES, NAMES, state, used)
     number = 1
     for step in range(7):
         for tool, name in enumerate(NAMES):
@@ -117,7 +117,7 @@ def test_beside_a_device_the_states_of_its_tool_are_passed_over(state: SharedToo
     """The device's is the second of three, so that the last one's place is not its count."""
     state.all["recording"] = 1
     every = ("left", "stylus", "right")
-    periods = Periods(NAMES, every, state, used)
+    periods = PeriodCollector(NAMES, every, state, used)
     for number in range(12):
         periods.note(answer(every[number % 3], number // 3, float(number)), number)
     rows = state.recorded()
