@@ -1,6 +1,6 @@
 """Harm done to a cell of real processes while a tool palpates at 1 kHz; a row for each fault.
 
-`pytest -m long tests/ros/test_faults.py -s` prints the table.
+`pytest -m long tests/ros/nodes/test_faults.py -s` prints the table.
 """
 
 from __future__ import annotations
