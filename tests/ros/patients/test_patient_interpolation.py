@@ -116,6 +116,7 @@ class Pursuit:
 def test_the_service_writes_what_loader_and_contact_take(
     node: Module, own_domain: dict[str, str], probe: Any, folder: Path
 ) -> None:
+    assert not _ask(probe, surface="missing.obj").success  # the atlas is loaded
     (worker,) = children(node.pid)
     before = computed_by(worker)
     answer = _ask(probe, **PATIENT, name="first")
