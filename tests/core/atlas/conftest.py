@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import sys
 
 import pytest
 
@@ -10,32 +10,23 @@ from avatar_core.atlas import growth as atlas_build
 from avatar_core.atlas.anatomy import Anatomy
 from avatar_core.atlas.growth import AtlasOptions, build_anatomy, new_atlas
 from avatar_core.atlas.model import Atlas
-from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
-from avatar_core.geometry.phantom import phantom_liver, population
+from avatar_core.cli import main as cli
+from avatar_core.geometry.mesh import TetMesh, tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import RegistrationRule, Template
-from tests.core.atlas.rough import OPTIONS, N
+from tests.core.atlas.rough import OPTIONS, Command, N, make_livers, make_template
 from tests.helpers.disk_cache import cached_on_disk
 
 
 @pytest.fixture(scope="session")
 def template(phantom_mesh: TetMesh) -> Template:
-    return _template(phantom_mesh)
-
-
-def _template(mesh: TetMesh) -> Template:
-    return Template("phantom", mesh, regions_by_rule(mesh))
+    return make_template(phantom_mesh)
 
 
 @pytest.fixture(scope="session")
 def livers() -> list[SurfaceMesh]:
-    return _livers(N)
-
-
-def _livers(n: int) -> list[SurfaceMesh]:
-    coarse = phantom_liver(12e-3)
-    maps = population(n, seed=3)
-    return [replace(f.moved(coarse), name=f"liver{i}") for i, f in enumerate(maps)]
+    return make_livers(N)
 
 
 @pytest.fixture(scope="session")
@@ -50,8 +41,8 @@ def members() -> list[Anatomy]:
 
 @cached_on_disk
 def _members(options: AtlasOptions, n: int) -> list[Anatomy]:
-    empty = new_atlas(_template(tetrahedralize(phantom_liver(), 700)), options)
-    return [build_anatomy(empty, liver) for liver in _livers(n)]
+    empty = new_atlas(make_template(tetrahedralize(phantom_liver(), 700)), options)
+    return [build_anatomy(empty, liver) for liver in make_livers(n)]
 
 
 @pytest.fixture(scope="session")
@@ -71,3 +62,16 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(atlas_build, "register", counted)
     return names
+
+
+@pytest.fixture
+def avatar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs ``avatar`` in this process."""
+
+    def command(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["avatar", *map(str, arguments)])
+        code = cli.main()
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return command

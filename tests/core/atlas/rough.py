@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import numpy as np
 from avatar_core.atlas.growth import AtlasOptions
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.workers import Workers
+from avatar_core.geometry.mesh import TetMesh, regions_by_rule
+from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.registration import RegistrationRule
+from avatar_core.shapes.registration import RegistrationRule, Template
 
 # a rough registration, 0.3 s instead of 6 s: what an atlas does with it is the same
 ROUGH = RegistrationRule(
@@ -20,6 +23,18 @@ ROUGH = RegistrationRule(
 OPTIONS = AtlasOptions(spacing=0.02, rule=ROUGH)
 ALONE = Workers(jobs=1)
 N = 6
+
+Command = Callable[..., tuple[int, str, str]]  # arguments to exit code, output and errors
+
+
+def make_template(mesh: TetMesh) -> Template:
+    return Template("phantom", mesh, regions_by_rule(mesh))
+
+
+def make_livers(n: int) -> list[SurfaceMesh]:
+    coarse = phantom_liver(12e-3)
+    maps = population(n, seed=3)
+    return [replace(f.moved(coarse), name=f"liver{i}") for i, f in enumerate(maps)]
 
 
 def write_obj(path: Path, surface: SurfaceMesh) -> Path:

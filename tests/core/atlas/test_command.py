@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -16,33 +14,21 @@ from avatar_core.atlas import growth as atlas_build
 from avatar_core.atlas.growth import AtlasOptions
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.storage import save_atlas
-from avatar_core.cli import main as cli
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import RegistrationRule, Template
-from tests.core.atlas.rough import ROUGH, write_obj
+from tests.core.atlas.rough import ROUGH, Command, write_obj
 
 
 @pytest.fixture
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], template: Template
-) -> Callable[..., tuple[int, str, str]]:
+def run(monkeypatch: pytest.MonkeyPatch, avatar: Command, template: Template) -> Command:
     """Runs ``avatar atlas`` with a small template and a rough registration."""
     monkeypatch.setattr(atlas_build, "default_template", lambda n: template)
     monkeypatch.setattr(atlas_build, "AtlasOptions", partial(AtlasOptions, rule=ROUGH))
-
-    def command(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["avatar", "atlas", *map(str, arguments)])
-        code = cli.main()
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return command
+    return partial(avatar, "atlas")
 
 
 @pytest.mark.long
-def test_create_add_and_show(
-    run: Callable[..., tuple[int, str, str]], livers: list[SurfaceMesh], tmp_path: Path
-) -> None:
+def test_create_add_and_show(run: Command, livers: list[SurfaceMesh], tmp_path: Path) -> None:
     file, folder = tmp_path / "a.h5", tmp_path / "livers"
     folder.mkdir()
     for liver in livers[:2]:
@@ -81,7 +67,7 @@ def test_create_add_and_show(
     ],
 )
 def test_a_stopped_command_goes_on(
-    run: Callable[..., tuple[int, str, str]],
+    run: Command,
     livers: list[SurfaceMesh],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -106,10 +92,7 @@ def test_a_stopped_command_goes_on(
 
 
 def test_the_command_refuses_clearly(
-    run: Callable[..., tuple[int, str, str]],
-    atlas: Atlas,
-    livers: list[SurfaceMesh],
-    tmp_path: Path,
+    run: Command, atlas: Atlas, livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:
     file, liver = tmp_path / "a.h5", write_obj(tmp_path / "liver0.obj", livers[0])
     hollow = tmp_path / "hollow"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,64 +10,47 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
+from avatar_core.atlas.anatomy import Anatomy
 from avatar_core.atlas.base import PatientError, base_of, numbers_of
-from avatar_core.atlas.growth import AtlasOptions, build_anatomy, new_atlas
+from avatar_core.atlas.growth import build_anatomy, new_atlas
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.patient import PatientOptions, patient_vademecum
 from avatar_core.atlas.response import ResponseSolver
 from avatar_core.atlas.storage import load_atlas, save_atlas
-from avatar_core.cli import main as cli
 from avatar_core.errors import RegistrationError
 from avatar_core.fem.norms import relative_l2
-from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
-from avatar_core.geometry.phantom import phantom_liver, population
+from avatar_core.geometry.mesh import tetrahedralize
+from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.reduction.galerkin import ReductionRule
-from avatar_core.shapes.registration import RegistrationRule, Template
 from avatar_core.studies.transport import summarized, transport_row
 from avatar_core.vademecum.storage import load_vademecum
+from tests.core.atlas.rough import OPTIONS, Command, make_livers, make_template, write_obj
 from tests.helpers.disk_cache import cached_on_disk
 
-# rough and coarse, 1 s an anatomy; the atlas's own tests use the same rule
-ROUGH = RegistrationRule(
-    n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
-)
 QUICK = PatientOptions(n_vertices=350, n_certified=6, tolerance=0.1)
-N = 4
+N = 4  # members of the atlas; the next liver is a patient
 
 
 @pytest.fixture(scope="module")
-def livers(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """N anatomies and a patient, as files."""
-    return _livers(tmp_path_factory.mktemp("livers"))
-
-
-def _livers(folder: Path) -> list[Path]:
-    coarse, paths = phantom_liver(12e-3), []
-    for i, shape in enumerate(population(N + 1, seed=3)):
-        path = folder / f"liver{i}.obj"
-        moved = shape.moved(coarse)
-        lines = [f"v {x} {y} {z}" for x, y, z in moved.vertices * 1e3]
-        lines += [f"f {a} {b} {c}" for a, b, c in moved.faces + 1]
-        path.write_text("\n".join(lines) + "\n")
-        paths.append(path)
-    return paths
+def files(livers: list[SurfaceMesh], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("livers")
+    return [write_obj(folder / f"{liver.name}.obj", liver) for liver in livers[: N + 1]]
 
 
 @pytest.fixture(scope="module")
-def atlas() -> Atlas:
-    return _atlas()
+def atlas(empty: Atlas) -> Atlas:
+    """Members with their responses."""
+    return empty.with_anatomies(_with_responses())
 
 
 @cached_on_disk
-def _atlas() -> Atlas:
-    phantom_mesh = tetrahedralize(phantom_liver(), 700)
+def _with_responses() -> list[Anatomy]:
     with TemporaryDirectory() as folder:
-        surfaces = [read_surface(path) for path in _livers(Path(folder))[:N]]
-    template = Template("phantom", phantom_mesh, regions_by_rule(phantom_mesh))
-    empty = new_atlas(template, AtlasOptions(spacing=0.02, rule=ROUGH))
-    members = [build_anatomy(empty, surface, ResponseSolver(rank=30)) for surface in surfaces]
-    return empty.with_anatomies(members)
+        files = [write_obj(Path(folder) / f"{one.name}.obj", one) for one in make_livers(N)]
+        surfaces = [read_surface(file) for file in files]
+    empty = new_atlas(make_template(tetrahedralize(phantom_liver(), 700)), OPTIONS)
+    return [build_anatomy(empty, surface, ResponseSolver(rank=30)) for surface in surfaces]
 
 
 @pytest.fixture(scope="module")
@@ -87,12 +68,12 @@ def test_responses_survive_the_file_bit_for_bit(atlas: Atlas, file: Path) -> Non
 
 
 def test_a_member_gets_its_own_vademecum_bit_for_bit(
-    atlas: Atlas, file: Path, livers: list[Path]
+    atlas: Atlas, file: Path, files: list[Path]
 ) -> None:
-    member = patient_vademecum(read_surface(livers[2]), base_of(atlas), "interpolated", QUICK)
+    member = patient_vademecum(read_surface(files[2]), base_of(atlas), "interpolated", QUICK)
     uncertified = replace(QUICK, n_certified=0)
     again = patient_vademecum(
-        read_surface(livers[2]), base_of(load_atlas(file)), "interpolated", uncertified
+        read_surface(files[2]), base_of(load_atlas(file)), "interpolated", uncertified
     )
     assert member.neighbours[0] == "liver2" and member.weights[0] == 1.0
     assert member.weights[1:].any() == np.False_
@@ -114,20 +95,20 @@ def test_a_member_gets_its_own_vademecum_bit_for_bit(
 
 
 @pytest.mark.long
-def test_copies_count_once(atlas: Atlas, livers: list[Path]) -> None:
+def test_copies_count_once(atlas: Atlas, files: list[Path]) -> None:
     doubled = atlas.with_anatomies([atlas["liver1"]])
     base = base_of(doubled)
     assert base.copies == (N,)
-    patient = patient_vademecum(read_surface(livers[N]), base, "interpolated", QUICK)
+    patient = patient_vademecum(read_surface(files[N]), base, "interpolated", QUICK)
     assert "liver1-2" not in patient.neighbours
     assert patient.weights.sum() == pytest.approx(1.0, abs=1e-9)
 
 
 @pytest.mark.long
-def test_an_atlas_of_one_answers(atlas: Atlas, livers: list[Path]) -> None:
+def test_an_atlas_of_one_answers(atlas: Atlas, files: list[Path]) -> None:
     alone = atlas.without_anatomies().with_anatomies([atlas["liver0"]])
     options = replace(QUICK, n_certified=0)
-    patient = patient_vademecum(read_surface(livers[N]), base_of(alone), "interpolated", options)
+    patient = patient_vademecum(read_surface(files[N]), base_of(alone), "interpolated", options)
     assert patient.neighbours == ("liver0",) and patient.weights.tolist() == [1.0]
 
 
@@ -154,24 +135,22 @@ def test_another_kind_of_organ_is_refused(atlas: Atlas) -> None:
         pytest.param("certify", marks=pytest.mark.long),
     ],
 )
-def test_a_build_can_be_stopped_in_every_stage(
-    atlas: Atlas, livers: list[Path], stage: str
-) -> None:
+def test_a_build_can_be_stopped_in_every_stage(atlas: Atlas, files: list[Path], stage: str) -> None:
     def stop(now: str, fraction: float, error: float) -> None:
         if now.startswith(stage):
             raise InterruptedError(stage)
 
-    surface: SurfaceMesh = read_surface(livers[N])
+    surface: SurfaceMesh = read_surface(files[N])
     with pytest.raises(InterruptedError, match=stage):
         patient_vademecum(surface, base_of(atlas), "reduced", QUICK, stop)
 
 
 @pytest.mark.long
 def test_the_study_measures_each_fidelity_against_all_solutions(
-    atlas: Atlas, livers: list[Path]
+    atlas: Atlas, files: list[Path]
 ) -> None:
     options = replace(QUICK, reduction=ReductionRule(max_solution_fraction=0.6))
-    row = transport_row(read_surface(livers[1]), base_of(atlas), options)
+    row = transport_row(read_surface(files[1]), base_of(atlas), options)
     assert row["name"] == "liver1" and row["solved_solutions"] == 3 * row["n_positions"]
     assert row["reduced"] < min(v for k, v in row.items() if k.startswith("interpolated"))
     assert row["reduced_solutions"] < row["solved_solutions"]
@@ -182,34 +161,19 @@ def test_the_study_measures_each_fidelity_against_all_solutions(
     assert all(np.isfinite(value) for value in summary.values())
 
 
-@pytest.fixture
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
-    def command(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["avatar", "patient", *map(str, arguments)])
-        code = cli.main()
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return command
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     "fidelity", ["interpolated", "reduced", pytest.param("solved", marks=pytest.mark.long)]
 )
 def test_the_command_writes_a_certified_vademecum(
-    run: Callable[..., tuple[int, str, str]],
-    file: Path,
-    livers: list[Path],
-    tmp_path: Path,
-    fidelity: str,
+    avatar: Command, file: Path, files: list[Path], tmp_path: Path, fidelity: str
 ) -> None:
     output = tmp_path / "patient.h5"
     arguments = ["--fidelity", fidelity, "--vertices", 350, "--certify", 6, "--tolerance", 0.2]
     times = tmp_path / "times.json"
-    code, out, err = run(livers[N], "--atlas", file, "-o", output, "--timings", times, *arguments)
+    code, out, err = avatar(
+        "patient", files[N], "--atlas", file, "-o", output, "--timings", times, *arguments
+    )
     assert code == 0, err
     assert "liver" in out and "CPU time" in out
     spent = {one["stage"]: one["cpu_seconds"] for one in json.loads(times.read_text())}
@@ -223,11 +187,11 @@ def test_the_command_writes_a_certified_vademecum(
 
 @pytest.mark.long
 def test_a_tolerance_out_of_reach_exits_with_three(
-    run: Callable[..., tuple[int, str, str]], file: Path, livers: list[Path], tmp_path: Path
+    avatar: Command, file: Path, files: list[Path], tmp_path: Path
 ) -> None:
     output = tmp_path / "patient.h5"
     arguments = ["--vertices", 350, "--certify", 6, "--tolerance", 1e-4]
-    code, _, err = run(livers[N], "--atlas", file, "-o", output, *arguments)
+    code, _, err = avatar("patient", files[N], "--atlas", file, "-o", output, *arguments)
     assert code == 3 and "not converged" in err
     assert not load_vademecum(output).convergence.converged
 
@@ -247,13 +211,13 @@ def test_a_tolerance_out_of_reach_exits_with_three(
     ],
 )
 def test_bad_requests_are_one_line(
-    run: Callable[..., tuple[int, str, str]],
+    avatar: Command,
     file: Path,
-    livers: list[Path],
+    files: list[Path],
     tmp_path: Path,
     arguments: list[str],
     remedy: str,
 ) -> None:
-    code, _, err = run(livers[N], "--atlas", file, "-o", tmp_path / "p.h5", *arguments)
+    code, _, err = avatar("patient", files[N], "--atlas", file, "-o", tmp_path / "p.h5", *arguments)
     assert code == 1 and remedy in err and err.count("\n") == 1
     assert not list(tmp_path.iterdir())
