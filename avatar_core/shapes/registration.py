@@ -121,6 +121,10 @@ class SimilarityTransform:
         """Move points, shape (k, 3) [m]."""
         return self.scale * points @ self.rotation.T + self.translation
 
+    def back(self, points: FloatArray) -> FloatArray:
+        """Move points, shape (k, 3) [m], from the target to the template."""
+        return (points - self.translation) @ self.rotation / self.scale
+
     @property
     def angle(self) -> float:
         """Angle of the rotation [deg]."""

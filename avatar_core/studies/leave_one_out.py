@@ -10,7 +10,7 @@ best setting: LLE among numbers of neighbours up to all, PCA among numbers of co
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
@@ -18,11 +18,20 @@ import igl
 import numpy as np
 
 from avatar_core.common.processes import repeatable
-from avatar_core.geometry.level_set import DistanceGrid, GridBox, dice, isosurface
+from avatar_core.geometry.level_set import (
+    DistanceGrid,
+    GridBox,
+    dice,
+    isosurface,
+    orientation_offset,
+)
+from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.barycenter import barycenter_weights, convex_weights
 from avatar_core.shapes.lle import Gram
-from avatar_core.studies.alignment import align
+from avatar_core.shapes.registration import RegistrationRule, align_upright
+from avatar_core.shapes.springs import sample_target
 from avatar_core.studies.shapes import (
     PAPER_GRID,
     FloatArray,
@@ -42,6 +51,9 @@ if TYPE_CHECKING:
 
 K_PAPER = 10
 NEAR = 3.0  # distances are made exact this many spacings around the blended surface
+# The closest fit counts here, whichever way an organ lies: no prior holds it upright.
+FREE = RegistrationRule(rotation_spread=90.0)
+N_TEMPLATE = 1000  # vertices of the mesh of the phantom that is aligned to the livers
 ALIGNMENTS = ("centred", "similarity")
 
 
@@ -186,15 +198,26 @@ def placed(livers: Livers, alignment: str, settings: LeaveOneOutSettings) -> Bas
         moved = [centred(surface) for surface in livers.surfaces]
     else:
         reference, moved = phantom_liver(), []
+        template, rule = tetrahedralize(reference, N_TEMPLATE), FREE
         for i, surface in enumerate(follow(livers.surfaces, "alignment")):
-            found = align(surface, reference)
-            moved.append(found.moved(surface))
-            scales[i] = 1.0 / found.scale
-            if not found.converged:
+            upright = _upright(surface, reference)
+            target = sample_target(upright, 3 * rule.n_samples)
+            found, converged = align_upright(template, target, rule)
+            moved.append(replace(upright, vertices=found.back(upright.vertices)))
+            scales[i] = found.scale
+            if not converged:
                 notices.append(f"{surface.name}: the alignment did not converge")
     box = paper_box(moved, settings.shape)
     vectors = distance_vectors(moved, box)
     return Base(box, vectors, scales, livers.subjects, Gram.of(list(vectors)), tuple(notices))
+
+
+def _upright(surface: SurfaceMesh, reference: SurfaceMesh) -> SurfaceMesh:
+    """The surface with its axes along those of the reference, if it is turned."""
+    offset = orientation_offset(surface, reference)
+    if not offset.is_turned:
+        return surface
+    return replace(surface, vertices=surface.vertices @ offset.rotation.T)
 
 
 def methods(base: Base, settings: LeaveOneOutSettings) -> list[Method]:

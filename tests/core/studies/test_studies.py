@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from avatar_core.cli import main as cli
 from avatar_core.errors import SurfaceError
@@ -37,7 +38,7 @@ from avatar_core.studies import (
     samples,
 )
 from avatar_core.studies.response import carried, relative_errors, trilinear
-from avatar_core.studies.shapes import paper_box, read_livers, subject_numbers
+from avatar_core.studies.shapes import Livers, paper_box, read_livers, subject_numbers
 from avatar_core.studies.study import Row, Run, Study, mean_and_worst
 
 Conduct = Callable[..., Run]
@@ -262,6 +263,23 @@ def test_accuracy_time(conduct: Conduct, tmp_path: Path) -> None:
 
 
 # --- the parts --------------------------------------------------------------------------------
+
+
+def test_moved_organs_are_laid_on_the_phantom() -> None:
+    """One that is larger and stands on its side, and one that is tilted."""
+    organ = phantom_liver(12e-3)
+    side, tilt = (Rotation.from_euler("z", a, degrees=True).as_matrix() for a in (90.0, 5.0))
+    larger = replace(organ, vertices=1.2 * organ.vertices @ side.T + 0.05)
+    tilted = replace(organ, vertices=organ.vertices @ tilt.T - 0.02)
+    livers = Livers((organ, larger, tilted), np.arange(3), ())
+    base = leave_one_out.placed(
+        livers, "similarity", leave_one_out.LeaveOneOutSettings(shape=COARSE)
+    )
+    np.testing.assert_allclose(base.scales, base.scales[0] * np.array([1.0, 1.2, 1.0]), rtol=5e-3)
+    assert base.scales[0] == pytest.approx(1.0, rel=0.02)
+    # a degree of the tilt is left, 0.2 m away at the corners of the box
+    assert np.abs(base.vectors - base.vectors[0]).max() < 5e-3
+    assert base.notices == ()
 
 
 def test_leave_one_out_weights_are_those_of_the_library() -> None:
