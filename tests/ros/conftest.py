@@ -180,6 +180,11 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
         session.exitstatus = pytest.ExitCode.OK
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if IS_MISSING:
+        terminalreporter.line("tests/ros is left out: ROS 2 or avatar_ros is not installed")
+
+
 @contextmanager
 def free_domain() -> Iterator[int]:
     """A DDS domain that no other worker or run of these tests on this machine has meanwhile."""

@@ -96,4 +96,3 @@ class ShownModes:
         statistics.modes_shown, statistics.modes = shown, self._most
         statistics.promised_l2 = point.l2 if point else _NAN
         statistics.promised_force = point.force if point else _NAN
-        statistics.promised_step_p99 = _NAN

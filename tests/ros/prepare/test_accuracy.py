@@ -8,10 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.framework import qos
 from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
 from avatar_ros.nodes.contact_reports import ShownModesLog
@@ -25,9 +21,6 @@ from avatar_core.vademecum.accuracy import Budget
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.hand import Hand, felt
-
-pytestmark = pytest.mark.ros
-
 
 # --- Shedding, without a node ------------------------------------------------------------------
 

@@ -14,10 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel
 from avatar_ros.loop.safety import Safety, band_topics
 from avatar_ros.loop.settings import CHANGEABLE, CONTACT
@@ -39,8 +35,6 @@ from avatar_core.vademecum.at_values import at_values
 from tests.helpers.soft_organ import soft_organ
 from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.stepped_loop import Queue, SteppedLoop, pose
-
-pytestmark = pytest.mark.ros
 
 TIP = Tip("sphere", 5e-3)
 LOW, HIGH = 0.6, 1.7

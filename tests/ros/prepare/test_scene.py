@@ -12,10 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.prepare.requests import PreparationRequest

@@ -6,10 +6,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.loop.settings import CONTACT, MATERIAL, chosen_material
 from avatar_ros.nodes.contact import ContactNode
 from avatar_ros.prepare.scenes import usable_material
@@ -25,8 +21,6 @@ from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum
 from tests.core.offline.test_coordinates import BARE, YOUNG
 from tests.helpers.soft_organ import organ_on_springs
-
-pytestmark = pytest.mark.ros
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-pytest.importorskip("avatar_ros.msg", reason="avatar_ros is not installed")
-
 from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.msg import Log, Parameter, ParameterType, ParameterValue
