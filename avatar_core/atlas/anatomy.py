@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import AvatarError
 from avatar_core.fem.elasticity import Element, Material
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.shapes.registration import RegistrationQuality, SimilarityTransform
-
-FloatArray = NDArray[np.float64]
 
 
 class AtlasError(AvatarError):

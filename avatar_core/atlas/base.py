@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avatar_core.atlas.model import Atlas
 from avatar_core.common.arrays import FloatArray
@@ -45,8 +44,8 @@ class PatientBase:
     vertices: FloatArray
     responses: Sequence[CompactResponse]
     copies: tuple[int, ...] = ()
-    distances: Sequence[NDArray[np.float64]] | None = None
-    distance_of: Callable[[SurfaceMesh, Registration], NDArray[np.float64]] | None = None
+    distances: Sequence[FloatArray] | None = None
+    distance_of: Callable[[SurfaceMesh, Registration], FloatArray] | None = None
     rule: RegistrationRule = field(default_factory=RegistrationRule)
     registrations: dict[str, Registration] = field(default_factory=dict)
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from avatar_core.atlas.anatomy import Anatomy, AtlasError, Duplicate, free_name, require_shapes
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.geometry.level_set import DistanceGrid, GridBox, signed_distance
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
@@ -26,9 +27,6 @@ from avatar_core.shapes.registration import (
     SimilarityTransform,
     Template,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LARGEST_ORGAN = (0.33, 0.26, 0.26)  # along x, y, z [m]
 SPACING = 0.009  # gives about 49,000 points with LARGEST_ORGAN, as many as in the paper [m]

@@ -19,7 +19,6 @@ from typing import Literal, get_args
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
 from avatar_core.atlas.base import PatientBase, PatientError
 from avatar_core.common.arrays import FloatArray
@@ -81,7 +80,7 @@ def patient_weights(
     return kriging(vectors, point, k, left)
 
 
-def centred(vertices: FloatArray) -> NDArray[np.float64]:
+def centred(vertices: FloatArray) -> FloatArray:
     """Vertices (..., n, 3) without their translation, as vectors (..., 3 n) [m]."""
     exact = np.asarray(vertices, dtype=np.float64)
     moved = exact - exact.mean(axis=-2, keepdims=True)
@@ -89,7 +88,7 @@ def centred(vertices: FloatArray) -> NDArray[np.float64]:
 
 
 def kriging(
-    vectors: Sequence[NDArray[np.float64]],
+    vectors: Sequence[FloatArray],
     point: FloatArray,
     n_neighbors: int,
     leave_out: Collection[int] = (),

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.surface_formats import LABEL_MAPS
-
-FloatArray = NDArray[np.float64]
 
 MAX_LABEL_BYTES = 2**30  # of a decompressed label map
 

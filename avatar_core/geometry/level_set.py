@@ -9,16 +9,13 @@ from itertools import product
 
 import igl
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.label_maps import march
 from avatar_core.geometry.surface import SurfaceMesh
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Shapes are compared at one volume, on one cube of grid points; far outside, where thin lobes
 # differ most from organ to organ, the distance saturates early.
@@ -189,7 +186,7 @@ def distance_in_box(surface: SurfaceMesh, box: GridBox, band: float | None = Non
 
 
 def _band_values(
-    surface: SurfaceMesh, origin: FloatArray, spacing: float, shape: NDArray[np.int64], band: float
+    surface: SurfaceMesh, origin: FloatArray, spacing: float, shape: IntArray, band: float
 ) -> FloatArray:
     """Distance cut to the band, evaluated only where a coarser grid does not exclude the band.
 

@@ -11,14 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.label_maps import march
 from avatar_core.geometry.level_set import grid_points
 from avatar_core.geometry.surface import SurfaceMesh
 
-FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 LevelSet = Callable[[FloatArray], FloatArray]
 
@@ -92,7 +91,7 @@ def smooth_union(a: FloatArray, b: FloatArray, width: float) -> FloatArray:
 
 
 def relax(
-    vertices: FloatArray, faces: NDArray[np.int64], level_set: LevelSet, sweeps: int = 15
+    vertices: FloatArray, faces: IntArray, level_set: LevelSet, sweeps: int = 15
 ) -> FloatArray:
     """Even out a triangulation of a level set: neighbour averages, put back on the zero surface.
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import igl
 import numpy as np
-from numpy.typing import NDArray
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.skin import weld
 
@@ -22,9 +22,7 @@ def require_displayable(n: int) -> None:
         )
 
 
-def resampled(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], n: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def resampled(vertices: FloatArray, faces: IntArray, n: int) -> tuple[FloatArray, IntArray]:
     """A surface with about n vertices: subdivided by Loop's scheme, then edges collapsed.
 
     Loop's limit surface is smooth (Loop, 1987); edges collapse in the order of the quadric error
@@ -48,9 +46,7 @@ def resampled(
     return np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
 
 
-def unified(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def unified(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
     """Triangles whose corners coincide, made to share them."""
     index = weld(vertices)
     _, first = np.unique(index, return_index=True)
@@ -59,7 +55,7 @@ def unified(
     return vertices[first], shared[~flat]
 
 
-def is_manifold(faces: NDArray[np.int64]) -> bool:
+def is_manifold(faces: IntArray) -> bool:
     """Whether two triangles meet on every edge, and one fan of them at every vertex."""
     faces = np.ascontiguousarray(faces, np.int64)
     closed = len(igl.boundary_facets(faces)[0]) == 0

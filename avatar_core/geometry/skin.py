@@ -17,10 +17,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import SurfaceError
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Soup = tuple[FloatArray, IntArray]
 
 CRACK = 0.05  # gaps narrower than this are cracks, no holes [mean edges]
@@ -158,7 +157,7 @@ def _boundary(soup: Soup) -> Soup:
     merged, vertices = weld(soup[0]), soup[0]
     representative = np.empty(len(vertices), dtype=np.int64)
     representative[merged] = np.arange(len(vertices))
-    faces = representative[merged[soup[1]]]
+    faces: IntArray = representative[merged[soup[1]]]
     kept: list[FloatArray] = []
     for halving in range(HALVINGS + 1):
         separates = _separates(soup, vertices[faces])

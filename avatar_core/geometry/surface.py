@@ -18,13 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.label_files import is_label_map
 from avatar_core.geometry.skin import Skin, components, directed_edges, skin_of, weld
 from avatar_core.geometry.surface_files import content_of, parse, stated_axes
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Soup = tuple[FloatArray, IntArray]
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}

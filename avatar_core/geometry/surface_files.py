@@ -15,9 +15,9 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avatar_core.common import files
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import SurfaceError, one_line
 from avatar_core.geometry.label_files import is_label_map
 from avatar_core.geometry.label_maps import surface_of_label
@@ -25,8 +25,6 @@ from avatar_core.geometry.surface_formats import MESHES, SUFFIXES
 from avatar_core.geometry.vtk_files import read_polydata
 from avatar_core.geometry.vtk_xml_files import read_vtp, stated_axes_of
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Soup = tuple[FloatArray, IntArray]
 
 MAX_FILE_BYTES = 4 << 30

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import MeshError, one_line
 
 _REMEDY = "pip install 'pytetwild>=0.4.2,<0.5'"
@@ -30,8 +31,8 @@ _UNSEEDED = "fTetWild takes no seed on this system: two meshes of one surface di
 
 
 def fill_box(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32], edge: float, envelope: float
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    vertices: FloatArray, faces: NDArray[np.int32], edge: float, envelope: float
+) -> tuple[FloatArray, NDArray[np.int32]]:
     """Fill the box around a surface with tetrahedra that follow it, the same ones each time.
 
     Parameters

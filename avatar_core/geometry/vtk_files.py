@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from avatar_core.common.arrays import FloatArray, IntArray
+
 Cells = tuple[IntArray, IntArray]  # where each cell begins and the last ends, and the corners
 
 _TYPES = {

@@ -20,7 +20,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from avatar_core.geometry.vtk_files import FloatArray, IntArray, fans, strips
+from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.geometry.vtk_files import fans, strips
 
 _TYPES = {f"Int{8 * n}": f"i{n}" for n in (1, 2, 4, 8)}
 _TYPES |= {f"UInt{8 * n}": f"u{n}" for n in (1, 2, 4, 8)}

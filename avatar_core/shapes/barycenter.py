@@ -10,13 +10,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import nnls
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import LLEError
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Vectors = Sequence[FloatArray] | FloatArray  # one row or one array per shape
 
 DEFAULT_REGULARIZATION = 1e-6  # real livers: a better leave-one-out Dice than the usual 1e-3

@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.common.jit import compiled
-
-FloatArray = NDArray[np.float64]
 
 _LEAST_CURVATURE = 1e-3  # replaces that of concave modes; a stretch has 4
 
@@ -30,7 +28,7 @@ class Distortion:
     tets : ndarray of int, shape (n_tets, 4)
     """
 
-    def __init__(self, reference: FloatArray, tets: NDArray[np.int64]) -> None:
+    def __init__(self, reference: FloatArray, tets: IntArray) -> None:
         self.tets, self.n_vertices = tets, len(reference)
         corners = reference[tets]
         edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import LLEError
 from avatar_core.shapes.barycenter import (
     DEFAULT_REGULARIZATION,
@@ -29,9 +30,6 @@ from avatar_core.shapes.barycenter import (
     require_regularization,
     truncation,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 BLOCK = 8192  # values of each vector per block of the Gram matrix: the blocks stay in cache
 ROUNDING = 4 * float(np.finfo(float).eps)  # of an inner product, relative to the lengths

@@ -17,16 +17,14 @@ from functools import cached_property
 
 import numpy as np
 import rslab
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import RegistrationError
 from avatar_core.geometry.mesh import MeshQuality, Regions, TetMesh, quality
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.distortion import Distortion
 from avatar_core.shapes.springs import Target, sample_target, surface_springs
-
-FloatArray = NDArray[np.float64]
 
 PLAUSIBLE_SCALE = (0.5, 2.0)  # of livers against the template, measured 0.82 to 1.27
 

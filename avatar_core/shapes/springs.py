@@ -14,12 +14,10 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import RegistrationError
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh, winding_number
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 RETURN_NORMAL_LENGTH = 0.03  # of springs from samples when those from vertices use none [m]
 _NEAR = 0.5e-3  # distance from a face at which its two sides are distinguished [m]

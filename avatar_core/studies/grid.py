@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from avatar_core.common.arrays import FloatArray
 from avatar_core.common.processes import repeatable
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.level_set import distance_grid, isosurface, signed_distance
@@ -29,7 +30,7 @@ from avatar_core.geometry.point_location import closest_points
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
-from avatar_core.studies.shapes import FloatArray, read_livers
+from avatar_core.studies.shapes import read_livers
 from avatar_core.studies.study import Row, Run, Study, column, follow, label, mean_and_worst
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from avatar_core.common.arrays import FloatArray
 from avatar_core.common.processes import repeatable
 from avatar_core.fem.patch_loads import default_patch_radius, load_surface
 from avatar_core.geometry.level_set import GridBox, reinitialize
@@ -21,7 +22,7 @@ from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.shapes.lle import CLEAR_GAP, estimate_dimension, fit, locally_linear_embedding
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
-from avatar_core.studies.shapes import PAPER_GRID, FloatArray, as_grid, distance_vectors, paper_box
+from avatar_core.studies.shapes import PAPER_GRID, as_grid, distance_vectors, paper_box
 from avatar_core.studies.study import Row, Run, Study, column, follow, mean_and_worst, where
 
 if TYPE_CHECKING:

@@ -13,12 +13,12 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from avatar_core.common.arrays import FloatArray
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import TetMesh
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from avatar_core.common.arrays import FloatArray
 from avatar_core.common.processes import repeatable
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import barycenter
 from avatar_core.shapes.lle import LLE, locally_linear_embedding
-from avatar_core.studies.shapes import PAPER_GRID, FloatArray, distance_vectors, paper_box
+from avatar_core.studies.shapes import PAPER_GRID, distance_vectors, paper_box
 from avatar_core.studies.study import Row, Run, Study, column, follow, label, mean_and_worst, where
 
 if TYPE_CHECKING:

@@ -7,17 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.level_set import DistanceGrid, GridBox, distance_grid, distance_in_box
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.geometry.surface_formats import MESHES
 from avatar_core.studies.study import follow
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 DEFAULT_FOLDER = Path("../shared/data/livers")
 
