@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from avatar_core.cli.output import EXIT_STOPPED, require_output
+from avatar_core.cli.progress import item_bar
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES, SUFFIXES
 
@@ -90,7 +91,7 @@ def create(
     require_output(file, [".h5"], surfaces)
     sources = _sources(surfaces, unit, axes, label)
     options = AtlasOptions(template_vertices, box, spacing)
-    with _bar(len(sources)) as progress:
+    with _resumable(), item_bar(len(sources)) as progress:
         growth = create_atlas(
             file,
             sources,
@@ -122,7 +123,7 @@ def add(
     from avatar_core.atlas.workers import Workers
 
     sources = _sources(surfaces, unit, axes, label)
-    with _bar(len(sources)) as progress:
+    with _resumable(), item_bar(len(sources)) as progress:
         growth = extend_atlas(
             file,
             sources,
@@ -260,24 +261,10 @@ def _files(path: Path) -> list[Path]:
 
 
 @contextmanager
-def _bar(total: int) -> Iterator[Callable[[int, int, str], None]]:
-    """A progress bar over the surfaces."""
-    from tqdm import tqdm
-
-    with tqdm(
-        total=total,
-        bar_format="{desc:16.16s} {n_fmt}/{total_fmt} |{bar}| {elapsed}<{remaining}",
-        file=sys.stderr,
-        disable=None,
-    ) as bar:
-
-        def advance(done: int, _: int, name: str) -> None:
-            bar.set_description_str(name, refresh=False)
-            bar.update(done - bar.n)
-
-        try:
-            yield advance
-        except KeyboardInterrupt:
-            bar.close()
-            print("avatar: run the same command again to resume", file=sys.stderr)
-            raise typer.Exit(EXIT_STOPPED) from None
+def _resumable() -> Iterator[None]:
+    """Say after Ctrl-C how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("avatar: run the same command again to resume", file=sys.stderr)
+        raise typer.Exit(EXIT_STOPPED) from None

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from avatar_core.cli.build_bar import BuildBar
 from avatar_core.cli.output import require_output
+from avatar_core.cli.progress import build_stages, stage_bar
 from avatar_core.cli.vademecum import (
     Axes,
     Label,
@@ -67,7 +67,7 @@ def bench_step(
     for n in shown:
         require_displayable(n)
     organ = read_organ(surface, unit, axes, label)
-    with BuildBar() as progress:
+    with stage_bar(build_stages()) as progress:
         rows, summary = run_step_bench(organ, vertices, shown, progress)
     print(
         f"load average {load_average():.2f}; 10 mm spheres sliding 5 mm deep, field at all shown "
@@ -98,7 +98,7 @@ def bench_effects(
     require(modes >= 36, f"--modes is {modes}; inertia and self_weight need at least 36")
     _require_json(output, surface)
     organ = read_organ(surface, unit, axes, label)
-    with BuildBar(large=True) as progress:
+    with stage_bar(build_stages(large=True)) as progress:
         vademecum = build_for_effects(organ, vertices, modes, progress)
 
     def announce(scene: str) -> None:
@@ -151,7 +151,7 @@ def bench_cell(
     with tempfile.TemporaryDirectory(prefix="avatar_bench_") as folder:
         file = Path(surface)
         if file.suffix != ".h5":
-            with BuildBar() as progress:
+            with stage_bar(build_stages()) as progress:
                 built = build(
                     read_organ(surface, "mm", None, None),
                     OrganOptions(n_vertices=vertices),

@@ -10,12 +10,12 @@ import typer
 
 from avatar_core.cli.atlas import atlas
 from avatar_core.cli.bench import bench, require_ros, run_cell
-from avatar_core.cli.build_bar import BuildBar
 from avatar_core.cli.calibrate import calibrate
 from avatar_core.cli.cell import Host, Port, cell, require_ui, run_page
 from avatar_core.cli.export import export
 from avatar_core.cli.output import EXIT_STOPPED, require_output
 from avatar_core.cli.patient import patient
+from avatar_core.cli.progress import build_stages, stage_bar
 from avatar_core.cli.register import register
 from avatar_core.cli.replay import replay
 from avatar_core.cli.scene import scene
@@ -101,7 +101,7 @@ def demo(
         require_output(output, [".png", ".pdf", ".svg"], [])
     print("1. building the vademecum of the built-in liver")
     surface = phantom_liver()
-    with BuildBar() as progress:
+    with stage_bar(build_stages()) as progress:
         built = build(surface, OrganOptions(n_vertices=vertices), progress)
     with tempfile.TemporaryDirectory(prefix="avatar_demo_") as folder:
         file = Path(folder) / "phantom.h5"
@@ -115,7 +115,7 @@ def demo(
         print(f"2. running loader, contact and tool as ROS 2 processes for {seconds:g} s")
         run_cell(file, seconds)
     print("3. resolving a contact and drawing the picture")
-    with BuildBar.of("contacts") as progress:
+    with stage_bar() as progress:
         palpation_picture(v, surface, output, lambda done: progress("contacts", done, float("nan")))
     print(f"   {output}")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from avatar_core.cli.output import Overwrite, require_output
+from avatar_core.cli.progress import stage_bar
 from avatar_core.cli.timings import StageClock, Timings, require_timings, show_timings
 from avatar_core.cli.vademecum import (
     EXIT_NOT_CONVERGED,
@@ -113,7 +113,7 @@ def patient(
     organ = read_organ(surface, unit, axes, label)
     for notice in organ.notices:
         print(f"notice: {notice}", file=sys.stderr)
-    with _StageBar() as progress:
+    with stage_bar() as progress:
         report = clock.following(progress)
         found = patient_vademecum(organ, base, fidelity, options, report)  # type: ignore[arg-type]
     clock.begin("save")
@@ -152,28 +152,3 @@ def _show_origin(found: Patient) -> None:
     )
     for notice in found.notices:
         print(f"notice: {notice}", file=sys.stderr)
-
-
-class _StageBar:
-    """A progress bar for the stages of a build, with the current error if it is known."""
-
-    def __enter__(self) -> _StageBar:
-        from tqdm import tqdm
-
-        self._bar = tqdm(
-            total=1.0,
-            bar_format="{desc:36s} {percentage:3.0f}% |{bar}| {elapsed}",
-            file=sys.stderr,
-            disable=None,
-        )
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def __call__(self, stage: str, fraction: float, error: float) -> None:
-        """Show the completed fraction of a stage, and the error (NaN: unknown)."""
-        text = stage if math.isnan(error) else f"{stage}, error {error:.1%}"
-        self._bar.set_description_str(text, refresh=False)
-        self._bar.n = min(fraction, 1.0)
-        self._bar.refresh()

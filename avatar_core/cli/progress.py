@@ -1,23 +1,88 @@
-"""A progress bar for what may take more than two seconds."""
+"""Progress bars, on standard error where it is a terminal."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
-_FROM = 2.0  # [s]
+if TYPE_CHECKING:
+    from avatar_core.offline.rule import Progress
+
+_FROM = 2.0  # from which the bar of what may be short is shown [s]
+
+# Parts of a build, of its stages; those of "contacts" are added.
+_LINEAR = {"mesh": 0.1, "solve": 0.45, "modes": 0.2, "certify": 0.15, "time": 0.1}
+_LARGE = {
+    "mesh": 0.02,
+    "solve": 0.05,
+    "modes": 0.05,
+    "certify": 0.03,
+    "large": 0.3,
+    "push": 0.5,
+    "time": 0.05,
+}
+_PER_SITE = 0.4  # of a place of contacts, over all else
 
 
 @contextmanager
 def progress_bar(unit: str) -> Iterator[Callable[[int, int], None]]:
     """A bar that appears after ``_FROM`` seconds; told how many are done and how many there are."""
-    from tqdm import tqdm
-
-    with tqdm(unit=f" {unit}", file=sys.stderr, disable=None, delay=_FROM, leave=False) as bar:
+    with _bar(unit=f" {unit}", delay=_FROM, leave=False) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total = max(total, done)
             bar.update(done - bar.n)
 
         yield show
+
+
+@contextmanager
+def stage_bar(stages: dict[str, float] | None = None) -> Iterator[Progress]:
+    """A bar that is told stage, completed fraction, and error (NaN: unknown).
+
+    stages : part of each stage of the whole, in their order; None: fractions are of the whole
+    """
+    with _bar(total=1.0, bar_format="{desc:36s} {percentage:3.0f}% |{bar}| {elapsed}") as bar:
+
+        def show(stage: str, fraction: float, error: float) -> None:
+            text = stage if math.isnan(error) else f"{stage}, error {error:.1%}"
+            bar.set_description_str(text, refresh=False)
+            bar.n = min(1.0, fraction if stages is None else _reached(stages, stage, fraction))
+            bar.refresh()
+
+        yield show
+
+
+def build_stages(large: bool = False, contact_sites: int = 0) -> dict[str, float]:
+    """The stages of a build, ``contact_sites`` among them or none."""
+    total = 1.0 + _PER_SITE * contact_sites
+    *first, last = ((name, part / total) for name, part in (_LARGE if large else _LINEAR).items())
+    return dict([*first, ("contacts", 1.0 - 1.0 / total), last])
+
+
+def _reached(stages: dict[str, float], stage: str, fraction: float) -> float:
+    names = list(stages)
+    before = names[: names.index(stage)] if stage in stages else names
+    return sum(stages[name] for name in before) + stages.get(stage, 0.0) * min(fraction, 1.0)
+
+
+@contextmanager
+def item_bar(total: int) -> Iterator[Callable[[int, int, str], None]]:
+    """A bar over so many things; told how many are done, their number and the name of one."""
+    layout = "{desc:16.16s} {n_fmt}/{total_fmt} |{bar}| {elapsed}<{remaining}"
+    with _bar(total=total, bar_format=layout) as bar:
+
+        def show(done: int, _: int, name: str) -> None:
+            bar.set_description_str(name, refresh=False)
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def _bar(**options: Any) -> Any:
+    from tqdm import tqdm
+
+    return tqdm(file=sys.stderr, disable=None, **options)

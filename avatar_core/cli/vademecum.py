@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from avatar_core.cli.build_bar import BuildBar
 from avatar_core.cli.output import Overwrite, require_output
+from avatar_core.cli.progress import build_stages, stage_bar
 from avatar_core.cli.timings import StageClock, Timings, require_timings, show_timings
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES
@@ -216,7 +216,7 @@ def vademecum(
     warning = orientation_warning(organ)
     if warning:
         print(f"warning: {warning}", file=sys.stderr)
-    with BuildBar(material != "linear", contact_sites) as progress:
+    with stage_bar(build_stages(material != "linear", contact_sites)) as progress:
         report = clock.following(progress)
         built = build(organ, options, report)
     for notice in built.provenance.notices[len(organ.notices) :]:
