@@ -7,20 +7,18 @@ vectors are stored: adding an organ costs one registration, one vector and one r
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from avatar_core.atlas.anatomy import Anatomy, AtlasError, Duplicate, free_name, require_shapes
 from avatar_core.common.arrays import FloatArray, IntArray
-from avatar_core.geometry.level_set import DistanceGrid, GridBox, signed_distance
+from avatar_core.geometry.level_set import GridBox, signed_distance
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.barycenter import DEFAULT_REGULARIZATION, Barycenter, barycenter
-from avatar_core.shapes.lle import LLE, Gram, fit
+from avatar_core.shapes.lle import Gram, fit
 from avatar_core.shapes.registration import (
     Registration,
     RegistrationRule,
@@ -166,67 +164,6 @@ class Atlas:
         """Raise AtlasError if the organ is too long for the box; needs no registration."""
         if not surface.extent.max() < (self.box.upper - self.box.origin).max():
             raise AtlasError(_too_large(surface, self.box))
-
-    def grid(self, vector: ArrayLike) -> DistanceGrid:
-        """A distance vector, or a combination of some, as a grid on the box."""
-        box = self.box
-        values = np.asarray(vector, dtype=np.float64).reshape(box.shape)
-        return DistanceGrid(np.array(box.origin), box.spacing, values)
-
-    def barycenter(
-        self,
-        vector: ArrayLike,
-        n_neighbors: int,
-        *,
-        regularization: float = DEFAULT_REGULARIZATION,
-        convex: bool = False,
-        leave_out: Collection[str] = (),
-    ) -> Barycenter:
-        """Weights of an organ in terms of its neighbours (Eq. 15); numbers as in `anatomies`.
-
-        vector : ndarray, shape (n_points,), of `distance_vector` [m]
-        leave_out : names of members that get no weight, nor do their duplicates
-
-        Raises AtlasError for an unknown name, LLEError if nothing is left or k <= 0.
-        """
-        left = {int(self.same_as[self.index(name)]) for name in leave_out}
-        excluded = [i for i, j in enumerate(self.same_as) if i != j or int(j) in left]
-        return barycenter(
-            self.vectors,
-            vector,
-            n_neighbors,
-            regularization=regularization,
-            convex=convex,
-            leave_out=excluded,
-        )
-
-    def lle(
-        self,
-        n_neighbors: int,
-        *,
-        regularization: float = DEFAULT_REGULARIZATION,
-        convex: bool = False,
-    ) -> LLE:
-        """Weights of every member in terms of the others, from the stored inner products.
-
-        Raises LLEError if the atlas is empty or k <= 0.
-        """
-        return fit(
-            self.vectors,
-            n_neighbors,
-            regularization=regularization,
-            convex=convex,
-            gram=self.gram if self.anatomies else None,
-        )
-
-    def registered(self, names: Sequence[str] | None = None) -> FloatArray:
-        """The template registered to some anatomies, or to all, each in its own coordinates.
-
-        Returns ndarray, shape (n, n_template_vertices, 3) [m].
-        """
-        chosen = self.names if names is None else names
-        rows = [self[name].registered for name in chosen]
-        return np.array(rows).reshape(len(rows), len(self.template.mesh.vertices), 3)
 
     def registration(self, name: str) -> Registration:
         """The registration of an anatomy, without its history."""

@@ -5,7 +5,6 @@ Stamps are the recorded ones; times of receipt are nominal, period by period fro
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ from avatar_core.bags import types
 from avatar_core.bags.periods import ORGAN
 from avatar_core.bags.read import ABOUT, POSES, STATES, About
 from avatar_core.common.arrays import FloatArray
+from avatar_core.common.files import replaced
 from avatar_core.contact.status import PLACED
-from avatar_core.errors import StorageError, one_line
+from avatar_core.errors import StorageError
 from avatar_core.scene.recording import Recording
 from avatar_core.scene.replay import scene_of
 
@@ -39,25 +39,20 @@ def write_mcap(recording: Recording, path: str | Path) -> None:
     library, path = types.rosbag2(), Path(path)
     if path.exists():
         raise StorageError(f"{path} exists; give another name")
-    if not path.parent.is_dir():
-        raise StorageError(f"folder {path.parent} does not exist; create it first")
     names = [tool.name for tool in scene_of(recording).tools]
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            # The library writes folders, and the file's name into the file.
-            bag = Path(folder) / path.stem
-            writer = library.Writer(
-                bag, version=_METADATA_VERSION, storage_plugin=library.StoragePlugin.MCAP
-            )
-            writer.set_compression(library.CompressionMode.STORAGE, library.CompressionFormat.ZSTD)
-            with writer:
-                _Messages(writer, recording, names).write()
-            shutil.move(bag / f"{path.stem}.mcap", path)
-    except OSError as error:
-        raise StorageError(
-            f"cannot write {path} ({one_line(error, 120)}); free disk space or choose another "
-            "folder"
-        ) from error
+    with (
+        replaced(path) as whole,
+        tempfile.TemporaryDirectory(prefix=whole.name, dir=path.parent) as folder,
+    ):
+        # The library writes folders, and the file's name into the file.
+        bag = Path(folder) / path.stem
+        writer = library.Writer(
+            bag, version=_METADATA_VERSION, storage_plugin=library.StoragePlugin.MCAP
+        )
+        writer.set_compression(library.CompressionMode.STORAGE, library.CompressionFormat.ZSTD)
+        with writer:
+            _Messages(writer, recording, names).write()
+        (bag / f"{path.stem}.mcap").rename(whole)
 
 
 class _Messages:

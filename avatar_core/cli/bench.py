@@ -14,16 +14,8 @@ import typer
 
 from avatar_core.cli.output import require_output
 from avatar_core.cli.progress import build_stages, stage_bar
-from avatar_core.cli.vademecum import (
-    Axes,
-    Label,
-    Surface,
-    Unit,
-    Vertices,
-    finite,
-    read_organ,
-    require,
-)
+from avatar_core.cli.vademecum import Axes, Label, Surface, Unit, Vertices, read_organ, require
+from avatar_core.common.dataclass_json import plain
 from avatar_core.errors import AvatarError
 
 if TYPE_CHECKING:
@@ -78,7 +70,7 @@ def bench_step(
         print(f"{key:22s} {value:10.4g}")
     if output is not None:
         document = {"name": "step", "summary": summary, "rows": [asdict(row) for row in rows]}
-        output.write_text(json.dumps(finite(document), indent=2))
+        output.write_text(json.dumps(plain(document), indent=2))
 
 
 @bench.command("effects")
@@ -114,7 +106,7 @@ def bench_effects(
         print(f"{key:22s} {value:10.3f}")
     if output is not None:
         document = {"name": "effects", "summary": summary, "rows": [asdict(row) for row in rows]}
-        output.write_text(json.dumps(finite(document), indent=2))
+        output.write_text(json.dumps(plain(document), indent=2))
 
 
 def _effects_table(rows: list[EffectRow]) -> str:

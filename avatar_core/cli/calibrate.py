@@ -15,10 +15,10 @@ from avatar_core.cli.numbers import ToolTransform, pose
 from avatar_core.cli.output import require_output
 from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.uncertainty import given_of
-from avatar_core.cli.vademecum import finite, require
+from avatar_core.cli.vademecum import require
+from avatar_core.common.dataclass_json import plain
 
 if TYPE_CHECKING:
-    from avatar_core.bags.touched import Touched, TouchFile
     from avatar_core.uncertainty.calibration import Calibration
 
 EXIT_NOT_EXPLAINED = 3
@@ -84,7 +84,7 @@ def calibrate(
     ] = False,
 ) -> None:
     """Find Young's modulus and the coordinates of a vademecum from touches with measured forces."""
-    from avatar_core.bags.touched import TouchFile
+    from avatar_core.bags.touched import TouchFile, read_touched
     from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
     from avatar_core.uncertainty.calibration_report import say
     from avatar_core.uncertainty.palpation import palpation_of
@@ -101,7 +101,8 @@ def calibrate(
         require_ros()
     known = given_of(given or [])
     transform = None if tool_transform is None else pose("--tool-transform", tool_transform)
-    touched = _read(TouchFile(recording, tool, transform, 1e-3 * radius))
+    with progress_bar("messages") as progress:
+        touched = read_touched(TouchFile(recording, tool, transform, 1e-3 * radius), progress)
     palpation = palpation_of(touched.position, touched.force)
     vademecum = load_vademecum(file)
     priors = priors_of(vademecum, known)
@@ -120,16 +121,6 @@ def calibrate(
         _set(found)
 
 
-def _read(file: TouchFile) -> Touched:
-    from avatar_core.bags.files import is_bag
-    from avatar_core.bags.touched import read_touched
-
-    if not is_bag(file.path):
-        return read_touched(file)
-    with progress_bar("messages") as progress:
-        return read_touched(file, progress)
-
-
 def _write(output: Path, name: str, table: object, found: Calibration) -> None:
     from avatar_core.uncertainty import calibration_report as report
     from avatar_core.uncertainty.calibration import TouchTable
@@ -138,7 +129,7 @@ def _write(output: Path, name: str, table: object, found: Calibration) -> None:
     if output.suffix == ".yaml":
         output.write_text(report.distributions_text(name, found))
     elif output.suffix == ".json":
-        output.write_text(json.dumps(finite(report.numbers(table, found)), indent=1) + "\n")
+        output.write_text(json.dumps(plain(report.numbers(table, found)), indent=1) + "\n")
     else:
         report.picture(output, name, table, found)
     print(output)

@@ -12,7 +12,8 @@ import typer
 
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import require_output
-from avatar_core.cli.vademecum import Axes, Unit, finite, parsed_axes
+from avatar_core.cli.vademecum import Axes, Unit, parsed_axes
+from avatar_core.common.dataclass_json import plain
 from avatar_core.geometry.surface_formats import MESH_NAMES
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def register(
         print("notice: the response is that of small strains", file=sys.stderr)
     _write(vademecum, found, output)
     if as_json:
-        print(json.dumps(finite(_summary(vademecum, found, estimates)), indent=2))
+        print(json.dumps(plain(_summary(vademecum, found, estimates)), indent=2))
         return
     print("; ".join([*map(_sentence, estimates), _verdict(found)]))
 
@@ -144,7 +145,7 @@ def _summary(vademecum: Vademecum, found: Registered, estimates: list[Estimate])
 
     fit = found.fit
     traction, length, noise, mismatch = fit.scales.tolist()
-    document = {
+    return {
         "targets": [asdict(one) for one in estimates],
         "residual_rms": found.rms,
         "rigid_motion": {
@@ -166,13 +167,3 @@ def _summary(vademecum: Vademecum, found: Registered, estimates: list[Estimate])
         "n_steps": fit.n_steps,
         "model_error": found.model_error,
     }
-    return dict(_listed(document))
-
-
-def _listed(value: Any) -> Any:
-    """Arrays as lists."""
-    if isinstance(value, dict):
-        return {key: _listed(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_listed(item) for item in value]
-    return value.tolist() if hasattr(value, "tolist") else value

@@ -14,6 +14,7 @@ import typer
 from avatar_core.cli.output import Overwrite, require_output
 from avatar_core.cli.progress import build_stages, stage_bar
 from avatar_core.cli.timings import StageClock, Timings, require_timings, show_timings
+from avatar_core.common.dataclass_json import plain
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES
 
@@ -254,7 +255,7 @@ def show(
     certificate |= {"bytes": v.nbytes}
     print(
         json.dumps(
-            finite(
+            plain(
                 {
                     **asdict(v.info()),
                     "element": v.element,
@@ -455,14 +456,3 @@ def _show_large(v: Vademecum) -> None:
             f"    at {c.n_lost} of {c.n_sites} sites full finite elements lost equilibrium before "
             "the stored range ends"
         )
-
-
-def finite(value: Any) -> Any:
-    """JSON has no NaN: null instead."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

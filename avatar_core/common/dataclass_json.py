@@ -1,4 +1,4 @@
-"""Dataclasses from JSON of unknown origin: every value is checked against the type of its field.
+"""Values for JSON; and dataclasses from JSON of unknown origin, checked field by field.
 
 The inverse of ``json.dumps(dataclasses.asdict(...))``. msgspec.convert is faster (0.3 ms instead of
 9 ms for the largest attribute) but, like pydantic, ignores fields that a plain dataclass does not
@@ -8,6 +8,7 @@ have, which is how a newer file is recognised here.
 from __future__ import annotations
 
 import json
+import math
 import types
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
@@ -19,6 +20,17 @@ Kind = TypeVar("Kind")
 
 MAX_LETTERS = 4 << 20  # of JSON; the curve of a large vademecum has 50,000
 MAX_NAME = 200  # of a name, in letters
+
+
+def plain(value: Any) -> Any:
+    """What JSON can hold: lists of arrays and tuples, plain numbers, null of what is not finite."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):  # of numpy
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def parsed(text: str, key: str) -> Any:

@@ -1,4 +1,4 @@
-"""Opening files of unknown origin, regular files only, of limited size; and finding our own.
+"""Opening files of unknown origin, regular and of limited size; writing and finding our own.
 
 A path may name something else between the check and the opening, so the open descriptor is checked
 again; opening never blocks.
@@ -7,13 +7,14 @@ again; opening never blocks.
 from __future__ import annotations
 
 import os
+import secrets
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from avatar_core.errors import AvatarError
+from avatar_core.errors import AvatarError, StorageError, one_line
 
 
 class FileError(AvatarError):
@@ -55,6 +56,33 @@ def content_of(source: BinaryIO) -> bytes:
     if len(content) > size:
         raise FileError("it grows while it is read")
     return content
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """A file to write in the place of another, which it takes on leaving without an error.
+
+    Raises
+    ------
+    StorageError
+        For a missing folder or a full disk; nothing is left behind.
+    """
+    if not path.parent.is_dir():
+        raise StorageError(f"folder {path.parent} does not exist; create it first")
+    whole = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        yield whole
+        with whole.open("rb") as file:
+            os.fsync(file.fileno())
+        os.replace(whole, path)
+    except OSError as error:
+        raise StorageError(
+            f"cannot write {path} ({one_line(error, 120)}); "
+            "free disk space or choose another folder"
+        ) from error
+    finally:
+        with suppress(OSError):
+            whole.unlink(missing_ok=True)
 
 
 def shipped(folder: str) -> dict[str, Path]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import tempfile
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import BinaryIO
@@ -18,7 +17,7 @@ from typing import BinaryIO
 import h5py
 import numpy as np
 
-from avatar_core.common.files import FileError, opened
+from avatar_core.common.files import FileError, opened, replaced
 from avatar_core.errors import StorageError, one_line
 
 Arrays = dict[str, np.ndarray]
@@ -46,26 +45,9 @@ def replace_file(
     StorageError
         If the folder does not exist or the disk is full; the old file is then unchanged.
     """
-    if not path.parent.is_dir():
-        raise StorageError(f"folder {path.parent} does not exist; create it first")
     content = encoded(arrays, attributes, packed)
-    try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise StorageError(
-            f"cannot write {path} ({one_line(error, 120)}); "
-            "free disk space or choose another folder"
-        ) from error
+    with replaced(path) as whole:
+        whole.write_bytes(content)
 
 
 def encoded(

@@ -8,9 +8,9 @@ import meshio
 import numpy as np
 from numpy.typing import ArrayLike
 
+from avatar_core.common.files import replaced
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import StorageError
-from avatar_core.scene.written import replaced
 from avatar_core.vademecum.model import Vademecum
 
 # Options of meshio by suffix, each for a single file: XDMF with HDF5 would write a second one, with

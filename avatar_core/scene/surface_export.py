@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from avatar_core.common.files import replaced
 from avatar_core.errors import StorageError
 from avatar_core.geometry.surface import METRES
-from avatar_core.scene.written import replaced
 from avatar_core.vademecum.model import Vademecum
 
 AXES = ("LPS", "RAS")

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from avatar_core.common.dataclass_json import plain
 from avatar_core.common.machine import processor
 from avatar_core.offline.rule import Progress
 
@@ -152,7 +153,7 @@ class Run(Generic[S]):
             "seconds": seconds,
         }
         record, picture = (self.folder / f"{self.study.name}.{end}" for end in ("json", "png"))
-        record.write_text(json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+        record.write_text(json.dumps(plain(document), indent=2, allow_nan=False) + "\n")
         self._draw(picture)
         return record, picture
 
@@ -209,7 +210,7 @@ class RowFile:
 
 
 def _line(row: Row) -> str:
-    return json.dumps(_plain(row), allow_nan=False) + "\n"
+    return json.dumps(plain(row), allow_nan=False) + "\n"
 
 
 def _parsed(line: str) -> Row | None:
@@ -286,14 +287,3 @@ def _text(value: Value) -> str:
     if value is None:
         return "-"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _plain(value: Any) -> Any:
-    """Plain Python scalars; NaN, which JSON does not have, becomes null."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "item"):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value

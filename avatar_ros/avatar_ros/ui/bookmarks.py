@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from avatar_core.common.files import replaced
 from avatar_core.errors import StorageError
-from avatar_core.scene.written import replaced
 from avatar_ros.ui.orientation import AXES
 from avatar_ros.ui.view import LOOKS
 

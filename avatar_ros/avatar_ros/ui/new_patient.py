@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from avatar_core.common.files import replaced
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.label_files import MAX_LABEL_BYTES, is_label_map
 from avatar_core.geometry.label_maps import labels_of
-from avatar_core.scene.written import replaced
 from avatar_ros.framework.conversions import mesh_arrays
 from avatar_ros.framework.reader import Reader
 from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING, stem

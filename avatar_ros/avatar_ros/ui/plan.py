@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from avatar_core.common.files import replaced
 from avatar_core.errors import AvatarError
 from avatar_core.scene.surface_export import write_surfaces
-from avatar_core.scene.written import replaced
 from avatar_ros.ui.alerts import alerts_of_organ
 from avatar_ros.ui.bookmarks import Bookmark, Bookmarks
 from avatar_ros.ui.camera import pose_of

@@ -18,11 +18,19 @@ from avatar_core.atlas.growth import (
 )
 from avatar_core.atlas.model import Atlas, box_around
 from avatar_core.atlas.storage import load_atlas, save_atlas
-from avatar_core.errors import LLEError
 from avatar_core.fem.elasticity import Material
+from avatar_core.geometry.level_set import DistanceGrid
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.shapes.lle import fit
 from avatar_core.shapes.registration import Template
 from tests.core.atlas.rough import ALONE, OPTIONS, N, same, write_obj
+
+
+def grid_of(atlas: Atlas, vector: np.ndarray) -> DistanceGrid:
+    """A distance vector as a grid on the box."""
+    box = atlas.box
+    return DistanceGrid(np.array(box.origin), box.spacing, vector.reshape(box.shape))
+
 
 # --- growing ----------------------------------------------------------------------------------
 
@@ -41,7 +49,7 @@ def test_growing_one_by_one_equals_all_at_once(
     # the origins of the products differ, so it is rounding that may differ
     assert not np.array_equal(grown.gram.origin, atlas.gram.origin)
     for k in (2, N - 1):
-        one, other = grown.lle(k), atlas.lle(k)
+        one, other = (fit(a.vectors, k, gram=a.gram) for a in (grown, atlas))
         np.testing.assert_allclose(one.weight_matrix, other.weight_matrix, rtol=0, atol=1e-10)
         assert np.abs(other.weight_matrix.sum(axis=1) - 1).max() < 1e-12
 
@@ -64,7 +72,7 @@ def test_distances_are_those_of_the_placed_organ_at_its_own_size(
         placed = atlas.place(liver, one.alignment)
         assert placed.volume == pytest.approx(liver.volume, rel=1e-9)
         # the interior of the grid at 20 mm: two-lobed organs of 1.5 l, measured 0.4 to 4 %
-        assert atlas.grid(one.distances).volume == pytest.approx(one.volume, rel=0.08)
+        assert grid_of(atlas, one.distances).volume == pytest.approx(one.volume, rel=0.08)
     # elsewhere in the scanner it is the same organ, but for where the alignment's iteration ends
     shifted = replace(livers[0], vertices=livers[0].vertices + np.array([0.4, -0.2, 0.1]))
     again = build_anatomy(atlas, shifted)
@@ -72,27 +80,12 @@ def test_distances_are_those_of_the_placed_organ_at_its_own_size(
     assert np.sqrt(np.mean(difference**2)) < 1e-3
 
 
-def test_a_member_is_its_own_barycenter(atlas: Atlas) -> None:
-    point = atlas.barycenter(atlas.vectors[2], 3)
-    assert point.member == 2 and point.weights.tolist() == [1, 0, 0]
-    left = atlas.barycenter(atlas.vectors[2], N, leave_out=["liver2"])
-    assert left.member is None and 2 not in left.neighbors and len(left.neighbors) == N - 1
-    shape = left.combine(atlas.vectors)
-    # Eq. 17 has six parameters: five neighbours get near, not there
-    assert atlas.grid(shape).volume == pytest.approx(atlas.anatomies[2].volume, rel=0.08)
-    with pytest.raises(AtlasError, match="avatar atlas show"):
-        atlas.barycenter(atlas.vectors[2], 3, leave_out=["nobody"])
-
-
-def test_registered_vertices_and_registrations_come_back(
-    atlas: Atlas, livers: list[SurfaceMesh]
-) -> None:
-    vertices = atlas.registered(["liver4", "liver1"])
-    assert vertices.shape == (2, len(atlas.template.mesh.vertices), 3)
+def test_registrations_come_back(atlas: Atlas, livers: list[SurfaceMesh]) -> None:
     registration = atlas.registration("liver1")
-    assert np.array_equal(registration.mesh.vertices, vertices[1])
+    assert np.array_equal(registration.mesh.vertices, atlas["liver1"].registered)
     assert registration.mesh.volume == pytest.approx(livers[1].volume, rel=0.02)
-    assert atlas.registered([]).shape == (0, len(atlas.template.mesh.vertices), 3)
+    with pytest.raises(AtlasError, match="avatar atlas show"):
+        atlas.registration("nobody")
 
 
 def with_response(atlas: Atlas, name: str, response: Response) -> Atlas:
@@ -120,18 +113,7 @@ def test_responses_are_kept_and_must_fit(atlas: Atlas, tmp_path: Path) -> None:
 # --- one, the same, too large -----------------------------------------------------------------
 
 
-def test_atlas_of_one(empty: Atlas, members: list[Anatomy], tmp_path: Path) -> None:
-    save_atlas(empty.with_anatomies(members[:1]), tmp_path / "a.h5")
-    one = load_atlas(tmp_path / "a.h5")
-    point = one.barycenter(members[1].distances, 3)
-    assert point.weights.tolist() == [1.0] and point.hull_distance > 0 and point.notices
-    with pytest.raises(LLEError, match="left"):
-        one.barycenter(members[1].distances, 3, leave_out=["liver0"])
-    with pytest.raises(LLEError, match="empty"):
-        empty.barycenter(members[1].distances, 3)
-
-
-def test_duplicates_are_kept_reported_and_count_once(
+def test_duplicates_are_kept_and_reported(
     atlas: Atlas, empty: Atlas, members: list[Anatomy]
 ) -> None:
     hashed = [
@@ -148,18 +130,10 @@ def test_duplicates_are_kept_reported_and_count_once(
     ]
     assert "same shape as liver0" in str(doubled.duplicates[0])
     assert doubled.with_anatomies([members[1]]).names[-1] == "liver1-3"
-    vector = members[4].distances
-    for leave_out in (["liver4"], ["liver4", "liver1-2"], ["liver4", "liver0"]):
-        point = doubled.barycenter(vector, N, leave_out=leave_out)
-        rest = [name for name in leave_out if name != "liver1-2"]
-        rest += ["liver1"] if "liver1-2" in leave_out else []
-        alone = atlas.barycenter(vector, N, leave_out=rest)
-        np.testing.assert_array_equal(point.neighbors, alone.neighbors)
-        np.testing.assert_allclose(point.weights, alone.weights, rtol=0, atol=1e-12)
 
 
 def test_two_identical_livers(
-    template: Template, livers: list[SurfaceMesh], members: list[Anatomy], tmp_path: Path
+    template: Template, livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:
     file = tmp_path / "a.h5"
     growth = create_atlas(file, [livers[0]] * 2, OPTIONS, template=template, workers=ALONE)
@@ -168,8 +142,7 @@ def test_two_identical_livers(
     assert all(": registration not converged" in line for line in growth.notices[1:])
     assert len(growth.notices) == 1 + sum(not one.converged for one in growth.atlas.anatomies)
     twins = load_atlas(file)
-    assert twins.barycenter(members[1].distances, 5).neighbors.tolist() == [0]
-    assert twins.lle(3).weight_matrix[1].tolist() == [1.0, 0.0]
+    assert twins.same_as.tolist() == [0, 0]
 
 
 def test_what_a_file_states_against_the_axes_given_is_said(
