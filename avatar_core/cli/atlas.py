@@ -13,6 +13,7 @@ import typer
 
 from avatar_core.cli.output import EXIT_STOPPED, require_output
 from avatar_core.cli.progress import item_bar
+from avatar_core.cli.vademecum import AsJson, Axes, Label, Unit, parsed_axes, say_notices
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES, SUFFIXES
 
@@ -27,7 +28,7 @@ atlas = typer.Typer(
     rich_markup_mode=None,  # which takes units, such as [m], for markup
 )
 
-File = Annotated[Path, typer.Argument(metavar="ATLAS.h5", help="file of the atlas")]
+AtlasFile = Annotated[Path, typer.Argument(metavar="ATLAS.h5", help="file of the atlas")]
 Surfaces = Annotated[
     list[str],
     typer.Argument(
@@ -36,15 +37,6 @@ Surfaces = Annotated[
         "'phantom', the built-in liver",
     ),
 ]
-Unit = Annotated[str, typer.Option(help="unit of length in the files: mm, cm or m")]
-Axes = Annotated[
-    str | None,
-    typer.Option(
-        help="coordinate axes of the files: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS; "
-        "default: as each header states (SPACE=LPS, as 3D Slicer writes), else RAS"
-    ),
-]
-Label = Annotated[str | None, typer.Option(help="number or name of the organ in label maps")]
 Jobs = Annotated[
     int | None, typer.Option(help="number of processes on this machine; default: one per CPU")
 ]
@@ -60,7 +52,7 @@ Scheduler = Annotated[
 
 @atlas.command()
 def create(
-    file: File,
+    file: AtlasFile,
     surfaces: Surfaces,
     unit: Unit = "mm",
     axes: Axes = None,
@@ -105,7 +97,7 @@ def create(
 
 @atlas.command()
 def add(
-    file: File,
+    file: AtlasFile,
     surfaces: Surfaces,
     unit: Unit = "mm",
     axes: Axes = None,
@@ -135,9 +127,7 @@ def add(
 
 
 @atlas.command()
-def show(
-    file: File, as_json: Annotated[bool, typer.Option("--json", help="print as JSON")] = False
-) -> None:
+def show(file: AtlasFile, as_json: AsJson = False) -> None:
     """Show the members of an atlas, with the quality of their registrations."""
     from avatar_core.atlas.storage import load_atlas
 
@@ -215,8 +205,7 @@ def _report(file: Path, growth: Growth) -> None:
     """Print what was added and skipped; raises AvatarError if nothing was added."""
     for one in growth.skipped:
         print(f"skipped: {one.name}: {one.reason.removeprefix(f'{one.name}: ')}", file=sys.stderr)
-    for notice in growth.notices:
-        print(f"notice: {notice}", file=sys.stderr)
+    say_notices(growth.notices)
     n_sources = len(growth.added) + len(growth.skipped)
     if not growth.added:
         raise AvatarError(f"none of {n_sources} surface(s) can be used; nothing was written")
@@ -232,7 +221,6 @@ def _sources(
 ) -> list[Source]:
     """The surfaces named, those of a folder in the order of their names."""
     from avatar_core.atlas.growth import SurfaceFile
-    from avatar_core.cli.vademecum import parsed_axes
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.geometry.surface import METRES, axes_matrix
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from avatar_core.cli.bench import require_ros
-from avatar_core.cli.numbers import ToolTransform, pose
+from avatar_core.cli.numbers import ToolTransform, pose_of
 from avatar_core.cli.output import require_output
 from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.uncertainty import given_of
-from avatar_core.cli.vademecum import require
+from avatar_core.cli.vademecum import File, require, say_notices
 from avatar_core.common.dataclass_json import plain
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ _FORMATS = (".yaml", ".json", ".png", ".pdf", ".svg")
 
 
 def calibrate(
-    file: Annotated[Path, typer.Argument(help="vademecum (.h5)")],
+    file: File,
     recording: Annotated[
         Path,
         typer.Option(
@@ -100,7 +100,7 @@ def calibrate(
     if set_them:
         require_ros()
     known = given_of(given or [])
-    transform = None if tool_transform is None else pose("--tool-transform", tool_transform)
+    transform = pose_of(tool_transform)
     with progress_bar("messages") as progress:
         touched = read_touched(TouchFile(recording, tool, transform, 1e-3 * radius), progress)
     palpation = palpation_of(touched.position, touched.force)
@@ -110,8 +110,7 @@ def calibrate(
         table = touch_table(vademecum, touched.tip, palpation, progress)
     errors = Errors(sensor, least, 1e-3 * depth, extent=extent)
     found = calibrated(table, priors, errors)
-    for note in touched.notes:
-        print(f"notice: {note}", file=sys.stderr)
+    say_notices(touched.notes)
     say(vademecum.name, table, found)
     for one in output or []:
         _write(one, vademecum.name, table, found)

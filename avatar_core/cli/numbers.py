@@ -31,6 +31,8 @@ def numbers(option: str, text: str, counts: tuple[int, ...], remedy: str) -> lis
     return found
 
 
-def pose(option: str, text: str) -> tuple[float, ...]:
-    """Position [m] and quaternion of an option, x,y,z,x,y,z,w."""
-    return tuple(numbers(option, text, (7,), "seven numbers, as 0,0,0.1,0,0,0,1"))
+def pose_of(text: str | None) -> tuple[float, ...] | None:
+    """Position [m] and quaternion of ``--tool-transform``, x,y,z,x,y,z,w, if it is given."""
+    if text is None:
+        return None
+    return tuple(numbers("--tool-transform", text, (7,), "seven numbers, as 0,0,0.1,0,0,0,1"))

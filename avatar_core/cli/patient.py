@@ -16,12 +16,14 @@ from avatar_core.cli.vademecum import (
     Axes,
     Groups,
     Label,
+    Output,
     Supports,
     Surface,
     Unit,
     Vertices,
     read_organ,
     require,
+    say_notices,
     show_text,
 )
 
@@ -34,7 +36,7 @@ WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
 def patient(
     surface: Surface,
     atlas: Annotated[Path, typer.Option(help="atlas (.h5) made by 'avatar atlas create'")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="vademecum to write (.h5)")],
+    output: Output,
     fidelity: Annotated[
         str,
         typer.Option(
@@ -111,8 +113,7 @@ def patient(
         supports=supports,
     )
     organ = read_organ(surface, unit, axes, label)
-    for notice in organ.notices:
-        print(f"notice: {notice}", file=sys.stderr)
+    say_notices(organ.notices)
     with stage_bar() as progress:
         report = clock.following(progress)
         found = patient_vademecum(organ, base, fidelity, options, report)  # type: ignore[arg-type]
@@ -150,5 +151,4 @@ def _show_origin(found: Patient) -> None:
         f"  CPU time: registration {s.registration:.1f} s, mesh {s.mesh:.1f} s, response "
         f"{s.response:.1f} s, certificate {s.certificate:.1f} s"
     )
-    for notice in found.notices:
-        print(f"notice: {notice}", file=sys.stderr)
+    say_notices(found.notices)

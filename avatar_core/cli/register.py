@@ -12,7 +12,7 @@ import typer
 
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import require_output
-from avatar_core.cli.vademecum import Axes, Unit, parsed_axes
+from avatar_core.cli.vademecum import AsJson, Axes, File, Unit, parsed_axes
 from avatar_core.common.dataclass_json import plain
 from avatar_core.geometry.surface_formats import MESH_NAMES
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def register(
-    file: Annotated[Path, typer.Argument(help="vademecum (.h5)")],
+    file: File,
     points: Annotated[
         Path,
         typer.Option(
@@ -51,7 +51,7 @@ def register(
             "or else where it is displaced most"
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print as JSON")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Bring an organ to a cloud of points on its deformed surface: where is the tumour now?"""
     from avatar_core.registration.cloud import read_cloud

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from avatar_core.cli.numbers import ToolTransform, pose
+from avatar_core.cli.numbers import ToolTransform, pose_of
 from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.vademecum import require
 
@@ -66,9 +66,7 @@ def replay(
 
     require(rate is None or 100.0 <= rate <= 2000.0, f"--rate is {rate} Hz; give 100 to 2000")
     require(device in DEVICES, f"--device is {device}; choose {', '.join(DEVICES)}")
-    transform = None
-    if tool_transform is not None:
-        transform = pose("--tool-transform", tool_transform)
+    transform = pose_of(tool_transform)
     if is_bag(file):
         how = _How(tool, scene, transform, rate, DEVICES[device])
         _replay_bag(file, vademecum, how, tolerance)

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from avatar_core.cli.vademecum import say_notices
 from avatar_core.errors import StorageError
 from avatar_core.studies import NAMES, load_study
 
@@ -45,8 +46,7 @@ def study(
     start = time.perf_counter()
     run = chosen.conduct(chosen.quick if quick else chosen.full, output, surfaces)
     seconds = time.perf_counter() - start
-    for notice in run.notices:
-        print(f"notice: {notice}", file=sys.stderr)
+    say_notices(run.notices)
     print(run.table())
     print(run.sentence)
     record, picture = run.write(seconds)

@@ -11,7 +11,7 @@ import typer
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import require_output
 from avatar_core.cli.progress import progress_bar
-from avatar_core.cli.vademecum import require
+from avatar_core.cli.vademecum import File, require
 
 if TYPE_CHECKING:
     from avatar_core.uncertainty.distributions import Distribution
@@ -22,7 +22,7 @@ _DEPTHS = "1,2,4,6,8"
 
 
 def uncertainty(
-    file: Annotated[Path, typer.Argument(help="vademecum (.h5)")],
+    file: File,
     given: Annotated[
         list[str],
         typer.Option(

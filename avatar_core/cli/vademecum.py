@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 
 EXIT_NOT_CONVERGED = 3
 
+File = Annotated[Path, typer.Argument(help="vademecum (.h5)")]
+Output = Annotated[Path, typer.Option("-o", "--output", help="vademecum to write (.h5)")]
+AsJson = Annotated[bool, typer.Option("--json", help="print as JSON")]
 Surface = Annotated[
     str,
     typer.Argument(
@@ -34,12 +38,12 @@ Surface = Annotated[
         "'phantom': the built-in liver"
     ),
 ]
-Unit = Annotated[str, typer.Option(help="unit of length in the file: mm, cm or m")]
+Unit = Annotated[str, typer.Option(help="unit of length in the files: mm, cm or m")]
 Axes = Annotated[
     str | None,
     typer.Option(
-        help="coordinate axes of the file: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS; "
-        "default: as its header states (SPACE=LPS, as 3D Slicer writes), else RAS"
+        help="coordinate axes of the files: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS; "
+        "default: as each header states (SPACE=LPS, as 3D Slicer writes), else RAS"
     ),
 ]
 Label = Annotated[
@@ -67,7 +71,7 @@ Vertices = Annotated[int, typer.Option(help="approximate number of mesh vertices
 
 def vademecum(
     surface: Surface,
-    output: Annotated[Path, typer.Option("-o", "--output", help="vademecum to write (.h5)")],
+    output: Output,
     unit: Unit = "mm",
     axes: Axes = None,
     label: Label = None,
@@ -212,16 +216,14 @@ def vademecum(
         with_mesh_error=mesh_error,
         n_displayed=displayed,
     )
-    for notice in (*organ.notices, *(lesion.notices if lesion else ())):
-        print(f"notice: {notice}", file=sys.stderr)
+    say_notices((*organ.notices, *(lesion.notices if lesion else ())))
     warning = orientation_warning(organ)
     if warning:
         print(f"warning: {warning}", file=sys.stderr)
     with stage_bar(build_stages(material != "linear", contact_sites)) as progress:
         report = clock.following(progress)
         built = build(organ, options, report)
-    for notice in built.provenance.notices[len(organ.notices) :]:
-        print(f"notice: {notice}", file=sys.stderr)
+    say_notices(built.provenance.notices[len(organ.notices) :])
     clock.begin("save")
     save_vademecum(built, output)
     clock.begin("show")
@@ -239,10 +241,7 @@ def vademecum(
         raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
-def show(
-    file: Annotated[Path, typer.Argument(help="vademecum (.h5)")],
-    as_json: Annotated[bool, typer.Option("--json", help="print as JSON")] = False,
-) -> None:
+def show(file: File, as_json: AsJson = False) -> None:
     """Show what a vademecum contains, its certified errors, and what it cost to build."""
     from avatar_core.vademecum.storage import load_vademecum
 
@@ -332,6 +331,12 @@ def require(condition: bool, message: str) -> None:
     """Raise AvatarError with the message unless the condition holds."""
     if not condition:
         raise AvatarError(message)
+
+
+def say_notices(notices: Iterable[str]) -> None:
+    """Print notices to standard error."""
+    for notice in notices:
+        print(f"notice: {notice}", file=sys.stderr)
 
 
 def show_text(v: Vademecum) -> None:
