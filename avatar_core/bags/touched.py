@@ -18,8 +18,8 @@ from avatar_core.scene.replay import scene_of
 from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
 from avatar_core.uncertainty.calibration_report import numbers, verdict
 from avatar_core.uncertainty.distributions import parse
+from avatar_core.uncertainty.known import priors_of
 from avatar_core.uncertainty.palpation import palpation_of
-from avatar_core.uncertainty.priors import priors_of
 from avatar_core.vademecum.storage import load_vademecum
 
 RADIUS = 5e-3  # of a tip of which no radius is given [m]
@@ -59,14 +59,11 @@ def read_touched(file: TouchFile, progress: Progress | None = None) -> Touched:
     StorageError
         For a file that cannot be read, a tool that it does not have, or a bag without forces.
     """
-    return _of_bag(file, progress) if is_bag(file.path) else _of_recording(file)
-
-
-def _of_bag(file: TouchFile, progress: Progress | None) -> Touched:
+    if not is_bag(file.path):
+        return _of_recording(file)
     from avatar_core.bags.palpation import measured_path  # of the extra bags
 
-    path = measured_path(file.path, file.tool, file.transform, progress)
-    return Touched(Tip("sphere", file.radius), path.tip, path.force, path.notes)
+    return measured_path(file, progress)
 
 
 def _of_recording(file: TouchFile) -> Touched:

@@ -87,8 +87,8 @@ def calibrate(
     from avatar_core.bags.touched import TouchFile, read_touched
     from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
     from avatar_core.uncertainty.calibration_report import say
+    from avatar_core.uncertainty.known import priors_of
     from avatar_core.uncertainty.palpation import palpation_of
-    from avatar_core.uncertainty.priors import priors_of
     from avatar_core.vademecum.storage import load_vademecum
 
     for one in output or []:

@@ -106,6 +106,10 @@ def _value(kind: Any, value: Any, key: str) -> Any:
         return of_plain(rest, value, key)
     if origin is tuple:
         return _tuple(get_args(kind), value, key)
+    if origin is dict:
+        return {
+            name: of_plain(get_args(kind)[1], one, f"{key}.{name}") for name, one in value.items()
+        }
     if isinstance(kind, type) and issubclass(kind, Enum):
         try:
             return kind(value)

@@ -34,8 +34,8 @@ from avatar_core.studies.report import Panel
 from avatar_core.studies.study import ProgressBar, Row, column, follow
 from avatar_core.uncertainty.calibration import Errors, TouchTable, calibrated, touch_table
 from avatar_core.uncertainty.distributions import Distribution, Fixed
+from avatar_core.uncertainty.known import priors_of
 from avatar_core.uncertainty.palpation import Palpation
-from avatar_core.uncertainty.priors import priors_of
 from avatar_core.vademecum.model import Vademecum
 
 if TYPE_CHECKING:

@@ -29,6 +29,8 @@ from avatar_core.contact.effects.tip_law import (
     tip_law_arrays,
     tip_law_state,
 )
+from avatar_core.contact.error_map import is_reached
+from avatar_core.contact.tip_response import closest_weights
 from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.coordinates import Coordinate
@@ -76,6 +78,26 @@ def log_edges(
         of_draws = np.exp(weights @ found[:, t, :, k] + stiffer)
         edges[t, :, k] = np.log(np.quantile(of_draws, (LOW, HIGH), axis=0)).T
     return edges
+
+
+def force_spread_at(
+    vademecum: Vademecum, tip: Tip, known: Mapping[str, Distribution], points: np.ndarray
+) -> FloatArray:
+    """Half of the band that holds 90 % of the force, over its middle, shape (n,).
+
+        (F_95 - F_5) / (F_95 + F_5)
+
+    of a tip ``DEPTHS[1]`` deep, by :func:`log_edges`; NaN off the accessible surface.
+
+    Parameters
+    ----------
+    known : of all parameters of the vademecum, by :func:`avatar_core.uncertainty.known.known_of`
+    points : ndarray, shape (n, 3), of the surface at rest [m]
+    """
+    edges = log_edges(vademecum, (tip,), known)[0, :, 1]
+    positions, weights = closest_weights(vademecum.surface, np.ascontiguousarray(points, float))
+    width = np.sum(weights * np.ptp(edges, axis=1)[positions], axis=1)
+    return np.where(is_reached(vademecum, points), np.tanh(0.5 * width), np.nan)
 
 
 def log_forces(vademecum: Vademecum, tips: Sequence[Tip]) -> FloatArray:

@@ -1,20 +1,25 @@
-"""What is known of all parameters of a vademecum: what is given, for the rest its own values."""
+"""What is known of all parameters of a vademecum: what is given, for the rest its own values, or
+anything within its ranges."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from avatar_core.common.dataclass_json import of_plain, plain
 from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import CoordinateError
 from avatar_core.reduction.coordinates import Coordinate, fixed_support, option_of
-from avatar_core.uncertainty.distributions import Distribution, Fixed, within
+from avatar_core.uncertainty.distributions import Distribution, Fixed, LogUniform, Uniform, within
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
+
+# From the softest livers of elastography to twice the 170 kPa of the paper.
+YOUNG = LogUniform(500.0, 350e3)
 
 
 @dataclass(frozen=True)
@@ -53,22 +58,12 @@ class Held:
 
     def plain(self) -> dict[str, Any]:
         """As numbers and text, for a message."""
-        coordinates = [
-            [c.name, float(c.low), float(c.high), int(c.n_nodes)] for c in self.coordinates
-        ]
-        own = {name: float(value) for name, value in self.own.items()}
-        return {
-            "own": own,
-            "coordinates": coordinates,
-            "reference": float(self.reference),
-            "fixed": list(self.fixed),
-        }
+        return dict(plain(asdict(self)))
 
     @staticmethod
     def of_plain(stored: Mapping[str, Any]) -> Held:
         """The inverse of :meth:`plain`."""
-        coordinates = tuple(Coordinate(*one) for one in stored["coordinates"])
-        return Held(dict(stored["own"]), coordinates, stored["reference"], tuple(stored["fixed"]))
+        return of_plain(Held, stored, "held")
 
     def known(self, given: Mapping[str, Distribution]) -> dict[str, Distribution]:
         """A distribution of every coordinate and of "young", within what the vademecum holds.
@@ -94,16 +89,44 @@ class Held:
             raise fixed_support(self.fixed[0], self.own["young"])
         found = {"young": young}
         for c in self.coordinates:
-            scale = self._scale(young) if c.kind == "support" else 1.0
+            scale = self.scale(c, young)
             whole = given.get(c.name, Fixed(self.own[c.name]))
             found[c.name] = within(c.name, whole, scale * c.low, scale * c.high)
         return found
 
-    def _scale(self, young: Distribution) -> float:
-        """Of the ranges of supports, whose stiffness counts over Young's modulus."""
+    def scale(self, coordinate: Coordinate, young: Distribution) -> float:
+        """Of a coordinate's range: the stiffness of supports counts over Young's modulus."""
+        if coordinate.kind != "support":
+            return 1.0
         return float(young.ppf(np.array(0.5))) / self.reference
 
 
 def known_of(vademecum: Vademecum, given: Mapping[str, Distribution]) -> dict[str, Distribution]:
     """:meth:`Held.known` of a vademecum."""
     return Held.by(vademecum).known(given)
+
+
+def priors_of(
+    vademecum: Vademecum, given: Mapping[str, Distribution] | None = None
+) -> dict[str, Distribution]:
+    """A distribution of every coordinate and of "young": as given, or as wide as may be.
+
+    A coordinate lies anywhere in its range; Young's modulus in ``YOUNG``, unless a support that is
+    no coordinate fixes it.
+
+    Raises
+    ------
+    CoordinateError
+        As :meth:`Held.known`.
+    """
+    given, held = given or {}, Held.by(vademecum)
+    own = Fixed(held.own["young"])
+    wide: dict[str, Distribution] = {"young": own if held.fixed else YOUNG}
+    young = given.get("young", wide["young"])
+    for c in held.coordinates:
+        if c.kind == "poisson":
+            wide[c.name] = Uniform(c.low, c.high)
+            continue
+        scale = held.scale(c, young)
+        wide[c.name] = LogUniform(scale * c.low, scale * c.high)
+    return held.known(wide | dict(given))

@@ -10,8 +10,8 @@ import numpy as np
 from avatar_core.contact.error_map import force_error_at
 from avatar_core.errors import AvatarError, one_line
 from avatar_core.uncertainty.distributions import Distribution, Fixed
+from avatar_core.uncertainty.force_ratios import force_spread_at
 from avatar_core.uncertainty.known import Held
-from avatar_core.uncertainty.spread_map import force_spread_at
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.loop.settings import chosen_known
 from avatar_ros.prepare.bands import usable_known

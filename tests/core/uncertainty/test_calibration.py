@@ -30,8 +30,8 @@ from avatar_core.uncertainty.distributions import (
     read_distributions,
 )
 from avatar_core.uncertainty.fit_check import chance, local_chance, normal_scores
+from avatar_core.uncertainty.known import YOUNG, priors_of
 from avatar_core.uncertainty.palpation import N_SAMPLES, Palpation, palpation_of
-from avatar_core.uncertainty.priors import YOUNG, priors_of
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum

@@ -18,11 +18,10 @@ from avatar_core.errors import CoordinateError
 from avatar_core.geometry.tip import Tip
 from avatar_core.uncertainty.bands import bands_of
 from avatar_core.uncertainty.distributions import Distribution, Fixed, Lognormal, Uniform
-from avatar_core.uncertainty.force_ratios import DEPTHS, log_edges, log_forces
+from avatar_core.uncertainty.force_ratios import DEPTHS, force_spread_at, log_edges, log_forces
 from avatar_core.uncertainty.force_table import ForceTable
 from avatar_core.uncertainty.known import Held, known_of
 from avatar_core.uncertainty.material_grid import MaterialGrid
-from avatar_core.uncertainty.spread_map import force_spread_at
 from avatar_core.vademecum.accuracy import Detail
 from avatar_core.vademecum.at_values import at_values, own_compliance, own_compliance_at
 from avatar_core.vademecum.model import Vademecum
