@@ -8,7 +8,7 @@ that they differ in the response only. Supports hold a patient that is ``reduced
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
@@ -34,7 +34,7 @@ from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.linear import build_vademecum
-from avatar_core.offline.rule import BuildRule
+from avatar_core.offline.rule import BuildRule, Progress, silent
 from avatar_core.offline.supports import SupportOption
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.reduction.galerkin import (
@@ -51,15 +51,10 @@ from avatar_core.vademecum.model import Convergence, RankError, Vademecum
 from avatar_core.vademecum.tip_field import make_tip_field
 
 Fidelity = Literal["interpolated", "reduced", "solved"]
-Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
 
 _CERTIFIED = {"interpolated": 24, "reduced": 24, "solved": 200}  # each is a fine solution
 RESIDUAL_SUPPORT = 2.0  # support of interpolated residual compliance, in patch radii
 _FAR_HULL = 0.5  # hull distance over the mean distance to the neighbours, above which to warn
-
-
-def _silent(stage: str, fraction: float, error: float) -> None:
-    """Ignore progress."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +149,7 @@ def patient_vademecum(
     atlas: Atlas | PatientBase,
     fidelity: Fidelity = "reduced",
     options: PatientOptions | None = None,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Patient:
     """Build the vademecum of a new patient: register, mesh, solve and certify.
 
@@ -186,7 +181,7 @@ def posed_patient(
     base: PatientBase,
     fidelity: Fidelity,
     options: PatientOptions,
-    progress: Progress = _silent,
+    progress: Progress = silent,
     clock: dict[str, float] | None = None,
 ) -> tuple[PatientProblem, Barycenter]:
     """A patient registered and meshed, with clamp and access, before anything is solved.
@@ -225,7 +220,7 @@ def build_patient(
     weights: Barycenter,
     fidelity: Fidelity,
     options: PatientOptions,
-    progress: Progress = _silent,
+    progress: Progress = silent,
     clock: dict[str, float] | None = None,
 ) -> Patient:
     """The vademecum of a patient that is registered and meshed; see :func:`patient_vademecum`."""
@@ -303,7 +298,7 @@ def reduced(
     base: PatientBase,
     weights: Barycenter,
     options: PatientOptions,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> tuple[Vademecum, tuple[GalerkinErrorEstimate, ...]]:
     """The vademecum of :func:`reduced_response`, and the error estimate after each enrichment."""
     found = reduced_response(problem, base, weights, options, progress)
@@ -315,7 +310,7 @@ def reduced_response(
     base: PatientBase,
     weights: Barycenter,
     options: PatientOptions,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> ReducedResponse:
     """Galerkin projection on the patient's own mesh; see :mod:`avatar_core.reduction.galerkin`."""
     combined = combine(base.responses, weights, options.reduction.n_start)
@@ -349,7 +344,7 @@ def vademecum_of_reduced(
 
 
 def solved(
-    problem: PatientProblem, options: PatientOptions, progress: Progress = _silent
+    problem: PatientProblem, options: PatientOptions, progress: Progress = silent
 ) -> Vademecum:
     """Full finite elements for every load position."""
     return build_vademecum(
@@ -376,7 +371,7 @@ def _display(problem: PatientProblem, options: PatientOptions) -> Display | None
 
 
 def certified(
-    vademecum: Vademecum, problem: PatientProblem, n_loads: int, progress: Progress = _silent
+    vademecum: Vademecum, problem: PatientProblem, n_loads: int, progress: Progress = silent
 ) -> Vademecum:
     """The vademecum with a certificate: its errors on unseen loads against full finite elements."""
     return vademecum.with_certificate(

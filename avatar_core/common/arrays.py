@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.integer]
+Soup = tuple[FloatArray, IntArray]  # points and triangles
 
 
 def farthest_points(points: FloatArray, n: int, first: int = 0) -> IntArray:

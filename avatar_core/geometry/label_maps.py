@@ -14,11 +14,9 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.arrays import FloatArray, IntArray, Soup
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.label_files import LabelMap, Segment, read_label_map
-
-Soup = tuple[FloatArray, IntArray]
 
 LABEL_SPACING = 2.0  # label maps finer than this are averaged to it [mm]
 _MAX_LABELS = 100  # more are an image

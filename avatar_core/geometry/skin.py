@@ -17,10 +17,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.arrays import FloatArray, IntArray, Soup
 from avatar_core.errors import SurfaceError
-
-Soup = tuple[FloatArray, IntArray]
 
 CRACK = 0.05  # gaps narrower than this are cracks, no holes [mean edges]
 OFF = 0.01  # a cover farther than this from the surface does not lie on it [mean edges]

@@ -24,8 +24,6 @@ from avatar_core.geometry.label_files import is_label_map
 from avatar_core.geometry.skin import Skin, components, directed_edges, skin_of, weld
 from avatar_core.geometry.surface_files import content_of, parse, stated_axes
 
-Soup = tuple[FloatArray, IntArray]
-
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 PLAUSIBLE_EXTENT = (0.05, 0.5)  # largest extent of an organ [m]
 STRAY_FRACTION = 0.02  # components below this part of the volume are dropped

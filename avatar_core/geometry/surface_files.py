@@ -17,15 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from avatar_core.common import files
-from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.arrays import IntArray, Soup
 from avatar_core.errors import SurfaceError, one_line
 from avatar_core.geometry.label_files import is_label_map
 from avatar_core.geometry.label_maps import surface_of_label
 from avatar_core.geometry.surface_formats import MESHES, SUFFIXES
 from avatar_core.geometry.vtk_files import read_polydata
 from avatar_core.geometry.vtk_xml_files import read_vtp, stated_axes_of
-
-Soup = tuple[FloatArray, IntArray]
 
 MAX_FILE_BYTES = 4 << 30
 HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for

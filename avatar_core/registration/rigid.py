@@ -41,10 +41,6 @@ class RigidMotion:
         """The inverse motion of points, shape (n, 3) [m]."""
         return np.asarray(self.centre + (points - self.shift - self.centre) @ self.matrix)
 
-    def unknowns(self) -> FloatArray:
-        """Turn and shift, shape (6,)."""
-        return np.concatenate([self.turn, self.shift])
-
     def with_unknowns(self, unknowns: FloatArray) -> RigidMotion:
         """Another motion about the same centre."""
         return RigidMotion(self.centre, unknowns[:3], unknowns[3:])

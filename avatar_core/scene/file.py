@@ -15,6 +15,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import yaml
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
+from avatar_core.common.dataclass_json import plain
 from avatar_core.common.files import shipped
 from avatar_core.common.quantities import check_line, is_whole, lies_in
 from avatar_core.contact.effects import EFFECTS, Effect, Viscoelasticity
@@ -122,7 +123,7 @@ def write_scene(scene: Scene) -> str:
     for section, keys in SECTIONS.items():
         values = {key: getattr(scene, key) for key in keys}
         chosen = {k: v for k, v in values.items() if v is not None and not isinstance(v, tuple)}
-        document[section] = {key: _plain(value) for key, value in chosen.items()}
+        document[section] = {key: plain(value) for key, value in chosen.items()}
     if scene.supports:
         document["material"]["supports"] = {s.name: float(s.stiffness) for s in scene.supports}
     document["tools"] = [
@@ -137,14 +138,7 @@ def write_scene(scene: Scene) -> str:
 def _plain_fields(one: Any) -> dict[str, Any]:
     """The fields of a dataclass that have a value."""
     values = {field.name: getattr(one, field.name) for field in fields(one)}
-    return {name: _plain(value) for name, value in values.items() if value is not None}
-
-
-def _plain(value: Any) -> Any:
-    """Plain Python types: YAML does not know those of numpy."""
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return float(value) if isinstance(value, float) else value
+    return {name: plain(value) for name, value in values.items() if value is not None}
 
 
 def _fields(owner: type, entries: Entries, path: str) -> dict[str, Any]:

@@ -79,11 +79,13 @@ def test_a_rigid_motion_and_its_derivatives() -> None:
     rng = np.random.default_rng(0)
     points, normals = rng.standard_normal((2, 7, 3))
     motion = RigidMotion(np.array([0.1, -0.2, 0.3]), shift=np.array([0.3, 0.1, -0.2]))
-    motion = motion.with_unknowns(motion.unknowns())
+    motion = motion.with_unknowns(np.concatenate([motion.turn, motion.shift]))
     np.testing.assert_allclose(motion.back(motion(points)), points, atol=1e-12)
     rows = motion.rows(motion(points), normals)
     for k, step in enumerate(1e-6 * np.eye(6)):
-        moved = motion.with_unknowns(motion.unknowns() + step)(points) - motion(points)
+        moved = motion.with_unknowns(np.concatenate([motion.turn, motion.shift]) + step)(
+            points
+        ) - motion(points)
         np.testing.assert_allclose(rows[:, k], (moved * normals).sum(axis=1) / 1e-6, atol=1e-5)
 
 
