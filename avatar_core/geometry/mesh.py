@@ -105,7 +105,7 @@ class TetMesh:
     @cached_property
     def pieces(self) -> np.ndarray:
         """Face-connected component of each element, shape (n_tets,)."""
-        return _face_components(self.tets)
+        return _components(self.tets[:, _TET_FACES])
 
     @property
     def volume(self) -> float:
@@ -264,16 +264,20 @@ def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
 
 def _largest_component(tets: np.ndarray) -> np.ndarray:
     """Elements of the largest face-connected component."""
-    label = _face_components(tets)
+    label = _components(tets[:, _TET_FACES])
     return tets[label == np.bincount(label).argmax()]
 
 
-def _face_components(tets: np.ndarray) -> np.ndarray:
-    faces = np.sort(tets[:, _TET_FACES].reshape(-1, 3), axis=1)
-    _, face_id = np.unique(faces, axis=0, return_inverse=True)
-    face_id = face_id.ravel()
-    owner = np.repeat(np.arange(len(tets)), 4)
-    incidence = sp.csr_matrix((np.ones(len(owner)), (owner, face_id)))
+def _components(sides: np.ndarray) -> np.ndarray:
+    """Component of each element, shape (n,), by the sides that elements share.
+
+    sides : ndarray of int, shape (n, n_sides, n_corners)
+    """
+    n, n_sides, n_corners = sides.shape
+    corners = np.sort(sides.reshape(-1, n_corners), axis=1)
+    _, side = np.unique(corners, axis=0, return_inverse=True)
+    owner = np.repeat(np.arange(n), n_sides)
+    incidence = sp.csr_matrix((np.ones(len(owner)), (owner, side.ravel())))
     return np.asarray(connected_components(incidence @ incidence.T, directed=False)[1])
 
 
@@ -319,12 +323,7 @@ def without_islands(
     ids = np.flatnonzero(chosen)
     if len(ids) == 0:
         return chosen
-    edges = np.sort(faces[ids][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    _, edge = np.unique(edges, axis=0, return_inverse=True)
-    incidence = sp.csr_matrix(
-        (np.ones(edge.size), (np.repeat(np.arange(len(ids)), 3), edge.ravel()))
-    )
-    _, label = connected_components(incidence @ incidence.T, directed=False)
+    label = _components(faces[ids][:, [[0, 1], [1, 2], [2, 0]]])
     fraction = np.bincount(label, weights=area[ids]) / area[ids].sum()
     kept = np.zeros_like(chosen)
     kept[ids[fraction[label] >= least]] = True
