@@ -14,8 +14,6 @@ whatever the neighbours are; compared with an exact representation, x = sum_j v_
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -44,8 +42,6 @@ from avatar_core.shapes.lle import (
     spectrum,
 )
 from tests.helpers.examples import examples
-
-Figure = Callable[[str], None]
 
 NONE = 1e-12  # a regularisation that is almost none
 EPS = float(np.finfo(float).eps)
@@ -97,17 +93,6 @@ def explained(target: np.ndarray, coordinates: np.ndarray) -> float:
 # --- weights ----------------------------------------------------------------------------------
 
 
-def test_weights_minimise_the_distance_among_all_that_sum_to_one(cloud):
-    x, neighbors = cloud[0], cloud[1:7]
-    weights = barycenter_weights(local_gram(x, neighbors), NONE)
-    assert weights.sum() == pytest.approx(1.0, abs=1e-14)
-    # eliminate the constraint: w = w_0 + sum over the other directions, ordinary least squares
-    edges = (neighbors[1:] - neighbors[0]).T
-    free = np.linalg.lstsq(edges, x - neighbors[0], rcond=None)[0]
-    # the regularisation moves them by its size times the condition, here about 100
-    assert np.allclose(weights[1:], free, atol=1e-9)
-
-
 @pytest.mark.parametrize("regularization", [1e-3, 1e-9])
 def test_weights_do_not_see_rotation_scale_and_shift(cloud, regularization):
     rng = np.random.default_rng(4)
@@ -134,18 +119,6 @@ def test_point_in_the_affine_hull_is_reproduced_and_so_is_every_affine_map():
     matrix, shift = rng.standard_normal((3, 40)), rng.standard_normal(3)
     images = corners @ matrix.T + shift
     assert np.allclose(found.combine(images), matrix @ (wanted @ corners) + shift, atol=1e-8)
-
-
-def test_more_neighbours_than_dimensions_stay_bounded(flat):
-    _, points = flat
-    base = fit(points, 30)
-    # the smallest of all solutions of an underdetermined system: no large weights
-    assert np.abs(base.weights).sum(axis=1).max() < 5
-    assert np.allclose(base.weight_matrix.sum(axis=1), 1.0, atol=1e-12)
-    rest = points - base.weight_matrix @ points
-    size = np.linalg.norm(points - points.mean(axis=0), axis=1).mean()
-    # the ridge of 1e-6 of the trace against variances of a tenth of it: at most 1e-5
-    assert np.linalg.norm(rest, axis=1).max() < 1e-4 * size
 
 
 @pytest.mark.parametrize(("k", "regularization"), [(5, 1e-3), (12, 1e-3), (12, 1e-6), (25, 1e-9)])
@@ -212,13 +185,6 @@ def test_convex_weights_equal_a_general_optimiser(cloud):
     assert np.allclose(ours, found.x, atol=1e-4)  # where the general optimiser stops
 
 
-def test_convex_base_has_no_negative_weight(cloud):
-    base = fit(cloud, 8, convex=True)
-    assert base.weights.min() >= 0
-    assert np.allclose(base.weights.sum(axis=1), 1.0)
-    assert fit(cloud, 8).weights.min() < -0.01
-
-
 # --- members and equals -----------------------------------------------------------------------
 
 
@@ -253,17 +219,6 @@ def test_equal_members_count_once(cloud):
     assert np.array_equal(base.barycenter(new).weights, clean.barycenter(new).weights)
 
 
-def test_near_equal_neighbours_share_their_weight():
-    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    near = np.vstack([corners, corners[1] + [0.0, 1e-5]])
-    point = np.array([0.5, 0.2])
-    shared = barycenter(near, point, 4)
-    weights = shared.weights[np.argsort(shared.neighbors)]
-    # as if it stood there once: one half of .5 each, up to their distance over the ridge's root
-    assert weights == pytest.approx([0.3, 0.25, 0.2, 0.25], abs=0.01)
-    assert shared.absolute_sum == pytest.approx(1.0, abs=0.01)
-
-
 # --- bad requests -----------------------------------------------------------------------------
 
 
@@ -294,6 +249,10 @@ def test_members_left_out_have_no_weight(cloud):
         (lambda x: embed(fit(x, 5), 0), "0 dimension"),
         (lambda x: spectrum(fit(x, 5), 60), "60 dimension"),
         (lambda x: estimate_dimension(fit(x[:3], 5)), "at least 4"),
+        (lambda x: estimate_dimension(fit(x, 1)), "at least 4 and 2"),
+        (lambda x: embed(fit(x[:1], 10), 1), "add some"),
+        (lambda x: embed(fit([x[0]] * 5, 3), 1), "different anatomies"),
+        (lambda x: estimate_dimension(fit(x[:1], 10)), "from 1 different anatomies"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:divide by zero", "ignore:invalid value")
@@ -398,7 +357,7 @@ def test_swiss_roll_is_unrolled():
     assert max(linear) < 0.6
 
 
-@pytest.mark.parametrize("d", [2, 3, 5])
+@pytest.mark.parametrize("d", [1, 2, 3, 5])
 def test_dimension_of_affine_families(d):
     rng = np.random.default_rng(d)
     points = rng.uniform(-1, 1, (200, d)) @ rng.standard_normal((d, 60))
@@ -509,13 +468,22 @@ def base_of(kind: str, n: int, length: int, seed: int) -> np.ndarray:
     single=st.booleans(),
 )
 @example(kind="scattered", n=10, k=5, length=40, r=1e-6, seed=0, single=True)
-def check_any_base(
+@example(kind="scattered", n=1, k=10, length=40, r=1e-6, seed=0, single=False)
+@example(kind="near", n=12, k=4, length=2, r=1e-6, seed=0, single=False)
+@example(kind="in line", n=7, k=6, length=40, r=1e-6, seed=0, single=False)
+@example(kind="one far away", n=6, k=6, length=40, r=1e-6, seed=0, single=False)
+def test_any_base_gives_bounded_weights_that_sum_to_one(
     kind: str, n: int, k: int, length: int, r: float, seed: int, single: bool
 ) -> None:
+    """Fitted, grown or asked for a new point; n = 1, k = 1, k = n, k > n, any regularisation."""
     base = base_of(kind, n, length, seed)
     rng = np.random.default_rng(seed + 1)
     if single:
-        base = base.astype(np.float32).astype(np.float64)
+        read = base.astype(np.float32)
+        base = read.astype(np.float64)
+        held = fit(read, k, regularization=r).weights
+        assert held.dtype == np.float64
+        assert np.array_equal(held, fit(base, k, regularization=r).weights)
     grown = fit(base[:1], k, regularization=r)
     for row in base[1:]:
         grown = with_one_more(grown, row)
@@ -527,8 +495,6 @@ def check_any_base(
     for x in (inside, outside):
         found = barycenter(base, x, k, regularization=r)
         sound(found, base, x, r)
-        most = np.sqrt(1.0 + 1.0 / (r * len(found.weights)))
-        tally["share"] = max(tally["share"], float(np.linalg.norm(found.weights) / most))
         convex = barycenter(base, x, k, regularization=r, convex=True)
         assert convex.weights.min() >= 0.0
         # the nearest point p of the hull: no neighbour lies on x's side of the plane through p
@@ -551,21 +517,10 @@ def check_any_base(
         )
 
 
-tally = {"share": 0.0}
-
-
-@pytest.mark.examples
-def test_any_base_gives_bounded_weights_that_sum_to_one(figure: Figure) -> None:
-    """Fitted, grown or asked for a new point; n = 1, k = 1, k = n, k > n, any regularisation."""
-    tally["share"] = 0.0
-    check_any_base()
-    figure(f"150 bases: |w| up to {tally['share']:.2f} of what the ridge allows")
-
-
 # --- one by one, on livers --------------------------------------------------------------------
 
 
-def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray, figure: Figure) -> None:
+def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray) -> None:
     """They share a weight; no shape made of them moves by more than they differ."""
     rng = np.random.default_rng(1)
     again = livers[:6] + NEAR * rng.uniform(-1.0, 1.0, (6, livers.shape[1]))
@@ -574,7 +529,6 @@ def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray, figu
     assert base.repeated == ()
     rows_are_sound(base, DEFAULT_REGULARIZATION)
     rms = NEAR / np.sqrt(3.0)
-    worst = 0.0
     for i in range(6):  # each is written by its twin, to the distance between the two
         twin = base.weight_matrix[i, 12 + i]
         assert twin == pytest.approx(1.0, abs=0.01)
@@ -593,38 +547,10 @@ def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray, figu
         one, other = base.barycenter(v @ livers), clean.barycenter(v @ livers)
         assert one.absolute_sum < 2.0 * other.absolute_sum
         apart = one.combine(both) - other.combine(livers)
-        worst = max(worst, float(np.sqrt(np.mean(apart**2))))
-    assert worst < rms
-    figure(f"shapes apart by {1e6 * worst:.2g} um, copies by {1e6 * rms:.1f} um")
+        assert np.sqrt(np.mean(apart**2)) < rms
 
 
-def test_collinear_anatomies(livers: np.ndarray, figure: Figure) -> None:
-    """One parameter: it is found between them and beyond, with small weights, and mapped."""
-    t = np.array([0.0, 0.1, 0.3, 0.35, 0.6, 0.8, 1.0])
-    line = livers[0] + np.outer(t, livers[1] - livers[0])
-    base = fit(line, 6)
-    rows_are_sound(base, DEFAULT_REGULARIZATION)
-    length = np.linalg.norm(livers[1] - livers[0])
-    worst = 0.0
-    for wanted in (0.2, 0.5, 0.97, -0.5, 2.0):
-        x = livers[0] + wanted * (livers[1] - livers[0])
-        found = base.barycenter(x)
-        sound(found, line, x, DEFAULT_REGULARIZATION)
-        assert found.condition == np.inf
-        off = abs(found.weights @ t[found.neighbors] - wanted)
-        both = np.vstack([t[found.neighbors], np.ones(6)])
-        v = np.linalg.norm(np.linalg.lstsq(both, np.array([wanted, 1.0]))[0])
-        ridge = DEFAULT_REGULARIZATION * (found.distances**2).sum()
-        assert off * length <= np.sqrt(ridge) * v + 1e-12
-        assert np.linalg.norm(found.weights) <= v + 1e-9
-        worst = max(worst, off)
-    y = embed(base, 1).coordinates[:, 0]
-    assert abs(np.corrcoef(y, t)[0, 1]) > 1.0 - 1e-9
-    assert estimate_dimension(base).from_local_pca == 1
-    figure(f"parameter off by {worst:.0e}")
-
-
-def test_one_neighbour(livers: np.ndarray, figure: Figure) -> None:
+def test_one_neighbour(livers: np.ndarray) -> None:
     base = fit(livers, 1)
     nearest = np.linalg.norm(livers[:, None] - livers, axis=2) + np.diag(np.full(12, np.inf))
     assert np.array_equal(base.neighbors[:, 0], nearest.argmin(axis=1))
@@ -633,16 +559,12 @@ def test_one_neighbour(livers: np.ndarray, figure: Figure) -> None:
     assert found.member is None and found.neighbors.tolist() == [4]
     assert found.residual == pytest.approx(NEAR * np.sqrt(livers.shape[1]), rel=1e-9)
     assert np.array_equal(found.combine(livers), livers[4])
-    with pytest.raises(LLEError, match="at least 4 and 2") as refused:
-        estimate_dimension(base)
-    assert "\n" not in str(refused.value)
     y = embed(base, 2).coordinates
     np.testing.assert_allclose(y.T @ y, 12.0 * np.eye(2), atol=1e-9)
-    figure("the nearest, with weight 1")
 
 
 @pytest.mark.parametrize("k", [11, 12, 13, 1000])
-def test_all_neighbours_and_more(livers: np.ndarray, k: int, figure: Figure) -> None:
+def test_all_neighbours_and_more(livers: np.ndarray, k: int) -> None:
     """Every other member is used, and the notice says so; an affine map is reproduced."""
     base = fit(livers, k)
     assert base.weights.shape == (12, 11)
@@ -660,10 +582,9 @@ def test_all_neighbours_and_more(livers: np.ndarray, k: int, figure: Figure) -> 
         assert found.residual <= bound
         off = np.abs(found.combine(images) - v @ images).max()
         assert off <= 3.0 * bound
-    figure(f"residual {1e3 * found.residual / np.sqrt(livers.shape[1]):.1e} mm")
 
 
-def test_a_gram_matrix_without_trace(figure: Figure) -> None:
+def test_a_gram_matrix_without_trace() -> None:
     """Neighbours that all are the point, up to what numbers can hold: equal shares."""
     for scale in (0.0, 5e-324, 1e-310, 1e-200):
         gram = scale * np.ones((4, 4))
@@ -680,37 +601,12 @@ def test_a_gram_matrix_without_trace(figure: Figure) -> None:
     rows_are_sound(alike, DEFAULT_REGULARIZATION)
     assert alike.barycenter(x).member == 0
     assert alike.barycenter(x + 1.0).weights.tolist() == [1.0]
-    with pytest.raises(LLEError, match="different anatomies") as refused:
-        embed(alike, 1)
-    assert "\n" not in str(refused.value)
-    figure("weights 1/k down to a trace of 2e-323")
-
-
-def test_a_base_of_one(livers: np.ndarray, figure: Figure) -> None:
-    base = fit(livers[:1], 10)
-    assert base.notices == ("10 neighbours asked for, 0 used: the base has no more",)
-    assert np.array_equal(base.weight_matrix, [[0.0]])  # not its own neighbour
-    for x in (livers[1], 1e6 * livers[1]):
-        found = base.barycenter(x)
-        sound(found, livers[:1], x, DEFAULT_REGULARIZATION)
-        assert found.weights.tolist() == [1.0] and found.member is None
-        assert found.residual == found.hull_distance == found.distances[0]
-    assert base.barycenter(livers[0]).member == 0
-    for call in (lambda: embed(base, 1), lambda: estimate_dimension(base)):
-        with pytest.raises(LLEError) as refused:
-            call()
-        assert "\n" not in str(refused.value)
-    pair = with_one_more(base, livers[1])
-    assert np.array_equal(pair.weight_matrix, [[0.0, 1.0], [1.0, 0.0]])
-    figure("weight 1, no map")
 
 
 @pytest.mark.parametrize(
     ("kind", "shift"), [(np.float64, 0.0), (np.float64, 64.0), (np.float32, 0.0)]
 )
-def test_a_query_equal_to_a_member(
-    livers: np.ndarray, kind: type, shift: float, figure: Figure
-) -> None:
+def test_a_query_equal_to_a_member(livers: np.ndarray, kind: type, shift: float) -> None:
     """Each one is known again, and no neighbour is taken for it, wherever the zero is."""
     base = fit(livers + shift, 8)
     for i in range(len(livers)):
@@ -722,48 +618,10 @@ def test_a_query_equal_to_a_member(
         beside = (livers[i] + shift + NEAR).astype(kind)
         assert base.barycenter(beside).member is None
         assert with_one_more(base, beside).repeated == ()
-    figure("weight 1 on all 12")
-
-
-@pytest.mark.parametrize("away", [1.0, 1e3, 1e6, 1e12])
-def test_a_query_far_outside(away: float, figure: Figure) -> None:
-    """Above the middle of a simplex: the hull distance is the height, the weights stay small."""
-    base = 0.1 * np.eye(6, 40)
-    x = base.mean(axis=0) + away * np.eye(40)[-1]
-    found = barycenter(base, x, 6)
-    sound(found, base, x, DEFAULT_REGULARIZATION)
-    assert found.hull_distance == pytest.approx(away, rel=1e-7)
-    # by symmetry; C is singular but for 0.01 of (away)^2, what is left of that in rounding
-    np.testing.assert_allclose(found.weights, 1.0 / 6.0, atol=1e-9)
-    # beyond a corner, linear continuation is what the ridge leaves of it
-    x = base[0] + away * (base[0] - base[1:].mean(axis=0))
-    found = barycenter(base, x, 6)
-    sound(found, base, x, DEFAULT_REGULARIZATION)
-    bound = np.sqrt(DEFAULT_REGULARIZATION * (found.distances**2).sum())
-    exact = np.sqrt((1.0 + away) ** 2 + 5.0 * (away / 5.0) ** 2)
-    assert found.residual <= bound * exact * (1.0 + 1e-9)
-    figure(f"sum |w| {found.absolute_sum:.3g}, hull distance {found.hull_distance:.3g}")
-
-
-def test_single_precision_input(livers: np.ndarray, figure: Figure) -> None:
-    """A base read as float32 has the weights of the numbers that it holds, in double precision."""
-    single = livers.astype(np.float32)
-    base, same = fit(single, 8), fit(single.astype(np.float64), 8)
-    assert base.weights.dtype == np.float64
-    assert np.array_equal(base.weights, same.weights)
-    x = (0.4 * livers[1] + 0.6 * livers[5]).astype(np.float32)
-    found = barycenter(single, x, 8)
-    sound(found, single.astype(np.float64), x, DEFAULT_REGULARIZATION)
-    exact = barycenter(single.astype(np.float64), x.astype(np.float64), 8)
-    np.testing.assert_array_equal(found.weights, exact.weights)
-    off = np.abs(base.weights - fit(livers, 8).weights).max()
-    figure(f"weights {off:.0e} from those of double precision")
 
 
 @pytest.mark.parametrize("convex", [False, True])
-def test_translation_and_order_change_nothing(
-    livers: np.ndarray, convex: bool, figure: Figure
-) -> None:
+def test_translation_and_order_change_nothing(livers: np.ndarray, convex: bool) -> None:
     """Bit for bit, where the differences of the vectors are exact: on a grid of 2^-40 m."""
     exact = np.round(livers * 2.0**40) / 2.0**40
     x = np.round(exact[:4].mean(axis=0) * 2.0**40) / 2.0**40
@@ -777,7 +635,8 @@ def test_translation_and_order_change_nothing(
         assert np.array_equal(number[other.neighbors], one.neighbors)
         assert np.array_equal(other.weights, one.weights)
     base, moved = fit(exact, 9, convex=convex), fit((exact + shift)[order], 9, convex=convex)
+    if convex:
+        assert base.weights.min() >= 0.0
     off = np.abs(moved.weight_matrix - base.weight_matrix[np.ix_(order, order)]).max()
     # rounding of the sums about the origin, which is 300 times as far away
     assert off < 1e-8
-    figure(f"a point: nothing; a base: {off:.0e}")
