@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ from avatar_core.bags.compare import comparable
 from avatar_core.bags.periods import BagPath, path_of
 from avatar_core.bags.read import read_bag
 from avatar_core.bags.write import write_mcap as export
-from avatar_core.cli import main as cli
 from avatar_core.contact.effects import Friction, Viscoelasticity
 from avatar_core.contact.haptics.force_guard import DEVICES, ForceLimits
 from avatar_core.errors import StorageError
@@ -43,6 +43,7 @@ from tests.core.bags.bag_files import (
     write_mcap,
     write_rosbag,
 )
+from tests.core.conftest import Command
 
 SAME = 1e-9  # [N]
 SCENE = write_scene(Scene())
@@ -150,12 +151,6 @@ def test_a_pose_that_is_too_old_is_no_pose(organ: Vademecum, cell: Cell, tmp_pat
     assert (path.recording.periods.tip[365:] == 1e3).all()
     np.testing.assert_array_equal(path.recording.periods.tip[340:355, 0] - cell.tip[339], 0.0)
     assert found.known[200:340].all() and found.difference(path.recording) <= SAME
-
-
-def test_a_difference_is_seen(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
-    other = replace(cell, sent=cell.sent * (1.0 + 1e-6))
-    path, found = replayed(write_rosbag(tmp_path / "bag", other.messages()), organ)
-    assert found.difference(path.recording) > 1e-7
 
 
 def test_poses_alone_give_forces(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
@@ -428,52 +423,33 @@ def test_our_types_are_those_of_the_nodes() -> None:
 # --- the commands -----------------------------------------------------------------------------
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["avatar", *map(str, arguments)])
-    return cli.main()
-
-
-@pytest.fixture
-def file_of_organ(organ: Vademecum, tmp_path: Path) -> Path:
+def test_the_commands(avatar: Command, organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
     save_vademecum(organ, tmp_path / "liver.h5")
-    return tmp_path / "liver.h5"
-
-
-def test_the_commands(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    organ: Vademecum,
-    cell: Cell,
-    file_of_organ: Path,
-    tmp_path: Path,
-) -> None:
-    given = ("--vademecum", file_of_organ)
+    replay_of = partial(avatar, "replay", "--vademecum", tmp_path / "liver.h5")
     bag = write_rosbag(tmp_path / "bag", [info(organ.id), *cell.messages()])
-    assert run(monkeypatch, "replay", bag, *given) == 0
-    said = capsys.readouterr().out
+    code, said, _ = replay_of(bag)
+    assert code == 0 and "is unknown" not in said
     assert "compared with the wrenches" in said and "largest difference 0.00e+00 N" in said
-    assert "is unknown" not in said
-    assert run(monkeypatch, "replay", bag, *given, "--scene", "needle_probe") == 1
-    assert "--scene, --tool-transform and --device of the cell" in capsys.readouterr().err
-    other = write_rosbag(tmp_path / "other", [info("f" * 64), *cell.messages()])
-    assert run(monkeypatch, "replay", other, *given) == 1
-    assert "made with the vademecum ffffffffffff" in capsys.readouterr().err
     poses = write_mcap(tmp_path / "poses.mcap", only(cell.messages(), "measured_cp"))
-    assert run(monkeypatch, "replay", poses, *given) == 0
-    said = capsys.readouterr().out
+    code, said, _ = replay_of(poses)
+    assert code == 0
     assert "no forces in the bag" in said and "whether it was made with this" in said
-    assert run(monkeypatch, "replay", bag, *given, "--scene", "two_tools") == 1
-    assert "give a scene of one tool" in capsys.readouterr().err
-    assert run(monkeypatch, "replay", bag, *given, "--scene", "relaxation") == 1
-    assert "which viscoelasticity remembers" in capsys.readouterr().err
-    assert run(monkeypatch, "replay", bag, *given, "--tool-transform", "1,2") == 1
-    assert "seven numbers" in capsys.readouterr().err
+    other = write_rosbag(tmp_path / "other", [info("f" * 64), *cell.messages()])
+    for arguments, reason in (
+        ((other,), "made with the vademecum ffffffffffff"),
+        ((bag, "--scene", "needle_probe"), "--scene, --tool-transform and --device of the cell"),
+        ((bag, "--scene", "two_tools"), "give a scene of one tool"),
+        ((bag, "--scene", "relaxation"), "which viscoelasticity remembers"),
+        ((bag, "--tool-transform", "1,2"), "seven numbers"),
+    ):
+        code, _, err = replay_of(*arguments)
+        assert code == 1 and reason in err
     save_recording(recorded(organ, ()), tmp_path / "made.h5")
     made = tmp_path / "made.mcap"
-    assert run(monkeypatch, "export", tmp_path / "made.h5", "-o", made) == 0
-    assert "without 1 clouds" in capsys.readouterr().out
-    assert run(monkeypatch, "replay", made, *given) == 0
-    assert "compared with the computed forces" in capsys.readouterr().out
+    code, said, _ = avatar("export", tmp_path / "made.h5", "-o", made)
+    assert code == 0 and "without 1 clouds" in said
+    code, said, _ = replay_of(made)
+    assert code == 0 and "compared with the computed forces" in said
 
 
 def test_without_the_extra(
