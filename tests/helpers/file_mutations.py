@@ -1,6 +1,6 @@
 """Vademecum and atlas files, and what others may make of them.
 
-Arrays that claim what they do not hold, or lie in another file, are test_hostile_files.py's.
+Arrays that claim what they do not hold, and links, are test_hostile_files.py's.
 
 Bytes are changed blindly, and structure on purpose; then the checksum is made right again, so that
 it is the reader that has to notice. Each mutation is a function of a seed alone.
@@ -175,45 +175,9 @@ def _dtype(rng: np.random.Generator, file: h5py.File) -> None:
     _replaced(file, dataset, data=data)
 
 
-def _chunked(rng: np.random.Generator, file: h5py.File) -> None:
-    dataset = _dataset(rng, file)
-    array = dataset[...]
-    if array.ndim and array.size:
-        filters: dict[str, Any] = pick(
-            rng, ({}, {"compression": "gzip"}, {"shuffle": True}, {"fletcher32": True})
-        )
-        _replaced(file, dataset, data=array, chunks=array.shape, **filters)
-
-
-def _links(rng: np.random.Generator, file: h5py.File) -> None:
-    """Out of the file, to nowhere, round in a circle."""
-    key = _dataset(rng, file).name
-    group = key.rpartition("/")[0] or key
-    at = key if rng.random() < 0.5 else group
-    copy = file[at]
-    del file[at]
-    made: tuple[Callable[[], Any], ...] = (
-        lambda: h5py.ExternalLink("/etc/passwd", "/x"),
-        lambda: h5py.ExternalLink("other.h5", at),
-        lambda: h5py.SoftLink("/nowhere"),
-        lambda: h5py.SoftLink(at),
-        lambda: file["/"],
-        lambda: copy,
-    )
-    file[at] = made[int(rng.integers(0, len(made)))]()
-
-
 def _removed(rng: np.random.Generator, file: h5py.File) -> None:
     key = _dataset(rng, file).name
     del file[key if rng.random() < 0.7 else key.rpartition("/")[0] or key]
-
-
-def _renamed(rng: np.random.Generator, file: h5py.File) -> None:
-    key = _dataset(rng, file).name
-    names = ("x", "a b", "\n", "x" * 300, "é", "..", "anatomies/x", "a/b/c/d/e/f/g/h")
-    name = names[int(rng.integers(0, len(names)))]
-    if name not in file:
-        file.move(key, name)
 
 
 def _groups(rng: np.random.Generator, file: h5py.File) -> None:
@@ -276,8 +240,8 @@ def _changed(rng: np.random.Generator, value: Any) -> Any:
 
 
 _OF_STRUCTURE = (
-    *(_values, _values, _shape, _dtype, _chunked, _links),
-    *(_removed, _renamed, _groups, _attribute, _json, _json),
+    *(_values, _values, _shape, _dtype),
+    *(_removed, _groups, _attribute, _json, _json),
 )
 
 

@@ -14,7 +14,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -51,16 +50,6 @@ class Campaign:
             if result["outcome"] not in OUTCOMES
         ]
 
-    def figures(self) -> str:
-        """One line."""
-        slowest = max(self.results.values(), key=lambda result: result["seconds"])
-        peak = max(result["peak"] for result in self.results.values())
-        counts = self.counts
-        return (
-            f"{len(self.results)} mutants: {counts['refused']} refused, {counts['loaded']} loaded, "
-            f"slowest {slowest['seconds']:.2f} s, peak {peak / 1e6:.0f} MB"
-        )
-
 
 def campaign(door: str, seeds: range) -> Campaign:
     """Open all mutants at a door; a process that dies is a result, and another one goes on."""
@@ -85,28 +74,23 @@ def _result(line: str, end: str) -> dict[str, Any]:
         return dict(json.loads(line))
     except ValueError:  # the last one, that the process died of
         seed = int(line.split(":")[1].split(",")[0])
-        return {"seed": seed, "outcome": "died", "message": end, "seconds": 0.0, "peak": 0}
+        return {"seed": seed, "outcome": "died", "message": end}
 
 
 @dataclass(frozen=True)
 class Door:
-    """make : suffix and bytes of a mutant; read : what opens it; check : what was read.
-
-    reader : pid of the process that opens it, if there is one
-    """
+    """make : suffix and bytes of a mutant; read : what opens it; check : what was read."""
 
     make: Callable[[int], tuple[str, bytes]]
     read: Callable[[Path], Any]
     check: Callable[[Any], None]
-    reader: Callable[[], int | None]
 
 
 def _confined(function: Callable[[Path], Any], make: Any, check: Callable[[Any], None]) -> Door:
     """A door behind which another process reads."""
     from avatar_core.common.confined import Confined
 
-    confined = Confined(MEMORY)
-    return Door(make, partial(confined.call, SECONDS, function), check, lambda: confined.pid)
+    return Door(make, partial(Confined(MEMORY).call, SECONDS, function), check)
 
 
 def _vademecum_bytes(seed: int) -> tuple[str, bytes]:
@@ -206,7 +190,7 @@ def _loader() -> Door:
         conversions.vademecum_info(asdict(vademecum.info()), Header())
         conversions.surface_mesh(vademecum.surface_vertices, vademecum.surface_faces)
 
-    return Door(_vademecum_bytes, read, check, lambda: reader.pid)
+    return Door(_vademecum_bytes, read, check)
 
 
 def _patient() -> Door:
@@ -233,7 +217,7 @@ def _patient() -> Door:
             request.mesh = conversions.surface_mesh(soup.vertices * 1e-3, soup.faces % 2**32)
         return read_confined(patient_request(request, settings), reader)  # type: ignore[arg-type]
 
-    return Door(mutant, read, _require_surface, lambda: reader.pid)
+    return Door(mutant, read, _require_surface)
 
 
 def _every() -> Door:
@@ -246,12 +230,7 @@ def _every() -> Door:
         turn = seed % len(doors)
         return doors[turn].make(seed // len(doors))
 
-    return Door(
-        make,
-        lambda path: doors[turn].read(path),
-        lambda made: doors[turn].check(made),
-        lambda: doors[turn].reader(),
-    )
+    return Door(make, lambda path: doors[turn].read(path), lambda made: doors[turn].check(made))
 
 
 DOORS: dict[str, Callable[[], Door]] = {
@@ -273,7 +252,6 @@ def open_one(door: Door, seed: int, folder: Path) -> dict[str, Any]:
     path = folder / f"{seed}.{suffix}"
     path.write_bytes(content)
     signal.setitimer(signal.ITIMER_REAL, PATIENCE)  # nobody handles it: it ends the process
-    begin = time.perf_counter()
     outcome, message = "loaded", ""
     try:
         door.check(door.read(path))
@@ -283,18 +261,8 @@ def open_one(door: Door, seed: int, folder: Path) -> dict[str, Any]:
             outcome = "refused in other than one short line"
     except Exception as error:
         outcome, message = f"raised {type(error).__name__}", str(error)
-    seconds = time.perf_counter() - begin
     signal.setitimer(signal.ITIMER_REAL, 0.0)
-    return {"outcome": outcome, "message": message[:LONGEST_LINE], "seconds": seconds}
-
-
-def _peak(pid: int | None) -> int:
-    """Largest resident memory of a process so far [bytes]."""
-    try:
-        status = Path(f"/proc/{pid or 'self'}/status").read_text()
-    except FileNotFoundError:
-        return 0
-    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+    return {"outcome": outcome, "message": message[:LONGEST_LINE]}
 
 
 def main(name: str, first: int, last: int, keep: str = "") -> int:
@@ -304,9 +272,7 @@ def main(name: str, first: int, last: int, keep: str = "") -> int:
         folder = Path(keep or own)
         for seed in range(first, last):
             print(f'{{"seed": {seed}, ', end="", flush=True)
-            found = open_one(door, seed, folder)
-            found["peak"] = max(_peak(None), _peak(door.reader()))
-            print(json.dumps(found)[1:], flush=True)
+            print(json.dumps(open_one(door, seed, folder))[1:], flush=True)
     return 0
 
 

@@ -205,20 +205,8 @@ def _bad_indices(rng: np.random.Generator, soup: Soup) -> Soup:
     return Soup(soup.vertices, faces)
 
 
-def _degenerate(rng: np.random.Generator, soup: Soup) -> Soup:
-    faces = soup.faces.copy()
-    hit = rng.integers(0, len(faces), int(rng.integers(1, len(faces))))
-    faces[hit, 1] = faces[hit, 0]
-    return Soup(soup.vertices, faces)
-
-
-def _duplicated(rng: np.random.Generator, soup: Soup) -> Soup:
-    again = rng.integers(0, len(soup.faces), int(rng.integers(1, 3 * len(soup.faces))))
-    order = [0, 1, 2] if rng.random() < 0.5 else [0, 2, 1]
-    return Soup(soup.vertices, np.vstack([soup.faces, soup.faces[again][:, order]]))
-
-
 def _non_manifold(rng: np.random.Generator, soup: Soup) -> Soup:
+    """More triangles across the ball, some of them again or without an area."""
     extra = rng.integers(0, len(soup.vertices), (int(rng.integers(1, 40)), 3))
     return Soup(soup.vertices, np.vstack([soup.faces, extra]))
 
@@ -234,20 +222,7 @@ def _flat(rng: np.random.Generator, soup: Soup) -> Soup:
     return Soup(soup.vertices * size, soup.faces)
 
 
-def _shuffled(rng: np.random.Generator, soup: Soup) -> Soup:
-    return Soup(soup.vertices[rng.permutation(len(soup.vertices))], soup.faces)
-
-
-_OF_SOUP = (
-    _bad_coordinates,
-    _bad_indices,
-    _degenerate,
-    _duplicated,
-    _non_manifold,
-    _holes,
-    _flat,
-    _shuffled,
-)
+_OF_SOUP = (_bad_coordinates, _bad_indices, _non_manifold, _holes, _flat)
 
 # --- what happens to texts ----------------------------------------------------------------------
 

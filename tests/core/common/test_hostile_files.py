@@ -17,6 +17,7 @@ from avatar_core.atlas.storage import load_atlas
 from avatar_core.common.files import FileError, content_of, opened
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.geometry.surface import read_surface
+from avatar_core.uncertainty.distributions import read_distributions
 from avatar_core.vademecum.storage import is_vademecum, load_vademecum, parse_vademecum
 from tests.helpers.file_mutations import pristine, sealed
 
@@ -60,6 +61,11 @@ def say(key: str, value: object) -> Change:
     return lambda file: file.attrs.__setitem__(key, value)
 
 
+def within_itself(file: h5py.File) -> None:
+    del file["far"]
+    file["far"] = file["/"]
+
+
 def virtual(file: h5py.File) -> None:
     shape = file["far/space"].shape
     layout = h5py.VirtualLayout(shape, "f4")
@@ -84,6 +90,9 @@ HOSTILE: dict[str, tuple[Change, str]] = {
     "virtual numbers": (virtual, "outside the file"),
     "link to a file": (link("far", h5py.ExternalLink("/etc/passwd", "/far")), "only a link"),
     "link to a name": (link("far", h5py.SoftLink("/near")), "only a link"),
+    "link to nowhere": (link("far/space", h5py.SoftLink("/nowhere")), "only a link"),
+    "link in a circle": (link("far", h5py.SoftLink("/far")), "only a link"),
+    "group within itself": (within_itself, "only a link"),
     "array as attribute": (say("name", np.zeros(8000)), "'name' is missing"),
     "text of 20 MB": (say("provenance", "x" * 20_000_000), "letters"),
     "nested JSON": (say("provenance", "[" * 200_000), "cannot be understood"),
@@ -108,7 +117,7 @@ def test_hostile_structure_is_refused_before_it_is_read(what: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("read", [load_vademecum, load_atlas, read_surface])
+@pytest.mark.parametrize("read", [load_vademecum, load_atlas, read_surface, read_distributions])
 def test_only_ordinary_files_are_opened(tmp_path: Path, read: Callable[[Path], object]) -> None:
     pipe = tmp_path / "pipe.obj"
     os.mkfifo(pipe)  # opening it would wait for a writer
