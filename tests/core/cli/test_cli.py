@@ -31,8 +31,6 @@ from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.vademecum.storage import load_vademecum
 from tests.core.conftest import Command
 
-TRIANGLE = "v 0 0 0\nv 100 0 0\nv 0 100 0\n"
-
 
 def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
     lines = [f"v {x} {y} {z}" for x, y, z in vertices]
@@ -41,9 +39,9 @@ def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
     return path
 
 
-def phantom_file(folder: Path, scale: float = 1e3) -> Path:
+def phantom_file(folder: Path) -> Path:
     liver = phantom_liver(12e-3)
-    return write_obj(folder / "liver.obj", liver.vertices * scale, liver.faces)
+    return write_obj(folder / "liver.obj", liver.vertices * 1e3, liver.faces)
 
 
 @pytest.fixture
@@ -62,32 +60,14 @@ def refused(avatar: Command, tmp_path: Path) -> Callable[[list[object], str], No
 
 @pytest.mark.parametrize(
     ("content", "remedy"),
-    [
-        (None, "check the path"),
-        ("", "surface"),
-        (TRIANGLE + "f 1 2 3\nf 1 3 2\n", "clos"),
-        (TRIANGLE.replace("100 0 0", "nan 0 0") + "f 1 2 3\n", "finite"),
-    ],
-    ids=["missing", "empty", "two triangles", "NaN"],
+    [(None, "check the path"), ("v 0 0 0\nv 100 0 0\nv 0 100 0\nf 1 2 3\nf 1 3 2\n", "clos")],
+    ids=["missing", "two triangles"],
 )
 def test_bad_surface(refused: Any, tmp_path: Path, content: str | None, remedy: str) -> None:
     source = tmp_path / "organ.obj"
     if content is not None:
         source.write_text(content)
     refused([source], remedy)
-
-
-def test_open_surface(refused: Any, tmp_path: Path) -> None:
-    liver = phantom_liver(12e-3)
-    middle = liver.vertices[liver.faces].mean(axis=1)[:, 0]
-    half = liver.faces[middle > np.median(middle)]
-    source = write_obj(tmp_path / "half.obj", liver.vertices * 1e3, half)
-    refused([source], "open")
-
-
-@pytest.mark.parametrize("scale", [1e4, 10.0], ids=["too large", "too small"])
-def test_wrong_unit(refused: Any, tmp_path: Path, scale: float) -> None:
-    refused([phantom_file(tmp_path, scale)], "unit")
 
 
 @pytest.mark.parametrize(
@@ -185,12 +165,6 @@ def test_unknown_option_is_a_usage_error(avatar: Command) -> None:
     assert code == 2 and "--colour" in err
 
 
-@pytest.mark.parametrize("command", [[], ["vademecum"], ["show"], ["demo"], ["bench", "step"]])
-def test_help(avatar: Command, command: list[str]) -> None:
-    code, out, _ = avatar(*command, "--help")
-    assert code == 0 and "Usage" in out
-
-
 def commands(group: Any, *words: str) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Every command of a group, with the words that call it."""
     for name, command in group.commands.items():
@@ -201,10 +175,11 @@ def commands(group: Any, *words: str) -> Iterator[tuple[tuple[str, ...], Any]]:
 
 
 def test_help_shows_every_unit(avatar: Command) -> None:
+    assert avatar("--help")[0] == 0
     n_metres = 0
     for words, command in commands(typer.main.get_command(cli.app)):
         code, out, _ = avatar(*words, "--help")
-        assert code == 0
+        assert code == 0 and "Usage" in out
         shown = " ".join(out.split())
         for parameter in command.params:
             units = re.findall(r"\[[^\]]+\]", parameter.help or "")
