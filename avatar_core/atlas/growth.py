@@ -10,14 +10,14 @@ import hashlib
 import json
 import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from avatar_core.atlas.anatomy import Anatomy, AtlasError, Response
 from avatar_core.atlas.checkpoint import Checkpoint, checkpoint_of
-from avatar_core.atlas.model import LARGEST_ORGAN, SPACING, Atlas, anatomy_of, box_around
+from avatar_core.atlas.model import LARGEST_ORGAN, SPACING, Atlas, box_around
 from avatar_core.atlas.storage import ATLAS_SCHEMA, load_atlas, save_atlas
 from avatar_core.atlas.workers import Workers
 from avatar_core.common.processes import repeatable
@@ -284,8 +284,17 @@ def build_anatomy(
     surface = source.read() if isinstance(source, SurfaceFile) else source
     atlas.require_room(surface)
     registration = register(atlas.template, surface, atlas.rule)
-    anatomy = anatomy_of(atlas, surface, registration)
-    return replace(anatomy, response=solve_response(registration)) if solve_response else anatomy
+    return Anatomy(
+        name=surface.name,
+        surface=surface,
+        volume=surface.volume,
+        alignment=registration.alignment,
+        distances=atlas.distance_vector(surface, registration.alignment),
+        registered=registration.mesh.vertices,
+        quality=registration.quality,
+        converged=registration.converged,
+        response=solve_response(registration) if solve_response else None,
+    )
 
 
 def checkpoint_keys(builder: AnatomyBuilder, sources: Sequence[Source]) -> list[str | None]:

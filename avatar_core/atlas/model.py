@@ -15,7 +15,7 @@ import numpy as np
 
 from avatar_core.atlas.anatomy import Anatomy, AtlasError, Duplicate, free_name, require_shapes
 from avatar_core.common.arrays import FloatArray, IntArray
-from avatar_core.geometry.level_set import GridBox, signed_distance
+from avatar_core.geometry.level_set import GridBox
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.lle import Gram, fit
@@ -158,7 +158,7 @@ class Atlas:
         placed = self.place(surface, alignment)
         if not self.box.margin(placed) > 0.0:
             raise AtlasError(_too_large(surface, self.box))
-        return signed_distance(self.box.points, placed)
+        return placed.skin.signed_distance(self.box.points)
 
     def require_room(self, surface: SurfaceMesh) -> None:
         """Raise AtlasError if the organ is too long for the box; needs no registration."""
@@ -197,23 +197,6 @@ def box_around(
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     x, y, z = middle - spacing * (np.array([nx, ny, nz]) - 1) / 2
     return GridBox((float(x), float(y), float(z)), spacing, (nx, ny, nz))
-
-
-def anatomy_of(atlas: Atlas, surface: SurfaceMesh, registration: Registration) -> Anatomy:
-    """A new member for an atlas, from its registration with the atlas's template.
-
-    Raises AtlasError if the organ sticks out of the box.
-    """
-    return Anatomy(
-        name=surface.name,
-        surface=surface,
-        volume=surface.volume,
-        alignment=registration.alignment,
-        distances=atlas.distance_vector(surface, registration.alignment),
-        registered=registration.mesh.vertices,
-        quality=registration.quality,
-        converged=registration.converged,
-    )
 
 
 def _grown(gram: Gram, vectors: Sequence[FloatArray]) -> Gram:

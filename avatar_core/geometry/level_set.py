@@ -131,20 +131,6 @@ class OrientationOffset:
         )
 
 
-def signed_distance(points: FloatArray, surface: SurfaceMesh) -> FloatArray:
-    """Distance to the boundary of the solid inside the surface, negative inside, shape (k,) [m].
-
-    points : ndarray, shape (k, 3) [m]
-
-    Distance (AABB tree) and sign (winding number) are computed separately: pseudo-normals and rays
-    give wrong signs on cracked surfaces. Both refer to the skin of the surface: holes are covered,
-    faces inside are ignored, and an inside-out surface has the same inside.
-
-    Raises SurfaceError if the surface encloses nothing or has a large hole.
-    """
-    return surface.skin.signed_distance(points)
-
-
 def padded_box(surfaces: Sequence[SurfaceMesh], spacing: float, padding: float) -> GridBox:
     """Box that reaches padding [m] beyond all surfaces on every side."""
     low = np.min([surface.bounding_box[0] for surface in surfaces], axis=0)
@@ -174,7 +160,7 @@ def distance_in_box(surface: SurfaceMesh, box: GridBox, band: float | None = Non
     """
     origin = np.array(box.origin)
     if band is None:
-        values = signed_distance(box.points, surface).reshape(box.shape)
+        values = surface.skin.signed_distance(box.points).reshape(box.shape)
     elif band >= 2 * box.spacing:
         values = _band_values(surface, origin, box.spacing, np.array(box.shape), band)
     else:
@@ -194,7 +180,7 @@ def _band_values(
     same sign and lies beyond the band.
     """
     if min(shape) < COARSEST:
-        values = signed_distance(grid_points(origin, spacing, shape.tolist()), surface)
+        values = surface.skin.signed_distance(grid_points(origin, spacing, shape.tolist()))
         return np.clip(values, -band, band).reshape(shape)
     reach = np.sqrt(3.0) * spacing
     coarse = _band_values(surface, origin, 2 * spacing, shape // 2 + 1, band + reach)
@@ -204,7 +190,7 @@ def _band_values(
     near = (np.abs(known) < band + spacing * np.sqrt(steps)) & (steps > 0)
     values = np.clip(known, -band, band)
     points = origin + spacing * np.argwhere(near)
-    values[near] = np.clip(signed_distance(points, surface), -band, band)
+    values[near] = np.clip(surface.skin.signed_distance(points), -band, band)
     return values
 
 
@@ -309,5 +295,5 @@ def _compared(surface: SurfaceMesh) -> DistanceGrid:
     moved = SurfaceMesh(scale * (surface.vertices - centre), surface.faces)
     n = 2 * round(COMPARED_HALF_WIDTH / COMPARED_SPACING) + 1
     origin = np.full(3, -COMPARED_HALF_WIDTH)
-    values = signed_distance(grid_points(origin, COMPARED_SPACING, (n, n, n)), moved)
+    values = moved.skin.signed_distance(grid_points(origin, COMPARED_SPACING, (n, n, n)))
     return DistanceGrid(origin, COMPARED_SPACING, np.clip(values, *COMPARED_RANGE).reshape(n, n, n))

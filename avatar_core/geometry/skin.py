@@ -44,7 +44,11 @@ class Skin:
         return _inside(self.covered, points)
 
     def signed_distance(self, points: FloatArray) -> FloatArray:
-        """Distance to the boundary, negative inside, shape (k,) [m]."""
+        """Distance to the boundary, negative inside, shape (k,) [m].
+
+        Distance (AABB tree) and sign (winding number) are computed separately: pseudo-normals and
+        rays give wrong signs on cracked surfaces.
+        """
         points = np.ascontiguousarray(points, dtype=np.float64)
         squared = igl.point_mesh_squared_distance(points, *self.boundary)[0]
         return np.where(self.contains(points), -1.0, 1.0) * np.sqrt(squared)

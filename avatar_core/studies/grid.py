@@ -24,7 +24,7 @@ import numpy as np
 from avatar_core.common.arrays import FloatArray
 from avatar_core.common.processes import repeatable
 from avatar_core.fem.patch_loads import load_surface
-from avatar_core.geometry.level_set import distance_grid, isosurface, signed_distance
+from avatar_core.geometry.level_set import distance_grid, isosurface
 from avatar_core.geometry.mesh import Regions, TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.point_location import closest_points
 from avatar_core.geometry.surface import SurfaceMesh
@@ -226,10 +226,10 @@ def distance_error(
     """|phi_h - phi| / |phi| in L2 over the organ, at random points of it."""
     low, high = surface.bounding_box
     points = np.random.default_rng(settings.seed).uniform(low, high, (settings.n_points, 3))
-    exact = signed_distance(points, surface)
+    exact = surface.skin.signed_distance(points)
     inside = exact < 0
     corners, back = trilinear(points[inside], origin, h)
-    found = back @ signed_distance(corners, surface)
+    found = back @ surface.skin.signed_distance(corners)
     return float(np.linalg.norm(found - exact[inside]) / np.linalg.norm(exact[inside]))
 
 

@@ -23,7 +23,6 @@ import igl
 import numpy as np
 
 from avatar_core.common.processes import cpu_seconds
-from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.pipeline import OrganOptions, build
@@ -135,7 +134,7 @@ def _meshed(surface: SurfaceMesh, settings: MeshesSettings) -> tuple[Row, TetMes
     mesh = tetrahedralize(surface, settings.n_vertices)
     regions_by_rule(mesh)
     seconds = cpu_seconds() - start
-    off = np.abs(signed_distance(_points_on(mesh, settings.n_points), surface))
+    off = np.abs(surface.skin.signed_distance(_points_on(mesh, settings.n_points)))
     faces = mesh.boundary_faces.astype(np.int64)
     missed, _, _ = igl.point_mesh_squared_distance(surface.vertices, mesh.vertices, faces)
     shape = quality(mesh)

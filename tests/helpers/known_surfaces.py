@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry.level_set import DistanceGrid, signed_distance
+from avatar_core.geometry.level_set import DistanceGrid
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 
 RADIUS = 0.06  # of the ball [m]
@@ -136,7 +136,7 @@ def steepest(grid: DistanceGrid) -> float:
 def gradient_length(points: np.ndarray, surface: SurfaceMesh, step: float = 1e-6) -> np.ndarray:
     """|grad phi| of the signed distance itself, by central differences of a micrometre."""
     probes = points[:, None] + step * np.vstack([np.eye(3), -np.eye(3)])
-    phi = signed_distance(probes.reshape(-1, 3), surface).reshape(-1, 2, 3)
+    phi = surface.skin.signed_distance(probes.reshape(-1, 3)).reshape(-1, 2, 3)
     return np.linalg.norm((phi[:, 0] - phi[:, 1]) / (2 * step), axis=1)
 
 

@@ -21,8 +21,8 @@ from avatar_core.geometry.level_set import (
     isosurface,
     padded_box,
     reinitialize,
-    signed_distance,
 )
+from avatar_core.geometry.skin import Skin
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from tests.helpers.examples import examples
 from tests.helpers.known_surfaces import (
@@ -67,7 +67,7 @@ def box_around(surface: SurfaceMesh, spacing: float, shift: tuple[float, float, 
 def test_distance_to_a_sphere_is_exact_up_to_its_facets():
     points = np.random.default_rng(3).uniform(-0.1, 0.1, (2000, 3))
     exact = np.linalg.norm(points, axis=1) - RADIUS
-    distance = signed_distance(points, ball(level=5))  # facets are 0.03 mm deep
+    distance = ball(level=5).skin.signed_distance(points)  # facets are 0.03 mm deep
     assert np.max(np.abs(distance - exact)) < 3e-5
     assert distance.min() < -0.04  # negative inside
 
@@ -77,9 +77,9 @@ def test_sign_survives_cracks_and_flipped_faces(phantom):
     faces = np.array(cracked.faces)
     faces[::200] = faces[::200, ::-1]
     points = np.random.default_rng(5).uniform(*phantom.bounding_box, (5000, 3))
-    expected = signed_distance(points, phantom)
+    expected = phantom.skin.signed_distance(points)
     clear = np.abs(expected) > 3e-3  # half an edge: a flipped face disturbs w next to itself
-    found = signed_distance(points, replace(cracked, faces=faces))
+    found = replace(cracked, faces=faces).skin.signed_distance(points)
     assert np.array_equal(found[clear] < 0, expected[clear] < 0)
 
 
@@ -92,7 +92,7 @@ def test_no_wrong_sign_on_real_livers(livers_dir, step):
         points = rng.uniform(low - 0.01, high + 0.01, (1000, 3))
         # the sum of solid angles over all triangles, without the tree and its expansions
         winding = igl.winding_number(surface.vertices, surface.faces.astype(np.int64), points)
-        assert np.array_equal(signed_distance(points, surface) < 0, winding > 0.5), path.stem
+        assert np.array_equal(surface.skin.signed_distance(points) < 0, winding > 0.5), path.stem
 
 
 # --- isosurface and volume ----------------------------------------------------------------------
@@ -116,7 +116,7 @@ def test_isosurface_is_closed_outward_and_where_the_distance_is_zero():
     # linear interpolation between grid points: error h^2 / (8 R) at the most
     radius = np.linalg.norm(surface.vertices, axis=1)
     assert np.max(np.abs(radius - RADIUS)) < spacing**2 / (8 * RADIUS) * 1.01
-    assert signed_distance(np.zeros((1, 3)), surface)[0] < 0
+    assert surface.skin.signed_distance(np.zeros((1, 3)))[0] < 0
 
 
 def test_trilinear_sampling_reproduces_affine_fields_and_stops_at_the_edge():
@@ -140,7 +140,7 @@ def test_grid_in_a_fixed_box_has_the_shape_asked_for(phantom):
     assert np.array_equal(box.points, grid.points)
     n = 31 * 37 * 5 + 37 * 7 + 11
     assert np.allclose(box.points[n], np.array(box.origin) + 8e-3 * np.array([5, 7, 11]))
-    assert grid.values[5, 7, 11] == signed_distance(box.points[n : n + 1], phantom)[0]
+    assert grid.values[5, 7, 11] == phantom.skin.signed_distance(box.points[n : n + 1])[0]
 
 
 def test_margin_says_how_far_a_surface_is_from_the_sides(phantom):
@@ -169,12 +169,13 @@ def test_narrow_band_equals_the_full_grid_near_the_surface(phantom):
 
 def test_narrow_band_computes_few_of_many_points(phantom, monkeypatch):
     asked: list[int] = []
+    working = Skin.signed_distance
 
-    def counted(points: np.ndarray, surface: SurfaceMesh) -> np.ndarray:
+    def counted(skin: Skin, points: np.ndarray) -> np.ndarray:
         asked.append(len(points))
-        return signed_distance(points, surface)
+        return working(skin, points)
 
-    monkeypatch.setattr("avatar_core.geometry.level_set.signed_distance", counted)
+    monkeypatch.setattr(Skin, "signed_distance", counted)
     grid = distance_grid(phantom, 2e-3, 6e-3, band=4e-3)
     # the shell of 4 mm + 3.5 mm on both sides of 0.09 m2 is 0.17 M points of 0.9 M
     assert sum(asked) < 0.25 * grid.values.size

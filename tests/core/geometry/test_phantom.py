@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.phantom import (
     VISCERAL_NORMAL,
     Ellipsoid,
@@ -50,7 +49,7 @@ def test_phantom_has_the_size_of_a_liver(phantom):
 def test_right_lobe_is_the_large_one_and_the_left_lobe_tapers(phantom):
     rng = np.random.default_rng(0)
     points = rng.uniform(*phantom.bounding_box, (40_000, 3))
-    inside = points[signed_distance(points, phantom) < 0]
+    inside = points[phantom.skin.signed_distance(points) < 0]
     areas = [np.sum(np.abs(inside[:, 0] - x) < 0.01) for x in (0.03, -0.05, -0.09)]
     assert areas[0] > 2 * areas[1] > 4 * areas[2]
     right, left = inside[inside[:, 0] > 0.02], inside[inside[:, 0] < -0.06]
@@ -74,7 +73,7 @@ def test_visceral_face_is_flat_and_the_dome_is_not(phantom):
 
 def test_notch_parts_the_lobes_at_the_inferior_border(phantom):
     across = np.array([[-0.053, 0.056, 0.005], [-0.039, 0.056, 0.005], [-0.016, 0.056, 0.005]])
-    left, between, right = signed_distance(across, phantom)
+    left, between, right = phantom.skin.signed_distance(across)
     assert left < -0.003
     assert right < -0.003
     assert between > 0.003

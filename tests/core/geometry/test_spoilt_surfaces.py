@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry.level_set import DistanceGrid, distance_grid, isosurface, signed_distance
+from avatar_core.geometry.level_set import DistanceGrid, distance_grid, isosurface
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from tests.helpers.examples import examples
 from tests.helpers.known_surfaces import (
@@ -228,13 +228,13 @@ def test_a_fissure_thinner_than_the_spacing(figure, width, turn, shift):
     middle = rng.uniform([0, -0.049, SIZE[2] / 2 - DEPTH + 1e-3], [0, 0.049, 0.059], (300, 3))
     for x in (0.0, 0.6 * width, -0.6 * width, 5 * width, -5 * width):
         points = np.add(middle, (x, 0, 0)) @ rotation.T + moved
-        phi = signed_distance(points, surface)
+        phi = surface.skin.signed_distance(points)
         assert np.array_equal(phi < 0, np.full(300, x != 0))
         if abs(x) == 0.6 * width:
             assert np.allclose(phi, -0.1 * width, rtol=1e-3, atol=1e-9)
     # what the grid cannot show it leaves out: nothing of it deeper inside than a cell
     zero = isosurface(grid)
-    depth = -signed_distance(zero.vertices, surface)
+    depth = -surface.skin.signed_distance(zero.vertices)
     assert depth.max() < spacing
     if width == 5e-4:
         figure(f"volume {error:+.2%} at a width of h / 5")
@@ -251,7 +251,7 @@ def test_a_fissure_along_the_grid_costs_half_a_cell_of_it_at_most(figure, width,
     across = np.array([nearest + shift * spacing, 0, 0])
     moved = SurfaceMesh(upright.vertices + across, upright.faces)
     grid = type(grid)(
-        grid.origin, spacing, signed_distance(grid.points, moved).reshape(grid.values.shape)
+        grid.origin, spacing, moved.skin.signed_distance(grid.points).reshape(grid.values.shape)
     )
     error = grid.volume - signed_volume(upright)
     # clip(1/2 - phi/h) loses h / 4 on either side where a plane of points meets the fissure;

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from avatar_core.errors import RegistrationError
 from avatar_core.fem.patch_loads import load_surface
-from avatar_core.geometry.level_set import signed_distance
 from avatar_core.geometry.mesh import TetMesh, quality, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.point_location import closest_points, locate
@@ -91,7 +90,7 @@ def ring(radius: float = 0.085, thickness: float = 0.03, n: int = 48, m: int = 2
 
 
 def distance_to(surface: SurfaceMesh, mesh: TetMesh) -> np.ndarray:
-    return np.abs(signed_distance(mesh.vertices[mesh.surface_vertices], surface))
+    return np.abs(surface.skin.signed_distance(mesh.vertices[mesh.surface_vertices]))
 
 
 # --- the energy -------------------------------------------------------------------------------
@@ -167,7 +166,7 @@ def test_samples_look_outward_whatever_the_faces_say(phantom):
     faces = phantom.faces.copy()
     faces[::50] = faces[::50, ::-1]
     target = sample_target(replace(phantom, faces=faces), 4000)
-    ahead = signed_distance(target.points + 2e-3 * target.normals, phantom)
+    ahead = phantom.skin.signed_distance(target.points + 2e-3 * target.normals)
     assert np.mean(ahead > 0) > 0.998  # 0.98 if the flipped faces were believed
     exact = sample_target(phantom, 4000)
     assert exact.volume == pytest.approx(phantom.volume, rel=2e-3)  # 4000 samples of the integral
@@ -322,7 +321,7 @@ def test_interpolation_takes_the_closest_surface_point_outside(warped, patient):
     assert matrix.min() >= -1e-9  # never extrapolates
     found = matrix @ warped.mesh.vertices  # of the identity: the point itself or the closest one
     outline = SurfaceMesh(warped.mesh.vertices, warped.mesh.boundary_faces)
-    expected = np.maximum(signed_distance(patient.vertices, outline), 0.0)
+    expected = np.maximum(outline.skin.signed_distance(patient.vertices), 0.0)
     assert np.linalg.norm(found - patient.vertices, axis=1) == pytest.approx(expected, abs=1e-8)
 
 
@@ -346,7 +345,7 @@ def test_points_are_located_where_the_winding_number_says_inside(warped):
     outline = SurfaceMesh(mesh.vertices, mesh.boundary_faces)
     points = np.random.default_rng(9).uniform(*outline.bounding_box, (2000, 3))
     tet, weight = locate(mesh, points)
-    assert np.array_equal(tet >= 0, signed_distance(points, outline) < 0)
+    assert np.array_equal(tet >= 0, outline.skin.signed_distance(points) < 0)
     inside = tet >= 0
     found = np.einsum("ik,ikd->id", weight[inside], mesh.vertices[mesh.tets[tet[inside]]])
     assert found == pytest.approx(points[inside], abs=1e-12)
