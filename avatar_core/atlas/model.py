@@ -141,14 +141,9 @@ class Atlas:
 
         alignment : of its registration, from the template to the organ
         """
-        center = self._center
+        center = self.template.mesh.centroid
         moved = (surface.vertices - alignment(center)) @ alignment.rotation + center
         return replace(surface, vertices=moved)
-
-    @cached_property
-    def _center(self) -> FloatArray:
-        mesh = self.template.mesh
-        return mesh.vertex_volumes @ mesh.vertices / mesh.volume
 
     def distance_vector(self, surface: SurfaceMesh, alignment: SimilarityTransform) -> FloatArray:
         """Signed distances of the placed organ at the points of the box, shape (n_points,) [m].

@@ -222,11 +222,11 @@ def carried_by_place(
     closest point. Evaluated at the patient's own points, which avoids the interpolation error of
     the paper's grid.
     """
-    mesh, here = elasticity.mesh, _centroid(registration.mesh)
+    mesh, here = elasticity.mesh, registration.mesh.centroid
     moved = []
     for j in weights.neighbors:
         other = TetMesh(np.asarray(base.vertices[j], float), registration.mesh.tets)
-        placed = TetMesh(other.vertices - _centroid(other) + here, other.tets)
+        placed = TetMesh(other.vertices - other.centroid + here, other.tets)
         laid = replace(registration, mesh=placed)
         fields = interpolation_matrix(placed, mesh.vertices)
         positions = load_map(laid, base.loads, surface.centers)
@@ -259,7 +259,3 @@ def _clamped(response: CompactResponse, elasticity: Elasticity) -> CompactRespon
     held = elasticity.clamped_nodes
     space.reshape(-1, 3, space.shape[1])[held[held < len(elasticity.mesh.vertices)]] = 0.0
     return replace(response, space=space)
-
-
-def _centroid(mesh: TetMesh) -> FloatArray:
-    return np.asarray(mesh.vertex_volumes @ mesh.vertices / mesh.volume)

@@ -56,7 +56,7 @@ def export(
     from avatar_core.contact.tool_path import middle_of_access
     from avatar_core.geometry.surface import METRES
     from avatar_core.scene.export import DISPLACEMENT, FORMATS, organ_mesh, write_mesh
-    from avatar_core.scene.surface_export import AXES, SURFACE_FORMATS, export_surfaces
+    from avatar_core.scene.surface_export import AXES, SURFACE_FORMATS, displaced, write_surfaces
     from avatar_core.vademecum.storage import load_vademecum
 
     require(modes >= 0, f"--modes is {modes}; ask for 0 or more")
@@ -78,9 +78,9 @@ def export(
         print(f"{output}: {len(mesh.points)} vertices, {n_modes} modes, at rest, in m and RAS")
     else:
         displacement = vademecum.displacement_at(point, newtons)
-        for path, (vertices, _) in export_surfaces(
-            vademecum, output, displacement, unit, axes
-        ).items():
+        points = displaced(vademecum, displacement)
+        written = write_surfaces(vademecum, output, points, unit, axes)
+        for path, (vertices, _) in written.items():
             print(f"{path}: {len(vertices)} vertices, deformed, in {unit} and {axes}")
     _say_load(vademecum, point, newtons, float((displacement**2).sum(axis=1).max() ** 0.5))
 

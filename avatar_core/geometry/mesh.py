@@ -112,6 +112,11 @@ class TetMesh:
         """Volume of the organ [m^3]."""
         return float(self.tet_volumes.sum())
 
+    @cached_property
+    def centroid(self) -> np.ndarray:
+        """Of the organ, shape (3,) [m]."""
+        return np.asarray(self.vertex_volumes @ self.vertices / self.volume)
+
     @property
     def mean_surface_edge(self) -> float:
         """Mean edge length of the boundary triangles [m]."""

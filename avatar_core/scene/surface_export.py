@@ -22,12 +22,13 @@ Fields = Mapping[str, np.ndarray]
 Write = Callable[[Path, np.ndarray, np.ndarray, str, Fields], None]
 
 
-def export_surfaces(
+def write_surfaces(
     vademecum: Vademecum,
     path: str | Path,
-    displacement: np.ndarray,
+    points: np.ndarray,
     unit: str = "mm",
     axes: str = "LPS",
+    fields: Fields | None = None,
 ) -> dict[Path, tuple[np.ndarray, np.ndarray]]:
     """Write the deformed organ, and each structure inside into a file of its own.
 
@@ -36,8 +37,10 @@ def export_surfaces(
     Parameters
     ----------
     path : .stl, .obj or .vtp, of the organ
-    displacement : ndarray, shape (n_vertices, 3), of the mesh [m]
+    points : ndarray, shape (n, 3), displayed vertices where they are now [m]; see :func:`displaced`
     unit, axes : of what is written
+    fields : values at displayed vertices, shape (n,), or vectors along RAS, (n, 3); .vtp alone
+        holds them, vectors along its own axes
 
     Returns
     -------
@@ -47,22 +50,6 @@ def export_surfaces(
     ------
     StorageError
         For another suffix, unit or axes, a missing folder or a full disk.
-    """
-    return write_surfaces(vademecum, path, displaced(vademecum, displacement), unit, axes)
-
-
-def write_surfaces(
-    vademecum: Vademecum,
-    path: str | Path,
-    points: np.ndarray,
-    unit: str = "mm",
-    axes: str = "LPS",
-    fields: Fields | None = None,
-) -> dict[Path, tuple[np.ndarray, np.ndarray]]:
-    """The same for displayed vertices that are where a cloud has them, shape (n, 3) [m].
-
-    fields : values at displayed vertices, shape (n,), or vectors along RAS, (n, 3); .vtp alone
-        holds them, vectors along its own axes
     """
     path = Path(path)
     if path.suffix not in SURFACE_FORMATS:

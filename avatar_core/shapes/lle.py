@@ -1,9 +1,8 @@
 """Locally linear embedding (LLE) of a base of shapes.
 
-:func:`locally_linear_embedding` does all of it; :func:`fit` computes the weights alone, and
-:func:`embed` the coordinates. The embedding follows Eq. 16 of Gonzalez, Cueto & Chinesta (2015)
-with M = (I - W)^T (I - W); the last term of the matrix printed there has the wrong sign (Roweis &
-Saul 2000, Science 290:2323).
+:func:`fit` computes the weights, :func:`embed` the coordinates. The embedding follows Eq. 16 of
+Gonzalez, Cueto & Chinesta (2015) with M = (I - W)^T (I - W); the last term of the matrix printed
+there has the wrong sign (Roweis & Saul 2000, Science 290:2323).
 """
 
 from __future__ import annotations
@@ -138,34 +137,6 @@ class LLE:
         )
 
 
-def locally_linear_embedding(
-    vectors: Sequence[ArrayLike] | FloatArray,
-    n_neighbors: int,
-    n_components: int,
-    *,
-    regularization: float = DEFAULT_REGULARIZATION,
-    convex: bool = False,
-) -> tuple[LLE, Embedding]:
-    """Weights of a base of shapes (Eq. 15) and its low-dimensional coordinates (Eq. 16).
-
-    Parameters
-    ----------
-    vectors : ndarray, shape (n, D), or n arrays of shape (D,)
-    n_neighbors : k, neighbours of each member
-    n_components : d, dimension of the coordinates; see `estimate_dimension`
-    regularization : part of the trace added to the diagonal of each local Gram matrix
-    convex : non-negative weights; regularization is then not used
-
-    Raises
-    ------
-    LLEError
-        If there are not more different anatomies than components, k <= 0, a value is not finite, or
-        lengths differ.
-    """
-    base = fit(vectors, n_neighbors, regularization=regularization, convex=convex)
-    return base, embed(base, n_components)
-
-
 def fit(
     vectors: Sequence[ArrayLike] | FloatArray,
     n_neighbors: int,
@@ -177,6 +148,9 @@ def fit(
     """Weights of every member of a base in terms of its neighbours (Eq. 15).
 
     vectors : n arrays of shape (D,), not copied; an array of shape (n, D) will do
+    n_neighbors : k, neighbours of each member
+    regularization : part of the trace added to the diagonal of each local Gram matrix
+    convex : non-negative weights; regularization is then not used
     gram : their inner products, if known
 
     Raises LLEError if the base is empty, k <= 0, a value is not finite or lengths differ.

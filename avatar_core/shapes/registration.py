@@ -328,7 +328,7 @@ def align_upright(
         If the scale leaves 0.5 to 2.
     """
     scale = (target.volume / mesh.volume) ** (1.0 / 3.0)
-    center = mesh.vertex_volumes @ mesh.vertices / mesh.volume
+    center = mesh.centroid
     _require_scale(scale, target.surface.name)
     turn, shift = np.eye(3), target.center
     prior = _PRIOR_DISTANCE / np.radians(rule.rotation_spread)

@@ -20,7 +20,7 @@ from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix
-from avatar_core.shapes.lle import CLEAR_GAP, estimate_dimension, fit, locally_linear_embedding
+from avatar_core.shapes.lle import CLEAR_GAP, embed, estimate_dimension, fit
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
 from avatar_core.studies.shapes import PAPER_GRID, as_grid, distance_vectors, paper_box
 from avatar_core.studies.study import Row, Run, Study, column, follow, mean_and_worst, where
@@ -86,9 +86,9 @@ class InSilicoStudy(Study[InSilicoSettings]):
         spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < n]
         for row in (*held_out_rows(livers, run.settings), *spectra):
             run.add(row)
-        base, embedding = locally_linear_embedding(livers.vectors, NEIGHBORS, 2)
+        base = fit(livers.vectors, NEIGHBORS)
         run.kept["eigenvalues"] = estimate_dimension(base).eigenvalues
-        run.kept["flat"] = embedding.coordinates
+        run.kept["flat"] = embed(base, 2).coordinates
         run.notices += _spectrum_notices(spectra)
 
     def summary(self, run: Run[InSilicoSettings]) -> dict[str, float]:
