@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core.bags.palpation import measured_path
-from avatar_core.bags.touched import TouchFile
+from avatar_core.bags.touched import TouchFile, measured_path
 from avatar_core.errors import StorageError
 from tests.core.bags.bag_files import PERIOD, Cell, Message, make, only, vector, write_mcap
 
