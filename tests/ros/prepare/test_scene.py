@@ -279,7 +279,7 @@ def test_the_force_does_not_jump_when_effects_change(
     largest = np.linalg.norm(np.diff(felt, axis=0), axis=1).max()
     print(f"\n{len(felt)} wrenches, {apart:.4f} N apart, largest change {largest:.5f} N")
     assert apart > 0.02
-    # 1/100 for each period; some wrenches do not arrive here. tests/ros/loop/test_loop.py counts them.
+    # 1/100 for each period; some wrenches do not arrive here: the tests of the loop count them.
     assert largest < 0.1 * apart
 
 
