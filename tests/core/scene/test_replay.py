@@ -131,11 +131,6 @@ def test_after_lost_periods_what_relaxes_is_unknown(organ: Vademecum) -> None:
         assert found.difference(with_gap) <= SAME
 
 
-@pytest.mark.long
-def test_breath_is_never_known(organ: Vademecum) -> None:
-    assert not replay(recorded(organ, (Respiration(),)), organ).known.any()
-
-
 def test_the_command_says_how_far_forces_differ(
     avatar: Command, straight: Vademecum, tmp_path: Path
 ) -> None:

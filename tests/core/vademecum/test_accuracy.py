@@ -70,16 +70,6 @@ def test_choice_is_the_fastest_of_all_that_meet_the_budget(
         assert choose(curve, budget) == best
 
 
-@given(st.integers(0, 50), st.floats(1e-3, 1.0), st.floats(1.0, 10.0))
-def test_looser_tolerance_is_never_slower(seed: int, tolerance: float, looser: float) -> None:
-    curve = some_curve(seed)
-    try:
-        tight = choose(curve, Budget(tolerance, np.inf))
-    except AccuracyError:
-        return
-    assert choose(curve, Budget(tolerance * looser, np.inf)).p50 <= tight.p50
-
-
 def test_infeasible_budget_names_the_two_nearest_points() -> None:
     points = (
         CurvePoint(Detail(10), 0.20, 0.05, 1, 10e-6, 12e-6),
@@ -133,11 +123,6 @@ def test_values_that_come_in_threes_count_once() -> None:
 
 def _draws(rng: np.random.Generator) -> np.ndarray:
     return rng.exponential(size=(400, 200))
-
-
-def test_curve_survives_the_file() -> None:
-    curve = some_curve(3)
-    assert AccuracyCurve.of_plain(curve.plain()) == curve
 
 
 def test_front_is_beaten_by_none() -> None:
