@@ -26,15 +26,13 @@ from avatar_core.cli import picture
 from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.contact.effects.tip_law import LAW_ERROR, UNSHIFTED
 from avatar_core.contact.model import estimate_error, prepare, step
-from avatar_core.errors import ContactError, CoordinateError, MeshError, StorageError
+from avatar_core.errors import MeshError, StorageError
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
-from avatar_core.pipeline import OrganOptions
-from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.certificate import Certificate, ContactSites
 from avatar_core.vademecum.force_error import PROMISED, ForceError
 from avatar_core.vademecum.model import Provenance, Vademecum
@@ -202,19 +200,6 @@ def test_poses_that_the_step_refuses_are_counted_in_a_notice(
     assert found.certificate is not None
     assert found.certificate.contact_sites.n_contacts == 3
     assert "3 poses" in found.provenance.notices[0]
-
-
-@pytest.mark.parametrize("n", [-1, 1, 2])
-def test_too_few_places_are_refused(n: int) -> None:
-    with pytest.raises(ContactError, match="at least 3"):
-        OrganOptions(n_contact_sites=n)
-
-
-def test_several_materials_are_refused() -> None:
-    with pytest.raises(CoordinateError, match="one linear material"):
-        OrganOptions(n_contact_sites=3, coordinates=(Coordinate.parse("poisson=0.40:0.49"),))
-    with pytest.raises(CoordinateError, match="one linear material"):
-        OrganOptions(n_contact_sites=3, large="neo-hookean")
 
 
 # --- Files ---------------------------------------------------------------------------------------
