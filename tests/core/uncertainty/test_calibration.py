@@ -31,7 +31,7 @@ from avatar_core.uncertainty.distributions import (
 )
 from avatar_core.uncertainty.fit_check import chance, local_chance, normal_scores
 from avatar_core.uncertainty.known import YOUNG, priors_of
-from avatar_core.uncertainty.palpation import N_SAMPLES, Palpation, palpation_of
+from avatar_core.uncertainty.palpation import N_SAMPLES, palpation_of
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
@@ -265,11 +265,10 @@ def run(
 
 
 def test_the_command_says_and_writes_what_was_found(run: Command, tmp_path: Path) -> None:
-    code, out, err = run("push.h5", "-o", "found.yaml", "-o", "found.json", "-o", "found.png")
-    said = out + err
+    code, said, err = run("push.h5", "-o", "found.yaml", "-o", "found.json", "-o", "found.png")
     assert code == 0
     assert "8 touches" in said and "the fit is good" in said
-    assert "which the cell computed" in said or "that the cell computed" in said
+    assert "that the cell computed" in err
     found = read_distributions(tmp_path / "found.yaml")
     assert set(found) == set(TRUE)
     told = json.loads((tmp_path / "found.json").read_text())
@@ -314,15 +313,6 @@ def test_the_command_refuses_in_a_line(
     assert reason in err and (out + err).count("\n") == 1
 
 
-def test_a_palpation_keeps_whole_touches(tips: np.ndarray, forces: np.ndarray) -> None:
-    found = palpation_of(tips, np.linalg.norm(forces, axis=1))
-    kept = np.ones(N_TOUCHES, bool)
-    kept[[0, 3]] = False
-    some: Palpation = found.where(kept)
-    assert some.n_touches == N_TOUCHES - 2
-    np.testing.assert_array_equal(some.tip[some.touch == 0], found.tip[found.touch == 1])
-
-
 # --- The check of fit -----------------------------------------------------------------------------
 
 
@@ -353,10 +343,7 @@ def test_touches_that_deviate_alike_around_a_place_are_found_out(
     assert local_chance(bump, places, SOFTER) < LEAST_PROBABILITY / 2.0
     mixed = [np.random.default_rng(k).permutation(bump) for k in range(20)]
     assert np.median([local_chance(scores, places, SOFTER) for scores in mixed]) > 0.1
-
-
-def test_a_side_does_not_matter(places: np.ndarray, bump: np.ndarray) -> None:
-    """Something soft is found as something hard is."""
+    # something soft is found as something hard is
     assert local_chance(-bump, places, SOFTER) == local_chance(bump, places, SOFTER)
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avatar_core.contact.effects import SeveralTools, Tumour
+from avatar_core.contact.effects import SeveralTools
 from avatar_core.contact.force_band import DEPTH, RATIO, ForceBand
 from avatar_core.contact.layout import lay_out
 from avatar_core.contact.model import ContactModel, make_model, prepare, step
@@ -162,17 +162,6 @@ def test_the_band_stays_where_it_is_while_the_material_changes(organ: Vademecum)
     np.testing.assert_allclose(bands, [bands[0]] * 3, rtol=0.01)
 
 
-def test_what_is_not_given_has_the_value_in_use(organ: Vademecum) -> None:
-    """Of Young's modulus alone, the ratio is the same wherever the others stand."""
-    young = {"young": Fixed(7e3)}
-    for values in ({"poisson": 0.33}, {"contrast": 8.0}):
-        here = at_values(organ, values)
-        ratio = (
-            log_edges(here, [SPHERE], known_of(here, young)) - log_forces(here, [SPHERE])[..., None]
-        )
-        np.testing.assert_allclose(ratio, np.log(7e3 / here.material.young_modulus), atol=2e-3)
-
-
 def test_a_support_counts_over_young() -> None:
     """At twice the modulus and stiffness the force is twice as large; a stiffer support alone is
     felt less."""
@@ -296,17 +285,6 @@ def test_a_fixed_support_fixes_young_whatever_its_median() -> None:
     assert known_of(organ, {"young": Fixed(own)})["young"] == Fixed(own)
     with pytest.raises(CoordinateError, match="support bare_area is fixed"):
         known_of(organ, {"young": Lognormal(own, 1.3)})
-
-
-def test_a_tumour_of_the_scene_is_the_contrast_in_use(organ: Vademecum) -> None:
-    """A scene's contrast moves the force, and not the band."""
-    from avatar_core.contact.effects.tumour import at_contrast
-
-    found = [
-        log_edges(v, [SPHERE], known_of(v, KNOWN))
-        for v in (at_contrast(organ, Tumour(c)) for c in (1.0, 9.0))
-    ]
-    np.testing.assert_array_equal(*found)
 
 
 # --- How far the force is not known over the surface ----------------------------------------------
