@@ -166,6 +166,8 @@ FRICTION = "name: a\neffects:\n  friction:\n    static: {}\n"
         (FRICTION.format("'0.4'"), 4, ["'0.4' in quotes; it must be a number"]),
         (FRICTION.format("true"), 4, ["friction.static is true; it must be a number"]),
         (FRICTION.format(".inf"), 4, ["friction.static is .inf"]),
+        (FRICTION.format("inf"), 4, ["friction.static is inf"]),
+        (FRICTION.format("nan"), 4, ["friction.static is nan"]),
         (FRICTION.format("1e999"), 4, ["friction.static is 1e999"]),
         (FRICTION.format(".nan"), 4, ["friction.static is .nan"]),
         (FRICTION.format("0:30"), 4, ["friction.static is 0:30"]),  # 30 to YAML 1.1
