@@ -171,7 +171,7 @@ def _line(error: str, row: dict[str, Any], by: str) -> str:
 
 def _best(rows: list[Row]) -> dict[str, Any]:
     """All modes, all vertices."""
-    found = [r for r in _of(rows, "vademecum") if r["cloud"] == "volume"]
+    found = [r for r in _of(rows, "vademecum") if r.get("cloud") == "volume"]
     return min(found, key=lambda r: r["error"])
 
 
