@@ -112,3 +112,16 @@ def test_only_balls_are_shifted() -> None:
     np.testing.assert_array_equal(shift.value[1], shift.value[3])
     assert shifts_of(roof(), tips[:1]).value.size == 0
     assert shifts_of(roof()._replace(shift=None), tips).value.size == 0
+
+
+def test_a_plane_shifts_nothing() -> None:
+    mesh = box_mesh(4)
+    field = make_felt_field(mesh, box_regions(mesh), PATCH)
+    x, z = np.random.default_rng(0).uniform(0.03, 0.07, (2, 100))
+    for radius in RADII:
+        shift, out = shifts_of(field, [Tip("sphere", radius)]), np.empty(100)
+        values = dense(shift.value[0], shift.brick)
+        for depth in (0.0, 1e-3, 4e-3):
+            at = np.stack([x, np.full(100, 0.1 + radius - depth), z], axis=1)
+            evaluate_all(values, field.origin, shift.spacing[0], at, out, np.empty_like(at))
+            assert abs(out).max() < 1e-6
