@@ -23,7 +23,7 @@ MAX_NAME = 200  # of a name, in letters
 
 
 def plain(value: Any) -> Any:
-    """What JSON can hold: lists of arrays and tuples, plain numbers, null of what is not finite."""
+    """Convert a value for JSON: arrays become lists, numbers plain, and non-finite numbers null."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if hasattr(value, "tolist"):  # of numpy

@@ -1,4 +1,4 @@
-"""What a step, or the loop around it, found for a tool: the one list of status codes.
+"""Status codes of a tool, from the step or from the loop around it: the one list.
 
 avatar_ros/msg/ContactState.msg, msg_docs/contact_state.md and avatar_ros.loop.statuses are compared
 with it by tests/ros/loop/test_statuses.py.

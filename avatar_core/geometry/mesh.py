@@ -114,7 +114,7 @@ class TetMesh:
 
     @cached_property
     def centroid(self) -> np.ndarray:
-        """Of the organ, shape (3,) [m]."""
+        """Centroid of the organ, shape (3,) [m]."""
         return np.asarray(self.vertex_volumes @ self.vertices / self.volume)
 
     @property

@@ -1,4 +1,4 @@
-"""What all studies share: :class:`Study`, one :class:`Run` of it, its rows and the files it writes.
+"""The frame of all studies: :class:`Study`, one :class:`Run` of it, its rows and its files.
 
 A study is a module of this package with an instance of :class:`Study`, ``STUDY``. It says what to
 measure and how to sum it up; folders, row files, tables, JSON and pictures are made here.

@@ -1,11 +1,9 @@
-"""YAML of scenes: what it means, what is refused, what is written, and the page about it."""
+"""YAML of scenes: what it means, what is refused and what is written."""
 
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterator
-from dataclasses import MISSING, Field, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +25,10 @@ from avatar_core.contact.effects import (
 )
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
-from avatar_core.scene.file import SECTIONS, parse_scene, read_scene, write_scene
-from avatar_core.scene.model import CONFLICTS, Scene, SupportStiffness, Tool
+from avatar_core.scene.file import parse_scene, read_scene, write_scene
+from avatar_core.scene.model import CONFLICTS, Scene, Tool
 from avatar_core.scene.yaml_lines import MAX_BYTES
 from tests.helpers.examples import examples
-from tests.helpers.paths import ROOT
 from tests.helpers.scene_cases import PRONY, SHIPPED, refusal
 from tests.helpers.slowness import within
 
@@ -487,72 +484,3 @@ def test_no_text_raises_anything_but_a_scene_error_of_one_line(text: str) -> Non
     except SceneError as error:
         assert str(error).startswith("x:")
         assert "\n" not in str(error)
-
-
-# --- The page has every key, with the unit, range and default of the code -------------------------
-
-
-PAGE = (ROOT / "msg_docs" / "scenes.md").read_text()
-WORDS = {"the vademecum's", "none", "all"}  # of a default that is None
-
-
-def rows() -> dict[str, list[str]]:
-    """Unit, range and default by key."""
-    found = {}
-    for line in PAGE.splitlines():
-        if line.startswith("| `"):
-            key, *cells = (cell.strip() for cell in line.strip("|").split("|"))
-            found[key.strip("`")] = cells[:3]
-    return found
-
-
-def keys() -> Iterator[tuple[str, Field[Any] | None]]:
-    """All that a scene file may hold, by path."""
-    section = {name: group for group, names in SECTIONS.items() for name in names}
-    for each in fields(Scene):
-        if each.name not in ("tools", "effects"):
-            group = section.get(each.name)
-            yield f"{group}.{each.name}" if group else each.name, each
-    yield "tools", None
-    for each in fields(Tool):
-        if each.name != "tip":
-            yield f"tools.{each.name}", each
-    for each in fields(Tip):
-        yield f"tools.tip.{each.name}", each
-    for name, effect in EFFECTS.items():
-        yield name, None
-        for each in fields(effect):
-            yield f"{name}.{each.name}", each
-    yield "viscoelasticity.file", None
-
-
-@pytest.mark.parametrize(("key", "item"), [*keys()], ids=lambda value: value if value else "")
-def test_a_key_is_as_the_page_says(key: str, item: Field[Any] | None) -> None:
-    unit, span, default = rows()[key]
-    if item is None:
-        return
-    of_supports = next(f for f in fields(SupportStiffness) if f.name == "stiffness")
-    number = of_supports if key == "material.supports" else item
-    if "quantity" in number.metadata:
-        allowed = number.metadata["quantity"]
-        assert (unit, span) == (allowed.unit, f"{allowed.low:g} to {allowed.high:g}")
-    if item.default is MISSING:
-        assert default in ("required", "") or key.endswith(".name")
-    elif item.default is None or item.default == ():
-        assert default in WORDS
-    elif isinstance(item.default, tuple):
-        assert default == str([round(value) for value in item.default])
-    elif isinstance(item.default, float):
-        assert default == f"{item.default:g}"
-    else:
-        assert default == (str(item.default) or "(empty)")
-
-
-def test_there_is_no_other_key() -> None:
-    assert set(rows()) == {key for key, _ in keys()}
-
-
-def test_its_example_is_a_scene() -> None:
-    (text,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
-    scene = parse_scene(text, "page")
-    assert {effect.name for effect in scene.effects} == {"friction", "respiration", "several_tools"}

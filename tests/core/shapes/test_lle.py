@@ -1,4 +1,4 @@
-"""Weights, embedding and growth of a base against their mathematics and scikit-learn.
+"""Weights and growth of a base against their mathematics and scikit-learn.
 
 Also of bases that leave the weights undecided: equal, nearly equal, in line, few, far away.
 With C the local Gram matrix of k neighbours, r the regularisation and d the least distance, the
@@ -31,15 +31,7 @@ from avatar_core.shapes.barycenter import (
     convex_weights,
     local_gram,
 )
-from avatar_core.shapes.lle import (
-    LLE,
-    Gram,
-    embed,
-    estimate_dimension,
-    fit,
-    local_variances,
-    spectrum,
-)
+from avatar_core.shapes.lle import LLE, Gram, embed, estimate_dimension, fit, spectrum
 from tests.helpers.examples import examples
 
 NONE = 1e-12  # a regularisation that is almost none
@@ -55,38 +47,6 @@ def livers() -> np.ndarray:
     organs = [shape.moved(phantom) for shape in population(12, seed=3, bend=5e-3)]
     box = padded_box(organs, 14e-3, 20e-3)
     return np.array([distance_in_box(organ, box).values.ravel() for organ in organs])
-
-
-@pytest.fixture(scope="module")
-def cloud() -> np.ndarray:
-    """60 points of a curved three-parameter family in 200 dimensions."""
-    rng = np.random.default_rng(0)
-    t = rng.uniform(-1, 1, (60, 3))
-    features = np.hstack([t, 0.3 * t**2, 0.3 * t * t[:, [1, 2, 0]]])
-    return features @ rng.standard_normal((9, 200))
-
-
-@pytest.fixture(scope="module")
-def flat() -> tuple[np.ndarray, np.ndarray]:
-    """Parameters (150, 4) and points (150, 80) of an affine family."""
-    rng = np.random.default_rng(1)
-    t = rng.uniform(-1, 1, (150, 4))
-    return t, t @ rng.standard_normal((4, 80)) + rng.standard_normal(80)
-
-
-def swiss_roll(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters (arc, height) and points of a rolled-up sheet in space."""
-    rng = np.random.default_rng(0)
-    t = 1.5 * np.pi * (1 + 2 * rng.random(n))
-    height = 20 * rng.random(n)
-    return np.c_[t, height], np.c_[t * np.cos(t), height, t * np.sin(t)]
-
-
-def explained(target: np.ndarray, coordinates: np.ndarray) -> float:
-    """Part of the variance of target that is an affine function of the coordinates."""
-    columns = np.c_[np.ones(len(coordinates)), coordinates]
-    rest = target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0]
-    return float(1 - rest.var() / target.var())
 
 
 # --- weights ----------------------------------------------------------------------------------
@@ -300,109 +260,6 @@ def test_base_with_equals_grows_like_the_batch(cloud):
     one_by_one, batch = grown(points, 2, 5), fit(points, 5)
     assert one_by_one.repeated == batch.repeated == (12, 21)
     assert np.abs(one_by_one.weight_matrix - batch.weight_matrix).max() < 1e-10
-
-
-# --- embedding --------------------------------------------------------------------------------
-
-
-def test_eigenvalues_are_the_reconstruction_errors_of_the_coordinates(cloud):
-    base = fit(cloud, 8, regularization=1e-3)
-    found = embed(base, 3)
-    y = found.coordinates
-    assert np.allclose(y.T @ y, len(cloud) * np.eye(3), atol=1e-9)
-    assert np.allclose(y.mean(axis=0), 0.0, atol=1e-9)
-    errors = np.sum((y - base.weight_matrix @ y) ** 2, axis=0) / len(cloud)  # Eq. 16
-    # one eigenvalue carries the rounding of M, about 1e-15
-    assert np.allclose(errors, found.eigenvalues, atol=1e-13)
-    rest = np.eye(60) - base.weight_matrix
-    assert np.allclose(np.linalg.eigvalsh(rest.T @ rest)[1:4], found.eigenvalues, atol=1e-13)
-
-
-def test_embedding_spans_that_of_scikit_learn(cloud):
-    manifold = pytest.importorskip("sklearn.manifold")
-    theirs = manifold.LocallyLinearEmbedding(
-        n_neighbors=10, n_components=3, reg=1e-3, eigen_solver="dense"
-    ).fit_transform(cloud)
-    embedding = embed(fit(cloud, 10, regularization=1e-3), 3)
-    ours = embedding.coordinates
-    a, b = np.linalg.qr(theirs)[0], np.linalg.qr(ours)[0]
-    assert np.linalg.svd(a.T @ b, compute_uv=False).min() > 1 - 1e-9
-
-
-def test_embedding_of_an_affine_family_is_affine_in_its_parameters(flat):
-    t, points = flat
-    base = fit(points, 10, regularization=1e-9)
-    found = embed(base, 4)
-    # regularisation 1e-9 of the trace against local variances of a hundredth of it
-    assert explained(t, found.coordinates) > 1 - 1e-6
-    # the affine map from parameters to coordinates holds out of sample too
-    new = np.array([[0.1, -0.3, 0.5, 0.2], [0.0, 0.6, -0.2, -0.4]])
-    matrix = np.linalg.lstsq(np.c_[np.ones(150), t], found.coordinates, rcond=None)[0]
-    slope = np.linalg.lstsq(np.c_[np.ones(150), t], points, rcond=None)[0]
-    for parameters in new:
-        point = base.barycenter(np.r_[1.0, parameters] @ slope)
-        assert found.of(point) == pytest.approx(np.r_[1.0, parameters] @ matrix, abs=1e-3)
-    assert np.array_equal(found.of(base.barycenter(points[7])), found.coordinates[7])
-
-
-def test_swiss_roll_is_unrolled():
-    parameters, points = swiss_roll(800)
-    found = embed(fit(points, 8, regularization=1e-2), 2).coordinates
-    order = np.argsort(np.argsort(parameters[:, 0]))
-    along = [abs(np.corrcoef(order, np.argsort(np.argsort(c)))[0, 1]) for c in found.T]
-    # over 3 seeds 0.998 to 1.000; larger k short-cuts between the layers (0.7)
-    assert max(along) > 0.99
-    linear = [abs(np.corrcoef(order, np.argsort(np.argsort(c)))[0, 1]) for c in points.T]
-    assert max(linear) < 0.6
-
-
-@pytest.mark.parametrize("d", [1, 2, 3, 5])
-def test_dimension_of_affine_families(d):
-    rng = np.random.default_rng(d)
-    points = rng.uniform(-1, 1, (200, d)) @ rng.standard_normal((d, 60))
-    found = estimate_dimension(fit(points, 12))
-    assert (found.from_gap, found.from_local_pca, found.agree) == (d, d, True)
-    assert found.notices == ()
-    assert found.gap > 100
-    assert np.all(np.diff(found.eigenvalues) >= 0)
-    assert found.local_variances.sum() == pytest.approx(1.0)
-
-
-def test_local_variances_find_a_curved_sheet_and_full_noise():
-    rolled = fit(swiss_roll(800)[1], 10, regularization=1e-3)
-    assert estimate_dimension(rolled).from_local_pca == 2
-    rng = np.random.default_rng(6)
-    noise = estimate_dimension(fit(rng.standard_normal((200, 40)), 12))
-    assert noise.gap < 3  # nothing stands out
-    assert noise.notices[0].startswith("no clear gap")
-    assert noise.from_local_pca >= 10
-
-
-def test_local_variances_equal_those_of_the_singular_values(cloud):
-    base = fit(cloud, 7)
-    near = cloud[base.neighbors[11]]
-    squared = np.linalg.svd(near - near.mean(axis=0), compute_uv=False)[:6] ** 2
-    assert np.allclose(local_variances(base)[11], squared / squared.sum(), atol=1e-12)
-
-
-def test_inner_products_are_those_about_the_mean_and_grow_about_it(cloud):
-    long = np.tile(cloud, 50)  # more values than one block
-    first = Gram.of(tuple(long[:-1]))
-    assert np.allclose(first.origin, long[:-1].mean(axis=0), atol=1e-14)
-    gram = first.grown(tuple(long[:-1]), long[-1])
-    difference = long - first.origin
-    wanted = difference @ difference.T
-    # sums of 1e4 products, each rounded to 1e-16 of the largest
-    assert np.allclose(gram.products, wanted, rtol=0, atol=1e-13 * wanted.max())
-    squared = np.sum((long[3] - long) ** 2, axis=1)
-    assert np.allclose(gram.squared_distances(np.array([3]))[0], squared, atol=1e-12 * wanted.max())
-
-
-def test_known_inner_products_are_used(cloud):
-    base = fit(cloud, 8)
-    again = fit(cloud, 8, gram=base.gram)
-    assert again.gram is base.gram
-    assert np.array_equal(again.weights, base.weights)
 
 
 # --- bases that leave the weights undecided ------------------------------------------------------

@@ -10,7 +10,7 @@ from avatar_core.errors import SurfaceError
 from avatar_core.geometry.level_set import DistanceGrid, distance_in_box, padded_box
 from avatar_core.geometry.phantom import ShapeMap, population
 from avatar_core.shapes.lle import estimate_dimension, fit
-from tests.core.shapes.test_lle import explained
+from tests.core.shapes.test_embedding import explained
 
 
 @pytest.fixture(scope="module")
