@@ -3,11 +3,10 @@
 numba's reference counting is off in the step (``_nrt``): arrays come in from outside and outlive
 it, so that counting their users would cost a third of its time for nothing; and without it numba
 refuses, when it compiles, whatever would create an array. Every function but the entries is inlined
-into these. A division by zero gives an infinity instead of an exception.
+into these and has no wrapper for Python; called from there, it runs as plain Python. A division by
+zero gives an infinity instead of an exception.
 
-What is inlined has no wrapper for Python and no machine code of its own, which would be compiled
-for nothing (:mod:`avatar_core.common.inlined_code`). Called from Python, such a part runs as plain
-Python. Arrays come in as an :class:`avatar_core.common.array_table.ArrayTable`. What was compiled
+Arrays come in as an :class:`avatar_core.common.array_table.ArrayTable`. What was compiled
 is kept on disk (:mod:`avatar_core.common.compiled_cache`).
 """
 
@@ -20,7 +19,6 @@ from numba import njit
 from numba.core.registry import CPUDispatcher
 
 from avatar_core.common.compiled_cache import ContentCache
-from avatar_core.common.inlined_code import InlinedCode
 
 _STEP: dict[str, Any] = {"error_model": "numpy", "_nrt": False}
 _NO_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -46,8 +44,7 @@ class _Part(CPUDispatcher):
 
 
 def _part(function: Callable[..., Any], **options: Any) -> Any:
-    options |= {"forceinline": True, "pipeline_class": InlinedCode}
-    part = compiled(**_NO_WRAPPERS, **_STEP, **options)(function)
+    part = compiled(forceinline=True, **_NO_WRAPPERS, **_STEP, **options)(function)
     if isinstance(part, CPUDispatcher):
         part.__class__ = _Part
     return part

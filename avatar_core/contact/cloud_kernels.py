@@ -31,45 +31,36 @@ MAX_PAST = 4  # regions whose history of loads is shown
 
 
 @fast
-def deform(model, space, state, out, effects):  # type: ignore[no-untyped-def]
+def deform(model, state, out, effects):  # type: ignore[no-untyped-def]
     """The cloud under the forces of a period."""
     e = effects
-    _displace(
-        model,
-        space,
-        state,
-        out,
-        e.superposition,
-        e.large_deformation,
-        e.friction,
-        e.viscoelasticity,
-    )
+    _displace(model, state, out, effects)
     write_cloud(model, state, out.cloud, e.tip_law, e.dent, e.display)
     shift_cloud(e.respiration, out.cloud)
 
 
 @fast
-def _displace(  # type: ignore[no-untyped-def]
-    model, space, state, out, superposition, large_deformation, friction, viscoelasticity
-):
+def _displace(model, state, out, effects):  # type: ignore[no-untyped-def]
     """The displacement of all points into ``state.field``."""
-    if superposition is None and out.n_contacts[0] == 0:
+    superposition, large_deformation = effects.superposition, effects.large_deformation
+    viscoelasticity = effects.viscoelasticity
+    if not superposition.on and out.n_contacts[0] == 0:
         state.field[:] = np.float32(0.0)
         return
     _release_regions(state)
-    if viscoelasticity is not None:
+    if viscoelasticity.on:
         _load_past(model, state, large_deformation, viscoelasticity)
     for t in range(state.passage.shape[0]):
         if state.force[t] > 0.0:
-            _load_regions(model, state, large_deformation, friction, viscoelasticity, t)
+            _load_regions(model, state, effects, t)
     _move_globals(model, state, superposition)
-    _sum_modes(model, space, state, large_deformation)
+    _sum_modes(model, state, large_deformation)
 
 
 @fast
 def _move_globals(model, state, superposition):  # type: ignore[no-untyped-def]
     """Amplitudes that the effects give to the global modes, less those of the touched regions."""
-    if superposition is None:
+    if not superposition.on:
         return
     for k in range(model.region_start[0]):
         moved = superposition.total[k]
@@ -94,7 +85,7 @@ def _touch(model, state, large_deformation, r):  # type: ignore[no-untyped-def]
     state.touched[state.n_touched[0]] = r
     state.n_touched[0] += 1
     state.amplitude[model.region_start[r] : model.region_start[r + 1]] = np.float32(0.0)
-    if large_deformation is not None:
+    if large_deformation.on:
         start = large_deformation.start
         state.amplitude[start[r] : start[r + 1]] = np.float32(0.0)
 
@@ -110,11 +101,13 @@ def _add_load(model, state, j, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _load_regions(model, state, large_deformation, friction, viscoelasticity, t):  # type: ignore[no-untyped-def]
+def _load_regions(model, state, effects, t):  # type: ignore[no-untyped-def]
     """The force of a tip on the regions of the load positions that carry it.
 
     A region fades out before the tip leaves it, so that few are read; the others take its part.
     """
+    large_deformation, friction = effects.large_deformation, effects.friction
+    viscoelasticity = effects.viscoelasticity
     region_weight, kept = state.region_weight, 0.0
     for i in range(state.n_nodes[t]):
         region_weight[model.region[state.nodes[t, i]]] = 0.0
@@ -124,20 +117,20 @@ def _load_regions(model, state, large_deformation, friction, viscoelasticity, t)
         kept += _kept_weight(model, state, t, i)
     n, scale = state.normal[t], state.scale[t] / kept
     f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
-    if friction is not None:
+    if friction.on:
         f0, f1, f2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
     second = third = 0.0
-    if large_deformation is not None:
+    if large_deformation.on:
         second, third = powers_of_depth(state, large_deformation, t)
     for i in range(state.n_nodes[t]):
         j, w = state.nodes[t, i], _kept_weight(model, state, t, i)
         if w != 0.0:
             r = model.region[j]
             _touch(model, state, large_deformation, r)
-            if viscoelasticity is None:
+            if not viscoelasticity.on:
                 part = w * scale
                 _add_load(model, state, j, part * f0, part * f1, part * f2)
-            if large_deformation is not None:
+            if large_deformation.on:
                 add_nonlinear_load(state, large_deformation, r, j, w / kept, second, third)
 
 
@@ -203,10 +196,10 @@ def _fade_regions(model, state):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _sum_modes(model, space, state, large_deformation):  # type: ignore[no-untyped-def]
+def _sum_modes(model, state, large_deformation):  # type: ignore[no-untyped-def]
     """The displacement of every block: of global modes that stand apart, and of touched regions."""
     amplitude, start, shown = state.amplitude, model.region_start, state.shown[0]
-    core, level, rows = model.core, model.level, model.block_start
+    space, core, level, rows = model.space, model.core, model.level, model.block_start
     n_global, n_regions = start[0], start.shape[0] - 1
     for b in range(rows.shape[1] - 1):
         u = state.field[b * BLOCK : (b + 1) * BLOCK]
@@ -217,7 +210,7 @@ def _sum_modes(model, space, state, large_deformation):  # type: ignore[no-untyp
             r = state.touched[q]
             own = amplitude[start[r] : start[r + 1]]
             add_part(space, core, level, rows[1 + r], own, shown, b, u)
-            if large_deformation is not None:
+            if large_deformation.on:
                 first, end = large_deformation.start[r], large_deformation.start[r + 1]
                 bent = rows[1 + n_regions + r]
                 add_part(space, core, level, bent, amplitude[first:end], ALL, b, u)

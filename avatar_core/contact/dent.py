@@ -150,7 +150,7 @@ def add_dents(  # type: ignore[no-untyped-def]
         their position and displacement
     tip, patch : 1 or 0, whether the dent of the tip is put in, and that of the patch taken off
     """
-    if law is None or dents is None:
+    if not law.on or not dents.on:
         return
     for t in range(state.passage.shape[0]):
         if state.force[t] > 0.0 and law.elastic[t] > 0.0:

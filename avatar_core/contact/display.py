@@ -62,7 +62,7 @@ def write_cloud(model, state, cloud, law, dents, display):  # type: ignore[no-un
     """The cloud, from what the modes displace in ``state.field``: with the dents of tips, at the
     displayed vertices if they are not the mesh's."""
     flat = cloud.reshape(6 * cloud.shape[0])
-    if display is None:
+    if not display.on:
         _write(model.rest, model.place, state.field, cloud)
         add_dents(model, state, law, dents, dents, model.rest, flat, 6, 1.0, 1.0)
         return

@@ -19,11 +19,9 @@ For one tip on an organ at rest, W = lambda gamma lambda / 2,
 the normal force, and the small tangential one by which a frictionless tip slides towards softer
 tissue. Without it a closed path would gain or lose energy.
 
-``space`` holds the modes of the cloud apart from the rest of the model, so that what does not read
-them is compiled once for all of their precisions. ``effects`` holds the effects of a scene
-(:mod:`avatar_core.contact.effects.selection`), each None or its arrays. A stage takes those it
-needs as arguments of their own and does nothing for None: numba compiles the step for every
-selection of effects, without the branches on what is None.
+``effects`` holds the effects of a scene (:mod:`avatar_core.contact.effects.selection`). A stage
+takes those that it needs and does nothing for one that is not ``on``: all scenes share one compiled
+step, and a scene costs a branch for what it leaves out.
 
 Every iteration here is bounded; where one ends unconverged, the status of all tips in contact is
 NOT_CONVERGED.
@@ -45,7 +43,11 @@ from avatar_core.contact.effects.friction import (
     solve_friction,
 )
 from avatar_core.contact.effects.inertia import advance_inertia, predict_inertia
-from avatar_core.contact.effects.large_deformation import add_nonlinear_force, sample_coefficients
+from avatar_core.contact.effects.large_deformation import (
+    add_nonlinear_force,
+    evaluate_added_depth,
+    sample_coefficients,
+)
 from avatar_core.contact.effects.respiration import to_organ_frame, to_world_frame
 from avatar_core.contact.effects.several_tools import (
     assemble_coupling,
@@ -54,7 +56,6 @@ from avatar_core.contact.effects.several_tools import (
 )
 from avatar_core.contact.effects.tip_law import (
     add_tip_force,
-    added_depth,
     advance_tips,
     law_error,
     predict_tips,
@@ -187,13 +188,13 @@ def contact_solve(model, state, out, tips, effects):  # type: ignore[no-untyped-
 
 
 @entry
-def contact_deform(model, space, state, out, effects):  # type: ignore[no-untyped-def]
+def contact_deform(model, state, out, effects):  # type: ignore[no-untyped-def]
     """Second half: the cloud under these forces. Real-time safe, as :func:`contact_solve`."""
-    deform(model, space, state, out, effects)
+    deform(model, state, out, effects)
 
 
 @entry
-def force_error(model, state, out, tips, tip_law):  # type: ignore[no-untyped-def]
+def force_error(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
     """Expected error of the forces: the relative error at the tip, times the force.
 
     Of a real tip, the patch's error counts with the part of the depth that is the patch's, and that
@@ -206,9 +207,10 @@ def force_error(model, state, out, tips, tip_law):  # type: ignore[no-untyped-de
         if size > 0.0:
             cell = cell_at(model.origin, model.spacing[0], tips[t])
             relative = value_in_cell(model.force_error, cell)
-            if tip_law is not None:
+            if effects.tip_law.on:
                 part = state.self_compliance[t] * state.force[t] / max(-state.gap[t], 1e-6)
-                relative = law_error(tip_law, state.steepness[t], t) + min(part, 1.0) * relative
+                relative *= min(part, 1.0)
+                relative += law_error(effects.tip_law, state.steepness[t], t)
             out.force_error[t] = size * relative
 
 
@@ -217,30 +219,19 @@ def _solve_period(model, state, out, tips, effects):  # type: ignore[no-untyped-
     """Locate, assemble, solve, differentiate, advance. ``tips`` may change."""
     e = effects
     to_organ_frame(e.respiration, tips)
-    status = _locate_tips(
-        model, state, out, tips, e.superposition, e.large_deformation, e.friction, e.tip_law
-    )
+    status = _locate_tips(model, state, out, tips, effects)
     couple_near_fields(model, state, e.several_tools, e.friction)
-    _predict(e.superposition, e.viscoelasticity, e.inertia, e.self_weight)
+    _predict(effects)
     predict_tips(e.tip_law, e.viscoelasticity)
-    _assemble_incremental(model, state, e.superposition, e.viscoelasticity, e.inertia)
-    converged = solve_contact(
-        model,
-        state,
-        tips,
-        e.superposition,
-        e.several_tools,
-        e.large_deformation,
-        e.friction,
-        e.tip_law,
-    )
+    _assemble_incremental(model, state, effects)
+    converged = solve_contact(model, state, tips, effects)
     if not converged:
         for t in range(tips.shape[0]):
             if state.active[t]:
                 out.status[t] = NOT_CONVERGED
     superpose_modes(state, e.superposition, e.friction)
     write_forces(model, state, out, tips, e)
-    advance_history(state, e.superposition, e.viscoelasticity, e.friction, e.self_weight)
+    advance_history(state, effects)
     advance_tips(state, e.tip_law, e.viscoelasticity)
     advance_inertia(e.superposition, e.inertia)
     to_world_frame(e.respiration, out)
@@ -250,10 +241,10 @@ def _solve_period(model, state, out, tips, effects):  # type: ignore[no-untyped-
 
 
 @inlined
-def _locate_tips(  # type: ignore[no-untyped-def]
-    model, state, out, tips, superposition, large_deformation, friction, tip_law
-):
+def _locate_tips(model, state, out, tips, effects):  # type: ignore[no-untyped-def]
     """Gap and compliance of each tip on its own; returns the worst status."""
+    superposition, large_deformation = effects.superposition, effects.large_deformation
+    friction, tip_law = effects.friction, effects.tip_law
     status = OK
     for t in range(tips.shape[0]):
         out.status[t] = locate(model, state, t, tips[t], superposition, tip_law)
@@ -262,7 +253,7 @@ def _locate_tips(  # type: ignore[no-untyped-def]
             state.force[t] = 0.0
             continue
         modal_load(model, state, t)
-        if superposition is not None:
+        if superposition.on:
             near_column(model, state, t)
             near = near_along_normal(state, t, state.column[t])
         else:
@@ -275,113 +266,111 @@ def _locate_tips(  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _predict(superposition, viscoelasticity, inertia, self_weight):  # type: ignore[no-untyped-def]
+def _predict(effects):  # type: ignore[no-untyped-def]
     """Modes at the end of the period without any load, and their gain by a unit load."""
-    if viscoelasticity is not None:
+    superposition, viscoelasticity = effects.superposition, effects.viscoelasticity
+    inertia, self_weight = effects.inertia, effects.self_weight
+    if viscoelasticity.on:
         predict_history(viscoelasticity)
         superposition.near_gain[0] = viscoelasticity.gain[0]
-    if inertia is not None:
-        predict_inertia(superposition, inertia, viscoelasticity, self_weight)
-    elif viscoelasticity is not None:
-        predict_modes(superposition, viscoelasticity, self_weight)
-    elif self_weight is not None:
+    if inertia.on:
+        predict_inertia(effects)
+    elif viscoelasticity.on:
+        predict_modes(effects)
+    elif self_weight.on:
         for k in range(superposition.free.shape[0]):
             superposition.free[k] = self_weight.amplitude[k]
 
 
 @fast
-def _assemble_incremental(  # type: ignore[no-untyped-def]
-    model, state, superposition, viscoelasticity, inertia
-):
+def _assemble_incremental(model, state, effects):  # type: ignore[no-untyped-def]
     """Displacement without load at each tip, and its compliance within the period."""
-    if superposition is None:
+    superposition, viscoelasticity = effects.superposition, effects.viscoelasticity
+    inertia = effects.inertia
+    if not superposition.on:
         return
     for t in range(state.passage.shape[0]):
         if not state.active[t]:
             continue
         free_tip_displacement(model, state, superposition, viscoelasticity, t)
-        if inertia is not None:
+        if inertia.on:
             far, near = 0.0, near_along_normal(state, t, state.column[t])
             for k in range(state.mode.shape[1]):
                 far += superposition.gain[k] * state.mode[t, k] * state.mode[t, k]
             incremental = state.scale[t] ** 2 * (far + superposition.near_gain[0] * near)
             state.compliance[t, t] += incremental - state.self_compliance[t]
-        elif viscoelasticity is not None:
+        elif viscoelasticity.on:
             softened = viscoelasticity.gain[0] - 1.0
             state.compliance[t, t] += softened * state.self_compliance[t]
 
 
 @inlined
-def solve_contact(  # type: ignore[no-untyped-def]
-    model, state, tips, superposition, several_tools, large_deformation, friction, tip_law
-):
+def solve_contact(model, state, tips, effects):  # type: ignore[no-untyped-def]
     """Forces of all tips, by the cheapest solver for the effects; whether it converged."""
-    if friction is not None:
-        return solve_friction(
-            model, state, tips, superposition, several_tools, large_deformation, friction, tip_law
-        )
-    if several_tools is not None:
+    superposition, several_tools = effects.superposition, effects.several_tools
+    large_deformation, friction = effects.large_deformation, effects.friction
+    tip_law = effects.tip_law
+    if friction.on:
+        return solve_friction(model, state, tips, effects)
+    if several_tools.on:
         assemble_coupling(state, superposition, several_tools)
-    if several_tools is not None or (large_deformation is not None and tip_law is None):
-        return solve_together(state, superposition, several_tools, large_deformation, tip_law)
-    return solve_alone(state, superposition, large_deformation, tip_law)
+    if several_tools.on or (large_deformation.on and not tip_law.on):
+        return solve_together(state, effects)
+    return solve_alone(state, effects)
 
 
 @inlined
-def solve_alone(state, superposition, large_deformation, tip_law):  # type: ignore[no-untyped-def]
+def solve_alone(state, effects):  # type: ignore[no-untyped-def]
     """0 <= lambda  perp  gap + C lambda >= 0, each tip on its own; a patch in closed form."""
+    superposition, tip_law = effects.superposition, effects.tip_law
     for t in range(state.passage.shape[0]):
         if state.active[t]:
             gap = state.gap[t]
-            if superposition is not None:
+            if superposition.on:
                 gap -= superposition.free_normal[t]
             own = state.compliance[t, t]
-            if tip_law is not None:
+            if tip_law.on:
                 tip_law.place[t] = 0.0  # to the bit, the force knows nothing of the last pose
-                state.force[t] = solve_tip(
-                    state, superposition, tip_law, large_deformation, t, -gap, own
-                )
+                state.force[t] = solve_tip(state, effects, t, -gap, own)
             else:
                 state.force[t] = max(0.0, -gap / own)
     return True
 
 
 @inlined
-def solve_together(  # type: ignore[no-untyped-def]
-    state, superposition, several_tools, large_deformation, tip_law
-):
+def solve_together(state, effects):  # type: ignore[no-untyped-def]
     """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda + h >= 0, from the last forces.
 
     With large deformation each update of a patch is a Newton step. Sweeps hardly change how tips
     close to each other share their load; then they restart from the active-set solution. Returns
     whether the last sweep changed every gap by less than ``GAP_TOLERANCE``.
     """
+    superposition, several_tools = effects.superposition, effects.several_tools
+    large_deformation, tip_law = effects.large_deformation, effects.tip_law
     n_tools = state.passage.shape[0]
     for sweep in range(MAX_SWEEPS):
-        if several_tools is not None and sweep < MAX_EXACT and sweep % PATIENCE == PATIENCE - 1:
-            solve_active_set(state, superposition, several_tools, large_deformation, tip_law)
+        if several_tools.on and sweep < MAX_EXACT and sweep % PATIENCE == PATIENCE - 1:
+            solve_active_set(state, effects)
         worst = 0.0
         for t in range(n_tools):
             if not state.active[t]:
                 continue
             compliance, before = state.compliance[t, t], state.force[t]
             gap = state.gap[t]
-            if superposition is not None:
+            if superposition.on:
                 gap -= superposition.free_normal[t]
-            if several_tools is not None:
+            if several_tools.on:
                 for s in range(n_tools):
                     if s != t and state.active[s]:
                         gap += state.compliance[t, s] * state.force[s]
-            if tip_law is not None:
-                new = solve_tip(
-                    state, superposition, tip_law, large_deformation, t, -gap, compliance
-                )
+            if tip_law.on:
+                new = solve_tip(state, effects, t, -gap, compliance)
             else:
                 gap += compliance * before
-                if large_deformation is not None:
-                    added, tangent = added_depth(state, superposition, None, large_deformation, t)
-                    gap += added
-                    compliance += tangent
+                if large_deformation.on:
+                    evaluate_added_depth(state, large_deformation, t)
+                    gap += large_deformation.added_depth[t, 0]
+                    compliance += large_deformation.added_depth[t, 1] * state.self_compliance[t]
                 new = max(0.0, before - gap / compliance)
             worst = max(worst, abs(new - before) * compliance)
             state.force[t] = new
@@ -400,19 +389,7 @@ def write_forces(model, state, out, tips, effects):  # type: ignore[no-untyped-d
         if state.force[t] <= 0.0:
             continue
         _write_force_at_rest(state, out, t)
-        write_superposed_force(
-            model,
-            state,
-            out,
-            tips[t],
-            e.superposition,
-            e.several_tools,
-            e.large_deformation,
-            e.friction,
-            e.viscoelasticity,
-            e.tip_law,
-            t,
-        )
+        write_superposed_force(model, state, out, tips[t], effects, t)
         _add_fading_force(model, state, out, e.friction, t)
         if add_nonlinear_force(state, e.large_deformation, out, t) and out.status[t] == OK:
             out.status[t] = EXTRAPOLATED
@@ -444,7 +421,7 @@ def _add_fading_force(model, state, out, friction, t):  # type: ignore[no-untype
     if chi < 1.0:
         fading = model.softness[0] / (chi * chi)
         square = state.force[t] * state.force[t]
-        if friction is not None:
+        if friction.on:
             square = force_squared(friction, t)
         for d in range(3):
             out.force[t, d] -= 0.5 * square * fading * state.access_slope[t, d]

@@ -18,8 +18,7 @@ from avatar_core.common.array_table import ArrayTable
 from avatar_core.contact import kernels, locate
 from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.selection import Selection, allocate
-from avatar_core.contact.effects.tip_law import dent_energy
+from avatar_core.contact.effects.selection import Selection, allocate, every_effect
 from avatar_core.contact.kernels import Out, State
 from avatar_core.contact.layout import PERIOD, Layout, lay_out
 from avatar_core.contact.status import FAR_AWAY as FAR_AWAY
@@ -33,8 +32,7 @@ if TYPE_CHECKING:
 
 
 class Compiled(NamedTuple):
-    """Both halves of a step, compiled for the types of one model; and the error of its forces, with
-    its arguments."""
+    """Both halves of a step, and the error of its forces with its arguments."""
 
     solve: Callable[..., int]
     deform: Callable[..., None]
@@ -42,14 +40,9 @@ class Compiled(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """The arguments of a step but the tips.
-
-    arrays : of the model, but for its ``space``
-    space : modes of the cloud
-    """
+    """The arguments of a step but the tips."""
 
     arrays: ArrayTable
-    space: np.ndarray
     state: ArrayTable
     out: ArrayTable
     effects: ArrayTable
@@ -172,7 +165,7 @@ def prepare(
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
 ) -> ContactModel:
-    """Lay out a vademecum for the step, and compile the step for the effects. Not real-time safe.
+    """Lay out a vademecum for the step. Not real-time safe: the first time compiles the step.
 
     Parameters
     ----------
@@ -194,18 +187,15 @@ def prepare(
 
 
 def make_model(layout: Layout) -> ContactModel:
-    """Allocate state and outputs, and compile and run the step once. Not real-time safe."""
+    """Allocate state and outputs, and run the step once. Not real-time safe."""
     arrays, state, out, effects = layout.arrays, _state(layout), _out(layout), _effects(layout)
     far_away = np.full((len(arrays.tip_offset), 3), FAR_AWAY)
     tables = Tables(
-        ArrayTable(arrays._replace(space=None)),
-        arrays.space,
-        *map(ArrayTable, (state, out, effects)),
+        ArrayTable(arrays), ArrayTable(state), ArrayTable(out), ArrayTable(effects, every_effect())
     )
-    around = (tables.arrays, tables.state, tables.out, far_away)
-    law = None if effects.tip_law is None else ArrayTable(effects.tip_law)
-    error = partial(compiled_for(kernels.force_error, *around, law), *around, law)
-    first = compiled_for(kernels.contact_solve, *around, tables.effects)
+    around = (tables.arrays, tables.state, tables.out, far_away, tables.effects)
+    error = partial(compiled_for(kernels.force_error, *around), *around)
+    first = compiled_for(kernels.contact_solve, *around)
     compiled = Compiled(first, compiled_for(kernels.contact_deform, *tables), error)
     model = ContactModel(layout, state, effects, out, far_away, tables, compiled)
     model.reset()
@@ -314,7 +304,7 @@ def step(model: ContactModel, tips: np.ndarray) -> int:
 def solve(model: ContactModel, tips: np.ndarray) -> int:
     """The first half of :func:`step`: forces and contacts. Real-time safe, as :func:`step`."""
     model.tips[:] = tips
-    arrays, _, state, out, effects = model.tables
+    arrays, state, out, effects = model.tables
     return model.compiled.solve(arrays, state, out, model.tips, effects)
 
 
@@ -331,27 +321,3 @@ def estimate_error(model: ContactModel) -> None:
     the sending of the forces.
     """
     model.compiled.error()
-
-
-def stored_energy(model: ContactModel) -> float:
-    """Elastic energy of the organ, lambda . C lambda / 2 and that of large deformation [J].
-
-    Not defined with viscoelasticity, which stores and dissipates at once.
-    """
-    state, effects = model.state, model.effects
-    active = np.flatnonzero(state.force > 0.0)
-    if effects.friction is not None:
-        push, compliance = effects.friction.push, effects.friction.compliance
-        energy = 0.5 * sum(
-            float(push[t] @ compliance[t, s] @ push[s]) for t in active for s in active
-        )
-    else:
-        force = state.force[active]
-        energy = 0.5 * force @ state.compliance[np.ix_(active, active)] @ force
-    if effects.tip_law is not None:
-        energy += sum(dent_energy(effects.tip_law, int(t)) for t in active)
-    if effects.large_deformation is not None:
-        for t in active:
-            h, _, whole, _ = effects.large_deformation.added_depth[t]
-            energy += h * state.force[t] - whole / state.self_compliance[t]
-    return float(energy)

@@ -86,7 +86,7 @@ def modes_at_nodes(model, state, t, amplitude, out):  # type: ignore[no-untyped-
 def free_tip_displacement(model, state, superposition, viscoelasticity, t):  # type: ignore[no-untyped-def]
     """Displacement of a tip's patch without any load in this period."""
     modes_at_nodes(model, state, t, superposition.free, superposition.displacement)
-    if viscoelasticity is not None:
+    if viscoelasticity.on:
         near_free_displacement(model, state, viscoelasticity, t, superposition.near_free[t])
     n = state.n_nodes[t]
     superposition.free_normal[t] = 0.0
@@ -94,7 +94,7 @@ def free_tip_displacement(model, state, superposition, viscoelasticity, t):  # t
         value = 0.0
         for i in range(n):
             value += state.weight[t, i, 0] * superposition.displacement[i, d]
-            if viscoelasticity is not None:
+            if viscoelasticity.on:
                 value += state.weight[t, i, 0] * superposition.near_free[t, i, d]
         superposition.free_displacement[t, d] = state.scale[t] * value
         superposition.free_normal[t] += state.normal[t, d] * superposition.free_displacement[t, d]
@@ -103,14 +103,14 @@ def free_tip_displacement(model, state, superposition, viscoelasticity, t):  # t
 @fast
 def superpose_modes(state, superposition, friction):  # type: ignore[no-untyped-def]
     """The modes under the forces that were found."""
-    if superposition is None:
+    if not superposition.on:
         return
     total = superposition.total
     total[:] = 0.0
     for t in range(state.passage.shape[0]):
         if state.force[t] <= 0.0:
             continue
-        if friction is not None:
+        if friction.on:
             add_modal_load(state, friction, t, total)
         else:
             force = state.force[t] * state.scale[t]
@@ -121,55 +121,44 @@ def superpose_modes(state, superposition, friction):  # type: ignore[no-untyped-
 
 
 @fast
-def _displacement_at_nodes(  # type: ignore[no-untyped-def]
-    model, state, superposition, several_tools, friction, viscoelasticity, t
-):
+def _displacement_at_nodes(model, state, effects, t):  # type: ignore[no-untyped-def]
     """Displacement at the nodes of a tip by all causes, and by its unit normal force at rest."""
+    superposition, several_tools = effects.superposition, effects.several_tools
+    friction, viscoelasticity = effects.friction, effects.viscoelasticity
     displacement, unit = superposition.displacement, superposition.unit_displacement
     modes_at_nodes(model, state, t, state.mode[t], unit)
     modes_at_nodes(model, state, t, superposition.total, displacement)
     for i in range(state.n_nodes[t]):
         for d in range(3):
             unit[i, d] += state.column[t, i, d]
-    if friction is not None:
-        add_near_friction(model, state, superposition, several_tools, friction, t)
+    if friction.on:
+        add_near_friction(model, state, effects, t)
     else:
         near = -state.force[t] * state.scale[t] * superposition.near_gain[0]
         for i in range(state.n_nodes[t]):
             for d in range(3):
                 displacement[i, d] += near * state.column[t, i, d]
-        if several_tools is not None:
+        if several_tools.on:
             add_near_of_others(state, superposition, several_tools, t)
-    if viscoelasticity is not None:
+    if viscoelasticity.on:
         for i in range(state.n_nodes[t]):
             for d in range(3):
                 displacement[i, d] += superposition.near_free[t, i, d]
 
 
 @fast
-def write_superposed_force(  # type: ignore[no-untyped-def]
-    model,
-    state,
-    out,
-    tip,
-    superposition,
-    several_tools,
-    large_deformation,
-    friction,
-    viscoelasticity,
-    tip_law,
-    t,
-):
+def write_superposed_force(model, state, out, tip, effects, t):  # type: ignore[no-untyped-def]
     """F of the module's docstring, without the terms of large deformation and fading access."""
-    if superposition is None:
+    superposition, friction = effects.superposition, effects.friction
+    if not superposition.on:
         return
     n, a, count = state.normal[t], state.scale[t], state.n_nodes[t]
     displacement, unit = superposition.displacement, superposition.unit_displacement
     gradient = superposition.normal_gradient
     _normal_gradient(model, state, superposition, t, tip)
-    _displacement_at_nodes(model, state, superposition, several_tools, friction, viscoelasticity, t)
+    _displacement_at_nodes(model, state, effects, t)
     g0, g1, g2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
-    if friction is not None:
+    if friction.on:
         g0, g1, g2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
     u0 = u1 = u2 = v0 = v1 = v2 = 0.0
     for i in range(count):
@@ -191,10 +180,8 @@ def write_superposed_force(  # type: ignore[no-untyped-def]
             joint += dw * (g0 * u[0] + g1 * u[1] + g2 * u[2])
         change = 0.5 * state.self_slope[t, d] / state.self_compliance[t] - slope / state.gram[t, t]
         value = a * (joint + change * (g0 * u0 + g1 * u1 + g2 * u2))
-        if friction is not None:
-            value -= target_derivative(
-                model, state, superposition, large_deformation, friction, tip_law, t, d
-            )
+        if friction.on:
+            value -= target_derivative(model, state, effects, t, d)
         else:
             turned = turn0 * u0 + turn1 * u1 + turn2 * u2
             value += state.force[t] * (state.slope[t, d] - a * turned)

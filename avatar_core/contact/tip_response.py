@@ -199,7 +199,7 @@ def gather(model, state, t, cell, superposition):  # type: ignore[no-untyped-def
                 if row < 0:
                     continue
                 b = wx[i] * wy[j] * wz[k]
-                if superposition is not None:
+                if superposition.on:
                     b0, b1 = dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k]
                     b2 = wx[i] * wy[j] * dz[k]
                 for e in range(model.carrier.shape[1]):
@@ -214,7 +214,7 @@ def gather(model, state, t, cell, superposition):  # type: ignore[no-untyped-def
                         weight[q] = 0.0
                         n += 1
                     weight[q, 0] += b * carrier_weight
-                    if superposition is not None:
+                    if superposition.on:
                         weight[q, 1] += b0 * carrier_weight
                         weight[q, 2] += b1 * carrier_weight
                         weight[q, 3] += b2 * carrier_weight

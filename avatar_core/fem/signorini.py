@@ -150,11 +150,6 @@ class CondensedContact:
         self._compliance = _condensed(elasticity, loads, progress)
 
     @property
-    def n_candidates(self) -> int:
-        """Number of pressures that the organ is condensed to."""
-        return len(self._compliance)
-
-    @property
     def first_depths(self) -> np.ndarray:
         """Depth at which each tip first touches, to an element, shape (n_pushes,) [m].
 
@@ -201,39 +196,6 @@ class CondensedContact:
         """Displacements of the mesh's vertices, shape (n_contacts, n_vertices, 3) [m]."""
         solution = self.elasticity.solve(np.stack([contact.loads for contact in contacts], axis=1))
         return self.elasticity.at_vertices(solution).T.reshape(len(contacts), -1, 3)
-
-
-def resolved_contact(
-    elasticity: Elasticity,
-    tips: Sequence[Tip],
-    points: np.ndarray,
-    axes: np.ndarray,
-    depths: Sequence[float],
-) -> tuple[Contact, np.ndarray]:
-    """The contact of tips that press at once, and the displacement of the mesh's vertices.
-
-    Parameters
-    ----------
-    elasticity : Elasticity, on a mesh fine around the points
-    tips : of each tool
-    points : ndarray, shape (n_tips, 3), places on the surface [m]
-    axes : ndarray, shape (n_tips, 3), unit, pointing out of the organ
-    depths : of each tip's lowest point below its place, along its axis [m]
-
-    Returns
-    -------
-    contact : Contact
-    displacement : ndarray, shape (n_vertices, 3) [m]
-
-    Raises
-    ------
-    ContactError, ConvergenceError
-        As :class:`CondensedContact`.
-    """
-    pushes = [Push(*each) for each in zip(tips, points, axes, strict=True)]
-    condensed = CondensedContact(elasticity, pushes, np.array(depths))
-    contact = condensed.solve(range(len(pushes)), depths)
-    return contact, condensed.displacements([contact])[0]
 
 
 def through_centre(push: Push, touch: Touch) -> Push:

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar_core.contact.model import FAR_AWAY, ContactModel, Status, step, stored_energy
+from avatar_core.contact.model import FAR_AWAY, ContactModel, Status, step
 from avatar_core.geometry.tip import Tip
+from tests.helpers.energies import stored_energy
 
 AWAY = np.full(3, FAR_AWAY)
 

@@ -110,7 +110,7 @@ def friction_state(arrays: FrictionArrays, n_tools: int, n_modes: int) -> Fricti
 @fast
 def gather_friction(model, state, friction, t):  # type: ignore[no-untyped-def]
     """Modal loads of unit forces along x, y and z, and the near part of the tip's compliance."""
-    if friction is None:
+    if not friction.on:
         return
     mode = friction.mode[t]
     mode[:] = np.float32(0.0)
@@ -139,17 +139,17 @@ def _near_between(model, state, friction, t, s):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _assemble(  # type: ignore[no-untyped-def]
-    model, state, superposition, several_tools, large_deformation, friction, tip_law
-):
+def _assemble(model, state, effects):  # type: ignore[no-untyped-def]
     """The 3 x 3 blocks of C between all tips in contact."""
+    superposition, several_tools = effects.superposition, effects.several_tools
+    friction, tip_law = effects.friction, effects.tip_law
     for t in range(state.passage.shape[0]):
         for s in range(t + 1):
             if not (state.active[t] and state.active[s]):
                 continue
             if s != t:
                 friction.near[t, s] = 0.0
-                if several_tools is not None and several_tools.near[s, t]:
+                if several_tools.on and several_tools.near[s, t]:
                     _near_between(model, state, friction, t, s)
             scale = state.scale[t] * state.scale[s]
             for c in range(3):
@@ -166,17 +166,18 @@ def _assemble(  # type: ignore[no-untyped-def]
             fade = model.softness[0] * (1.0 / state.access[t] - 1.0)
             for d in range(3):
                 friction.compliance[t, t, d, d] += fade
-            if tip_law is not None:
-                _press_alone(state, superposition, large_deformation, tip_law, t)
+            if tip_law.on:
+                _press_alone(state, effects, t)
                 _add_tangential_dent(state, friction, tip_law, t)
 
 
 @fast
-def _press_alone(state, superposition, large_deformation, tip_law, t):  # type: ignore[no-untyped-def]
+def _press_alone(state, effects, t):  # type: ignore[no-untyped-def]
     """The contact radius that the tip would have without friction and other tips."""
+    superposition = effects.superposition
     depth, kept = superposition.free_normal[t] - state.gap[t], state.force[t]
     own = state.compliance[t, t]
-    solve_tip(state, superposition, tip_law, large_deformation, t, depth, own)
+    solve_tip(state, effects, t, depth, own)
     state.force[t] = kept
 
 
@@ -198,11 +199,10 @@ def _add_tangential_dent(state, friction, tip_law, t):  # type: ignore[no-untype
 
 
 @inlined
-def solve_friction(  # type: ignore[no-untyped-def]
-    model, state, tips, superposition, several_tools, large_deformation, friction, tip_law
-):
+def solve_friction(model, state, tips, effects):  # type: ignore[no-untyped-def]
     """Stick where friction can hold the tip, slip elsewhere; whether the last sweeps converged."""
-    _assemble(model, state, superposition, several_tools, large_deformation, friction, tip_law)
+    friction = effects.friction
+    _assemble(model, state, effects)
     mu_s, mu_k = friction.coefficients[0], friction.coefficients[1]
     for t in range(state.passage.shape[0]):
         if not state.active[t]:
@@ -218,19 +218,17 @@ def solve_friction(  # type: ignore[no-untyped-def]
             friction.limit[t] = mu_s
         elif friction.motion[t] == SLIPS:
             friction.limit[t] = mu_k
-    converged = _sweep(state, superposition, several_tools, large_deformation, friction, tip_law)
+    converged = _sweep(state, effects)
     again = False
     for t in range(state.passage.shape[0]):
         if state.active[t] and friction.motion[t] == STICKS and not _sticks(state, friction, t):
             friction.limit[t] = mu_k
             again = True
     if again:
-        converged = _sweep(
-            state, superposition, several_tools, large_deformation, friction, tip_law
-        )
+        converged = _sweep(state, effects)
     for t in range(state.passage.shape[0]):
         if state.active[t]:
-            _slide_anchor(state, superposition, several_tools, friction, t)
+            _slide_anchor(state, effects, t)
     return converged
 
 
@@ -256,22 +254,19 @@ def _set_offset(model, state, friction, tips, t):  # type: ignore[no-untyped-def
 
 
 @inlined
-def _sweep(state, superposition, several_tools, large_deformation, friction, tip_law):  # type: ignore[no-untyped-def]
+def _sweep(state, effects):  # type: ignore[no-untyped-def]
     """Gauss-Seidel over the tips, normal then tangential force of each; whether it converged."""
+    several_tools = effects.several_tools
     for sweep in range(MAX_SWEEPS):
-        if several_tools is not None and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
+        if several_tools.on and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
             start = (sweep // PATIENCE) % (state.passage.shape[0] + 1)
-            newton_steps(
-                state, superposition, several_tools, large_deformation, friction, tip_law, start
-            )
+            newton_steps(state, effects, start)
         worst = 0.0
         for t in range(state.passage.shape[0]):
             if state.active[t]:
-                change = _update_normal(
-                    state, superposition, several_tools, large_deformation, friction, tip_law, t
-                )
+                change = _update_normal(state, effects, t)
                 worst = max(worst, change)
-                change = _update_tangential(state, superposition, several_tools, friction, t)
+                change = _update_tangential(state, effects, t)
                 worst = max(worst, change)
         if worst < GAP_TOLERANCE:
             return True
@@ -279,12 +274,11 @@ def _sweep(state, superposition, several_tools, large_deformation, friction, tip
 
 
 @fast
-def _update_normal(  # type: ignore[no-untyped-def]
-    state, superposition, several_tools, large_deformation, friction, tip_law, t
-):
+def _update_normal(state, effects, t):  # type: ignore[no-untyped-def]
     """0 <= lambda  perp  gap - n . U + h >= 0."""
+    friction, tip_law = effects.friction, effects.tip_law
     n, c = state.normal[t], friction.compliance[t, t]
-    u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
+    u0, u1, u2 = patch_displacement(state, effects, t)
     gap = state.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2)
     stiff = 0.0
     for i in range(3):
@@ -292,14 +286,12 @@ def _update_normal(  # type: ignore[no-untyped-def]
             stiff += n[i] * c[i, j] * n[j]
     g = friction.push[t]
     force = -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
-    if tip_law is not None:
+    if tip_law.on:
         depth = stiff * force - gap
-        change = (
-            solve_tip(state, superposition, tip_law, large_deformation, t, depth, stiff) - force
-        )
+        change = solve_tip(state, effects, t, depth, stiff) - force
     else:
         state.force[t] = max(0.0, force)
-        added, tangent = added_depth(state, superposition, tip_law, large_deformation, t)
+        added, tangent = added_depth(state, effects, t)
         stiff += tangent
         change = max(0.0, force - (gap + added) / stiff) - force
     for d in range(3):
@@ -309,10 +301,11 @@ def _update_normal(  # type: ignore[no-untyped-def]
 
 
 @fast
-def _update_tangential(state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
+def _update_tangential(state, effects, t):  # type: ignore[no-untyped-def]
     """tau <- tau + (y - U)_t / c_t, projected to |tau| <= mu lambda."""
+    friction = effects.friction
     n, c, g, y = state.normal[t], friction.compliance[t, t], friction.push[t], friction.offset[t]
-    u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
+    u0, u1, u2 = patch_displacement(state, effects, t)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
     along = x0 * n[0] + x1 * n[1] + x2 * n[2]
     across = c[0, 0] + c[1, 1] + c[2, 2]
@@ -349,8 +342,9 @@ def _sticks(state, friction, t):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _slide_anchor(state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
+def _slide_anchor(state, effects, t):  # type: ignore[no-untyped-def]
     """Move the anchor of a slipping tip with it, and set the state of the tip."""
+    friction = effects.friction
     friction.slipped[t] = 0.0
     if state.force[t] <= 0.0:
         friction.motion[t] = NONE
@@ -360,7 +354,7 @@ def _slide_anchor(state, superposition, several_tools, friction, t):  # type: ig
         friction.motion[t] = STICKS
         return
     n, y = state.normal[t], friction.offset[t]
-    u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
+    u0, u1, u2 = patch_displacement(state, effects, t)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
     if friction.motion[t] != NONE:
         along = x0 * n[0] + x1 * n[1] + x2 * n[2]
@@ -384,12 +378,14 @@ def add_modal_load(state, friction, t, total):  # type: ignore[no-untyped-def]
 
 
 @fast
-def add_near_friction(model, state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
+def add_near_friction(model, state, effects, t):  # type: ignore[no-untyped-def]
     """Add the near displacement at the nodes of a tip by the pushes of all tips."""
+    superposition, several_tools = effects.superposition, effects.several_tools
+    friction = effects.friction
     for s in range(state.passage.shape[0]):
         if state.force[s] <= 0.0:
             continue
-        if s != t and (several_tools is None or not several_tools.near[s, t]):
+        if s != t and (not several_tools.on or not several_tools.near[s, t]):
             continue
         factor, g = state.scale[s] * superposition.near_gain[0], friction.push[s]
         for i in range(state.n_nodes[s]):
@@ -407,15 +403,14 @@ def add_near_friction(model, state, superposition, several_tools, friction, t): 
 
 
 @fast
-def target_derivative(  # type: ignore[no-untyped-def]
-    model, state, superposition, large_deformation, friction, tip_law, t, d
-):
+def target_derivative(model, state, effects, t, d):  # type: ignore[no-untyped-def]
     """g . d(target)/dp_d of U = y + n (gap - n . y), y = p - r n - s_a.
 
     The dent's own tangential displacement, give tau, turns with n: - give lambda tau . dn/dp_d.
     """
+    superposition, friction = effects.superposition, effects.friction
     n, g, y, r = state.normal[t], friction.push[t], friction.offset[t], model.tip_offset[t]
-    added, _ = added_depth(state, superposition, tip_law, large_deformation, t)
+    added, _ = added_depth(state, effects, t)
     gap = state.gap[t] + added
     gap -= n[0] * y[0] + n[1] * y[1] + n[2] * y[2]
     slope = state.slope[t, d]
@@ -439,7 +434,7 @@ def force_squared(friction, t):  # type: ignore[no-untyped-def]
 @fast
 def add_torque(model, state, friction, out, t):  # type: ignore[no-untyped-def]
     """Moment about the tip's centre of the force at its contact point, -r n x F."""
-    if friction is None:
+    if not friction.on:
         return
     n, r, f = state.normal[t], model.tip_offset[t], out.force[t]
     out.torque[t, 0] -= r * (n[1] * f[2] - n[2] * f[1])

@@ -26,15 +26,17 @@ LEAST_PIVOT = 1e-9
 
 
 @fast
-def patch_displacement(state, superposition, several_tools, friction, t):  # type: ignore[no-untyped-def]
+def patch_displacement(state, effects, t):  # type: ignore[no-untyped-def]
     """U of a tip's patch: the displacement by the present pushes and without them."""
+    superposition, several_tools = effects.superposition, effects.several_tools
+    friction = effects.friction
     u0, u1, u2 = (
         superposition.free_displacement[t, 0],
         superposition.free_displacement[t, 1],
         superposition.free_displacement[t, 2],
     )
     for s in range(state.passage.shape[0]):
-        if s != t and (several_tools is None or not state.active[s]):
+        if s != t and (not several_tools.on or not state.active[s]):
             continue
         c, g = friction.compliance[t, s], friction.push[s]
         u0 += c[0, 0] * g[0] + c[0, 1] * g[1] + c[0, 2] * g[2]
@@ -44,21 +46,18 @@ def patch_displacement(state, superposition, several_tools, friction, t):  # typ
 
 
 @inlined
-def newton_steps(  # type: ignore[no-untyped-def]
-    state, superposition, several_tools, large_deformation, friction, tip_law, start
-):
+def newton_steps(state, effects, start):  # type: ignore[no-untyped-def]
     """Replace all pushes by those of the Newton step with the least residual.
 
     start : 0 from the present pushes, t from tip t - 1 alone
     """
+    superposition, friction = effects.superposition, effects.friction
     push, best, n_tools = friction.push, friction.best, state.passage.shape[0]
     least = np.inf
     for k in range(STEPS + 1):
         size = 0.0
         for t in range(n_tools):
-            size += _linearise(
-                state, superposition, several_tools, large_deformation, friction, tip_law, t
-            )
+            size += _linearise(state, effects, t)
         if size < least:
             least = size
             for t in range(n_tools):
@@ -98,10 +97,10 @@ def _start_from_one_tip(state, superposition, friction, t):  # type: ignore[no-u
 
 
 @inlined
-def _linearise(  # type: ignore[no-untyped-def]
-    state, superposition, several_tools, large_deformation, friction, tip_law, t
-):
+def _linearise(state, effects, t):  # type: ignore[no-untyped-def]
     """A tip's rows of the Newton system; returns its squared residual [N^2]."""
+    large_deformation, friction = effects.large_deformation, effects.friction
+    tip_law = effects.tip_law
     matrix, rhs, n_tools = friction.matrix, friction.rhs, state.passage.shape[0]
     for i in range(3):
         rhs[3 * t + i] = 0.0
@@ -114,12 +113,12 @@ def _linearise(  # type: ignore[no-untyped-def]
     for i in range(3):
         normal += n[i] * (c[i, 0] * n[0] + c[i, 1] * n[1] + c[i, 2] * n[2])
     across = 0.5 * (c[0, 0] + c[1, 1] + c[2, 2] - normal)
-    u0, u1, u2 = patch_displacement(state, superposition, several_tools, friction, t)
+    u0, u1, u2 = patch_displacement(state, effects, t)
     force = -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
     w, bending = state.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2), 0.0
-    if large_deformation is not None or tip_law is not None:
+    if large_deformation.on or tip_law.on:
         state.force[t] = max(0.0, force)
-        added, bending = added_depth(state, superposition, tip_law, large_deformation, t)
+        added, bending = added_depth(state, effects, t)
         w += added
     pressed = force - w / (normal + bending)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2

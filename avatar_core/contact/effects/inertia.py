@@ -85,26 +85,28 @@ def inertia_state(
 
 
 @fast
-def predict_inertia(superposition, inertia, viscoelasticity, self_weight):  # type: ignore[no-untyped-def]
+def predict_inertia(effects):  # type: ignore[no-untyped-def]
     """Modes at the end of the period without any load, and their gain by a unit load."""
+    superposition, inertia = effects.superposition, effects.inertia
+    viscoelasticity, self_weight = effects.viscoelasticity, effects.self_weight
     dt = inertia.period[0]
     for k in range(inertia.mass.shape[0]):
         m, q, v = inertia.mass[k], inertia.modes[k], inertia.velocity[k]
         stiff, before, after = 1.0, q, q  # dR/dq, R now, R at the end for constant q
-        if viscoelasticity is not None:
+        if viscoelasticity.on:
             stiff = 1.0 / viscoelasticity.gain[0]
             before, after = viscoelasticity.rest[0] * viscoelasticity.elastic[k], 0.0
             for i in range(viscoelasticity.decay.shape[0]):
                 before += viscoelasticity.past[i, k]
             after = viscoelasticity.held[k] + stiff * viscoelasticity.elastic[k]
-        elif self_weight is not None:  # R is relative to the sagged organ
+        elif self_weight.on:  # R is relative to the sagged organ
             before -= self_weight.amplitude[k]
             after -= self_weight.amplitude[k]
         whole = 2.0 * m / dt + 0.5 * stiff * dt + inertia.damping[k]
         middle = (2.0 * m * v / dt - 0.5 * (before + after)) / whole
         superposition.free[k] = q + dt * middle
         superposition.gain[k] = dt / whole
-    if viscoelasticity is not None:
+    if viscoelasticity.on:
         for k in range(inertia.mass.shape[0], superposition.free.shape[0]):
             superposition.free[k] = -viscoelasticity.gain[0] * viscoelasticity.held[k]
             superposition.gain[k] = viscoelasticity.gain[0]
@@ -113,7 +115,7 @@ def predict_inertia(superposition, inertia, viscoelasticity, self_weight):  # ty
 @fast
 def advance_inertia(superposition, inertia):  # type: ignore[no-untyped-def]
     """Complete the period: modes and their velocities at its end."""
-    if inertia is None:
+    if not inertia.on:
         return
     dt = inertia.period[0]
     for k in range(superposition.total.shape[0]):
@@ -122,8 +124,3 @@ def advance_inertia(superposition, inertia):  # type: ignore[no-untyped-def]
             speed = 2.0 * (new - inertia.modes[k]) / dt - inertia.velocity[k]
             inertia.velocity[k] = speed if abs(speed) > 1e-30 else 0.0
         inertia.modes[k] = new if abs(new) > 1e-30 else 0.0
-
-
-def kinetic_energy(inertia: InertiaState) -> float:
-    """sum_k m_k v_k^2 / 2 [J]."""
-    return float(0.5 * inertia.mass @ inertia.velocity**2)

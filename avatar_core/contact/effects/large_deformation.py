@@ -78,9 +78,9 @@ def large_deformation_state(arrays: LargeDeformationArrays, n_tools: int) -> Lar
 @inlined
 def sample_coefficients(model, state, law, large_deformation, t, tip):  # type: ignore[no-untyped-def]
     """beta_2, beta_3, the reach and k at a tip, with their gradients."""
-    if large_deformation is None:
+    if not large_deformation.on:
         return
-    if law is not None:
+    if law.on:
         gamma, taken = state.self_compliance[t], law.value[t, TAKEN]
         large_deformation.kept[t] = 1.0 - taken / gamma
         for d in range(3):
@@ -113,7 +113,7 @@ def evaluate_added_depth(state, large_deformation, t):  # type: ignore[no-untype
 @fast
 def add_nonlinear_force(state, large_deformation, out, t):  # type: ignore[no-untyped-def]
     """d/dp of the energy H = 1/gamma int_0^a h, at fixed force; whether a exceeds the reach."""
-    if large_deformation is None:
+    if not large_deformation.on:
         return False
     evaluate_added_depth(state, large_deformation, t)
     added, gradient = large_deformation.added_depth[t], large_deformation.coefficient_gradient[t]

@@ -66,7 +66,7 @@ def respiration_state(arrays: RespirationArrays) -> RespirationState:
 @inlined
 def to_organ_frame(respiration, tips):  # type: ignore[no-untyped-def]
     """Advance the breath by a period, and transform the tips to the organ's frame."""
-    if respiration is None:
+    if not respiration.on:
         return
     period = respiration.timing[0]
     respiration.clock[0] = (respiration.clock[0] + respiration.timing[2]) % period
@@ -81,7 +81,7 @@ def to_organ_frame(respiration, tips):  # type: ignore[no-untyped-def]
 @inlined
 def to_world_frame(respiration, out):  # type: ignore[no-untyped-def]
     """Contacts back to the world's frame; the frames do not rotate, so forces stay the same."""
-    if respiration is None:
+    if not respiration.on:
         return
     for i in range(out.n_contacts[0]):
         for d in range(3):
@@ -91,7 +91,7 @@ def to_world_frame(respiration, out):  # type: ignore[no-untyped-def]
 @fast
 def shift_cloud(respiration, cloud):  # type: ignore[no-untyped-def]
     """Deformed positions to the world's frame; displacements stay relative to the organ."""
-    if respiration is None:
+    if not respiration.on:
         return
     x, y, z = (
         np.float32(respiration.shift[0]),

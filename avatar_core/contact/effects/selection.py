@@ -1,13 +1,15 @@
-"""From the effects that a scene names to the arguments of its step.
+"""From the effects that a scene names to the arrays of its step.
 
 Offline, :func:`selected_arrays` asks each chosen effect for the constant arrays it needs; then
-:func:`allocate` adds state and scratch. An effect that is not chosen stays None in both.
+:func:`allocate` adds state and scratch. An effect that is not chosen stays None in both; compiled
+code finds it off.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
@@ -61,27 +63,27 @@ if TYPE_CHECKING:
 
 
 class Constants(NamedTuple):
-    """Constant arrays of each effect, in the order of the step's arguments; None if not chosen.
+    """Constant arrays of each effect, None if it is not chosen.
 
     tip_law, dent : no effects, but absent where the load is the vademecum's own patch
     display : no effect either, but absent where the mesh's own vertices are shown
     """
 
-    several_tools: Any = None
-    large_deformation: Any = None
-    friction: Any = None
-    viscoelasticity: Any = None
-    inertia: Any = None
-    self_weight: Any = None
-    respiration: Any = None
-    tip_law: Any = None
-    dent: Any = None
-    tilt: Any = None
-    display: Any = None
+    several_tools: SeveralToolsArrays | None = None
+    large_deformation: LargeDeformationArrays | None = None
+    friction: FrictionArrays | None = None
+    viscoelasticity: ViscoelasticityArrays | None = None
+    inertia: InertiaArrays | None = None
+    self_weight: SelfWeightArrays | None = None
+    respiration: RespirationArrays | None = None
+    tip_law: TipLawArrays | None = None
+    dent: DentArrays | None = None
+    tilt: TiltArrays | None = None
+    display: DisplayArrays | None = None
 
 
 class Selection(NamedTuple):
-    """The step's arguments after ``tips``.
+    """The effects of a step, each None or its arrays.
 
     superposition : present with any effect but large deformation, respiration and tilt
     tip_law : with the tilt of the tips
@@ -100,20 +102,12 @@ class Selection(NamedTuple):
     display: Any
 
 
+# Kind of each effect's constant arrays, by its name.
 ARRAYS: dict[str, Any] = {
-    "several_tools": SeveralToolsArrays,
-    "large_deformation": LargeDeformationArrays,
-    "friction": FrictionArrays,
-    "viscoelasticity": ViscoelasticityArrays,
-    "inertia": InertiaArrays,
-    "self_weight": SelfWeightArrays,
-    "respiration": RespirationArrays,
-    "tip_law": TipLawArrays,
-    "dent": DentArrays,
-    "tilt": TiltArrays,
-    "display": DisplayArrays,
+    name: get_args(kind)[0] for name, kind in get_type_hints(Constants).items()
 }
-NO_EFFECTS = Constants()
+
+_NONE, _POINTS = np.zeros(1, np.int64), np.zeros(0, np.int32)
 
 _E = TypeVar("_E", bound=Effect)
 
@@ -219,3 +213,36 @@ def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int)
         dent_state(dent) if dent else None,
         display,
     )
+
+
+@cache
+def every_effect() -> Selection:
+    """All effects at once, as small as they can be: the types of arrays that a step may read."""
+    f4, grid = np.float32, (1, 1, 1)
+    law = TipLawArrays(
+        profile=np.zeros((1, 1, 8)),
+        radius=np.ones(1),
+        bluntness=np.zeros(1),
+        least_kappa=np.zeros(1),
+        mindlin=np.zeros(1),
+        error_factor=np.zeros(1),
+        modulus=np.zeros(1),
+        large_dent=np.zeros((1, 6)),
+        local=np.zeros((5, *grid), f4),
+    )
+    constants = Constants(
+        SeveralToolsArrays(np.zeros(1)),
+        LargeDeformationArrays(np.zeros((3, *grid), f4), np.zeros((1, 2, 1), f4), _NONE),
+        friction_arrays(Friction()),
+        viscoelasticity_arrays(Viscoelasticity((0.5,), (0.1,)), 1e-3),
+        inertia_arrays(Inertia(), np.zeros(1), 1e-3),
+        SelfWeightArrays(np.zeros(1)),
+        respiration_arrays(Respiration(), 1e-3),
+        law,
+        DentArrays(np.zeros(1), np.zeros((1, 1)), np.zeros((2, 1)), np.zeros(1), _NONE, _POINTS),
+        TiltArrays(np.zeros(3), np.zeros(1), np.zeros((3, *grid), f4)),
+        DisplayArrays(
+            np.zeros((1, 4), np.int32), np.zeros((1, 4), f4), np.zeros((1, 3), f4), _NONE, _POINTS
+        ),
+    )
+    return allocate(constants, 1, 1, 1)

@@ -70,7 +70,7 @@ def several_tools_state(
 @inlined
 def couple_near_fields(model, state, several_tools, friction):  # type: ignore[no-untyped-def]
     """Near fields between all pairs of tips in contact; with friction, whether they overlap."""
-    if several_tools is None:
+    if not several_tools.on:
         return
     n_tools = state.passage.shape[0]
     for t in range(n_tools):
@@ -82,7 +82,7 @@ def couple_near_fields(model, state, several_tools, friction):  # type: ignore[n
             if state.active[t] and state.active[s]:
                 near = _are_near(state, several_tools, t, s)
                 several_tools.near[t, s] = several_tools.near[s, t] = near
-                if friction is None and near:
+                if not friction.on and near:
                     _couple_pair(model, state, several_tools, t, s)
 
 
@@ -158,7 +158,7 @@ def assemble_coupling(state, superposition, several_tools):  # type: ignore[no-u
 
 
 @inlined
-def solve_active_set(state, superposition, several_tools, large_deformation, tip_law):  # type: ignore[no-untyped-def]
+def solve_active_set(state, effects):  # type: ignore[no-untyped-def]
     """Contact forces by the active-set method, as a start for the sweeps that follow.
 
     Nonnegative least squares in energy (Lawson & Hanson, Solving Least Squares Problems, Sec.
@@ -167,7 +167,8 @@ def solve_active_set(state, superposition, several_tools, large_deformation, tip
     and the energy decreases, however close the tips are. With large deformation this is one Newton
     step. It may end after its last exchange without the solution: the sweeps decide on convergence.
     """
-    _linearise(state, superposition, several_tools, large_deformation, tip_law)
+    several_tools = effects.several_tools
+    _linearise(state, effects)
     n_tools, force, trial = state.passage.shape[0], state.force, several_tools.trial
     active = several_tools.active_set
     for _ in range(MAX_EXCHANGES * n_tools):
@@ -197,8 +198,10 @@ def solve_active_set(state, superposition, several_tools, large_deformation, tip
 
 
 @inlined
-def _linearise(state, superposition, several_tools, large_deformation, tip_law):  # type: ignore[no-untyped-def]
+def _linearise(state, effects):  # type: ignore[no-untyped-def]
     """Gap without forces and compliance at the present forces; tips with a force are active."""
+    superposition, several_tools = effects.superposition, effects.several_tools
+    large_deformation, tip_law = effects.large_deformation, effects.tip_law
     for t in range(state.passage.shape[0]):
         several_tools.active_set[t] = False
         if not state.active[t]:
@@ -207,8 +210,8 @@ def _linearise(state, superposition, several_tools, large_deformation, tip_law):
         for s in range(state.passage.shape[0]):
             several_tools.matrix[t, s] = state.compliance[t, s]
         several_tools.free_gap[t] = state.gap[t] - superposition.free_normal[t]
-        if large_deformation is not None or tip_law is not None:
-            added, tangent = added_depth(state, superposition, tip_law, large_deformation, t)
+        if large_deformation.on or tip_law.on:
+            added, tangent = added_depth(state, effects, t)
             several_tools.matrix[t, t] += tangent
             several_tools.free_gap[t] += added - tangent * state.force[t]
 

@@ -111,7 +111,7 @@ def tilt_state(arrays: TiltArrays) -> TiltState:
 @fast
 def sample_tilt(tilt, t, cell):  # type: ignore[no-untyped-def]
     """How a tip leans; returns how deep its edge is below the centre of its face, a s [m]."""
-    if tilt is None:
+    if not tilt.on:
         return 0.0
     tilt.sine[t], tilt.cosine[t] = 0.0, 1.0
     e, slope = tilt.axis[t], tilt.gradient
@@ -147,7 +147,7 @@ def _righting(ratio):  # type: ignore[no-untyped-def]
 def evaluate_tilt(tilt, t, load):  # type: ignore[no-untyped-def]
     """What leaning adds to the depth of the lowest point [m], to its derivative by the load F / E*
     [1/m], and to the stored energy over E* [m^3]."""
-    if tilt is None:
+    if tilt is None or not tilt.on:
         return 0.0, 0.0, 0.0
     a, edge = tilt.punch[t], tilt.punch[t] * tilt.sine[t]
     if edge == 0.0 or load <= 0.0:
@@ -171,7 +171,7 @@ def add_righting(tilt, out, t, stiffness, elastic, relaxed):  # type: ignore[no-
 
     stiffness : E* [Pa]; elastic : F on an elastic organ [N]; relaxed : of it, what is left
     """
-    if tilt is None:
+    if not tilt.on:
         return
     a, sine = tilt.punch[t], tilt.sine[t]
     if sine == 0.0 or elastic <= 0.0 or tilt.cosine[t] <= 0.0:

@@ -185,7 +185,7 @@ def tip_law_state(arrays: TipLawArrays, n_terms: int, tilt: TiltState | None = N
 @inlined
 def edge_below(law, t, cell):  # type: ignore[no-untyped-def]
     """How deep the lowest point of a tip that leans is below the one that its pose says [m]."""
-    return 0.0 if law is None else sample_tilt(law.tilt, t, cell)
+    return 0.0 if not law.on else sample_tilt(law.tilt, t, cell)
 
 
 @fast
@@ -243,7 +243,8 @@ def _find_place(state, law, large_deformation, t, of_depth, of_load, target):  #
         leaning, bent, _ = evaluate_tilt(law.tilt, t, load)
         value = of_depth * (delta + leaning) + of_load * load - target
         rise = slope * (of_depth * (1.0 + 2.0 * a * bent) + 2.0 * a * of_load)
-        if large_deformation is not None and of_depth > 0.0:
+        # None, as without a step, is known when it compiles
+        if large_deformation is not None and large_deformation.on and of_depth > 0.0:
             state.force[t] = law.value[t, STIFFNESS] * load
             evaluate_added_depth(state, large_deformation, t)
             added, bend = large_deformation.added_depth[t, 0], large_deformation.added_depth[t, 1]
@@ -266,17 +267,19 @@ def _find_place(state, law, large_deformation, t, of_depth, of_load, target):  #
 
 
 @inlined
-def solve_tip(state, superposition, law, large_deformation, t, depth, compliance):  # type: ignore[no-untyped-def]
+def solve_tip(state, effects, t, depth, compliance):  # type: ignore[no-untyped-def]
     """The force of a tip at a depth [m], the organ's own compliance in this period being known.
 
     For viscoelastic tissue the force is e / gain + held, e that on an elastic organ. Of modes with
     mass hardly any compliance is left in a period: it may be less than c, but the depth still grows
     with the force.
     """
+    superposition, law = effects.superposition, effects.tip_law
+    large_deformation = effects.large_deformation
     if depth - compliance * law.held[t] <= 0.0:
         law.elastic[t], law.place[t] = 0.0, 0.0
         return max(0.0, law.held[t])
-    gain = superposition.near_gain[0] if superposition is not None else 1.0
+    gain = superposition.near_gain[0] if superposition.on else 1.0
     stiffness = law.value[t, STIFFNESS]
     most = 0.5 * MOST_TAKEN / (stiffness * law.radius[t]) * law.large_dent[t, LEAST]
     own = max(-most, compliance / gain - law.value[t, TAKEN])
@@ -288,9 +291,11 @@ def solve_tip(state, superposition, law, large_deformation, t, depth, compliance
 
 
 @fast
-def evaluate_tip(state, superposition, law, large_deformation, t):  # type: ignore[no-untyped-def]
+def evaluate_tip(state, effects, t):  # type: ignore[no-untyped-def]
     """delta + eta - c e at the present force, and its derivative by the force."""
-    gain = superposition.near_gain[0] if superposition is not None else 1.0
+    superposition, law = effects.superposition, effects.tip_law
+    large_deformation = effects.large_deformation
+    gain = superposition.near_gain[0] if superposition.on else 1.0
     elastic, taken = gain * (state.force[t] - law.held[t]), law.value[t, TAKEN]
     law.elastic[t] = max(0.0, elastic)
     delta, a = 0.0, 0.0
@@ -300,7 +305,7 @@ def evaluate_tip(state, superposition, law, large_deformation, t):  # type: igno
         delta, _, _, a = dent(law, t)
     a = max(a, LEAST_CONTACT * law.radius[t])
     tangent = 1.0 / (2.0 * law.value[t, STIFFNESS] * a) - taken
-    if large_deformation is not None:
+    if large_deformation.on:
         deeper, slope, _ = evaluate_large_dent(law, t, load)
         delta += deeper
         tangent += slope / law.value[t, STIFFNESS]
@@ -311,15 +316,16 @@ def evaluate_tip(state, superposition, law, large_deformation, t):  # type: igno
 
 
 @fast
-def added_depth(state, superposition, law, large_deformation, t):  # type: ignore[no-untyped-def]
+def added_depth(state, effects, t):  # type: ignore[no-untyped-def]
     """Depth beside C lambda at the present force: of the dent and of large deformation.
 
     Returns it [m] and its derivative by the force [m/N].
     """
+    law, large_deformation = effects.tip_law, effects.large_deformation
     depth = tangent = 0.0
-    if law is not None:
-        depth, tangent = evaluate_tip(state, superposition, law, large_deformation, t)
-    if large_deformation is not None:
+    if law.on:
+        depth, tangent = evaluate_tip(state, effects, t)
+    if large_deformation.on:
         evaluate_added_depth(state, large_deformation, t)
         depth += large_deformation.added_depth[t, 0]
         tangent += large_deformation.added_depth[t, 1] * state.self_compliance[t]
@@ -341,14 +347,14 @@ def tangential_compliance(law, t):  # type: ignore[no-untyped-def]
 @fast
 def add_tip_force(state, law, large_deformation, out, t):  # type: ignore[no-untyped-def]
     """The derivative of the dent's energy at constant force, relaxed as the force has."""
-    if law is None:
+    if not law.on:
         return
     e = law.elastic[t]
     if e <= 0.0:
         return
     third, fourth, stored = _moments(law, t)
     stiffness, gradient = law.value[t, STIFFNESS], law.gradient[t]
-    if large_deformation is not None:
+    if large_deformation.on:
         stored += evaluate_large_dent(law, t, e / stiffness)[2]
     stored += evaluate_tilt(law.tilt, t, e / stiffness)[2]
     relaxed = state.force[t] / e
@@ -420,7 +426,7 @@ def _stand_on(law, curvature, growth, anisotropy):  # type: ignore[no-untyped-de
 @inlined
 def predict_tips(law, viscoelasticity):  # type: ignore[no-untyped-def]
     """The load that would keep each dent as it is, sum_i exp(-dt / tau_i) h_i - e sum_i r_i."""
-    if law is None or viscoelasticity is None:
+    if not law.on or not viscoelasticity.on:
         return
     for t in range(law.held.shape[0]):
         law.held[t] = 0.0
@@ -432,7 +438,7 @@ def predict_tips(law, viscoelasticity):  # type: ignore[no-untyped-def]
 @inlined
 def advance_tips(state, law, viscoelasticity):  # type: ignore[no-untyped-def]
     """The history that each tip carries along, at the end of a period; it ends with the contact."""
-    if law is None or viscoelasticity is None:
+    if not law.on or not viscoelasticity.on:
         return
     v = viscoelasticity
     for t in range(law.held.shape[0]):
@@ -441,12 +447,3 @@ def advance_tips(state, law, viscoelasticity):  # type: ignore[no-untyped-def]
             past = v.decay[i] * law.past[i, t] + v.ramp[i] * (new - law.last[t])
             law.past[i, t] = past if state.active[t] else 0.0
         law.last[t] = new
-
-
-def dent_energy(law: TipLawState, t: int) -> float:
-    """E* (Phi + Psi) - c F^2 / 2 of a tip at rest [J]."""
-    _, _, stored = _moments(law, t)
-    stiffness, taken = law.value[t, STIFFNESS], law.value[t, TAKEN]
-    load = law.elastic[t] / stiffness
-    stored += evaluate_large_dent(law, t, load)[2] + evaluate_tilt(law.tilt, t, load)[2]
-    return float(stiffness * stored - 0.5 * taken * law.elastic[t] ** 2)

@@ -22,7 +22,7 @@ FLATTENINGS = (0.5, 1.5)  # of -tau, over the most that a tip with its radius ca
 @inlined
 def sample_surface(model, law, t, tip):  # type: ignore[no-untyped-def]
     """kappa, tau, D, E* and c at a tip, with their gradients."""
-    if law is None:
+    if not law.on:
         return
     cell = cell_at(model.origin, model.spacing[0], tip)
     for k in range(5):

@@ -132,12 +132,14 @@ def predict_history(viscoelasticity):  # type: ignore[no-untyped-def]
 
 
 @fast
-def predict_modes(superposition, viscoelasticity, self_weight):  # type: ignore[no-untyped-def]
+def predict_modes(effects):  # type: ignore[no-untyped-def]
     """Modes at the end of the period without any load, and their gain, without inertia."""
+    superposition, viscoelasticity = effects.superposition, effects.viscoelasticity
+    self_weight = effects.self_weight
     gain = viscoelasticity.gain[0]
     for k in range(superposition.free.shape[0]):
         free = -gain * viscoelasticity.held[k]
-        if self_weight is not None:
+        if self_weight.on:
             free += self_weight.amplitude[k]
         superposition.free[k] = free
         superposition.gain[k] = gain
@@ -164,16 +166,16 @@ def near_free_displacement(model, state, viscoelasticity, t, near_free):  # type
 
 
 @fast
-def advance_history(  # type: ignore[no-untyped-def]
-    state, superposition, viscoelasticity, friction, self_weight
-):
+def advance_history(state, effects):  # type: ignore[no-untyped-def]
     """Complete the period: e and h_i at its end."""
-    if viscoelasticity is None:
+    superposition, viscoelasticity = effects.superposition, effects.viscoelasticity
+    friction, self_weight = effects.friction, effects.self_weight
+    if not viscoelasticity.on:
         return
     v = viscoelasticity
     for k in range(v.elastic.shape[0]):
         new = superposition.total[k]
-        if self_weight is not None:
+        if self_weight.on:
             new -= self_weight.amplitude[k]
         if abs(new) < 1e-30:
             new = 0.0
@@ -187,7 +189,7 @@ def advance_history(  # type: ignore[no-untyped-def]
             continue
         a, n = state.scale[t], state.normal[t]
         f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
-        if friction is not None:
+        if friction.on:
             f0, f1, f2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
         for i in range(state.n_nodes[t]):
             w = a * state.weight[t, i, 0]

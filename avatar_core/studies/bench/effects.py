@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.contact.effects import (
     Effect,
     Friction,
@@ -26,9 +25,6 @@ from avatar_core.contact.effects import (
 from avatar_core.contact.effects.selection import find
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.contact.tool_path import middle_of_access
-from avatar_core.fem.elasticity import Elasticity, Material
-from avatar_core.fem.patch_loads import load_surface
-from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.large_deformation import (
@@ -36,10 +32,10 @@ from avatar_core.offline.large_deformation import (
     hyperelastic_problem,
     with_large_deformation,
 )
-from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule, Progress
 from avatar_core.studies.bench.methods import SPHERE, one_pass, tool_paths
-from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.studies.organ import Organ
+from avatar_core.vademecum.model import Vademecum
 
 ROUNDS = 7  # pairs of slides; other processes disturb some of them
 N_STEPS = 1500
@@ -85,16 +81,7 @@ def build_for_effects(
     surface: SurfaceMesh, n_vertices: int, modes: int, progress: Progress
 ) -> Vademecum:
     """A vademecum of so many modes at most that serves all effects (minutes)."""
-    rule = BuildRule(max_modes=modes)
-    mesh = tetrahedralize(surface, n_vertices)
-    regions = regions_by_rule(mesh)
-    elasticity = Elasticity(mesh, Material(), regions.clamped)
-    loads = load_surface(mesh, regions)
-    provenance = Provenance(surface.name, surface.source_sha256)
-    field = make_felt_field(mesh, regions, loads.patch_radius, surface)
-    linear = build_vademecum(
-        surface.name, elasticity, regions, loads, field, rule, provenance, progress
-    )
+    linear = Organ.of(surface, n_vertices).linear(BuildRule(max_modes=modes), progress)
     problem = hyperelastic_problem(linear, "neo-hookean")
     return with_large_deformation(linear, problem, "neo-hookean", LargeRule(), progress)
 

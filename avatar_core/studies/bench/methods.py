@@ -17,6 +17,7 @@ from avatar_core.common.jit import compiled
 from avatar_core.contact import kernels
 from avatar_core.contact.cloud import shown_vertices
 from avatar_core.contact.display import write_cloud
+from avatar_core.contact.effects.selection import every_effect
 from avatar_core.contact.effects.tip_surface import sample_surface
 from avatar_core.contact.locate import locate
 from avatar_core.contact.model import ContactModel, compiled_for, prepare, step
@@ -126,8 +127,8 @@ def _dense(
     cloud = shown_cloud(vademecum)
     model = prepare(vademecum, (SPHERE,) * n_tools, cloud=cloud)
     columns, compliance = _columns(vademecum, cloud), _compliance(vademecum)
-    arrays, _, state, out, _ = model.tables
-    effects = ArrayTable(model.effects._replace(large_deformation=None))
+    arrays, state, out, _ = model.tables
+    effects = ArrayTable(model.effects._replace(large_deformation=None), every_effect())
     around = (arrays, state, out, model.tips, effects, columns, compliance)
     compiled_step = compiled_for(_dense_step, *around)
 
@@ -264,9 +265,7 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
         assemble_own(model, state, t, near)
         sample_surface(model, e.tip_law, t, tips[t])
     _couple_dense(state, e.several_tools, compliance)
-    kernels.solve_contact(
-        model, state, tips, e.superposition, e.several_tools, None, None, e.tip_law
-    )
+    kernels.solve_contact(model, state, tips, e)
     kernels.write_forces(model, state, out, tips, e)
     u = state.field[: columns.shape[2]]
     u[:] = np.float32(0.0)
@@ -282,7 +281,7 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
 
 @compiled(fastmath=True)
 def _couple_dense(state, several_tools, compliance):  # type: ignore[no-untyped-def]
-    if several_tools is not None:
+    if several_tools.on:
         for t in range(state.passage.shape[0]):
             for s in range(state.passage.shape[0]):
                 several_tools.near[t, s] = s != t

@@ -25,13 +25,13 @@ Waiting = Callable[[str], AbstractContextManager[object]]
 
 @dataclass(frozen=True)
 class StepCost:
-    """One compiled step.
+    """The step of one scene.
 
     p50_us, p99_us : of the whole step, forces and cloud, medians over the passes [us]; NaN if the
         tools never touch at once
     n_steps : timed, those in which all tools touch
     bytes : of the model
-    layout_seconds, compile_seconds : what it takes to prepare; numba keeps what it has compiled
+    layout_seconds : what it takes to lay out
     """
 
     name: str
@@ -40,7 +40,6 @@ class StepCost:
     n_steps: int
     bytes: int
     layout_seconds: float
-    compile_seconds: float
 
 
 def time_scene(
@@ -62,7 +61,7 @@ def time_scene(
         del chosen["scene"]
     prepared = []
     for name, one in chosen.items():
-        with waiting(f"preparing and compiling the step, {name}"):
+        with waiting(f"preparing the step, {name}"):
             prepared.append(_prepared(vademecum, one, name))
     with waiting("timing"):
         passes = [[ready.timed() for ready in prepared] for _ in range(PASSES)]
@@ -79,7 +78,6 @@ class _Prepared:
     model: ContactModel
     tips: np.ndarray
     layout_seconds: float
-    compile_seconds: float
 
     def timed(self) -> np.ndarray:
         """Times of one pass from rest [us]."""
@@ -94,13 +92,7 @@ class _Prepared:
             for q in (0.5, 0.99)
         )
         return StepCost(
-            self.name,
-            p50,
-            p99,
-            sum(map(len, times)),
-            self.model.nbytes,
-            self.layout_seconds,
-            self.compile_seconds,
+            self.name, p50, p99, sum(map(len, times)), self.model.nbytes, self.layout_seconds
         )
 
 
@@ -110,14 +102,13 @@ def _prepared(vademecum: Vademecum, scene: Scene, name: str) -> _Prepared:
     layout = spec.layout(spec.finest, PERIOD)
     laid_out = time.perf_counter()
     model = make_model(layout)
-    compiled = time.perf_counter()
     starts = starts_apart(vademecum, len(spec.tips))
     paths = [
         push_and_slide(vademecum, tip.offset, PUSH, DEPTH, STEPS, at)
         for tip, at in zip(spec.tips, starts, strict=True)
     ]
     tips = _followed(model, np.ascontiguousarray(np.stack(paths, axis=1)))
-    return _Prepared(name, model, tips, laid_out - start, compiled - laid_out)
+    return _Prepared(name, model, tips, laid_out - start)
 
 
 def _followed(model: ContactModel, tips: np.ndarray) -> np.ndarray:

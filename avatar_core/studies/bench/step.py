@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from avatar_core.contact.ball_shift import make_felt_field
-from avatar_core.fem.elasticity import Elasticity, Material
-from avatar_core.fem.patch_loads import load_surface
-from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress
 from avatar_core.studies.bench.methods import (
     StepRow,
@@ -20,8 +15,9 @@ from avatar_core.studies.bench.methods import (
     time_steps,
     time_tip_over_patch,
 )
+from avatar_core.studies.organ import Organ
 from avatar_core.vademecum.display import display_of, outline
-from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.model import Vademecum
 
 MODES = (3, 5)  # that are shown, and all
 N_TOOLS = 3  # a sphere has one contact; three of them are at least three
@@ -35,17 +31,12 @@ def run_step_bench(
     n_vertices : of the mesh, all of which are shown; then its surface at each number of
         ``displayed`` vertices
     """
-    organ, elasticity = _built(surface, n_vertices, progress)
-    rows = _rows(organ, (*MODES, organ.n_modes))
-    rows.append(time_direct(elasticity, organ))
-    summary = {
-        "tip_over_patch": time_tip_over_patch(organ, organ.n_modes),
-        "table_over_step": table_over_steps(organ),
-        "step_p50_us": _row(rows, 1).p50_us,
-        "step_p99_us": _row(rows, N_TOOLS).p99_us,
-        "rival_p99_us": _row(rows, N_TOOLS, "dense table").p99_us,
-        "direct_p99_us": rows[-1].p99_us,
-    }
+    progress("mesh", 0.0, NO_ERROR)
+    meshed = Organ.of(surface, n_vertices)
+    organ = meshed.linear(BuildRule(), progress)
+    rows, summary = time_organ(organ)
+    rows.append(time_direct(meshed.elasticity, organ))
+    summary["direct_p99_us"] = rows[-1].p99_us
     for n in displayed:
         fine = replace(organ, display=display_of(organ.mesh, outline(organ.mesh, surface, n)))
         more = _rows(fine, (organ.n_modes,))
@@ -55,6 +46,18 @@ def run_step_bench(
     return rows, summary
 
 
+def time_organ(organ: Vademecum) -> tuple[list[StepRow], dict[str, float]]:
+    """Rows and summary of a vademecum as it is."""
+    rows = _rows(organ, (*MODES, organ.n_modes))
+    return rows, {
+        "tip_over_patch": time_tip_over_patch(organ, organ.n_modes),
+        "table_over_step": table_over_steps(organ),
+        "step_p50_us": _row(rows, 1).p50_us,
+        "step_p99_us": _row(rows, N_TOOLS).p99_us,
+        "rival_p99_us": _row(rows, N_TOOLS, "dense table").p99_us,
+    }
+
+
 def _rows(vademecum: Vademecum, modes: Sequence[int]) -> list[StepRow]:
     """A vademecum with so many modes and a dense table, with one tool and with several."""
     rows: list[StepRow] = []
@@ -62,24 +65,6 @@ def _rows(vademecum: Vademecum, modes: Sequence[int]) -> list[StepRow]:
         rows += [time_steps(vademecum, n_tools, some) for some in modes]
         rows.append(time_dense_table(vademecum, n_tools))
     return rows
-
-
-def _built(
-    surface: SurfaceMesh, n_vertices: int, progress: Progress
-) -> tuple[Vademecum, Elasticity]:
-    progress("mesh", 0.0, NO_ERROR)
-    mesh = tetrahedralize(surface, n_vertices)
-    regions = regions_by_rule(mesh)
-    elasticity = Elasticity(mesh, Material(), regions.clamped)
-    loads = load_surface(mesh, regions)
-    field = make_felt_field(mesh, regions, loads.patch_radius, surface)
-    provenance = Provenance(surface.name, surface.source_sha256)
-    return (
-        build_vademecum(
-            surface.name, elasticity, regions, loads, field, BuildRule(), provenance, progress
-        ),
-        elasticity,
-    )
 
 
 def _row(rows: Sequence[StepRow], tools: int, method: str = "vademecum") -> StepRow:

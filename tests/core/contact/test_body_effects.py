@@ -10,8 +10,7 @@ from skfem import Basis, BilinearForm, ElementTetP1, ElementTetP2, ElementVector
 from skfem.helpers import dot
 
 from avatar_core.contact.effects import Inertia, Respiration, SelfWeight
-from avatar_core.contact.effects.inertia import kinetic_energy, vibration_modes
-from avatar_core.contact.effects.tip_law import dent_energy
+from avatar_core.contact.effects.inertia import vibration_modes
 from avatar_core.contact.model import ContactModel, prepare, step
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.fem.elasticity import Elasticity
@@ -19,6 +18,7 @@ from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.coarse_liver import RADIUS, liver_model, press_in, spots
+from tests.helpers.energies import dent_energy, kinetic_energy
 from tests.helpers.tool_motion import AWAY, follow
 
 DENSITY = 1060.0  # [kg/m^3]
@@ -67,6 +67,7 @@ def swing_energy(model: ContactModel) -> float:
     return kinetic_energy(inertia) + 0.5 * float(inertia.modes @ inertia.modes)
 
 
+@pytest.mark.long
 def test_a_released_organ_swings_out_with_its_frequencies() -> None:
     """The energy only falls, that of each mode as exp(- 2 zeta omega t)."""
     zeta, period, n_decay = 0.05, 1e-3, 400

@@ -118,6 +118,7 @@ def test_below_the_surface_the_change_depends_on_the_distance() -> None:
     assert not below[ALONG > END].any()
 
 
+@pytest.mark.long
 def test_a_patch_shows_what_it_did() -> None:
     assert lay_out(organ("cube"), (Tip("patch", 3e-3),)).effects.dent is None
     assert lay_out(organ("cube"), (SPHERE,)).effects.dent is not None
@@ -136,6 +137,7 @@ def test_a_dent_in_relaxing_tissue_keeps_its_shape() -> None:
     np.testing.assert_allclose(soft.out.cloud[:, 3:], exact, atol=1e-3 * DEPTH)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("times", "limit"), [(0, 0.02e-3), (2, 0.03e-3)])
 def test_a_cube_shows_sneddons_dent(times: int, limit: float) -> None:
     """Along the normal, within two patch radii of a tip; at the vertices of a coarse mesh, and
@@ -162,6 +164,7 @@ def test_a_cube_shows_sneddons_dent(times: int, limit: float) -> None:
     assert np.abs(old).max() > 1.4e-3
 
 
+@pytest.mark.long
 def test_the_changes_of_several_tips_add_up() -> None:
     """Each is that of the tip by itself, pressed until it bears the same force."""
     tips = (SPHERE, Tip("sphere", 5e-3))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 
@@ -46,10 +45,7 @@ CHOICES: dict[str, Effect] = {
 def test_an_effect_is_absent_from_the_step_when_off(
     phantom_vademecum: Vademecum, name: str
 ) -> None:
-    """No argument of the compiled step, no array in the model: only None.
-
-    The arguments decide what is compiled; nothing has to be for that.
-    """
+    """No array in the model: only None."""
     without = lay_out(phantom_vademecum, (PATCH,), effects=())
     with_it = lay_out(phantom_vademecum, (PATCH,), effects=(CHOICES[name],))
     given, more = _effects(without), _effects(with_it)
@@ -60,18 +56,11 @@ def test_an_effect_is_absent_from_the_step_when_off(
     assert all(getattr(more, other) is None for other in CHOICES if other != name)
 
 
-def test_the_bare_step_is_compiled_for_no_effect(phantom_vademecum: Vademecum) -> None:
-    """Its last argument is none, but for the law of a tip that is no patch, and for a display."""
-    for tip in (PATCH, SPHERE):
-        model = prepare(phantom_vademecum, (tip,), cloud="off", effects=())
-        arrays, _, state, out, effects = model.tables
-        arguments = (arrays, state, out, model.tips, effects)
-        signature = tuple(numba.typeof(argument) for argument in arguments)
-        *others, law, dent, display = map(str, effects.numba_type.members.values())
-        assert display == "none" and phantom_vademecum.display is None
-        assert set(others) == {"none"}
-        assert (law == "none") == (dent == "none") == (tip is PATCH)
-        assert signature in kernels.contact_solve.overloads
+def test_all_scenes_share_one_compiled_step(phantom_vademecum: Vademecum) -> None:
+    for tip, effects in ((PATCH, ()), (SPHERE, ()), (SPHERE, tuple(CHOICES.values()))):
+        prepare(phantom_vademecum, (tip,), effects=effects)
+    for kernel in (kernels.contact_solve, kernels.contact_deform, kernels.force_error):
+        assert len(kernel.signatures) == 1
 
 
 def test_the_list_of_effects_is_complete() -> None:

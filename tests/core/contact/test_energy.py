@@ -47,6 +47,7 @@ def stiffest(model: ContactModel) -> float:
 # --- The force is the derivative of the energy ----------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("tip", "effects"),
     [
@@ -181,6 +182,7 @@ def test_grazing_has_no_steps_and_costs_nothing(spot: Spot, turn: float, depth: 
     assert abs(loop.work[-1]) <= touches * stiff * h**2 / 8.0 + 0.01 * peak
 
 
+@pytest.mark.long
 def test_tool_larger_than_a_small_liver() -> None:
     """40 mm across on a liver of 29 mm: bounded, conservative, and let go as it was."""
     scale, radius = 0.15, 20e-3

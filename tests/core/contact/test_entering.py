@@ -54,6 +54,7 @@ def test_tip_that_starts_inside_gets_no_force_before_it_has_left(
     assert np.linalg.norm(back.force[-1]) > 1.0
 
 
+@pytest.mark.long
 def test_push_through_the_organ_at_5_m_per_s() -> None:
     """The force grows with the depth; beyond 25 mm, and once barred, it is none."""
     model, spot = liver_model(), spots()[0]

@@ -25,6 +25,7 @@ from tests.helpers.flat_organ import (
 from tests.helpers.tool_motion import follow
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("compliance", [COMPLIANCE, 1e-6, 1e-8])
 def test_a_dragged_tip_sticks_up_to_the_static_limit_and_slips_with_the_kinetic_force(
     compliance: float,

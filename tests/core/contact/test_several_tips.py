@@ -14,10 +14,11 @@ from avatar_core.contact.effects.selection import Constants, selected_arrays
 from avatar_core.contact.effects.tip_law import dent
 from avatar_core.contact.effects.tip_profile import TAKEN
 from avatar_core.contact.layout import Layout
-from avatar_core.contact.model import ContactModel, Status, make_model, prepare, step, stored_energy
+from avatar_core.contact.model import ContactModel, Status, make_model, prepare, step
 from avatar_core.geometry.tip import Shape, Tip
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.coarse_liver import RADIUS, Spot, any_spot, liver_model, spots
+from tests.helpers.energies import stored_energy
 from tests.helpers.examples import examples
 from tests.helpers.flat_organ import COMPLIANCE, at_depth, flat_organ
 from tests.helpers.tool_motion import AWAY
@@ -50,6 +51,7 @@ def test_two_tools_share_the_organ() -> None:
     assert (two.out.contact_penetration[:2] < 1e-5).all()
 
 
+@pytest.mark.long
 @often
 @given(
     spot=any_spot(),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatar_core.contact.effects import Effect, Friction, Tilt, Viscoelasticity
-from avatar_core.contact.model import ContactModel, Status, prepare, step, stored_energy
+from avatar_core.contact.model import ContactModel, Status, prepare, step
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
 from avatar_core.fem.elasticity import Elasticity
@@ -17,6 +17,7 @@ from avatar_core.scene.model import Scene, Tool
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers import box_organ
 from tests.helpers.box_organ import MATERIAL, body_mesh, organ, top
+from tests.helpers.energies import stored_energy
 from tests.helpers.flat_organ import E_STAR, ORIGIN, UP, at_depth, flat_organ
 from tests.helpers.tool_motion import energy_slope, press
 
@@ -40,6 +41,7 @@ def pressed(angle: float, depth: float, about: float = 0.0, *effects: Effect) ->
     return model
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("about", [0.0, 2.0])
 def test_a_punch_that_touches_all_over_is_righted_by_its_closed_form(about: float) -> None:
     """M = 4/3 E* a^3 sin cos about e x n, and the force of an upright punch."""

@@ -133,6 +133,7 @@ def true_force(
     return float(truth.forces[0, 0])
 
 
+@pytest.mark.long
 def test_a_tip_on_an_organ_feels_a_resolved_contact(straight: Vademecum) -> None:
     tip, depth = Tip("sphere", 5e-3), 2e-3
     site = draw_sites(straight, phantom_liver(12e-3), 8, 1)[2]

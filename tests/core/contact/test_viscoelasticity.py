@@ -30,6 +30,7 @@ def relaxed_force(times: np.ndarray, depths: np.ndarray, t: float) -> float:
     return force
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("period", [0.1e-3, 1e-3, 10e-3])
 def test_relaxation_is_exact_for_motion_in_straight_lines(period: float) -> None:
     """Down, hold, further down, half back: the closed form to 1e-6 whatever the step."""

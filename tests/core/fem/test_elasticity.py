@@ -197,15 +197,11 @@ def test_thick_sphere_under_pressure_is_lames(nu: float, figure: Figure) -> None
     assert worst < 0.025
 
 
-@pytest.mark.parametrize("shape", ["cube", "sphere"])
-def test_no_pressure_is_unseen_by_taylor_hood(shape: str, figure: Figure) -> None:
+def test_no_pressure_is_unseen_by_taylor_hood(figure: Figure) -> None:
     """inf over p of sup over u of (p, div u) / |p| |u| stays away from 0 as the mesh is refined."""
 
     def inf_sup(n: int) -> float:
-        if shape == "sphere":
-            problem: Elasticity = ThickSphere(n, 0.4999, "Taylor-Hood").problem
-        else:
-            problem = clamped_cube(n, element="Taylor-Hood")
+        problem = clamped_cube(n, element="Taylor-Hood")
         free = problem._free
         shear, coupling, mass = problem._terms.mixed
         coupling = coupling[:, free].toarray()
@@ -328,6 +324,7 @@ def _certificate(mesh: TetMesh, scale: float, patch: pytest.MonkeyPatch) -> Cert
     return certify(found, problem, 12)
 
 
+@pytest.mark.long
 def test_organs_of_millimetres_and_metres_get_the_same_certificate(
     monkeypatch: pytest.MonkeyPatch, figure: Figure
 ) -> None:

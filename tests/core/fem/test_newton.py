@@ -250,6 +250,7 @@ def lobe() -> tuple[TetMesh, np.ndarray]:
     return mesh, box_regions(cube).clamped
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "way", "spacing", "bearable"),
     [

@@ -12,7 +12,6 @@ from avatar_core.fem.signorini import (
     Push,
     complementary,
     half_space_radius,
-    resolved_contact,
     through_centre,
 )
 from avatar_core.geometry.refinement import Grading, refine
@@ -50,6 +49,7 @@ def pressed() -> CondensedContact:
     return CondensedContact(_cube(0.7e-3, 0.25, 0.7), pushes, np.array([2e-3, 1e-3, 1e-3]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("depth", [1e-3, 2e-3])
 def test_a_sphere_feels_sneddons_force(pressed: CondensedContact, depth: float) -> None:
     touch = pressed.solve([0], [depth]).touches[0]
@@ -164,9 +164,8 @@ def test_two_tips_soften_each_other_as_two_point_forces() -> None:
     aside = np.array([0.5 * apart, 0.0, 0.0])
     places = np.stack([TOP - aside, TOP + aside])
     elasticity = _cube(0.6e-3, 0.25, 0.5, *places)
-    contact, _ = resolved_contact(
-        elasticity, [SPHERE, SPHERE], places, np.array([UP, UP]), [depth, depth]
-    )
+    pushes = [Push(SPHERE, place, UP) for place in places]
+    contact = CondensedContact(elasticity, pushes, depth).solve((0, 1), (depth, depth))
     assert contact.forces[0] == pytest.approx(contact.forces[1], rel=0.01)
     lowered = contact.forces[0] / (np.pi * MODULUS * apart)
     assert contact.forces[0] == pytest.approx(_sphere_force(3e-3, depth - lowered), rel=0.02)
