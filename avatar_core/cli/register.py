@@ -12,13 +12,15 @@ import typer
 
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import require_output
-from avatar_core.cli.vademecum import AsJson, Axes, File, Unit, parsed_axes
+from avatar_core.cli.vademecum import AsJson, Axes, File, Unit, parsed_axes, say_notices
 from avatar_core.common.dataclass_json import plain
 from avatar_core.geometry.surface_formats import MESH_NAMES
 
 if TYPE_CHECKING:
     from avatar_core.registration.register import Estimate, Registered
     from avatar_core.vademecum.model import Vademecum
+
+EXIT_NOT_EXPLAINED = 3
 
 
 def register(
@@ -66,17 +68,21 @@ def register(
     rule = RegistrationRule(noise=noise)
     target = None if at is None else numbers("--at", at, (3,), "three numbers, as 0,0.07,0.005")
     cloud = read_cloud(points, unit, parsed_axes(axes))
+    say_notices(cloud.notices)
     vademecum = load_vademecum(file)
     found = registered_to(vademecum, cloud, rule)
     given = [] if target is None else [target_at(vademecum, found, target)]  # type: ignore[arg-type]
     estimates = given or _shown(vademecum, found)
     if vademecum.large is not None:
         print("notice: the response is that of small strains", file=sys.stderr)
-    _write(vademecum, found, output)
     if as_json:
         print(json.dumps(plain(_summary(vademecum, found, estimates)), indent=2))
-        return
-    print("; ".join([*map(_sentence, estimates), _verdict(found)]))
+    if found.problems:  # no place is told, nor written
+        print(_verdict(found), file=sys.stderr if as_json else sys.stdout)
+        raise typer.Exit(EXIT_NOT_EXPLAINED)
+    _write(vademecum, found, output)
+    if not as_json:
+        print("; ".join([*map(_sentence, estimates), _verdict(found)]))
 
 
 def _shown(vademecum: Vademecum, found: Registered) -> list[Estimate]:
@@ -107,7 +113,9 @@ def _verdict(found: Registered) -> str:
 
     motion = found.motion
     shift = 1e3 * float(np.linalg.norm(motion.shift))
-    fit = "the fit is good" if not found.problems else f"NOT EXPLAINED: {', '.join(found.problems)}"
+    fit = "the fit is good"
+    if found.problems:
+        fit = f"NOT EXPLAINED: {', '.join(found.problems)}; nothing is written"
     return (
         f"residual {1e3 * found.rms:.2f} mm rms; rigid motion {shift:.1f} mm, "
         f"{motion.angle:.1f} degrees; {fit}"

@@ -6,6 +6,9 @@ again in every function: with the 150 arrays of a step, that was most of what it
 compiled code gets the table's address and reads, of the arrays that it names, what it needs.
 Attributes read as those of the tuple do. What is read never changes, and the compiler is told so:
 it reads it before a loop, not within.
+
+A tuple may hold None for another tuple. Compiled code then finds a table whose ``on`` is False,
+with empty arrays of the types that a tuple ``like`` it has: one compiled function serves both.
 """
 
 from __future__ import annotations
@@ -34,24 +37,36 @@ _WORD = ir.IntType(64)
 class ArrayTable:
     """Where the arrays of a named tuple lie, and those of the tuples in it.
 
-    arrays : the tuple, kept alive; its members are arrays, None, or such tuples
+    arrays : the tuple, kept alive; its members are arrays, or such tuples, or None. All None: a
+        table that is off.
+    like : a tuple of the same kind without any None, for the types of what is None; not needed
+        where nothing is
     numba_type : TableType
     address : of the table, for compiled code
+
+    Raises
+    ------
+    TypeError
+        For an array that is not contiguous, or of another type than in ``like``.
     """
 
-    def __init__(self, arrays: Any) -> None:
+    def __init__(self, arrays: Any, like: Any = None) -> None:
         self.arrays = arrays
-        self.numba_type = TableType.of(arrays)
-        self._words = np.array(_words(arrays), np.int64)
+        self.numba_type = TableType.of(arrays if like is None else like)
+        self._words = np.array(_words(self.numba_type, arrays), np.int64)
         self.address = int(self._words.ctypes.data)
 
 
 class TableType(types.Type):
-    """Names and numba types of a table's members, and where the words of each begin."""
+    """Names and numba types of a table's members, and where the words of each begin.
+
+    The first word of a table is whether it is on. Compiled code writes to no constant, so that
+    arrays that may not be written are of the same type as others.
+    """
 
     def __init__(self, kind: str, members: dict[str, Any]) -> None:
         self.members = members
-        self.start, self.n_words = {}, 0
+        self.start, self.n_words = {}, 1
         for name, of in members.items():
             self.start[name] = self.n_words
             self.n_words += _n_words(of)
@@ -64,24 +79,25 @@ class TableType(types.Type):
 
 
 def _type_of(member: Any) -> Any:
-    if member is None or isinstance(member, np.ndarray):
-        return typeof(member)
+    if isinstance(member, np.ndarray):
+        return types.Array(typeof(member).dtype, member.ndim, "C")
     return TableType.of(member)
 
 
 def _n_words(of: Any) -> int:
-    if isinstance(of, TableType):
-        return of.n_words
-    return 0 if of == types.none else 1 + 2 * of.ndim
+    return of.n_words if isinstance(of, TableType) else 1 + 2 * int(of.ndim)
 
 
-def _words(arrays: Any) -> list[int]:
-    words: list[int] = []
-    for member in arrays:
-        if isinstance(member, np.ndarray):
-            words += [member.ctypes.data, *member.shape, *member.strides]
-        elif member is not None:
-            words += _words(member)
+def _words(of: Any, member: Any) -> list[int]:
+    if member is None:
+        return [0] * _n_words(of)
+    if isinstance(member, np.ndarray):
+        if _type_of(member) != of or not member.flags.c_contiguous:
+            raise TypeError(f"{member.dtype} {member.shape} of strides {member.strides} for {of}")
+        return [member.ctypes.data, *member.shape, *member.strides]
+    words = [1]
+    for name, value in member._asdict().items():
+        words += _words(of.members[name], value)
     return words
 
 
@@ -109,15 +125,15 @@ class _Members(AttributeTemplate):
     key = TableType
 
     def generic_resolve(self, of: TableType, name: str) -> Any:  # type: ignore[override]
-        return of.members.get(name)
+        return types.boolean if name == "on" else of.members.get(name)
 
 
 @lower_getattr_generic(TableType)
 def _read(context: Any, builder: Any, of: TableType, table: Any, name: str) -> Any:
-    member = of.members[name]
+    if name == "on":
+        return builder.icmp_signed("!=", _load_constant(builder, table), _WORD(0))
     first = builder.gep(table, [_WORD(of.start[name])], inbounds=True)
-    if member == types.none:
-        return context.get_dummy_value()
+    member = of.members[name]
     return first if isinstance(member, TableType) else _array(context, builder, member, first)
 
 

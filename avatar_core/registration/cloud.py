@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +12,11 @@ from numpy.typing import ArrayLike
 
 from avatar_core.common import files
 from avatar_core.common.arrays import FloatArray, IntArray
-from avatar_core.errors import RegistrationError, one_line
+from avatar_core.errors import AvatarError, RegistrationError, one_line
 from avatar_core.geometry.point_location import closest_points
 from avatar_core.geometry.surface import METRES, axes_matrix
 from avatar_core.geometry.surface_files import parse, stated_axes
-from avatar_core.geometry.surface_formats import MESHES
+from avatar_core.geometry.surface_formats import MESHES, kind_of
 
 COLUMNS = (".xyz", ".csv", ".txt")  # x, y, z in each line
 LEAST_POINTS = 50
@@ -25,19 +27,23 @@ _DOUBTED = 0.015  # distance of a cloud beyond which its axes are doubted [m]
 _TRIED = 300  # points of a cloud whose distances are looked at
 _MOST_EXTENT = 1.3  # of a cloud over that of the organ; a deformed organ is hardly larger
 _LEAST_EXTENT = 0.1  # the same, below which the unit is doubted
+_SAME = 1e-4  # of the extent, within which points count once: they tell the same again
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
     """Points on a deformed surface.
 
-    points : ndarray, shape (n, 3) [m], RAS
+    points : ndarray, shape (n, 3) [m], RAS; those that stand several times are kept once
     name : of the file; ``unit`` that was applied
+    notices : what was left out, one line each
     """
 
     points: FloatArray
     name: str = "cloud"
     unit: str = "m"
+    notices: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         points = np.array(self.points, dtype=np.float64)
@@ -48,6 +54,11 @@ class Cloud:
             raise RegistrationError(
                 f"{self.name}: {bad} of {len(points)} points are NaN or infinite; remove them"
             )
+        different = _different(points)
+        if repeated := len(points) - len(different):
+            notice = f"{self.name}: {repeated} points stand several times: each counts once"
+            object.__setattr__(self, "notices", (*self.notices, notice))
+            points = points[different]
         if len(points) < LEAST_POINTS:
             raise RegistrationError(
                 f"{self.name}: {len(points)} points are too few to register to; give at least "
@@ -59,8 +70,7 @@ class Cloud:
     @property
     def extent(self) -> float:
         """Diagonal of the box that holds 98 % of the points along each axis [m]."""
-        low, high = np.percentile(self.points, [1.0, 99.0], axis=0)
-        return float(np.linalg.norm(high - low))
+        return _extent(self.points)
 
     def thinned(self) -> FloatArray:
         """At most ``MOST_POINTS`` of the points, shape (n, 3) [m]."""
@@ -70,8 +80,24 @@ class Cloud:
         return self.points[np.sort(chosen)]
 
 
+def _extent(points: FloatArray) -> float:
+    low, high = np.percentile(points, [1.0, 99.0], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _different(points: FloatArray) -> IntArray:
+    """The first of all points that are the same, in their order, shape (n,)."""
+    if len(points) == 0:
+        return np.empty(0, dtype=np.int64)
+    cell = max(_SAME * _extent(points), np.finfo(float).tiny)
+    _, first = np.unique(np.rint(points / cell), axis=0, return_index=True)
+    return np.asarray(np.sort(first))
+
+
 def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None = None) -> Cloud:
-    """Read PLY, OBJ, VTK, VTP and STL (their vertices), or XYZ, CSV and TXT (first three columns).
+    """Read the vertices of a mesh, or XYZ, CSV and TXT: the columns x, y and z, or the first three.
+
+    Points at the origin are dropped with a notice: cameras write them for pixels without depth.
 
     Parameters
     ----------
@@ -87,12 +113,17 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
     path = Path(path)
     if unit not in METRES:
         raise RegistrationError(f"unit '{unit}' is unknown; use one of {', '.join(METRES)}")
-    if path.suffix.lower() not in (*MESHES, *COLUMNS):
+    is_mesh, suffix = kind_of(path) in MESHES, path.suffix.lower()
+    # A number behind a point, as in a UID, is no suffix.
+    if not is_mesh and suffix.strip(".0123456789") and suffix not in COLUMNS:
         known = ", ".join((*MESHES, *COLUMNS))
         raise RegistrationError(f"{path.name}: not a cloud; use {known}")
-    matrix = axes_matrix((_stated(path) or "RAS") if axes is None else axes)
-    points = _points(path) @ matrix[:3, :3].T + matrix[:3, 3]
-    return Cloud(METRES[unit] * points, path.name, unit)
+    matrix = axes_matrix(((is_mesh and stated_axes(path)) or "RAS") if axes is None else axes)
+    points = _points(path, is_mesh)
+    empty = (points == 0.0).all(axis=1)
+    notice = f"{path.name}: {empty.sum()} points at the origin are dropped: pixels without depth"
+    points = points[~empty] @ matrix[:3, :3].T + matrix[:3, 3]
+    return Cloud(METRES[unit] * points, path.name, unit, (notice,) if empty.any() else ())
 
 
 def require_on_organ(cloud: Cloud, vertices: FloatArray, faces: IntArray) -> None:
@@ -135,22 +166,18 @@ def _unit_hint(ratio: float, unit: str) -> str:
     return "give the cloud of this organ alone, and its unit (--unit)"
 
 
-def _stated(path: Path) -> str | None:
-    text = path.suffix.lower() in (".xyz", ".csv", ".txt")
-    return None if text else stated_axes(path)
-
-
-def _points(path: Path) -> FloatArray:
+def _points(path: Path, is_mesh: bool) -> FloatArray:
     """Coordinates of a file, shape (n, 3), in its unit and axes."""
     try:
-        with files.opened(path, MOST_BYTES):
-            pass
-        return _read(path)
+        if is_mesh:
+            return parse(path, None)[0]
+        with files.opened(path, MOST_BYTES) as source:
+            return _columns(path.name, files.content_of(source))
     except files.FileError as error:
         raise RegistrationError(
             f"cannot read {path}: {error}; check the path and its permissions"
         ) from error
-    except RegistrationError:
+    except AvatarError:
         raise
     except Exception as error:  # of parsers, each with errors of its own
         raise RegistrationError(
@@ -158,23 +185,70 @@ def _points(path: Path) -> FloatArray:
         ) from error
 
 
-def _read(path: Path) -> FloatArray:
-    return _columns(path) if path.suffix.lower() in COLUMNS else parse(path, None)[0]
+def _columns(name: str, content: bytes) -> FloatArray:
+    """The numbers in the columns x, y and z, or in the first three, shape (n, 3)."""
+    is_wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")  # as spreadsheets write "Unicode text"
+    text = content.decode("utf-16" if is_wide else "utf-8-sig", errors="replace")
+    lines = [line for line in text.replace('"', "").splitlines() if line.strip()]
+    titles = list(takewhile(lambda line: not _is_number(_words(line)[:1]), lines))
+    rows = [_words(line) for line in lines[len(titles) :] if line.lstrip()[0] != "#"]
+    if not rows:
+        raise RegistrationError(f"{name}: it holds no numbers; give x, y, z in each line")
+    _require_points(name, lines[len(titles) :], rows)
+    n = len(rows[0])
+    named = [found for title in titles if (found := _named(title))]
+    if not named and n > 3 and titles and titles[-1].lstrip()[0] != "#":
+        raise RegistrationError(
+            f"{name}: its {n} columns are called '{titles[-1].strip()[:60]}'; call three x, y and z"
+        )
+    chosen = named[-1] if named else [0, 1, 2]
+    points = np.array([[float(row[k]) for k in chosen] for row in rows], np.float64).reshape(-1, 3)
+    if not named and n > 3 and len(points) > 1 and (np.diff(points[:, 0]) >= 0.0).all():
+        raise RegistrationError(
+            f"{name}: the first of its {n} columns only rises, as a time or a number does; leave "
+            "it out, or call the columns in the first line, such as t,x,y,z"
+        )
+    return points
 
 
-def _columns(path: Path) -> FloatArray:
-    """The first three numbers of each line, after a line of titles at most."""
-    text = path.read_text(encoding="utf-8", errors="replace").replace(",", " ").replace(";", " ")
-    lines = [line for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
-    if lines and not _is_number(lines[0].split()[0]):
-        lines = lines[1:]
-    rows = [[float(word) for word in line.split()[:3]] for line in lines]
-    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+def _words(line: str) -> list[str]:
+    """The fields of a line; a title keeps its unit, as in ``x [mm]``, to itself."""
+    line = re.sub(r"[\[(].*?[\])]", "", line).strip().lstrip("#")
+    if ";" in line:
+        return [word.strip() for word in line.split(";")]
+    words = line.split()
+    return (
+        words if any(map(_DECIMAL_COMMA.fullmatch, words[1:])) else line.replace(",", " ").split()
+    )
 
 
-def _is_number(word: str) -> bool:
+def _require_points(name: str, lines: list[str], rows: list[list[str]]) -> None:
+    """Raise RegistrationError if numbers have decimal commas."""
+    for line, row in zip(lines, rows, strict=False):
+        # Behind a comma, 020 is a fraction.
+        if any(map(_DECIMAL_COMMA.fullmatch, row)) or re.search(r"\d,0\d+(,|$)", line):
+            raise RegistrationError(
+                f"{name}: decimal commas, as in '{line.strip()[:40]}'; write numbers with points"
+            )
+
+
+def _named(title: str) -> list[int] | None:
+    """Places of the columns x, y and z in a line of titles; None if it does not name each once."""
+    words = [word.lower() for word in _words(title)]
+    for ends in (("x", "y", "z"), ("points:0", "points:1", "points:2")):
+        for pattern in ("{}", "(.*[^a-z])?{}"):
+            places = [
+                [k for k, word in enumerate(words) if re.fullmatch(pattern.format(end), word)]
+                for end in ends
+            ]
+            if all(len(one) == 1 for one in places):
+                return [one[0] for one in places]
+    return None
+
+
+def _is_number(words: list[str]) -> bool:
     try:
-        float(word)
-    except ValueError:
+        float(words[0].replace(",", "."))
+    except (ValueError, IndexError):
         return False
     return True

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import RegistrationError
 
 Spread = Callable[[FloatArray], FloatArray]  # scales -> prior standard deviations (n,)
 
@@ -118,7 +119,12 @@ def posterior(found: Equations, spread: FloatArray, noise: float, mismatch: floa
     right = spread * (inverse * found.right - found.cell_rows.T @ (taken * found.cell_right))
     system = spread[:, None] * hessian * spread
     system.flat[:: len(spread) + 1] += 1.0
-    factor = cholesky(system, lower=True, check_finite=False, overwrite_a=True)
+    try:
+        factor = cholesky(system, lower=True, check_finite=False, overwrite_a=True)
+    except LinAlgError as error:
+        raise RegistrationError(
+            "the points leave no solution, as where many stand side by side; thin them out"
+        ) from error
     solved = cho_solve((factor, True), right, check_finite=False)
     square = inverse * found.square - taken @ found.cell_right**2 - right @ solved
     log_noise = 2.0 * found.n_points * np.log(noise) - found.log_weights

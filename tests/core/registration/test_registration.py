@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 import scipy.sparse as sp
 
 from avatar_core.cli import main as cli
-from avatar_core.errors import RegistrationError
+from avatar_core.errors import AvatarError, RegistrationError
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.point_location import carriers
 from avatar_core.registration.cloud import Cloud, read_cloud
@@ -28,6 +29,8 @@ from avatar_core.studies.registration_truth import Case, RegistrationSettings, T
 from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
+
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
 
 SETTINGS = RegistrationSettings(n_points=1500, peak=(0.012, 0.012))
 
@@ -262,11 +265,16 @@ def test_another_unit_or_other_axes_are_suspected(phantom_vademecum: Vademecum, 
 def test_every_format_gives_the_same_points(tmp_path: Path, case: Case) -> None:
     points = 1e3 * case.cloud.points
     meshio.write(tmp_path / "c.ply", meshio.Mesh(points, []))
+    shutil.copy(tmp_path / "c.ply", tmp_path / "1.2.840.113619")
+    lines = "\n".join(f"{x} {y} {z}" for x, y, z in points)
+    head = f"# vtk DataFile Version 3.0\nt\nASCII\nDATASET POLYDATA\nPOINTS {len(points)} double\n"
+    (tmp_path / "c.vtk").write_text(head + lines)
+    (tmp_path / "cloud").write_text(lines)
     (tmp_path / "c.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in points))
     np.savetxt(tmp_path / "c.xyz", points)
     rows = points * [-1.0, -1.0, 1.0]
     np.savetxt(tmp_path / "c.csv", rows, delimiter=",", header="x,y,z", comments="")
-    for name in ("c.ply", "c.obj", "c.xyz"):
+    for name in ("c.ply", "1.2.840.113619", "c.vtk", "cloud", "c.obj", "c.xyz"):
         found = read_cloud(tmp_path / name)
         np.testing.assert_allclose(found.points, case.cloud.points, atol=1e-9)
     turned = read_cloud(tmp_path / "c.csv", axes="LPS")
@@ -280,8 +288,13 @@ def test_every_format_gives_the_same_points(tmp_path: Path, case: Case) -> None:
         ("missing.xyz", None, "check the path"),
         ("words.xyz", "a b c\nd e f\n", "x, y, z in each line"),
         ("short.csv", "1,2\n3,4\n", "x, y, z"),
-        ("empty.ply", "", "not a readable cloud"),
+        ("empty.ply", "", "not a readable PLY file"),
         ("cloud.doc", "", "not a cloud"),
+        ("comma.csv", "X;Y;Z\n" + "53,873;63,020;42,527\n" * 60, "decimal commas, as in '53,873;"),
+        ("comma.xyz", "53,873 63,020 42,527\n" * 60, "decimal commas"),
+        ("quoted.csv", '"53,873","63,020","42,527"\n' * 60, "decimal commas"),
+        ("time.csv", "".join(f"{t},1.5,2.5,3.5\n" for t in range(60)), "first of its 4 columns"),
+        ("called.csv", "t,a,b,c\n" + "1.0,1.5,2.5,3.5\n" * 60, "columns are called 't,a,b,c'"),
     ],
 )
 def test_unreadable_files_are_refused(
@@ -289,8 +302,43 @@ def test_unreadable_files_are_refused(
 ) -> None:
     if content is not None:
         (tmp_path / name).write_text(content)
-    with pytest.raises(RegistrationError, match=message):
+    with pytest.raises(AvatarError, match=message):
         read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("titles", "row"),
+    [
+        ("time,x,y,z", "{0},{1},{2},{3}"),
+        ("\ufeffX [mm];Y [mm];Z [mm];r", "{1};{2};{3};255"),
+        ("# z y x", "{3} {2} {1}"),
+        ("pos.x\tpos.y\tpos.z\tw", "{1}\t{2}\t{3}\t0.5"),
+        ('"Points:0","Points:1","Points:2","f"', "{1},{2},{3},0"),
+        ("", "{1}, {2}, {3}, 255, 0, 0"),
+    ],
+)
+def test_columns_are_found_by_their_names(
+    tmp_path: Path, case: Case, titles: str, row: str
+) -> None:
+    points = 1e3 * case.cloud.points
+    lines = [titles, *(row.format(k, *point) for k, point in enumerate(points.tolist()))]
+    (tmp_path / "c.csv").write_text("\n".join(lines), encoding="utf-8")
+    found = read_cloud(tmp_path / "c.csv")
+    np.testing.assert_allclose(found.points, case.cloud.points, atol=1e-9)
+
+
+def test_points_that_say_nothing_new_are_left_out(tmp_path: Path, case: Case) -> None:
+    """Copies would be taken for so many measurements, and pixels without depth for the organ."""
+    points = case.cloud.points[::5]
+    copies = np.tile(points, (5, 1)) + 1e-9 * np.random.default_rng(0).random((5 * len(points), 3))
+    found = Cloud(copies)
+    np.testing.assert_allclose(found.points, points, atol=1e-8)
+    assert f"{4 * len(points)} points stand several times" in found.notices[0]
+    assert not Cloud(points).notices
+    np.savetxt(tmp_path / "c.xyz", np.vstack([1e3 * points, np.zeros((30, 3))]))
+    found = read_cloud(tmp_path / "c.xyz")
+    np.testing.assert_allclose(found.points, points, atol=1e-9)
+    assert "30 points at the origin are dropped" in found.notices[0]
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
@@ -331,6 +379,27 @@ def test_the_command_writes_the_surface_with_its_deviation(
     assert document["explained"] and len(document["forces"]) >= 1
     assert run(monkeypatch, *given, "-o", tmp_path / "out.vtu", "--noise", "1") == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_command_tells_no_place_that_the_model_does_not_explain(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    phantom_vademecum: Vademecum,
+    case: Case,
+) -> None:
+    save_vademecum(phantom_vademecum, tmp_path / "v.h5")
+    x, y, z = 1e3 * case.cloud.points.T
+    ripple = 4.0 * np.sin(2 * np.pi * x / 30.0) * np.sin(2 * np.pi * z / 30.0)
+    np.savetxt(tmp_path / "c.xyz", np.stack([x, y + ripple, z], axis=1))
+    given = (tmp_path / "v.h5", "--points", tmp_path / "c.xyz", "-o", tmp_path / "out.vtp")
+    assert run(monkeypatch, *given) == 3
+    said = capsys.readouterr().out
+    assert "NOT EXPLAINED" in said and "now at" not in said and said.count("\n") == 1
+    assert not (tmp_path / "out.vtp").exists()
+    assert run(monkeypatch, *given, "--json") == 3
+    said, errors = capsys.readouterr()
+    assert json.loads(said)["explained"] is False and "NOT EXPLAINED" in errors
 
 
 def test_noise_is_a_length() -> None:
