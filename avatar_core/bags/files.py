@@ -1,21 +1,28 @@
-"""Opening bags: a folder with metadata.yaml, or a single .mcap or .db3; whole or damaged.
+"""Opening bags: a folder, or a single .mcap or .db3; whole or damaged, compressed or not.
 
-What can be read is read, and a note says what could not.
+The files of a folder are read one by one. Its metadata.yaml only tells which they are: that a file
+or a message is compressed is seen from its beginning. What can be read is read, and a note says
+what could not.
 """
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from avatar_core.bags.truncated import longest_readable
-from avatar_core.bags.types import rosbag2
+from avatar_core.bags.types import rosbag2, zstd
 from avatar_core.errors import StorageError, one_line
 
 MCAP, SQLITE3 = ".mcap", ".db3"
 SUFFIXES = (MCAP, SQLITE3)
+_ZSTD, _ZSTD_BEGINS = ".zstd", b"\x28\xb5\x2f\xfd"  # which no message of ROS begins with
+_LIST = "relative_file_paths"
 _REMEDY = {
     MCAP: "it may be truncated; copy it again, or try 'mcap recover'",
     SQLITE3: "it may be truncated; copy it again, or try 'sqlite3 FILE .recover'",
@@ -24,7 +31,7 @@ _REMEDY = {
 
 def is_bag(path: Path) -> bool:
     """Whether a path names a bag and no file of HDF5, by its name."""
-    return path.is_dir() or path.suffix.lower() in (*SUFFIXES, ".bag", ".zstd")
+    return path.is_dir() or path.suffix.lower() in (*SUFFIXES, ".bag", _ZSTD)
 
 
 class OpenBag:
@@ -79,40 +86,43 @@ class OpenBag:
                         self.notes.append(f"{reader.path}: none of {expected:,} messages is read")
                     break
                 n_read += 1
-                yield message
+                yield *message[:2], _unpacked(message[2])
 
     def _source(self, reader: Any, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
-        storage = reader.storage
-        scan = getattr(storage, "messages_scan", None)
-        if scan is not None and not storage.chunks:
-            # Without an index, ``messages`` refuses what two topics received out of order.
-            return iter(scan(connections))
-        return iter(reader.messages(connections))
+        # In the order of an MCAP file: its chunks hold all topics, and the index hides when a clock
+        # was set back.
+        read = getattr(reader.storage, "messages_scan", reader.messages)
+        return iter(read(connections))
 
     def _readers_of(self, path: Path) -> list[Any]:
         if not path.exists():
             raise StorageError(f"there is no bag {path}; give a folder, a .mcap or a .db3")
         if not path.is_dir():
             return [self._reader_of_file(path)]
-        files = sorted(f for f in path.iterdir() if f.suffix in SUFFIXES)
-        if not (path / "metadata.yaml").exists():
-            if not files:
-                raise StorageError(f"{path} holds no .mcap or .db3; give the folder of one bag")
-            self.notes.append(f"{path} has no metadata.yaml; its files are read one by one")
-            return self._readers_of_files(files)
+        files = sorted(filter(_is_storage, path.iterdir()), key=_in_order)
+        if not files:
+            raise StorageError(f"{path} holds no .mcap or .db3; give the folder of one bag")
+        return self._readers_of_files(self._listed(path, files))
+
+    def _listed(self, path: Path, files: list[Path]) -> list[Path]:
+        """The files that metadata.yaml lists, or all without it."""
+        import yaml
+
         try:
-            folder = self._opened(path)
-        except Exception as error:
-            why = one_line(error, 120)
-            if not files:
-                raise StorageError(f"{path} is no readable bag ({why}); copy it again") from error
-            self.notes.append(f"{path} is damaged ({why}); its files are read one by one")
-            return self._readers_of_files(files)
-        if folder.compression_mode == "message":
-            return [folder]
-        # The folder's reader passes over topics whose quality of service is written differently in
-        # metadata.yaml and in the files, as in some bags of rosbag2 itself.
-        return self._readers_of_files([storage.path for storage in folder.storage.storages])
+            held = yaml.safe_load((path / "metadata.yaml").read_text())
+            names = [Path(n).name for n in held["rosbag2_bagfile_information"][_LIST]]
+        except FileNotFoundError:
+            self.notes.append(f"{path} has no metadata.yaml; its files are read one by one")
+            return files
+        except Exception as error:  # whatever is no such file
+            self.notes.append(
+                f"{path} is damaged ({one_line(error, 120)}); its files are read one by one"
+            )
+            return files
+        listed = [file for file in files if {file.name, file.stem} & set(names)]
+        if missing := len(names) - len(listed):
+            self.notes.append(f"{missing} of the {len(names)} files of {path} are missing")
+        return listed or files
 
     def _readers_of_files(self, files: Sequence[Path]) -> list[Any]:
         readers, errors = [], []
@@ -131,10 +141,12 @@ class OpenBag:
             raise StorageError(
                 f"{file} is a bag of ROS 1; convert it: rosbags-convert --src {file}"
             )
-        if file.suffix not in SUFFIXES:
+        if not _is_storage(file):
             raise StorageError(f"{file} ends in '{file.suffix}'; give the bag's folder")
         if not file.is_file():
             raise StorageError(f"{file} is no file; give a bag")
+        if file.suffix == _ZSTD:
+            return self._reader_of_file(self._decompressed(file))
         try:
             return self._opened(file)
         except Exception as error:  # whatever the library raises for what is no such file
@@ -144,6 +156,17 @@ class OpenBag:
                     f"{file} is no readable bag ({one_line(error, 120)}); {_REMEDY[file.suffix]}"
                 ) from error
             return reader
+
+    def _decompressed(self, file: Path) -> Path:
+        """A copy of a compressed file, as far as it goes, for as long as the bag is open."""
+        folder = self._stack.enter_context(TemporaryDirectory(prefix="avatar_bag_"))
+        whole = Path(folder) / file.stem
+        try:
+            with zstd().open(file, "rb") as packed, whole.open("wb") as out:
+                shutil.copyfileobj(packed, out)
+        except Exception as error:  # whatever the library raises for what is no such file
+            self.notes.append(f"{file} is damaged ({one_line(error, 120)})")
+        return whole
 
     def _recovered(self, file: Path) -> Any:
         """A reader of the whole records of a file that was not closed; None if there are none."""
@@ -164,3 +187,24 @@ class OpenBag:
 
     def _opened(self, path: Any) -> Any:
         return self._stack.enter_context(self._library.Reader(path))
+
+
+def _is_storage(file: Path) -> bool:
+    """Whether a file's name is that of messages, compressed or not."""
+    return (file.with_suffix("") if file.suffix == _ZSTD else file).suffix in SUFFIXES
+
+
+def _in_order(file: Path) -> list[str | int]:
+    """Sorts bag_10 behind bag_2."""
+    parts = re.split(r"(\d+)", file.name)
+    return [int(part) if part.isdecimal() else part for part in parts]
+
+
+def _unpacked(content: bytes) -> bytes:
+    """A message, whether it was compressed or not."""
+    if content[:4] != _ZSTD_BEGINS:
+        return content
+    try:
+        return bytes(zstd().decompress(content))
+    except Exception:  # then it is refused as any that is damaged
+        return content

@@ -35,6 +35,7 @@ _GAP = 1.5  # periods
 _REMEMBERING = {"friction", *REMEMBER_FOR_EVER}
 _HELD = 0.02  # for which a pose is held, by default; after it a zero is sent [s]
 _FOLLOWED = 5e-3  # by which a tip may move and be still in contact, however deep it is [m]
+_REPEATED = 3  # times that a clock set back may give a stamp again
 _UNIT = 1e-3  # by which a quaternion may differ from length 1, as in the loop
 
 
@@ -82,7 +83,7 @@ def path_of(
     origin, rotation = _parts(transform or IDENTITY)
     answers, table = _answers(bag, poses)
     rate = rate or (bag.about.rate if bag.about else _rate(table.received))
-    row = _pose_of(poses, table.stamp, answers)
+    row = _pose_of(poses, table, answers)
     known = row >= 0
     status, tip_kind = _placement(answers, table, known)
     kept = (tip_kind != _MISSING) & _of_organ(answers, table, vademecum_id)
@@ -126,14 +127,14 @@ def path_of(
 
 def valid_tips(
     bag: Bag, transform: tuple[float, ...] | None = None
-) -> tuple[np.ndarray, FloatArray, list[str]]:
-    """When each valid pose was received (n,) [ns], its tip in the organ's frame (n, 3) [m], notes.
+) -> tuple[Table, FloatArray, list[str]]:
+    """The valid poses, their tips in the organ's frame (n, 3) [m], and notes.
 
     transform, errors : as of :func:`path_of`
     """
     poses, _, notes = _valid_poses(bag, transform)
     tip = _moved(poses.values[:, :3], *_parts(transform or IDENTITY))
-    return poses.received, tip, notes
+    return poses, tip, notes
 
 
 _ANSWER = {"states": "contact_state", "wrenches": "wrenches", "poses": "poses"}
@@ -210,14 +211,17 @@ def _numbers(received: np.ndarray, rate: float, lost: np.ndarray) -> np.ndarray:
     return np.cumsum(steps)
 
 
-def _pose_of(poses: Table, stamp: np.ndarray, answers: str) -> np.ndarray:
-    """The pose of each stamp, the last received if there are several; -1 without one."""
+def _pose_of(poses: Table, answered: Table, answers: str) -> np.ndarray:
+    """The pose of each answer's stamp, the last received before it if there are several; or -1."""
     if answers == "poses":
         return np.arange(len(poses))
-    order = np.argsort(poses.stamp, kind="stable")
-    sorted_stamp = poses.stamp[order]
+    order = np.argsort(poses.stamp, kind="stable")  # and so by the time of receipt
+    sorted_stamp, stamp = poses.stamp[order], answered.stamp
     at = np.searchsorted(sorted_stamp, stamp, side="right") - 1
     found = (at >= 0) & (sorted_stamp[np.maximum(at, 0)] == stamp)
+    for _ in range(_REPEATED):
+        later = found & (poses.received[order[at]] > answered.received)
+        at = at - (later & (at > 0) & (sorted_stamp[at - 1] == stamp))
     return np.where(found, order[np.maximum(at, 0)], -1)
 
 

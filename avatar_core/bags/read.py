@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from avatar_core.bags import types
 from avatar_core.bags.files import OpenBag
 from avatar_core.bags.table import Table, TableWriter
@@ -190,18 +192,30 @@ class _Topics:
         states = self._states_of_tool()
         for topic, n in self._failed.items():
             self._notes.append(f"{n:,} messages of {topic} are damaged or of another version")
+        back = self._set_back()
+        if back:
+            seconds = ", ".join(f"{1e-9 * step:.3g}" for step in back)
+            self._notes.append(f"the clock was set back by {seconds} s: times of receipt go on")
         return Bag(
             path,
             self._tool,
-            self._poses.table(),
-            None if chosen is None else wrenches[chosen].table(),
+            self._poses.table(back),
+            None if chosen is None else wrenches[chosen].table(back),
             chosen or "",
             self._axes[chosen] if chosen else "absolute",
-            None if states is None else states.table(),
+            None if states is None else states.table(back),
             tuple(self._ids),
             self._about,
             (*notes, *self._notes),
         )
+
+    def _set_back(self) -> list[int]:
+        """By how much the clock was set back each time [ns]; nothing unless all topics saw it."""
+        topics = (self._poses, *self._wrenches.values(), *self._states.values())
+        each = [one.set_back() for one in topics if len(one)]
+        if len({len(steps) for steps in each}) != 1 or not each[0]:
+            return []
+        return [int(step) for step in np.median(each, axis=0)]
 
     def _states_of_tool(self) -> TableWriter | None:
         """States that name the tool; those of another name if they are the only ones, as remapped

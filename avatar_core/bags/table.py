@@ -1,14 +1,21 @@
-"""Messages of one topic as they are read: columns that grow, without an object for each."""
+"""Messages of one topic as they are read: columns that grow, without an object for each.
+
+A recorder's clock may be set back while it writes. A topic shows that by a few steps back in the
+order of its file; times of receipt then go on from where they were.
+"""
 
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from avatar_core.errors import StorageError
 
+_BACK = 50_000_000  # from a message to the next: more than recorders mix up [ns]
+_FEW = 3  # times that a clock is set back; more often, messages were written in any order
 MAX_MESSAGES = 10_000_000  # of a topic: nearly three hours at 1 kHz, 700 MB
 
 
@@ -76,10 +83,27 @@ class TableWriter:
         self._label.append(index)
         self._values.extend(values)
 
-    def table(self) -> Table:
-        """What was collected, sorted by the time of receipt; repeated messages once."""
+    def set_back(self) -> list[int]:
+        """By how much the clock was set back, time after time [ns]."""
+        steps = np.diff(np.array(self._received, np.int64))
+        back = steps < -_BACK
+        if not 0 < back.sum() <= _FEW:
+            return []
+        period = int(np.median(steps[~back])) if not back.all() else 0
+        return [period - step for step in steps[back].tolist()]
+
+    def table(self, set_back: Sequence[int] = ()) -> Table:
+        """The collected messages, sorted by the time of receipt; repeated messages once.
+
+        set_back : as of :meth:`set_back`, of all topics
+        """
+        received = np.array(self._received, np.int64)
+        if set_back:
+            after = np.flatnonzero(np.diff(received) < -_BACK) + 1
+            for first, step in zip(after, set_back, strict=True):
+                received[first:] += step
         whole = Table(
-            np.array(self._received, np.int64),
+            received,
             np.array(self._stamps, np.int64),
             np.array(self._label, np.int64),
             tuple(self._labels),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ import numpy as np
 from avatar_core.bags.files import is_bag
 from avatar_core.bags.periods import valid_tips
 from avatar_core.bags.read import WRENCHES, Progress, read_bag
+from avatar_core.bags.table import Table
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import StorageError
 from avatar_core.geometry.tip import Tip
@@ -21,12 +23,17 @@ from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
 from avatar_core.uncertainty.calibration_report import numbers, verdict
 from avatar_core.uncertainty.distributions import parse
 from avatar_core.uncertainty.known import priors_of
-from avatar_core.uncertainty.palpation import palpation_of
+from avatar_core.uncertainty.palpation import Palpation, palpation_of
+from avatar_core.uncertainty.sensor import sensed
+from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum
 
 RADIUS = 5e-3  # of a tip of which no radius is given [m]
 SENSOR = {f"{prefix}measured_cf": axes for prefix, axes in (("", "absolute"), ("body/", "body"))}
 _NEXT = 0.05  # from a pose to the wrenches before and after it, at most [s]
+_DIFFER = 0.9  # part of the stamps that are others than those before them, at least
+_BACK = 100_000_000  # by which a stamp may be before the one before it [ns]
+_ONE_CLOCK = 1_000_000_000  # between the delays of two topics that share a clock, at most [ns]
 
 
 @dataclass(frozen=True)
@@ -46,12 +53,21 @@ class TouchFile:
 
 
 class Touched(NamedTuple):
-    """What a file says of a tool: its tip, where it was (n, 3) [m], the forces (n,) [N]."""
+    """Tip of a tool, times (n,) [s], positions (n, 3) [m] and forces, as a file has them.
+
+    vector : (n, 3) [N], in the sensor's axes
+    """
 
     tip: Tip
+    time: FloatArray
     position: FloatArray
-    force: FloatArray
+    vector: FloatArray
     notes: tuple[str, ...]
+
+    @property
+    def force(self) -> FloatArray:
+        """Size of the forces, shape (n,) [N]."""
+        return np.asarray(np.linalg.norm(self.vector, axis=1))
 
 
 def read_touched(file: TouchFile, progress: Progress | None = None) -> Touched:
@@ -68,8 +84,9 @@ def read_touched(file: TouchFile, progress: Progress | None = None) -> Touched:
 def measured_path(file: TouchFile, progress: Progress | None = None) -> Touched:
     """Read ``measured_cp`` and ``measured_cf`` of a tool; ``servo_cf`` where there is no sensor.
 
-    Forces are linear in time between wrenches, and NaN far from any. Notes say what was left out,
-    and where the forces come from.
+    Forces are linear in time between wrenches, and NaN far from any. Times are those of the
+    headers, or of receipt where these do not tell when something was measured. Notes say what was
+    left out, and where the forces come from.
 
     Raises
     ------
@@ -82,15 +99,36 @@ def measured_path(file: TouchFile, progress: Progress | None = None) -> Touched:
         raise StorageError(
             f"{bag.path} has no {bag.tool}/measured_cf and no {bag.tool}/servo_cf; record the force"
         )
-    received, tip, notes = valid_tips(bag, file.transform)
-    size = np.linalg.norm(wrenches.values, axis=1)
-    force = np.interp(received, wrenches.received, size, np.nan, np.nan)
-    after = np.clip(np.searchsorted(wrenches.received, received), 1, len(wrenches) - 1)
-    gap = wrenches.received[after] - wrenches.received[after - 1]
-    force[gap > 2.0 * _NEXT * 1e9] = np.nan
+    poses, tip, notes = valid_tips(bag, file.transform)
+    by_stamps = _stamps_tell(poses, wrenches)
+    if not by_stamps:
+        notes.append(
+            "stamps do not tell when poses and forces were measured: times of receipt are taken"
+        )
+    when, measured = (one.stamp if by_stamps else one.received for one in (poses, wrenches))
+    order, rising = np.argsort(when, kind="stable"), np.argsort(measured, kind="stable")
+    when, measured, values = when[order], measured[rising], wrenches.values[rising]
+    begin = min(when[0], measured[0])  # floats hold no nanoseconds since 1970
+    vector = np.column_stack(
+        [np.interp(when - begin, measured - begin, one, np.nan, np.nan) for one in values.T]
+    )
+    after = np.clip(np.searchsorted(measured, when), 1, len(measured) - 1)
+    vector[measured[after] - measured[after - 1] > 2.0 * _NEXT * 1e9] = np.nan
     if bag.wrench not in SENSOR:
         notes.append(f"forces are those of {bag.wrench}, which the cell computed, not a sensor's")
-    return Touched(Tip("sphere", file.radius), tip, force, (*bag.notes, *notes))
+    time = 1e-9 * (when - begin)
+    return Touched(Tip("sphere", file.radius), time, tip[order], vector, (*bag.notes, *notes))
+
+
+def _stamps_tell(poses: Table, wrenches: Table) -> bool:
+    """Whether the headers of both topics hold times of one clock."""
+    late = []
+    for one in (poses, wrenches):
+        differ = np.diff(one.stamp) != 0
+        if one.stamp.min() <= 0 or differ.mean() < _DIFFER or np.diff(one.stamp).min() < -_BACK:
+            return False
+        late.append(np.median(one.received - one.stamp))
+    return bool(abs(late[0] - late[1]) < _ONE_CLOCK)
 
 
 def _of_recording(file: TouchFile) -> Touched:
@@ -105,10 +143,27 @@ def _of_recording(file: TouchFile) -> Touched:
     periods, k = found.periods, number - 1
     return Touched(
         tips[k],
+        periods.number / found.rate,
         periods.tip[:, k],
-        np.linalg.norm(periods.force[:, k], axis=1),
+        periods.force[:, k],
         ("forces of a recording are those that the cell computed, unless a sensor's were put in",),
     )
+
+
+def palpated(
+    organ: Vademecum, touched: Touched, errors: Errors
+) -> tuple[Palpation, Errors, tuple[str, ...]]:
+    """The touches of a file without the sensor's zero and lag, their errors, and all notes.
+
+    Raises
+    ------
+    StorageError
+        If nothing was touched, or the sensor's zero is not known.
+    """
+    found = sensed(organ, touched.tip, touched.time, touched.position, touched.vector)
+    palpation = palpation_of(touched.position, found.size)
+    errors = replace(errors, mesh=math.hypot(errors.mesh, found.lost / 2.0))  # of all alike
+    return palpation, errors, (*touched.notes, *found.notices)
 
 
 def calibrated_files(
@@ -133,6 +188,7 @@ def calibrated_files(
     touched = read_touched(TouchFile(recording, tool, transform, radius or RADIUS))
     organ = load_vademecum(vademecum)
     priors = priors_of(organ, known)
-    table = touch_table(organ, touched.tip, palpation_of(touched.position, touched.force))
-    found = calibrated(table, priors, Errors())
+    palpation, errors, _ = palpated(organ, touched, Errors())
+    table = touch_table(organ, touched.tip, palpation)
+    found = calibrated(table, priors, errors)
     return numbers(table, found) | {"verdict": verdict(table, found)[0]}

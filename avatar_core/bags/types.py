@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from functools import lru_cache
+from importlib import import_module
 from types import ModuleType
 from typing import Any
 
@@ -75,6 +77,11 @@ def rosbag2() -> ModuleType:
         raise StorageError("bags need rosbags; pip install '.[bags]'") from error
     module: ModuleType = rosbag2
     return module
+
+
+def zstd() -> ModuleType:
+    """Python's module for Zstandard, or the one that rosbags brings for older Pythons."""
+    return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 
 
 @lru_cache(maxsize=1)

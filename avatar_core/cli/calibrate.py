@@ -84,11 +84,10 @@ def calibrate(
     ] = False,
 ) -> None:
     """Find Young's modulus and the coordinates of a vademecum from touches with measured forces."""
-    from avatar_core.bags.touched import TouchFile, read_touched
+    from avatar_core.bags.touched import TouchFile, palpated, read_touched
     from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
     from avatar_core.uncertainty.calibration_report import say
     from avatar_core.uncertainty.known import priors_of
-    from avatar_core.uncertainty.palpation import palpation_of
     from avatar_core.vademecum.storage import load_vademecum
 
     for one in output or []:
@@ -103,14 +102,14 @@ def calibrate(
     transform = pose_of(tool_transform)
     with progress_bar("messages") as progress:
         touched = read_touched(TouchFile(recording, tool, transform, 1e-3 * radius), progress)
-    palpation = palpation_of(touched.position, touched.force)
     vademecum = load_vademecum(file)
     priors = priors_of(vademecum, known)
+    errors = Errors(sensor, least, 1e-3 * depth, extent=extent)
+    palpation, errors, notes = palpated(vademecum, touched, errors)
     with progress_bar("materials") as progress:
         table = touch_table(vademecum, touched.tip, palpation, progress)
-    errors = Errors(sensor, least, 1e-3 * depth, extent=extent)
     found = calibrated(table, priors, errors)
-    say_notices(touched.notes)
+    say_notices(notes)
     say(vademecum.name, table, found)
     for one in output or []:
         _write(one, vademecum.name, table, found)

@@ -53,6 +53,7 @@ from avatar_core.vademecum.accuracy import Detail
 from avatar_core.vademecum.model import Vademecum
 
 LEAST_PROBABILITY = 0.01  # of so bad a fit, below which the model is called wrong
+MOST_RMS = 0.25  # of ln F, above which no fit is good; surfaces 0.3 mm off their places give 0.16
 NINETY = 1.6449  # deviations from the middle that hold 90 % of a normal distribution
 _N_WEIGHTINGS = 4  # by the forces that the last one expects
 _FARTHEST = 4.0  # deviations from what was known, of the values that are tried
@@ -164,7 +165,12 @@ class Calibration:
     @property
     def explained(self) -> bool:
         """Whether the model can have made these forces."""
-        return self.probability >= LEAST_PROBABILITY
+        return self.probability >= LEAST_PROBABILITY and self.rms <= MOST_RMS
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the misfit."""
+        return float(np.sqrt(np.mean(self.misfit**2)))
 
     def value(self, name: str, deviations: float = 0.0) -> float:
         """The most probable value of a parameter, or one some deviations above it."""

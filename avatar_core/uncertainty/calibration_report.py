@@ -46,11 +46,11 @@ def _unit(parameter: str) -> str:
 
 def verdict(table: TouchTable, found: Calibration) -> list[str]:
     """Whether the model fits, and where it does not."""
-    rms = float(np.sqrt(np.mean(found.misfit**2)))
-    chance = f"a fit so bad comes by chance in {found.probability:.2g} of cases"
+    told = f"forces differ by {found.rms:.1%} rms; "
+    told += f"a fit so bad comes by chance in {found.probability:.2g} of cases"
     if found.explained:
-        return [f"the fit is good: forces differ by {rms:.1%} rms; {chance}"]
-    lines = [f"NOT EXPLAINED: forces differ by {rms:.1%} rms; {chance}"]
+        return [f"the fit is good: {told}"]
+    lines = [f"NOT EXPLAINED: {told}"]
     for touch in np.argsort(-np.abs(found.deviations))[:_WORST]:
         at = table.palpation.tip[table.palpation.touch == touch][-1]
         place = "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * at))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,10 @@ from avatar_core.bags.read import read_bag
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene
-from tests.core.bags.bag_files import Cell, write_mcap, write_rosbag
+from avatar_core.vademecum.model import Vademecum
+from tests.core.bags.bag_files import PERIOD, Cell, write_mcap, write_rosbag
+
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
 
 Spoil = Callable[[bytes], bytes]
 
@@ -82,6 +86,48 @@ def test_a_folder_without_metadata(cell: Cell, tmp_path: Path) -> None:
     bag = read_bag(folder)
     np.testing.assert_array_equal(bag.poses.values[:, :3], cell.tip)
     assert bag.notes == (f"{folder} has no metadata.yaml; its files are read one by one",)
+
+
+@pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
+@pytest.mark.parametrize("compression", ["MESSAGE", "FILE"])
+def test_a_compressed_bag_without_metadata(
+    plugin: str, compression: str, cell: Cell, tmp_path: Path
+) -> None:
+    """And a file of it alone."""
+    folder = write_rosbag(tmp_path / "bag", cell.messages(), plugin, 9, compression)
+    (folder / "metadata.yaml").unlink()
+    (file,) = folder.iterdir()
+    for path in (folder, file):
+        np.testing.assert_array_equal(read_bag(path).poses.values[:, :3], cell.tip)
+
+
+def test_a_file_that_the_metadata_list_is_missing(cell: Cell, tmp_path: Path) -> None:
+    folder = write_rosbag(tmp_path / "bag", cell.messages())
+    held = yaml.safe_load((folder / "metadata.yaml").read_text())
+    held["rosbag2_bagfile_information"]["relative_file_paths"].append("bag_1.mcap")
+    (folder / "metadata.yaml").write_text(yaml.safe_dump(held))
+    bag = read_bag(folder)
+    assert len(bag.poses) == len(cell.stamp)
+    assert bag.notes == (f"1 of the 2 files of {folder} are missing",)
+
+
+@pytest.mark.parametrize("back", [200 * PERIOD, 200 * PERIOD + 300_000])
+@pytest.mark.parametrize("chunks", [True, False])
+def test_a_clock_that_is_set_back(
+    back: int, chunks: bool, organ: Vademecum, cell: Cell, tmp_path: Path
+) -> None:
+    """In the middle of a push; stamps come again, or do not."""
+    moved = replace(cell, stamp=cell.stamp - back * (np.arange(len(cell.stamp)) >= 400))
+    messages, bag = moved.messages(), tmp_path / "bag"
+    if chunks:
+        bag = write_mcap(tmp_path / "bag.mcap", messages, chunk_size=1 << 14)
+    else:
+        write_rosbag(bag, messages)
+    read = read_bag(bag)
+    assert [note for note in read.notes if "was set back by 0.2 s: times of" in note]
+    path = path_of(read, write_scene(Scene()), organ.id)
+    np.testing.assert_array_equal(path.recording.periods.tip[:, 0], cell.tip)
+    np.testing.assert_array_equal(path.recording.periods.force[:, 0], cell.sent)
 
 
 @pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
@@ -170,7 +216,8 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
     for name, match in (
         ("none", "there is no bag"),
         ("old.bag", "a bag of ROS 1; convert it"),
-        ("half.db3.zstd", "give the bag's folder"),
+        ("half.db3.zstd", "no readable bag"),
+        ("bag.txt", "give the bag's folder"),
     ):
         if "." in name:
             (tmp_path / name).write_bytes(b"x")

@@ -45,6 +45,8 @@ from tests.core.bags.bag_files import (
 )
 from tests.core.conftest import Command
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 SAME = 1e-9  # [N]
 SCENE = write_scene(Scene())
 Writer = Callable[[Path, Iterable[Message]], Path]

@@ -39,6 +39,8 @@ from tests.core.conftest import Command
 from tests.helpers.soft_organ import organ_on_springs, soft_organ
 from tests.helpers.touches import SPHERE, felt, path_over, recording_of
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 N_TOUCHES = 8
 TRUE = {"young": 6e3, "poisson": 0.45, "contrast": 5.0}
 SENSOR_ALONE = Errors(sensor=0.02, least=1e-9, depth=0.0, mesh=1e-9, extent=0.0)

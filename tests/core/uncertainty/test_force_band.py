@@ -29,6 +29,8 @@ from tests.helpers import box_organ
 from tests.helpers.box_organ import UP, top
 from tests.helpers.soft_organ import organ_on_springs, soft_organ, soft_tumour
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 SPHERE, PATCH = Tip("sphere", 5e-3), Tip("patch", 8e-3)
 KNOWN: dict[str, Distribution] = {
     "young": Lognormal(5e3, 1.4),

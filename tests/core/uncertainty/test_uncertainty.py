@@ -41,6 +41,8 @@ from tests.core.conftest import Command
 from tests.helpers.paths import PARAMS
 from tests.helpers.soft_organ import organ_on_springs, soft_organ, soft_tumour
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 DEPTHS = [1e-3, 3e-3]
 PATCH = Tip("patch", 8e-3)
 KNOWN = {
