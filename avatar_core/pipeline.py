@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -14,10 +15,11 @@ from avatar_core.certify.parametric import certify_range
 from avatar_core.common.processes import cpu_seconds, repeatable
 from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.contact.timing import timed
-from avatar_core.errors import ContactError, CoordinateError, MaterialError, MeshError
+from avatar_core.errors import AvatarError, ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.fem.supports import Support
+from avatar_core.geometry.doubts import doubts_of
 from avatar_core.geometry.groups import regions_from_groups
 from avatar_core.geometry.level_set import orientation_offset
 from avatar_core.geometry.mesh import Regions, TetMesh, regions_by_rule, tetrahedralize
@@ -160,6 +162,7 @@ def build(
         Of the stage that refused, with the remedy.
     """
     options = options or OrganOptions()
+    provenance = _provenance(surface, options)
     progress("mesh", 0.0, NO_ERROR)
     mesh = tetrahedralize(surface, options.n_vertices)
     progress("mesh", 1.0, NO_ERROR)
@@ -168,7 +171,6 @@ def build(
     loads = load_surface(mesh, regions, options.patch_radius)
     common = (surface.name, elasticity, regions, loads)
     tip_field = make_felt_field(mesh, regions, loads.patch_radius, surface)
-    provenance = _provenance(surface, options)
 
     def count(done: int) -> None:
         progress("certify", done / options.n_certified, NO_ERROR)
@@ -199,8 +201,17 @@ def build(
         )
     certificate = vademecum.certificate or certificate
     certificate = replace(certificate, build_cpu_seconds=cpu_seconds())
-    assert certificate.curve is not None
-    curve = timed(vademecum, certificate.curve, lambda done: progress("time", done, NO_ERROR))
+    return _timed(vademecum.with_certificate(certificate), progress)
+
+
+def _timed(vademecum: Vademecum, progress: Progress) -> Vademecum:
+    """The vademecum with the times of its curve, or a notice why they were not measured."""
+    certificate = vademecum.certificate
+    assert certificate is not None and certificate.curve is not None
+    try:
+        curve = timed(vademecum, certificate.curve, lambda done: progress("time", done, NO_ERROR))
+    except AvatarError as error:
+        return vademecum.with_notices(f"steps were not timed: {error}")
     return vademecum.with_certificate(replace(certificate, curve=curve))
 
 
@@ -271,9 +282,17 @@ def _elasticity(
     return problem if options.coordinates else problem.refining()
 
 
-def orientation_warning(surface: SurfaceMesh) -> str | None:
-    """A warning if the surface lies more than 45 degrees off the phantom, naming the option."""
-    return orientation_offset(surface, phantom_liver()).warning
+@lru_cache(maxsize=1)  # a command says them before it builds
+def notices_of(surface: SurfaceMesh, options: OrganOptions) -> tuple[str, ...]:
+    """Notices before a build, one line each: what was read, and what is doubtful.
+
+    Raises SurfaceError if less than half of the tumour lies in the organ.
+    """
+    tumours = () if options.tumour is None else (options.tumour,)
+    read = [notice for one in (surface, *tumours) for notice in one.notices]
+    turned = orientation_offset(surface, phantom_liver()).warning
+    doubts = doubts_of(surface, tumours, options.groups is not None)
+    return (*dict.fromkeys(read), *((turned,) if turned else ()), *doubts)
 
 
 def _provenance(surface: SurfaceMesh, options: OrganOptions) -> Provenance:
@@ -291,7 +310,7 @@ def _provenance(surface: SurfaceMesh, options: OrganOptions) -> Provenance:
         axes=surface.axes_name,
         versions=tuple(f"{name} {_version(name)}" for name in _RECORDED),
         parameters=tuple(f"{name}={value}" for name, value in sorted(parameters.items())),
-        notices=surface.notices,
+        notices=notices_of(surface, options),
     )
 
 

@@ -109,5 +109,5 @@ def provenance(problem: PatientProblem) -> Provenance:
         unit=surface.unit,
         axes=surface.axes_name,
         parameters=tuple(f"{name}={value}" for name, value in parameters.items()),
-        notices=surface.notices,
+        notices=surface.notices + problem.notices,
     )

@@ -22,6 +22,7 @@ from avatar_core.atlas.storage import ATLAS_SCHEMA, load_atlas, save_atlas
 from avatar_core.atlas.workers import Workers
 from avatar_core.common.processes import repeatable
 from avatar_core.errors import AvatarError
+from avatar_core.geometry.doubts import size_notice
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
@@ -242,7 +243,7 @@ def _growth(atlas: Atlas, results: Sequence[Anatomy | Skipped], resumed: int) ->
     notices += tuple(
         f"{one.name}: {notice}"
         for one in grown.anatomies[len(atlas) :]
-        for notice in one.surface.notices
+        for notice in one.surface.notices + size_notice(one.surface)
     )
     skipped = tuple(one for one in results if isinstance(one, Skipped))
     return Growth(grown, added, skipped, resumed, notices)

@@ -31,6 +31,7 @@ from avatar_core.certify.linear import certify
 from avatar_core.common.processes import cpu_seconds, repeatable
 from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.patch_loads import patch_loads
+from avatar_core.geometry.doubts import doubts_of
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.linear import build_vademecum
@@ -128,7 +129,8 @@ class Patient:
     estimates : GalerkinErrorEstimate after each enrichment (``reduced`` only); the last one is that
         of the result
     solutions : number of full finite element solutions
-    notices : what did not converge, and where the patient lies in the base, one line each
+    notices : what is doubtful of the organ, what did not converge, and where the patient lies in
+        the base, one line each
     seconds : StageSeconds
     """
 
@@ -195,6 +197,7 @@ def posed_patient(
             "solved for a clamp or supports of your own"
         )
     clock = {} if clock is None else clock
+    doubts = doubts_of(surface, options.inside, options.groups is not None)
     progress("registration", 0.0, np.nan)
     with _timed(clock, "registration"):
         known = base.registrations.get(surface.source_sha256)
@@ -211,7 +214,7 @@ def posed_patient(
             problem = patient_problem(
                 surface, base, registration, mesh, options.groups, options.supports
             )
-    return problem, weights
+    return replace(problem, notices=doubts), weights
 
 
 def build_patient(
@@ -247,9 +250,7 @@ def build_patient(
         spent = replace(vademecum.certificate, build_cpu_seconds=sum(clock.values()))
         vademecum = vademecum.with_certificate(spent)
     progress("certify", 1.0, _mean_error(vademecum))
-    return _patient(
-        vademecum, fidelity, base, problem.registration, weights, estimates, solutions, clock
-    )
+    return _patient(vademecum, fidelity, base, problem, weights, estimates, solutions, clock)
 
 
 def require_fidelity(fidelity: str) -> None:
@@ -388,7 +389,7 @@ def _patient(
     vademecum: Vademecum,
     fidelity: Fidelity,
     base: PatientBase,
-    registration: Registration,
+    problem: PatientProblem,
     weights: Barycenter,
     estimates: tuple[GalerkinErrorEstimate, ...],
     solutions: int,
@@ -402,7 +403,8 @@ def _patient(
         barycenter=weights,
         estimates=estimates,
         solutions=solutions,
-        notices=_warnings(base, registration, weights, fidelity, vademecum),
+        notices=problem.notices
+        + _warnings(base, problem.registration, weights, fidelity, vademecum),
         seconds=StageSeconds(
             *(clock.get(name, 0.0) for name in ("registration", "mesh", "response", "certificate"))
         ),

@@ -26,6 +26,7 @@ class PatientProblem:
 
     surface : of the patient; registration : of the template to it
     mesh, regions, loads, elasticity : the patient's
+    notices : what is doubtful of the organ, one line each
     """
 
     surface: SurfaceMesh
@@ -34,6 +35,7 @@ class PatientProblem:
     regions: Regions
     loads: LoadSurface
     elasticity: Elasticity
+    notices: tuple[str, ...] = ()
 
     @property
     def outline(self) -> SurfaceMesh | None:

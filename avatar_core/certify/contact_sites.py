@@ -99,10 +99,8 @@ def with_contact_sites(
         notices.insert(0, f"only {len(sites)} of {n} places are far enough from the border")
     found = summarized(contacts, law_factor(contacts))
     certificate = replace(vademecum.certificate or Certificate.unknown(), contact_sites=found)
-    said = (*vademecum.provenance.notices, *(f"contact sites: {notice}" for notice in notices))
-    return replace(
-        vademecum, certificate=certificate, provenance=replace(vademecum.provenance, notices=said)
-    )
+    said = (f"contact sites: {notice}" for notice in notices)
+    return vademecum.with_certificate(certificate).with_notices(*said)
 
 
 def _reported(sites: Sequence[Site], progress: Progress) -> Iterator[Site]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -77,22 +77,12 @@ def create(
     used, and nothing was written.
     """
     from avatar_core.atlas.growth import AtlasOptions, create_atlas
-    from avatar_core.atlas.response import ResponseSolver
-    from avatar_core.atlas.workers import Workers
 
     require_output(file, [".h5"], surfaces)
     sources = _sources(surfaces, unit, axes, label)
     options = AtlasOptions(template_vertices, box, spacing)
-    with _resumable(), item_bar(len(sources)) as progress:
-        growth = create_atlas(
-            file,
-            sources,
-            options,
-            workers=Workers(jobs, scheduler),
-            solve_response=None if shapes_only else ResponseSolver(),
-            progress=progress,
-        )
-    _report(file, growth)
+    grow = partial(create_atlas, file, sources, options)
+    _report(file, _grown(grow, len(sources), shapes_only, jobs, scheduler))
 
 
 @atlas.command()
@@ -111,19 +101,10 @@ def add(
     The old file stays until the new one is complete. Exit code 1: no surface could be used.
     """
     from avatar_core.atlas.growth import extend_atlas
-    from avatar_core.atlas.response import ResponseSolver
-    from avatar_core.atlas.workers import Workers
 
     sources = _sources(surfaces, unit, axes, label)
-    with _resumable(), item_bar(len(sources)) as progress:
-        growth = extend_atlas(
-            file,
-            sources,
-            workers=Workers(jobs, scheduler),
-            solve_response=None if shapes_only else ResponseSolver(),
-            progress=progress,
-        )
-    _report(file, growth)
+    grow = partial(extend_atlas, file, sources)
+    _report(file, _grown(grow, len(sources), shapes_only, jobs, scheduler))
 
 
 @atlas.command()
@@ -201,6 +182,27 @@ def _show_text(file: Path, atlas: Atlas) -> None:
         )
 
 
+def _grown(
+    grow: Callable[..., Growth],
+    n_sources: int,
+    shapes_only: bool,
+    jobs: int | None,
+    scheduler: str | None,
+) -> Growth:
+    """The atlas after its growth; says after Ctrl-C how to go on."""
+    from avatar_core.atlas.response import ResponseSolver
+    from avatar_core.atlas.workers import Workers
+
+    response = None if shapes_only else ResponseSolver()
+    try:
+        with item_bar(n_sources) as progress:
+            workers = Workers(jobs, scheduler)
+            return grow(workers=workers, solve_response=response, progress=progress)
+    except KeyboardInterrupt:
+        print("avatar: run the same command again to resume", file=sys.stderr)
+        raise typer.Exit(EXIT_STOPPED) from None
+
+
 def _report(file: Path, growth: Growth) -> None:
     """Print what was added and skipped; raises AvatarError if nothing was added."""
     for one in growth.skipped:
@@ -246,13 +248,3 @@ def _files(path: Path) -> list[Path]:
     if not found:
         raise AvatarError(f"no surface in {path}; it should hold files of {', '.join(SUFFIXES)}")
     return found
-
-
-@contextmanager
-def _resumable() -> Iterator[None]:
-    """Say after Ctrl-C how to go on."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        print("avatar: run the same command again to resume", file=sys.stderr)
-        raise typer.Exit(EXIT_STOPPED) from None

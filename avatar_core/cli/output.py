@@ -46,7 +46,7 @@ def require_output(
     if not os.access(output.parent, os.W_OK | os.X_OK):
         raise StorageError(f"folder {output.parent} cannot be written to; choose another")
     for source in inputs:
-        if source is not None and _same_file(output, source):
+        if source is not None and same_file(output, source):
             raise StorageError(f"{output} is also read ({source}); give another name")
     there = os.path.lexists(output)
     if there and not overwrite and replaces is not None and not replaces(output):
@@ -55,7 +55,7 @@ def require_output(
         )
 
 
-def _same_file(one: str | Path, other: str | Path) -> bool:
+def same_file(one: str | Path, other: str | Path) -> bool:
     """Whether both exist and are one file, through links too."""
     try:
         return os.path.samefile(one, other)

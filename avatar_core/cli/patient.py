@@ -113,7 +113,6 @@ def patient(
         supports=supports,
     )
     organ = read_organ(surface, unit, axes, label)
-    say_notices(organ.notices)
     with stage_bar() as progress:
         report = clock.following(progress)
         found = patient_vademecum(organ, base, fidelity, options, report)  # type: ignore[arg-type]

@@ -157,17 +157,17 @@ def _show_cost(one: Scene, v: Vademecum) -> None:
     print(
         f"  cost of a step here and now (load average {load_average():.2f}): a push of "
         f"{PUSH * 1e3:g} mm and a slide {DEPTH * 1e3:g} mm deep;\n"
-        "  of the steps in which all tools touch, each with its cloud; numba keeps what it compiled"
+        "  of the steps in which all tools touch, each with its cloud"
     )
     print(
         f"    {'':22s} {'p50 us':>8s} {'p99 us':>8s} {'steps':>7s} {'model MB':>9s} "
-        f"{'laid out s':>10s} {'compiled s':>10s}"
+        f"{'laid out s':>10s}"
     )
     names = {"bare": "bare: one tool, alone", "scene": "this scene"}
     for row in rows:
         print(
             f"    {names[row.name]:22s} {row.p50_us:8.1f} {row.p99_us:8.1f} {row.n_steps:7d} "
-            f"{row.bytes / 1e6:9.1f} {row.layout_seconds:10.2f} {row.compile_seconds:10.2f}"
+            f"{row.bytes / 1e6:9.1f} {row.layout_seconds:10.2f}"
         )
     if not one.effects:
         print("    (without effects, this scene is the bare step)")

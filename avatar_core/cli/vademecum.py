@@ -5,19 +5,19 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from avatar_core.cli.output import Overwrite, require_output
+from avatar_core.cli.output import Overwrite, require_output, same_file
 from avatar_core.cli.progress import build_stages, stage_bar
 from avatar_core.cli.timings import StageClock, Timings, require_timings, show_timings
 from avatar_core.common.dataclass_json import plain
 from avatar_core.errors import AvatarError
-from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES
+from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, LABEL_MAPS, MESH_NAMES
 
 if TYPE_CHECKING:
     from avatar_core.fem.supports import Support
@@ -47,7 +47,11 @@ Axes = Annotated[
     ),
 ]
 Label = Annotated[
-    str | None, typer.Option(help="number or name (.seg.nrrd, .dcm) of the organ in a label map")
+    str | None,
+    typer.Option(
+        help="number or name (.seg.nrrd, .dcm) of the organ in a label map; several, as 1,2,3, "
+        "are one organ"
+    ),
 ]
 Groups = Annotated[
     Path | None,
@@ -110,11 +114,15 @@ def vademecum(
         Path | None,
         typer.Option(
             help="surface file of a tumour, in unit and axes of the organ unless it states its "
-            "own, or a label map, such as that of the organ"
+            "own, or a label map; default with --tumour-label: that of the organ"
         ),
     ] = None,
     tumour_label: Annotated[
-        str | None, typer.Option(help="number or name of the tumour in its label map")
+        str | None,
+        typer.Option(
+            help="number or name of the tumour in its label map; in that of the organ, it belongs "
+            "to the organ"
+        ),
     ] = None,
     contrast: Annotated[
         float, typer.Option(help="Young's modulus inside the tumour over that outside [-]")
@@ -165,7 +173,7 @@ def vademecum(
     from avatar_core.offline.large_deformation import LargeRule
     from avatar_core.offline.rule import BuildRule
     from avatar_core.offline.supports import SupportOption
-    from avatar_core.pipeline import OrganOptions, build, orientation_warning
+    from avatar_core.pipeline import OrganOptions, build, notices_of
     from avatar_core.reduction.coordinates import Coordinate
     from avatar_core.vademecum.storage import is_vademecum, load_vademecum, save_vademecum
 
@@ -194,8 +202,7 @@ def vademecum(
     require_timings(timings)
     clock = StageClock()
     clock.begin("surface")
-    organ = read_organ(surface, unit, axes, label)
-    lesion = None if tumour is None else _read_tumour(tumour, unit, axes, tumour_label, organ)
+    organ, lesion = _read_with_tumour(surface, unit, axes, label, tumour, tumour_label)
     options = OrganOptions(
         n_vertices=vertices,
         material=Material(young, poisson),
@@ -216,14 +223,12 @@ def vademecum(
         with_mesh_error=mesh_error,
         n_displayed=displayed,
     )
-    say_notices((*organ.notices, *(lesion.notices if lesion else ())))
-    warning = orientation_warning(organ)
-    if warning:
-        print(f"warning: {warning}", file=sys.stderr)
+    notices = notices_of(organ, options)
+    say_notices(notice for notice in notices if notice not in organ.notices)
     with stage_bar(build_stages(material != "linear", contact_sites)) as progress:
         report = clock.following(progress)
         built = build(organ, options, report)
-    say_notices(built.provenance.notices[len(organ.notices) :])
+    say_notices(built.provenance.notices[len(notices) :])
     clock.begin("save")
     save_vademecum(built, output)
     clock.begin("show")
@@ -291,14 +296,44 @@ def _large_summary(v: Vademecum) -> dict[str, Any] | None:
     return {"material": v.large.material, "bytes": v.large.nbytes, "certificate": certificate}
 
 
-def read_organ(surface: str, unit: str, axes: str | None, label: str | None) -> SurfaceMesh:
-    """A surface from a file, or the built-in liver."""
+def read_organ(
+    surface: str, unit: str, axes: str | None, label: str | None, inside: Sequence[str] = ()
+) -> SurfaceMesh:
+    """A surface from a file, or the built-in liver; see ``read_surface``.
+
+    Prints at once what was read: whatever is refused later, this may say why.
+    """
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.geometry.surface import read_surface
 
     if surface == "phantom":
         return phantom_liver()
-    return read_surface(surface, unit, parsed_axes(axes), label)
+    organ = read_surface(surface, unit, parsed_axes(axes), label, inside)
+    say_notices(organ.notices)
+    return organ
+
+
+def _read_with_tumour(
+    surface: str,
+    unit: str,
+    axes: str | None,
+    label: str | None,
+    tumour: Path | None,
+    tumour_label: str | None,
+) -> tuple[SurfaceMesh, SurfaceMesh | None]:
+    """An organ, with what was cut out of its label for the tumour, and the tumour if there is one.
+
+    A tumour's label without a file is one of the organ's label map.
+    """
+    if tumour is None and tumour_label is None:
+        return read_organ(surface, unit, axes, label), None
+    if tumour is None:
+        is_map = surface.lower().endswith(LABEL_MAPS)
+        require(is_map, f"--tumour-label is that of a label map, not of {surface}; give --tumour")
+        tumour = Path(surface)
+    inside = (tumour_label,) if tumour_label and same_file(surface, tumour) else ()
+    organ = read_organ(surface, unit, axes, label, inside)
+    return organ, _read_tumour(tumour, unit, axes, tumour_label, organ)
 
 
 def _read_tumour(

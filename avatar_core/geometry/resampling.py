@@ -7,7 +7,7 @@ import numpy as np
 
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry.skin import weld
+from avatar_core.geometry.skin import signed_volume, weld
 
 MOST_VERTICES = 1_000_000
 
@@ -26,8 +26,9 @@ def resampled(vertices: FloatArray, faces: IntArray, n: int) -> tuple[FloatArray
     """A surface with about n vertices: subdivided by Loop's scheme, then edges collapsed.
 
     Loop's limit surface is smooth (Loop, 1987); edges collapse in the order of the quadric error
-    (Garland & Heckbert, 1997). A surface that is no manifold has flat triangles split in four
-    instead, and gets n vertices at least.
+    (Garland & Heckbert, 1997). Both shrink a convex surface, so that its vertices are then moved
+    along their normals by (V_before - V) / A, with volume V and area A. A surface that is no
+    manifold has flat triangles split in four instead, and gets n vertices at least.
 
     Parameters
     ----------
@@ -37,13 +38,19 @@ def resampled(vertices: FloatArray, faces: IntArray, n: int) -> tuple[FloatArray
     vertices, faces = np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64)
     manifold = is_manifold(faces)
     split = igl.loop if manifold else igl.upsample
+    volume = signed_volume(vertices, faces)
     while len(vertices) < n:
         vertices, faces = split(vertices, faces)
     n_faces = len(faces) - 2 * (len(vertices) - n)  # a collapse takes a vertex and two triangles
     if manifold and n_faces < len(faces):
         fortran = np.asfortranarray(vertices), np.asfortranarray(faces, dtype=np.int32)
         vertices, faces, _, _ = igl.qslim(*fortran, n_faces)
-    return np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
+    vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
+    if manifold:
+        lost = volume - signed_volume(vertices, faces)
+        area = 0.5 * igl.doublearea(vertices, faces).sum()
+        vertices = vertices + lost / area * igl.per_vertex_normals(vertices, faces)
+    return vertices, faces
 
 
 def unified(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:

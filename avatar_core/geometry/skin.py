@@ -204,3 +204,9 @@ def _separates(soup: Soup, corners: FloatArray) -> NDArray[np.bool_]:
 def _inside(soup: Soup, points: FloatArray) -> NDArray[np.bool_]:
     points = np.ascontiguousarray(points, dtype=np.float64)
     return np.greater(np.abs(igl.fast_winding_number(*soup, points)), 0.5)
+
+
+def signed_volume(vertices: FloatArray, faces: NDArray[Any]) -> float:
+    """V = 1/6 sum a . (b x c) about the mean vertex, in the vertices' unit cubed."""
+    corners = vertices[faces] - vertices[faces].mean(axis=(0, 1))
+    return float(np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])) / 6)

@@ -21,8 +21,8 @@ from scipy.spatial import cKDTree
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.label_files import is_label_map
-from avatar_core.geometry.skin import Skin, components, directed_edges, skin_of, weld
-from avatar_core.geometry.surface_files import content_of, parse, stated_axes
+from avatar_core.geometry.skin import Skin, components, directed_edges, signed_volume, skin_of, weld
+from avatar_core.geometry.surface_files import content_of, parsed, stated_axes
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 PLAUSIBLE_EXTENT = (0.05, 0.5)  # largest extent of an organ [m]
@@ -80,7 +80,7 @@ class SurfaceMesh:
     def volume(self) -> float:
         """Enclosed volume [m3]: V = 1/6 sum a.(b x c), by winding number if cracked or doubled."""
         if self.is_watertight and np.all(np.abs(self.clear_winding) < 1.5):
-            return abs(_signed_volume(self.vertices, self.faces))
+            return abs(signed_volume(self.vertices, self.faces))
         return _winding_volume(self)
 
     @cached_property
@@ -145,8 +145,9 @@ def read_surface(
         from the file's coordinates to RAS in the file's unit; None: as the file's header states
         (``SPACE=LPS``, as 3D Slicer writes it), RAS if it states none. Axes that are given hold
         against the header, with a notice.
-    label : number, or name in a ``.seg.nrrd``, of one in a label map; not needed for the only one
-    inside : further labels that belong to the organ, as tumours that were cut out of it
+    label : number, or name in a ``.seg.nrrd``, of one in a label map, or several with commas
+        between; not needed for the only one
+    inside : further labels inside the organ, as tumours; those cut out of its label are filled
     one_body : small stray bodies are dropped, others refused; False for tumours
 
     Raises SurfaceError naming cause and remedy: file missing or unreadable, no triangles, points
@@ -157,7 +158,7 @@ def read_surface(
     stated = stated_axes(path)
     matrix = axes_matrix((stated or "RAS") if axes is None else axes)
     content = content_of(path)
-    vertices, faces = parse(path, label, inside)
+    (vertices, faces), read = parsed(path, label, inside, one_body, 1e3 * scale)
     _check_arrays(vertices, faces, path.name)
     vertices = scale * (vertices @ matrix[:3, :3].T + matrix[:3, 3])
     if np.linalg.det(matrix[:3, :3]) < 0:  # a mirror turns every face round
@@ -168,9 +169,10 @@ def read_surface(
         name=path.name.split(".")[0],
         unit=unit,
         axes=matrix,
-        notices=_contradictions(matrix, stated, path),
+        notices=read + _contradictions(matrix, stated, path),
         source_sha256=hashlib.sha256(content).hexdigest(),
     )
+    surface = _with_faces(surface, surface.faces)  # loose vertices would count in the box
     if one_body:
         surface = keep_organ(surface)
     surface = orient_outward(require_closed(surface))
@@ -270,7 +272,7 @@ def winding_number(surface: SurfaceMesh, points: FloatArray) -> FloatArray:
 
 def _clear_winding(surface: SurfaceMesh, n: int = 24, band: float = 0.02) -> FloatArray:
     """Winding number on an n^3 grid in the bounding box, off the surface by band x diagonal."""
-    points = _box_points(*surface.bounding_box, (n, n, n))
+    points = box_points(*surface.bounding_box, (n, n, n))
     squared, _, _ = igl.point_mesh_squared_distance(points, surface.vertices, _int64(surface.faces))
     clear = squared > (band * np.linalg.norm(surface.extent)) ** 2
     return winding_number(surface, points[clear])
@@ -336,7 +338,7 @@ def _rim(edges: IntArray) -> IntArray:
 def _patch_volumes(surface: SurfaceMesh, labels: IntArray) -> FloatArray:
     """|Signed volume| of each component about its own centre [m3]."""
     parts = [surface.faces[labels == k] for k in range(labels.max() + 1)]
-    return np.array([abs(_signed_volume(surface.vertices, part)) for part in parts])
+    return np.array([abs(signed_volume(surface.vertices, part)) for part in parts])
 
 
 def _require_one_body(
@@ -374,12 +376,6 @@ def _with_faces(
     )
 
 
-def _signed_volume(vertices: FloatArray, faces: NDArray[Any]) -> float:
-    """V = 1/6 sum a . (b x c) about the mean vertex [m3]."""
-    corners = vertices[faces] - vertices[faces].mean(axis=(0, 1))
-    return float(np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])) / 6)
-
-
 def _winding_volume(surface: SurfaceMesh, n: int = 48) -> float:
     """Volume inside the skin by quadrature with the indicator clip(1/2 - phi / h, 0, 1) [m3].
 
@@ -388,12 +384,12 @@ def _winding_volume(surface: SurfaceMesh, n: int = 48) -> float:
     h = float(surface.extent.max()) / n
     low = surface.bounding_box[0] - h
     cells = np.ceil(surface.extent / h).astype(int) + 2
-    points = _box_points(low, low + h * cells, cells.tolist())
+    points = box_points(low, low + h * cells, cells.tolist())
     phi = surface.skin.signed_distance(points)
     return float(h**3 * np.clip(0.5 - phi / h, 0.0, 1.0).sum())
 
 
-def _box_points(low: FloatArray, high: FloatArray, shape: Iterable[int]) -> FloatArray:
+def box_points(low: FloatArray, high: FloatArray, shape: Iterable[int]) -> FloatArray:
     """Centres of the cells of a box divided into shape cells, shape (product, 3)."""
     axes = [
         a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, shape, strict=True)

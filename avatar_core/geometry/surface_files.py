@@ -8,8 +8,8 @@ Nothing is checked here but that the file can be read; :mod:`avatar_core.geometr
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,11 +21,17 @@ from avatar_core.common.arrays import IntArray, Soup
 from avatar_core.errors import SurfaceError, one_line
 from avatar_core.geometry.label_files import is_label_map
 from avatar_core.geometry.label_maps import surface_of_label
-from avatar_core.geometry.surface_formats import MESHES, SUFFIXES
-from avatar_core.geometry.vtk_files import read_polydata
+from avatar_core.geometry.ply_files import read_ply
+from avatar_core.geometry.surface_formats import (
+    BYTE_ORDER_MARK,
+    MAX_FILE_BYTES,
+    MESHES,
+    SUFFIXES,
+    kind_of,
+)
+from avatar_core.geometry.vtk_files import read_vtk
 from avatar_core.geometry.vtk_xml_files import read_vtp, stated_axes_of
 
-MAX_FILE_BYTES = 4 << 30
 HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for
 
 
@@ -33,20 +39,26 @@ HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for
 class Format:
     """How one format of meshes is read.
 
-    read : vertices (n, 3) and triangles (m, 3) of a file
+    read : vertices (n, 3) and triangles (m, 3) of a file's content
     comments : the part of a file's head that may state its axes; None if the format has none
     """
 
-    read: Callable[[Path], Soup]
+    read: Callable[[bytes], Soup]
     comments: Callable[[bytes], bytes] | None = None
 
 
 def content_of(path: Path) -> bytes:
     """The file's bytes, for its hash; SurfaceError if there is no such ordinary file."""
+    with _naming(path), files.opened(path, MAX_FILE_BYTES) as source:
+        return files.content_of(source)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Turn what the system says of a file into a SurfaceError."""
     try:
-        with files.opened(path, MAX_FILE_BYTES) as source:
-            return files.content_of(source)
-    except files.FileError as error:
+        yield
+    except (files.FileError, OSError) as error:
         raise SurfaceError(
             f"cannot read {path}: {error}; check the path and its permissions"
         ) from error
@@ -64,17 +76,13 @@ def stated_axes(path: Path) -> str | None:
     """
     if is_label_map(path):
         return "RAS"
-    kind = path.suffix.lower()
+    kind = kind_of(path)
     comments_of = _FORMATS[kind].comments if kind in MESHES else None
     if comments_of is None:
         return None
-    try:
-        with files.opened(path, MAX_FILE_BYTES) as source:
-            head = source.read(-1 if kind == ".vtp" else HEADER_BYTES)
-    except (files.FileError, OSError) as error:
-        raise SurfaceError(
-            f"cannot read {path}: {error}; check the path and its permissions"
-        ) from error
+    with _naming(path), files.opened(path, MAX_FILE_BYTES) as source:
+        head = source.read(-1 if kind == ".vtp" else HEADER_BYTES)
+    head = head.removeprefix(BYTE_ORDER_MARK)
     found = re.search(rb"\bSPACE=(RAS|LPS)\b", comments_of(head), re.IGNORECASE)
     return found[1].decode().upper() if found else None
 
@@ -106,18 +114,29 @@ def _vtp_comments(content: bytes) -> bytes:
     return b""
 
 
-def parse(path: Path, label: int | str | None, inside: Sequence[str] = ()) -> Soup:
-    """Vertices (n, 3) in the file's unit and axes, and triangles (m, 3).
+def parse(path: Path, label: int | str | None = None) -> Soup:
+    """Vertices (n, 3) in the file's unit and axes, and triangles (m, 3)."""
+    return parsed(path, label)[0]
 
-    label, inside : as of :func:`avatar_core.geometry.label_maps.surface_of_label`
+
+def parsed(
+    path: Path,
+    label: int | str | None = None,
+    inside: Sequence[str] = (),
+    is_organ: bool = True,
+    mm: float = 1.0,
+) -> tuple[Soup, tuple[str, ...]]:
+    """The result of :func:`parse`, and notices of a label map.
+
+    label, inside, is_organ, mm : as of :func:`avatar_core.geometry.label_maps.surface_of_label`
     """
-    kind = ".nii" if path.name.lower().endswith(".nii.gz") else path.suffix.lower()
-    if kind not in SUFFIXES:
+    kind = kind_of(path)
+    if not kind:
         raise SurfaceError(f"{path.name}: format not supported; use {', '.join(SUFFIXES)}")
     try:
         if is_label_map(path):
-            return surface_of_label(path, label, inside)
-        return _FORMATS[kind].read(path)
+            return surface_of_label(path, label, inside, is_organ, mm)
+        return _FORMATS[kind].read(content_of(path).removeprefix(BYTE_ORDER_MARK)), ()
     except SurfaceError:
         raise
     except Exception as error:  # of parsers, each with errors of its own
@@ -127,15 +146,11 @@ def parse(path: Path, label: int | str | None, inside: Sequence[str] = ()) -> So
         ) from error
 
 
-def _read_obj(path: Path) -> Soup:
-    """Wavefront OBJ: v, and f in all its forms (a, a/b, a//c, a/b/c, -1, polygons).
-
-    Own code because meshio refuses files whose texture and vertex counts differ, and misreads
-    negative indices.
-    """
+def _read_obj(content: bytes) -> Soup:
+    """Wavefront OBJ: v, and f in all its forms (a, a/b, a//c, a/b/c, -1, polygons)."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in content.decode("utf-8", errors="replace").splitlines():
         words = line.split()
         if words and words[0] == "v":
             vertices.append([float(word) for word in words[1:4]])
@@ -153,35 +168,46 @@ def _fan(polygons: Iterable[Iterable[int]]) -> IntArray:
     return np.array(triangles, dtype=np.int64).reshape(-1, 3)
 
 
-def _by_meshio(reader: str) -> Callable[[Path], Soup]:
-    """Reader of one format by meshio (asked directly: `meshio.read` prints and exits)."""
+def _read_stl(content: bytes) -> Soup:
+    """Binary STL, whatever lies behind its last triangle, and text."""
+    n = int.from_bytes(content[80:84], "little")
+    if 0 < 84 + 50 * n <= len(content):  # a text would have to be of gigabytes
+        record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        corners = np.frombuffer(content, record, n, 84)["corners"].reshape(-1, 3)
+    elif content.lstrip()[:5].lower() == b"solid" and b"\0" not in content[:512]:
+        words = re.findall(rb"\svertex\s+(\S+)\s+(\S+)\s+(\S+)", content, re.IGNORECASE)
+        corners = np.array(words, np.float64).reshape(-1, 3)
+    else:
+        raise ValueError(f"it ends before the last of its {n} triangles")
+    with np.errstate(invalid="ignore"):  # some bytes are signalling NaN
+        points, index = np.unique(corners.astype(np.float64), axis=0, return_inverse=True)
+    return points, index.reshape(-1, 3)
 
-    def read(path: Path) -> Soup:
-        import meshio
 
-        with np.errstate(over="ignore"):  # its test for binary STL overflows on text
-            mesh = getattr(meshio, reader).read(str(path))
-        blocks = [c.data for c in mesh.cells if c.type in ("triangle", "quad", "polygon")]
-        faces = [_fan(block.tolist()) for block in blocks]
-        points = np.asarray(mesh.points, dtype=np.float64)
-        return points, np.vstack(faces) if faces else np.empty((0, 3), dtype=np.int64)
-
-    return read
-
-
-def _read_vtk(path: Path) -> Soup:
-    """Legacy VTK: polygonal data by our own reader, which meshio cannot read, the rest by it."""
-    content = path.read_bytes()
-    if b"POLYDATA" in content[:1024].upper():
-        return read_polydata(content)
-    return _by_meshio("vtk")(path)
+def _read_off(content: bytes) -> Soup:
+    """OFF in text, with or without colours, normals and texture (COFF, NOFF, STOFF)."""
+    text = content.decode("utf-8", errors="replace")
+    begin = re.match(r"\s*(ST)?C?N?OFF(?![A-Za-z])", text)
+    if begin is None or "BINARY" in text[: begin.end() + 10]:
+        raise ValueError("it does not begin with OFF or COFF, or is binary; save it as text")
+    lines = [line.partition("#")[0].split() for line in text[begin.end() :].splitlines()]
+    (counts, *rows) = filter(None, lines)
+    n, m = (int(word) for word in counts[:2])
+    if min(n, m) < 0 or n + m > len(rows):
+        raise ValueError(f"it ends after {len(rows)} of {n + m} vertices and faces")
+    points = np.array([[float(word) for word in row[:3]] for row in rows[:n]], np.float64)
+    # Behind its corners, a face has its colour.
+    polygons = [[int(word) for word in row[: 1 + int(row[0])]] for row in rows[n : n + m]]
+    if any(len(polygon) != 1 + polygon[0] for polygon in polygons):
+        raise ValueError("a face has fewer corners than it announces")
+    return points.reshape(-1, 3), _fan(polygon[1:] for polygon in polygons)
 
 
 _FORMATS = {
     ".obj": Format(_read_obj, _obj_comments),
-    ".stl": Format(_by_meshio("stl"), _stl_comments),
-    ".ply": Format(_by_meshio("ply"), _ply_comments),
-    ".vtk": Format(_read_vtk, _vtk_comments),
-    ".vtp": Format(lambda path: read_vtp(path.read_bytes()), _vtp_comments),
-    ".off": Format(_by_meshio("off")),
+    ".stl": Format(_read_stl, _stl_comments),
+    ".ply": Format(read_ply, _ply_comments),
+    ".vtk": Format(read_vtk, _vtk_comments),
+    ".vtp": Format(read_vtp, _vtp_comments),
+    ".off": Format(_read_off),
 }

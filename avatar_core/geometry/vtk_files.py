@@ -1,10 +1,10 @@
-"""Polygonal data in legacy VTK files, versions 1 to 5.1, in ASCII and binary (big endian).
+"""Surfaces in legacy VTK files, versions 1 to 5.1, in ASCII and binary (big endian).
 
 A file is five lines of header and then sections, each a keyword with counts and its numbers:
-``POINTS``; ``POLYGONS`` and ``TRIANGLE_STRIPS``, which become triangles; ``VERTICES``, ``LINES``,
-``METADATA`` and ``FIELD``, which are skipped. It is read as far as ``POINT_DATA`` or ``CELL_DATA``,
-behind which there is no geometry. What a count claims is compared with what the file holds before
-memory is allocated for it.
+``POINTS``; ``POLYGONS``, ``TRIANGLE_STRIPS``, and ``CELLS`` with ``CELL_TYPES``, which become
+triangles; ``VERTICES``, ``LINES``, ``METADATA`` and ``FIELD``, which are skipped. It is read as far
+as ``POINT_DATA`` or ``CELL_DATA``, behind which there is no geometry. What a count claims is
+compared with what the file holds before memory is allocated for it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.arrays import FloatArray, IntArray, Soup
 
 Cells = tuple[IntArray, IntArray]  # where each cell begins and the last ends, and the corners
 
@@ -38,13 +38,15 @@ _TYPES = {
     "double": ">f8",
 }
 _CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS")
+_DATASETS = ("POLYDATA", "UNSTRUCTURED_GRID")
+_POLYGONS, _STRIP = (5, 7, 9), 6  # cell types: triangle, polygon, quadrilateral; triangle strip
 _WORD = re.compile(rb"\S+")
 _VERSION = re.compile(rb"# vtk DataFile Version +([1-9]\d?)(\.\d+)?\s*", re.IGNORECASE)
 _NEWEST = 5
 
 
-def read_polydata(content: bytes) -> tuple[FloatArray, IntArray]:
-    """Points and triangles of a legacy VTK file with ``DATASET POLYDATA``.
+def read_vtk(content: bytes) -> Soup:
+    """Points and triangles of a legacy VTK file of polygonal data or of an unstructured grid.
 
     Polygons of more than three corners become fans about their first corner, those of fewer none;
     the triangles of strips come last. Whether their corners exist is not checked.
@@ -59,7 +61,7 @@ def read_polydata(content: bytes) -> tuple[FloatArray, IntArray]:
     ValueError, OverflowError
         The file is none of these, ends too early, or contradicts itself.
     """
-    return _Reader(content).polydata()
+    return _Reader(content).surface()
 
 
 class _Reader:
@@ -71,19 +73,26 @@ class _Reader:
         self._version = 0
         self._binary = False
 
-    def polydata(self) -> tuple[FloatArray, IntArray]:
+    def surface(self) -> Soup:
         self._header()
         points: FloatArray = np.empty((0, 3))
         polygons = in_strips = _no_triangles()
+        cells: Cells = np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int64)
         while (keyword := self._word()) not in ("", "POINT_DATA", "CELL_DATA"):
             if keyword == "DATASET":
-                self._expect("POLYDATA")
+                self._expect(*_DATASETS)
             elif keyword == "POINTS":
                 points = self._points()
             elif keyword == "POLYGONS":
                 polygons = fans(*self._cells())
             elif keyword == "TRIANGLE_STRIPS":
                 in_strips = strips(*self._cells())
+            elif keyword == "CELLS":
+                cells = self._cells()
+            elif keyword == "CELL_TYPES":
+                kinds = self._numbers(self._count(), np.dtype(">i4"))
+                polygons = fans(*_chosen(cells, np.isin(kinds, _POLYGONS)))
+                in_strips = strips(*_chosen(cells, kinds == _STRIP))
             else:
                 self._skip(keyword)
         return points, np.vstack([polygons, in_strips])
@@ -209,10 +218,10 @@ class _Reader:
         if n_bytes > left:
             raise ValueError(f"it ends {n_bytes - left} byte(s) before what it announces")
 
-    def _expect(self, word: str) -> None:
+    def _expect(self, *words: str) -> None:
         found = self._word()
-        if found != word:
-            raise ValueError(f"{word} expected, not {found[:20]!r}")
+        if found not in words:
+            raise ValueError(f"{' or '.join(words)} expected, not {found[:20]!r}")
 
     def _count(self) -> int:
         word = self._word()
@@ -276,6 +285,15 @@ def _split(row: NDArray[Any], n: int) -> Cells:
         raise ValueError(f"{n} cells take {at} numbers, not {len(row)}")
     starts = np.concatenate([[0], np.cumsum(counts)])
     return starts, np.delete(row, starts[:-1] + np.arange(n)).astype(np.int64)
+
+
+def _chosen(cells: Cells, kept: NDArray[Any]) -> Cells:
+    """Some of the cells, a mask (n,)."""
+    starts, corners = cells
+    lengths = np.diff(starts)
+    if len(kept) != len(lengths):
+        raise ValueError(f"{len(lengths)} cells have {len(kept)} types")
+    return np.concatenate([[0], np.cumsum(lengths[kept])]), corners[np.repeat(kept, lengths)]
 
 
 def _windows(starts: IntArray) -> tuple[IntArray, IntArray]:

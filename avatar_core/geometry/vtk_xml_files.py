@@ -20,7 +20,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.arrays import FloatArray, IntArray, Soup
 from avatar_core.geometry.vtk_files import fans, strips
 
 _TYPES = {f"Int{8 * n}": f"i{n}" for n in (1, 2, 4, 8)}
@@ -31,7 +31,7 @@ _MOST = 1100  # times that zlib makes anything smaller
 _AXES = "SPACE"  # the field in which 3D Slicer states them
 
 
-def read_vtp(content: bytes) -> tuple[FloatArray, IntArray]:
+def read_vtp(content: bytes) -> Soup:
     """Points and triangles of all pieces; polygons become fans, strips come last in each piece.
 
     Returns

@@ -12,7 +12,7 @@ IJCARS 15:1107, 2020; Mendizabal, Tagliabue & Dall'Alba, IJCARS 18:1295, 2023). 
     triangular    folds of two layers, along the edge of a strip as wide as a mesh's triangle: 1e6
     falciform     a thin fold, loose in most positions: 1e5
 
-Each may be wrong by a factor of 100 (``UNCERTAIN``). Where this matters, keep it as a coordinate.
+Each may be wrong by a factor of 100. Where this matters, keep it as a coordinate.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ TYPICAL = {  # [N/m^3]
     "left_triangular": 1e6,
     "falciform": 1e5,
 }
-UNCERTAIN = 100.0  # factor by which each may be wrong, either way
 CLAMPED = "clamped"
 
 

@@ -26,7 +26,9 @@ from avatar_core.geometry.resampling import is_manifold, resampled, unified
 from avatar_core.geometry.surface import SurfaceMesh
 
 ORGAN = "organ"  # the first part
-MOST_OF_STRUCTURE = 4000  # vertices
+# Vertices of a structure. Two triangles of a ball meet at 3 degrees with the fewest, on the mean of
+# their edges, and look smooth; at 15 degrees on a lesion of 20 mm by marching cubes.
+FEWEST_OF_STRUCTURE, MOST_OF_STRUCTURE = 2000, 4000
 Triangles = tuple[np.ndarray, np.ndarray]  # vertices (n, 3) [m], faces (m, 3)
 
 
@@ -100,8 +102,10 @@ def outline(mesh: TetMesh, surface: SurfaceMesh, n: int) -> Triangles:
 
 
 def structure(surface: SurfaceMesh) -> Triangles:
-    """A surface inside an organ, such as that of a tumour, with no more vertices than is useful."""
+    """A smooth surface inside an organ, such as that of a tumour, of the same volume.
+
+    A label map gives a lesion some hundred triangles; their edges would be seen.
+    """
     vertices, faces = unified(*surface.skin.boundary)
-    if len(vertices) > MOST_OF_STRUCTURE:
-        return resampled(vertices, faces, MOST_OF_STRUCTURE)
-    return vertices, faces
+    n = min(max(len(vertices), FEWEST_OF_STRUCTURE), MOST_OF_STRUCTURE)
+    return resampled(vertices, faces, n)

@@ -290,6 +290,11 @@ class Vademecum:
         """The same vademecum with a certificate of its errors."""
         return replace(self, certificate=certificate)
 
+    def with_notices(self, *notices: str) -> Vademecum:
+        """The same vademecum with more notices of its build."""
+        said = (*self.provenance.notices, *notices)
+        return replace(self, provenance=replace(self.provenance, notices=said))
+
     def with_large_certificate(self, certificate: LargeCertificate) -> Vademecum:
         """The same vademecum with a certificate of its errors at large deformation."""
         assert self.large is not None

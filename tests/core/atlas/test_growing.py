@@ -132,28 +132,18 @@ def test_duplicates_are_kept_and_reported(
     assert doubled.with_anatomies([members[1]]).names[-1] == "liver1-3"
 
 
-def test_two_identical_livers(
+def test_what_is_doubtful_of_a_file_is_said(
     template: Template, livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:
-    file = tmp_path / "a.h5"
-    growth = create_atlas(file, [livers[0]] * 2, OPTIONS, template=template, workers=ALONE)
-    assert growth.added == ("liver0", "liver0-2")
-    assert growth.notices[0] == "liver0-2 has the same shape as liver0: kept, but not counted again"
-    assert all(": registration not converged" in line for line in growth.notices[1:])
-    assert len(growth.notices) == 1 + sum(not one.converged for one in growth.atlas.anatomies)
-    twins = load_atlas(file)
-    assert twins.same_as.tolist() == [0, 0]
-
-
-def test_what_a_file_states_against_the_axes_given_is_said(
-    template: Template, livers: list[SurfaceMesh], tmp_path: Path
-) -> None:
-    file = write_obj(tmp_path / "liver0.obj", livers[0])
+    """Axes that its header contradicts, and an organ too small for a liver."""
+    small = replace(livers[0], vertices=0.7 * livers[0].vertices)
+    file = write_obj(tmp_path / "liver0.obj", small)
     file.write_text("# SPACE=LPS\n" + file.read_text())
     source = SurfaceFile(file, axes="RAS")
     growth = create_atlas(tmp_path / "a.h5", [source], OPTIONS, template=template, workers=ALONE)
     (said,) = (line for line in growth.notices if "SPACE=LPS" in line)
     assert said.startswith("liver0: axes RAS")
+    assert any(line.startswith("liver0: the organ holds") for line in growth.notices)
 
 
 def test_the_default_box_holds_a_large_liver_and_about_49000_points(template: Template) -> None:

@@ -14,7 +14,7 @@ from avatar_core.atlas.base import PatientBase, PatientError, leave_one_out
 from avatar_core.atlas.patient import PatientOptions, build_patient, patient_vademecum
 from avatar_core.atlas.patient_problem import PatientProblem, patient_problem
 from avatar_core.atlas.transfer import combine, kriging, patient_weights
-from avatar_core.errors import LLEError
+from avatar_core.errors import LLEError, SurfaceError
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.reduction.galerkin import (
     GalerkinBasis,
@@ -26,6 +26,9 @@ from avatar_core.reduction.galerkin import (
     solve_probes,
 )
 from tests.helpers.bent_base import bent_phantoms, patient_mesh, registration_of
+from tests.helpers.known_surfaces import ball
+
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
 
 ROOMY = ReductionRule(n_start=20, n_block=6, n_probes=8, max_solution_fraction=0.6)
 
@@ -262,7 +265,9 @@ def test_probes_are_exact(case: Case) -> None:
 @pytest.mark.parametrize("fidelity", ["interpolated", "reduced"])
 def test_each_fidelity_is_a_certified_vademecum(case: Case, fidelity: str) -> None:
     options = PatientOptions(tolerance=0.05, n_certified=10, reduction=ROOMY)
-    patient = build_patient(case.problem, case.base, _weights(case), fidelity, options)  # type: ignore[arg-type]
+    problem = replace(case.problem, notices=("a doubt",))
+    patient = build_patient(problem, case.base, _weights(case), fidelity, options)  # type: ignore[arg-type]
+    assert patient.notices[0] == patient.vademecum.provenance.notices[-1] == "a doubt"
     certificate = patient.vademecum.certificate
     assert certificate is not None
     # unseen loads; a coarse phantom's interpolation between its load positions counts too
@@ -287,6 +292,12 @@ def test_bad_requests_are_one_line_errors(case: Case, fidelity: str, options: di
             require.n_neighbors,
         )
     assert "\n" not in str(caught.value)
+
+
+def test_a_lesion_out_of_place_is_refused_before_any_work(case: Case) -> None:
+    options = PatientOptions(inside=(ball(0.01, (0.3, 0.0, 0.0), level=2),))
+    with pytest.raises(SurfaceError, match="0% of the lesion"):
+        patient_vademecum(case.problem.surface, case.base, "reduced", options)
 
 
 def test_a_tolerance_must_be_a_fraction() -> None:

@@ -53,18 +53,6 @@ def test_bad_surfaces_are_skipped(
         assert word in reason and "\n" not in reason
 
 
-def test_nothing_is_written_if_no_surface_can_be_used(template: Template, tmp_path: Path) -> None:
-    growth = create_atlas(
-        tmp_path / "a.h5",
-        [SurfaceFile(tmp_path / "missing.obj")],
-        OPTIONS,
-        template=template,
-        workers=ALONE,
-    )
-    assert growth.added == () and len(growth.skipped) == 1
-    assert not any(tmp_path.iterdir())
-
-
 # --- many at once -----------------------------------------------------------------------------
 
 
@@ -157,8 +145,3 @@ def test_without_dask_the_extra_is_named(
     with pytest.raises(AtlasError, match=r"\.\[cluster\]"):
         create_atlas(tmp_path / "a.h5", livers[:1], OPTIONS, template=template, workers=workers)
     assert not any(tmp_path.iterdir())
-
-
-def test_no_jobs_are_refused() -> None:
-    with pytest.raises(AtlasError, match="--jobs"):
-        Workers(jobs=0)

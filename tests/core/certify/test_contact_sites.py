@@ -23,10 +23,11 @@ from avatar_core.certify.contact_sites import (
     with_contact_sites,
 )
 from avatar_core.cli import picture
+from avatar_core.contact import timing
 from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.contact.effects.tip_law import LAW_ERROR, UNSHIFTED
 from avatar_core.contact.model import estimate_error, prepare, step
-from avatar_core.errors import MeshError, StorageError
+from avatar_core.errors import ContactError, MeshError, StorageError
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.surface import SurfaceMesh
@@ -239,6 +240,25 @@ def test_the_command_resolves_contacts_and_says_what_it_left_out(
     stored = json.loads(avatar("show", file, "--json")[1])["certificate"]["contact_sites"]
     assert stored["n_contacts"] == 36
     assert stored["mean"] == pytest.approx(0.04)
+
+
+def test_a_certified_build_is_written_whatever_times_it(
+    box: Vademecum, avatar: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refuses(*_: Any) -> None:
+        raise ContactError("no path to slide along")
+
+    monkeypatch.setattr(pipeline, "tetrahedralize", lambda *_: box.mesh)
+    monkeypatch.setattr(timing, "slide", refuses)
+    write_obj(tmp_path / "box.obj", outline(box).vertices, outline(box).faces)
+    source, file = [tmp_path / "box.obj", "--unit", "m"], tmp_path / "v.h5"
+    small = ["--modes", "10", "--certify", "5", "--element", "P1", "--tolerance", "0.9"]
+    code, out, err = avatar("vademecum", *source, "-o", file, *small)
+    assert code == 0
+    assert "notice: steps were not timed: no path to slide along\n" in err
+    assert ", not timed" in out
+    built = load_vademecum(file).certificate
+    assert built is not None and built.n_loads == 5
 
 
 def test_show_prints_contact_sites_and_what_the_force_is_of(

@@ -22,7 +22,7 @@ import typer
 from avatar_core.atlas.patient import _timed
 from avatar_core.cli import main as cli
 from avatar_core.cli.timings import StageClock, require_timings, show_timings
-from avatar_core.cli.vademecum import _read_tumour, read_organ
+from avatar_core.cli.vademecum import _read_tumour, _read_with_tumour, read_organ
 from avatar_core.common.processes import ModuleProcess
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.fem import patch_loads as loads
@@ -134,6 +134,37 @@ def test_a_tumour_in_a_label_map_lies_where_its_voxels_do(tmp_path: Path) -> Non
     tumour = _read_tumour(tmp_path / "found.nrrd", "mm", None, "4", surface)
     centre = 1e-3 * (np.array([20.0, 30.0, 40.0]) + 3.0 * 5.5) * [-1, -1, 1]
     np.testing.assert_allclose(tumour.vertices.mean(axis=0), centre, atol=1e-4)
+
+
+@pytest.mark.parametrize("names_its_file", [True, False])
+def test_an_organ_includes_the_tumour_that_was_cut_out_of_its_label(
+    tmp_path: Path, names_its_file: bool
+) -> None:
+    values = np.full((40, 40, 40), 7, np.uint8)
+    values[[0, -1]] = values[:, [0, -1]] = values[:, :, [0, -1]] = 0
+    values[10:20, 10:20, 10:20] = 3
+    path = tmp_path / "ct.nrrd"
+    fields = {"space": "RAS", "space directions": 3.0 * np.eye(3), "space origin": [0.0, 0.0, 0.0]}
+    nrrd.write(str(path), values, fields)
+    given = path if names_its_file else None
+    organ, lesion = _read_with_tumour(str(path), "mm", None, "7", given, "3")
+    assert 1e6 * organ.volume == pytest.approx(38**3 * 0.027, rel=0.01)
+    assert lesion is not None and 1e6 * lesion.volume == pytest.approx(27.0, rel=0.1)
+    assert organ.notices == ("read label 7, 1,455 ml; label 3, 27 ml, inside: 100%",)
+    with pytest.raises(AvatarError, match="--tumour-label is that of a label map"):
+        _read_with_tumour("liver.obj", "mm", None, None, None, "3")
+
+
+def test_what_was_read_is_said_before_a_lesion_is_refused(avatar: Command, tmp_path: Path) -> None:
+    values = np.zeros((60, 40, 40), np.uint8)
+    values[1:39, 1:39, 1:39], values[45:55, 10:20, 10:20] = 7, 3
+    fields = {"space": "RAS", "space directions": 3.0 * np.eye(3), "space origin": [0.0, 0.0, 0.0]}
+    nrrd.write(str(tmp_path / "ct.nrrd"), values, fields)
+    chosen = ["--label", "7", "--tumour-label", "3"]
+    code, _, err = avatar("vademecum", tmp_path / "ct.nrrd", *chosen, "-o", tmp_path / "v.h5")
+    read, refusal = err.splitlines()
+    assert code == 1 and read == "notice: read label 7, 1,482 ml; label 3, 27 ml, inside: 0%"
+    assert "0% of the lesion" in refusal
 
 
 @pytest.mark.long
@@ -331,6 +362,7 @@ def test_refused_before_anything_is_computed(said, tmp_path, command, reason):  
         "export v.h5 -o new.xdmf",
         "export v.h5 -o old.vtu",
         "bench step liver.obj -o old.json",
+        "bench step v.h5",
         "demo -o new.png --vertices 500",
     ],
 )

@@ -157,6 +157,7 @@ def test_an_inside_out_surface_keeps_its_inside(figure, tmp_path, phantom):
 # --- doubled -------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @few
 @given(gap=st.floats(1e-5, 3e-3), out=st.booleans())
 @example(gap=0.0, out=False)  # every triangle twice

@@ -12,7 +12,9 @@ from scipy.spatial import cKDTree
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry import surface as door
 from avatar_core.geometry import surface_files
+from avatar_core.geometry.doubts import doubts_of
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule
+from avatar_core.geometry.skin import signed_volume
 from avatar_core.geometry.surface import SurfaceMesh, ambiguous_fraction, axes_matrix, read_surface
 from avatar_core.geometry.surface_formats import MESHES, SUFFIXES
 from tests.helpers.known_surfaces import (
@@ -119,7 +121,7 @@ def test_mirrored_axes_keep_the_faces_outward(tmp_path):
     path = written(tmp_path, ASIDE)
     surface = read_surface(path, axes="LAS")
     assert surface.notices == ()
-    assert door._signed_volume(surface.vertices, surface.faces) > 0
+    assert signed_volume(surface.vertices, surface.faces) > 0
 
 
 @pytest.mark.parametrize("axes", ["RAR", "XYZ", "RA", np.diag([2.0, 2, 2, 1]), np.eye(3)])
@@ -327,3 +329,4 @@ def test_all_real_livers_are_accepted_as_they_are(livers_dir):
         n_faces = path.read_text().count("\nf ")
         assert len(liver.faces) == n_faces, path.name
         assert liver.notices == (), path.name
+        assert doubts_of(liver) == (), path.name

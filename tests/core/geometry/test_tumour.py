@@ -80,6 +80,7 @@ def sphere_on(vademecum: Vademecum, radius: float) -> ContactModel:
     return prepare(vademecum, (Tip("sphere", radius),), cloud="off", effects=())
 
 
+@pytest.mark.long
 def test_a_tip_feels_the_tumour_under_it_and_not_aside() -> None:
     harder = _cube_with_tumour()
     law = sphere_on(harder, RADIUS)

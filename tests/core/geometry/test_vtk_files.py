@@ -154,7 +154,7 @@ def test_an_index_out_of_range_is_refused(
         (3.0, "FIELD data 99999999999999999", "within a field"),
         (3.0, "FIELD data 1\nx 999999999 999999999 string", "before what it announces"),
         (3.0, "FACES 1 4", "unknown section 'FACES'"),
-        (3.0, "DATASET STRUCTURED_POINTS", "POLYDATA expected"),
+        (3.0, "DATASET STRUCTURED_POINTS", "POLYDATA or UNSTRUCTURED_GRID expected"),
         (6.0, "POINTS 0 float", "version 6"),
     ],
 )

@@ -48,6 +48,8 @@ from tests.helpers.soft_organ import (
     soft_tumour,
 )
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 
 @pytest.fixture(scope="module")
 def tumour() -> SurfaceMesh:
@@ -117,24 +119,6 @@ def test_weights_of_several_coordinates_find_their_node() -> None:
 def test_a_bad_coordinate_is_refused(text: str, reason: str) -> None:
     with pytest.raises(CoordinateError, match=reason):
         Coordinate.parse(text)
-
-
-# --- the stiffness is affine ------------------------------------------------------------------
-
-
-def test_stiffness_is_the_sum_of_its_terms(problem: Elasticity) -> None:
-    here = problem.at(Material(0.2e6, 0.45), 7.0)
-    u = np.random.default_rng(0).standard_normal((3 * problem.n_nodes, 2))
-    terms = [theta * here.apply_term(q, u) for q, theta in enumerate(here.factors)]
-    np.testing.assert_allclose(sum(terms), here.stiffness @ u, rtol=1e-9)
-
-
-def test_an_inclusion_that_is_everything_scales_the_stiffness(problem: Elasticity) -> None:
-    everywhere = Inclusion(np.ones(len(problem.mesh.tets)), 3.0)
-    clamped = np.zeros(len(problem.mesh.boundary_faces), bool)
-    stiff = Elasticity(problem.mesh, Material(), clamped, "P2", everywhere).stiffness
-    plain = Elasticity(problem.mesh, Material(), clamped, "P2").stiffness
-    assert abs(stiff - 3.0 * plain).max() < 1e-9 * abs(plain).max()
 
 
 def test_the_share_inside_a_ball_is_its_volume(organ: Vademecum, tumour: SurfaceMesh) -> None:

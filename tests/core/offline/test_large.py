@@ -39,7 +39,7 @@ from tests.helpers.tool_motion import energy_slope, load_positions
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 RADIUS = 5e-3
-SPHERE, PATCH = Tip("sphere", RADIUS), Tip("patch", RADIUS)
+PATCH = Tip("patch", RADIUS)
 both = pytest.mark.parametrize("material", ["neo-hookean", "st-venant-kirchhoff"])
 
 
@@ -270,6 +270,7 @@ def test_show_tells_what_combinations_cost(
 # --- contact ----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_patch_feels_the_bent_force(bent: Vademecum, model: ContactModel) -> None:
     """As the file says at the load position, but for the smoothing of what a tip feels."""
     middle = bent.surface.centers[middle_of_access(bent)]
@@ -348,16 +349,3 @@ def test_force_is_the_derivative_of_the_energy(bent: Vademecum, share: float) ->
         force = model.out.force[0].copy()
         slope = energy_slope(model, tip, 1e-5)[0]
         np.testing.assert_allclose(force, -slope, atol=2e-3 * np.linalg.norm(force))
-
-
-@pytest.mark.long
-def test_two_tips_stay_coupled(bent: Vademecum) -> None:
-    model = prepare(bent, (SPHERE,) * 2, cloud="off")
-    one, other = inner_positions(bent)[[0, 20]]
-    tips = np.vstack([tip_at(bent, 4e-3, one), tip_at(bent, 4e-3, other)])
-    assert step(model, tips) in (Status.OK, Status.EXTRAPOLATED)
-    both_forces = model.state.force.copy()
-    away = tips.copy()
-    away[1] += 1.0
-    step(model, away)
-    assert model.state.force[0] > both_forces[0]  # the other tip had moved this place already

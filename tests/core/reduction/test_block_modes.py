@@ -124,6 +124,7 @@ def test_blocks_of_points_are_compact_and_full() -> None:
     assert compact_order(points[:0], POINTS).shape == (0,)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("history", [False, True])
 def test_a_step_shows_the_displacement_of_the_vademecum(
     phantom_vademecum: Vademecum, history: bool

@@ -149,6 +149,7 @@ def test_point_and_force_are_written_alike(
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".stl", ".obj", ".vtp"])
 @pytest.mark.parametrize(("unit", "axes"), [("mm", "LPS"), ("m", "RAS")])
 def test_a_surface_comes_back_to_its_place(

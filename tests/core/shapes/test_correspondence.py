@@ -262,6 +262,7 @@ def patient(phantom: SurfaceMesh) -> TetMesh:
     return tetrahedralize(replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT), 1000)
 
 
+@pytest.mark.long
 def test_regions_keep_their_place_and_area_on_another_mesh(warped, patient):
     carried = carry_regions(warped, patient)
     own, registered = warped.template.regions, warped.mesh

@@ -9,6 +9,7 @@ from typing import Any
 
 import igl
 import numpy as np
+import pytest
 
 from avatar_core.common.splines import evaluate
 from avatar_core.geometry.local_profile import MIDDLE
@@ -148,6 +149,7 @@ def test_an_edge_is_rounded_without_a_jump_of_the_gradient() -> None:
     assert turn.max() < 1e3
 
 
+@pytest.mark.long
 def test_a_real_liver_is_felt_where_its_surface_is(livers_dir: Path) -> None:
     """Within 0.1 mm (root mean square) and 0.3 mm (worst) where a ball of 3 mm follows it."""
     surface = read_surface(livers_dir / "LiTS-23.obj")

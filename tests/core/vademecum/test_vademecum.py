@@ -135,6 +135,7 @@ def test_foreign_hdf5_and_missing_file_are_refused(tmp_path: Path) -> None:
         load_vademecum(tmp_path / "c.h5")
 
 
+@pytest.mark.long
 def test_full_disk_leaves_the_old_file(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
     """A write that fails half way (file size limit) keeps what was there, and no scraps."""
     file = tmp_path / "a.h5"
@@ -169,6 +170,7 @@ def with_both(v: Vademecum) -> Vademecum:
     return replace(v, display=display_of(v.mesh, organ_surface, [("lesion", lesion)]))
 
 
+@pytest.mark.long
 def test_a_display_is_stored(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
     fine = with_both(phantom_vademecum)
     before = save_vademecum(phantom_vademecum, tmp_path / "plain.h5")
@@ -213,6 +215,6 @@ def test_arrays_that_do_not_fit_are_refused(
     fine = with_both(phantom_vademecum)
     arrays, attributes = _arrays(fine), _attributes(fine)
     arrays[key] = spoil(arrays[key])
-    replace_file(tmp_path / "spoilt.h5", arrays, attributes, packed=True)
+    replace_file(tmp_path / "spoilt.h5", arrays, attributes)
     with pytest.raises(StorageError, match=message):
         load_vademecum(tmp_path / "spoilt.h5")
