@@ -1,9 +1,8 @@
 """Accuracy against time, online and offline, with rivals in the same run.
 
 Online: every level of detail of the displacement, timed on this machine, with errors on loads that
-neither the build nor the certificate used. Offline: mesh size, grid of a level set, interpolation
-of shapes, and fidelity of a patient. Also whether certified errors, and the estimated error of each
-force, hold.
+neither the build nor the certificate used. Offline: size of the mesh, and number of solved loads.
+Also whether certified errors, and the estimated error of each force, hold.
 """
 
 from __future__ import annotations
@@ -18,25 +17,26 @@ from avatar_core.certify.linear import measured
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.pipeline import OrganOptions, build
 from avatar_core.studies.force_error import ForceErrors, force_errors
-from avatar_core.studies.offline_cost import (
-    grid_rows,
-    load_rows,
-    mesh_rows,
-    patient_rows,
-    shape_rows,
-)
+from avatar_core.studies.offline_cost import load_rows, mesh_rows
 from avatar_core.studies.online_cost import (
     Promises,
-    budget_rows,
     cost_of_effects,
     curve_rows,
     fastest_within,
     promises,
     rival_rows,
 )
-from avatar_core.studies.report import Panel, write_report
 from avatar_core.studies.shapes import read_liver
-from avatar_core.studies.study import ProgressBar, Row, Run, Study, column, where
+from avatar_core.studies.study import (
+    Panel,
+    ProgressBar,
+    Row,
+    Run,
+    Study,
+    column,
+    draw_panels,
+    where,
+)
 from avatar_core.vademecum.model import Vademecum
 
 if TYPE_CHECKING:
@@ -58,24 +58,20 @@ class AccuracyTimeSettings:
     n_fresh: int = 100
     n_contacts: int = 1000
     meshes: tuple[int, ...] = (1200, 1800, 2600)
-    spacings: tuple[float, ...] = (20e-3, 10e-3, 5e-3, 2.5e-3)
     projections: tuple[float, ...] = (0.02, 5e-3, 1.5e-3)
-    n_livers: int = 32
-    n_base: int = 6
-    n_patient: int = 600
 
 
 class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
-    """All sweeps and the promises on LiTS-4, or the first liver of a folder, and a page."""
+    """All sweeps and the promises on LiTS-4, or the first liver of a folder."""
 
     name = "accuracy-time"
     full = AccuracyTimeSettings()
-    quick = AccuracyTimeSettings(1200, 60, 40, 150, (1200,), (20e-3, 10e-3), (5e-3,), 16, 3, 350)
+    quick = AccuracyTimeSettings(1200, 60, 40, 150, (1200,), (5e-3,))
     paper: ClassVar = {"modes_for_10_percent": "11", "rate_hz": "1000, without a table"}
 
     def measure(self, run: Run[AccuracyTimeSettings]) -> None:
         settings, surface = run.settings, read_liver(run.surfaces, "LiTS-4")
-        with ProgressBar(5) as bar:
+        with ProgressBar(4) as bar:
             options = OrganOptions(n_vertices=settings.n_vertices, n_certified=settings.n_certified)
             v = build(surface, options, bar.begin("build"))
             assert v.certificate is not None and v.certificate.curve is not None
@@ -86,16 +82,13 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
             run.kept |= {"organ": v, "promises": promises(curve, fresh)}
             run.kept["contacts"] = force_errors(v, elasticity, settings.n_contacts, FRESH)
             bar.begin("rivals")
-            run.rows += curve_rows(curve) + budget_rows(curve)
+            run.rows += curve_rows(curve)
             run.rows += rival_rows(v, elasticity, curve, settings.n_fresh // 2, FRESH)
             run.rows += cost_of_effects(v)
-            bar.begin("mesh, loads and grid")
+            bar.begin("mesh and loads")
             run.rows += mesh_rows(surface, settings.meshes)
             run.rows += load_rows(elasticity, v.surface, settings.projections)
-            run.rows += grid_rows(surface, settings.spacings)
-            bar.begin("shapes and patients")
-            run.rows += shape_rows(run.surfaces, settings.n_livers)
-            run.rows += patient_rows(settings.n_base, settings.n_patient)
+        run.notices += short_table(run.rows)
 
     def summary(self, run: Run[AccuracyTimeSettings]) -> dict[str, float]:
         rows, v = run.rows, run.kept["organ"]
@@ -107,7 +100,6 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
             "points_kept_fraction": kept.points_kept,
             "force_error_coverage": contacts.coverage,
             "force_error_overestimate": contacts.overestimate,
-            "budgets_as_enumerated": float(column(_of(rows, "choose"), "as_enumerated").mean()),
             "front_points": sum(bool(row.get("front")) for row in rows),
             "l2_95": best["error"],
             **_beside_table(rows, v),
@@ -127,24 +119,15 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
             f"force covered {summary['force_error_coverage']:.1%} of contacts"
         )
 
-    def report(self, run: Run[AccuracyTimeSettings]) -> None:
-        """Write the page."""
-        panels = run.kept["panels"] = _panels(run.rows, run.kept["contacts"], run.summary)
-        page = write_report(run.folder, self.name, run.sentence, run.summary, panels, run.rows)
-        run.notices += [*short_table(run.rows), f"the page with all plots: {page}"]
-
     def draw(self, figure: Figure, run: Run[AccuracyTimeSettings]) -> None:
-        panels = run.kept["panels"]
-        shown = (panels[0], panels[2], panels[3])
-        for axes, panel in zip(figure.subplots(1, 3, width_ratios=(5, 3, 3)), shown, strict=True):
-            panel.draw(axes)
+        draw_panels(figure, _panels(run.rows, run.kept["contacts"]))
 
 
 STUDY = AccuracyTimeStudy()
 
 
 def short_table(rows: list[Row]) -> tuple[str, ...]:
-    """The README's table: fastest steps within some errors, rivals, budgets; all vertices shown."""
+    """Fastest steps within some errors, and rivals; all vertices shown."""
     volume = [row for row in rows if row.get("cloud") == "volume"]
     lines = ["| 95 % of loads within | step p50 / p99 [us] | by | MB |", "|---|---|---|---|"]
     for error in (0.01, 0.015, 0.02, 0.05, 0.10, 0.20, 0.40):
@@ -156,10 +139,6 @@ def short_table(rows: list[Row]) -> tuple[str, ...]:
     for name in ("dense table", "direct solve"):
         (row,) = (row for row in volume if row["method"] == name)
         lines.append(_line(f"{row['error']:.1%}", row, name))
-    lines += [
-        f"{row['tolerance']:.0%} in {row['deadline_us']:.0f} us: {row['setting']}"
-        for row in _of(rows, "choose")
-    ]
     return tuple(lines)
 
 
@@ -194,100 +173,19 @@ def _beside_table(rows: list[Row], vademecum: Vademecum) -> dict[str, float]:
 
 # --- Plots -----------------------------------------------------------------------------------
 
-_QUANTITIES = {"mesh": "mesh, when refined (time of a build)", "grid": "grid (time of a level set)"}
 
-
-def _panels(rows: list[Row], contacts: ForceErrors, summary: dict[str, float]) -> tuple[Panel, ...]:
+def _panels(rows: list[Row], contacts: ForceErrors) -> tuple[Panel, ...]:
     return (
-        Panel("online", _online_sentence(rows), partial(_online, rows, "volume")),
+        Panel("online, all vertices: fewer modes are faster", partial(_online, rows, "volume")),
+        Panel("online, vertices of the surface alone", partial(_online, rows, "surface")),
+        Panel("error said with a force", partial(_force, contacts)),
+        Panel("cost of effects: one that is not named costs nothing", partial(_effects, rows)),
+        Panel("size of the mesh", partial(_offline, rows, "mesh")),
         Panel(
-            "surface",
-            "The same for the vertices of the surface alone, which is what a display needs.",
-            partial(_online, rows, "surface"),
+            "response to every load: solved, or projected on solutions of some",
+            partial(_offline, rows, "loads"),
         ),
-        Panel(
-            "force",
-            f"The error said with each force against its true error, for unseen contacts: "
-            f"{summary['force_error_coverage']:.1%} lie above the line, with a median of "
-            f"{summary['force_error_overestimate']:.1f} times the true error.",
-            partial(_force, contacts),
-        ),
-        Panel(
-            "effects",
-            "Time of a step with one effect each: what a scene does not name costs nothing.",
-            partial(_effects, rows),
-        ),
-        Panel("offline", _offline_sentence(rows), partial(_offline, rows, ("mesh", "grid"))),
-        Panel("loads", _load_sentence(rows), partial(_offline, rows, ("loads",))),
-        Panel("shapes", _shape_sentence(rows), partial(_offline, rows, ("shape",))),
-        Panel("patients", _patient_sentence(rows), partial(_offline, rows, ("patient",))),
     )
-
-
-def _online_sentence(rows: list[Row]) -> str:
-    volume = [row for row in rows if row.get("cloud") == "volume"]
-    best, (table,) = _best(rows), _of(volume, "dense table")
-    return (
-        "Error of the displacement that a step shows against its time, all vertices: fewer modes "
-        f"are faster and worse. The dense table is within {table['error']:.1%} instead of "
-        f"{best['error']:.1%}, takes {_ratio(table, best, 'p50_us'):.1f} times as long and "
-        f"{_ratio(table, best, 'bytes'):.0f} times the memory; one basis for all places, the best "
-        "there is (SVD), stays behind."
-    )
-
-
-def _offline_sentence(rows: list[Row]) -> str:
-    meshes = [row for row in rows if row["stage"] == "mesh"]
-    finest = min((row for row in rows if row["stage"] == "grid"), key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
-    least, most = _ends([float(row["error"]) for row in meshes])  # type: ignore[arg-type]
-    own = _ends([float(row["vademecum_error"]) for row in meshes])  # type: ignore[arg-type]
-    return (
-        "Error of the displacement against CPU time offline. Refining the mesh changes the answer "
-        f"by {least:.1%} to {most:.1%}; on the same mesh the vademecum is {own[0]:.1%} to "
-        f"{own[1]:.1%} wrong, whatever its size. Kept on the grid of a level set and read back, "
-        f"displacements are {finest['error']:.1%} wrong at {finest['setting']}."
-    )
-
-
-def _load_sentence(rows: list[Row]) -> str:
-    mine = [row for row in rows if row["stage"] == "loads"]
-    (solved,), projected = _of(mine, "all solved"), _of(mine, "projected")
-    last = min(projected, key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
-    return (
-        "The response to every load, from the solutions for some of them and projection on these, "
-        f"against all solutions: {last['error']:.2%} wrong in the mean, {last['worst']:.1%} at "
-        f"worst, in {float(last['cpu_seconds']) / float(solved['cpu_seconds']):.2f} of their time."  # type: ignore[arg-type]
-    )
-
-
-def _shape_sentence(rows: list[Row]) -> str:
-    shapes = sorted((r for r in rows if r["stage"] == "shape"), key=lambda r: r["error"])  # type: ignore[arg-type,return-value]
-    (nearest,) = _of(shapes, "nearest neighbour")
-    return (
-        "Who writes a liver by the others, each left out: 1 - Dice, and the time of the weights. "
-        f"Nearest of all comes {shapes[0]['setting']} ({shapes[0]['error']:.1%}); the nearest "
-        f"neighbour alone is {nearest['error']:.1%} off."
-    )
-
-
-def _patient_sentence(rows: list[Row]) -> str:
-    patients = [row for row in rows if row["stage"] == "patient"]
-    least, most = _ends([float(r["error"]) for r in _of(patients, "interpolated")])  # type: ignore[arg-type]
-    (reduced,), (solved,) = _of(patients, "reduced"), _of(patients, "solved")
-    return (
-        "How a new patient's vademecum is made from a base of bent phantoms (displacement; time of "
-        f"the response alone): interpolated {least:.1%} to {most:.1%} wrong, with few or all "
-        f"neighbours; reduced {reduced['error']:.1%}; all loads solved {solved['error']:.1%}, "
-        "which is what a vademecum of so many modes leaves."
-    )
-
-
-def _ends(values: list[float]) -> tuple[float, float]:
-    return min(values), max(values)
-
-
-def _ratio(one: dict[str, Any], other: dict[str, Any], key: str) -> float:
-    return float(one[key]) / float(other[key])
 
 
 def _online(rows: list[Row], cloud: str, axes: Axes) -> None:
@@ -309,7 +207,6 @@ def _online(rows: list[Row], cloud: str, axes: Axes) -> None:
     axes.axhline(JND, color="#888888", ls=":", label=_NOTICED)
     _logarithmic(axes, "time of a step, median [us]", "error that 95 % of fresh loads keep [-]")
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    axes.set_title(f"{cloud}: error against time online")
 
 
 def _force(contacts: ForceErrors, axes: Axes) -> None:
@@ -321,7 +218,6 @@ def _force(contacts: ForceErrors, axes: Axes) -> None:
     axes.axhline(JND, color="#888888", ls="-.", label=_NOTICED)
     axes.set_xlim(1e-4, 1.0)
     _logarithmic(axes, "true error of the force [-]", "error said with the force [-]")
-    axes.set_title("error said with a force")
 
 
 def _effects(rows: list[Row], axes: Axes) -> None:
@@ -332,23 +228,17 @@ def _effects(rows: list[Row], axes: Axes) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("time of a step [us]")
     axes.legend(loc="upper right", fontsize=8)
-    axes.set_title("cost of effects")
 
 
-def _offline(rows: list[Row], stages: tuple[str, ...], axes: Axes) -> None:
-    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-    mine = [r for r in rows if r["stage"] in stages]
-    for colour, (stage, method) in zip(
-        colours, dict.fromkeys((r["stage"], r["method"]) for r in mine), strict=False
-    ):
-        some = [r for r in mine if (r["stage"], r["method"]) == (stage, method)]
-        some.sort(key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
+def _offline(rows: list[Row], stage: str, axes: Axes) -> None:
+    mine = where(rows, stage=stage)
+    for method in dict.fromkeys(str(row["method"]) for row in mine):
+        some = sorted(_of(mine, method), key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
         seconds, errors = column(some, "cpu_seconds"), column(some, "error")
-        label = method if len(stages) == 1 else _QUANTITIES[str(stage)]
-        axes.plot(seconds, errors, "o-" if len(some) > 1 else "o", c=colour, label=label)
+        axes.plot(seconds, errors, "o-", label=method)
         for k, row in enumerate(some):
             axes.annotate(
-                str(row["setting"]).split(", ")[-1],
+                str(row["setting"]),
                 (seconds[k], errors[k]),
                 xytext=(-4 if k % 2 else 4, 4),  # neighbours beside each other stay readable
                 ha="right" if k % 2 else "left",
@@ -357,10 +247,9 @@ def _offline(rows: list[Row], stages: tuple[str, ...], axes: Axes) -> None:
             )
         if stage == "mesh":
             own = column(some, "vademecum_error")
-            axes.plot(seconds, own, "s--", c=colour, label="vademecum, on the same mesh")
+            axes.plot(seconds, own, "s--", label="vademecum, on the same mesh")
     axes.margins(x=0.15)
     _logarithmic(axes, "CPU time [s]", "error [-]")
-    axes.set_title(" and ".join(stages))
 
 
 def _of(rows: list[Row], method: str) -> list[Row]:

@@ -1,4 +1,4 @@
-"""How certain an answer is whose data are not: section by section, one page.
+"""How certain an answer is whose data are not: section by section, one picture.
 
 A vademecum is exact to some per cent about a problem whose data are known to some tens of per cent.
 Each section of this study takes one of those data. A section is a module with a function that takes
@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.studies.certainty_bands import bands_section
 from avatar_core.studies.certainty_calibration import calibration_section
-from avatar_core.studies.certainty_registration import registration_section
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.certainty_supports import supports_section
-from avatar_core.studies.report import Panel, write_report
+from avatar_core.studies.registration import registration_section
 from avatar_core.studies.shapes import read_liver
-from avatar_core.studies.study import ProgressBar, Run, Study
+from avatar_core.studies.study import ProgressBar, Run, Study, draw_panels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,12 +28,11 @@ SECTIONS: tuple[Callable[[SurfaceMesh, CertaintySettings, ProgressBar], Section]
     calibration_section,
     registration_section,
 )
-_IN_ROW = 3  # panels of the picture
 N_STAGES = 7  # of the progress bar, over all sections
 
 
 class CertaintyStudy(Study[CertaintySettings]):
-    """All sections on LiTS-4, on one page."""
+    """All sections on LiTS-4, in one picture."""
 
     name = "certainty"
     full = CertaintySettings()
@@ -52,7 +50,7 @@ class CertaintyStudy(Study[CertaintySettings]):
         surface = read_liver(run.surfaces, "LiTS-4")
         with ProgressBar(N_STAGES) as bar:
             sections = [section(surface, run.settings, bar) for section in SECTIONS]
-        run.kept |= {"organ": surface.name, "sections": sections}
+        run.kept["sections"] = sections
         for section in sections:
             run.rows += [{"section": section.name, **row} for row in section.rows]
             run.notices += section.notices
@@ -64,23 +62,8 @@ class CertaintyStudy(Study[CertaintySettings]):
     def sentence(self, run: Run[CertaintySettings]) -> str:
         return " ".join(section.sentence for section in run.kept["sections"])
 
-    def report(self, run: Run[CertaintySettings]) -> None:
-        """Write ``certainty.html`` and its pictures."""
-        title = f"Certainty: {run.kept['organ']}"
-        page = write_report(run.folder, self.name, title, run.summary, _panels(run), run.rows)
-        run.notices.append(f"page: {page}")
-
     def draw(self, figure: Figure, run: Run[CertaintySettings]) -> None:
-        """Panels in rows of three; the sentence above them takes two inches."""
-        panels = _panels(run)
-        n_rows = -(-len(panels) // _IN_ROW)
-        figure.set_size_inches(15.0, 2.0 + 4.5 * n_rows)
-        for k, panel in enumerate(panels):
-            panel.draw(figure.add_subplot(n_rows, _IN_ROW, k + 1))
+        draw_panels(figure, [p for section in run.kept["sections"] for p in section.panels])
 
 
 STUDY = CertaintyStudy()
-
-
-def _panels(run: Run[CertaintySettings]) -> list[Panel]:
-    return [panel for section in run.kept["sections"] for panel in section.panels]

@@ -25,8 +25,7 @@ from avatar_core.geometry.tumour import volume_fraction_inside
 from avatar_core.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
-from avatar_core.studies.report import Panel
-from avatar_core.studies.study import ProgressBar, Row, column, follow
+from avatar_core.studies.study import Panel, ProgressBar, Row, column, follow
 from avatar_core.uncertainty.bands import HIGH, LOW, bands_of, drawn
 from avatar_core.uncertainty.distributions import Distribution, Lognormal, Uniform
 from avatar_core.uncertainty.force_table import force_table
@@ -78,7 +77,7 @@ def bands_section(surface: SurfaceMesh, settings: CertaintySettings, bar: Progre
             "band_full_draws_per_second": settings.n_draws / full_seconds,
         },
         rows=tuple(rows),
-        panels=(Panel("bands", _BANDS, partial(_draw, rows=rows)),),
+        panels=(Panel(_BANDS, partial(_draw, rows=rows)),),
         notices=("bands: of the phantom with a tumour, whose draws can all be solved",),
     )
 

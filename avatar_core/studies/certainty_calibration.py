@@ -30,8 +30,7 @@ from avatar_core.offline.supports import SupportOption, held_by
 from avatar_core.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
-from avatar_core.studies.report import Panel
-from avatar_core.studies.study import ProgressBar, Row, column, follow
+from avatar_core.studies.study import Panel, ProgressBar, Row, column, follow
 from avatar_core.uncertainty.calibration import Errors, TouchTable, calibrated, touch_table
 from avatar_core.uncertainty.distributions import Distribution, Fixed
 from avatar_core.uncertainty.known import priors_of
@@ -101,7 +100,7 @@ def calibration_section(
         sentence=_sentence(summary, settings.n_trials),
         summary=summary,
         rows=tuple(rows),
-        panels=(Panel("calibration", _FOUND, partial(_draw, rows=rows)),),
+        panels=(Panel(_FOUND, partial(_draw, rows=rows)),),
         notices=(
             f"calibration: of the phantom with a tumour, {len(vademecum.mesh.vertices)} vertices, "
             f"by forces of a mesh of {len(truth.problem.mesh.vertices)}",

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from avatar_core.studies.report import Panel
-from avatar_core.studies.study import Value
+from avatar_core.studies.study import Panel, Value
 
 
 @dataclass(frozen=True)

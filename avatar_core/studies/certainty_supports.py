@@ -19,22 +19,20 @@ import scipy.sparse as sp
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.common.supports import SUPPORT
-from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.errors import MaterialError
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.norms import l2_norm, relative_l2
-from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
-from avatar_core.geometry.mesh import Regions, TetMesh, tetrahedralize
+from avatar_core.fem.patch_loads import load_surface, patch_loads
+from avatar_core.geometry.mesh import TetMesh, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.offline.parametric import build_parametric_vademecum
-from avatar_core.offline.rule import BuildRule, Progress
+from avatar_core.offline.rule import BuildRule
 from avatar_core.offline.supports import SupportOption, held_by
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
-from avatar_core.studies.report import Panel
-from avatar_core.studies.study import ProgressBar, Row, column, follow, where
+from avatar_core.studies.organ import Organ
+from avatar_core.studies.study import Panel, ProgressBar, Row, column, follow, where
 from avatar_core.vademecum.at_values import at_values
-from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.model import Vademecum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,13 +45,9 @@ _N_LIMIT = 4  # load positions of the limits
 
 
 @dataclass(frozen=True, eq=False)
-class _Held:
+class _Held(Organ):
     """A liver on its bare area."""
 
-    outline: SurfaceMesh
-    regions: Regions
-    surface: LoadSurface
-    elasticity: Elasticity
     coordinate: Coordinate
 
 
@@ -63,7 +57,8 @@ def supports_section(
     """The vademecum over k, and the limits of full finite elements."""
     held = _held(surface, settings)
     start = time.process_time()
-    vademecum = _build(held, settings, bar.begin("supports"))
+    rule = BuildRule(max_modes=settings.max_modes)
+    vademecum = held.parametric((held.coordinate,), rule, bar.begin("supports"))
     seconds = time.process_time() - start
     rows = [*_unseen_rows(vademecum, held, settings)]
     bar.begin("limits of a support")
@@ -77,8 +72,8 @@ def supports_section(
         summary=summary,
         rows=tuple(rows),
         panels=(
-            Panel("support-errors", _ERRORS, partial(_draw_errors, rows=rows)),
-            Panel("support-limits", _LIMITS, partial(_draw_limits, rows=rows)),
+            Panel(_ERRORS, partial(_draw_errors, rows=rows)),
+            Panel(_LIMITS, partial(_draw_limits, rows=rows)),
         ),
         notices=(f"{surface.name} on its {PLACE}: {refusal}",),
     )
@@ -93,29 +88,13 @@ def _held(surface: SurfaceMesh, settings: CertaintySettings) -> _Held:
     return _Held(surface, regions, load_surface(mesh, regions), elasticity, option.coordinate)
 
 
-def _build(held: _Held, settings: CertaintySettings, progress: Progress) -> Vademecum:
-    return build_parametric_vademecum(
-        held.outline.name,
-        held.elasticity,
-        held.regions,
-        held.surface,
-        (held.coordinate,),
-        make_felt_field(
-            held.elasticity.mesh, held.regions, held.surface.patch_radius, held.outline
-        ),
-        BuildRule(max_modes=settings.max_modes),
-        Provenance(held.outline.name, ""),
-        progress,
-    )
-
-
 def _unseen_rows(vademecum: Vademecum, held: _Held, settings: CertaintySettings) -> list[Row]:
     """Errors at the ends and at one value drawn from each nth part of the range, one row each."""
     rng, n = np.random.default_rng(1), settings.n_values
     drawn = [held.coordinate.value_at((part + rng.random()) / n) for part in range(n)]
     rows: list[Row] = []
     for value in follow([LOW, *drawn, HIGH], "unseen values"):
-        faces = rng.permutation(len(held.surface.corners))[: settings.n_loads]
+        faces = rng.permutation(len(held.loads.corners))[: settings.n_loads]
         l2, contact = _errors(vademecum, held, value, faces)
         rows.append(
             {
@@ -135,7 +114,7 @@ def _errors(
     vademecum: Vademecum, held: _Held, value: float, faces: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
     """L2 of the displacement (3 n,) and of the contact compliance (n,) at centroids of faces."""
-    name, surface, mesh = held.coordinate.name, held.surface, held.elasticity.mesh
+    name, surface, mesh = held.coordinate.name, held.loads, held.elasticity.mesh
     problem, here = problem_at(held.elasticity, {name: value}), at_values(vademecum, {name: value})
     loads = patch_loads(problem, surface.centroids[faces], surface.patch_radius)
     solution = problem.solve(loads)
@@ -154,7 +133,7 @@ def _errors(
 
 
 def _limit_loads(held: _Held) -> tuple[Elasticity, sp.csr_matrix]:
-    elasticity, surface = held.elasticity, held.surface
+    elasticity, surface = held.elasticity, held.loads
     some = np.linspace(0, len(surface.corners) - 1, _N_LIMIT).astype(int)
     return elasticity, patch_loads(elasticity, surface.centroids[some], surface.patch_radius)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -16,27 +15,22 @@ import numpy as np
 from avatar_core.certify.combinations import COMBINATIONS, push_errors
 from avatar_core.certify.large_deformation import certify_large
 from avatar_core.certify.parametric import certify_range
-from avatar_core.contact.ball_shift import make_felt_field
-from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
-from avatar_core.fem.patch_loads import LoadSurface, load_surface
-from avatar_core.geometry.mesh import Regions, regions_by_rule, tetrahedralize
+from avatar_core.fem.elasticity import Element
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
-from avatar_core.geometry.tumour import read_tumour, volume_fraction_inside
+from avatar_core.geometry.tumour import read_tumour
 from avatar_core.offline.large_deformation import (
     LargeRule,
     hyperelastic_problem,
     with_large_deformation,
 )
-from avatar_core.offline.linear import build_vademecum
-from avatar_core.offline.parametric import build_parametric_vademecum
 from avatar_core.offline.rule import BuildRule, Progress
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.studies.bench.methods import time_steps
+from avatar_core.studies.organ import Organ
 from avatar_core.studies.shapes import DEFAULT_FOLDER, read_liver
 from avatar_core.studies.study import ProgressBar, Row, Run, Study, column, label, where
 from avatar_core.vademecum.large_deformation import LargeMaterial
-from avatar_core.vademecum.model import Provenance, Vademecum
-from avatar_core.vademecum.tip_field import TipField
+from avatar_core.vademecum.model import Vademecum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,22 +53,6 @@ class CoordinatesSettings:
     n_pushed: int = 6
     n_combined: int = 2
     patch_radius: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Organ:
-    """A meshed organ, ready for a build."""
-
-    outline: SurfaceMesh
-    regions: Regions
-    loads: LoadSurface
-    elasticity: Elasticity
-
-    @property
-    def tip_field(self) -> TipField:
-        """Where tips touch it."""
-        mesh, radius = self.elasticity.mesh, self.loads.patch_radius
-        return make_felt_field(mesh, self.regions, radius, self.outline)
 
 
 class CoordinatesStudy(Study[CoordinatesSettings]):
@@ -177,18 +155,9 @@ def _organ(
     surface: SurfaceMesh,
     settings: CoordinatesSettings,
     element: Element | None = None,
-    tumour: Path | None = None,
+    tumour: SurfaceMesh | None = None,
 ) -> Organ:
-    mesh = tetrahedralize(surface, settings.n_vertices)
-    regions = regions_by_rule(mesh)
-    inclusion = None
-    if tumour is not None:
-        inclusion = Inclusion(
-            volume_fraction_inside(mesh, read_tumour(tumour, axes=TUMOUR_AXES)), 1.0
-        )
-    material = Material()
-    elasticity = Elasticity(mesh, material, regions.clamped, element, inclusion)
-    return Organ(surface, regions, load_surface(mesh, regions, settings.patch_radius), elasticity)
+    return Organ.of(surface, settings.n_vertices, element, tumour, settings.patch_radius)
 
 
 # --- coordinates of the material ----------------------------------------------------------------
@@ -203,31 +172,27 @@ def _parametric(
 ) -> list[Row]:
     """Errors of the default against modes, and the time of its build."""
     start = time.process_time()
-    vademecum = build_parametric_vademecum(
-        organ.outline.name,
-        organ.elasticity,
-        organ.regions,
-        organ.loads,
-        coordinates,
-        organ.tip_field,
-        BuildRule(),
-        Provenance(organ.outline.name, ""),
-        progress,
-    )
+    vademecum = organ.parametric(coordinates, BuildRule(), progress)
     seconds = time.process_time() - start
     assert vademecum.parametric is not None
-    rows = []
+    rows: list[Row] = []
     for rank in RANKS:
         fewer = _with_modes(vademecum, rank)
         n_loads = settings.n_loads if rank == RANKS[-1] else settings.n_loads // 2
         c = certify_range(fewer, organ.elasticity, n_loads, seed=1)
-        found = {
-            "l2_mean": c.l2_mean,
-            "l2_worst": c.l2_worst,
-            "contact_mean": c.contact_mean,
-            "contact_worst": c.contact_worst,
-        }
-        rows.append(_row(name, organ, "default", rank, found, seconds))
+        rows.append(
+            {
+                "coordinate": name,
+                "organ": organ.outline.name,
+                "method": "default",
+                "modes": rank,
+                "l2_mean": c.l2_mean,
+                "l2_worst": c.l2_worst,
+                "contact_mean": c.contact_mean,
+                "contact_worst": c.contact_worst,
+                "build_cpu_seconds": seconds,
+            }
+        )
     return rows
 
 
@@ -250,22 +215,10 @@ def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[Row]
     liver, tumour = TUMOUR_FOLDER / "liver.vtk", TUMOUR_FOLDER / "liver_tumours.vtk"
     if not liver.is_file():
         return []
-    organ = _organ(read_surface(liver, axes=TUMOUR_AXES), settings, tumour=tumour)
+    surface = read_surface(liver, axes=TUMOUR_AXES)
+    organ = _organ(surface, settings, tumour=read_tumour(tumour, axes=TUMOUR_AXES))
     coordinates = (Coordinate("poisson", 0.40, 0.49), Coordinate("contrast", 0.5, 20.0))
     return _parametric(organ, "tumour", coordinates, settings, progress)
-
-
-def _row(
-    name: str, organ: Organ, method: str, modes: int, found: dict[str, float], seconds: float
-) -> Row:
-    return {
-        "coordinate": name,
-        "organ": organ.outline.name,
-        "method": method,
-        "modes": modes,
-        **found,
-        "build_cpu_seconds": seconds,
-    }
 
 
 # --- large deformation --------------------------------------------------------------------------
@@ -276,16 +229,7 @@ def _large(
 ) -> list[Row]:
     """One material: its summary, every push, and combinations of neo-Hookean ones."""
     start = time.process_time()
-    linear = build_vademecum(
-        organ.outline.name,
-        organ.elasticity,
-        organ.regions,
-        organ.loads,
-        organ.tip_field,
-        BuildRule(),
-        Provenance("", ""),
-        progress,
-    )
+    linear = organ.linear(BuildRule(), progress)
     problem = hyperelastic_problem(linear, material)
     bent = with_large_deformation(linear, problem, material, LargeRule(), progress)
     seconds = time.process_time() - start

@@ -18,7 +18,6 @@ import numpy as np
 
 from avatar_core.certify.linear import UnseenErrors
 from avatar_core.contact.effects import LargeDeformationEffect
-from avatar_core.errors import AccuracyError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm, relative_l2
 from avatar_core.fem.patch_loads import patch_loads
@@ -33,17 +32,14 @@ from avatar_core.studies.study import Row
 from avatar_core.vademecum.accuracy import (
     CONTENT,
     AccuracyCurve,
-    Budget,
     CurvePoint,
     Detail,
-    choose,
     upper_quantile,
 )
 from avatar_core.vademecum.model import Vademecum
 
 N_SNAPSHOTS = 150  # loads, three directions each
 _BATCH = 40
-TOLERANCES, DEADLINES = (0.01, 0.05, 0.20), (100e-6, 1e-3)  # [-], [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,33 +66,6 @@ def curve_rows(curve: AccuracyCurve) -> list[Row]:
     """The points of a curve; on the front: none of the same cloud is both faster and better."""
     front = {id(p) for cloud in ("surface", "volume") for p in curve.of(cloud).front()}
     return [_row("vademecum", p, id(p) in front) for p in curve.points if p.detail.cloud != "off"]
-
-
-def budget_rows(curve: AccuracyCurve) -> list[Row]:
-    """What is chosen for some budgets, all vertices shown, and whether going through all agrees."""
-    points = curve.of("volume")
-    rows: list[Row] = []
-    for tolerance in TOLERANCES:
-        for deadline in DEADLINES:
-            found: CurvePoint | None = None
-            try:
-                found = choose(points, Budget(tolerance, deadline))
-                setting = str(found.detail)
-            except AccuracyError as error:
-                setting = f"refused: {error}"
-            met = [p for p in points.points if p.l2 <= tolerance and p.p99 <= deadline]
-            rows.append(
-                {
-                    "stage": "budget",
-                    "method": "choose",
-                    "setting": setting,
-                    "tolerance": tolerance,
-                    "deadline_us": 1e6 * deadline,
-                    "p50_us": 1e6 * found.p50 if found else None,
-                    "as_enumerated": found == min(met, key=lambda p: p.p50, default=None),
-                }
-            )
-    return rows
 
 
 def _row(method: str, point: CurvePoint, front: bool = False) -> Row:

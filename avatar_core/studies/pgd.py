@@ -20,14 +20,14 @@ import numpy as np
 import scipy.sparse as sp
 
 from avatar_core.common.arrays import FloatArray, IntArray, farthest_points
-from avatar_core.fem.elasticity import Elasticity, Material
+from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm
-from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
-from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
+from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.pgd import LoadProblem, PGDRule, solve_pgd
 from avatar_core.reduction.regional import RegionalRule, regions_of, separate_regions
 from avatar_core.reduction.separated import SeparatedField
+from avatar_core.studies.organ import Organ
 from avatar_core.studies.shapes import read_liver
 from avatar_core.studies.study import Row, Run, Study, column, follow, label, where
 
@@ -81,15 +81,13 @@ class PGDStudy(Study[PGDSettings]):
 
     def measure(self, run: Run[PGDSettings]) -> None:
         surface = read_liver(run.surfaces, "LiTS-4")
-        mesh = tetrahedralize(surface, run.settings.n_vertices)
-        regions = regions_by_rule(mesh)
-        elasticity = Elasticity(mesh, Material(), regions.clamped)
-        positions = load_surface(mesh, regions)
+        organ = Organ.of(surface, run.settings.n_vertices)
+        elasticity, positions = organ.elasticity, organ.loads
         nodes = spread(positions, run.settings.n_loads)
         for kind in ("patch", "point"):
             for row in _rows(make_case(elasticity, positions, nodes, kind), kind):
                 run.add(row)
-        n = len(mesh.vertices)
+        n = len(elasticity.mesh.vertices)
         run.notices.append(f"{surface.name}, {n} vertices, {len(nodes)} load nodes")
 
     def summary(self, run: Run[PGDSettings]) -> dict[str, float]:

@@ -13,7 +13,7 @@ import platform
 import sys
 import textwrap
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -35,6 +35,7 @@ Row = dict[str, Value]
 Item = TypeVar("Item")
 S = TypeVar("S")
 
+_IN_ROW = 3  # panels of a picture
 PACKAGES = ("avatar", "numpy", "scipy", "libigl", "scikit-fem", "rslab", "scikit-learn")
 
 
@@ -69,9 +70,6 @@ class Study(ABC, Generic[S]):
     def draw(self, figure: Figure, run: Run[S]) -> None:
         """Draw the picture."""
 
-    def report(self, run: Run[S]) -> None:
-        """Write further files, such as a page."""
-
     def conduct(self, settings: S, folder: Path, surfaces: Path | None = None) -> Run[S]:
         """Measure and sum up.
 
@@ -85,7 +83,6 @@ class Study(ABC, Generic[S]):
         run = Run(self, settings, folder, surfaces)
         self.measure(run)
         run.summary = self.summary(run)
-        self.report(run)
         return run
 
 
@@ -230,6 +227,24 @@ def where(rows: Iterable[Row], **wanted: Value) -> list[Row]:
 def column(rows: Iterable[Row], key: str) -> NDArray[np.float64]:
     """The numbers of a column, in the rows that have it."""
     return np.array([row[key] for row in rows if key in row], float)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One plot of several, and the sentence above it."""
+
+    sentence: str
+    draw: Callable[[Axes], None]
+
+
+def draw_panels(figure: Figure, panels: Sequence[Panel]) -> None:
+    """Panels in rows of three; the finding above them takes two inches."""
+    n_rows = -(-len(panels) // _IN_ROW)
+    figure.set_size_inches(5.0 * _IN_ROW, 2.0 + 4.5 * n_rows)
+    for k, panel in enumerate(panels):
+        axes = figure.add_subplot(n_rows, _IN_ROW, k + 1)
+        panel.draw(axes)
+        axes.set_title(textwrap.fill(panel.sentence, 70), fontsize=8)
 
 
 def label(axes: Axes, x: str, y: str, title: str = "", legend: float = 8.0) -> None:

@@ -7,9 +7,10 @@ import pytest
 from tests.helpers.fuzzing import campaign
 
 QUICK = range(300)  # a third for each door
-LONG = range(10_000, 10_800)
+LONG = range(10_000, 10_300)
 
 
+@pytest.mark.long
 def test_a_mutant_is_refused_or_loaded() -> None:
     found = campaign("every", QUICK)
     assert not found.failures()

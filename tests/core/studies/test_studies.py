@@ -106,6 +106,7 @@ def test_meshes(conduct: Conduct, tmp_path: Path) -> None:
     assert run.summary["min_dihedral_deg"] > 5.0
 
 
+@pytest.mark.long
 def test_an_interrupted_study_leaves_its_rows_and_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -209,6 +210,7 @@ def test_indentation(conduct: Conduct) -> None:
     assert sum(row["kind"] == "coefficients" for row in run.rows) == len(settings.ratios)
 
 
+@pytest.mark.long
 def test_passivity(conduct: Conduct) -> None:
     summary = conduct(passivity.STUDY, passivity.PassivitySettings(5, 2, 700)).summary
     assert summary["border_error_worst"] < 0.01
@@ -243,28 +245,22 @@ def test_leave_one_out(conduct: Conduct) -> None:
 
 
 @pytest.mark.long
-def test_accuracy_time(conduct: Conduct, tmp_path: Path) -> None:
-    settings = accuracy_time.AccuracyTimeSettings(
-        400, 40, 40, 150, (300,), (20e-3, 10e-3), (5e-3,), 6, 3, 250
-    )
+def test_accuracy_time(conduct: Conduct) -> None:
+    settings = accuracy_time.AccuracyTimeSettings(400, 40, 40, 150, (300,), (5e-3,))
     run = conduct(accuracy_time.STUDY, settings)
     summary = run.summary
     assert summary["promise_kept_fraction"] >= 0.95
     assert summary["force_error_coverage"] >= 0.85  # 150 contacts: 90 % less two deviations
     assert summary["force_error_overestimate"] <= 3.0
     assert summary["front_points"] >= 5
-    assert summary["budgets_as_enumerated"] == 1.0
-    page = (tmp_path / "accuracy-time.html").read_text()
-    assert page.count("<figure>") == 8 and 'src="http' not in page  # it stands alone
-    rows = (tmp_path / "accuracy-time.csv").read_text().splitlines()
-    assert len(rows) == len(run.rows) + 1
     methods = {row["method"] for row in run.rows}
-    assert {"SVD optimum", "dense table", "direct solve", "PCA", "nearest neighbour"} <= methods
+    assert {"SVD optimum", "dense table", "direct solve", "projected"} <= methods
 
 
 # --- the parts --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_moved_organs_are_laid_on_the_phantom() -> None:
     """One that is larger and stands on its side, and one that is tilted."""
     organ = phantom_liver(12e-3)
@@ -350,10 +346,6 @@ def test_fields_pass_the_grid_unchanged_if_they_are_affine(phantom_mesh: TetMesh
     points = phantom_mesh.vertices[phantom_mesh.tets].mean(axis=1)[::7]
     corners, back = trilinear(points, np.array([-0.2, -0.2, -0.2]), 0.003)
     np.testing.assert_allclose(back @ corners, points, atol=1e-12)
-    there = interpolation_matrix(phantom_mesh, points)
-    np.testing.assert_allclose(there @ phantom_mesh.vertices, points, atol=1e-12)
-    outside = interpolation_matrix(phantom_mesh, np.array([[1.0, 1.0, 1.0]]))
-    assert math.isclose(outside.sum(), 1.0)
     field = np.ones((len(phantom_mesh.vertices), 3, 2))
     np.testing.assert_allclose(
         carried((back @ interpolation_matrix(phantom_mesh, corners)), field), 1.0
