@@ -53,7 +53,6 @@ class CellError(AvatarError):
 def run_cell(
     vademecum_path: str | Path,
     seconds: float = 60.0,
-    output_json: str | Path | None = None,
     real_time: bool = True,
     ordinary: bool = True,
     tip_radius: float = 0.005,
@@ -72,16 +71,13 @@ def run_cell(
     if not path.is_file():
         raise CellError(f"{path}: no such file; build one with 'avatar vademecum'")
     granted = real_time and _priority_is_granted()
-    report = CellReport(
+    return CellReport(
         machine=f"{platform.machine()} {platform.release()}",
         cores=len(os.sched_getaffinity(0)),
         vademecum=path.name,
         real_time=_measure(path, seconds, PRIORITY, tip_radius, changes) if granted else None,
         ordinary=_measure(path, seconds, 0, tip_radius, changes) if ordinary else None,
     )
-    if output_json is not None:
-        report.save(Path(output_json))
-    return report
 
 
 def _priority_is_granted() -> bool:
@@ -296,7 +292,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="write all figures as JSON")
     chosen = parser.parse_args()
     return print_report(
-        lambda: run_cell(chosen.vademecum, chosen.seconds, chosen.output, changes=chosen.changes)
+        lambda: run_cell(chosen.vademecum, chosen.seconds, changes=chosen.changes), chosen.output
     )
 
 

@@ -2,22 +2,41 @@
 
 from __future__ import annotations
 
+import json
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, ClassVar
 
+from avatar_core.common.dataclass_json import plain
 from avatar_core.errors import AvatarError
 
 
-class Report(Protocol):
-    """What a benchmark found."""
+@dataclass(frozen=True)
+class Report(ABC):
+    """Report of the benchmark of a name."""
 
+    name: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def summary(self) -> dict[str, float]:
+        """Key figures."""
+
+    @abstractmethod
     def table(self) -> str:
         """In lines for a terminal."""
 
+    def figures(self) -> dict[str, Any]:
+        """All of them."""
+        return asdict(self)
+
     def save(self, path: Path) -> None:
-        """Write all figures as JSON."""
+        """Write all figures as JSON; those that could not be measured are null."""
+        document = {"name": self.name, "summary": self.summary, **self.figures()}
+        path.write_text(json.dumps(plain(document), indent=2, allow_nan=False) + "\n")
 
 
 def print_report(measure: Callable[[], Report], output: Path | None = None) -> int:

@@ -1,27 +1,25 @@
 """What the nodes take of a processor while nobody asks anything of them.
 
 Contact node and loader run without a vademecum, the patients' service with an atlas if there is
-one, and beside them a node of rclpy with the contact node's topics alone, each in a domain of its
-own. ``avatar bench idle`` runs it as ``python -m avatar_ros.bench.idle SECONDS``.
+one, each in a domain of its own. ``avatar bench idle`` runs it as
+``python -m avatar_ros.bench.idle SECONDS``.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from avatar_ros.bench.cell import CellError, Module, isolated_environment
-from avatar_ros.bench.command import print_report
+from avatar_ros.bench.command import Report, print_report
 from avatar_ros.bench.footprint import children
 from avatar_ros.bench.thread_times import between, thread_times
 
-PROMISED = 0.03  # of a core, of the contact node with its worker
 _LEAST = 0.0005  # of a core, of a thread that has a row of its own
 _CALM = 0.15  # of a core, below which a process has started, even if it gets but a fifth of one
 _SETTLED = 5  # seconds in a row below that
@@ -50,8 +48,10 @@ ALL = "all"
 
 
 @dataclass(frozen=True)
-class IdleReport:
+class IdleReport(Report):
     """What ``avatar bench idle`` prints."""
+
+    name = "idle"
 
     load_average: float
     seconds: float
@@ -68,21 +68,14 @@ class IdleReport:
         return found
 
     def table(self) -> str:
-        contact = self.summary["contact"]
-        kept = "kept" if contact <= PROMISED else "missed"
         return "\n".join(
             [
                 f"load average {self.load_average:.2f} before; {self.seconds:g} s",
                 HEADER,
                 *(thread.row() for thread in self.threads),
-                f"contact and its worker: {contact:.2%} of a core, promised {PROMISED:.0%}: {kept}",
+                f"contact and its worker: {self.summary['contact']:.2%} of a core",
             ]
         )
-
-    def save(self, path: Path) -> None:
-        """Write all figures as JSON."""
-        document = {"name": "idle", "summary": self.summary, **asdict(self)}
-        path.write_text(json.dumps(document, indent=2) + "\n")
 
 
 def run_idle(seconds: float, atlas: Path | None = None) -> IdleReport:
@@ -129,15 +122,14 @@ def _nodes(atlas: Path | None) -> Iterator[dict[str, Module]]:
     if atlas is not None:
         of_patients = ["-p", f"atlas:={atlas}", "-p", f"library_dir:={atlas.parent}"]
     asked = {
-        "bare node": ("bench.bare_node", []),
-        "contact": ("contact", []),
-        "vademecum_loader": ("vademecum_loader", []),
-        "patient_interpolation": ("patient_interpolation", ["--ros-args", *of_patients]),
+        "contact": [],
+        "vademecum_loader": [],
+        "patient_interpolation": ["--ros-args", *of_patients],
     }
     with ExitStack() as ended:
         found = {}
-        for name, (module, arguments) in asked.items():
-            found[name] = Module(module, arguments, isolated_environment())
+        for name, arguments in asked.items():
+            found[name] = Module(name, arguments, isolated_environment())
             ended.callback(found[name].finish)
         yield found
 

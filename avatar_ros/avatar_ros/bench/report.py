@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from avatar_ros.bench import footprint
+from avatar_ros.bench.command import Report
 from avatar_ros.bench.footprint import FootprintGrowth
 from avatar_ros.bench.scripted_tool import RoundTrips
 
@@ -81,8 +80,10 @@ class CellMeasurement:
 
 
 @dataclass(frozen=True)
-class CellReport:
+class CellReport(Report):
     """What ``avatar bench cell`` prints; ``real_time`` is None where priority is refused."""
+
+    name = "cell"
 
     machine: str
     cores: int
@@ -103,10 +104,13 @@ class CellReport:
             "latency_p99_ms": best.latency.p99_ms,
         }
 
-    def save(self, path: Path) -> None:
-        """Write all figures as JSON; those that could not be measured are null."""
-        document = {"name": "cell", "summary": self.summary, **asdict(self)}
-        path.write_text(json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+    def figures(self) -> dict[str, Any]:
+        """All but the round trips."""
+        found = super().figures()
+        for run in (found["real_time"], found["ordinary"]):
+            if run is not None:
+                del run["round_trips"]
+        return found
 
     def table(self) -> str:
         """Both modes side by side, one figure a line; then what the processes took."""
@@ -124,14 +128,6 @@ class CellReport:
                 f"{footprint.MAX_GROWTH:g} MB, a file or a thread: {said}"
             )
         return "\n".join(lines)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(held) for name, held in value.items() if name != "round_trips"}
-    if isinstance(value, list | tuple):
-        return [_plain(held) for held in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _times(times: Times) -> str:

@@ -204,13 +204,13 @@ class ScriptedTool:
 
 def main() -> int:
     options = _options()
+    vademecum = load_vademecum(options.vademecum)  # a broken one ends before anything runs
+    tips = palpation(vademecum, options.tip_radius, options.seconds, options.rate)
+    del vademecum
     stop = StopSignal()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(f"scripted_{options.tool}", enable_rosout=False)
     try:
-        vademecum = load_vademecum(options.vademecum)
-        tips = palpation(vademecum, options.tip_radius, options.seconds, options.rate)
-        del vademecum
         tool = ScriptedTool(node, options.tool, options.frame, options.rate)
         tool.wait_for_model(options.timeout)
         granted = realtime.claim(options.priority)

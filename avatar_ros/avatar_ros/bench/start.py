@@ -7,7 +7,6 @@ tip in the organ. ``avatar bench start`` runs it as ``python -m avatar_ros.bench
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import signal
 import subprocess
@@ -15,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,14 +26,13 @@ from rclpy.executors import SingleThreadedExecutor
 from avatar_core.contact import tool_path
 from avatar_core.vademecum.storage import load_vademecum
 from avatar_ros.bench.cell import CellError, isolated_environment
-from avatar_ros.bench.command import print_report
+from avatar_ros.bench.command import Report, print_report
 from avatar_ros.bench.footprint import children
 from avatar_ros.bench.thread_times import thread_times
 from avatar_ros.framework import discovery, qos, realtime
 from avatar_ros.framework.templates import PoseTemplate, stamp_bytes
 from avatar_ros.msg import ContactState, VademecumInfo
 
-PROMISED = 6.0  # from launch to the first force, on a quiet machine with warm caches [s]
 STAGES = ("contact node answers", "vademecum announced", "first wrench with a model", "first force")
 _RADIUS = 5e-3  # of the tip, the node's default [m]
 _DEPTH = 3e-3  # [m]
@@ -62,17 +60,14 @@ class StartStage:
 
 
 @dataclass(frozen=True)
-class StartReport:
+class StartReport(Report):
     """What ``avatar bench start`` prints."""
+
+    name = "start"
 
     vademecum: str
     load_average: float
     stages: tuple[StartStage, ...]
-
-    @property
-    def seconds(self) -> float:
-        """From launch to the first force [s]."""
-        return self.stages[-1].seconds
 
     @property
     def summary(self) -> dict[str, float]:
@@ -91,14 +86,7 @@ class StartReport:
             row = f"{stage.name:28}{stage.seconds:>8.2f}{sum(stage.cpu.values()):>8.2f}"
             row += "".join(f"{stage.cpu.get(name, 0.0):>{width}.2f}" for name in names)
             lines.append(row)
-        kept = "kept" if self.seconds <= PROMISED else "missed"
-        lines.append(f"{self.seconds:.2f} s, promised {PROMISED:g} s on a quiet machine: {kept}")
         return "\n".join(lines)
-
-    def save(self, path: Path) -> None:
-        """Write all figures as JSON."""
-        document = {"name": "start", "summary": self.summary, **asdict(self)}
-        path.write_text(json.dumps(document, indent=2) + "\n")
 
 
 def run_start(vademecum: Path, command: list[str] | None = None) -> StartReport:

@@ -8,16 +8,20 @@ import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import nullcontext
+from typing import Any
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.timer import Timer
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from avatar_core.errors import AvatarError
 from avatar_ros.framework import discovery
+from avatar_ros.framework.answering import answer_always, never_raising
 from avatar_ros.framework.ending import end_within
 from avatar_ros.framework.parameters import Parameter, ParameterError, declare
 from avatar_ros.framework.ports import Ports
@@ -36,12 +40,15 @@ class ManagedNode(LifecycleNode, ABC):
     before anything starts.
 
     refusal : why the last transition failed
+    is_shut_down : whether it was shut down, by the process or by a client
     ports : makes publishers and subscriptions
     """
 
     def __init__(self, name: str, declared: tuple[Parameter, ...]) -> None:
         super().__init__(name)
         self.refusal = ""
+        self.is_shut_down = False
+        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.ports = Ports(self)
         declare(self, declared)
 
@@ -71,6 +78,17 @@ class ManagedNode(LifecycleNode, ABC):
         """Whether requests are still to be answered before the node is destroyed."""
         return False
 
+    def create_timer(self, *what: Any, **how: Any) -> Timer:
+        """A timer that also runs with ``use_sim_time`` while nobody sends ``/clock``."""
+        return super().create_timer(*what, **{"clock": self._steady_clock, **how})
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *what: Any, **how: Any
+    ) -> Any:
+        """A subscription whose callback's exception is logged: no message ends the node."""
+        heard = never_raising(self, topic, callback)
+        return super().create_subscription(msg_type, topic, heard, *what, **how)
+
     def bring_up(self) -> bool:
         """Configure and activate; false if the node refused."""
         return all(
@@ -91,6 +109,7 @@ class ManagedNode(LifecycleNode, ABC):
         return self._attempt(self.clean_up)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.is_shut_down = True
         return self._attempt(self.release)
 
     def release(self) -> None:
@@ -117,6 +136,7 @@ class ManagedNode(LifecycleNode, ABC):
 
 def spin_until(stop: StopSignal, node: Node) -> None:
     """Serve a plain node until the signal is received, then shut it and rclpy down."""
+    answer_always(node)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
@@ -157,6 +177,7 @@ def run(make_node: Callable[[], ManagedNode], keeps_time: bool = False) -> int:
 
 
 def _live(node: ManagedNode, stop: StopSignal) -> int:
+    answer_always(node)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     leave: Callable[[], object] = node.trigger_shutdown
@@ -174,7 +195,8 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
         leave = node.release  # no other transition leads out of one that has not ended
         return 0
     finally:
-        leave()
+        if not node.is_shut_down:
+            leave()
         end = time.monotonic() + _LAST_ANSWERS
         while node.has_pending_answers and time.monotonic() < end:
             executor.spin_once(timeout_sec=_LOOK)

@@ -11,10 +11,12 @@ from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import CallbackGroup
+from rclpy.duration import Infinite
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.qos import (
+    LivelinessPolicy,
     QoSCompatibility,
     QoSPolicyKind,
     QoSProfile,
@@ -22,6 +24,7 @@ from rclpy.qos import (
     qos_policy_name_from_kind,
 )
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.qos import Quality
@@ -34,6 +37,10 @@ POLICIES = (
 )
 
 
+ONE_CELL = (  # the remedy
+    "end all but one (a node that was killed counts for 20 s), or give each cell its own "
+    "ROS_DOMAIN_ID or namespace"
+)
 _MAX_LOGGED = 100  # lines; from then on, mismatches are in the diagnostics only
 
 
@@ -52,6 +59,39 @@ class PolledSubscriptions(CallbackGroup):
 
     def ending_execution(self, entity: Any) -> None:
         pass
+
+
+def publishers(node: Node, topic: str) -> dict[str, str]:
+    """Full name of the node of each publisher of a topic, by the publisher's GID."""
+    ends = node.get_publishers_info_by_topic(topic)
+    return {bytes(end.endpoint_gid).hex(): _full_name(end) for end in ends}
+
+
+def _full_name(end: TopicEndpointInfo) -> str:
+    """Namespace and name of the node of a publisher, which the middleware learns a little later."""
+    if end.node_name == "_NODE_NAME_UNKNOWN_":
+        return "a node that just joined"
+    return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+
+
+def rivals(node: Node, topic: str) -> str:
+    """Who publishes a topic that should have one publisher; empty if it has one at most."""
+    if node.count_publishers(topic) <= 1:  # which is faster
+        return ""
+    names = " and ".join(sorted(publishers(node, topic).values()))
+    return f"{topic} is published by {names}"
+
+
+def _as_discovered(profile: QoSProfile) -> QoSProfile:
+    """A profile of ours as others find it: what was left to the middleware is infinite."""
+    return QoSProfile(
+        depth=profile.depth,
+        reliability=profile.reliability,
+        durability=profile.durability,
+        deadline=profile.deadline if profile.deadline.nanoseconds else Infinite,
+        liveliness=LivelinessPolicy.AUTOMATIC,
+        liveliness_lease_duration=Infinite,
+    )
 
 
 class Ports:
@@ -124,7 +164,8 @@ class Ports:
         Only topics that have had an incompatible end are checked, and silent ones.
         """
         found = []
-        for (side, topic), own in list(self._suspects.items()):
+        for (side, topic), profile in list(self._suspects.items()):
+            own = _as_discovered(profile)
             publishes = side == "publisher"
             look = self._node.get_subscriptions_info_by_topic
             if not publishes:

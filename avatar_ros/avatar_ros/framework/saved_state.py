@@ -14,6 +14,8 @@ from typing import Any
 
 from rclpy.node import Node
 
+from avatar_core.common.files import replaced
+from avatar_core.errors import StorageError
 from avatar_ros.framework.parameters import Parameter, ParameterError
 
 STATE_DIR = Parameter(
@@ -70,10 +72,9 @@ class SavedState:
         text = json.dumps({"started": self._started, "changed": changed}, indent=1)
         if text == self._written:
             return
-        part = self._path.with_name(f".{self._path.name}.{os.getpid()}")
         try:
-            part.write_text(text + "\n")
-            part.replace(self._path)
+            with replaced(self._path) as part:
+                part.write_text(text + "\n")
             self._written = text
-        except OSError as error:
-            self._log(f"state_dir: {self._path} not written ({error.strerror}); free some space")
+        except StorageError as error:
+            self._log(f"state_dir: {error}")

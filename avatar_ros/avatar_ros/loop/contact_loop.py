@@ -340,6 +340,7 @@ class ContactLoop:
             status = NO_MODEL
         elif status == OK:
             status = int(active.model.out.status[i])
+            tool.note_solved(status)
             if status == OK and not guard.engaged:
                 status = ENGAGING
         n, error = 0, _NO_ERROR

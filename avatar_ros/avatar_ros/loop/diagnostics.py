@@ -16,11 +16,13 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from avatar_core.contact.haptics.force_guard import ForceGuard
 from avatar_core.contact.haptics.passivity import Passivity
 from avatar_core.contact.status import Status
+from avatar_ros.framework.ports import ONE_CELL
 from avatar_ros.loop.device import OF_DEVICE
-from avatar_ros.loop.statuses import explanation
+from avatar_ros.loop.statuses import EXPLANATIONS, explanation
 from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.msg import LoopStatistics
 
+_WITH_FORCE = (Status.NOT_CONVERGED, Status.EXTRAPOLATED)  # faults that do not set it to zero
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -29,22 +31,28 @@ class Faults:
     """Faults of one tool in a window: how often each status was entered, and the present one.
 
     said : the operating state of its device, in words; empty if it is not asked or said none
+    senders : names of the nodes that send its poses
     """
 
     counts: dict[int, int]
     status: int
     said: str = ""
+    senders: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
         """Cause and remedy in one line; empty without a fault."""
         status = self.status
-        if status == Status.OK and self.counts:
-            status = max(self.counts, key=lambda key: self.counts[key])
-        if status == Status.OK:
+        if status not in EXPLANATIONS:
+            entered = [key for key in self.counts if key in EXPLANATIONS]
+            status = max(entered, key=lambda key: self.counts[key], default=int(Status.OK))
+        if status not in EXPLANATIONS:
             return ""
-        said = f" (it says {self.said})" if self.said and status in OF_DEVICE else ""
-        return f"no force: {explanation(status)}{said}"
+        detail = f"it says {self.said}" if self.said and status in OF_DEVICE else ""
+        if status == Status.SEVERAL_PUBLISHERS:
+            detail = ", ".join(self.senders)
+        force = "" if status in _WITH_FORCE else "no force: "
+        return f"{force}{explanation(status)}{f' ({detail})' if detail else ''}"
 
 
 class FaultCounter:
@@ -62,7 +70,9 @@ class FaultCounter:
             new = now - self._seen[i]
             self._seen[i] = now
             counts = {int(k): int(new[k]) for k in np.flatnonzero(new) if k != 0}
-            found.append(Faults(counts, tool.fault, tool.operating_state))
+            status = tool.fault if tool.fault != Status.OK else tool.solved
+            senders = tuple(tool.senders.values())
+            found.append(Faults(counts, status, tool.operating_state, senders))
         return found
 
 
@@ -148,6 +158,13 @@ def vademecum_status(name: str, identity: str, accuracy: str) -> DiagnosticStatu
     if not identity:
         return _status(f"{name}: vademecum", WARN, "none: no force; load one", {})
     return _status(f"{name}: vademecum", OK, accuracy, {"id": identity})
+
+
+def cells_status(name: str, rivals: Sequence[str]) -> DiagnosticStatus:
+    """Status of topics that another cell publishes, too; ``rivals`` are one line each."""
+    if not rivals:
+        return _status(f"{name}: other cells", OK, "none was found", {})
+    return _status(f"{name}: other cells", ERROR, f"{'; '.join(rivals)}: {ONE_CELL}", {})
 
 
 def qos_status(name: str, mismatches: list[str]) -> DiagnosticStatus:

@@ -36,9 +36,9 @@ _LEAP_INTERVAL = 2e-3  # between two poses, to which ``leap`` refers [s]
 _SLOW = 0.75  # of the timeout: poses that lie farther apart are slow
 # a stream that was refused is so until the next message, or until none came for this long [ns]
 _SILENCE = 2_500_000_000
+_ENDED = (STALE_POSE, LOST_TOOL)  # the stream of poses
 _OF_A_STREAM = (INVALID_POSE, UNKNOWN_FRAME, SEVERAL_PUBLISHERS, SLOW_POSES)
 _NO_INTERVALS = (0, 0, 0)  # [ns]
-_ALTERNATION = 500_000_000  # within which messages of several publishers alternate [ns]
 _NO_NUMBER = 2**64 - 1  # of middleware that does not count messages
 _N_STATUS = 32
 
@@ -52,9 +52,11 @@ class ToolChannel:
     status : OK with a usable pose, otherwise the reason why there is none
     stamp : of the last valid pose, eight bytes; zero before the first
     publishers : of its poses, as the node last counted them; one that was killed counts for a while
+    senders : name of the node of each publisher, by its GID, as the node found them; the node's
     listeners : to its wrenches, likewise; band_listeners : to their bands
     device : OK if its device takes forces or is not asked, otherwise why it does not; the node's
     operating_state : what its device said last, in words; empty before, the node's likewise
+    solved : status of the last step for it; the loop's
     faults : how often each status was entered since the node started, by its number
     """
 
@@ -74,11 +76,13 @@ class ToolChannel:
         self.status = NO_POSE
         self.stamp = NO_STAMP
         self.publishers = 0
+        self.senders: dict[str, str] = {}
         self.listeners = 0
         self.band_listeners = 0
         self.band_publishers = band
         self.device = OK
         self.operating_state = ""
+        self.solved = OK
         self.faults = np.zeros(_N_STATUS, np.int64)
         self._edges = [WrenchTemplate(frame) for _ in band]
         self._reader = PoseReader(frame)
@@ -91,8 +95,13 @@ class ToolChannel:
         self._heard = 0  # the last message, valid or not [ns]
         self._intervals = _NO_INTERVALS  # between the last valid poses of this stream [ns]
         self._number = -1  # of the last message, as its publisher counts
-        self._last_decrease = -_ALTERNATION  # when the numbers last decreased [ns]
-        self._several_until = 0  # [ns]
+        self._renewed = (
+            self._mixed
+        ) = -1  # when the numbers last decreased after a stream, in it [ns]
+        self._counted = 0  # when the node last counted publishers [ns]
+        self._sender = ""  # GID of the last publisher that was heard alone
+        self._replaced: set[str] = set()  # publishers whose stream had ended when another's began
+        self._several = False  # publishers, beside those that were replaced
         self._orientation: tuple[float, float, float, float] | None = None  # of the last valid pose
         self._kind = safety.wrench
         self._axes = (0.0, 0.0, 0.0, 1.0)  # of the last valid pose, as long as the channel exists
@@ -137,6 +146,32 @@ class ToolChannel:
             return False
         self._place(tip, turn)
         return True
+
+    def note_solved(self, status: int) -> None:
+        """Note what the step of the model returned for it. Real-time safe."""
+        if status != self.solved:
+            self.faults[status] += 1
+            self.solved = status
+
+    def note_senders(self, senders: dict[str, str], now: int) -> None:
+        """Note who sends poses; called by the node, outside the loop.
+
+        The middleware knows a driver that was killed for another 20 s. It does not count if its
+        stream had ended when that of the next one began, unless it sends again.
+
+        senders : as the attribute
+        now : before they were asked for [ns]
+        """
+        if self._mixed >= self._counted:
+            self._replaced = set()
+        elif self._renewed >= self._counted and len(senders.keys() - self._replaced) == 2:
+            self._replaced.add(self._sender)
+        self._replaced &= senders.keys()
+        alive = senders.keys() - self._replaced
+        if len(alive) == 1 and self._heard >= self._counted:
+            (self._sender,) = alive
+        self._several = len(alive) > 1
+        self.senders, self.publishers, self._counted = senders, len(senders), now
 
     def point(self, shaft: np.ndarray, axis: np.ndarray) -> None:
         """Turn a direction in the frame of the last pose into the organ's frame. Real-time safe.
@@ -219,15 +254,17 @@ class ToolChannel:
         return SLOW_POSES if self._intervals[-1] > timeout else STALE_POSE
 
     def _comes_from_several(self, info: Any, now: int) -> bool:
-        """Whether message numbers decreased twice lately; once is a restart. Real-time safe."""
+        """Whether the node counted several publishers, or the numbers of messages say so before it
+        counts again: of one publisher they increase. Real-time safe."""
         number = info["publication_sequence_number"] if info else None
         if number is not None and number != _NO_NUMBER:
-            if number <= self._number:
-                if now - self._last_decrease < _ALTERNATION:
-                    self._several_until = now + _ALTERNATION
-                self._last_decrease = now
+            if number <= self._number and self.status in _ENDED:
+                self._renewed = now
+            elif number <= self._number:
+                self._mixed = now
             self._number = number
-        return now < self._several_until
+        counted = self._several and self._renewed < self._counted
+        return counted or self._mixed >= self._counted
 
     def _place(self, tip: np.ndarray, turn: np.ndarray) -> None:
         """Transform the last pose into the organ's frame. Real-time safe."""

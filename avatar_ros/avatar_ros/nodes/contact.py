@@ -34,7 +34,7 @@ from avatar_core.reduction.coordinates import option_of
 from avatar_core.uncertainty.distributions import Distribution, mappings
 from avatar_core.uncertainty.known import Held
 from avatar_core.vademecum.accuracy import AccuracyCurve
-from avatar_ros.framework import promises, qos, realtime
+from avatar_ros.framework import qos, realtime
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
@@ -241,8 +241,7 @@ class ContactNode(ManagedNode):
                 self._set_cloud_divisor(prepared.cloud_divisor)
             self._scene = self._supplier.scene if self._supplier is not None else ""
             self._save_state()
-            promised = f"{promises.SCENE:g} s, {promises.COMPILED_SCENE:g} s if it was compiled"
-            response.message = promises.kept("in use", time.monotonic() - begin, promised)
+            response.message = f"in use after {time.monotonic() - begin:.2f} s"
             response.success = True
         except Exception as error:  # a service always answers; the text decides what is raised
             response.message = one_line(error)

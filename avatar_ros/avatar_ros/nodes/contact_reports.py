@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from avatar_ros.framework.ports import Ports
+from avatar_ros.framework.ports import ONE_CELL, Ports, publishers, rivals
 from avatar_ros.loop import diagnostics
 from avatar_ros.loop.contact_loop import ContactLoop, Publishers
 from avatar_ros.loop.device import ToolDevice
@@ -50,7 +50,10 @@ class ContactReports:
         self._node, self._loop, self._tools = node, loop, tools
         self._devices, self._publishers, self._ports = devices, publishers, ports
         self._faults = diagnostics.FaultCounter(tools)
+        self._owned = [node.resolve_topic_name("vademecum")]  # topics that one cell publishes
+        self._owned += [tool.publisher.topic_name for tool in tools]
         self._logged: dict[str, str] = {}  # last fault, by tool
+        self._logged_rivals: list[str] = []
         self._shown_modes_log = ShownModesLog(node)
         self._timers: list[Timer] = []  # of the reports, and of the counts between them
         self._n_reports = 0
@@ -114,11 +117,14 @@ class ContactReports:
         limits = {p.name: node.get_parameter(p.name).value for p in THRESHOLDS}
         accuracy = active.shown_modes.accuracy if active.shown_modes is not None else ""
         mismatches = self._ports.mismatches()
+        others = [line for topic in self._owned if (line := rivals(node, topic))]
+        self._log_rivals(others)
         time.sleep(_PAUSE)
         statuses = [
             diagnostics.loop_status(name, window, nominal, limits),
             diagnostics.vademecum_status(name, active.id, accuracy),
             diagnostics.qos_status(name, mismatches),
+            diagnostics.cells_status(name, others),
         ]
         if report is not None:
             self._shown_modes_log.note(report)
@@ -135,6 +141,12 @@ class ContactReports:
         message.header.stamp = node.get_clock().now().to_msg()
         self._publishers.diagnostics.publish(message)
 
+    def _log_rivals(self, lines: list[str]) -> None:
+        """Log other cells when they come or change."""
+        for line in (line for line in lines if line not in self._logged_rivals):
+            self._node.get_logger().error(f"{line}: {ONE_CELL}")
+        self._logged_rivals = lines
+
     def _log_fault(self, tool: str, text: str) -> None:
         """Log a tool's fault when it differs from the last window's."""
         if text != self._logged.get(tool, ""):
@@ -148,13 +160,21 @@ class ContactReports:
         """Note who sends each tool's poses and takes its wrenches, and which devices are there."""
         for tool in self._tools:
             was_connected = tool.connected
-            tool.publishers = tool.subscription.get_publisher_count()
+            now = time.monotonic_ns()
+            tool.note_senders(self._senders(tool), now)
             tool.listeners = tool.publisher.get_subscription_count()
             tool.band_listeners = sum(p.get_subscription_count() for p in tool.band_publishers)
             if tool.connected and not was_connected:
                 self._loop.wake()
         for device in self._devices:
             device.attend()
+
+    def _senders(self, tool: ToolChannel) -> dict[str, str]:
+        """As :meth:`ToolChannel.note_senders` takes them; looked up only where it matters, because
+        the loop waits for that."""
+        topic = tool.subscription.topic_name
+        n, known = self._node.count_publishers(topic), tool.senders
+        return known if n == len(known) <= 1 else publishers(self._node, topic)
 
 
 class ShownModesLog:

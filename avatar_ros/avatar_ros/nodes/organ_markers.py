@@ -9,13 +9,14 @@ from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
 from avatar_ros.framework import qos
+from avatar_ros.framework.announced import Announced
 from avatar_ros.framework.conversions import mesh_arrays
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import AUTOSTART, Parameter
 from avatar_ros.framework.templates import NO_STAMP
 from avatar_ros.msg import VademecumInfo
-from avatar_ros.ui.colours import colours
-from avatar_ros.ui.display import NewestCloud, TriangleTemplate
+from avatar_ros.ui.view.colours import colours
+from avatar_ros.ui.view.display import NewestCloud, TriangleTemplate
 
 _REST_SHADE = (0.6, 0.6, 0.6, 0.25)  # grey, transparent
 
@@ -36,7 +37,7 @@ class MarkersNode(ManagedNode):
     """Subscribes the topics of loader and contact node; publishes two markers."""
 
     def __init__(self) -> None:
-        self._own_subscriptions: list[Any] = []
+        self._announced: list[Announced] = []
         self._own_publishers: list[Any] = []
         self._frame = ""
         self._surface: Mesh | None = None
@@ -51,11 +52,9 @@ class MarkersNode(ManagedNode):
             self.create_publisher(Marker, "organ_rest", qos.LATCHED),
             self.create_publisher(Marker, "organ_deformed", qos.COMMAND),
         ]
-        self._own_subscriptions = [
-            self.create_subscription(
-                VademecumInfo, "vademecum_info", self._take_frame, qos.LATCHED
-            ),
-            self.create_subscription(Mesh, "rest_surface", self._take_surface, qos.LATCHED),
+        self._announced = [
+            Announced(self, VademecumInfo, "vademecum_info", self._take_frame),
+            Announced(self, Mesh, "rest_surface", self._take_surface),
         ]
 
     def activate(self) -> None:
@@ -68,11 +67,11 @@ class MarkersNode(ManagedNode):
             self._timer = None
 
     def clean_up(self) -> None:
-        for subscription in self._own_subscriptions:
-            self.destroy_subscription(subscription)
+        for announced in self._announced:
+            announced.close()
         for publisher in self._own_publishers:
             self.destroy_publisher(publisher)
-        self._own_subscriptions, self._own_publishers = [], []
+        self._announced, self._own_publishers = [], []
         self._forget()
 
     def _forget(self) -> None:

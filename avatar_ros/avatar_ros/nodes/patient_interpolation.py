@@ -16,7 +16,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from avatar_core.errors import one_line
 from avatar_core.geometry.label_files import is_label_map
 from avatar_ros.action import BuildPatient
-from avatar_ros.framework import conversions, promises
+from avatar_ros.framework import conversions
 from avatar_ros.framework.beside import Beside
 from avatar_ros.framework.library import RefusedError, file_name, find_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
@@ -193,7 +193,7 @@ class PatientInterpolationNode(ManagedNode):
         self, request: InterpolatePatient.Request, response: InterpolatePatient.Response
     ) -> InterpolatePatient.Response:
         try:
-            _fill(response, await self._beside.done(lambda: self.build(request)), request.fidelity)
+            _fill(response, await self._beside.done(lambda: self.build(request)))
         except Exception as error:  # a service always answers; the surface decides what is raised
             self._refuse("interpolate_patient", response, error)
         return response
@@ -208,7 +208,7 @@ class PatientInterpolationNode(ManagedNode):
             return self.build(goal.request, tell, lambda: goal.is_cancel_requested)
 
         try:
-            _fill(result, await self._beside.done(work), goal.request.fidelity)
+            _fill(result, await self._beside.done(work))
             goal.succeed()
         except Exception as error:  # as above
             self._refuse("build_patient", result, error)
@@ -229,7 +229,7 @@ class PatientInterpolationNode(ManagedNode):
             self.get_logger().error(text)
 
 
-def _fill(answer: Any, built: Built | Previewed, fidelity: str) -> None:
+def _fill(answer: Any, built: Built | Previewed) -> None:
     if isinstance(built, Previewed):
         answer.boundary = conversions.surface_mesh(built.vertices, built.faces)
         answer.regions = array("B", built.regions.tobytes())
@@ -240,8 +240,7 @@ def _fill(answer: Any, built: Built | Previewed, fidelity: str) -> None:
         return
     for name, value in asdict(built).items():
         setattr(answer, name, value)
-    promised = f"{promises.PATIENT[fidelity or _DEFAULT_FIDELITY]:g} s"
-    answer.message = promises.kept("written", built.seconds, promised)
+    answer.message = f"written after {built.seconds:.2f} s"
     answer.success = True
 
 

@@ -14,15 +14,15 @@ from geometry_msgs.msg import PoseStamped
 from shape_msgs.msg import Mesh
 
 from avatar_ros.framework import qos
+from avatar_ros.framework.announced import Announced
 from avatar_ros.framework.conversions import mesh_arrays
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import AUTOSTART, Parameter
 from avatar_ros.framework.ports import PolledSubscriptions
 from avatar_ros.loop.statuses import explanation
 from avatar_ros.msg import ContactState, VademecumInfo
-from avatar_ros.ui.actions import Wanted
-from avatar_ros.ui.display import NewestCloud
-from avatar_ros.ui.requests import Requests
+from avatar_ros.ui.session.requests import Requests, Wanted
+from avatar_ros.ui.view.display import NewestCloud
 
 try:
     from avatar_ros.slicer import messages
@@ -51,6 +51,7 @@ class SlicerBridge(ManagedNode):
         self._follower = Follower()
         self._asked: deque[str] = deque(maxlen=8)  # patients to build, as they were written
         self._requests: Requests | None = None
+        self._announced: list[Announced] = []
         self._own_subscriptions: list[Any] = []
         self._timer: Any = None
         self._drive: Any = None  # publisher and timer, while a program moves the tool
@@ -71,18 +72,16 @@ class SlicerBridge(ManagedNode):
             ) from error
         self._requests = Requests(self)
         polled = PolledSubscriptions()
+        self._announced = [
+            Announced(self, VademecumInfo, "vademecum_info", self._take_frame),
+            Announced(self, Mesh, "rest_surface", self._take_surface),
+        ]
         self._own_subscriptions = [
-            self.create_subscription(
-                VademecumInfo, "vademecum_info", self._take_frame, qos.LATCHED
-            ),
-            self.create_subscription(Mesh, "rest_surface", self._take_surface, qos.LATCHED),
-            *(
-                self.create_subscription(kind, topic, _never_called, depth, callback_group=polled)
-                for kind, topic, depth in (
-                    (PoseStamped, f"{tool}/measured_cp", qos.NEWEST),
-                    (ContactState, "contact_state", qos.NEWEST),
-                )
-            ),
+            self.create_subscription(kind, topic, _never_called, qos.NEWEST, callback_group=polled)
+            for kind, topic in (
+                (PoseStamped, f"{tool}/measured_cp"),
+                (ContactState, "contact_state"),
+            )
         ]
         self.get_logger().info(f"3D Slicer may connect to {host}:{port}, in OpenIGTLinkIF")
 
@@ -104,7 +103,9 @@ class SlicerBridge(ManagedNode):
             self._requests = None
         for subscription in self._own_subscriptions:
             self.destroy_subscription(subscription)
-        self._own_subscriptions = []
+        for announced in self._announced:
+            announced.close()
+        self._announced, self._own_subscriptions = [], []
         self._forget()
         self._frame, self._surface = "", None
 
@@ -152,7 +153,7 @@ class SlicerBridge(ManagedNode):
 
     def _send_tool(self, link: Link) -> None:
         """Pose and force of the tool."""
-        pose, state = (_newest(subscription) for subscription in self._own_subscriptions[2:])
+        pose, state = (_newest(subscription) for subscription in self._own_subscriptions)
         if pose is not None and pose.header.frame_id == self._frame:
             p, q = pose.pose.position, pose.pose.orientation
             place = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])

@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 from avatar_core.common.confined import Imported
 from avatar_core.common.processes import return_memory
 from avatar_core.errors import AvatarError, StorageError, one_line
-from avatar_ros.framework import conversions, promises, qos
+from avatar_ros.framework import conversions, qos
 from avatar_ros.framework.beside import Beside
 from avatar_ros.framework.library import read_in_library
 from avatar_ros.framework.managed_node import ManagedNode, run
@@ -138,8 +138,8 @@ class LoaderNode(ManagedNode):
         if name:
             self.load(name)
 
-    def load(self, name: str) -> tuple[VademecumInfo, int]:
-        """Verify a file of the library and announce it; returns its size, too [bytes].
+    def load(self, name: str) -> VademecumInfo:
+        """Verify a file of the library and announce it.
 
         Raises
         ------
@@ -158,7 +158,7 @@ class LoaderNode(ManagedNode):
         self.get_logger().info(
             f"announced {info.name!r} ({info.id[:12]}), {len(data) / 1e6:.1f} MB"
         )
-        return info, len(data)
+        return info
 
     def _answer(
         self, request: LoadVademecum.Request, response: LoadVademecum.Response
@@ -167,10 +167,9 @@ class LoaderNode(ManagedNode):
         try:
             if not self._is_active:
                 raise StorageError("the node is inactive; activate it first")
-            response.info, n_bytes = self.load(request.name)
+            response.info = self.load(request.name)
             self._state.save({"vademecum": request.name})
-            promised = f"{promises.reading(n_bytes):.1f} s"
-            response.message = promises.kept("announced", time.monotonic() - begin, promised)
+            response.message = f"announced after {time.monotonic() - begin:.2f} s"
             response.success = True
         except Exception as error:  # a service always answers; the file decides what is raised
             response.message = one_line(error)

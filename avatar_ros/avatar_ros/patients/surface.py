@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from avatar_core.geometry.label_files import MAX_LABEL_BYTES, is_label_map
+from avatar_core.geometry.label_files import is_label_map
 from avatar_core.geometry.surface import (
     SurfaceMesh,
     keep_organ,
@@ -16,6 +16,7 @@ from avatar_core.geometry.surface import (
     require_plausible_size,
 )
 from avatar_core.geometry.tumour import read_tumour
+from avatar_core.geometry.volumes import MAX_VOXEL_BYTES
 from avatar_ros.framework.reader import Reader
 from avatar_ros.patients.protocol import PatientRequest
 
@@ -29,9 +30,9 @@ def read_confined(request: PatientRequest, reader: Reader) -> SurfaceMesh:
         return reader.read(
             "mesh", request.vertices.nbytes + request.faces.nbytes, surface_of, request
         )
-    # these may unpack to MAX_LABEL_BYTES
+    # these may unpack to MAX_VOXEL_BYTES
     packed = is_label_map(Path(request.surface))
-    n_bytes = MAX_LABEL_BYTES if packed else os.path.getsize(request.surface)
+    n_bytes = MAX_VOXEL_BYTES if packed else os.path.getsize(request.surface)
     return reader.read(os.path.basename(request.surface), n_bytes, surface_of, request)
 
 
@@ -39,7 +40,7 @@ def read_inside(request: PatientRequest, reader: Reader) -> tuple[SurfaceMesh, .
     """What lies inside the organ of a label map, by its labels, read in the process of a reader."""
     name = os.path.basename(request.surface)
     return tuple(
-        reader.read(name, MAX_LABEL_BYTES, structure_of, request, label) for label in request.inside
+        reader.read(name, MAX_VOXEL_BYTES, structure_of, request, label) for label in request.inside
     )
 
 

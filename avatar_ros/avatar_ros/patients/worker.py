@@ -123,7 +123,7 @@ def preview_of(problem: PatientProblem, supports: Sequence[SupportOption]) -> Pr
     for k, support in enumerate(supports):  # those that are clamped are none
         if support.name in springs:
             regions[springs[support.name]] = FIRST_SPRING + k
-    notices = [*problem.surface.notices, *problem.registration.notices]
+    notices = [*problem.surface.notices, *problem.notices, *problem.registration.notices]
     return Previewed(vertices, faces, regions.astype(np.uint8), notices)
 
 

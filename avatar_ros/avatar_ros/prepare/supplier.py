@@ -1,10 +1,10 @@
 """Supplies the contact node with prepared models, without delaying its loop.
 
 Deserialising 40 MB, verifying them and preparing the contact model would each hold Python's
-global lock for tens of milliseconds; compiling the step for a new selection of effects, for tens of
-seconds. A worker process (:mod:`avatar_ros.prepare.worker`) does all that: it subscribes to
-`vademecum` and puts the prepared arrays into sealed shared memory. This process only maps that
-memory, and reads the compiled step from numba's cache.
+global lock for tens of milliseconds; compiling the step, once on a machine, for tens of seconds.
+A worker process (:mod:`avatar_ros.prepare.worker`) does all that: it subscribes to `vademecum` and
+puts the prepared arrays into sealed shared memory. This process only maps that memory, and reads
+the compiled step from numba's cache.
 """
 
 from __future__ import annotations

@@ -66,11 +66,15 @@ class ModelPreparer:
                 vademecum = _verified(message.id, bytes(message.data), self._reader)
                 self._prepare(vademecum, self._request, 0, {})
             except Exception as error:  # whatever an untrusted file provokes
-                name = message.name[:_MAX_NAME]
-                self._send(Refused(0, f"vademecum {name!r} refused: {one_line(error)}"))
+                self._send_refused(message, one_line(error))
                 return
             self._vademecum = vademecum
             return_memory()
+
+    def refuse(self, message: Any, reason: str) -> None:
+        """Report a VademecumFile that is not taken, unless it is in use."""
+        if self._vademecum is None or message.id != self._vademecum.id:
+            self._send_refused(message, reason)
 
     def listen(self) -> None:
         """Take changes of the request until the socket is closed."""
@@ -114,8 +118,8 @@ class ModelPreparer:
         held, bands, unused = self._bands.prepare(spec, request.uncertainty)
         handle, contents = write_shared(spec.layout(spec.finest, request.period).flat() | bands)
         try:
-            # Compiles the step for these effects, if that was never done on this machine, from
-            # arrays as the node will map them: it then finds the same types in numba's cache.
+            # Compiles the step, if that was never done on this machine: the node then finds it in
+            # numba's cache.
             arrays = map_shared(os.dup(handle), contents)
             model = make_model(Layout.of(arrays))
             ForceBand.of(model, arrays)
@@ -135,6 +139,9 @@ class ModelPreparer:
             self._send(ready, handle)
         finally:
             os.close(handle)
+
+    def _send_refused(self, message: Any, reason: str) -> None:
+        self._send(Refused(0, f"vademecum {message.name[:_MAX_NAME]!r} refused: {reason}"))
 
     def _send(self, packet: Packet, *handles: int) -> None:
         self._channel.send(packet, *handles)
@@ -180,7 +187,7 @@ def main() -> int:
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
-    from avatar_ros.framework import qos
+    from avatar_ros.framework.announced import Announced
     from avatar_ros.framework.managed_node import spin_until
     from avatar_ros.framework.stop_signal import StopSignal
     from avatar_ros.msg import VademecumFile
@@ -202,7 +209,7 @@ def main() -> int:
         start_parameter_services=False,
         enable_rosout=False,
     )
-    node.create_subscription(VademecumFile, request.topic, preparer.receive, qos.LATCHED)
+    Announced(node, VademecumFile, request.topic, preparer.receive, preparer.refuse)
     with contextlib.suppress(BrokenPipeError):  # the contact node is gone
         spin_until(stop, node)
     return 0

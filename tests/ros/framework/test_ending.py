@@ -45,6 +45,7 @@ def test_a_process_that_ends_by_itself_does_so_before() -> None:
         assert end_of(process, 60.0) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_node_that_still_reads_its_organ_ends(
     own_domain: dict[str, str], organ: Any, tmp_path: Path, number: signal.Signals

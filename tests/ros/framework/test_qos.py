@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import pytest
@@ -17,10 +18,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.helpers.slowness import slowness
+from tests.ros.conftest import Probe
 from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.running import running, running_cell
 
@@ -190,6 +192,20 @@ def test_a_driver_that_does_not_match_is_named(contact: Module, probe: Any) -> N
 
 
 @by_default
+def test_a_listener_that_does_not_match_is_named_alone_while_it_is_there(
+    contact: Module, probe: Any
+) -> None:
+    late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    probe.node.create_subscription(WrenchStamped, "tool/servo_cf", lambda _: None, RELIABLE)
+    with closing(Probe()) as other:
+        other.node.create_subscription(WrenchStamped, "tool/servo_cf", lambda _: None, late)
+        said = diagnosis(probe, lambda status: status.level == DiagnosticStatus.WARN)
+        assert said.message.count("not matched") == 1
+        assert "transient local" in said.message and "liveliness" not in said.message
+    diagnosis(probe, lambda status: status.level == DiagnosticStatus.OK)
+
+
+@by_default
 def test_a_viewer_that_does_not_match_is_named(contact: Module, probe: Any) -> None:
     from sensor_msgs.msg import PointCloud2
 
@@ -197,4 +213,5 @@ def test_a_viewer_that_does_not_match_is_named(contact: Module, probe: Any) -> N
     probe.node.create_subscription(PointCloud2, "deformation", lambda _: None, RELIABLE)
     said = diagnosis(probe, lambda status: status.level == DiagnosticStatus.WARN)
     assert "/deformation: not matched with probe" in said.message
+    assert "deadline" not in said.message.lower()
     assert "qos_overrides./deformation.publisher.reliability" in contact.said()

@@ -131,6 +131,7 @@ def _threads(pid: int) -> str:
     return " ".join(sorted((task / "comm").read_text().strip() for task in tasks))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "shared_memory"), [("vademecum_loader", True), ("contact", False)]
 )

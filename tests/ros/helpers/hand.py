@@ -12,11 +12,14 @@ from avatar_ros.msg import ContactState
 
 
 class Hand:
-    """Publishes one pose again and again, each time with a new stamp."""
+    """Publishes one pose again and again, each time with a new stamp; one at a time of a node."""
 
     def __init__(self, probe: Any, position: np.ndarray, frame: str = "organ") -> None:
-        self._clock = probe.node.get_clock()
-        self._publisher = probe.node.create_publisher(PoseStamped, "tool/measured_cp", qos.NEWEST)
+        node = probe.node
+        self._clock = node.get_clock()
+        for before in [p for p in node.publishers if p.topic == "/tool/measured_cp"]:
+            node.destroy_publisher(before)
+        self._publisher = node.create_publisher(PoseStamped, "/tool/measured_cp", qos.NEWEST)
         self.pose = PoseStamped()
         self.pose.header.frame_id = frame
         self.pose.pose.orientation.w = 1.0

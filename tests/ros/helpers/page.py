@@ -8,8 +8,8 @@ from typing import Any
 
 import nibabel
 import numpy as np
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.tool_state import ROW, SharedToolState
+from avatar_ros.ui.tools.tool_state import ROW, SharedToolState
+from avatar_ros.ui.view.organ import Organ
 
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene

@@ -24,7 +24,15 @@ def parameter_values(probe: Any, node: str, names: Iterable[str]) -> dict[str, A
 
 def set_parameters(probe: Any, node: str, values: Mapping[str, Any]) -> list[bool]:
     """Set one after the other; whether each was taken."""
+    return [answer.successful for answer in _answers(probe, node, values)]
+
+
+def set_parameter(probe: Any, node: str, name: str, value: Any) -> Any:
+    """The answer: ``successful``, and else a ``reason``."""
+    return _answers(probe, node, {name: value})[0]
+
+
+def _answers(probe: Any, node: str, values: Mapping[str, Any]) -> Any:
     messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
     request = SetParameters.Request(parameters=messages)
-    results = probe.call(SetParameters, f"/{node}/set_parameters", request).results
-    return [result.successful for result in results]
+    return probe.call(SetParameters, f"/{node}/set_parameters", request).results

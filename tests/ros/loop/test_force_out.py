@@ -56,6 +56,17 @@ class Cell:
         ]
         return np.array([[status, *force] for status, force in found])
 
+    def counts(self, *publishers: str) -> None:
+        """The node counts these publishers, by their identifiers."""
+        named = {publisher: f"/{publisher}" for publisher in publishers}
+        self.tool.note_senders(named, round(1e9 * self.bench.now) + 1)
+
+    def refuses(self) -> bool:
+        """Whether the poses of some periods are those of several publishers."""
+        several = self.hold(5)[:, 0] == ContactState.STATUS_SEVERAL_PUBLISHERS
+        assert several.all() or not several.any()
+        return bool(several[0])
+
 
 @pytest.fixture
 def cell(bench: Any, touch: tuple[np.ndarray, np.ndarray]) -> Iterator[Cell]:
@@ -87,20 +98,12 @@ def leap(cell: Cell) -> tuple[int, np.ndarray]:
 
 
 def second_publisher(cell: Cell) -> tuple[int, np.ndarray]:
-    """Each counts its own messages; the second goes away."""
-    queue = cell.bench.poses[0]
-
-    def other() -> bytes:
-        queue.number -= 1000
-        return pose(cell.tip)
-
-    cell.hold(1, other)
-    queue.number += 1000
-    cell.hold(1)
-    first = cell.hold(1, other)
-    queue.number += 1000
+    """Each counts its own messages; the second goes away, as the node finds."""
+    cell.bench.poses[0].number -= 1000
+    first = cell.hold(1)
+    cell.bench.poses[0].number += 1000
     found = np.vstack([first, cell.hold(11)])
-    cell.hold(500)
+    cell.counts("driver")
     return ContactState.STATUS_SEVERAL_PUBLISHERS, found
 
 
@@ -191,8 +194,44 @@ def test_what_the_poses_lack_is_said_before_what_the_device_does(cell: Cell) -> 
 
 
 def test_a_tool_that_starts_again_is_one_publisher(cell: Cell) -> None:
+    """At once after a silence, even if it is known from before; otherwise once it was counted."""
+    for silent, known in ((30, ("driver",)), (30, ("driver", "again")), (0, ("again",))):
+        cell.counts("driver")
+        cell.hold(silent, lambda: None)
+        cell.bench.poses[0].number = 0
+        assert cell.refuses() == (silent == 0)
+        cell.counts(*known)
+        assert not cell.refuses()
+
+
+def test_a_tool_that_starts_again_while_another_joins_is_not_taken_for_it(cell: Cell) -> None:
+    cell.counts("driver")
+    cell.hold(30, lambda: None)
     cell.bench.poses[0].number = 0
-    assert (cell.hold(100)[:, 0] == OK).all()
+    assert not cell.refuses()
+    cell.counts("again", "forgotten")
+    assert cell.refuses()
+
+
+@pytest.mark.parametrize("sends", [False, True])
+def test_another_publisher_is_found_by_its_identifier(cell: Cell, sends: bool) -> None:
+    """However seldom it sends; one that was killed counts again when it sends again."""
+    cell.counts("driver")
+    cell.counts("driver", "forgotten")
+    assert cell.refuses()
+    cell.counts("driver")
+    assert not cell.refuses()
+    cell.hold(30, lambda: None)
+    cell.counts("driver", "again")
+    cell.bench.poses[0].number = 0
+    assert not cell.refuses()
+    cell.counts("driver", "again")
+    assert not cell.refuses()
+    if sends:
+        cell.bench.poses[0].number -= 5
+    assert cell.refuses() == sends
+    cell.counts("driver", "again")
+    assert cell.refuses() == sends
 
 
 def test_while_it_comes_back_the_status_says_so(cell: Cell) -> None:
@@ -270,6 +309,7 @@ def test_a_loop_that_breaks_lets_go(cell: Cell, monkeypatch: pytest.MonkeyPatch)
     assert (last.x, last.y, last.z) == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", ["observe", "control"])
 def test_passivity_is_watched_or_kept(
     bench: Any, touch: tuple[np.ndarray, np.ndarray], mode: str

@@ -70,7 +70,6 @@ def test_a_clock_that_goes_back_is_only_told(bench: Any, touch: Any) -> None:
     assert summary.missed == 0
 
 
-@pytest.mark.long  # the step of two tools is compiled
 def test_the_age_is_that_of_the_pose_that_was_answered(bench: Any, touch: Any) -> None:
     """A first tool without a pose was 54 years old."""
     cell = bench(n_tools=2)
@@ -105,6 +104,7 @@ def test_5_khz_and_10_hz(bench: Any, touch: Any) -> None:
     assert np.ptp(np.linalg.norm(np.array(fine)[:, 1:], axis=1)) > 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("hertz", [1, 5, 20, 33, 45])
 def test_a_slow_stream_is_called_so_before_its_second_pose(
     bench: Any, touch: Any, hertz: int
@@ -176,6 +176,7 @@ def test_a_tool_that_joins_an_idle_loop_is_not_slow(bench: Any, touch: Any, hert
     assert list(np.flatnonzero(tool.faults)) == [OK]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("hertz", [1, 5, 20, 33, 100, 1000])
 @pytest.mark.parametrize("fault", ["frame", "stamp", "NaN", "quaternion"])
 def test_what_came_last_says_why_there_is_no_force(
@@ -226,6 +227,22 @@ def test_a_stream_is_judged_by_when_it_comes(bench: Any, touch: Any, hertz: int,
     again = [cell.step(pose(tip)) for _ in range(5)]  # at 1 kHz
     assert [status == OK for status, _ in again] == [expected == OK] * 2 + [True] * 3
     assert again[-1][1].any()
+
+
+def test_a_tip_that_stays_out_of_range_is_a_fault_that_lasts(bench: Any, touch: Any) -> None:
+    """Until it has left the organ; its poses are sound all the time."""
+    cell = bench()
+    cell.press(touch, 0.0)
+    cell.step(None, after=60.0)
+    counter = FaultCounter(cell.tools)
+    for _ in range(3):
+        found = [cell.step(pose(touch[0] - 30e-3 * touch[1]))[0] for _ in range(10)]
+        assert found == [BARRED] * 10
+        assert counter.window()[0].text.startswith("no force: the tool is too deep")
+    for _ in range(2):
+        cell.step(pose(touch[0] + 12e-3 * touch[1]))
+        said = counter.window()[0].text
+    assert said == ""
 
 
 @pytest.mark.parametrize(("depth", "expected"), [(0.0, OK), (10e-3, BARRED)])

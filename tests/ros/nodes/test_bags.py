@@ -27,6 +27,8 @@ from avatar_ros.msg import ContactState, VademecumInfo
 from tests.core.bags.bag_files import STORE
 from tests.helpers.slowness import Deadline
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 SECONDS = 4  # one touch
 _BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 _RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)

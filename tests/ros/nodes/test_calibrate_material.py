@@ -23,6 +23,8 @@ from tests.helpers.soft_organ import organ_on_springs
 from tests.helpers.touches import felt, path_over, recording_of
 from tests.ros.helpers.running import running
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 SUPPORT = "support.bare_area"
 TRUE = {"young": 6e3, SUPPORT: 3e6}
 N_TOUCHES = 4

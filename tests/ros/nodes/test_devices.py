@@ -24,6 +24,8 @@ from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.running import running_cell
 from tests.ros.helpers.stepped_loop import pose
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 DEVICES = PARAMS / "devices"
 CRTK = QoSProfile(depth=10)  # of crtk_python_client: reliable, the last ten
 # Of what cisst-ros publishes when it changes.

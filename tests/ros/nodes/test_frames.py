@@ -22,6 +22,8 @@ from avatar_ros.msg import ContactState
 from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.running import running
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 LISTENER = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # tf2's of tf_static
 # Of the originals, RIHS01 (REP 2016).
 HASHES = {

@@ -7,6 +7,7 @@ import pytest
 from tests.helpers.fuzzing import campaign
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("door", ["loader", "patient"])
 def test_a_mutant_is_refused_or_loaded(door: str) -> None:
     found = campaign(door, range(100))

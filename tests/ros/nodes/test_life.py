@@ -18,6 +18,7 @@ from avatar_ros.bench.footprint import children
 from avatar_ros.framework import qos
 from avatar_ros.framework.conversions import vademecum_file
 from avatar_ros.nodes.cell import node_arguments, wait_after
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -68,7 +69,14 @@ def test_without_vademecum_the_wrench_is_zero_and_a_broken_one_changes_nothing(
         assert state.status == ContactState.STATUS_NO_MODEL
 
 
-@pytest.mark.long  # their step is compiled
+def test_it_reports_in_simulated_time_without_a_clock(
+    own_domain: dict[str, str], probe: Any
+) -> None:
+    with running("contact", own_domain, "use_sim_time:=true"):
+        probe.next(LoopStatistics, "statistics", qos.STATISTICS, timeout=20.0)
+        probe.next(DiagnosticArray, "/diagnostics", qos.STATISTICS, timeout=20.0)
+
+
 def test_two_tools_have_topics_of_their_own(own_domain: dict[str, str], probe: Any) -> None:
     values = ["tools:=[left,right]", "tip.radius:=[0.004,0.008]"]
     values += ["tip.shape:=[sphere,cone]", "tip.half_angle:=[0.0,60.0]"]
@@ -130,6 +138,7 @@ def test_a_wrong_parameter_is_refused(
 
 
 # refused when it is declared, and when the node is configured
+@pytest.mark.long
 @pytest.mark.parametrize(("node", "arguments", "reason"), [WRONG[0], WRONG[5], WRONG[9]])
 def test_a_wrong_parameter_ends_the_node(
     own_domain: dict[str, str], node: str, arguments: list[str], reason: str
@@ -314,6 +323,7 @@ def test_a_node_that_dies_again_and_again_is_given_time() -> None:
     assert [wait_after(deaths) for deaths in range(1, 9)] == [0, 1, 2, 4, 8, 16, 30, 30]
 
 
+@pytest.mark.long
 def test_a_node_that_refuses_to_start_ends_the_cell_and_is_named(
     own_domain: dict[str, str], tmp_path: Path
 ) -> None:

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
-from avatar_ros.ui.colours import colours, table, top_for
+from avatar_ros.ui.view.colours import colours, table, top_for
 from visualization_msgs.msg import Marker
 
 from tests.helpers.paths import PARAMS
@@ -20,6 +20,8 @@ from tests.helpers.slowness import within
 from tests.ros.helpers.doc_pages import entry, index, topic
 from tests.ros.helpers.hand import Hand, wait_for_model
 from tests.ros.helpers.running import running
+
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
 
 
 @pytest.fixture(scope="module")

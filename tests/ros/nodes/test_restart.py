@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -197,6 +198,18 @@ def test_a_broken_file_is_named_and_not_used(tmp_path: Path) -> None:
         (tmp_path / "left.contact.json").write_text(text)
         assert SavedState(node, {"a": 1}).load() == {}
         assert "left.contact.json not used" in node.said.pop()
+
+
+def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path) -> None:
+    node: Any = Started(tmp_path)
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, most))
+    try:
+        SavedState(node, {"a": 1}).save({"a": 2})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+    assert "left.contact.json" in node.said.pop()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_directory_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -12,8 +12,6 @@ from avatar_ros.framework import qos
 from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
 from avatar_ros.nodes.contact_reports import ShownModesLog
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import GetParameters, SetParameters
 
 from avatar_core.contact.model import prepare
 from avatar_core.errors import AccuracyError
@@ -21,6 +19,9 @@ from avatar_core.vademecum.accuracy import Budget
 from avatar_ros.msg import ContactState, LoopStatistics
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.hand import Hand, felt
+from tests.ros.helpers.parameters import parameter_values, set_parameter
+
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
 
 # --- Shedding, without a node ------------------------------------------------------------------
 
@@ -128,17 +129,10 @@ def hand(cell: dict[str, Any], probe: Any, touch: tuple[np.ndarray, np.ndarray])
     return Hand(probe, touch[0])
 
 
-def set_budget(probe: Any, **values: Any) -> Any:
-    """Set parameters below ``accuracy``; the first answer."""
-    kinds = {float: ("double", ParameterType.PARAMETER_DOUBLE)}
-    kinds[str] = ("string", ParameterType.PARAMETER_STRING)
-    named = []
-    for name, value in values.items():
-        field, kind = kinds[type(value)]
-        given = ParameterValue(type=kind, **{f"{field}_value": value})
-        named.append(Parameter(name=f"accuracy.{name}", value=given))
-    request = SetParameters.Request(parameters=named)
-    return probe.call(SetParameters, "/contact/set_parameters", request).results[0]
+def set_budget(probe: Any, **value: Any) -> Any:
+    """Set a parameter below ``accuracy``; the answer."""
+    ((name, wanted),) = value.items()
+    return set_parameter(probe, "contact", f"accuracy.{name}", wanted)
 
 
 def statistics(probe: Any, hand: Hand, wanted: Any) -> LoopStatistics:
@@ -182,9 +176,8 @@ def test_a_tolerance_beyond_every_detail_is_refused_in_the_answer(
     best = min(p.l2 for p in organ.certificate.curve.of("surface").points)
     assert not answer.successful
     assert f"within 1e-06 of l2 in any time; nearest: {best:.3g}" in answer.reason
-    request = GetParameters.Request(names=["accuracy.tolerance"])
-    kept = probe.ask(GetParameters, "/contact/get_parameters", request)
-    assert kept.values[0].double_value == 0.0
+    kept = parameter_values(probe, "contact", ["accuracy.tolerance"])
+    assert kept == {"accuracy.tolerance": 0.0}
 
 
 def test_a_deadline_below_all_measured_times_is_refused(probe: Any, hand: Hand) -> None:

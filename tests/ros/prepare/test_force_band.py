@@ -36,6 +36,8 @@ from tests.helpers.soft_organ import soft_organ
 from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.stepped_loop import Queue, SteppedLoop, pose
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 TIP = Tip("sphere", 5e-3)
 LOW, HIGH = 0.6, 1.7
 N_BLEND = round(1e3 * BLEND)

@@ -15,8 +15,6 @@ import pytest
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.prepare.scenes import usable_material
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import GetParameters, SetParameters
 
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.geometry.phantom import phantom_liver
@@ -30,6 +28,7 @@ from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import PATIENT
 from tests.ros.helpers.hand import Hand, felt
+from tests.ros.helpers.parameters import parameter_values, set_parameter
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]  # an organ with coordinates is solved first
 
@@ -86,17 +85,10 @@ def _settled(probe: Any, hand: Hand) -> np.ndarray:
     return felt(probe, hand)[1]
 
 
-def _set(probe: Any, **values: float) -> Any:
-    """Set parameters below ``material``; the first answer."""
-    named = [
-        Parameter(
-            name=f"material.{name}",
-            value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value),
-        )
-        for name, value in values.items()
-    ]
-    request = SetParameters.Request(parameters=named)
-    return probe.call(SetParameters, "/contact/set_parameters", request).results[0]
+def _set(probe: Any, **value: float) -> Any:
+    """Set a parameter below ``material``; the answer."""
+    ((name, wanted),) = value.items()
+    return set_parameter(probe, "contact", f"material.{name}", wanted)
 
 
 def _until(probe: Any, hand: Hand, wanted: Any) -> np.ndarray:
@@ -245,7 +237,4 @@ def test_calibrated_values_are_set_all_or_none(
 
 def parameters(probe: Any) -> list[float]:
     names = ["material.young_modulus", "material.poisson_ratio"]
-    answer = probe.call(
-        GetParameters, "/contact/get_parameters", GetParameters.Request(names=names)
-    )
-    return [value.double_value for value in answer.values]
+    return list(parameter_values(probe, "contact", names).values())

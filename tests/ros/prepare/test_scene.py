@@ -17,7 +17,6 @@ from avatar_ros.framework import qos
 from avatar_ros.prepare.requests import PreparationRequest
 from avatar_ros.prepare.scenes import model_spec
 from geometry_msgs.msg import Quaternion, WrenchStamped
-from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
@@ -25,19 +24,19 @@ from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_core.scene.yaml_lines import MAX_BYTES
-from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_ros.msg import ContactState
 from avatar_ros.srv import LoadScene
 from tests.helpers.paths import PARAMS
 from tests.helpers.slowness import Deadline
-from tests.ros.conftest import PATIENT, START_TIMEOUT, free_domain
+from tests.ros.conftest import START_TIMEOUT, free_domain
 from tests.ros.helpers.answers import ROUNDING, took
 from tests.ros.helpers.hand import Hand, force_of
+from tests.ros.helpers.parameters import parameter_values
 from tests.ros.prepare.test_material import _set
 
-pytestmark = [pytest.mark.ros, pytest.mark.long]  # a step is compiled for each scene
+pytestmark = [pytest.mark.ros, pytest.mark.long]
 
 SCENES = sorted((PARAMS / "scenes").glob("*.yaml"))
-ALONE = ("breathing", "hanging", "release")  # scenes for which nothing else compiles the step
 YOUNG = 0.17e6  # [Pa] of the organ
 BARE = "name: bare"
 FRICTION = "effects: {friction: {static: 1.0, kinetic: 1.0}}"
@@ -130,10 +129,7 @@ def _refusal(path: Path, organ: Any) -> str:
     return ""
 
 
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(p, marks=[pytest.mark.long] * (p.stem in ALONE), id=p.stem) for p in SCENES],
-)
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
 def test_a_shipped_scene_loads_or_says_why_not(
     palpation: Palpation, organ: Any, path: Path
 ) -> None:
@@ -145,7 +141,7 @@ def test_a_shipped_scene_loads_or_says_why_not(
     if refusal:
         assert answer.message == refusal
     else:  # faded in meanwhile
-        seconds = took(answer.message, "in use", "2 s, 60 s if it was compiled")
+        seconds = took(answer.message, "in use")
         assert 0.0 < seconds <= time.monotonic() - asked + ROUNDING
     expected = [] if refusal else [effect.name for effect in read_scene(path).effects]
     assert answer.effects == expected
@@ -169,18 +165,12 @@ def test_most_shipped_scenes_load_here(organ: Any) -> None:
         ({"name": "../contact"}, "come with avatar: "),
         ({"name": "/etc/passwd"}, "come with avatar: "),
         ({"yaml": "effects: [fricton]"}, "yaml:1: effects.fricton is unknown; did you mean"),
-        ({"yaml": "effects: {friction: {static: 0.1, kinetic: 0.3}}"}, "above static"),
         ({"yaml": "effects: [large_deformation]"}, "--material"),
-        ({"yaml": "effects: [tumour]"}, "--tumour"),
-        ({"yaml": "effects: [large_deformation, tumour]"}, "exclude each other"),
         ({"yaml": "effects: {viscoelasticity: {file: prony.csv}}"}, "this scene is no file"),
-        ({"yaml": "material: {poisson_ratio: 0.45}"}, "--coordinate poisson"),
         ({"yaml": "outputs: {modes: 5000}"}, "5000 modes"),
-        ({"yaml": "- palpation"}, "a list"),
         ({"yaml": "tools: [{name: a}, {name: b}]\neffects: [several_tools]"}, "parameter tools"),
         ({"yaml": "\0"}, "both are empty"),  # a string ends there, on its way
         ({"yaml": "#" * (MAX_BYTES + 1)}, f"at most {MAX_BYTES}"),
-        ({"yaml": "'" * MAX_BYTES}, "yaml:1: "),
         ({"yaml": "\U0001f600" * MAX_BYTES}, "with less"),
     ],
     ids=lambda value: str(value)[:40],
@@ -197,23 +187,18 @@ def test_a_bad_scene_is_refused_and_the_node_goes_on(
     np.testing.assert_allclose(palpation.hold(), before, rtol=1e-3)
 
 
-def test_with_friction_a_tip_is_held_back(palpation: Palpation) -> None:
-    way = 1e-3 * palpation.across
-    free = palpation.across_force(palpation.go(way))
-    palpation.go(np.zeros(3))
-    assert list(palpation.load(FRICTION).effects) == ["friction"]
-    held = palpation.across_force(palpation.go(way))
-    # without friction the normal's tilt over 1 mm is all there is
-    assert held < -2.0 * abs(free)
-
-
 def test_with_friction_a_turning_tool_drags_the_tissue(palpation: Palpation) -> None:
     assert palpation.load(FRICTION).success
     before = palpation.across_force(palpation.hold())
-    # the tip's lowest point moves along `across`: turn x (-n) = across
-    _turn_by(palpation, 0.2 * np.cross(palpation.across, palpation.normal))
-    after = palpation.across_force(palpation.hold())
-    assert after < before - 0.1 * abs(palpation.hold() @ palpation.normal)
+
+    def is_dragged() -> bool:
+        """A busy machine may lose the poses of a turn."""
+        # the tip's lowest point moves along `across`: turn x (-n) = across
+        _turn_by(palpation, 0.2 * np.cross(palpation.across, palpation.normal))
+        force = palpation.hold()
+        return palpation.across_force(force) < before - 0.1 * abs(force @ palpation.normal)
+
+    palpation.probe.until(is_dragged, START_TIMEOUT)
 
 
 def test_without_friction_a_turning_tool_feels_the_same(palpation: Palpation) -> None:
@@ -229,13 +214,6 @@ def _turn_by(palpation: Palpation, vector: np.ndarray) -> None:
         q.x, q.y, q.z = np.sin(part / 2) * vector / angle
         q.w = np.cos(part / 2)
         palpation.probe.spin(0.004)
-
-
-def test_with_viscoelasticity_the_force_falls(palpation: Palpation) -> None:
-    before = np.linalg.norm(palpation.hold())
-    assert list(palpation.load(RELAXING).effects) == ["viscoelasticity"]
-    after = np.linalg.norm(palpation.hold(2.0))  # ten relaxation times
-    assert after == pytest.approx(0.5 * before, rel=0.02)
 
 
 def test_a_scene_brings_its_material_and_a_parameter_goes_before_it(palpation: Palpation) -> None:
@@ -257,9 +235,8 @@ def test_a_scene_brings_its_cloud(palpation: Palpation, organ: Any) -> None:
     assert answer.success
     n_vertices = len(organ.mesh.vertices)
     probe.next(PointCloud2, "deformation", qos.NEWEST, lambda c: c.width == n_vertices, 10.0)
-    request = GetParameters.Request(names=["cloud_divisor"])
-    values = probe.ask(GetParameters, "/contact/get_parameters", request).values
-    assert values[0].integer_value == 20
+    kept = parameter_values(probe, "contact", ["cloud_divisor"])
+    assert kept == {"cloud_divisor": 20}
     assert palpation.load(BARE).success
     n_surface = len(organ.surface_vertices)
     probe.next(PointCloud2, "deformation", qos.NEWEST, lambda c: c.width == n_surface, 10.0)
@@ -318,70 +295,3 @@ def test_the_scene_may_be_a_parameter(own_domain: dict[str, str], library: Path)
         finally:
             codes = [process.finish() for process in (contact, loader)]
     assert codes == [0, 0]
-
-
-# --- How the loop keeps time ----------------------------------------------------------------------
-
-
-@pytest.mark.timing
-def test_the_loop_goes_on_while_a_scene_is_compiled(
-    own_domain: dict[str, str],
-    probe: Any,
-    library: Path,
-    touch: tuple[np.ndarray, np.ndarray],
-    tmp_path: Path,
-) -> None:
-    environment = own_domain | {"NUMBA_CACHE_DIR": str(tmp_path)}  # nothing is compiled yet
-    files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
-    loader = Module("vademecum_loader", ["--ros-args", *files], environment)
-    contact = Module("contact", PATIENT, environment)
-    palpation = None
-    windows: list[LoopStatistics] = []
-    try:
-        probe.next(
-            ContactState, "contact_state", qos.state(1), lambda s: s.vademecum_id, timeout=300.0
-        )
-        palpation = Palpation(probe, *touch)
-        probe.node.create_subscription(LoopStatistics, "statistics", windows.append, qos.STATISTICS)
-        for name in ("needle_probe", "palpation", "needle_probe"):
-            windows.clear()
-            probe.spin(4.0)
-            print(f"\nat rest: {_summary(windows)}")
-            rate, missed = _rate(windows), _missed(windows)
-            windows.clear()
-            begin = time.monotonic()
-            answer = palpation.load(name=name)
-            assert answer.success, answer.message
-            seconds = time.monotonic() - begin
-            probe.spin(1.5)
-            print(f"{name}, in use after {seconds:.1f} s: {_summary(windows)}")
-            # tells a loop that goes on from one that waits for the compiler
-            assert _rate(windows) > 0.6 * rate
-            assert _missed(windows) < missed + 0.4
-    finally:
-        if palpation is not None:
-            palpation.close()
-        codes = [process.finish() for process in (contact, loader)]
-    assert codes == [0, 0]
-
-
-def _rate(windows: list[LoopStatistics]) -> float:
-    """Periods per second."""
-    return sum(w.periods for w in windows) / sum(w.window for w in windows)
-
-
-def _missed(windows: list[LoopStatistics]) -> float:
-    """Of the periods."""
-    return sum(w.missed for w in windows) / sum(w.periods for w in windows)
-
-
-def _summary(windows: list[LoopStatistics]) -> str:
-    periods = sum(w.periods for w in windows)
-    missed = sum(w.missed for w in windows)
-    rate = periods / sum(w.window for w in windows)
-    longest = 1e3 * max(w.period_max for w in windows)
-    compute = 1e3 * max(w.compute_p99 for w in windows)
-    return (
-        f"{rate:.0f} Hz, {missed} of {periods} periods missed, longest {longest:.1f} ms, "
-        f"step p99 {compute:.2f} ms"
-    )

@@ -9,9 +9,9 @@ import pytest
 from avatar_ros.loop.settings import CONTACT, MATERIAL, chosen_material
 from avatar_ros.nodes.contact import ContactNode
 from avatar_ros.prepare.scenes import usable_material
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.presets import HINTS, SLIDERS
-from avatar_ros.ui.recorder import scene_in_force
+from avatar_ros.ui.session.presets import HINTS, SLIDERS
+from avatar_ros.ui.session.recorder import scene_in_force
+from avatar_ros.ui.view.organ import Organ
 
 from avatar_core.common.supports import ATTACHMENTS
 from avatar_core.scene.file import parse_scene, write_scene

@@ -32,6 +32,8 @@ from tests.ros.helpers.doc_pages import parameter_rows, yaml_parameters
 from tests.ros.helpers.hand import wait_for_model
 from tests.ros.helpers.running import running
 
+pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+
 SECONDS = 30.0  # for an answer
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 

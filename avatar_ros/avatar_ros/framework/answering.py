@@ -1,0 +1,87 @@
+"""Services that answer whatever they are asked, and topics that take whatever is sent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from inspect import iscoroutinefunction
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.node import Node
+
+from avatar_core.errors import one_line
+from avatar_ros.framework.parameters import ParameterError
+
+Answer = Callable[[Any, Any], Any]  # of a request and an empty response
+
+
+def answer_always(node: Node) -> None:
+    """Have each service of a node refuse, and log, a request that its callback raises for.
+
+    rclpy's own services raise, e.g. for a transition that is not allowed now. The exception would
+    end the node, and its client would wait forever.
+    """
+    for service in node.services:
+        if not iscoroutinefunction(service.callback):  # those are ours, and catch all
+            service.callback = _answering(node, service)
+
+
+def never_raising(node: Node, topic: str, callback: Callable[..., Any]) -> Callable[..., None]:
+    """A callback of a topic that logs what ``callback`` raises."""
+
+    @wraps(callback)  # rclpy looks at its parameters
+    def hear(*message: Any) -> None:
+        try:
+            callback(*message)
+        except Exception as error:
+            node.get_logger().error(f"{topic}: a message is not taken: {one_line(error)}")
+
+    return hear
+
+
+def _answering(node: Node, service: Any) -> Answer:
+    ask, kind, name = service.callback, service.srv_type, service.srv_name.rpartition("/")[2]
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            _require_declared(node, kind, request)
+            return ask(request, response)
+        except Exception as error:
+            reason = one_line(error)
+            node.get_logger().error(f"{name}: {reason}")
+            return _refused(kind, request, reason)
+
+    return _one_by_one(answer) if kind is SetParameters else answer
+
+
+def _require_declared(node: Node, kind: Any, request: Any) -> None:
+    """Name parameters that a node does not have; rclpy's own refusal names none."""
+    if kind in (SetParameters, SetParametersAtomically):
+        unknown = [one.name for one in request.parameters if not node.has_parameter(one.name)]
+        if unknown:
+            raise ParameterError(f"{node.get_name()} has no parameter {', '.join(unknown)}")
+
+
+def _one_by_one(answer: Answer) -> Answer:
+    """Set each parameter by itself, so that one that is refused keeps no other from being set."""
+
+    def answer_each(request: SetParameters.Request, response: SetParameters.Response) -> Any:
+        for parameter in request.parameters:
+            alone = answer(SetParameters.Request(parameters=[parameter]), SetParameters.Response())
+            response.results = [*response.results, *alone.results]
+        return response
+
+    return answer_each
+
+
+def _refused(kind: Any, request: Any, reason: str) -> Any:
+    """A response that says so where it has a field for it, otherwise an empty one."""
+    response = kind.Response()  # ``success`` is false in it
+    result = SetParametersResult(successful=False, reason=reason)
+    if kind is SetParameters:
+        response.results = [result for _ in request.parameters]
+    elif kind is SetParametersAtomically:
+        response.result = result
+    return response
