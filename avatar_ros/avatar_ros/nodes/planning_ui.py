@@ -1,14 +1,14 @@
 """The planning page: an organ in the browser that is pressed with the mouse, simulated at 1 kHz.
 
 Needs the extra ``ui``. viser serves the page. A process of its own
-(:mod:`avatar_ros.ui.tool_driver`) sends the poses of all tools and reads the answers, and clouds
-are shown 30 times a second, so neither the page nor its users can delay the contact loop.
+(:mod:`avatar_ros.ui.tools.tool_driver`) sends the poses of all tools and reads the answers.
+Clouds are shown 30 times a second. Neither the page nor its users can delay the contact loop.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,49 +23,49 @@ from avatar_core.common.processes import free_at_once
 from avatar_core.errors import AvatarError
 from avatar_core.vademecum.storage import parse_vademecum
 from avatar_ros.framework import qos
+from avatar_ros.framework.announced import Announced
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import ParameterError, values
 from avatar_ros.framework.reader import Reader
 from avatar_ros.loop.settings import MATERIAL, TIP
 from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
-from avatar_ros.ui.actions import Actions
-from avatar_ros.ui.alerts import alerts
-from avatar_ros.ui.bookmarks import Bookmark
-from avatar_ros.ui.camera import turn_camera
-from avatar_ros.ui.chosen import Chosen, Page
-from avatar_ros.ui.coloured import Coloured
-from avatar_ros.ui.display import RATE
-from avatar_ros.ui.force_band import NewestBand
-from avatar_ros.ui.guard import Guard, guarded
-from avatar_ros.ui.library import Library
-from avatar_ros.ui.live import Live
-from avatar_ros.ui.measures import Measures, Now
-from avatar_ros.ui.measures_view import MeasuresView
-from avatar_ros.ui.new_patient import NewPatient
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.orientation import Pose
+from avatar_ros.ui.measure.measures import TOOL, Measures, Now
+from avatar_ros.ui.measure.measures_view import MeasuresView
 from avatar_ros.ui.panels import Panels
-from avatar_ros.ui.plan import Plan, PlanNow
-from avatar_ros.ui.player import Played, Player
-from avatar_ros.ui.presets import material_text
-from avatar_ros.ui.preview_view import PreviewView
-from avatar_ros.ui.recorder import Recorder
-from avatar_ros.ui.recordings import Page as RecordingsPage
-from avatar_ros.ui.recordings import Recordings
-from avatar_ros.ui.requests import Requests
-from avatar_ros.ui.scan_view import ScanView
+from avatar_ros.ui.patient.new_patient import NewPatient
+from avatar_ros.ui.patient.preview_view import PreviewView
+from avatar_ros.ui.plan.plan import Plan, PlanNow
+from avatar_ros.ui.scan import upload
+from avatar_ros.ui.scan.library import Library
+from avatar_ros.ui.scan.scan_view import ScanView
+from avatar_ros.ui.server.guard import Guard, guarded
+from avatar_ros.ui.server.pacing import Pacing, paced
+from avatar_ros.ui.session.alerts import alerts, alerts_of_switch
+from avatar_ros.ui.session.chosen import Chosen, Page
+from avatar_ros.ui.session.coloured import Coloured
+from avatar_ros.ui.session.force_band import NewestBand
+from avatar_ros.ui.session.live import Live
+from avatar_ros.ui.session.player import Played, Player
+from avatar_ros.ui.session.presets import material_text
+from avatar_ros.ui.session.recorder import Recorder
+from avatar_ros.ui.session.recordings import Page as RecordingsPage
+from avatar_ros.ui.session.recordings import Recordings
+from avatar_ros.ui.session.requests import Requests
+from avatar_ros.ui.session.shown_period import ShownPeriod
+from avatar_ros.ui.session.texts import frame_text, plain, warnings
 from avatar_ros.ui.settings import PLANNING_UI
-from avatar_ros.ui.shown_period import ShownPeriod
-from avatar_ros.ui.texts import frame_text, plain, warnings
-from avatar_ros.ui.tool_state import SharedToolState, ToolDriverProcess, organ_number
-from avatar_ros.ui.view import GLASS, WHOLE, OrganView
+from avatar_ros.ui.tools.tool_state import SharedToolState, ToolDriverProcess, organ_number
+from avatar_ros.ui.view.display import RATE
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.view import GLASS, WHOLE, OrganView
 
 FRAME = "organ"
-_PLOT_FRAMES = 6  # between two points of the plots
+_PLOT_FRAMES = 6  # between two points of the plots, and two sets of measures
 _CUT_FRAMES = 3  # between two places of a cut that is dragged
 _POLL_FRAMES = 30  # between two checks of library and nodes
 _TIP = tuple(parameter.name for parameter in TIP)
-_OF_CONTACT = (*_TIP, "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
+_FOLLOWED = (*MATERIAL, "uncertainty")  # parameters of the contact node, once a second
+_OF_CONTACT = (*_TIP, *_FOLLOWED, "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
 
 
 class PlanningNode(ManagedNode):
@@ -77,6 +77,7 @@ class PlanningNode(ManagedNode):
         self._driver = ToolDriverProcess(self._state)
         self._recorder = Recorder(self._state)
         self._lines: list[str] = []  # numbers that are shown
+        self._measured: list[str] = []
         self._alerts: list[str] = []
         self._reader = Reader(1 << 30)  # of organs, for which the page waits
         self._files = Reader(1 << 30)  # of what users choose, in threads of their own
@@ -84,9 +85,9 @@ class PlanningNode(ManagedNode):
         self._band = NewestBand(self, self._state.force_of)
         self._was_missing, self._is_to_restore = True, False
         self._frame, self._frame_id = 0, FRAME
-        self._began = time.monotonic()
         self._missed = 0.0  # part of the periods
-        self._own_subscriptions: list[Any] = []
+        self._announced: list[Announced] = []
+        self._statistics: Any = None
         self._timer: Any = None
         super().__init__("planning_ui", PLANNING_UI)
 
@@ -97,10 +98,12 @@ class PlanningNode(ManagedNode):
         folder = Path(value["library_dir"]).expanduser()
         if not folder.is_dir():
             raise ParameterError(f"parameter library_dir: {folder} is not a directory")
-        self._library = Library(folder.resolve())
+        self._library = Library(folder.resolve(), self._reader)
         guard = Guard(value["host"], value["token"])
-        with guarded(guard):
+        pacing = Pacing()
+        with guarded(guard, pacing.note), paced(pacing):
             self._server = server = viser.ViserServer(value["host"], value["port"], verbose=False)
+        upload.bound(server)
         self._requests = Requests(self)
         self._chosen = chosen = Chosen(
             self._state,
@@ -123,17 +126,16 @@ class PlanningNode(ManagedNode):
         self._coloured = Coloured(
             self._view,
             chosen,
-            self._requests,
             self._say,
             lambda field: self._panels.organ.show_colours(field),
             self._in_executor,
         )
-        self._measures = Measures(MeasuresView(server))
+        self._measures = Measures(MeasuresView(server, self._drag_dot))
         server.scene.on_click()(self._click)
         self._plan = Plan(
             self._library.folder,
             self._plan_now,
-            self._return_to,
+            chosen.return_to,
             lambda labels: self._panels.plan.offer(labels),
             self._say,
         )
@@ -152,65 +154,48 @@ class PlanningNode(ManagedNode):
             ),
         )
         self._scan = ScanView(
-            server, self._library.folder, self._files, lambda: self._panels.scan, self._say
+            server,
+            self._library.folder,
+            self._files,
+            lambda *given: self._panels.scan.show_scan(*given),
+            self._say,
+            self._view.turn_to,
         )
-        self._new_patient = new = NewPatient(
+        self._new_patient = NewPatient(
             self._library.folder,
             self._files,
             self._requests,
             lambda: self._panels.patient,
             PreviewView(server, self._view.set_aside),
-            self._use_built,
+            self._choose_built,
             self._say,
         )
         self._panels = Panels(
             server,
-            Actions(
-                vademecum=lambda name: self._requests.load_vademecum(name, self._say),
-                material=chosen.choose_material,
-                scene=chosen.choose_scene,
-                choose_surface=new.choose_surface,
-                build=new.build,
-                end_preview=new.end_preview,
-                brush=new.brush,
-                cancel=self._requests.cancel_patient,
-                tool=chosen.tools.choose,
-                nudge=chosen.tools.nudge,
-                lift=chosen.tools.lift,
-                record=self._recordings.record,
-                play=self._recordings.play,
-                pause=lambda: self._player.pause(True),
-                seek=self._player.seek,
-                stop_playing=self._player.close,
-                turn=self._view.turn_to,
-                look=chosen.choose_look,
-                mark_reach=lambda on: self._in_executor(lambda: self._view.mark_reach(on)),
-                colours=self._coloured.choose,
-                style=self._view.style,
-                scan=self._scan.choose,
-                place_scan=self._scan.place,
-                grey=self._scan.grey,
-                measure=self._measures.choose,
-                clear_measures=self._measures.clear,
-                undo=chosen.undo,
-                keep=self._plan.keep,
-                drop=self._plan.drop,
-                go_back=self._plan.go_back,
-                report=self._plan.report,
-                export=self._plan.export,
-            ),
+            chosen=chosen,
+            view=self._view,
+            coloured=self._coloured,
+            measures=self._measures,
+            plan=self._plan,
+            player=self._player,
+            recordings=self._recordings,
+            scan=self._scan,
+            new_patient=self._new_patient,
+            load=lambda name: self._requests.load_vademecum(name, self._say),
+            mark_reach=lambda on: self._in_executor(lambda: self._view.mark_reach(on)),
+            store=partial(upload.receive, self._library.folder, self._files, self._say),
         )
         server.on_client_disconnect(self._panels.forget_client)
         self._panels.scene.offer(len(chosen.tools.labels))
-        self._own_subscriptions = [
-            self.create_subscription(
-                VademecumInfo, "vademecum_info", self._take_frame, qos.LATCHED
-            ),
-            self.create_subscription(VademecumFile, "vademecum", self._take_organ, qos.LATCHED),
-            self.create_subscription(
-                LoopStatistics, "statistics", self._take_statistics, qos.STATISTICS
+        self._announced = [
+            Announced(self, VademecumInfo, "vademecum_info", self._take_frame),
+            Announced(
+                self, VademecumFile, "vademecum", self._take_organ, lambda _, why: self._say(why)
             ),
         ]
+        self._statistics = self.create_subscription(
+            LoopStatistics, "statistics", self._take_statistics, qos.STATISTICS
+        )
         self.get_logger().info(f"planning page at {guard.address(server.get_port())}")
 
     def activate(self) -> None:
@@ -224,9 +209,11 @@ class PlanningNode(ManagedNode):
         self._driver.end()
 
     def clean_up(self) -> None:
-        for subscription in self._own_subscriptions:
-            self.destroy_subscription(subscription)
-        self._own_subscriptions = []
+        if self._statistics is not None:
+            self.destroy_subscription(self._statistics)
+        for announced in self._announced:
+            announced.close()
+        self._announced, self._statistics = [], None
         self._live.close()
         self._band.close()
         if self._server is not None:
@@ -277,21 +264,22 @@ class PlanningNode(ManagedNode):
         self._coloured.forget()
         self._panels.show_organ(organ)
         self._chosen.organ, self._live.organ = organ, organ_number(organ.id)
-        self._lines, self._alerts = [], []
+        self._lines, self._measured, self._alerts = [], [], []
         self._listen_to_clouds()
         self._requests.parameters_of_contact(tuple(MATERIAL), self._chosen.note_contact)
         self._plan.show_organ(organ)
         self._say(f"{organ.name} is shown")
 
     def _take_statistics(self, window: LoopStatistics) -> None:
-        now = time.monotonic() - self._began
         self._missed = window.missed / max(window.periods, 1)
-        self._panels.timing.show_loop(
-            now, window.step_p99, window.missed / max(window.window, 1e-3)
-        )
 
     def _show(self) -> None:
-        """Update the page; called for every frame."""
+        """Update the page; called for every frame, whose messages come together."""
+        if self._server is not None:
+            with self._server.atomic():
+                self._show_frame()
+
+    def _show_frame(self) -> None:
         organ = self._organ
         self._frame += 1
         if self._frame % _POLL_FRAMES == 1:
@@ -312,12 +300,12 @@ class PlanningNode(ManagedNode):
             return
         shown = self._live.draw(self._view)
         self._place_tools(shown)
-        if self._frame % _PLOT_FRAMES == 0:
-            self._show_numbers(organ, shown, self._chosen.values(organ))
+        self._show_numbers(organ, shown, self._chosen.values(organ), self._chosen.given)
 
     def _follow_choice(self) -> None:
         """Show which tool is chosen, and listen to the band of its force."""
         tools = self._chosen.tools
+        tools.advance()
         self._band.follow(tools.chosen, tools.name)
         self._view.name_tools(tools.labels, tools.chosen)
         self._panels.tool.show_tools(tools.names, tools.name)
@@ -333,15 +321,20 @@ class PlanningNode(ManagedNode):
         largest = self._view.move(played.cloud, tips, forces)
         self._view.grey(any(one.missing for one in played.shown))
         self._place_tools(played.shown)
-        if self._frame % _PLOT_FRAMES == 0:
-            self._panels.recordings.show(self._player.part)
-            drawn = [one._replace(largest=largest) for one in played.shown]
-            self._show_numbers(organ, drawn, played.material)
+        self._panels.recordings.show(self._player.part)
+        drawn = [one._replace(largest=largest) for one in played.shown]
+        self._show_numbers(organ, drawn, played.material, played.given)
 
     def _show_numbers(
-        self, organ: Organ, shown: Sequence[ShownPeriod], material: dict[str, float]
+        self,
+        organ: Organ,
+        shown: Sequence[ShownPeriod],
+        material: dict[str, float],
+        given: dict[str, float],
     ) -> None:
-        """Beside the picture, of the same period; material: in force then, by coordinate [SI].
+        """Beside the picture, of the same period.
+
+        material : in force then, by coordinate [SI]; given : what somebody chose of it
 
         Numbers are those of the chosen tool, alerts those of all.
         """
@@ -352,20 +345,24 @@ class PlanningNode(ManagedNode):
         n_kept = self._recorder.n_periods if self._recorder.is_on else None
         numbers = frame_text(mine, material_text(organ, material), n_kept, tools.label)
         self._panels.show_numbers("<br>".join(numbers))
-        self._alerts = alerts(organ.info, shown, tools.labels)
+        switching = alerts_of_switch(
+            self._requests.switching, self._chosen.scene_name, self._recorder.is_on
+        )
         over = [*self._new_patient.alerts(organ.name), *self._player.alerts, *self._scan.alerts]
-        self._panels.show_alerts([*over, *self._alerts])
+        self._alerts = [*switching, *over, *alerts(organ.info, given, shown, tools.labels)]
+        self._panels.show_alerts(self._alerts)
+        self._panels.show_scale(self._coloured.legend())
+        if self._frame % _PLOT_FRAMES == 0:
+            self._measured = self._measure(mine, material)
+            self._panels.tool.show_period(mine if is_live else None)
+        self._lines = [*map(plain, numbers), *self._measured]
+
+    def _measure(self, mine: ShownPeriod, material: dict[str, float]) -> list[str]:
+        """Draw what is measured around the chosen tool, and say it in lines."""
         self._measures.change_tip(self._chosen.tip)
         measured = self._measures.lines(Now(self._view.points, mine.tip, material["young"]))
         self._panels.measure.show(measured)
-        self._lines = [*map(plain, numbers), *measured]
-        self._panels.show_scale(self._coloured.legend())
-        tool = self._panels.tool
-        if mine.missing or not is_live:
-            tool.forget_force()
-        else:
-            now = time.monotonic() - self._began
-            tool.show_force(now, mine.size, np.nan_to_num(mine.error), mine.band)
+        return measured
 
     def _poll_cell(self) -> None:
         """Check which nodes run, what the library holds, and that the tool driver runs."""
@@ -383,12 +380,12 @@ class PlanningNode(ManagedNode):
             self._was_missing = True
         elif self._was_missing or not tools.names:  # an answer may be lost
             self._was_missing = False
-            self._requests.parameters_of_contact(
-                (*_OF_CONTACT, *MATERIAL), self._on_contact_started
-            )
+            self._requests.parameters_of_contact(_OF_CONTACT, self._on_contact_started)
         elif self._is_to_restore and statuses and ContactState.STATUS_NO_MODEL not in statuses:
             self._is_to_restore = False
             self._chosen.send_again()
+        else:  # others set these too, as `avatar calibrate --set`
+            self._requests.parameters_of_contact(_FOLLOWED, self._chosen.follow_contact)
 
     def _on_contact_started(self, values: dict[str, Any]) -> None:
         """The contact node runs, for the first time or again."""
@@ -433,12 +430,17 @@ class PlanningNode(ManagedNode):
             self._panels.say(text)
 
     def _click(self, event: Any) -> None:
-        """A click on the organ: measure there; on a preview: paint."""
-        ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        """A click on the organ: put the tool there, or measure; on a preview: paint."""
+        ray, view = (np.array(event.ray_origin), np.array(event.ray_direction)), self._view
         if self._new_patient.is_previewing:
             self._new_patient.paint(*ray)
-        elif self._organ is not None:
-            self._say(self._measures.click(*ray, self._view.points, self._view.faces))
+        elif (place := view.clicked(*ray)) is not None:
+            is_measured = self._measures.mode != TOOL
+            taken = self._measures.click if is_measured else self._chosen.put_tool
+            self._say(taken(place, view.points))
+
+    def _drag_dot(self, dot: int, origin: np.ndarray, direction: np.ndarray) -> None:
+        self._measures.drag(dot, origin, direction, self._view.points, self._view.faces)
 
     def _in_executor(self, do: Callable[[], None]) -> None:
         """Draw in the thread that draws the organ: controls call from several."""
@@ -447,14 +449,14 @@ class PlanningNode(ManagedNode):
 
     def _offer_files(self) -> None:
         try:
-            self._panels.offer(*self._library.offer())
+            self._panels.offer(self._library.offer())
         except OSError as error:  # as of a share that is not mounted any more
             self._say(f"the library cannot be read: {error.strerror}")
 
-    def _use_built(self, file: str) -> None:
+    def _choose_built(self, file: str) -> None:
+        """A patient was built: it can be loaded, but the organ in use stays."""
         self._offer_files()
         self._panels.organ.choose_file(file)
-        self._requests.load_vademecum(file, self._say)
 
     # --- The plan ----------------------------------------------------------------------------
 
@@ -475,16 +477,18 @@ class PlanningNode(ManagedNode):
             tuple(self._lines),
             tuple(self._alerts),
             self._view.points,
-            self._player.is_on,
+            self._coloured.scale,
+            self._not_now(),
+            chosen.given,
         )
 
-    def _return_to(self, kept: Bookmark, client: Any) -> None:
-        """Scene, material, look, tool and view of a kept state."""
-        if self._organ is None:
-            return
-        self._chosen.return_to(kept.scene, kept.material, kept.look, np.array(kept.targets))
-        if client is not None and kept.camera:
-            turn_camera(client, Pose(*np.array(kept.camera).reshape(3, 3)))
+    def _not_now(self) -> str:
+        """Why what is shown is no state of now; empty if it is."""
+        if self._player.is_on:
+            return "a recording is shown: go back to now, and keep that"
+        if self._new_patient.is_previewing:
+            return "a preview is shown, not the organ in use: end the preview first"
+        return ""
 
 
 def main() -> int:

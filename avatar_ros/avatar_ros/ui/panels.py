@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from html import escape
 from typing import Any
 
 import viser
 
-from avatar_ros.ui.actions import Actions
-from avatar_ros.ui.index_page import TITLE
-from avatar_ros.ui.legend import legend
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.orientation import NAMES
-from avatar_ros.ui.preview_view import BRUSHES
+from avatar_ros.ui.measure.measures import Measures
+from avatar_ros.ui.patient.new_patient import NewPatient
+from avatar_ros.ui.patient.preview_view import BRUSHES
+from avatar_ros.ui.plan.plan import Plan
+from avatar_ros.ui.scan.library import Found
+from avatar_ros.ui.scan.scan_view import ScanView
+from avatar_ros.ui.server.index_page import TITLE, WARNING
+from avatar_ros.ui.session.chosen import Chosen
+from avatar_ros.ui.session.coloured import Coloured
+from avatar_ros.ui.session.player import Player
+from avatar_ros.ui.session.recordings import Recordings
 from avatar_ros.ui.tabs.inside import InsideTab
 from avatar_ros.ui.tabs.measure import MeasureTab
 from avatar_ros.ui.tabs.organ import OrganTab
@@ -22,8 +28,11 @@ from avatar_ros.ui.tabs.plan import PlanTab
 from avatar_ros.ui.tabs.recordings import RecordingsTab
 from avatar_ros.ui.tabs.scan import ScanTab
 from avatar_ros.ui.tabs.scene import SceneTab
-from avatar_ros.ui.tabs.timing import TimingTab
 from avatar_ros.ui.tabs.tool import ToolTab
+from avatar_ros.ui.view.legend import DISPLACEMENT, legend
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.orientation import NAMES
+from avatar_ros.ui.view.view import OrganView
 
 PANEL_WIDTH = 350  # [px]; leaves 450 of 800 for the organ
 BESIDE = "tool"
@@ -33,13 +42,33 @@ _BANNER = (
     "position:fixed;left:14px;top:10px;max-width:52vw;z-index:6;pointer-events:none;"
     "font-size:15px;font-weight:600"
 )
-_ALERT = "padding:6px 12px;margin-bottom:6px;border-radius:4px;color:#fff;background:#b3261e"
+_ALERT = f"padding:6px 12px;margin-bottom:6px;border-radius:4px;color:#fff;background:{WARNING}"
 
 
 class Panels:
-    """Controls and readouts of the page."""
+    """Controls and readouts of the page; each tab gets the parts of the page that it works on.
 
-    def __init__(self, server: viser.ViserServer, actions: Actions) -> None:
+    load : loads a file of the library; mark_reach : draws a pattern where tools reach, or none
+    store : takes name and content of a file that a browser sends
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        *,
+        chosen: Chosen,
+        view: OrganView,
+        coloured: Coloured,
+        measures: Measures,
+        plan: Plan,
+        player: Player,
+        recordings: Recordings,
+        scan: ScanView,
+        new_patient: NewPatient,
+        load: Callable[[str], None],
+        mark_reach: Callable[[bool], None],
+        store: Callable[[str, bytes], None],
+    ) -> None:
         gui = server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.set_panel_label(TITLE)
@@ -49,37 +78,35 @@ class Panels:
         self._state = gui.add_html("")
         self._cell, self._news = "starting ...", ""
         self._readout = gui.add_html("")
-        self._bar = gui.add_html(legend(1e-3))
+        self._bar = gui.add_html(legend(DISPLACEMENT, 1.0))
         views = gui.add_button_group("View from", tuple(VIEWS))
-        views.on_click(lambda event: actions.turn(VIEWS[event.target.value]))
+        views.on_click(lambda event: view.turn_to(VIEWS[event.target.value]))
         tabs = gui.add_tab_group()
         with tabs.add_tab("Tool"):
-            self.tool = ToolTab(gui, actions)
-            self.recordings = RecordingsTab(gui, actions)
+            self.tool = ToolTab(gui, chosen.tools, recordings)
+            self.recordings = RecordingsTab(gui, recordings, player)
         with tabs.add_tab("Organ"):
-            self.organ = OrganTab(gui, actions)
-            self.inside = InsideTab(gui, actions)
-            self.scan = ScanTab(gui, actions)
+            self.organ = OrganTab(gui, chosen, coloured, load, mark_reach, store)
+            self.inside = InsideTab(gui, view)
+            self.scan = ScanTab(gui, scan)
         with tabs.add_tab("Measure"):
-            self.measure = MeasureTab(gui, actions)
+            self.measure = MeasureTab(gui, measures)
         with tabs.add_tab("Plan"):
-            self.plan = PlanTab(gui, actions)
+            self.plan = PlanTab(gui, plan, chosen)
         with tabs.add_tab("Patient"):
-            self.patient = PatientTab(gui, actions, tuple(BRUSHES))
+            self.patient = PatientTab(gui, new_patient, load, tuple(BRUSHES))
         with tabs.add_tab("Scene"):
-            self.scene = SceneTab(gui, actions)
-        with tabs.add_tab("Timing"):
-            self.timing = TimingTab(gui)
-        for number, view in enumerate(VIEWS.values(), 1):
-            name = NAMES.get(view, "beside the tool")
+            self.scene = SceneTab(gui, chosen)
+        for number, side in enumerate(VIEWS.values(), 1):
+            name = NAMES.get(side, "beside the tool")
             command = gui.add_command(f"View: {name}", hotkey=str(number))  # type: ignore[arg-type]
-            command.on_trigger(partial(self._on_view, actions, view))
+            command.on_trigger(partial(self._on_view, view, side))
         undo = gui.add_command("Undo the last change", hotkey="Z", modifier="cmd/ctrl")
-        undo.on_trigger(lambda _: actions.undo())
+        undo.on_trigger(lambda _: chosen.undo())
         self._cubes: dict[int, Any] = {}
 
-    def _on_view(self, actions: Actions, view: str, _: Any) -> None:
-        actions.turn(view)
+    def _on_view(self, view: OrganView, side: str, _: Any) -> None:
+        view.turn_to(side)
 
     def show_cube(self, client: Any, drawing: str) -> None:
         """Show in one browser from where the organ is seen."""
@@ -93,14 +120,12 @@ class Panels:
         """A browser has left."""
         self._cubes.pop(client.client_id, None)
 
-    def offer(
-        self, files: list[str], surfaces: list[str], images: list[str], recordings: list[str]
-    ) -> None:
+    def offer(self, found: Found) -> None:
         """Offer the files of the library."""
-        self.recordings.offer(recordings)
-        self.organ.offer(files)
-        self.scan.offer(images)
-        self.patient.offer(surfaces)
+        self.recordings.offer(found.recordings)
+        self.organ.offer(found.vademecums, found.damaged)
+        self.scan.offer(found.images)
+        self.patient.offer(found.surfaces)
 
     def show_organ(self, organ: Organ) -> None:
         """Show name, certificate and material of another organ."""
@@ -138,7 +163,7 @@ class Panels:
 
 
 _STATE = "height:4.4em;overflow:auto;margin:0 1em;font-size:13px;line-height:1.45"
-_NUMBERS = "height:7.7em;overflow:hidden;margin:0 1em;font-size:14px;line-height:1.5"
+_NUMBERS = "height:8.8em;overflow:hidden;margin:0 1em;font-size:14px;line-height:1.5"
 
 
 def _set(handle: Any, content: str) -> None:

@@ -54,7 +54,7 @@ def server(viser_server: Any) -> Any:
 @pytest.fixture(scope="session")
 def cube() -> Any:
     """An organ as the page shows it: a cube of 200 mm."""
-    from avatar_ros.ui.organ import Organ
+    from avatar_ros.ui.view.organ import Organ
 
     return Organ.of(replace(box("cube"), id="a" * 64))
 
@@ -62,7 +62,7 @@ def cube() -> Any:
 @pytest.fixture
 def state() -> Any:
     """The memory that the page shares with the driver of two tools."""
-    from avatar_ros.ui.tool_state import SharedToolState
+    from avatar_ros.ui.tools.tool_state import SharedToolState
 
     from tests.ros.helpers.page import PLACES
 
@@ -147,7 +147,7 @@ def page(nodes: Any, port: int, shots: Path) -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def shown(folder: Path, nodes: Any) -> Any:
     """The organ that the page shows first."""
-    from avatar_ros.ui.organ import Organ
+    from avatar_ros.ui.view.organ import Organ
 
     from avatar_core.vademecum.storage import load_vademecum
 

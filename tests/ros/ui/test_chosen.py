@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from avatar_ros.loop.settings import MATERIAL
-from avatar_ros.ui.chosen import Chosen
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.recordings import Page, Recordings
-from avatar_ros.ui.tool_state import SharedToolState
-from avatar_ros.ui.view import CUT, GLASS, WHOLE
+from avatar_ros.ui.session.chosen import Chosen
+from avatar_ros.ui.session.recordings import Page, Recordings
+from avatar_ros.ui.tools.tool_state import SharedToolState
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.view import CUT, GLASS, WHOLE
 
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scene
@@ -62,6 +62,8 @@ def chosen(cell: Noted, state: SharedToolState) -> Chosen:
         outward=lambda place: UP,
         lifted=lambda place, clearance: place + clearance * UP,
         usable=usable,
+        vertices=np.zeros((0, 3)),
+        faces=np.zeros((0, 3), int),
     )
     return made
 
@@ -110,6 +112,13 @@ def test_values_are_those_of_coordinates_that_the_organ_has(chosen: Chosen) -> N
 def test_a_material_that_is_refused_is_not_shown(chosen: Chosen) -> None:
     chosen.choose_material({"young": 13.0})
     assert chosen.organ is not None and chosen.values(chosen.organ)["young"] == 90e3
+
+
+def test_what_another_client_sets_is_shown_once(chosen: Chosen, cell: Noted) -> None:
+    """As `avatar calibrate --set`; a user may be typing another value."""
+    for _ in range(3):
+        chosen.follow_contact({"material.young_modulus": 8e3, "uncertainty": ""})
+    assert chosen.given == {"young": 8e3} and cell.of("show_material") == [{"young": 8e3}]
 
 
 def test_of_a_slider_the_last_look_is_drawn(chosen: Chosen, cell: Noted) -> None:

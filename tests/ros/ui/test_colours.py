@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.ui import tone
-from avatar_ros.ui.bands import cut
-from avatar_ros.ui.coloured import DISPLACEMENT, ERROR, SPREAD, Coloured
-from avatar_ros.ui.colours import N_BANDS, band_colours, tissue_colours
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.refined import finer, refined
+from avatar_ros.ui.session.coloured import DISPLACEMENT, ERROR, SPREAD, Coloured
+from avatar_ros.ui.view import tone
+from avatar_ros.ui.view.bands import cut
+from avatar_ros.ui.view.colours import N_BANDS, band_colours, tissue_colours
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.refined import finer, refined
 
 from avatar_core.contact.fine_surface import _LEVELS, FineSurface, _split
 from avatar_core.geometry.tip import Tip
@@ -154,7 +154,6 @@ class Shown:
 
     def __init__(self, parameter: str = "") -> None:
         self.page = Noted(in_executor=lambda do: do())
-        self.cell = Noted(parameters_of_contact=lambda names, then: then({names[0]: parameter}))
         self.view: Any = SimpleNamespace(
             top=1e-3, field_top=0.5, opacity=1.0, paint=self.page.paint, is_reach_marked=False
         )
@@ -162,11 +161,13 @@ class Shown:
         self.organ = Organ.of(cube)
         values = {"young": cube.material.young_modulus}
         self.chosen: Any = SimpleNamespace(
-            organ=self.organ, tip=Tip("sphere", 5e-3), values=lambda _: values
+            organ=self.organ,
+            tip=Tip("sphere", 5e-3),
+            values=lambda _: values,
+            contact={"uncertainty": parameter},
         )
-        cell: Any = self.cell
         page = self.page.say, self.page.show, lambda do: self.page.in_executor(do)
-        self.coloured = Coloured(self.view, self.chosen, cell, *page)
+        self.coloured = Coloured(self.view, self.chosen, *page)
 
     @property
     def painted(self) -> list[Any]:
@@ -191,7 +192,8 @@ def test_what_is_not_known_is_painted_where_tools_reach(known: str) -> None:
     reached = np.unique(page.organ.faces[page.organ.accessible])
     assert np.nanmedian(values[reached]) == pytest.approx(np.tanh(1.6449 * np.log(1.4)), rel=0.02)
     assert np.isfinite(values).mean() < 0.5
-    assert "spread of the force [%]" in page.coloured.legend()
+    assert "spread of the force [%], 0 to 50" in page.coloured.legend()
+    assert page.coloured.scale == ("spread of the force [%]", 50.0)
     assert page.said == [
         "the distribution of poisson is not used in cube: this vademecum has no 'poisson' but "
         "young; build it with --coordinate poisson=LOW:HIGH"
@@ -203,13 +205,14 @@ def test_the_displacement_comes_back(known: str) -> None:
     page.coloured.choose(SPREAD)
     page.coloured.choose(DISPLACEMENT)
     assert page.painted[1] is None
-    assert "displacement [mm]" in page.coloured.legend()
+    assert "displacement [mm], 0 to 1" in page.coloured.legend()
+    assert page.coloured.scale == ("displacement [mm]", 1.0)
 
 
 @pytest.mark.parametrize(
     ("field", "parameter", "said"),
     [
-        (SPREAD, "", "give contact the parameter uncertainty"),
+        (SPREAD, "", "parameter uncertainty of the contact node has no distribution"),
         (SPREAD, "nowhere", "no distributions 'nowhere' come with"),
         (ERROR, "", "errors of this organ were never measured"),
     ],
@@ -230,17 +233,13 @@ def test_another_organ_shows_its_displacement(known: str) -> None:
     assert "displacement [mm]" in page.coloured.legend()
 
 
-def test_a_late_answer_does_not_change_what_was_chosen_since(known: str) -> None:
-    """The contact node may answer when another field, or another organ, is shown already."""
-    for change in (lambda page: page.coloured.choose(DISPLACEMENT), lambda p: p.coloured.forget()):
-        page = Shown(known)
-        page.coloured._requests = late = Noted()  # type: ignore[assignment]
-        page.coloured.choose(SPREAD)
-        change(page)
-        ((_, _, answer),) = late.calls
-        answer({"uncertainty": known})
-        assert all(field is None for field in page.painted)
-        assert "displacement [mm]" in page.coloured.legend()
+def test_a_spread_is_offered_only_of_what_is_said_to_be_unknown(known: str) -> None:
+    page = Shown(known)
+    assert SPREAD in page.coloured.fields
+    page.coloured.choose(SPREAD)
+    page.chosen.contact["uncertainty"] = ""  # set by another client
+    assert SPREAD not in page.coloured.fields
+    assert "displacement [mm]" in page.coloured.legend()
 
 
 def test_errors_of_the_last_organ_are_not_painted_on_the_next(
@@ -252,7 +251,7 @@ def test_errors_of_the_last_organ_are_not_painted_on_the_next(
         page.chosen.organ = None
         return np.ones(3)
 
-    monkeypatch.setattr("avatar_ros.ui.coloured.force_error_at", slow)
+    monkeypatch.setattr("avatar_ros.ui.session.coloured.force_error_at", slow)
     page.coloured.choose(ERROR)
     assert page.painted == []
 

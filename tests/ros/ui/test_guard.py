@@ -8,7 +8,8 @@ from http.client import HTTPConnection, HTTPResponse
 
 import pytest
 import viser
-from avatar_ros.ui.guard import Guard, guarded
+from avatar_ros.ui.server.guard import Guard, guarded
+from avatar_ros.ui.server.index_page import ALIVE
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -18,8 +19,13 @@ ELSEWHERE = "http://127.0.0.1:1"  # the same site for cookies, another origin
 
 
 @pytest.fixture(scope="module")
-def port() -> Iterator[int]:
-    with guarded(Guard("127.0.0.1", TOKEN)):
+def guard() -> Guard:
+    return Guard("127.0.0.1", TOKEN)
+
+
+@pytest.fixture(scope="module")
+def port(guard: Guard) -> Iterator[int]:
+    with guarded(guard):
         server = viser.ViserServer("127.0.0.1", free_port(), verbose=False)
     yield server.get_port()
     server.stop()
@@ -47,6 +53,13 @@ def is_let_in(port: int, **headers: str) -> bool:
     except InvalidStatus as error:
         assert error.response.status_code == 403
         return False
+
+
+def test_an_open_tab_can_ask_which_start_of_the_page_answers(port: int, guard: Guard) -> None:
+    cookie = cookie_of(port)
+    answers = [asked(port, ALIVE, Cookie=cookie).read().decode() for _ in range(2)]
+    assert answers == [guard.start] * 2 and guard.start != Guard("127.0.0.1", TOKEN).start
+    assert asked(port, ALIVE).status == 403
 
 
 def test_the_printed_address_opens_the_page_and_the_browser_keeps_its_token(port):

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
-from avatar_ros.ui.measuring import Place, depth, gap, hit, is_plane, margin
+from avatar_ros.ui.measure.measures import PLANE, TOOL, Measures
+from avatar_ros.ui.measure.measures_view import MeasuresView
+from avatar_ros.ui.session.presets import material_text
+from avatar_ros.ui.view.measuring import Place, depth, gap, hit, is_plane, margin
+from avatar_ros.ui.view.organ import Organ
 
+from avatar_core.geometry.tip import Tip
+from tests.helpers.box_organ import UP
 from tests.helpers.small_files import ball
+from tests.ros.helpers.page import Noted
 
 RADIUS = 0.05
 POINTS, FACES = ball(2000, RADIUS)
@@ -57,7 +67,58 @@ def test_a_margin_is_that_of_the_plane_and_negative_if_it_cuts(
     assert margin(plane[::-1], POINTS) == pytest.approx(expected, abs=FACETS)
 
 
+def test_a_lesion_without_a_contrast_is_called_as_stiff_as_the_organ(cube: Organ) -> None:
+    sick = replace(cube, structures={"lesion": cube.faces})
+    assert "as stiff" in material_text(sick, {"young": 8e3})
+    assert "as stiff" not in material_text(cube, {"young": 8e3})
+    assert "as stiff" not in material_text(sick, {"young": 8e3, "contrast": 3.0})
+
+
 def test_three_points_on_a_line_are_no_plane() -> None:
     assert not is_plane(np.outer([0.0, 1.0, 2.0], [0.01, 0.0, 0.0]))
     assert not is_plane(np.zeros((3, 3)))
     assert is_plane(0.05 * np.eye(3))
+
+
+# --- What was placed --------------------------------------------------------------------------
+
+CORNERS = np.array([[0.05, 0.2, 0.05], [0.15, 0.2, 0.05], [0.1, 0.2, 0.15]])
+
+
+def test_a_dot_of_a_plane_is_dragged_over_the_organ(cube: Organ) -> None:
+    view, surface = Noted(), (cube.vertices, cube.faces)
+    measures = Measures(view)  # type: ignore[arg-type]
+    measures.show_organ(cube, Tip())
+    assert measures.mode == TOOL
+    measures.mode = PLANE
+    for corner in CORNERS:
+        place = hit(corner + 0.3 * UP, -UP, *surface)
+        assert place is not None
+        measures.click(place, cube.vertices)
+    first = 3  # of the plane's dots
+
+    def placed() -> np.ndarray:
+        return np.array([place.at(cube.vertices) for place in measures._places[PLANE]])
+
+    np.testing.assert_allclose(placed(), CORNERS, atol=1e-6)
+    measures.drag(first + 1, np.array([0.18, 0.5, 0.08]), -UP, *surface)
+    moved = np.array([CORNERS[0], [0.18, 0.2, 0.08], CORNERS[2]])
+    np.testing.assert_allclose(placed(), moved, atol=1e-6)
+    measures.drag(first + 1, np.array([0.5, 0.5, 0.5]), -UP, *surface)  # beside the organ
+    measures.drag(first + 1, 0.5 * (CORNERS[0] + CORNERS[2]) + UP, -UP, *surface)  # on a line
+    measures.drag(0, CORNERS[0] + UP, -UP, *surface)  # no probe was placed
+    np.testing.assert_allclose(placed(), moved, atol=1e-6)
+
+
+def test_the_ray_to_a_dragged_dot_begins_at_the_camera(server: Any) -> None:
+    dragged: list[Any] = []
+    view = MeasuresView(server, lambda *given: dragged.append(given))
+    (binding,) = view._dots[4]._impl.drag_cb
+    event = Noted()
+    event.client, event.end_position = Noted(), (0.0, 0.0, 1.0)  # type: ignore[attr-defined]
+    event.client.camera = Noted()  # type: ignore[attr-defined]
+    event.client.camera.position = (0.0, 2.0, 1.0)  # type: ignore[attr-defined]
+    binding.callback(event)
+    ((dot, origin, way),) = dragged
+    assert dot == 4
+    np.testing.assert_array_equal([origin, way], [[0.0, 2.0, 1.0], [0.0, -2.0, 0.0]])

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from avatar_ros.framework.conversions import surface_mesh
 from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING, stem
-from avatar_ros.ui.actions import Wanted
-from avatar_ros.ui.new_patient import NewPatient
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.preview_view import BRUSHES
-from avatar_ros.ui.structures_view import STRUCTURE
+from avatar_ros.ui.patient.new_patient import NewPatient
+from avatar_ros.ui.patient.preview_view import BRUSHES
+from avatar_ros.ui.session.requests import Wanted
 from avatar_ros.ui.tabs.inside import InsideTab
-from avatar_ros.ui.tabs.patient import FREE, GUESS, SPRUNG, PatientTab
+from avatar_ros.ui.tabs.patient import FREE, GUESS, INSIDE, ORGAN, SPRUNG, PatientTab
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.structures_view import STRUCTURE
 from viser import ViserServer
 
 from avatar_core.common.supports import ATTACHMENTS
@@ -64,7 +64,7 @@ def cell(cube: Organ) -> Cell:
 
 @pytest.fixture
 def new(cell: Cell, tmp_path: Path) -> NewPatient:
-    parts: Any = (AtOnce(), cell, lambda: cell, cell, cell.use, cell.say)
+    parts: Any = (AtOnce(), cell, lambda: cell, cell, cell.built, cell.say)
     return NewPatient(tmp_path, *parts)
 
 
@@ -138,6 +138,25 @@ def test_springs_are_painted_by_name_and_kept_for_the_build(
     assert cell.asked.groups == ""  # springs were painted, and a clamp is asked for
 
 
+def test_a_patient_that_was_built_is_offered_and_the_organ_in_use_stays(
+    new: NewPatient, cell: Cell, server: ViserServer, user: Noted
+) -> None:
+    tab = PatientTab(server.gui, user, user.load, tuple(BRUSHES))  # type: ignore[arg-type]
+    new._tab = lambda: tab
+    tab.begin()
+    assert tab._cancel.visible and tab._progress.animated
+    tab.show_progress("factorising", 0.5, float("nan"))
+    assert not tab._progress.animated and tab._progress.value == 50.0
+    new.build(Wanted("cube.stl", fidelity="reduced"))
+    assert cell.of("built") == ["x.h5"] and not tab._cancel.visible
+    assert not user.calls
+    (use,) = tab._use._impl.update_cb
+    use(None)
+    assert user.of("load") == ["x.h5"] and not tab._use.visible
+    new.build(Wanted("cube.stl", fidelity="reduced", preview=True))
+    assert not tab._use.visible
+
+
 def test_labels_are_offered_of_a_label_map_alone(
     new: NewPatient, cell: Cell, tmp_path: Path
 ) -> None:
@@ -163,21 +182,32 @@ def user() -> Noted:
 
 @pytest.fixture
 def tab(server: ViserServer, user: Noted) -> PatientTab:
-    return PatientTab(server.gui, user, tuple(BRUSHES))  # type: ignore[arg-type]
+    return PatientTab(server.gui, user, user.load, tuple(BRUSHES))  # type: ignore[arg-type]
 
 
-def test_labels_and_boxes_of_a_file_reach_the_build(tab: PatientTab) -> None:
+def test_labels_of_a_file_reach_the_build(tab: PatientTab, user: Noted) -> None:
     tab.offer(["case.nii.gz", "liver.stl"])
-    tab.offer_labels(("liver", "lesion", "vein"))
-    assert list(tab._boxes) == ["lesion", "vein"]
-    tab._boxes["vein"].value = True
-    wanted = tab._wanted(preview=True)
-    assert (wanted.surface, wanted.label, wanted.inside) == ("case.nii.gz", "liver", ("vein",))
-    assert wanted.preview
-    tab._label.value = "lesion"
-    assert list(tab._boxes) == ["liver", "vein"]
+    assert user.of("choose_surface") == []  # a scan is no patient that somebody asked for
+    tab._ask()
+    assert user.of("build") == [] and "choose a surface" in tab._stage.content
+    tab._surfaces.value = "case.nii.gz"
+    tab._unit.value, tab._axes.value = "cm", "LPS"  # of another file
+    tab.offer_labels(("left lobe", "right lobe", "lesion", "vein"))
+    assert not (tab._unit.visible or tab._axes.visible)  # a label map states both
+    assert tab._wanted().unit == tab._wanted().axes == ""
+    tab._ask()
+    assert user.of("build") == [] and "which labels are the organ" in tab._stage.content
+    for name, role in (("left lobe", ORGAN), ("right lobe", ORGAN), ("vein", INSIDE)):
+        tab._roles[name].value = role
+    tab._ask(preview=True)
+    (wanted,) = user.of("build")
+    assert (wanted.surface, wanted.label) == ("case.nii.gz", "left lobe,right lobe")
+    assert wanted.inside == ("vein",) and wanted.preview
+    tab.offer_labels(("liver",))
+    assert tab._wanted().label == "liver"  # the only one
     tab.offer_labels(())
     assert tab._wanted().label == "" and tab._wanted().inside == ()
+    assert tab._unit.visible and tab._wanted().unit == "cm"
 
 
 def test_springs_are_asked_for_by_stiffness(tab: PatientTab, user: Noted) -> None:

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.ui.colours import N_BANDS, TISSUE, band_colours
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.view import CUT, GLASS, OrganView
+from avatar_ros.ui.view.colours import N_BANDS, TISSUE, band_colours
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.view import CUT, GLASS, OrganView
 from viser import ViserServer
 
 from avatar_core.geometry.tip import Tip

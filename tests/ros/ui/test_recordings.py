@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.ui.history import History
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.player import Player
-from avatar_ros.ui.presets import material_text
-from avatar_ros.ui.recorder import Recorder
-from avatar_ros.ui.recordings import Page, Recordings
-from avatar_ros.ui.texts import recorded_text
-from avatar_ros.ui.tool_state import N_ROWS, SharedToolState
-from avatar_ros.ui.tools import Tools
+from avatar_ros.ui.session.player import Player
+from avatar_ros.ui.session.presets import material_text
+from avatar_ros.ui.session.recorder import Recorder
+from avatar_ros.ui.session.recordings import Page, Recordings
+from avatar_ros.ui.session.texts import recorded_text
+from avatar_ros.ui.tools.history import History
+from avatar_ros.ui.tools.tool_state import N_ROWS, SharedToolState
+from avatar_ros.ui.tools.tools import Tools
+from avatar_ros.ui.view.organ import Organ
 
 from avatar_core.contact.effects.selection import default_effects
 from avatar_core.scene.file import read_scene, shipped_scene
@@ -45,10 +45,14 @@ def test_no_recording_begins_while_any_tool_touches(state: SharedToolState) -> N
     tools.use(NAMES, PLACES)
     chosen: Any = SimpleNamespace(organ=object(), tools=tools, moves_all=True)
     recorder, shown = Recorder(state), Page(page.say, page.show_recording, lambda: True)
-    recordings = Recordings(Path(), recorder, nothing, nothing, chosen, state, shown)  # type: ignore[arg-type]
+    cell: Any = SimpleNamespace(switching=("palpation", 12.0))
+    recordings = Recordings(Path(), recorder, nothing, cell, chosen, state, shown)  # type: ignore[arg-type]
+    recordings.record(True)  # a switch that takes effect later would be in it
+    assert page.of("say")[-1].startswith("scene palpation is being prepared")
+    cell.switching = None
     send(state, rows((OK, 0.0), (OK, 2.0)))
     recordings.record(True)
-    assert page.of("say") == ["lift right off the organ first: a recording starts at rest"]
+    assert page.of("say")[1:] == ["lift right off the organ first: a recording starts at rest"]
     assert not recorder.is_on
     recordings._begin(True)
     assert page.of("say")[-1].startswith("not recorded: right touched the organ again")
@@ -73,6 +77,9 @@ def test_a_recording_without_a_surface_is_written(
     """Of a contact node that sends none."""
     recorder = Recorder(state)
     recorder.open(cube.vademecum, Scene(effects=()), 1000.0)
+    state.all["n_rows"] = 7
+    assert recorder.n_periods == 0  # the scene is being loaded
+    state.all["n_rows"] = 0
     recorder.begin()
     state.rows[:, 0], state.all["n_rows"] = rows((OK, 1.0), (OK, 0.0)), 1
     saved = recorder.save(tmp_path)
@@ -126,11 +133,13 @@ def test_a_recording_is_scrubbed_and_each_state_is_one_period(
         player.seek(part)
         found = player.state(cube)
         assert found is not None
-        cloud, (period,), material = found
+        cloud, (period,), material, given = found
         assert np.linalg.norm(period.force) == pytest.approx(0.2 * k)
         assert np.abs(cloud[:, 4] + 2e-4 * k).max() < 1e-8
         np.testing.assert_allclose(cloud[:, :3] - cloud[:, 3:], cube.vertices, atol=1e-8)
-        assert material["young"] == 50e3 and material_text(cube, material).startswith("E 50 kPa")
+        assert material["young"] == given["young"] == 50e3 and material_text(
+            cube, material
+        ).startswith("E 50 kPa")
         assert player.part == pytest.approx(part)
     assert "not what the tool feels now" in player.alerts[0]
     player.close()

@@ -10,12 +10,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from avatar_ros.ui.actions import Wanted
-from avatar_ros.ui.requests import Requests
+from avatar_ros.ui.session.alerts import alerts_of_switch
+from avatar_ros.ui.session.requests import Requests, Wanted
 from rclpy.action import ActionServer
 
 from avatar_ros.action import BuildPatient
 from tests.ros.conftest import Probe
+from tests.ros.helpers.page import Noted
 
 AWAY = 0.5  # of a thread, right after it sent a goal: the answer comes meanwhile [s]
 
@@ -43,18 +44,18 @@ class Slow:
 
 def build_at_once(goal: Any) -> BuildPatient.Result:
     goal.succeed()
-    return BuildPatient.Result(success=True, file="case.h5")
+    return BuildPatient.Result(success=True, file="case.h5", notices=["read label 1, 5 ml"])
 
 
 @pytest.fixture
-def until_built(probe: Probe) -> Iterator[Callable[[list[Any]], None]]:
+def until_built(probe: Probe) -> Iterator[Callable[[list[Any], list[str]], None]]:
     """Asks for a patient in a thread of its own, and spins until there is a result."""
     requests = Requests(probe.node)
 
-    def ask(results: list[Any]) -> None:
+    def ask(results: list[Any], said: list[str]) -> None:
         probe.until(lambda: "patient_interpolation" not in requests.missing, 60.0)
         requests._build._client_handle = Slow(requests._build._client_handle)
-        given = (Wanted("case.stl"), lambda *stage: None, lambda text: None, results.append)
+        given = (Wanted("case.stl"), lambda *stage: None, said.append, results.append)
         Thread(target=requests.build_patient, args=given).start()
         probe.until(lambda: bool(results), 20.0)
 
@@ -71,8 +72,10 @@ def until_built(probe: Probe) -> Iterator[Callable[[list[Any]], None]]:
 
 def test_the_end_of_a_build_is_heard_however_early_the_goal_is_accepted(until_built: Any) -> None:
     results: list[Any] = []
-    until_built(results)
+    said: list[str] = []
+    until_built(results, said)
     assert [result.file for result in results] == ["case.h5"]
+    assert said == ["case.h5 built in 0 s; read label 1, 5 ml"]
 
 
 class Silent:
@@ -98,6 +101,23 @@ def test_a_contact_node_that_starts_again_is_asked_again() -> None:
     requests.contact_started()
     requests.set_material({"young": 4e3}, print)
     assert silent.asked == [1e3, 4e3]
+
+
+def test_a_scene_that_is_being_prepared_is_said_until_it_is_in_use() -> None:
+    requests, asked = Requests.__new__(Requests), list[Any]()
+    ready = Noted(service_is_ready=lambda: True, call_async=lambda request: ready)
+    ready._answers["add_done_callback"] = asked.append
+    requests.__dict__ |= {"_load_scene": ready, "_switch": None}
+    assert alerts_of_switch(requests.switching, "bare", False) == []
+    for name in ("breathing", "palpation"):
+        requests.load_scene(name, print)
+    (alert,) = alerts_of_switch(requests.switching, "bare", False)
+    assert alert == "Scene palpation is being prepared, 0 s; still in force: bare"
+    (alert,) = alerts_of_switch(requests.switching, "bare", True)
+    assert alert.endswith("the recording begins after it")
+    for answered, left in zip(asked, (True, False), strict=True):
+        answered(SimpleNamespace(result=lambda: None))
+        assert (requests.switching is not None) is left
 
 
 def building() -> tuple[Requests, list[Any], list[str]]:

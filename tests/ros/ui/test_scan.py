@@ -7,18 +7,23 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import nibabel
 import numpy as np
 import pytest
-from avatar_ros.ui.library import Library
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.scan import read_scan, slice_of
-from avatar_ros.ui.scan_view import ScanView
-from avatar_ros.ui.surface_view import section
+from avatar_ros.ui.scan.library import Library
+from avatar_ros.ui.scan.scan import read_scan, slice_of
+from avatar_ros.ui.scan.scan_view import ScanView
 from avatar_ros.ui.tabs.scan import NONE, ScanTab
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.orientation import AXES, basis, standard_view
+from avatar_ros.ui.view.surface_view import section
 from scipy.spatial.transform import Rotation
 from viser import ViserServer
 
+from avatar_core.common.hdf5 import replace_file
 from avatar_core.errors import SurfaceError
+from avatar_core.vademecum.storage import save_vademecum
+from tests.helpers.box_organ import organ
 from tests.helpers.small_files import ball
 from tests.ros.helpers.page import AtOnce, Noted, image
 
@@ -38,7 +43,7 @@ def tab(server: ViserServer, user: Noted) -> ScanTab:
 
 @pytest.fixture
 def planes(server: ViserServer, tmp_path: Path, tab: ScanTab, user: Noted) -> ScanView:
-    return ScanView(server, tmp_path, AtOnce(), lambda: tab, user.say)  # type: ignore[arg-type]
+    return ScanView(server, tmp_path, AtOnce(), tab.show_scan, user.say, user.turn_to)  # type: ignore[arg-type]
 
 
 # --- Lines ------------------------------------------------------------------------------------
@@ -121,11 +126,45 @@ def test_planes_of_an_image_lie_where_its_voxels_do(tmp_path: Path) -> None:
     assert slice_of(scan, 0, 0.75, 500.0, 100.0).grey.max() == 0  # level and window
 
 
+def test_planes_of_an_oblique_image_have_three_names(tmp_path: Path) -> None:
+    affine = np.eye(4)
+    affine[:3, :3] = Rotation.from_euler("z", 45.0, degrees=True).as_matrix()
+    scan = read_scan(image(tmp_path / "mr.nii", np.ones((4, 4, 4), np.int16), affine))
+    assert sorted(scan.planes) == ["axial", "coronal", "sagittal"]
+
+
 def test_large_values_of_an_image_stay_what_they_are(tmp_path: Path) -> None:
     values = np.zeros((4, 4, 4), np.uint16)
     values[1] = 60_000
     scan = read_scan(image(tmp_path / "mr.nii", values))
     assert (scan.low, scan.high) == (0.0, 60_000.0)
+
+
+def test_what_is_not_a_number_is_dark(tmp_path: Path) -> None:
+    values = np.full((4, 4, 4), np.nan, np.float32)
+    values[1:3] = [[[-1000.0, 50.0, 60.0, 900.0]]]
+    scan = read_scan(image(tmp_path / "ct.nii", values))
+    assert (scan.low, scan.high, scan.window) == (-1000.0, 900.0, 400.0)
+    assert (scan.values[0] == -1000.0).all()
+    scan = read_scan(image(tmp_path / "mr.nii", values + 2000.0))
+    assert scan.low == 0.0 and (scan.values[0] == 0.0).all()
+    with pytest.raises(SurfaceError, match="none of its voxels is a number"):
+        read_scan(image(tmp_path / "none.nii", np.full((4, 4, 4), np.nan, np.float32)))
+
+
+def test_a_doubtful_place_of_an_image_is_refused_or_said(planes: ScanView, tmp_path: Path) -> None:
+    one = nibabel.Nifti1Image(np.ones((4, 4, 4), np.uint8), np.eye(4))
+    one.set_qform(np.diag([1.0, 1.0, 1.0, 1.0]), 0)
+    one.set_sform(None, 0)
+    nibabel.save(one, tmp_path / "nowhere.nii")
+    with pytest.raises(SurfaceError, match="does not say where its axes point"):
+        read_scan(tmp_path / "nowhere.nii")
+    one.set_qform(np.eye(4) + np.eye(4, k=3), 1)
+    one.set_sform(np.eye(4), 1)
+    nibabel.save(one, tmp_path / "apart.nii")
+    planes.choose("apart.nii")
+    (alert,) = (line for line in planes.alerts if "1 mm apart" in line)
+    assert alert.startswith("Image apart.nii: its qform")
 
 
 def test_sheared_or_several_images_are_refused(tmp_path: Path) -> None:
@@ -145,14 +184,44 @@ def test_planes_have_their_controls(
     assert user.of("say") == [] and len(planes._planes) == 3
     assert tab._files.value == "mr.nii" and "mr.nii" in planes.alerts[0]
     before = planes._planes[2].image.copy()
-    tab._sliders[2].value = 90
-    assert user.calls[-1] == ("place_scan", 2, 0.9)
+    tab._shown[3].value = 90
+    assert user.calls[-1] == ("place", 2, 0.9)
     planes.place(2, 0.9)
     assert (planes._planes[2].image != before).any()
     np.testing.assert_allclose(planes._planes[2].position[2], 9e-3)
     planes.forget()
     assert planes._planes == [] and not tab._controls.visible and tab._files.value == NONE
     assert planes.alerts == []
+
+
+@pytest.mark.parametrize(
+    ("plane", "on_left", "on_top"),
+    [("axial", "R", "A"), ("coronal", "R", "S"), ("sagittal", "A", "S")],
+)
+def test_a_plane_alone_is_seen_as_radiologists_do(
+    planes: ScanView,
+    tab: ScanTab,
+    user: Noted,
+    cube: Organ,
+    tmp_path: Path,
+    plane: str,
+    on_left: str,
+    on_top: str,
+) -> None:
+    image(tmp_path / "ct.nii", np.ones((9, 9, 9), np.int16), 10.0 * np.eye(4)[[1, 2, 0, 3]])
+    planes.choose("ct.nii")
+    planes.follow(cube, cube.vertices)
+    of_all = len(planes._lines[0].points)
+    planes.see(tab._shown[0].options.index(plane) - 1)
+    right, up, _ = basis(standard_view(user.of("turn_to")[-1], cube.centre, cube.size))
+    assert right @ AXES[on_left] < -0.99 and up @ AXES[on_top] > 0.99
+    (seen,) = (one for one in planes._planes if one.visible)
+    normal = Rotation.from_quat(seen.wxyz, scalar_first=True).as_matrix()[:, 2]
+    np.testing.assert_allclose(np.abs(normal), np.abs(np.cross(right, up)), atol=0.03)
+    planes.follow(cube, cube.vertices)
+    assert 0 < len(planes._lines[0].points) < of_all
+    planes.see(None)
+    assert all(one.visible for one in planes._planes)
 
 
 def test_an_image_that_comes_late_is_not_drawn_in_the_next_organ(
@@ -215,7 +284,30 @@ def test_a_series_of_dicom_lies_in_the_patient(tmp_path: Path) -> None:
     np.testing.assert_allclose((scan.affine @ [*bright, 1.0])[:3], place, atol=1e-9)
     assert (scan.low, scan.high) == (-1024.0, 176.0)
     assert (scan.level, scan.window) == (40.0, 400.0)
-    assert Library(tmp_path).offer()[2] == ["ct/"]
+    assert Library(tmp_path, AtOnce()).offer().images == ["ct/"]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (lambda good: good[: len(good) // 2], "truncated file"),
+        (lambda good: b"not HDF5", "file signature not found"),
+        (lambda good: b"", "file signature not found"),
+    ],
+)
+def test_a_damaged_vademecum_is_listed_with_its_reason(
+    tmp_path: Path, content: Callable[[bytes], bytes], reason: str
+) -> None:
+    save_vademecum(organ("cube"), tmp_path / "good.h5")
+    (tmp_path / "bad.h5").write_bytes(content((tmp_path / "good.h5").read_bytes()))
+    replace_file(tmp_path / "atlas.h5", {}, {"format": "avatar atlas"})
+    library = Library(tmp_path, AtOnce())
+    found = library.offer()
+    assert found.vademecums == ["good.h5"]
+    (line,) = found.damaged
+    assert line.startswith("bad.h5 is no readable vademecum") and reason in line
+    save_vademecum(organ("cube"), tmp_path / "bad.h5")
+    assert library.offer().vademecums == ["bad.h5", "good.h5"] and not library.offer().damaged
 
 
 def test_a_series_of_a_real_scanner_lies_where_its_headers_say(tmp_path: Path) -> None:
@@ -249,4 +341,4 @@ def test_what_is_no_series_is_refused(tmp_path: Path) -> None:
     (tmp_path / "gap" / "7.dcm").unlink()  # the third of five slices
     with pytest.raises(SurfaceError, match="not one regular volume"):
         read_scan(tmp_path / "gap")
-    assert Library(tmp_path).offer()[2] == ["gap/", "one/"]
+    assert Library(tmp_path, AtOnce()).offer().images == ["gap/", "one/"]

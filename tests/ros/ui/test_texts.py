@@ -12,35 +12,45 @@ from typing import Any
 import numpy as np
 import pytest
 from avatar_ros.framework.templates import stamp_bytes
-from avatar_ros.loop.statuses import EXPLANATIONS
+from avatar_ros.loop.statuses import EXPLANATIONS, explanation
 from avatar_ros.nodes.planning_ui import PlanningNode
-from avatar_ros.ui.alerts import alerts
-from avatar_ros.ui.force_band import BandRatios
-from avatar_ros.ui.library import Library
-from avatar_ros.ui.live import Live
-from avatar_ros.ui.organ import Organ
 from avatar_ros.ui.panels import Panels
-from avatar_ros.ui.recorder import Recorder
-from avatar_ros.ui.shown_period import (
-    BEYOND,
-    OTHER_BEYOND,
+from avatar_ros.ui.scan.library import Library
+from avatar_ros.ui.session.alerts import alerts, alerts_of_organ
+from avatar_ros.ui.session.force_band import BandRatios
+from avatar_ros.ui.session.live import Live
+from avatar_ros.ui.session.recorder import Recorder
+from avatar_ros.ui.session.shown_period import (
     OTHER_ORGAN,
+    OTHER_UNKNOWN,
     SILENT,
     PeriodChooser,
     ShownPeriod,
 )
+from avatar_ros.ui.session.texts import (
+    BAND,
+    COVERS,
+    frame_text,
+    other_scenes,
+    plain,
+    scene_texts,
+    warnings,
+)
 from avatar_ros.ui.tabs.scene import SceneTab
-from avatar_ros.ui.texts import BAND, frame_text, other_scenes, scene_texts, warnings
-from avatar_ros.ui.tool_state import N_RECENT, SharedToolState, organ_number
+from avatar_ros.ui.tools.tool_state import N_RECENT, SharedToolState, organ_number
+from avatar_ros.ui.view.organ import Organ
 from viser import ViserServer
 
 from avatar_core.vademecum.model import VademecumInfo
 from avatar_ros.msg import ContactState
 from tests.ros.helpers.page import NAMES, OK, OUT, PLACES, TIP, Noted, rows, send
 
+# Statuses of a period whose step computed no force, though the tool may press.
+NO_FORCE = (OUT, ContactState.STATUS_SLOW_POSES, ContactState.STATUS_LEAP)
 
-def shown(force: float, error: float, fraction: float, largest: float) -> ShownPeriod:
-    return ShownPeriod(TIP, np.array([0.0, force, 0.0]), error, fraction, largest)
+
+def shown(force: float, error: float, largest: float) -> ShownPeriod:
+    return ShownPeriod(TIP, np.array([0.0, force, 0.0]), error, largest)
 
 
 def info(error: float) -> VademecumInfo:
@@ -65,26 +75,22 @@ def drawn(
     return chooser.drawn(now, largest, PLACES[: len(now)])
 
 
-def test_a_limited_force_is_no_measurement() -> None:
-    """The organ pushes with 25 N; the device gets its 20 N, and the page says both."""
-    now = shown(25.0, 2.7, 0.8, 0.0071)
-    text = " ".join(frame_text(now, "E 170 kPa", None))
-    assert "Force <b>25.00 N</b> ± 2.70 N, device 20.00 N" in text
-    assert "<b>7.1 mm</b>" in text and "E 170 kPa" in text
-    (alert,) = alerts(EXACT, [now])
-    assert alert == "Force limited: the device gets 20.00 N of 25.00 N"
-
-
-def test_a_force_that_the_device_gets_is_written_once() -> None:
-    free = shown(0.0, 0.0, 0.0, 0.0)  # nothing is held back
-    for now in (shown(3.3, 0.1, 1.0, 0.001), free):
-        assert "device" not in " ".join(frame_text(now, "", None))
-        assert alerts(EXACT, [now]) == []
+@pytest.mark.parametrize("status", [OK, ContactState.STATUS_ENGAGING])
+def test_no_device_is_spoken_of_at_tools_that_the_page_moves(
+    chooser: PeriodChooser, status: int
+) -> None:
+    """What a device would get, limited or while the force is faded in, nobody gets here."""
+    now = rows((status, 25.0))
+    now["sent_fraction"] = 0.0
+    (period,) = drawn(chooser, now, 0.0071)
+    numbers = [line for line in frame_text(period, "E 170 kPa", None) if " N" in line]
+    assert numbers == ["Force <b>25.00 N</b> ± 0.00 N"]
+    assert alerts(EXACT, (), [period]) == []
 
 
 def test_no_displacement_is_not_none() -> None:
     """Without a surface from the contact node, 20 N stand beside no 0.0 mm."""
-    text = " ".join(frame_text(shown(20.0, 1.0, 1.0, float("nan")), "", None))
+    text = " ".join(frame_text(shown(20.0, 1.0, float("nan")), "", None))
     assert "20.00 N" in text and "mm" not in text and "sends no surface" in text
 
 
@@ -110,18 +116,18 @@ def test_the_force_of_a_stamp_is_that_or_none(state: SharedToolState) -> None:
 # --- What is shown of a period ----------------------------------------------------------------
 
 
-def test_beyond_the_range_the_last_valid_shape_stays(chooser: PeriodChooser) -> None:
+@pytest.mark.parametrize("status", NO_FORCE)
+def test_without_a_force_the_last_valid_shape_stays(chooser: PeriodChooser, status: int) -> None:
     for force in (1.0, 20.0):
         assert chooser.take(rows((OK, force)))
         drawn(chooser, rows((OK, force)), 1e-4 * force)
     for _ in range(3):  # the organ of these periods lies at rest
-        assert not chooser.take(rows((OUT, 0.0)))
-        (held,) = drawn(chooser, rows((OUT, 0.0)), float("nan"))
+        assert not chooser.take(rows((status, 0.0)))
+        (held,) = drawn(chooser, rows((status, 0.0)), float("nan"))
         assert held.is_held and held.force[1] == 20.0 and held.largest == 2e-3
     text = " ".join(frame_text(held, "", None))
     assert "No force" in text and "20.00 N" in text and "2.0 mm" in text
-    (alert,) = alerts(EXACT, [held])
-    assert "No force" in alert and "beyond" in alert
+    assert alerts(EXACT, (), [held]) == [f"No force: {explanation(status)}"]
     assert chooser.take(rows((OK, 0.0)))
     assert not drawn(chooser, rows((OK, 0.0)), 0.0)[0].is_held
 
@@ -134,14 +140,16 @@ def test_a_tool_that_never_touched_holds_nothing(chooser: PeriodChooser) -> None
     assert chooser.take(rows((OUT, 0.0)))
 
 
-@pytest.mark.parametrize("missing", [BEYOND, SILENT, OTHER_ORGAN])
-def test_what_is_not_known_is_not_zero(chooser: PeriodChooser, missing: str) -> None:
-    """Pressed too deep from afar, a contact node that is gone, forces of another patient."""
-    now = ShownPeriod.without_force(TIP, missing)
-    if missing == BEYOND:
-        (now,) = drawn(chooser, rows((OUT, 0.0)), 0.0)
+@pytest.mark.parametrize("missing", [*NO_FORCE, SILENT, OTHER_ORGAN])
+def test_what_is_not_known_is_not_zero(chooser: PeriodChooser, missing: int | str) -> None:
+    """Poses that are too slow, a contact node that is gone, forces of another patient."""
+    if isinstance(missing, str):
+        now = ShownPeriod.without_force(TIP, missing)
+    else:
+        (now,) = drawn(chooser, rows((missing, 0.0)), 0.0)
+        missing = explanation(missing)
     assert re.search(r"\d (N|mm)", " ".join(frame_text(now, "", None))) is None
-    assert alerts(EXACT, [now]) == [f"No force: {missing}"]
+    assert alerts(EXACT, (), [now]) == [f"No force: {missing}"]
     assert np.isnan(now.size)
 
 
@@ -170,41 +178,56 @@ def test_a_tool_beyond_the_range_is_named_and_nothing_else_is_shown_as_of_now(
     chooser: PeriodChooser,
 ) -> None:
     """The organ of that period lies as if it were not there, and so do the other tools' forces."""
-    before, beyond = rows((OK, 1.0), (OK, 2.0)), rows((OK, 4.0), (OUT, 0))
-    for now in (before, beyond):
+    before = rows((OK, 1.0), (OK, 2.0))
+    for now in (before, rows((OK, 4.0), (OUT, 0))):
         assert chooser.take(now) == (now is before)
         shown = drawn(chooser, now)
-    assert [one.missing for one in shown] == [OTHER_BEYOND, BEYOND]
+    beyond = explanation(OUT)
+    assert [one.missing for one in shown] == [OTHER_UNKNOWN, beyond]
     assert all(one.is_held for one in shown) and shown[0].force[1] == 1.0
-    assert alerts(EXACT, shown, NAMES) == [
-        f"left: No force: {OTHER_BEYOND}",
-        f"right: No force: {BEYOND}",
+    assert alerts(EXACT, (), shown, NAMES) == [
+        f"left: No force: {OTHER_UNKNOWN}",
+        f"right: No force: {beyond}",
     ]
 
 
-def test_what_is_limited_on_another_tool_is_not_missed(chooser: PeriodChooser) -> None:
-    now = rows((OK, 1.0), (OK, 25.0))
-    now["sent_fraction"][1] = 0.8
-    shown = drawn(chooser, now)
-    expected = "Force limited: the device gets 20.00 N of 25.00 N"
-    assert alerts(EXACT, shown, NAMES) == [f"right: {expected}"]
-    assert alerts(EXACT, [shown[1], shown[1]], NAMES) == [expected]  # of both: said once
+def test_what_is_extrapolated_on_another_tool_is_not_missed(chooser: PeriodChooser) -> None:
+    shown = drawn(chooser, rows((OK, 1.0), (ContactState.STATUS_EXTRAPOLATED, 25.0)))
+    expected = "Extrapolated: pressed beyond what was computed; the force is a guess"
+    assert alerts(EXACT, (), shown, NAMES) == [f"right: {expected}"]
+    assert alerts(EXACT, (), [shown[1], shown[1]], NAMES) == [expected]  # of both: said once
 
 
 def test_a_patient_of_large_expected_error_is_marked() -> None:
     """Interpolated patients are 16 % wrong; what was never measured is no better."""
-    now = shown(0.0, 0.0, 1.0, 0.0)
-    (alert,) = alerts(info(0.16), [now])
-    assert "Large expected error" in alert and "16%" in alert
-    assert "never measured" in alerts(info(float("nan")), [now])[0]
-    assert alerts(info(0.02), [now]) == []
+    now = shown(0.0, 0.0, 0.0)
+    (alert,) = alerts(info(0.16), (), [now])
+    assert alert.startswith("Large expected error of displacement:")
+    assert "never measured" in alerts(info(float("nan")), (), [now])[0]
+    assert alerts(info(0.02), (), [now]) == []
+
+
+def test_a_stiffness_that_nobody_chose_is_called_assumed() -> None:
+    default = replace(EXACT, young_modulus=170e3)
+    (alert,) = alerts_of_organ(default, ("poisson",))
+    assert "Young's modulus is assumed: 170 kPa" in alert
+    assert alerts_of_organ(default, ("young",)) == []  # of a scene, a calibration or a user
+    assert alerts_of_organ(replace(EXACT, young_modulus=8e3), ()) == []  # it was given for the file
+
+
+def test_one_error_of_the_force_is_written_and_what_it_covers(cube: Organ) -> None:
+    lines = frame_text(shown(4.9, 0.1, 1e-3), "", None)
+    assert plain(lines[-1]) == COVERS and "±" in lines[0]
+    unknown = frame_text(shown(4.9, float("nan"), 1e-3), "", None)
+    assert COVERS not in map(plain, unknown)
+    assert "force" not in cube.summary()
 
 
 def test_an_extrapolated_force_is_marked_and_one_that_fades_in_is_not() -> None:
-    now = shown(3.0, 0.1, 0.5, 1e-3)
+    now = shown(3.0, 0.1, 1e-3)
     extrapolated = now._replace(status=ContactState.STATUS_EXTRAPOLATED)
-    assert "Extrapolated" in alerts(EXACT, [extrapolated])[0]
-    assert alerts(EXACT, [now._replace(status=ContactState.STATUS_ENGAGING)]) == []
+    assert "Extrapolated" in alerts(EXACT, (), [extrapolated])[0]
+    assert alerts(EXACT, (), [now._replace(status=ContactState.STATUS_ENGAGING)]) == []
 
 
 # --- The cloud --------------------------------------------------------------------------------
@@ -259,7 +282,7 @@ def test_the_page_shows_a_band_in_proportion_to_the_force_beside_it() -> None:
 
 
 def test_the_band_stands_beside_the_force() -> None:
-    now = shown(2.0, 0.1, 1.0, 1e-3)
+    now = shown(2.0, 0.1, 1e-3)
     assert BAND not in " ".join(frame_text(now, "", None))
     lines = frame_text(now._replace(band=(1.2, 3.4)), "", None)
     assert f"1.20 to 3.40 N: {BAND}" in lines
@@ -281,6 +304,12 @@ def test_each_line_ends_with_one_mark(statuses: tuple[int, ...]) -> None:
     for line in warnings(("vademecum_loader",), False, statuses, missed=0.2).splitlines():
         assert line[0] == "⚠" and not line[2].islower()
         assert line[-1] in ".?" and line[-2].isalnum() | (line[-2] in "`')")
+
+
+def test_an_organ_that_is_being_prepared_is_not_called_missing() -> None:
+    no_model = (ContactState.STATUS_NO_MODEL,)
+    assert "it is preparing it" in warnings((), True, no_model)
+    assert "No vademecum is loaded" in warnings((), False, no_model)
 
 
 def test_a_fault_of_one_tool_is_said_with_its_name() -> None:
@@ -317,7 +346,7 @@ def test_a_name_is_no_html(cube: Organ) -> None:
 
 def test_a_library_that_is_gone_is_said_and_ends_nothing(tmp_path: Path) -> None:
     said: list[str] = []
-    library = Library(tmp_path / "gone")
+    library = Library(tmp_path / "gone", Noted())  # type: ignore[arg-type]
     page: Any = SimpleNamespace(_library=library, _say=said.append, _panels=Noted())
     PlanningNode._offer_files(page)
     assert said == ["the library cannot be read: No such file or directory"]

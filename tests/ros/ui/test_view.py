@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.ui import tone
-from avatar_ros.ui.colours import HELD, N_BANDS, N_SHADES, TISSUE
-from avatar_ros.ui.cut_handle import CutHandle
-from avatar_ros.ui.legend import legend
-from avatar_ros.ui.organ import Organ
-from avatar_ros.ui.patterns import GAP, HATCH_GAP
-from avatar_ros.ui.surface_view import N_TONES
-from avatar_ros.ui.tip_body import tip_body, turn_to
-from avatar_ros.ui.view import CUT, GLASS, WHOLE, OrganView
+from avatar_ros.ui.view import tone
+from avatar_ros.ui.view.colours import HELD, N_BANDS, N_SHADES, TISSUE
+from avatar_ros.ui.view.cut_handle import CutHandle
+from avatar_ros.ui.view.legend import DISPLACEMENT, legend
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.patterns import GAP, HATCH_GAP
+from avatar_ros.ui.view.surface_view import N_TONES
+from avatar_ros.ui.view.tip_body import tip_body, turn_to
+from avatar_ros.ui.view.tool_view import ToolView
+from avatar_ros.ui.view.view import CUT, GLASS, HIDDEN, WHOLE, OrganView
 from viser import ViserServer
 
 from avatar_core.contact.model import ContactModel, prepare, step
@@ -100,13 +101,21 @@ def test_bands_and_tissue_together_cover_the_organ(view: OrganView, pressed: Con
 
 
 def test_the_same_cloud_is_not_sent_twice(view: OrganView, pressed: ContactModel) -> None:
-    """A tool at rest would cost the browser thirty pictures a second."""
+    """A tool at rest would cost the browser thirty pictures a second.
+
+    A cloud may come before the force of its period: the dent is drawn when the force is there.
+    """
     cloud, force = pressed.out.cloud, pressed.out.force[0]
+    plain = view.move(cloud, POSE[None], np.zeros((1, 3)))
     largest = view.move(cloud, POSE[None], force[None])
+    assert largest > 1.5 * plain
     (first, *_) = meshes(view, "bands")
     first.vertices = np.zeros_like(first.vertices)
     assert view.move(cloud.copy(), POSE[None], force[None]) == largest
     assert not np.any(first.vertices)
+    for held in (True, False):  # no number stands beside a shape that is not of now
+        view.grey(held)
+        assert view._marker.visible != held
 
 
 def test_cut_open_shows_half_and_the_far_wall(view: OrganView) -> None:
@@ -120,6 +129,40 @@ def test_cut_open_shows_half_and_the_far_wall(view: OrganView) -> None:
     assert {mesh.opacity for mesh in meshes(view, "tissue")} == {view.opacity} != {1.0}
     view.look(WHOLE)
     assert view.opacity == 1.0 and len(meshes(view, "inside")) == 1  # behind cracks
+
+
+def test_a_hidden_organ_is_neither_seen_nor_clicked(view: OrganView, server: ViserServer) -> None:
+    view.look(HIDDEN)
+    assert not server.scene._handle_from_node_name["/organ/surface"].visible
+    drawn = {mesh.name for group in ("tissue", "bands", "rim") for mesh in meshes(view, group)}
+    drawn |= {view._marker.name, view._place.name}
+    assert all(name.startswith("/organ/surface/") for name in drawn)
+    assert len(view.faces) == 0
+    view.set_aside(True)
+    view.set_aside(False)  # after a preview
+    assert not server.scene._handle_from_node_name["/organ/surface"].visible
+    view.look(WHOLE)
+    assert len(view.faces) > 0
+
+
+def test_a_click_on_a_tool_is_none_on_the_organ_behind_it(view: OrganView, cube: Organ) -> None:
+    """A press on a tool that is not dragged is a click for a browser."""
+    height = 0.05
+    tip, eye = cube.above(height), cube.above(0.5)
+    view.show_tools((SPHERE,), tip[None])
+    across = np.cross(UP, np.eye(3)[2])
+
+    def clicked(aside: float) -> bool:
+        """Whether the organ is, by a ray along the surface's normal."""
+        return view.clicked(eye + aside * across, -UP) is not None
+
+    radius = SPHERE.radius
+    assert [clicked(k * radius) for k in (0.0, 0.9, 1.1, 3.0)] == [False, False, True, True]
+    slanting = across + 1.5 * UP
+    by_shaft = tip + 0.05 * UP + 0.2 * slanting, -slanting
+    assert view.clicked(*by_shaft) is None
+    view.show_tools((SPHERE,), cube.above(-0.5)[None])  # behind the organ
+    assert clicked(0.0) and view.clicked(*by_shaft) is not None
 
 
 def shades(view: OrganView, first: int) -> list[Any]:
@@ -169,7 +212,13 @@ def test_what_springs_hold_is_hatched(view: OrganView) -> None:
     _, _, hatching = shades(view, 0)
     assert area([hatching]) == pytest.approx(there / HATCH_GAP, rel=0.2)
     assert area(meshes(view, "tissue")) == pytest.approx(whole, rel=1e-6)
-    assert "springs" in legend(1e-3, has_springs=True) and "springs" not in legend(1e-3)
+    assert "springs" in legend(DISPLACEMENT, 1.0, has_springs=True)
+    assert "springs" not in legend(DISPLACEMENT, 1.0)
+
+
+def test_the_legend_says_where_colours_of_glass_hold() -> None:
+    assert "plain background alone" in legend(DISPLACEMENT, 1.0, opacity=0.45)
+    assert "background alone" not in legend(DISPLACEMENT, 1.0)
 
 
 def test_little_error_looks_unlike_no_access(view: OrganView, cube: Organ) -> None:
@@ -285,14 +334,29 @@ def test_all_tools_are_drawn_with_their_names_and_forces(server: ViserServer, cu
     left, right = view._tools
     assert (left._text.text, right._text.text) == ("left 2.0 N", "[right]")
     assert left._arrow.visible and not right._arrow.visible
-    way: Any = SimpleNamespace(start_position=(0.0, 0.0, 0.0), end_position=(0.01, 0.0, 0.0))
-    right._dragged(way, False)
-    ((_, tool, place, _),) = user.calls
-    assert tool == 1 and np.allclose(place, PLACES[1] + [0.01, 0.0, 0.0])
     view.show_tools((Tip(),), PLACES[:1])
     view.name_tools(("",), 0)
     view.place_tools(PLACES[:1], np.zeros((1, 3)))
     assert len(view._tools) == 1 and not view._tools[0]._text.visible
+
+
+def test_a_browser_that_draws_late_drags_no_farther_than_the_mouse_went(
+    server: ViserServer, cube: Organ
+) -> None:
+    """It says of the tool where it drew it last: still where the drag began."""
+    user = Noted()
+    tool = ToolView(server, 1, user.drag)
+    tool.show(Tip(), PLACES[1], np.array([1.0, 0.0, 0.0, 0.0]))
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    for phase, way in (("start", 0.0), ("update", 0.01), ("update", 0.02), ("end", 0.02)):
+        event: Any = SimpleNamespace(
+            phase=phase, start_position=(0.0, 0.0, 0.0), end_position=(way, 0.0, 0.0)
+        )
+        tool._dragged(event, False)
+        _, number, begin, gone, along_shaft = user.calls[-1]
+        tool.place(begin + gone, upright, np.zeros(3))
+        np.testing.assert_allclose(tool.position, PLACES[1] + [way, 0.0, 0.0], atol=1e-9)
+        assert (number, along_shaft) == (1, False)
 
 
 @pytest.mark.parametrize("tip", BODIES, ids=lambda tip: tip.shape)

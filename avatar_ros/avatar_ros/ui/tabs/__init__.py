@@ -1,1 +1,1 @@
-"""The tabs of the planning page, each with its controls; what they do is in ``Actions``."""
+"""The tabs of the planning page with their controls; each works on the parts that it is given."""

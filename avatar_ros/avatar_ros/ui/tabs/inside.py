@@ -5,15 +5,15 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from avatar_ros.ui.actions import Actions
-from avatar_ros.ui.structures_view import STRUCTURE
+from avatar_ros.ui.view.structures_view import STRUCTURE
+from avatar_ros.ui.view.view import OrganView
 
 
 class InsideTab:
     """A row of controls for each structure of the vademecum in use."""
 
-    def __init__(self, gui: Any, actions: Actions) -> None:
-        self._gui, self._actions = gui, actions
+    def __init__(self, gui: Any, view: OrganView) -> None:
+        self._gui, self._view = gui, view
         self._folder = gui.add_folder("Inside the organ", expand_by_default=False, visible=False)
         self._rows: list[Any] = []
 
@@ -37,4 +37,4 @@ class InsideTab:
 
     def _on_change(self, name: str, row: tuple[Any, Any, Any], _: Any) -> None:
         is_seen, colour, opacity = (control.value for control in row)
-        self._actions.style(name, is_seen, colour, opacity / 100.0)
+        self._view.style(name, is_seen, colour, opacity / 100.0)

@@ -5,19 +5,18 @@ from __future__ import annotations
 from html import escape
 from typing import Any
 
-from avatar_ros.ui.actions import Actions
-from avatar_ros.ui.measures import PLANE, PROBE, RULER
+from avatar_ros.ui.measure.measures import PLANE, PROBE, RULER, TOOL, Measures
 
 
 class MeasureTab:
     """Choice of what a click places, and a list of numbers."""
 
-    def __init__(self, gui: Any, actions: Actions) -> None:
-        mode = gui.add_dropdown("A click places", (PROBE, RULER, PLANE))
-        mode.on_update(lambda event: actions.measure(event.target.value))
-        gui.add_button("Clear measures").on_click(lambda _: actions.clear_measures())
+    def __init__(self, gui: Any, measures: Measures) -> None:
+        mode = gui.add_dropdown("A click places", (TOOL, PROBE, RULER, PLANE))
+        mode.on_update(lambda event: setattr(measures, "mode", event.target.value))
+        gui.add_button("Clear measures").on_click(lambda _: measures.clear())
         self._numbers = gui.add_html("")
-        gui.add_markdown("Click on the organ. Places move with the tissue.")
+        gui.add_markdown("Click on the organ; drag a dot to move it. Places move with the tissue.")
 
     def show(self, lines: list[str]) -> None:
         """Show the numbers, one line each."""

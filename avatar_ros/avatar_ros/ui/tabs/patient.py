@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from avatar_core.common.supports import ATTACHMENTS
-from avatar_ros.ui.actions import Actions, Wanted
-from avatar_ros.ui.legend import key_of_access, key_of_clamp, key_of_springs
+from avatar_ros.ui.patient.new_patient import NewPatient
+from avatar_ros.ui.session.requests import Wanted
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
+from avatar_ros.ui.view.legend import key_of_access, key_of_clamp, key_of_springs
 
+ORGAN, INSIDE = "organ", "inside it"
+ROLES = (NOTHING, ORGAN, INSIDE)
+_HINT = "several may make up the organ; what is inside is shown, and is as stiff as the organ"
 UNITS = ("mm", "cm", "m")
 STATED = "as the file states, else RAS"
 AXES = (STATED, "RAS", "LPS", "LAS", "RPS")
@@ -27,17 +31,17 @@ _SECTION = "margin:0 1em;font-size:13px"
 class PatientTab:
     """Controls of a build and its progress.
 
-    brushes : what a click on a preview can paint
+    load : loads a file of the library; brushes : what a click on a preview can paint
     """
 
-    def __init__(self, gui: Any, actions: Actions, brushes: tuple[str, ...]) -> None:
-        self._gui, self._actions = gui, actions
+    def __init__(
+        self, gui: Any, new: NewPatient, load: Callable[[str], None], brushes: tuple[str, ...]
+    ) -> None:
+        self._gui, self._new, self._load = gui, new, load
         self._surfaces = gui.add_dropdown("Surface", (NOTHING,))
-        self._label = gui.add_dropdown("Organ's label", (NOTHING,), visible=False)
-        self._inside = gui.add_folder("Inside the organ", visible=False)
-        self._boxes: dict[str, Any] = {}
+        self._labels = gui.add_folder("Labels of the file", visible=False)
+        self._roles: dict[str, Any] = {}
         self._surfaces.on_update(lambda _: self._on_surface())
-        self._label.on_update(lambda _: self._offer_inside())
         self._unit = gui.add_dropdown("Unit of the file", UNITS)
         self._axes = gui.add_dropdown("Axes of the file", AXES)
         self._fidelity = gui.add_dropdown("Fidelity", FIDELITIES, initial_value="reduced")
@@ -51,7 +55,7 @@ class PatientTab:
         self._held.on_update(lambda _: self._on_held())
         gui.add_button(
             "Preview what holds it", hint="registers and meshes the organ; nothing is solved"
-        ).on_click(lambda _: actions.build(self._wanted(preview=True)))
+        ).on_click(lambda _: self._ask(preview=True))
         self._preview = [
             gui.add_html(
                 f'<div style="{_SECTION}">{key_of_clamp()}{key_of_access()} to tools</div>',
@@ -71,24 +75,41 @@ class PatientTab:
         ]
         self._brush, self._brushes, self._areas = brush, brushes, areas
         for control in (brush, radius):
-            control.on_update(lambda _: actions.brush(brush.value, radius.value / 1e3))
-        back.on_click(lambda _: actions.end_preview())
-        gui.add_button("Build patient").on_click(lambda _: actions.build(self._wanted()))
+            control.on_update(lambda _: new.brush(brush.value, radius.value / 1e3))
+        back.on_click(lambda _: new.end_preview())
+        gui.add_button("Build patient").on_click(lambda _: self._ask())
         self._stage = gui.add_markdown("")
-        self._progress: Any = gui.add_progress_bar(0.0)
-        gui.add_button("Cancel").on_click(lambda _: actions.cancel())
+        self._progress: Any = gui.add_progress_bar(0.0, visible=False)
+        self._cancel = gui.add_button("Cancel", visible=False)
+        self._cancel.on_click(lambda _: new.cancel())
+        self._built = ""
+        self._use = gui.add_button("", visible=False, hint="in place of the organ in use")
+        self._use.on_click(lambda _: self._on_use())
         self._began = {"": 0.0}
 
+    def _ask(self, preview: bool = False) -> None:
+        if self._surfaces.value == NOTHING:
+            self._stage.content = "choose a surface"
+        elif self._roles and not self._named(ORGAN):
+            self._stage.content = "choose which labels are the organ, one or several"
+        else:
+            self._new.build(self._wanted(preview))
+
+    def _named(self, role: str) -> tuple[str, ...]:
+        """Labels of a role."""
+        return tuple(name for name, one in self._roles.items() if one.value == role)
+
     def _wanted(self, preview: bool = False) -> Wanted:
-        has_labels = bool(self._label.visible)
+        has_labels = bool(self._roles)
+        is_stated = has_labels or self._axes.value == STATED
         return Wanted(
             self._surfaces.value,
-            self._unit.value,
-            "" if self._axes.value == STATED else self._axes.value,
+            "" if has_labels else self._unit.value,
+            "" if is_stated else self._axes.value,
             self._fidelity.value,
             self._tolerance.value / 100.0,
-            self._label.value if has_labels else "",
-            tuple(name for name, box in self._boxes.items() if box.value) if has_labels else (),
+            ",".join(self._named(ORGAN)),
+            self._named(INSIDE),
             supports=self._supports() if self._held.value == SPRUNG else (),
             preview=preview,
         )
@@ -105,27 +126,25 @@ class PatientTab:
         self._stiffness.visible = self._held.value == SPRUNG
 
     def offer(self, surfaces: list[str]) -> None:
-        """Offer the surfaces of the library."""
-        set_options(self._surfaces, surfaces)
+        """Offer the surfaces of the library; none is chosen before a user does."""
+        set_options(self._surfaces, [NOTHING, *surfaces])
 
     def _on_surface(self) -> None:
         self.offer_labels(())  # none of the last file
-        self._actions.choose_surface(self._surfaces.value)
+        self._new.choose_surface(self._surfaces.value)
 
     def offer_labels(self, labels: tuple[str, ...]) -> None:
-        """Offer the labels of the chosen file; none for a file that is no label map."""
-        set_options(self._label, list(labels))
-        self._label.visible = bool(labels)
-        self._offer_inside()
-
-    def _offer_inside(self) -> None:
-        """A box for each label but the organ's own."""
-        for box in self._boxes.values():
-            box.remove()
-        others = [name for name in self._label.options if name not in (NOTHING, self._label.value)]
-        self._inside.visible = bool(others)
-        with self._inside:
-            self._boxes = {name: self._gui.add_checkbox(name, False) for name in others}
+        """Offer a role for each label of the chosen file, none for one that is no label map."""
+        for role in self._roles.values():
+            role.remove()
+        only = ORGAN if len(labels) == 1 else NOTHING
+        with self._labels:
+            self._roles = {
+                name: self._gui.add_dropdown(name, ROLES, initial_value=only, hint=_HINT)
+                for name in labels
+            }
+        self._labels.visible = bool(labels)
+        self._unit.visible = self._axes.visible = not labels  # which a label map states
 
     def show_preview(self, is_shown: bool, springs: Mapping[str, float] | None = None) -> None:
         """Show the controls of a preview, or hide them.
@@ -140,6 +159,22 @@ class PatientTab:
         self._areas.visible = is_shown and bool(springs)
         set_options(self._brush, [*self._brushes, *springs])
 
+    def _on_use(self) -> None:
+        self._use.visible = False
+        self._load(self._built)
+
+    def begin(self) -> None:
+        """A build or a preview begins; it can be cancelled."""
+        self._use.visible = False
+        self._progress.visible = self._cancel.visible = True
+        self.show_progress("begins", 0.0, float("nan"))
+
+    def end(self, how: str, file: str = "") -> None:
+        """A build or a preview has ended; the file that was built is offered."""
+        self._progress.visible = self._cancel.visible = False
+        self._stage.content = how
+        self._built, self._use.label, self._use.visible = file, f"Use {file}", bool(file)
+
     def show_progress(self, stage: str, fraction: float, error: float) -> None:
         """Show how far a stage is, and how long it takes yet at this pace."""
         now = time.monotonic()
@@ -150,4 +185,5 @@ class PatientTab:
         known = "" if np.isnan(error) else f", expected error {error:.1%}"
         part = f": {fraction:.0%}" if fraction > 0.0 else ""  # of some stages, none is known
         self._stage.content = f"{stage}{part}{left}{known}"
-        self._progress.value = float(np.clip(100.0 * fraction, 0.0, 100.0))
+        self._progress.animated = fraction <= 0.0
+        self._progress.value = float(np.clip(100.0 * fraction, 0.0, 100.0)) or 100.0

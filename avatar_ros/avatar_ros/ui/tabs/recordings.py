@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from avatar_ros.ui.actions import Actions
+from avatar_ros.ui.session.player import Player
+from avatar_ros.ui.session.recordings import Recordings
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
 
 PLAY, PAUSE, CLOSE = "play", "pause", "back to now"
@@ -13,8 +14,8 @@ PLAY, PAUSE, CLOSE = "play", "pause", "back to now"
 class RecordingsTab:
     """Controls of a player."""
 
-    def __init__(self, gui: Any, actions: Actions) -> None:
-        self._actions = actions
+    def __init__(self, gui: Any, recordings: Recordings, player: Player) -> None:
+        self._recordings, self._player = recordings, player
         with gui.add_folder("Recordings", expand_by_default=False):
             self._files = gui.add_dropdown("Recording", (NOTHING,))
             group = gui.add_button_group("Recording", (PLAY, PAUSE, CLOSE))
@@ -34,12 +35,12 @@ class RecordingsTab:
 
     def _on_button(self, button: str) -> None:
         if button == PLAY:
-            self._actions.play(self._files.value)
+            self._recordings.play(self._files.value)
         elif button == PAUSE:
-            self._actions.pause()
+            self._player.pause(True)
         else:
-            self._actions.stop_playing()
+            self._player.close()
 
     def _on_time(self, event: Any) -> None:
         if event.client is not None:
-            self._actions.seek(self._time.value / 100.0)
+            self._player.seek(self._time.value / 100.0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from html import escape
 from typing import Any
 
-from avatar_ros.ui.actions import Actions
+from avatar_ros.ui.session.chosen import Chosen
+from avatar_ros.ui.session.texts import other_scenes, scene_texts
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
-from avatar_ros.ui.texts import other_scenes, scene_texts
 
 _IN_USE = "margin:0 1em;font-size:14px"
 
@@ -15,12 +15,13 @@ _IN_USE = "margin:0 1em;font-size:14px"
 class SceneTab:
     """Choice of a scene, with what it simulates."""
 
-    def __init__(self, gui: Any, actions: Actions) -> None:
+    def __init__(self, gui: Any, chosen: Chosen) -> None:
         self._in_use = gui.add_html("")
         self._scenes = gui.add_dropdown("Scene", (NOTHING,))
         self._text = gui.add_markdown("")
         self._scenes.on_update(lambda _: self._describe())
-        gui.add_button("Switch to scene").on_click(lambda _: actions.scene(self._scenes.value))
+        switch = gui.add_button("Switch to scene")
+        switch.on_click(lambda _: chosen.choose_scene(self._scenes.value))
         self._others = gui.add_markdown("")
         self._texts: dict[str, str] = {}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
@@ -10,15 +11,17 @@ from typing import Any
 import numpy as np
 from viser import uplot
 
-from avatar_ros.ui.actions import Actions
-from avatar_ros.ui.orientation import AXES
+from avatar_ros.ui.session.recordings import Recordings
+from avatar_ros.ui.session.shown_period import ShownPeriod
+from avatar_ros.ui.session.texts import BAND
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
-from avatar_ros.ui.tabs.plots import plot
-from avatar_ros.ui.texts import BAND
+from avatar_ros.ui.tools.tools import Tools
+from avatar_ros.ui.view.orientation import AXES
 
 STEP = 1e-3  # of a key [m]
 _HISTORY = 10.0  # of the plot [s]
 _LEAST_RANGE = 1.0  # of the plot [N]
+_PADDING = (14, 22, 0, 0)  # so that no number on an axis is cut [px]
 # Keys, what they do, and the side of the patient to which they move the tool; "": the normal.
 KEYS = {
     "J": ("Tool to the patient's right", "R"),
@@ -28,7 +31,6 @@ KEYS = {
     "U": ("Press the tool in", ""),
     "O": ("Lift the tool", ""),
 }
-_SIDES = {"right": "R", "left": "L", "up": "S", "down": "I"}  # of the patient, by button
 
 
 def _plot_of_force(gui: Any, has_band: bool) -> Any:
@@ -45,14 +47,28 @@ def _plot_of_force(gui: Any, has_band: bool) -> Any:
             for end in ("from", "to")
         ]
         bands.append(uplot.Band(series=(5, 4), fill="#009E7320"))
-    return plot(gui, "Force on the tool [N]", 120, _LEAST_RANGE, *curves, bands=tuple(bands))
+    values = {
+        "min": {"pad": 0, "soft": 0, "mode": 1},
+        "max": {"pad": 0.1, "soft": _LEAST_RANGE, "mode": 1},  # rest is a line at the bottom
+    }
+    return gui.add_uplot(
+        tuple(np.zeros(2) for _ in range(1 + len(curves))),
+        (uplot.Series(label="time [s]"), *curves),
+        title="Force on the tool [N] over time [s]",
+        scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=values)},
+        axes=(uplot.Axis(), uplot.Axis()),
+        legend=uplot.Legend(live=False),
+        bands=tuple(bands),
+        height=120,
+        padding=_PADDING,
+    )
 
 
 class ToolTab:
     """Choice of a tool, plot of the force on it, buttons that move it, and the recording."""
 
-    def __init__(self, gui: Any, actions: Actions) -> None:
-        self._gui, self._actions = gui, actions
+    def __init__(self, gui: Any, tools: Tools, recordings: Recordings) -> None:
+        self._moved, self._began = tools, time.monotonic()
         self._tools = gui.add_dropdown("Tool", (NOTHING,), visible=False)
         self._tools.on_update(self._on_tool)
         self._chosen = ""
@@ -62,15 +78,15 @@ class ToolTab:
         self._bands: deque[tuple[float, float]] = deque(maxlen=n)  # the force, where it has none
         self._plot, self._plot_of_band = _plot_of_force(gui, False), _plot_of_force(gui, True)
         self._plot_of_band.visible = False
-        for name, labels in (("Depth", ("press 1 mm", "lift 1 mm")), ("1 mm", tuple(_SIDES))):
+        for name, labels in (("Depth", ("press 1 mm", "lift 1 mm")), ("1 mm to", tuple(AXES))):
             group = gui.add_button_group(name, labels)
             group.on_click(lambda event: self._nudge(event.target.value))
-        gui.add_button("Lift off the organ").on_click(lambda _: actions.lift())
+        gui.add_button("Lift off the organ").on_click(lambda _: tools.lift())
         self._recording = gui.add_button("Record", hint="poses, forces and shapes, from rest")
-        self._recording.on_click(lambda _: actions.record(self._recording.label == "Record"))
+        self._recording.on_click(lambda _: recordings.record(self._recording.label == "Record"))
         gui.add_markdown(
-            "Drag the blue tip, with Shift along its shaft; or use the keys J L I K, "
-            "U to press, O to lift."
+            "Click on the organ to put the tip there. Drag the tip, with Shift along its shaft; "
+            "or use the keys J L I K, U to press, O to lift."
         )
         for key, (label, side) in KEYS.items():
             way = -STEP if key == "U" else STEP
@@ -88,17 +104,25 @@ class ToolTab:
 
     def _on_tool(self, event: Any) -> None:
         if event.client is not None:
-            self._actions.tool(self._tools.value)
+            self._moved.choose(self._tools.value)
 
     def _nudge(self, label: str) -> None:
         way = -STEP if label.startswith("press") else STEP
-        self._move(_SIDES.get(label, ""), way)
+        self._move(label if label in AXES else "", way)
 
     def _on_key(self, side: str, way: float, _: Any) -> None:
         self._move(side, way)
 
     def _move(self, side: str, way: float) -> None:
-        self._actions.nudge(AXES[side] if side else None, way)
+        self._moved.nudge(AXES[side] if side else None, way)
+
+    def show_period(self, shown: ShownPeriod | None) -> None:
+        """Add the force of a period to the plot; a gap where none is known or nothing is of now."""
+        if shown is None or shown.missing:
+            self.forget_force()
+        else:
+            now = time.monotonic() - self._began
+            self.show_force(now, shown.size, np.nan_to_num(shown.error), shown.band)
 
     def show_force(
         self, now: float, force: float, error: float, band: tuple[float, float] | None = None

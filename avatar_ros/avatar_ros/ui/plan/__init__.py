@@ -1,0 +1,1 @@
+"""The plan of the planning page: kept states, reports of them and exported surfaces."""

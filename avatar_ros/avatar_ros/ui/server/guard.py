@@ -1,0 +1,137 @@
+"""Who may use the planning page: whoever holds its token, from the page itself.
+
+Every site that is open in a browser can send requests to this machine, from inside. As Jupyter
+does, each request is checked, those that open a WebSocket too:
+
+- Host: this machine by an address, by ``localhost`` or by its name. Another name belongs to a site
+  that lets it point here.
+- Origin, which browsers state: the page itself.
+- The token: at the end of the address that is printed, and then in a cookie.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from io import StringIO
+from ipaddress import ip_address
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import websockets.asyncio.server
+from websockets import Headers, Request, Response
+
+from avatar_ros.ui.server.index_page import ALIVE, complete
+
+Check = Callable[[Any, Request], Response | None]
+
+_EVERYWHERE = ("0.0.0.0", "::", "")
+
+
+class Guard:
+    """Checks requests to a page that listens on ``host``; a new token is drawn unless one is given.
+
+    A token that was given stays the same over restarts, and so do bookmarks of the page.
+    ``start`` is another at each, by which an open tab knows.
+    """
+
+    def __init__(self, host: str, token: str = "") -> None:
+        self.start = secrets.token_hex(8)
+        self.host, self.token = host, token or secrets.token_urlsafe(24)
+        self._names = {"localhost", host.lower(), socket.gethostname().lower()}
+
+    def address(self, port: int) -> str:
+        """Where the page is on this machine, with the token."""
+        host = "127.0.0.1" if self.host in _EVERYWHERE else self.host
+        return f"http://{host}:{port}/?token={self.token}"
+
+    def refusal(self, request: Request) -> str | None:
+        """Why a request is refused, or None."""
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        if not self._is_ours(host):
+            return "this page has another address than the one asked for"
+        if origin is not None and urlsplit(origin).netloc != host:
+            return "the request comes from another site"
+        if not any(
+            hmac.compare_digest(token.encode(), self.token.encode()) for token in _tokens(request)
+        ):
+            return "open the address that planning_ui printed, which ends in ?token=..."
+        return None
+
+    def remember(self, request: Request, response: Response) -> None:
+        """Let the browser keep the token, for this page alone."""
+        name = _cookie(request.headers["Host"])
+        response.headers["Set-Cookie"] = f"{name}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+
+    def _is_ours(self, host: str) -> bool:
+        try:
+            place = urlsplit(f"//{host}")
+            name, _ = place.hostname or "", place.port
+            return name in self._names or bool(ip_address(name))
+        except ValueError:  # neither a name that is known nor an address, or no port
+            return False
+
+
+def _tokens(request: Request) -> list[str]:
+    """Those that a request holds, in its address and in its cookie."""
+    found = parse_qs(urlsplit(request.path).query).get("token", [])
+    cookies: SimpleCookie = SimpleCookie()
+    try:
+        for line in request.headers.get_all("Cookie"):
+            cookies.load(line)
+    except CookieError:  # of another page of this machine
+        return found
+    name = _cookie(request.headers["Host"])
+    return [*found, *([cookies[name].value] if name in cookies else [])]
+
+
+def _cookie(host: str) -> str:
+    """Name of the cookie: pages on other ports of a machine share its cookies."""
+    return f"avatar_{urlsplit(f'//{host}').port or 80}"
+
+
+def _answer(status: HTTPStatus, text: str) -> Response:
+    body = text.encode()
+    headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
+    return Response(status, status.phrase, headers, body)
+
+
+@contextmanager
+def guarded(guard: Guard, note: Callable[[str], bool] = lambda path: False) -> Iterator[None]:
+    """Servers of viser that start meanwhile ask the guard first.
+
+    note : gets the path of each request that the guard lets through; whether that was all of it
+
+    viser takes no check of its own; it hands ``websockets.serve`` one that answers with its files.
+    It prints its address without the token, which nobody could open: the node logs the right one.
+    """
+    serve: Any = websockets.asyncio.server.serve
+
+    def serve_guarded(*arguments: Any, process_request: Check, **named: Any) -> Any:
+        def check(connection: Any, request: Request) -> Response | None:
+            why = guard.refusal(request)
+            if why is not None:
+                return _answer(HTTPStatus.FORBIDDEN, f"403: {why}\n")
+            if request.path == ALIVE:
+                return _answer(HTTPStatus.OK, guard.start)
+            if note(request.path):
+                return Response(HTTPStatus.NO_CONTENT, "No Content", Headers())
+            response = process_request(connection, request)
+            if response is not None:
+                guard.remember(request, response)
+                complete(response)
+            return response
+
+        return serve(*arguments, process_request=check, **named)
+
+    websockets.asyncio.server.serve = serve_guarded  # type: ignore[misc, assignment]
+    try:
+        with redirect_stdout(StringIO()):
+            yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]

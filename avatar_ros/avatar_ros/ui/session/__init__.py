@@ -1,0 +1,1 @@
+"""State and requests of the planning page: periods, choices, requests, recordings, texts."""

@@ -1,0 +1,71 @@
+"""The plane that cuts an organ open, with an arrow by which a user moves it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.surface_view import Plane
+from avatar_ros.ui.view.tip_body import turn_to
+
+_BESIDE = 0.6  # of the organ's size, from its centre to the arrow
+_SIZE = 0.25  # of the arrow, over the organ's
+_MOVED = 1e-3  # part from which the handle is put elsewhere
+
+
+class CutHandle:
+    """One handle; ``on_cut`` gets the part of the organ's width that lies beyond the plane."""
+
+    def __init__(self, server: viser.ViserServer, on_cut: Callable[[float], None]) -> None:
+        self._server, self._on_cut = server, on_cut
+        self._handle: Any = None
+        self._shown: tuple[str, tuple[float, ...]] | None = None  # organ and normal
+        self._heights = (0.0, 1.0)  # of the plane where nothing is cut away, and all [m]
+        self._normal = np.zeros(3)
+
+    def show(self, organ: Organ, normal: np.ndarray, part: float) -> Plane:
+        """Put the handle where a part is cut away from the side of a normal; the plane there."""
+        heights = organ.vertices @ normal
+        self._heights, self._normal = (float(heights.max()), float(heights.min())), normal
+        first, last = self._heights
+        height = first + part * (last - first)
+        place = organ.centre + (height - float(organ.centre @ normal)) * normal
+        side = np.roll(np.abs(normal), 1)  # square to the normal, which is an axis
+        place = place + _BESIDE * organ.size * side
+        shown = (organ.id, tuple(normal.tolist()))
+        if self._handle is None or self._shown != shown:
+            self.hide()
+            self._shown = shown
+            self._handle = self._server.scene.add_transform_controls(
+                "/organ/cut",
+                scale=_SIZE * organ.size,
+                active_axes=(False, False, True),
+                disable_rotations=True,
+                disable_sliders=True,
+                depth_test=False,
+                wxyz=turn_to(normal),
+                position=tuple(place),
+            )
+            self._handle.on_update(lambda _: self._moved())
+        elif abs(self._part() - part) > _MOVED:  # not while the user holds it there
+            self._handle.position = tuple(place)
+        return Plane(height * normal, normal)
+
+    def hide(self) -> None:
+        """No plane cuts."""
+        if self._handle is not None:
+            self._handle.remove()
+            self._handle = None
+
+    def _part(self) -> float:
+        first, last = self._heights
+        height = float(np.array(self._handle.position) @ self._normal)
+        return float(np.clip((height - first) / (last - first), 0.0, 1.0))
+
+    def _moved(self) -> None:
+        if self._handle is not None:
+            self._on_cut(self._part())

@@ -1,0 +1,147 @@
+"""A tool on the planning page: its tip, its shaft, its name, and the force on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from avatar_core.geometry.tip import Tip
+from avatar_ros.ui.view import tone
+from avatar_ros.ui.view.colours import lightness, shaded
+from avatar_ros.ui.view.glb import unlit_glb
+from avatar_ros.ui.view.measuring import hit
+from avatar_ros.ui.view.tip_body import along_shaft, shaft_body, tip_body, turned
+
+TOOL, SHAFT = (0, 114, 178), (150, 160, 170)
+ARROW = (213, 94, 0)
+LEAST_FORCE = 1e-3  # that is shown [N]
+_UNSEEN = 1e-5  # change of positions [m], turns and forces [N] that nobody sees
+_SCALE = 0.004  # length of the arrow per force [m/N]
+_BESIDE = 0.01  # from a tip that feels nothing to its name [m]
+# Of labels around a tip, each has a quarter: beside two names, the largest displacement and a gap.
+_ANCHORS: tuple[Any, Any] = ("bottom-right", "bottom-left")
+_LENGTHS = (0.012, 0.06)  # of the arrow, at least and at most [m]
+
+
+class ToolView:
+    """Draws a tool.
+
+    number : among the tools, from 0
+    on_drag : gets the tool's number, where its tip was when the mouse took it [m], how far the
+        mouse moved since [m], and whether along the shaft alone
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        number: int,
+        on_drag: Callable[[int, np.ndarray, np.ndarray, bool], None],
+    ) -> None:
+        self._server, self._number, self._on_drag = server, number, on_drag
+        self._root = f"/tools/{number}"
+        self._node = server.scene.add_frame(self._root, show_axes=False)
+        self._tool: Any = None
+        self._arrow: Any = None
+        self._text: Any = None
+        self._label = ""
+        self._placed: np.ndarray | None = None  # tip, turn and force that are seen
+        self._taken = np.zeros((2, 3))  # tip and mouse when a drag began [m]
+        self._bodies: tuple[tuple[np.ndarray, np.ndarray], ...] = ()  # of tip and shaft, upright
+
+    def remove(self) -> None:
+        """Draw the tool no more."""
+        self._node.remove()
+
+    def show(self, tip: Tip, position: np.ndarray, wxyz: np.ndarray) -> None:
+        """Show a tool at a position [m]."""
+        self._placed = None
+        scene, root = self._server.scene, self._root
+        body, shaft = self._bodies = tip_body(tip), shaft_body(tip)
+        self._tool = scene.add_glb(
+            f"{root}/body", _shaded_glb(body, TOOL), position=position, wxyz=wxyz, cast_shadow=False
+        )
+        scene.add_glb(f"{root}/body/shaft", _shaded_glb(shaft, SHAFT), cast_shadow=False)
+        self._tool.on_drag("left")(lambda event: self._dragged(event, False))
+        self._tool.on_drag("left", modifier="shift")(lambda event: self._dragged(event, True))
+        self._arrow = scene.add_arrows(
+            f"{root}/force",
+            np.zeros((1, 2, 3)),
+            tuple(tone.instance(np.array(ARROW)).tolist()),
+            shaft_radius=0.0015,
+            head_radius=0.004,
+            head_length=0.008,
+            visible=False,
+        )
+        self._text = scene.add_label(
+            f"{root}/force_number",
+            "",
+            visible=False,
+            anchor=_ANCHORS[self._number % 2],
+            font_screen_scale=1.1,
+        )
+
+    def name(self, label: str, is_chosen: bool) -> None:
+        """Write a name beside the tip, the chosen tool's in brackets; empty: none."""
+        text = f"[{label}]" if label and is_chosen else label
+        if text != self._label:
+            self._label, self._placed = text, None
+
+    @property
+    def position(self) -> np.ndarray:
+        """Of the tip [m]."""
+        return np.array(self._tool.position)
+
+    def distance(self, origin: np.ndarray, direction: np.ndarray) -> float:
+        """From the origin of a ray to where it meets the tool [m]; infinite beside it."""
+        found = [np.inf]
+        for upright, faces in self._bodies:
+            points = self.position + turned(upright, np.array(self._tool.wxyz))
+            met = hit(origin, direction, points, faces)
+            if met is not None:
+                found.append(float(np.linalg.norm(met.at(points) - origin)))
+        return min(found)
+
+    def _dragged(self, event: Any, along_shaft: bool) -> None:
+        # Counted from the drag's begin: a slow browser says of a tool where it drew it long ago.
+        mouse = np.array(event.end_position)
+        if event.phase == "start":
+            self._taken = np.stack([self.position, mouse])
+        tip, begin = self._taken
+        self._on_drag(self._number, tip, mouse - begin, along_shaft)
+
+    def place(self, tip: np.ndarray, wxyz: np.ndarray, force: np.ndarray) -> None:
+        """Show the tool at its tip [m], with the force on it [N].
+
+        Nothing is sent where nothing changes: a browser draws only then.
+        """
+        now = np.concatenate([tip, wxyz, force])
+        if self._placed is not None and np.abs(now - self._placed).max() < _UNSEEN:
+            return
+        self._placed = now
+        self._tool.position, self._tool.wxyz = tuple(tip), wxyz
+        size = float(np.linalg.norm(force))
+        is_felt = size > LEAST_FORCE
+        end = tip + _BESIDE * along_shaft(wxyz)
+        if is_felt:
+            end = tip + force * (np.clip(_SCALE * size, *_LENGTHS) / size)
+            self._arrow.points = np.stack([tip, end])[None]
+        _set(self._arrow, "visible", is_felt)
+        text = f"{self._label} {size:.1f} N".strip() if is_felt else self._label
+        if text:
+            self._text.position = tuple(end)
+            _set(self._text, "text", text)
+        _set(self._text, "visible", bool(text))
+
+
+def _set(node: Any, name: str, value: Any) -> None:
+    """Change a property of a node, and send it only then."""
+    if getattr(node, name) != value:
+        setattr(node, name, value)
+
+
+def _shaded_glb(body: tuple[np.ndarray, np.ndarray], colour: tuple[int, int, int]) -> bytes:
+    vertices, faces = body
+    return unlit_glb(vertices, faces, shaded(colour, lightness(vertices, faces)))
