@@ -227,6 +227,8 @@ def _at_volume(values: FloatArray, wanted: float) -> Soup:
     levels, volumes = [0.5], []
     for _ in range(_MOST_LEVELS):
         vertices, faces = march(levels[-1] - values)
+        if not len(faces):
+            break
         volumes.append(signed_volume(vertices, faces))
         if abs(volumes[-1] - wanted) < _VOLUME_ERROR * wanted:
             break

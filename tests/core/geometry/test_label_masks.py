@@ -15,7 +15,6 @@ from tests.helpers.known_surfaces import refused
 SIZE = 4.0  # of voxels [mm]
 N = 40  # along each axis
 RADIUS = 60.0  # of the organ, about the middle of the map [mm]
-ORGAN = 4 / 3 * np.pi * RADIUS**3 * 1e-9  # [m^3]
 
 
 def ball(radius: float, *centre: float) -> np.ndarray:
@@ -38,6 +37,7 @@ def said(surface: SurfaceMesh, words: str) -> list[str]:
 
 
 LIVER = ball(RADIUS, 0, 0, 0)
+ORGAN = LIVER.sum() * (1e-3 * SIZE) ** 3  # [m^3]
 INNER = ball(20, 15, 0, 10)
 EDGE = ball(20, 0, 45, 0)  # two thirds of its surface touch the organ
 AWAY = ball(20, 0, 0, 65)  # a fifth of it lies in the organ
