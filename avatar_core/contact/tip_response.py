@@ -1,9 +1,11 @@
 """Interpolation of the response for a tip at any position: smooth weights and compliance.
 
 On the faces, the response is interpolated in s by the six-node triangles of the load positions,
-exact at each of them. Neither that interpolation nor the closest point s(p) is smooth: edges and
-folds would make the force jump. Weights and compliance are therefore sampled on the grid of the tip
-field and evaluated by the same B-splines B_q(p), twice differentiable almost everywhere:
+exact at each of them. A tip at p presses at the point s(p) of the faces closest to its contact,
+p - phi(p) n(p): the faces closest to p itself are others, as far above them as the centre of a
+large ball. Neither that interpolation nor s(p) is smooth: edges and folds would make the force
+jump. Weights and compliance are therefore sampled on the grid of the tip field and evaluated by the
+same B-splines B_q(p), twice differentiable almost everywhere:
 
     w_j(p)   = sum_q B_q(p) w_j(s(x_q))         weight of load position j, sum_j w_j = 1
     gamma(p) = sum_q B_q(p) [K gamma_0](x_q)    gamma_0 = n . C(s, s) n at s = s(x_q)
@@ -24,6 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.common.jit import compiled, fast
+from avatar_core.common.splines import evaluate_all
 from avatar_core.reduction.near_field import LocalBlocks, find_block, hash_rows
 
 if TYPE_CHECKING:
@@ -64,7 +67,17 @@ def tip_carriers(surface: LoadSurface, field: TipField, depth: float, height: fl
     shell &= _dilated(field.access > 0.0)
     points = field.origin + spacing * np.argwhere(shell)
     normal = grid_normals(field.distance, spacing)[shell]
-    return TipCarriers(shell, normal, *closest_weights(surface, points))
+    contact = points - field_at(field, points)[:, None] * normal
+    return TipCarriers(shell, normal, *closest_weights(surface, contact))
+
+
+def field_at(field: TipField, points: np.ndarray) -> np.ndarray:
+    """phi at points of its grid, shape (n,) [m]."""
+    value = np.empty(len(points))
+    evaluate_all(
+        field.distance, field.origin, field.spacing[0], points, value, np.empty_like(points)
+    )
+    return value
 
 
 def make_tip_response(
