@@ -13,7 +13,6 @@ from avatar_core.certify.large_deformation import certify_large, with_combinatio
 from avatar_core.certify.linear import certify, mesh_error
 from avatar_core.certify.parametric import certify_range
 from avatar_core.common.processes import cpu_seconds, repeatable
-from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.contact.timing import timed
 from avatar_core.errors import AvatarError, ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
@@ -40,7 +39,7 @@ from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.display import Display, boundary, display_of, outline, structure
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
-from avatar_core.vademecum.tip_field import with_tumour
+from avatar_core.vademecum.tip_field import make_tip_field, with_tumour
 
 COMBINED_SITES = 2  # at which large pushes are certified together with other effects
 _RECORDED = ("avatar", "numpy", "scipy", "scikit-fem", "libigl", "pytetwild", "rslab", "h5py")
@@ -170,7 +169,7 @@ def build(
     elasticity = _elasticity(mesh, regions, supports, options)
     loads = load_surface(mesh, regions, options.patch_radius)
     common = (surface.name, elasticity, regions, loads)
-    tip_field = make_felt_field(mesh, regions, loads.patch_radius, surface)
+    tip_field = make_tip_field(mesh, regions, loads.patch_radius, surface)
 
     def count(done: int) -> None:
         progress("certify", done / options.n_certified, NO_ERROR)

@@ -19,7 +19,6 @@ from numba.core.dispatcher import Dispatcher
 from avatar_core import pipeline
 from avatar_core.atlas import patient
 from avatar_core.contact import layout
-from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry import mesh
 from avatar_core.geometry.phantom import phantom_liver
@@ -66,13 +65,12 @@ def made_once() -> Iterator[None]:
     Models of an organ get copies of their own of its response and of the modes of its cloud.
     """
     rooms = ("common", "geometry", "fem", "reduction", "shapes", "vademecum", "contact")
-    felt = on_disk(make_felt_field, rooms=rooms)
+    felt = on_disk(make_tip_field, rooms=rooms)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Dispatcher, "compile", compiled_once(Dispatcher.compile))
         patch.setattr(mesh, "_fill", in_memory(on_disk(mesh._fill, _of_surface), _of_surface))
         for builder in (pipeline, patient):
-            patch.setattr(builder, "make_felt_field", felt)
-        patch.setattr(patient, "make_tip_field", on_disk(make_tip_field, rooms=rooms))
+            patch.setattr(builder, "make_tip_field", felt)
         for name, told in (
             ("tip_carriers", of_all),
             ("make_tip_response", of_all),

@@ -29,7 +29,6 @@ from avatar_core.atlas.transfer import (
 )
 from avatar_core.certify.linear import certify
 from avatar_core.common.processes import cpu_seconds, repeatable
-from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.doubts import doubts_of
 from avatar_core.geometry.mesh import tetrahedralize
@@ -340,7 +339,7 @@ def vademecum_of_reduced(
         options.tolerance,
         rank_errors=tuple(RankError(e.rank, e.mean, e.worst) for e in found.history),
     )
-    field_ = make_felt_field(*surroundings(problem))
+    field_ = make_tip_field(*surroundings(problem))
     return assembled(problem, found.response, found.support, convergence, options.rule, field_)
 
 
@@ -353,7 +352,7 @@ def solved(
         problem.elasticity,
         problem.regions,
         problem.loads,
-        make_felt_field(*surroundings(problem)),
+        make_tip_field(*surroundings(problem)),
         options.rule,
         provenance(problem),
         lambda stage, fraction, error: progress(f"response: {stage}", fraction, error),

@@ -23,6 +23,7 @@ from avatar_core.contact.effects.tip_law import law_error
 from avatar_core.contact.model import ContactModel, Status, estimate_error, prepare, step
 from avatar_core.errors import ContactError, ConvergenceError, MeshError
 from avatar_core.fem.norms import relative_l2
+from avatar_core.geometry.heights import tangents
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, ResolvedPlace, contacts_at
 from avatar_core.offline.rule import NO_ERROR, Progress, silent
@@ -38,7 +39,11 @@ DRAWN = 60  # places among which the sharpest and the most hollow one are found
 FITS = 1e-3  # overlap of a tip and the hollow around the place, above which it is left out [m]
 OPEN = 0.99  # access at the largest depth, below which the force fades
 FAR = 15e-3  # distance from the place beyond which displacements are compared [m]
+ASIDE = 4e-3  # of a place, where the surface's normals tell its curvature [m]
+THIN = 25e-3  # thickness of an organ at its edges [m]
 TINY = 1e-12  # [N]
+_MANY_DRAWN = 400  # places among which the thinnest ones are found
+_SKIN = 1e-4  # below a surface, from where the other side is looked for [m]
 LEAST_FACTOR = 0.5  # of the law's error: a few places by luck all well met prove no more
 
 
@@ -46,30 +51,30 @@ LEAST_FACTOR = 0.5  # of the law's error: a few places by luck all well met prov
 class Site:
     """A place on the organ's surface.
 
-    kind : "drawn", "ridge" or "hollow"
+    kind : "drawn", "ridge", "hollow" or "edge"
     point, normal : ndarray, shape (3,) [m], normal pointing out
-    kappa, anisotropy : local shape [1/m], [1/m^2]; see :mod:`avatar_core.geometry.local_profile`
+    kappa : mean curvature over ``ASIDE``, positive where convex [1/m]
     """
 
     kind: str
     point: np.ndarray
     normal: np.ndarray
     kappa: float
-    anisotropy: float
 
 
 @dataclass(frozen=True)
 class SiteContact:
-    """One contact: a sphere of a radius at a depth at a site; forces along that of the truth [N].
+    """One contact: a tip at a depth at a site; forces along that of the truth [N].
 
     truth : of the resolved contact; force : of the step; angle : between the two [rad]
     estimate : error of the force as it is said, of which law_estimate is the law's part
-    patch : of the vademecum's own patch; hertz : of a sphere on a flat half-space (Hertz 1882)
+    patch : of the vademecum's own patch; hertz : of a sphere on a flat half-space (Hertz 1882),
+    NaN of another tip
     far_l2 : relative L2 error of the displacement more than 15 mm away
     """
 
     site: Site
-    radius: float
+    tip: Tip
     depth: float
     truth: float
     force: float
@@ -194,6 +199,24 @@ def draw_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) ->
     return [*sites[: n - 2], replace(ridge, kind="ridge"), replace(hollow, kind="hollow")]
 
 
+def edge_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) -> list[Site]:
+    """At most ``n`` places where the organ is thin, below ``THIN``; the thinnest of those drawn."""
+    drawn = draw_contacts(vademecum, _MANY_DRAWN, seed)
+    sites = nearest_sites(vademecum, surface, drawn.place)
+    sites = [site for site in sites if _access(vademecum, site) > OPEN]
+    thick = np.array([_thickness(surface, site) for site in sites])
+    order = np.argsort(thick)[:n]
+    return [replace(sites[k], kind="edge") for k in order if thick[k] < THIN]
+
+
+def _thickness(surface: SurfaceMesh, site: Site) -> float:
+    """Of the organ along a site's normal [m]."""
+    faces = surface.faces.astype(np.int64)
+    start = site.point - _SKIN * site.normal
+    hits = igl.ray_mesh_intersect(start, -site.normal, surface.vertices, faces)
+    return _SKIN + min((distance for _, distance, *_ in hits), default=np.inf)
+
+
 def nearest_sites(vademecum: Vademecum, surface: SurfaceMesh, near: np.ndarray) -> list[Site]:
     """The places of the surface nearest to some points, shape (n, 3) [m]."""
     faces = surface.faces.astype(np.int64)
@@ -202,14 +225,17 @@ def nearest_sites(vademecum: Vademecum, surface: SurfaceMesh, near: np.ndarray) 
 
 
 def _site(vademecum: Vademecum, point: np.ndarray) -> Site:
-    field, slope = vademecum.tip_field, np.zeros(3)
+    field = vademecum.tip_field
 
-    def at(values: np.ndarray) -> float:
-        return float(evaluate(values, field.origin, field.spacing[0], point, slope, np.nan))
+    def normal_at(at: np.ndarray) -> np.ndarray:
+        slope = np.zeros(3)
+        evaluate(field.distance, field.origin, field.spacing[0], at, slope, np.nan)
+        return slope / max(float(np.linalg.norm(slope)), 1e-12)
 
-    kappa, anisotropy = at(field.curvature), at(field.anisotropy)
-    at(field.distance)
-    return Site("drawn", point, slope / np.linalg.norm(slope), kappa, anisotropy)
+    normal = normal_at(point)
+    across = np.stack([ASIDE * side[0] for side in tangents(normal[None])])
+    turns = [(normal_at(point + t) - normal_at(point - t)) @ t / ASIDE**2 for t in across]
+    return Site("drawn", point, normal, float(0.25 * sum(turns)))
 
 
 def _access(vademecum: Vademecum, site: Site) -> float:
@@ -282,7 +308,7 @@ def _at_site(
             out.append(
                 SiteContact(
                     site,
-                    tip.radius,
+                    tip,
                     depth,
                     float(truth.forces[i, k]),
                     float(force @ axis),
@@ -293,7 +319,9 @@ def _at_site(
                         * np.linalg.norm(models[i].out.force[0])
                     ),
                     float(pressed(patches[i], site, tip, depth) @ axis),
-                    float(hertz_force(vademecum.material, tip.radius, depth)),
+                    float(hertz_force(vademecum.material, tip.radius, depth))
+                    if tip.shape == "sphere"
+                    else np.nan,
                     float(relative_l2(shown[kept], moved[k].ravel()[kept], mass[kept])),
                 )
             )

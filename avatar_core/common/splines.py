@@ -134,28 +134,6 @@ def add_in_bricks(brick, values, cell, gradient):  # type: ignore[no-untyped-def
 
 
 @fast
-def add_second_derivatives(brick, values, cell, spacing, hessian):  # type: ignore[no-untyped-def]
-    """Second derivatives [1/m^2] of a field in bricks, added to (3, 3)."""
-    (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
-    end = 1.0 / (spacing * spacing)
-    curve = (end, -2.0 * end, end)
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                v = _in_brick(brick, values, nx + i, ny + j, nz + k)
-                hessian[0, 0] += curve[i] * wy[j] * wz[k] * v
-                hessian[1, 1] += wx[i] * curve[j] * wz[k] * v
-                hessian[2, 2] += wx[i] * wy[j] * curve[k] * v
-                for a, c, slope in (
-                    (0, 1, dx[i] * dy[j] * wz[k] * v),
-                    (0, 2, dx[i] * wy[j] * dz[k] * v),
-                    (1, 2, wx[i] * dy[j] * dz[k] * v),
-                ):
-                    hessian[a, c] += slope
-                    hessian[c, a] += slope
-
-
-@fast
 def _in_brick(brick, values, i, j, k):  # type: ignore[no-untyped-def]
     """A sample of a field in bricks."""
     b = brick[i >> _SHIFT, j >> _SHIFT, k >> _SHIFT]

@@ -10,14 +10,18 @@ x being a point at rest, s the surface point under the tip and n the normal ther
 Dimensionality Reduction (Popov & Hess, 2015, Sec. 3.2) both normal displacements of the surface are
 
     u(rho) = 2 / pi  int_0^min(rho, a)  w(x) / sqrt(rho^2 - x^2) dx,
-    w_tip(x) = delta - g(x) - kappa x^2 - pi/8 tau x^3,                                  x < a,
+    w_tip(x) = delta - g(x),                                                             x < a,
     w_patch(x) = 16 / (5 pi) F / (E* R_p) (1 - x^2 / R_p^2)^(5/2),                       x < R_p.
 
-Where the tip touches, that is u_tip = delta - f(rho) - kappa rho^2 / 2 - tau rho^3 / 6: the surface
-lies on the tip. Beside it u_tip is a Gauss rule in theta, s = s_a sin(theta) being the parameter of
-the tip's table, which misses the integral by less than 0.1 % of delta; by 0.4 % at the very rim of
-a punch, and by up to 2 % in touches of some hundredths of a millimetre. Of the patch there is a
-table, scaled so that its mean under the patch's own pressure is c F, what the force law takes off.
+Where the tip touches a plane, that is u_tip = delta - f(rho). On any other surface a point that
+lies b below the plane through s, or above it with b < 0, is kept out of the tip,
+
+    u_tip = delta - f(rho) + max(0, -b),                                               rho < a.
+
+Beside it u_tip is a Gauss rule in theta, s = s_a sin(theta) being the parameter of the tip's table,
+which misses the integral by less than 0.1 % of delta; by 0.4 % at the very rim of a punch, and by
+up to 2 % in touches of some hundredths of a millimetre. Of the patch there is a table, scaled so
+that its mean under the patch's own pressure is c F, what the force law takes off.
 Far off both are F / (pi E* rho). What is left of their difference at two patch radii, 0.4 % of the
 dent for contacts of up to 10 mm and 9 % for 20 mm, fades by the factor h from 1.5 patch radii on,
 once continuously differentiable; farther off nothing is touched.
@@ -40,7 +44,7 @@ from numpy.polynomial.legendre import leggauss
 
 from avatar_core.common.jit import fast
 from avatar_core.contact.effects.tip_law import PATCH, dent
-from avatar_core.contact.effects.tip_profile import INTERVALS, KAPPA, TAKEN, TAU
+from avatar_core.contact.effects.tip_profile import INTERVALS, TAKEN
 from avatar_core.geometry.tip import Tip
 
 REACH = 2.0  # of the change around a tip, in patch radii
@@ -168,13 +172,7 @@ def _add_dent(  # type: ignore[no-untyped-def]
     # held in registers: what is read from an array is read again after every write to the field
     place, normal = (s[0], s[1], s[2]), (n[0], n[1], n[2])
     shares = (tip, patch * law.elastic[t] * law.value[t, TAKEN])
-    contact = (
-        a * a,
-        delta,
-        law.value[t, TAU] / 6.0,
-        0.5 * law.value[t, KAPPA],
-        1.0 / law.radius[t],
-    )
+    contact = (a * a, delta, 1.0 / law.radius[t])
     reach = (REACH * dents.patch_radius[0]) ** 2
     height = dents.height[t]
     j, square = _nearest_position(model, state, t)
@@ -209,7 +207,6 @@ def _lay_springs(law, dents, t, delta):  # type: ignore[no-untyped-def]
     """
     m0 = m1 = m2 = m3 = 0.0
     end = min(law.place[t], 1.0)
-    kappa, cubic = law.value[t, KAPPA], np.pi / 8.0 * law.value[t, TAU]
     for i in range(NODES):
         s = end * dents.node[0, i] * INTERVALS
         k = min(int(s), INTERVALS - 1)
@@ -217,7 +214,7 @@ def _lay_springs(law, dents, t, delta):  # type: ignore[no-untyped-def]
         x, g = p[0] + u * (q[0] - p[0]), p[2] + u * (q[2] - p[2])
         width = end * dents.node[1, i] * (p[1] + u * (q[1] - p[1]))
         square = x * x
-        spring = width * (delta - g - (kappa + cubic * x) * square)
+        spring = width * (delta - g)
         dents.square[i], dents.spring[i] = square, spring
         m0 += spring
         m1 += 0.5 * spring * square
@@ -233,7 +230,7 @@ def _move(  # type: ignore[no-untyped-def]
     """Change the displacement of one point, if it is near enough.
 
     reach : (2 R_p)^2 [m^2]; shares : 1 or 0, of the tip's dent, and c F or 0 [m]; contact : a^2,
-    delta, tau / 6, kappa / 2, 1 / radius; far : sums of the series
+    delta, 1 / radius; far : sums of the series
     """
     at = rest[v]
     x, y, z = at[0] - place[0], at[1] - place[1], at[2] - place[2]
@@ -242,7 +239,8 @@ def _move(  # type: ignore[no-untyped-def]
         return
     part = square / reach
     if square < contact[0]:
-        tip = _inside(contact, height, np.sqrt(square))
+        below = -(x * normal[0] + y * normal[1] + z * normal[2])
+        tip = _inside(contact, height, np.sqrt(square), below)
     elif square < _SERIES**2 * contact[0]:
         tip = _outside(dents, square)
     else:
@@ -255,10 +253,11 @@ def _move(  # type: ignore[no-untyped-def]
 
 
 @fast
-def _inside(contact, height, r):  # type: ignore[no-untyped-def]
-    """u_tip where the tip touches [m]."""
-    f = _in_table(height, 1.0 - np.sqrt(max(0.0, 1.0 - r * contact[4])))
-    return contact[1] - f - (contact[3] + contact[2] * r) * r * r
+def _inside(contact, height, rho, below):  # type: ignore[no-untyped-def]
+    """u_tip where the tip touches [m], at a distance; points inside the organ are not below."""
+    f = _in_table(height, 1.0 - np.sqrt(max(0.0, 1.0 - rho * contact[2])))
+    aside = np.sqrt(max(0.0, rho * rho - below * below))
+    return contact[1] - f + max(0.0, min(aside, -below))
 
 
 @fast

@@ -3,9 +3,7 @@
 Each tool tip (a sphere of centre p and radius r; of other tips, p lies r above the lowest point)
 presses at the surface point below it, along the normal n = grad phi / |grad phi|. Its force deforms
 the organ as that of a patch would, but for the dent right under the tip, which
-:mod:`avatar_core.contact.effects.tip_law` adds. A sphere's distance is shifted by what the surface
-around it does to its contact (:mod:`avatar_core.contact.ball_shift`): phi is phi + psi from here
-on. Forces lambda of patches solve the Signorini
+:mod:`avatar_core.contact.effects.tip_law` adds. Forces lambda of patches solve the Signorini
 conditions
 
     gap_t = phi(p_t) - r_t,   gap_t + sum_t' C_tt' lambda_t' >= 0,   lambda >= 0,  complementary,
@@ -59,9 +57,9 @@ from avatar_core.contact.effects.tip_law import (
     advance_tips,
     law_error,
     predict_tips,
+    sample_organ,
     solve_tip,
 )
-from avatar_core.contact.effects.tip_surface import sample_surface
 from avatar_core.contact.effects.viscoelasticity import (
     advance_history,
     predict_history,
@@ -96,9 +94,6 @@ ModelArrays = namedtuple(
         "access",
         "origin",
         "spacing",
-        "brick",
-        "shift",
-        "shift_spacing",
         "row",
         "carrier",
         "carrier_weight",
@@ -132,8 +127,8 @@ State = namedtuple(
         "seen",  # (T, 3) last valid position of the tip in contact [m]
         "force",  # (T,) lambda
         "active",  # (T,) the tip is closer than its radius to a surface that it may touch
-        "gap",  # (T,) phi + psi - r
-        "slope",  # (T, 3) grad (phi + psi)
+        "gap",  # (T,) phi - r
+        "slope",  # (T, 3) grad phi
         "steepness",  # (T,) its length
         "normal",  # (T, 3) n
         "access",  # (T,) chi
@@ -259,7 +254,7 @@ def _locate_tips(model, state, out, tips, effects):  # type: ignore[no-untyped-d
         else:
             near = near_gram(model, state, t)
         assemble_own(model, state, t, near)
-        sample_surface(model, tip_law, t, tips[t])
+        sample_organ(model, tip_law, t, tips[t])
         sample_coefficients(model, state, tip_law, large_deformation, t, tips[t])
         gather_friction(model, state, friction, t)
     return status

@@ -31,8 +31,8 @@ from avatar_core.contact.effects.selection import (
 )
 from avatar_core.contact.effects.several_tools import SeveralTools
 from avatar_core.contact.effects.tilt import Tilt, tilt_arrays
-from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, UNSHIFTED, tip_law_arrays
-from avatar_core.contact.effects.tip_profile import ANISOTROPY, KAPPA, STIFFNESS, TAKEN, TAU
+from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, tip_law_arrays
+from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
 from avatar_core.contact.kernels import ModelArrays
 from avatar_core.contact.locate import MAX_DEPTH
 from avatar_core.contact.tip_response import (
@@ -49,9 +49,9 @@ from avatar_core.vademecum.accuracy import Cloud, Detail
 from avatar_core.vademecum.certificate import Certificate
 
 if TYPE_CHECKING:
+    from avatar_core.contact.effects.tip_law import ShapeFactor
     from avatar_core.vademecum.large_deformation import LargeDeformation
     from avatar_core.vademecum.model import Vademecum
-    from avatar_core.vademecum.tip_field import BallShift
 
 LANES = 32  # float32 numbers that a vectorised loop processes at once
 PERIOD = 1e-3  # of the steps [s]
@@ -62,8 +62,7 @@ class Layout:
     """The constant arrays of a step: of the organ and its tools, and of the chosen effects.
 
     arrays : ModelArrays
-        distance, access, origin, spacing: the tip field; brick, shift (n_tools, n_bricks, BRICK,
-        BRICK, BRICK), shift_spacing: psi of each tip; row, carrier, carrier_weight,
+        distance, access, origin, spacing: the tip field; row, carrier, carrier_weight,
         self_compliance: the tip response on its grid; force_error, relative, on the same grid;
         position (n_positions, 3) [m]; load (n_positions, 3, rank and zeros) and the contact_*
         blocks with their hash tables: compliance [m/N]; softness (1,), added where access fades
@@ -112,12 +111,12 @@ class _Shape:
 
     carriers: TipCarriers
     reach: float  # longest distance between the two positions of a block [m]
-    shift: BallShift  # of each tip
+    factor: ShapeFactor  # of each tip
 
     @classmethod
     def of(cls, vademecum: Vademecum, tips: Sequence[Tip]) -> _Shape:
         # Here, because the contact node needs none of it.
-        from avatar_core.contact.ball_shift import shifts_of
+        from avatar_core.contact.kept_factors import factors_of
 
         surface, field = vademecum.surface, vademecum.tip_field
         height = max(tip.offset for tip in tips)
@@ -125,7 +124,7 @@ class _Shape:
         return cls(
             tip_carriers(surface, field, MAX_DEPTH, height),
             float(far) * (1.0 + 1e-9),
-            shifts_of(field, tips),
+            factors_of(field, tips),
         )
 
 
@@ -186,7 +185,8 @@ def lay_out_details(
         tips,
         vademecum.material,
         _local(vademecum, response.self_compliance),
-        _error_factors(vademecum, tips),
+        shape.factor,
+        (vademecum.certificate or Certificate.unknown()).contact_sites.factor,
         large is not None and large.material == "neo-hookean",
     )
     clouds: dict[Cloud, CloudArrays] = {}
@@ -204,9 +204,6 @@ def lay_out_details(
             access=field.access,
             origin=field.origin,
             spacing=field.spacing,
-            brick=shape.shift.brick,
-            shift=shape.shift.value,
-            shift_spacing=shape.shift.spacing,
             row=response.row,
             carrier=response.carrier,
             carrier_weight=response.carrier_weight,
@@ -257,15 +254,14 @@ def lay_out_materials(
 
 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
-    """kappa, tau, D, E* and c on the grid of the tip field, shape (5, nx, ny, nz) float32.
+    """E* and c on the grid of the tip field, shape (2, nx, ny, nz) float32.
 
     Over a tumour of contrast q that stores the fraction f of the energy under a tip, E* is that of
     the organ over 1 - f + f / q.
     """
     stiffness = vademecum.material.plane_strain_modulus
     radius = vademecum.surface.patch_radius
-    field, local = vademecum.tip_field, np.zeros((5, *self_compliance.shape), np.float32)
-    local[KAPPA], local[TAU], local[ANISOTROPY] = field.curvature, field.growth, field.anisotropy
+    field, local = vademecum.tip_field, np.zeros((2, *self_compliance.shape), np.float32)
     local[STIFFNESS] = stiffness
     if field.tumour is not None and vademecum.contrast is not None:
         local[STIFFNESS] /= 1.0 - field.tumour + field.tumour / vademecum.contrast
@@ -280,13 +276,6 @@ def _nonlinear_arrays(
     values = np.vstack([large.depth, large.reach])
     grid = sampled_at_tip(vademecum.surface, vademecum.tip_field, response, values)
     return LargeDeformationArrays(grid, np.ascontiguousarray(large.terms.load), start)
-
-
-def _error_factors(vademecum: Vademecum, tips: Sequence[Tip]) -> np.ndarray:
-    """On the law's error of each tip: the organ's own, and what it is worth without a shift."""
-    organ = (vademecum.certificate or Certificate.unknown()).contact_sites.factor
-    shifted = [vademecum.tip_field.shift is not None and tip.shape == "sphere" for tip in tips]
-    return organ * np.where(shifted, 1.0, UNSHIFTED)
 
 
 def force_error_grid(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from avatar_core.common.jit import inlined
-from avatar_core.common.splines import add_in_bricks, cell_at, in_cell, on_grid
+from avatar_core.common.splines import cell_at, in_cell, on_grid
 from avatar_core.contact.effects.tip_law import edge_below
 from avatar_core.contact.status import Status
 from avatar_core.contact.tip_response import gather
@@ -42,10 +42,7 @@ def locate(model, state, t, tip, superposition, tip_law):  # type: ignore[no-unt
         return OK
     cell = cell_at(model.origin, model.spacing[0], tip)
     phi = in_cell(model.distance, cell, state.slope[t])
-    state.gap[t] = phi - model.tip_offset[t]
-    fine = cell_at(model.origin, model.shift_spacing[0], tip)
-    state.gap[t] += add_in_bricks(model.brick, model.shift[t], fine, state.slope[t])
-    state.gap[t] -= edge_below(tip_law, t, cell)
+    state.gap[t] = phi - model.tip_offset[t] - edge_below(tip_law, t, cell)
     if state.gap[t] >= 0.0:
         return OK
     access = in_cell(model.access, cell, state.access_slope[t])
@@ -83,7 +80,7 @@ def _is_continuous(state, t, tip):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_normal(state, t, p, phi):  # type: ignore[no-untyped-def]
-    """n = g / |g| with g = grad (phi + psi), and s = p - phi n."""
+    """n = g / |g| with g = grad phi, and s = p - phi n."""
     g = state.slope[t]
     state.steepness[t] = max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
     for d in range(3):

@@ -26,7 +26,7 @@ from collections import namedtuple
 import numpy as np
 
 from avatar_core.common.jit import fast
-from avatar_core.common.splines import add_second_derivatives, cell_at, second_derivatives
+from avatar_core.common.splines import cell_at, second_derivatives
 from avatar_core.contact.effects.friction import (
     add_modal_load,
     add_near_friction,
@@ -190,13 +190,10 @@ def write_superposed_force(model, state, out, tip, effects, t):  # type: ignore[
 
 @fast
 def _normal_gradient(model, state, superposition, t, p):  # type: ignore[no-untyped-def]
-    """dn/dp = (I - n n^T) grad g / |g|, g = grad (phi + psi)."""
+    """dn/dp = (I - n n^T) grad g / |g|, g = grad phi."""
     n, hessian = state.normal[t], superposition.hessian
     cell = cell_at(model.origin, model.spacing[0], p)
     second_derivatives(model.distance, cell, model.spacing[0], hessian)
-    spacing = model.shift_spacing[0]
-    fine = cell_at(model.origin, spacing, p)
-    add_second_derivatives(model.brick, model.shift[t], fine, spacing, hessian)
     for d in range(3):
         along = n[0] * hessian[0, d] + n[1] * hessian[1, d] + n[2] * hessian[2, d]
         for i in range(3):

@@ -1,14 +1,15 @@
-"""A ball pressed on an elastic half-space whose surface is not plane: boundary elements on rings.
+"""A tip pressed on an elastic half-space whose surface is not plane: boundary elements on rings.
 
-The surface lies H(r, theta) below the plane across the ball's axis, and the ball's lowest point d
-below that plane. With a pressure p >= 0 that is constant on each sector of a few rings,
+The surface lies H(r, theta) below the plane across the tip's axis, and the tip's lowest point d
+below that plane; the tip's own height above it is f(r). With a pressure p >= 0 that is constant on
+each sector of a few rings,
 
     u + H + f - d >= 0,   p >= 0,   p (u + H + f - d) = 0,      u = 1 / (pi E*) int p / |x - x'| dA
 
-(Boussinesq; Johnson, Contact Mechanics, 1985, Sec. 3.2), f(r) = R - sqrt(R^2 - r^2). Such p
-minimises p A p / 2 + b p over p >= 0, which accelerated projected gradients find (Beck & Teboulle,
-SIAM J. Imaging Sci. 2:183, 2009, restarted after O'Donoghue & Candes, 2015). The heights are small
-and smooth at the scale of the contact; it is a half-space all the same.
+(Boussinesq; Johnson, Contact Mechanics, 1985, Sec. 3.2). Such p minimises p A p / 2 + b p over
+p >= 0, which accelerated projected gradients find (Beck & Teboulle, SIAM J. Imaging Sci. 2:183,
+2009, restarted after O'Donoghue & Candes, 2015). The heights are small and smooth at the scale of
+the contact; it is a half-space all the same.
 
 A plane surface is met within 1 % of Sneddon's exact sphere.
 """
@@ -40,23 +41,18 @@ def sector_angles() -> np.ndarray:
     return 2.0 * np.pi * np.arange(SECTORS) / SECTORS
 
 
-def loads_on_heights(
-    radius: float, depth: np.ndarray, window: np.ndarray, height: np.ndarray
-) -> np.ndarray:
-    """F / E* on balls, shape (n,) [m^2].
+def loads_on_heights(under: np.ndarray, window: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """F / E* on tips, shape (n,) [m^2].
 
     Parameters
     ----------
-    radius : R of the balls [m]
-    depth : ndarray, shape (n,), d [m]
-    window : ndarray, shape (n,), outer radius of the rings, below R [m]: the ball touches inside
+    under : ndarray, shape (n, RINGS), f - d at the middles of the rings [m]
+    window : ndarray, shape (n,), outer radius of the rings [m]: the tip touches inside
     height : ndarray, shape (n, RINGS, SECTORS), H at the middles of the sectors [m]
     """
-    rise = window[:, None] * ring_radii()
-    gap = radius - np.sqrt(radius**2 - rise**2) - depth[:, None]
-    gap = (gap[:, :, None] + height).reshape(len(depth), RINGS * SECTORS) / window[:, None]
+    gap = (under[:, :, None] + height).reshape(len(under), RINGS * SECTORS) / window[:, None]
     step, weight, largest = _problem()
-    load = np.empty(len(depth))
+    load = np.empty(len(under))
     _solve((gap * (weight / largest)).astype(np.float32), step, weight, load)
     return load * window**2
 

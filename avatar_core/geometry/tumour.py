@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from avatar_core.errors import SurfaceError
-from avatar_core.geometry.local_profile import tangents
+from avatar_core.geometry.heights import tangents
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import LoadSurface, load_surface
 from avatar_core.geometry.mesh import Regions, regions_by_rule, tetrahedralize
@@ -15,7 +14,7 @@ from avatar_core.offline.parametric import build_parametric_vademecum
 from avatar_core.offline.rule import BuildRule, Progress
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.model import Provenance, Vademecum
-from avatar_core.vademecum.tip_field import TipField
+from avatar_core.vademecum.tip_field import TipField, make_tip_field
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,7 @@ class Organ:
     def tip_field(self) -> TipField:
         """Where tips touch it."""
         mesh, radius = self.elasticity.mesh, self.loads.patch_radius
-        return make_felt_field(mesh, self.regions, radius, self.outline)
+        return make_tip_field(mesh, self.regions, radius, self.outline)
 
     @property
     def provenance(self) -> Provenance:

@@ -157,33 +157,29 @@ def _pressed(
     law = _law(tip)
     if law is None:
         return np.asarray(DEPTHS / gamma[:, None])
-    curvature, growth, anisotropy, tumour = _under(vademecum, tip)
     stiffness = np.full(len(gamma), material.plane_strain_modulus)
     if contrast is not None:
+        tumour = _tumour_under(vademecum, tip)
         stiffness /= 1.0 - tumour + tumour / contrast
     taken = np.minimum(PATCH_ON_MESH / (stiffness * vademecum.surface.patch_radius), gamma)
     softness, load = stiffness * (gamma - taken), np.empty((len(DEPTHS), len(gamma)))
     for depth, found in zip(DEPTHS, load, strict=True):
         at = np.full(len(gamma), depth)
-        loads_at_depths(law, curvature, growth, anisotropy, softness, at, found)
+        loads_at_depths(law, softness, at, found)
     return np.asarray((stiffness * load).T)
 
 
 def _law(tip: Tip) -> TipLawState | None:
     """The law of an upright tip; None of a patch."""
-    arrays = tip_law_arrays((tip,), Material(), np.zeros((5, 0, 0, 0)))
+    arrays = tip_law_arrays((tip,), Material(), np.zeros((2, 0, 0, 0)))
     return None if arrays is None else tip_law_state(arrays, 0)
 
 
-def _under(vademecum: Vademecum, tip: Tip) -> FloatArray:
-    """kappa, tau, D and f where a tip touches each load position, (4, n_positions)."""
+def _tumour_under(vademecum: Vademecum, tip: Tip) -> FloatArray:
+    """f where a tip touches each load position, (n_positions,)."""
     field, surface = vademecum.tip_field, vademecum.surface
     at = surface.centers + tip.offset * surface.normals
     grid = ((at - field.origin) / field.spacing[0]).T
-    found = np.zeros((4, len(at)))
-    for row, values in zip(
-        found, (field.curvature, field.growth, field.anisotropy, field.tumour), strict=True
-    ):
-        if values is not None:
-            row[:] = map_coordinates(values, grid, order=2, prefilter=False, mode="nearest")
-    return found
+    if field.tumour is None:
+        return np.zeros(len(at))
+    return map_coordinates(field.tumour, grid, order=2, prefilter=False, mode="nearest")

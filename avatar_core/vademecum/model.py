@@ -107,7 +107,7 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "4.0"
+SCHEMA_VERSION = "5.0"
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from collections.abc import Container, Mapping
 import numpy as np
 
 from avatar_core.common.array_shapes import Shapes, require_indices, require_shapes
-from avatar_core.common.splines import BRICK
 from avatar_core.errors import StorageError
 from avatar_core.geometry.mesh import TetMesh
 
@@ -17,7 +16,6 @@ Arrays = Mapping[str, np.ndarray]
 LARGEST_LENGTH = 10.0  # of any coordinate or distance of an organ [m]
 _SPACINGS = (1e-4, 0.1)  # of the tip field [m]
 _PATCH_RADII = (1e-4, 0.1)  # [m]
-FINEST = 4.0  # spacings of the shift of balls in one of the tip field
 
 # Keys are attribute paths of a Vademecum; see array_shapes for the notation.
 _LINEAR: Shapes = {
@@ -44,9 +42,6 @@ _LINEAR: Shapes = {
     "tip_field/access": "f: nx ny nz",
     "tip_field/origin": "f: 3",
     "tip_field/spacing": "f: 1",
-    "tip_field/curvature": "f: nx ny nz",
-    "tip_field/growth": "f: nx ny nz",
-    "tip_field/anisotropy": "f: nx ny nz",
 }
 _PARAMETRIC: Shapes = {
     "parametric/basis/space": "f: 3*vertices basis",
@@ -65,11 +60,9 @@ _PARAMETRIC_BODY: Shapes = {
     "parametric/body/weight": "f: basis 3",
 }
 _TUMOUR: Shapes = {"tip_field/tumour": "f: nx ny nz"}
-_SHIFT: Shapes = {
-    "tip_field/shift/brick": "i: bx by bz",
-    "tip_field/shift/value": f"f: balls bricks {BRICK} {BRICK} {BRICK}",
-    "tip_field/shift/spacing": "f: 1",
-    "tip_field/shift/radius": "f: balls",
+_OUTLINE: Shapes = {
+    "tip_field/outline/vertices": "f: outlined 3",
+    "tip_field/outline/faces": "i: outline_faces 3",
 }
 _LARGE: Shapes = {
     "large/terms/region": "i: positions",
@@ -92,12 +85,12 @@ PARAMETRIC_KEYS = tuple(_PARAMETRIC)
 PARAMETRIC_BODY_KEYS = tuple(_PARAMETRIC_BODY)
 LARGE_KEYS = tuple(_LARGE)
 TUMOUR_KEYS = tuple(_TUMOUR)
-SHIFT_KEYS = tuple(_SHIFT)
+OUTLINE_KEYS = tuple(_OUTLINE)
 DISPLAY_KEYS = tuple(_DISPLAY)
 SUPPORT_KEYS = tuple(_SUPPORTS)
 
 # Each is present or absent as a whole; its first key decides.
-_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE, _TUMOUR, _SHIFT, _DISPLAY, _SUPPORTS)
+_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE, _TUMOUR, _OUTLINE, _DISPLAY, _SUPPORTS)
 
 
 def shapes_of(held: Container[str]) -> dict[str, str]:
@@ -209,23 +202,10 @@ def _require_tip_field(arrays: Arrays) -> None:
     _require_range("tip_field/spacing", float(arrays["tip_field/spacing"][0]), _SPACINGS)
     if min(arrays["tip_field/distance"].shape) < 3:
         raise StorageError("'tip_field' has fewer than 3 samples along an axis; build it again")
-    if SHIFT_KEYS[0] in arrays:
-        _require_shift(arrays)
-
-
-def _require_shift(arrays: Arrays) -> None:
-    """Bricks over the whole tip field, of numbers that exist, and balls of rising radii."""
-    brick, value, spacing, radius = (arrays[key] for key in SHIFT_KEYS)
-    coarse = float(arrays["tip_field/spacing"][0])
-    _require_range("tip_field/shift/spacing", float(spacing[0]), (coarse / FINEST, coarse))
-    _require_lengths(arrays, "tip_field/shift/value")
-    require_indices("tip_field/shift/brick", brick + 1, value.shape[1] + 1)
-    needed = (np.array(arrays["tip_field/distance"].shape) - 1) * coarse / spacing[0] + 2.0
-    covered = BRICK * np.array(brick.shape)
-    if (covered < needed).any() or (covered > needed + 2 * BRICK).any():
-        raise StorageError("'tip_field/shift/brick' does not cover the tip field; build it again")
-    if not (len(radius) and radius[0] > 0.0 and (np.diff(radius) > 0.0).all()):
-        raise StorageError("'tip_field/shift/radius' does not rise from above 0; build it again")
+    if OUTLINE_KEYS[0] in arrays:
+        vertices, faces = (arrays[key] for key in OUTLINE_KEYS)
+        _require_lengths(arrays, OUTLINE_KEYS[0])
+        require_indices(OUTLINE_KEYS[1], faces, len(vertices))
 
 
 def _require_lengths(arrays: Arrays, key: str) -> None:

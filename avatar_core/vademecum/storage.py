@@ -1,6 +1,6 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 4.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 5.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
 ``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve; those of the parts
@@ -16,9 +16,8 @@ below are null or empty without them. Datasets:
     contact_near/start, target, block [m/N]: of the symmetric blocks those whose target is their
     position or after it
     tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
-    tip_field/curvature [1/m], growth [1/m2], anisotropy [1/m2]; tip_field/tumour over a tumour
-    tip_field/shift/brick (bx, by, bz), value (n_radii, n_bricks, 8, 8, 8) [m], spacing [m], radius
-    (n_radii,) [m]
+    tip_field/tumour over a tumour
+    tip_field/outline/vertices (n, 3) [m], faces (m, 3)
 
 A vademecum with coordinates of the material has the JSON attributes ``coordinates``,
 ``contrast``, and
@@ -87,15 +86,15 @@ from avatar_core.vademecum.schema import (
     BODY_KEYS,
     DISPLAY_KEYS,
     LARGE_KEYS,
+    OUTLINE_KEYS,
     PARAMETRIC_BODY_KEYS,
     PARAMETRIC_KEYS,
-    SHIFT_KEYS,
     SUPPORT_KEYS,
     TUMOUR_KEYS,
     require_sound,
     shapes_of,
 )
-from avatar_core.vademecum.tip_field import BallShift, TipField
+from avatar_core.vademecum.tip_field import Outline, TipField
 
 FORMAT = "avatar vademecum"
 MAX_FILE_BYTES = 4 << 30
@@ -204,7 +203,7 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
     held = PARAMETRIC_KEYS[:1] * bool(v.parametric) + LARGE_KEYS[:1] * bool(v.large)
     held += BODY_KEYS[:1] * bool(v.body)
     held += TUMOUR_KEYS[:1] * (v.tip_field.tumour is not None)
-    held += SHIFT_KEYS[:1] * (v.tip_field.shift is not None)
+    held += OUTLINE_KEYS[:1] * (v.tip_field.outline is not None)
     held += DISPLAY_KEYS[:1] * bool(v.display)
     held += PARAMETRIC_BODY_KEYS[:1] * bool(v.parametric and v.parametric.body)
     for key in shapes_of(held):
@@ -312,9 +311,9 @@ def _regional(arrays: dict[str, np.ndarray], name: str) -> RegionalField:
 
 def _tip_field(arrays: dict[str, np.ndarray]) -> TipField:
     field = TipField(*(arrays.get(f"tip_field/{name}") for name in TipField._fields))
-    if SHIFT_KEYS[0] not in arrays:
+    if OUTLINE_KEYS[0] not in arrays:
         return field
-    return field._replace(shift=BallShift(*(arrays[key] for key in SHIFT_KEYS)))
+    return field._replace(outline=Outline(*(arrays[key] for key in OUTLINE_KEYS)))
 
 
 def _body(arrays: dict[str, np.ndarray], keys: tuple[str, ...]) -> BodyResponse | None:

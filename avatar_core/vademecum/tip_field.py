@@ -1,4 +1,4 @@
-"""The contact geometry of a tool tip: a smooth distance to the organ, its shape, and its access.
+"""The contact geometry of a tool tip: a smooth distance to the organ, and its access.
 
 phi(p) is the signed distance from p to the organ's outline, the surface that was read (negative
 inside); chi(p) is one where the closest point of the mesh is accessible and fades to zero beyond.
@@ -13,18 +13,16 @@ square of 0.02 to 0.04 mm, and 0.26 mm at worst, where a ball of 3 mm can follow
 it from either side and overlap it by less than 0.1 mm. Elsewhere it rounds edges over about two
 spacings, by up to 0.6 mm.
 
-kappa(p), tau(p) and D(p) say how the outline falls away around the closest point, across grad phi;
-see :mod:`avatar_core.geometry.local_profile`. Over a tumour, f(p) is the part of the energy under
-a tip that it stores; see :mod:`avatar_core.geometry.tumour`. All are sampled where a tip may need
-them, within ``MARGIN`` of the outline and near the accessible faces; elsewhere their mean stands
-in.
+Over a tumour, f(p) is the part of the energy under a tip that it stores; see
+:mod:`avatar_core.geometry.tumour`. It is sampled where a tip may need it, within ``MARGIN`` of the
+outline and near the accessible faces; elsewhere its mean stands in. The outline itself stands
+beside: psi of any tip is made of it (:mod:`avatar_core.contact.tip_shift`).
 """
 
 from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Callable
-from functools import partial
 
 import igl
 import numpy as np
@@ -37,9 +35,7 @@ from scipy.ndimage import (
     zoom,
 )
 
-from avatar_core.geometry.local_profile import LocalProfile, local_profile
 from avatar_core.geometry.mesh import Regions, TetMesh
-from avatar_core.geometry.offsets import Offsets, exact_offsets
 from avatar_core.geometry.skin import Skin, Soup
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tumour import strained_fraction
@@ -53,8 +49,7 @@ ROUND = 1.01  # depth over distance, up to which a side is round
 STEEPEST = 2.5  # depth over distance, at most: thin lobes
 MOST_STEPS = 12  # of the way, each by the distance that is left
 SMOOTHING = 0.5  # standard deviation of G, in spacings
-HALFWAY = 0.5  # of the way to the outline, where a tip reads the local profile
-SHARED = (1e-3, 0.1)  # closest points [m] and components of normals that share a profile
+SHARED = (1e-3, 0.1)  # closest points [m] and components of normals that share one f
 FADING = 0.5  # distance beyond the accessible surface over which access fades, in patch radii
 
 TUMOUR_SMOOTHING = 1.0  # standard deviation of the kernel for f, in spacings
@@ -62,39 +57,22 @@ TUMOUR_CONTACT = 4e-3  # radius of the contact for which f is sampled [m],
 TUMOUR_REACH = 2.0  # and patch radii within which energy counts: they fit resolved contacts of
 # spheres of 1.5 to 10 mm, 2 and 5 mm above a tumour, with the least error in the mean
 
-# distance [m], access, curvature [1/m], growth [1/m^2], anisotropy [1/m^2], tumour, each
-# (nx, ny, nz) float32: phi, chi, kappa, tau, D, f, the last None without a tumour; origin (3,) [m];
-# spacing (1,) [m]; shift, a BallShift, None without one
+# The surface that phi is the distance to: vertices (n, 3) float32 [m], faces (m, 3) int32.
+Outline = namedtuple("Outline", ["vertices", "faces"])
+
+# distance [m], access, tumour, each (nx, ny, nz) float32: phi, chi, f, None without a tumour;
+# origin (3,) [m]; spacing (1,) [m]; outline, None where no tip is shifted
 TipField = namedtuple(
     "TipField",
-    [
-        "distance",
-        "access",
-        "origin",
-        "spacing",
-        "curvature",
-        "growth",
-        "anisotropy",
-        "tumour",
-        "shift",
-    ],
+    ["distance", "access", "origin", "spacing", "tumour", "outline"],
     defaults=(None, None),
 )
 
-# psi of :mod:`avatar_core.contact.ball_shift` in bricks (:mod:`avatar_core.common.splines`) from
-# the same origin: brick (bx, by, bz) int32; value (n_radii, n_bricks, BRICK, BRICK, BRICK) float32
-# [m]; spacing (1,) [m]; radius (n_radii,) of the balls, rising [m]
-BallShift = namedtuple("BallShift", ["brick", "value", "spacing", "radius"])
-
 
 def make_tip_field(
-    mesh: TetMesh,
-    regions: Regions,
-    patch_radius: float,
-    outline: SurfaceMesh | None = None,
-    offsets: Offsets | None = None,
+    mesh: TetMesh, regions: Regions, patch_radius: float, outline: SurfaceMesh | None = None
 ) -> TipField:
-    """Sample phi, chi and the local profile around the accessible surface.
+    """Sample phi and chi around the accessible surface.
 
     Inside the organ, the distance is taken to the outline within the fading distance of the
     accessible faces, so that a push into a thin lobe does not come out at its back.
@@ -104,7 +82,6 @@ def make_tip_field(
     mesh, regions : the organ
     patch_radius : R [m]
     outline : the surface of which the mesh was made; None for the mesh's own boundary
-    offsets : from that surface; None for exact ones
 
     Raises
     ------
@@ -124,14 +101,11 @@ def make_tip_field(
         return np.array([_distance(skin, near, points), _access(mesh, regions, fade, points)])
 
     distance, access = _sampled(sample, shape)
-    plain, distance = (
-        spline_filter(smoothed(values, SMOOTHING), order=2)
-        for values in (distance, _deepened(distance))
-    )
-    offsets = offsets or partial(exact_offsets, skin.boundary)
-    profile = _profile(offsets, near, plain, access, origin)
+    distance = spline_filter(smoothed(_deepened(distance), SMOOTHING), order=2)
     distance, access = distance.astype(np.float32), access.astype(np.float32)
-    return TipField(distance, access, origin, np.array([SPACING]), *profile)
+    spacing, boundary = np.array([SPACING]), skin.boundary
+    outline_ = Outline(boundary[0].astype(np.float32), boundary[1].astype(np.int32))
+    return TipField(distance, access, origin, spacing, outline=outline_)
 
 
 def with_tumour(field: TipField, tumour: SurfaceMesh, patch_radius: float) -> TipField:
@@ -192,32 +166,6 @@ def _deepened(distance: np.ndarray) -> np.ndarray:
     out = distance.copy()
     out[inside] = -(near + np.minimum(near / SPACING, 1.0) * more)
     return out
-
-
-def _profile(
-    offsets: Offsets, near: Soup, distance: np.ndarray, access: np.ndarray, origin: np.ndarray
-) -> LocalProfile:
-    """kappa, tau and D of the outline on the grid, around the closest points.
-
-    Points with nearly the same closest point and direction share their profile: there are
-    several along each normal. Each grid point gets what is found ``HALFWAY`` to the outline.
-    """
-    known, normals = _around(distance, access)
-    closest = _closest(near, origin + SPACING * np.argwhere(known))[2]
-    first, group = _shared(closest, normals)
-    some = local_profile(offsets, closest[first], normals[first])
-
-    halfway = np.argwhere(known).T - HALFWAY / SPACING * (distance[known][:, None] * normals).T
-
-    def on_grid(values: np.ndarray) -> np.ndarray:
-        grid = np.zeros(distance.shape)
-        grid[known] = values[group]
-        grid = smoothed(grid, SMOOTHING, known)
-        grid[known] = map_coordinates(grid, halfway, order=2, prefilter=False, mode="nearest")
-        return grid.astype(np.float32)
-
-    profile = LocalProfile(*(on_grid(values) for values in some))
-    return profile._replace(anisotropy=np.maximum(profile.anisotropy, 0.0))
 
 
 def _around(distance: np.ndarray, access: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 
-from avatar_core.contact.ball_shift import make_felt_field
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.patch_loads import load_surface, patch_loads
 from avatar_core.geometry.mesh import Regions, TetMesh
@@ -18,6 +17,7 @@ from avatar_core.geometry.refinement import Grading, refine
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.tip_field import make_tip_field
 from tests.core.conftest import box_mesh, box_regions
 from tests.helpers.disk_cache import cached_on_disk
 
@@ -59,7 +59,7 @@ def organ(body: Body) -> Vademecum:
         Elasticity(mesh, MATERIAL, regions.clamped),
         regions,
         load_surface(mesh, regions, PATCH_RADIUS),
-        make_felt_field(mesh, regions, PATCH_RADIUS),
+        make_tip_field(mesh, regions, PATCH_RADIUS),
         BuildRule(),
         Provenance(body, ""),
     )

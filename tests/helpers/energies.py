@@ -9,7 +9,7 @@ import numpy as np
 from avatar_core.contact.effects.inertia import InertiaState
 from avatar_core.contact.effects.large_dent import evaluate_large_dent
 from avatar_core.contact.effects.tilt import evaluate_tilt
-from avatar_core.contact.effects.tip_law import TipLawState, _moments
+from avatar_core.contact.effects.tip_law import TipLawState, _stored
 from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
 from avatar_core.contact.model import ContactModel
 
@@ -40,7 +40,7 @@ def stored_energy(model: ContactModel) -> float:
 
 def dent_energy(law: TipLawState, t: int) -> float:
     """E* (Phi + Psi) - c F^2 / 2 of a tip at rest [J]."""
-    _, _, stored = _moments(law, t)
+    stored = _stored(law, t)
     stiffness, taken = law.value[t, STIFFNESS], law.value[t, TAKEN]
     load = law.elastic[t] / stiffness
     stored += evaluate_large_dent(law, t, load)[2]

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from avatar_core.contact.ball_shift import no_shift
 from avatar_core.contact.cloud_kernels import BLOCK
 from avatar_core.contact.dent import dent_arrays
 from avatar_core.contact.effects.base import Effect
@@ -68,15 +67,11 @@ def flat_organ(
     )
     start, slot = hash_rows(blocks)
     gamma = float((load[0, 2] ** 2).sum()) + float(single(near))
-    shift = no_shift(spacing * max(shape), np.zeros(1))
     arrays = ModelArrays(
         distance=distance.astype(single),
         access=np.ones(shape, single),
         origin=origin,
         spacing=np.array([spacing]),
-        brick=shift.brick,
-        shift=shift.value,
-        shift_spacing=shift.spacing,
         row=np.zeros(shape, np.int32),
         carrier=np.zeros((1, 3), np.int32),
         carrier_weight=np.array([[1.0, 0.0, 0.0]], single),
@@ -100,7 +95,7 @@ def flat_organ(
         rest=np.pad(points, ((0, 0), (0, 3))).astype(single),
         tip_offset=np.array([tip.offset]),
     )
-    local = np.zeros((5, *shape), single)
+    local = np.zeros((2, *shape), single)
     local[STIFFNESS], local[TAKEN] = E_STAR, PATCH / (E_STAR * PATCH_RADIUS)
     law, large = tip_law_arrays((tip,), MATERIAL, local), None
     if neo_hookean is not None:
@@ -110,8 +105,7 @@ def flat_organ(
             np.zeros((3, *shape), single), np.zeros((1, 2, 0), single), np.zeros(2, np.int64)
         )
     dent = dent_arrays((tip,), points, arrays.position, PATCH_RADIUS) if law else None
-    flat = np.zeros_like(arrays.distance)
-    field = TipField(arrays.distance, arrays.access, origin, arrays.spacing, flat, flat, flat)
+    field = TipField(arrays.distance, arrays.access, origin, arrays.spacing)
     leaning = find(effects, Tilt)
     tilt = tilt_arrays(leaning, (tip,), field) if leaning else None
     constants = selected_arrays(None, effects, None, large, 0.1, period, law, dent, tilt)  # type: ignore[arg-type]

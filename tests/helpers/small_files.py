@@ -13,7 +13,6 @@ from scipy.spatial import ConvexHull
 
 from avatar_core.atlas.anatomy import Anatomy, Response
 from avatar_core.atlas.model import Atlas
-from avatar_core.common.splines import BRICK
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.level_set import GridBox
@@ -30,7 +29,7 @@ from avatar_core.vademecum.large_deformation import POWERS, LargeCertificate, La
 from avatar_core.vademecum.modal_mass import BodyResponse
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.parametric import ParametricResponse
-from avatar_core.vademecum.tip_field import BallShift, TipField
+from avatar_core.vademecum.tip_field import Outline, TipField
 
 RADIUS = 0.06  # [m]
 RANK = 3
@@ -161,14 +160,10 @@ def _tip_field() -> TipField:
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     distance = (np.sqrt(x**2 + y**2 + z**2) - RADIUS).astype(np.float32)
     spacing = axis[1] - axis[0]
-    brick = np.array([0, 1, 2, 3, -1, -1, -1, -1], np.int32).reshape(2, 2, 2)
-    value = 1e-4 * np.random.default_rng(1).normal(size=(2, 4, BRICK, BRICK, BRICK))
-    shift = BallShift(
-        brick, value.astype(np.float32), np.array([0.9 * spacing]), np.array([3e-3, 8e-3])
-    )
-    flat = np.zeros_like(distance)
+    vertices, faces = ball()
+    outline = Outline(vertices.astype(np.float32), faces.astype(np.int32))
     place = (np.full(3, axis[0]), np.array([spacing]))
-    return TipField(distance, np.ones_like(distance), *place, flat, flat, flat, shift=shift)
+    return TipField(distance, np.ones_like(distance), *place, outline=outline)
 
 
 def _parametric(rng: np.random.Generator, vademecum: Vademecum) -> ParametricResponse:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, get_args, get_type_h
 
 import numpy as np
 
+from avatar_core.common.splines import BRICK
 from avatar_core.contact.dent import DentArrays, dent_state
 from avatar_core.contact.display import DisplayArrays
 from avatar_core.contact.effects.base import Effect
@@ -220,15 +221,16 @@ def every_effect() -> Selection:
     """All effects at once, as small as they can be: the types of arrays that a step may read."""
     f4, grid = np.float32, (1, 1, 1)
     law = TipLawArrays(
-        profile=np.zeros((1, 1, 8)),
+        profile=np.zeros((1, 1, 6)),
         radius=np.ones(1),
-        bluntness=np.zeros(1),
-        least_kappa=np.zeros(1),
         mindlin=np.zeros(1),
         error_factor=np.zeros(1),
         modulus=np.zeros(1),
         large_dent=np.zeros((1, 6)),
-        local=np.zeros((5, *grid), f4),
+        local=np.zeros((2, *grid), f4),
+        brick=np.zeros(grid, np.int32),
+        factor=np.zeros((1, 1, BRICK, BRICK, BRICK), f4),
+        factor_spacing=np.ones(1),
     )
     constants = Constants(
         SeveralToolsArrays(np.zeros(1)),

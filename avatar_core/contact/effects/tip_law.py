@@ -6,31 +6,28 @@ the tip dents is put in its place. With F the normal force and d the depth of th
 
     d = delta(F) + F [gamma - c],      c = 0.7665 / (E* R_p),      E* = E / (1 - nu^2),
 
-gamma the organ's compliance for the patch and c at most gamma. A tip on a surface that falls off
-around it as kappa r^2 / 2 + tau r^3 / 6 (a mean over all directions) touches within a radius a
-where (Popov & Hess, Method of Dimensionality Reduction, 2015, Sec. 3.2; g in ``geometry.tip``)
+gamma the organ's compliance for the patch and c at most gamma. On a half-space every body of
+revolution touches within a radius a where (Sneddon, Int. J. Eng. Sci. 3:47, 1965; g in
+:mod:`avatar_core.geometry.tip`)
 
-    delta = g(a) + kappa a^2 + pi/8 tau a^3,      F = 2 E* int_0^a x delta'(x) dx.
+    delta = g(a),      F = 2 E* int_0^a x g'(x) dx,
 
-That is Sneddon's solution for every body of revolution on a half-space, and Hertz's for small a.
-On a ridge or a saddle, where the relative curvatures are b +- sqrt(D) with b = 1 / R + kappa +
-tau r / 3, a sphere touches over an ellipse. Hertz's force (Johnson, Contact Mechanics, 1985, Sec.
-4.2) is then that of the curvature b (1 - D / b^2)^(2/3) all around, within 1 % where one is up to
-seven times the other. kappa is lowered by the difference to b; r is the radius where
-:mod:`avatar_core.geometry.local_profile` finds D.
+and from its full radius on as a punch. What the surface around the tip does to its contact
+multiplies E*, here and in what follows, but for that in c, by its shape factor
+(:mod:`avatar_core.contact.shape_factor`).
 
 The dent stores the energy E* Phi, Phi = int_0^a (delta(a) - delta(x))^2 dx, and the force on the
-tip is the derivative of all energy: at constant F, with M_n = int_0^a x^n / n delta'(x) dx,
+tip is the derivative of all energy: at constant F
 
-    dF_tip = 2 E* M_3 grad kappa + pi/4 E* M_4 grad tau - Phi grad E* - F^2 / 2 grad c.
+    dF_tip = - Phi grad E* - F^2 / 2 grad c.
 
 Where the scene chooses large deformation, a sphere in a neo-Hookean organ sinks by eta deeper than
 delta, which may be negative (:mod:`avatar_core.contact.effects.large_dent`),
 
     eta(F) = R e(w),      w = (3 F / (4 E* R^2))^(2/3),      Psi = int_0^(F / E*) L d eta(L),
 
-w being Hertz's depth over R, e fitted to our own finite elements. It depends on the force alone,
-whatever kappa and tau are, and adds its Psi to Phi: the force stays the derivative of one energy.
+w being Hertz's depth over R, e fitted to our own finite elements. It depends on the force alone and
+adds its Psi to Phi: the force stays the derivative of one energy.
 
 c is the Hankel transform 48 J_3(x) / x^3 of the patch's profile (1 - r^2 / R_p^2)^2, squared and
 integrated over x, over pi E* R_p, less what the organ's elements are too wide to show of it. In
@@ -47,20 +44,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.common.jit import entry, fast, inlined
+from avatar_core.common.splines import BRICK, add_in_bricks, cell_at, in_cell
 from avatar_core.contact.effects.large_deformation import evaluate_added_depth
 from avatar_core.contact.effects.large_dent import LEAST, evaluate_large_dent, large_dent_of
 from avatar_core.contact.effects.tilt import TiltState, add_righting, evaluate_tilt, sample_tilt
-from avatar_core.contact.effects.tip_profile import (
-    ANISOTROPY,
-    INTERVALS,
-    KAPPA,
-    STIFFNESS,
-    TAKEN,
-    TAU,
-    least_kappa,
-    profile_of,
-)
-from avatar_core.contact.effects.tip_surface import felt_shape
+from avatar_core.contact.effects.tip_profile import INTERVALS, STIFFNESS, TAKEN, profile_of
 from avatar_core.errors import ContactError
 from avatar_core.geometry.tip import Tip
 
@@ -72,29 +60,35 @@ PATCH = 0.7665  # c E* R_p on a half-space,
 # 1 / (E* R_p) deeper on elements that resolve it, and between load positions it is 0.5 % too stiff.
 # 0.67 to 0.75 fit resolved contacts alike.
 PATCH_ON_MESH = 0.723
-# Of the force, beside what the gap's slope is off one: with the patch's error they cover 92 % of
-# 297 contacts resolved on LiTS-4, -60 and -70, and are 2.9 times the true error in the median.
-LAW_ERROR = 0.006
-# Times as much where no shift says what is around the tip: then they cover 92 % as well.
-UNSHIFTED = 2.5
+# Of the force, and per |log s|, beside what the gap's slope is off one: with the patch's error they
+# cover 97 % of 87 contacts of balls resolved on LiTS-4, and are 2.2 times the true error in the
+# median.
+LAW_ERROR, SHAPE_ERROR = 0.006, 0.1
 TUMOUR_ERROR = 0.25  # of the force, per relative change of E* by a tumour underneath
 LEAST_CONTACT = 0.02  # contact radius over the tip's, where the tangent of a light touch is taken
 MOST_TAKEN = 0.9  # part of a dent's least compliance, 1 / (2 E* radius), that may be taken off
 MAX_STEPS = 60  # of Newton's method, with bisection where it leaves its bracket
 TOLERANCE = 1e-13  # [m] of depth, or relative of the force
 
+_EVERYWHERE = 1e3  # larger than any organ [m]
+
+# log s of tips in bricks (:mod:`avatar_core.common.splines`) from the origin of the tip field:
+# brick (bx, by, bz) int32; value (n_tips, n_bricks, BRICK, BRICK, BRICK) float32; spacing (1,) [m]
+ShapeFactor = namedtuple("ShapeFactor", ["brick", "value", "spacing"])
+
 TipLawArrays = namedtuple(
     "TipLawArrays",
     [
-        "profile",  # (T, INTERVALS + 1, 8) a, da/ds, g, dg/ds, M_1, M_3, M_4, Phi over s in [0, 1]
+        "profile",  # (T, INTERVALS + 1, 6) a, da/ds, g, dg/ds, M, Phi over s in [0, 1]
         "radius",  # (T,) of the tip [m]
-        "bluntness",  # (T,) curvature of a sphere, 0 for a tip that is none [1/m]
-        "least_kappa",  # (T,) below which a concave surface is not followed [1/m]
         "mindlin",  # (1,) tangential over normal compliance of a dent, (2 - nu) / (2 (1 - nu))
-        "error_factor",  # (T,) on the law's error, of the organ and of what is known of it
+        "error_factor",  # (1,) on the law's error, of the organ
         "modulus",  # (1,) E* without a tumour [Pa]
         "large_dent",  # (T, 6) of :func:`large_dent_of`
-        "local",  # (5, nx, ny, nz) kappa [1/m], tau [1/m^2], D [1/m^2], E* [Pa], c [m/N] on a grid
+        "local",  # (2, nx, ny, nz) E* [Pa] and c [m/N] on a grid
+        "brick",  # the ShapeFactor
+        "factor",
+        "factor_spacing",
     ],
 )
 TipLawState = namedtuple(
@@ -102,15 +96,18 @@ TipLawState = namedtuple(
     [
         "profile",
         "radius",
-        "bluntness",
-        "least_kappa",
         "mindlin",
         "error_factor",
         "modulus",
         "large_dent",
         "local",
-        "value",  # (T, 5) kappa, tau, D, E*, c at the tip
-        "gradient",  # (T, 5, 3)
+        "brick",
+        "factor",
+        "factor_spacing",
+        "shape",  # (T,) log s at the tip,
+        "shape_gradient",  # (T, 3) and its gradient [1/m]
+        "value",  # (T, 2) s E*, c at the tip
+        "gradient",  # (T, 2, 3)
         "place",  # (T,) s of the contact; above 1 the tip has sunk in to its full radius
         "elastic",  # (T,) F, or the force on an elastic organ that is dented alike [N]
         "past",  # (n, T) of viscoelasticity [N]
@@ -121,18 +118,26 @@ TipLawState = namedtuple(
 )
 
 
+def of_planes(n_tips: int) -> ShapeFactor:
+    """Zero everywhere: one brick that is none."""
+    value = np.zeros((n_tips, 0, BRICK, BRICK, BRICK), np.float32)
+    return ShapeFactor(np.full((1, 1, 1), -1, np.int32), value, np.array([_EVERYWHERE]))
+
+
 def tip_law_arrays(
     tips: Sequence[Tip],
     material: Material,
     local: np.ndarray,
-    error_factor: np.ndarray | float = 1.0,
+    shape: ShapeFactor | None = None,
+    error_factor: float = 1.0,
     neo_hookean: bool = False,
 ) -> TipLawArrays | None:
     """Tables of the tips; None where all are patches.
 
     material : of the organ
-    local : ndarray float32, shape (5, nx, ny, nz), kappa, tau, D, E* and c
-    error_factor : of each tip, or of all
+    local : ndarray float32, shape (2, nx, ny, nz), E* and c
+    shape : of each tip; None for a plane
+    error_factor : on the law's error
     neo_hookean : whether the dents of spheres are those of large strain
 
     Raises
@@ -148,13 +153,12 @@ def tip_law_arrays(
     return TipLawArrays(
         np.stack([profile_of(tip) for tip in tips]),
         np.array([tip.radius for tip in tips]),
-        np.array([1.0 / tip.radius if tip.shape == "sphere" else 0.0 for tip in tips]),
-        np.array([least_kappa(tip) for tip in tips]),
         np.array([(2.0 - nu) / (2.0 * (1.0 - nu))]),
-        np.broadcast_to(error_factor, len(tips)).astype(float),
+        np.array([error_factor]),
         np.array([material.plane_strain_modulus]),
         np.stack([large_dent_of(tip, nu, neo_hookean) for tip in tips]),
         local,
+        *(shape or of_planes(len(tips))),
     )
 
 
@@ -164,15 +168,18 @@ def tip_law_state(arrays: TipLawArrays, n_terms: int, tilt: TiltState | None = N
     return TipLawState(
         profile=arrays.profile,
         radius=arrays.radius,
-        bluntness=arrays.bluntness,
-        least_kappa=arrays.least_kappa,
         mindlin=arrays.mindlin,
         error_factor=arrays.error_factor,
         modulus=arrays.modulus,
         large_dent=arrays.large_dent,
         local=arrays.local,
-        value=np.ones((n, 5)),
-        gradient=np.zeros((n, 5, 3)),
+        brick=arrays.brick,
+        factor=arrays.factor,
+        factor_spacing=arrays.factor_spacing,
+        shape=np.zeros(n),
+        shape_gradient=np.zeros((n, 3)),
+        value=np.ones((n, 2)),
+        gradient=np.zeros((n, 2, 3)),
         place=np.zeros(n),
         elastic=np.zeros(n),
         past=np.zeros((n_terms, n)),
@@ -180,6 +187,24 @@ def tip_law_state(arrays: TipLawArrays, n_terms: int, tilt: TiltState | None = N
         held=np.zeros(n),
         tilt=tilt,
     )
+
+
+@inlined
+def sample_organ(model, law, t, tip):  # type: ignore[no-untyped-def]
+    """s E* and c at a tip, with their gradients."""
+    if not law.on:
+        return
+    cell, slope = cell_at(model.origin, model.spacing[0], tip), law.shape_gradient[t]
+    for k in range(2):
+        law.value[t, k] = in_cell(law.local[k], cell, law.gradient[t, k])
+    fine = cell_at(model.origin, law.factor_spacing[0], tip)
+    slope[:] = 0.0
+    law.shape[t] = add_in_bricks(law.brick, law.factor[t], fine, slope)
+    factor = np.exp(law.shape[t])
+    law.value[t, STIFFNESS] *= factor
+    for d in range(3):
+        law.gradient[t, STIFFNESS, d] *= factor
+        law.gradient[t, STIFFNESS, d] += law.value[t, STIFFNESS] * slope[d]
 
 
 @inlined
@@ -217,15 +242,9 @@ def dent(law, t):  # type: ignore[no-untyped-def]
     w, p, q, u, wall = _at_place(law, t)
     a = _hermite(w, p[0], q[0], p[1], q[1])
     g = _hermite(w, p[2], q[2], p[3], q[3])
-    first = _hermite(w, p[4], q[4], p[0] * p[3], q[0] * q[3])
-    kappa, cubic = law.value[t, KAPPA], np.pi / 8.0 * law.value[t, TAU]
-    delta = g + (kappa + cubic * a) * a * a + wall
-    load = 2.0 * (first + (kappa / 1.5 + 0.75 * cubic * a) * a * a * a + a * wall)
-    if law.place[t] > 1.0:
-        return delta, law.radius[t], load, a
-    slope = (1.0 - u) * p[3] + u * q[3]
-    slope += (2.0 * kappa + 3.0 * cubic * a) * a * ((1.0 - u) * p[1] + u * q[1])
-    return delta, slope, load, a
+    load = 2.0 * (_hermite(w, p[4], q[4], p[0] * p[3], q[0] * q[3]) + a * wall)
+    slope = law.radius[t] if law.place[t] > 1.0 else (1.0 - u) * p[3] + u * q[3]
+    return g + wall, slope, load, a
 
 
 @fast
@@ -352,75 +371,47 @@ def add_tip_force(state, law, large_deformation, out, t):  # type: ignore[no-unt
     e = law.elastic[t]
     if e <= 0.0:
         return
-    third, fourth, stored = _moments(law, t)
+    stored = _stored(law, t)
     stiffness, gradient = law.value[t, STIFFNESS], law.gradient[t]
     if large_deformation.on:
         stored += evaluate_large_dent(law, t, e / stiffness)[2]
     stored += evaluate_tilt(law.tilt, t, e / stiffness)[2]
     relaxed = state.force[t] / e
     for d in range(3):
-        change = 2.0 * stiffness * third * gradient[KAPPA, d] - stored * gradient[STIFFNESS, d]
-        change += 0.25 * np.pi * stiffness * fourth * gradient[TAU, d]
-        out.force[t, d] += (change - 0.5 * e * e * gradient[TAKEN, d]) * relaxed
+        change = stored * gradient[STIFFNESS, d] + 0.5 * e * e * gradient[TAKEN, d]
+        out.force[t, d] -= change * relaxed
     add_righting(law.tilt, out, t, stiffness, e, relaxed)
 
 
 @inlined
 def law_error(law, steepness, t):  # type: ignore[no-untyped-def]
-    """Relative error of the force by the law alone, larger over tumours and where the gap grows
-    by another length than the tip moves: by as much, the force is not that of its load."""
-    more = TUMOUR_ERROR * abs(law.value[t, STIFFNESS] / law.modulus[0] - 1.0)
+    """Relative error of the force by the law alone, larger over tumours, where the surface is no
+    plane, and where the gap grows by another length than the tip moves: by as much, the force is
+    not that of its load."""
+    plain = law.value[t, STIFFNESS] * np.exp(-law.shape[t])
+    more = TUMOUR_ERROR * abs(plain / law.modulus[0] - 1.0) + SHAPE_ERROR * abs(law.shape[t])
     more += abs(steepness - 1.0)
-    return law.error_factor[t] * (LAW_ERROR + more)
+    return law.error_factor[0] * (LAW_ERROR + more)
 
 
 @fast
-def _moments(law, t):  # type: ignore[no-untyped-def]
-    """M_3 [m^4], M_4 [m^5] and Phi [m^3] at ``place``."""
+def _stored(law, t):  # type: ignore[no-untyped-def]
+    """Phi [m^3] at ``place``."""
     w, p, q, _, wall = _at_place(law, t)
     a = _hermite(w, p[0], q[0], p[1], q[1])
-    m1 = _hermite(w, p[4], q[4], p[0] * p[3], q[0] * q[3])
-    m3 = _hermite(w, p[5], q[5], p[0] ** 3 * p[3] / 3.0, q[0] ** 3 * q[3] / 3.0)
-    m4 = _hermite(w, p[6], q[6], 0.25 * p[0] ** 4 * p[3], 0.25 * q[0] ** 4 * q[3])
-    phi = _hermite(w, p[7], q[7], 2.0 * p[4] * p[3], 2.0 * q[4] * q[3])
-    # beside g, of the surface: k x^2 + c x^3
-    k, c = law.value[t, KAPPA], np.pi / 8.0 * law.value[t, TAU]
-    phi += 2.0 * (k * (a * a * m1 - m3) + c * (a**3 * m1 - m4))
-    phi += a**5 * (8.0 / 15.0 * k * k + (7.0 / 6.0 * k + 9.0 / 14.0 * c * a) * c * a)
-    load = 2.0 * (m1 + (k / 1.5 + 0.75 * c * a) * a**3)
-    m3 += a**5 * (2.0 / 15.0 * k + c * a / 6.0)
-    m4 += a**6 * (k / 12.0 + 3.0 / 28.0 * c * a)
-    return m3 + a**3 * wall / 3.0, m4 + 0.25 * a**4 * wall, phi + (load + a * wall) * wall
+    first = _hermite(w, p[4], q[4], p[0] * p[3], q[0] * q[3])
+    phi = _hermite(w, p[5], q[5], 2.0 * p[4] * p[3], 2.0 * q[4] * q[3])
+    return phi + (2.0 * first + a * wall) * wall
 
 
 @entry
-def depths_under_loads(law, curvature, growth, anisotropy, load, depth):  # type: ignore[no-untyped-def]
-    """delta of the first tip, on surfaces of these shapes, for F / E* [m^2]; all (n,), the last
-    is written."""
+def loads_at_depths(law, softness, depth, load):  # type: ignore[no-untyped-def]
+    """F / E* [m^2] of the first tip at depths [m], over an organ that gives way by ``softness``
+    F / E* beside the dent, E* (gamma - c) [1/m]; all (n,), the last is written."""
     for i in range(len(load)):
-        _stand_on(law, curvature[i], growth[i], anisotropy[i])
-        _find_place(None, law, None, 0, 0.0, 1.0, load[i])
-        depth[i] = dent(law, 0)[0]
-
-
-@entry
-def loads_at_depths(law, curvature, growth, anisotropy, softness, depth, load):  # type: ignore[no-untyped-def]
-    """F / E* [m^2] of the first tip at depths [m] below surfaces of these shapes, over an organ
-    that gives way by ``softness`` F / E* beside the dent, E* (gamma - c) [1/m]; all (n,), the last
-    is written."""
-    for i in range(len(load)):
-        _stand_on(law, curvature[i], growth[i], anisotropy[i])
+        law.place[0] = 0.0
         _find_place(None, law, None, 0, 1.0, softness[i], depth[i])
         load[i] = dent(law, 0)[2]
-
-
-@fast
-def _stand_on(law, curvature, growth, anisotropy):  # type: ignore[no-untyped-def]
-    """The first tip over a surface of a shape, not in contact yet."""
-    law.value[0, KAPPA], law.value[0, TAU] = curvature, growth
-    law.value[0, ANISOTROPY] = anisotropy
-    felt_shape(law, 0)
-    law.place[0] = 0.0
 
 
 @inlined

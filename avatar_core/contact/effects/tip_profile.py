@@ -2,7 +2,7 @@
 
 On a flat half-space, in the notation of :mod:`avatar_core.contact.effects.tip_law`,
 
-    M_n(a) = int_0^a x^n / n g'(x) dx,      Phi(a) = int_0^a (g(a) - g(x))^2 dx.
+    M(a) = int_0^a x g'(x) dx,      Phi(a) = int_0^a (g(a) - g(x))^2 dx.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from numpy.polynomial.legendre import leggauss
 from avatar_core.geometry.tip import Tip
 
 INTERVALS = 256  # of the table
-KAPPA, TAU, ANISOTROPY, STIFFNESS, TAKEN = range(5)  # what the law of a tip reads where it is
+STIFFNESS, TAKEN = range(2)  # what the law of a tip reads where it is
 LAST = 3.0  # atanh of the last contact radius over that of a sphere
-LEAST_SLOPE = 0.2  # part of g' that a concave surface leaves
 
 
 def _contact_radius(tip: Tip, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -27,7 +26,7 @@ def _contact_radius(tip: Tip, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def profile_of(tip: Tip) -> np.ndarray:
-    """The table of one tip, shape (INTERVALS + 1, 8); see
+    """The table of one tip, shape (INTERVALS + 1, 6); see
     :class:`avatar_core.contact.effects.tip_law.TipLawArrays`."""
     s = np.linspace(0.0, 1.0, INTERVALS + 1)
     node, weight = leggauss(8)
@@ -35,19 +34,14 @@ def profile_of(tip: Tip) -> np.ndarray:
     (a, a_slope), (x, x_slope) = _contact_radius(tip, s), _contact_radius(tip, inner)
     width = x_slope * weight / (2.0 * INTERVALS)
     rise = tip.depth_slope(x) * width
-    moments = [_running(x**n / n * rise) for n in (1, 3, 4)]
     g = tip.depth(a)
     first, second = (_running(tip.depth(x) ** n * width) for n in (1, 2))
     stored = g**2 * a - 2.0 * g * first + second
-    return np.stack([a, a_slope, g, tip.depth_slope(a) * a_slope, *moments, stored], axis=1)
+    return np.stack(
+        [a, a_slope, g, tip.depth_slope(a) * a_slope, _running(x * rise), stored], axis=1
+    )
 
 
 def _running(parts: np.ndarray) -> np.ndarray:
     """Integrals from 0 to each knot."""
     return np.concatenate([[0.0], np.cumsum(parts.sum(axis=1))])
-
-
-def least_kappa(tip: Tip) -> float:
-    """The kappa at which delta' is ``LEAST_SLOPE`` of g' where it is least, without tau."""
-    a = tip.radius * np.linspace(0.0, 1.0, INTERVALS + 1)[1:-1]
-    return float(-(1.0 - LEAST_SLOPE) * (tip.depth_slope(a) / (2.0 * a)).min())

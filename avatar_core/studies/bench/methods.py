@@ -18,7 +18,7 @@ from avatar_core.contact import kernels
 from avatar_core.contact.cloud import shown_vertices
 from avatar_core.contact.display import write_cloud
 from avatar_core.contact.effects.selection import every_effect
-from avatar_core.contact.effects.tip_surface import sample_surface
+from avatar_core.contact.effects.tip_law import sample_organ
 from avatar_core.contact.locate import locate
 from avatar_core.contact.model import ContactModel, compiled_for, prepare, step
 from avatar_core.contact.tip_compliance import assemble_own, near_along_normal
@@ -263,7 +263,7 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
         _dense_column(state, t, t, compliance, state.column[t])
         near = near_along_normal(state, t, state.column[t])
         assemble_own(model, state, t, near)
-        sample_surface(model, e.tip_law, t, tips[t])
+        sample_organ(model, e.tip_law, t, tips[t])
     _couple_dense(state, e.several_tools, compliance)
     kernels.solve_contact(model, state, tips, e)
     kernels.write_forces(model, state, out, tips, e)

@@ -8,7 +8,6 @@ import pytest
 from avatar_core.common.splines import (
     BRICK,
     add_in_bricks,
-    add_second_derivatives,
     cell_at,
     evaluate,
     in_cell,
@@ -66,10 +65,6 @@ def test_bricks_are_the_same_field() -> None:
         value = in_cell(values, cell, gradient)
         assert add_in_bricks(brick, cut, cell, added) == pytest.approx(value, abs=1e-12)
         np.testing.assert_allclose(added - 1.0, gradient, rtol=1e-9, atol=1e-6)
-        hessian, more = np.zeros((3, 3)), np.ones((3, 3))
-        second_derivatives(values, cell, SPACING, hessian)
-        add_second_derivatives(brick, cut, cell, SPACING, more)
-        np.testing.assert_allclose(more - 1.0, hessian, rtol=1e-9, atol=1e-3)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 1.0])

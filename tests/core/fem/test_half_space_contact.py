@@ -14,13 +14,18 @@ from avatar_core.geometry.tip import Tip
 WINDOW = 1.8  # over the radius of the contact on a plane
 
 
+def on_heights(radius: float, depth: float, window: float, height: np.ndarray) -> float:
+    """F / E* on a ball over a surface ``height`` below the plane, (RINGS, SECTORS)."""
+    under = Tip("sphere", radius).height(window * ring_radii()) - depth
+    return float(loads_on_heights(under[None], np.array([window]), height[None])[0])
+
+
 def load(radius: float, depth: float, kappa_x: float = 0.0, kappa_y: float = 0.0) -> float:
     """F / E* on a ball over a surface that falls off as kappa_x x^2 / 2 + kappa_y y^2 / 2."""
     window = min(WINDOW * half_space_radius(Tip("sphere", radius), depth), 0.999 * radius)
     r, theta = window * ring_radii()[:, None], sector_angles()
     height = 0.5 * r**2 * (kappa_x * np.cos(theta) ** 2 + kappa_y * np.sin(theta) ** 2)
-    found = loads_on_heights(radius, np.array([depth]), np.array([window]), height[None])
-    return float(found[0])
+    return on_heights(radius, depth, window, height)
 
 
 @pytest.mark.parametrize("radius", [1.5e-3, 10e-3])
@@ -30,6 +35,17 @@ def test_a_plane_is_sneddons(radius: float, part: float) -> None:
     a = half_space_radius(Tip("sphere", radius), depth)
     exact = 0.5 * (a * a + radius**2) * np.log((radius + a) / (radius - a)) - a * radius
     assert load(radius, depth) == pytest.approx(exact, rel=0.015)
+
+
+@pytest.mark.parametrize("tip", [Tip("flat", 3e-3), Tip("cone", 8e-3, 60.0)])
+def test_any_tip_on_a_plane_is_sneddons(tip: Tip) -> None:
+    depth, a = 2e-3, min(half_space_radius(tip, 2e-3), tip.radius)
+    exact = 2.0 * a * depth if tip.shape == "flat" else a * depth
+    window = min(WINDOW * a, 0.999 * tip.radius)
+    under = tip.height(window * ring_radii()) - depth
+    plane = np.zeros((1, len(ring_radii()), len(sector_angles())))
+    found = loads_on_heights(under[None], np.array([window]), plane)[0]
+    assert found == pytest.approx(exact, rel=0.03)
 
 
 @pytest.mark.parametrize("kappa", [-50.0, 50.0, 200.0])
@@ -63,16 +79,16 @@ def test_the_tilt_of_a_plane_turns_the_force() -> None:
     radius, depth, tilt = 5e-3, 1e-3, np.radians(10.0)
     window = 2.2 * half_space_radius(Tip("sphere", radius), depth)
     height = np.tan(tilt) * window * ring_radii()[:, None] * np.cos(sector_angles())
-    tilted = loads_on_heights(radius, np.array([depth]), np.array([window]), height[None])[0]
+    tilted = on_heights(radius, depth, window, height)
     left = (depth - radius) * np.cos(tilt) + radius
     assert tilted == pytest.approx(load(radius, left), rel=0.04)
 
 
 def test_no_balls_no_loads() -> None:
-    assert loads_on_heights(5e-3, np.empty(0), np.empty(0), np.empty((0, 8, 8))).shape == (0,)
+    assert loads_on_heights(np.empty((0, 8)), np.empty(0), np.empty((0, 8, 8))).shape == (0,)
 
 
 def test_no_overlap_no_load() -> None:
     assert load(5e-3, 1e-3, 3e3, 3e3) > 0.0
-    window, height = np.array([1e-3]), np.full((1, len(ring_radii()), len(sector_angles())), 2e-3)
-    assert loads_on_heights(5e-3, np.array([1e-3]), window, height)[0] == 0.0
+    height = np.full((len(ring_radii()), len(sector_angles())), 2e-3)
+    assert on_heights(5e-3, 1e-3, 1e-3, height) == 0.0
