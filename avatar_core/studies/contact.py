@@ -1,9 +1,10 @@
 """Contact: the force of a real tip against resolved contact, Hertz, and the vademecum's own patch.
 
-Spheres of 1.5 to 10 mm press 1 to 5 mm deep at places drawn over each liver, a ridge and a hollow
-among them. The truth is Signorini's contact on the same organ, resolved
-(:mod:`avatar_core.offline.resolved_contact`), which is itself compared with Sneddon's exact sphere
-on a box. None of the livers took part in the calibration of the error that the step says.
+Spheres of 1.5 to 10 mm, a cone and a punch press 1 to 5 mm deep at places drawn over each liver, a
+ridge and a hollow among them, and at its thinnest edges. The truth is Signorini's contact on the
+same organ, resolved (:mod:`avatar_core.offline.resolved_contact`), which is itself compared with
+Sneddon's exact sphere on a box. None of the livers took part in the calibration of the error that
+the step says.
 """
 
 from __future__ import annotations
@@ -15,13 +16,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from skfem import MeshTet
 
-from avatar_core.certify.contact_sites import SiteContact, contacts_at_sites, draw_sites, summarized
+from avatar_core.certify.contact_sites import (
+    SiteContact,
+    contacts_at_sites,
+    draw_sites,
+    edge_sites,
+    summarized,
+)
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.signorini import half_space_radius
 from avatar_core.geometry.mesh import Regions, make_mesh
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, contacts_at
+from avatar_core.offline.resolved_contact import DEPTHS, contacts_at
 from avatar_core.offline.rule import BuildRule
 from avatar_core.pipeline import OrganOptions, build
 from avatar_core.studies.shapes import DEFAULT_FOLDER
@@ -31,16 +38,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+TIPS = (
+    *(Tip("sphere", radius) for radius in (1.5e-3, 3e-3, 5e-3, 7e-3, 10e-3)),
+    Tip("cone", 8e-3, half_angle=60.0),
+    Tip("flat", 3e-3),
+)
+KINDS = ("drawn", "ridge", "hollow", "edge")
 LIVERS = ("LiTS-1", "LiTS-50", "Amos-052", "Amos-086")  # not those of the calibration
 
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """Size of the study: livers by name, places on each, spheres and depths [m]."""
+    """Size of the study: livers by name, places and edges on each, tips and depths [m]."""
 
     livers: tuple[str, ...] = LIVERS
     n_places: int = 6
-    tips: tuple[Tip, ...] = SPHERES
+    n_edges: int = 2
+    tips: tuple[Tip, ...] = TIPS
     depths: tuple[float, ...] = DEPTHS
     options: OrganOptions = field(default_factory=OrganOptions)
 
@@ -53,6 +67,7 @@ class ContactStudy(Study[ContactSettings]):
     quick = ContactSettings(
         livers=LIVERS[:1],
         n_places=3,
+        n_edges=1,
         options=OrganOptions(rule=BuildRule(max_modes=60), n_certified=40),
     )
 
@@ -84,8 +99,8 @@ class ContactStudy(Study[ContactSettings]):
         left, right = figure.subplots(1, 2)
         contacts: list[SiteContact] = run.kept["contacts"]
         _draw_depths(left, contacts)
-        colours = {"drawn": "steelblue", "ridge": "crimson", "hollow": "seagreen"}
-        for kind, colour in colours.items():
+        colours = ("steelblue", "crimson", "seagreen", "darkorange")
+        for kind, colour in zip(KINDS, colours, strict=True):
             own = [contact for contact in contacts if contact.site.kind == kind]
             truth = [contact.truth for contact in own]
             ratio = [contact.force / contact.truth for contact in own]
@@ -104,9 +119,9 @@ def contacts_of(
 ) -> list[SiteContact]:
     """All contacts on one liver; what could not be resolved is counted in a notice."""
     vademecum = build(surface, settings.options)
-    sites = follow(
-        draw_sites(vademecum, surface, settings.n_places, seed=7), f"{surface.name}: places"
-    )
+    places = draw_sites(vademecum, surface, settings.n_places, seed=7)
+    places += edge_sites(vademecum, surface, settings.n_edges, seed=7)
+    sites = follow(places, f"{surface.name}: places")
     contacts, missing = contacts_at_sites(vademecum, surface, sites, settings.tips, settings.depths)
     notices += [f"{surface.name}, contact sites: {notice}" for notice in missing]
     return contacts
@@ -153,7 +168,32 @@ def summary_of(contacts: Sequence[SiteContact]) -> dict[str, float]:
         "coverage": found.coverage,
         "median_overestimate": found.overestimate,
         "patch_mean": float(patch.mean()),
-        "hertz_mean": float(hertz.mean()),
+        "hertz_mean": float(np.nanmean(hertz)),
+        **{
+            f"{group}_{key}": value
+            for group, own in _groups(contacts).items()
+            for key, value in _figures(own).items()
+        },
+    }
+
+
+def _groups(contacts: Sequence[SiteContact]) -> dict[str, list[SiteContact]]:
+    """Spheres by the kind of their place, and other tips by their shape; none is empty."""
+    spheres = [contact for contact in contacts if contact.tip.shape == "sphere"]
+    groups = {kind: [c for c in spheres if c.site.kind == kind] for kind in KINDS}
+    groups |= {s: [c for c in contacts if c.tip.shape == s] for s in ("cone", "flat")}
+    return {name: own for name, own in groups.items() if own}
+
+
+def _figures(contacts: Sequence[SiteContact]) -> dict[str, float]:
+    found = summarized(contacts)
+    return {
+        "contacts": float(found.n_contacts),
+        "mean": found.mean,
+        "p95": found.p95,
+        "worst": found.worst,
+        "coverage": found.coverage,
+        "overestimate": found.overestimate,
     }
 
 
@@ -163,8 +203,8 @@ def _row(name: str, contact: SiteContact) -> Row:
         "liver": name,
         "place": site.kind,
         "kappa_per_m": site.kappa,
-        "anisotropy_per_m2": site.anisotropy,
-        "radius_m": contact.radius,
+        "tip": contact.tip.shape,
+        "radius_m": contact.tip.radius,
         "depth_m": contact.depth,
         "true_n": contact.truth,
         "force_n": contact.force,
@@ -178,10 +218,10 @@ def _row(name: str, contact: SiteContact) -> Row:
 
 def _draw_depths(axes: Axes, contacts: Sequence[SiteContact]) -> None:
     """Force over depth at the first place, for the smallest and the largest sphere."""
-    first = [contact for contact in contacts if contact.site is contacts[0].site]
-    radii = sorted({contact.radius for contact in first})
+    first = [c for c in contacts if c.site is contacts[0].site and c.tip.shape == "sphere"]
+    radii = sorted({contact.tip.radius for contact in first})
     for radius, colour in ((radii[0], "crimson"), (radii[-1], "steelblue")):
-        own = sorted((c for c in first if c.radius == radius), key=lambda c: c.depth)
+        own = sorted((c for c in first if c.tip.radius == radius), key=lambda c: c.depth)
         depth = [1e3 * contact.depth for contact in own]
         for name, text, style in (
             ("truth", "resolved", "o"),

@@ -24,8 +24,7 @@ from avatar_core.certify.contact_sites import (
 )
 from avatar_core.cli import picture
 from avatar_core.contact import timing
-from avatar_core.contact.ball_shift import make_felt_field
-from avatar_core.contact.effects.tip_law import LAW_ERROR, UNSHIFTED
+from avatar_core.contact.effects.tip_law import LAW_ERROR
 from avatar_core.contact.model import estimate_error, prepare, step
 from avatar_core.errors import ContactError, MeshError, StorageError
 from avatar_core.fem.elasticity import Elasticity, Material
@@ -38,18 +37,20 @@ from avatar_core.vademecum.certificate import Certificate, ContactSites
 from avatar_core.vademecum.force_error import PROMISED, ForceError
 from avatar_core.vademecum.model import Provenance, Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from avatar_core.vademecum.tip_field import make_tip_field
 from tests.core.cli.test_cli import write_obj
 from tests.core.conftest import Command, box_mesh, box_regions
 from tests.helpers.box_organ import UP, organ
 
-SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
+SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
+BALL = Tip("sphere", 3e-3)
 FOUND = ContactSites(36, 3, 0.04, 0.1, 0.15, 0.92, 3.1, 1.4)
 Compared = Callable[..., Iterator[list[SiteContact]]]
 
 
 def contact(force: float, patch: float, law: float, site: Site = SITE) -> SiteContact:
     """A contact whose resolved force is 2 N; the patch's and the law's part of its error [N]."""
-    return SiteContact(site, 3e-3, 1e-3, 2.0, force, 0.0, patch + law, law, 6.0, 1.0, 0.05)
+    return SiteContact(site, BALL, 1e-3, 2.0, force, 0.0, patch + law, law, 6.0, 1.0, 0.05)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def box() -> Vademecum:
         elasticity,
         regions,
         loads,
-        make_felt_field(mesh, regions, loads.patch_radius),
+        make_tip_field(mesh, regions, loads.patch_radius),
         BuildRule(tolerance=0.9, max_modes=10),
         Provenance("box", ""),
     )
@@ -106,13 +107,6 @@ def test_the_factor_scales_the_laws_part_of_the_error_that_is_said(box: Vademecu
     assert force == same > 0.0
     law = force * (LAW_ERROR + steeper)
     assert thrice - once == pytest.approx(2.0 * law, rel=1e-5)
-
-
-def test_without_a_shift_of_balls_more_error_is_said(box: Vademecum) -> None:
-    force, said, steeper = pressed(box)
-    without = replace(box, tip_field=box.tip_field._replace(shift=None))
-    law = force * (LAW_ERROR + steeper)
-    assert pressed(without)[1] - said == pytest.approx((UNSHIFTED - 1.0) * law, rel=1e-3)
 
 
 def test_an_organ_without_contact_sites_says_the_same_error_as_with_the_factor_one(

@@ -28,8 +28,8 @@ def organ(*lobes: tuple[np.ndarray, float]) -> Any:
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     parts = ((np.zeros(3), RADIUS), *lobes)
     distance = np.min([np.linalg.norm(points - c, axis=-1) - r for c, r in parts], axis=0)
-    place, flat = (axis[[0, 0, 0]], axis[1:2] - axis[0]), np.zeros_like(distance)
-    field = TipField(distance, np.ones_like(distance), *place, flat, flat, flat)
+    place = (axis[[0, 0, 0]], axis[1:2] - axis[0])
+    field = TipField(distance, np.ones_like(distance), *place)
     normals = surface.vertices / RADIUS
     loads = LoadSurface(surface.vertices, normals, upper, np.arange(n), 0.012)
     return SimpleNamespace(surface=loads, tip_field=field)

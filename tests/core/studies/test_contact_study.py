@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from avatar_core.certify.contact_sites import Site, SiteContact
+from avatar_core.geometry.tip import Tip
 from avatar_core.studies.contact import reference_error, summary_of
 
-SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
+SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
 
 
 def contact(force: float, estimate: float, angle: float = 0.0) -> SiteContact:
     """A contact whose resolved force is 2 N."""
     return SiteContact(
-        SITE, 3e-3, 1e-3, 2.0, force, angle, estimate, 0.5 * estimate, 6.0, 1.0, 0.05
+        SITE, Tip("sphere", 3e-3), 1e-3, 2.0, force, angle, estimate, 0.5 * estimate, 6.0, 1.0, 0.05
     )
 
 
@@ -28,6 +29,8 @@ def test_key_figures_are_those_of_the_contacts() -> None:
     assert found["patch_mean"] == pytest.approx(2.0)
     assert found["hertz_mean"] == pytest.approx(0.5)
     assert found["far_field_l2"] == found["far_field_l2_median"] == 0.05
+    assert found["drawn_contacts"] == 4.0 and found["drawn_worst"] == pytest.approx(0.1)
+    assert "edge_mean" not in found and "cone_mean" not in found
     assert found["direction_mean_deg"] == pytest.approx(np.degrees(0.05))
 
 
