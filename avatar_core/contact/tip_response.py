@@ -8,10 +8,13 @@ jump. Weights and compliance are therefore sampled on the grid of the tip field 
 same B-splines B_q(p), twice differentiable almost everywhere:
 
     w_j(p)   = sum_q B_q(p) w_j(s(x_q))         weight of load position j, sum_j w_j = 1
-    gamma(p) = sum_q B_q(p) [K gamma_0](x_q)    gamma_0 = n . C(s, s) n at s = s(x_q)
+    gamma(p) = sum_q B_q(p) gamma_q             gamma(x_q) = [K gamma_0](x_q)
+                                                gamma_0 = n . C(s, s) n at s = s(x_q)
 
-with n = grad phi / |grad phi| the direction of pressing and K the kernel of the tip field, with a
-tenth of the patch radius. gamma is the compliance of a single tip; between tips t and t' it is
+with n = grad phi / |grad phi| the direction of pressing, K the kernel of the tip field with a tenth
+of the patch radius, and gamma_q such that the splines take those values: a sum of the values
+themselves would blur them. gamma is the compliance of a single
+tip; between tips t and t' it is
 
     C_tt' = a_t a_t' f_t . C f_t',    f_t = w(p_t) n(p_t),    a_t^2 = gamma(p_t) / (f_t . C f_t),
 
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.tip_field import TipField
 
 SMOOTHING = 0.1  # standard deviation of K, in patch radii
+BEYOND = 1.25  # times the largest value around it, at most, is a coefficient of gamma
 MAX_STENCIL = 27 * 6  # load positions that carry one tip, at most: six at each grid point of a cell
 
 # What carries a tip, by the organ's shape alone: shell (nx, ny, nz) bool, the n grid points that a
@@ -43,8 +47,8 @@ TipCarriers = namedtuple("TipCarriers", ["shell", "normal", "carrier", "weight"]
 
 # row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
 # 6) int32 load positions and carrier_weight (n_rows, 3 or 6) float32;
-# self_compliance, smoothing (nx, ny, nz) float32, gamma [m/N] and its relative change by
-# smoothing, K |gamma_0 / gamma - 1|
+# self_compliance, smoothing (nx, ny, nz) float32, gamma_q [m/N] and the relative change by K,
+# K |gamma_0 / K gamma_0 - 1|
 TipResponse = namedtuple(
     "TipResponse", ["row", "carrier", "carrier_weight", "self_compliance", "smoothing"]
 )
@@ -87,7 +91,7 @@ def make_tip_response(
     load: np.ndarray,
     near: LocalBlocks,
 ) -> TipResponse:
-    """Sample the self-compliance where a tip is carried.
+    """Sample the self-compliance where a tip is carried; elsewhere its mean stands in.
 
     Parameters
     ----------
@@ -113,9 +117,19 @@ def make_tip_response(
         row,
         carrier.astype(np.int32),
         weight.astype(np.float32),
-        smooth.astype(np.float32),
+        _taking(smooth),
         smoothed(change, deviation, shell).astype(np.float32),
     )
+
+
+def _taking(values: np.ndarray) -> np.ndarray:
+    """Coefficients of splines that take positive values, and stay positive where these jump."""
+    # Here, because the contact node needs none of it.
+    from scipy.ndimage import maximum_filter, minimum_filter, spline_filter
+
+    found = spline_filter(values, order=2)
+    least, most = minimum_filter(values, 3) / BEYOND, maximum_filter(values, 3) * BEYOND
+    return np.asarray(np.clip(found, least, most), np.float32)
 
 
 def sampled_at_tip(
