@@ -1,6 +1,6 @@
 """Shape factors of the tips that a scene has, computed once on a machine.
 
-A vademecum holds none: each takes about a second, and a scene has one tip or two. What was
+A vademecum holds none: each takes a second or three, and a scene has one tip or two. What was
 computed is kept by the content it was made of, a few in memory and some in the user's cache.
 """
 

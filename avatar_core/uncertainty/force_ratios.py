@@ -1,14 +1,14 @@
 """How far the edges of a force's band lie from the force, for every load position and some depths.
 
-A tip d deep that feels the force F on tissue of the modulus E* sinks, with L = F / E*, by
+A tip d deep that feels the force F on tissue of the modulus E* sinks, with L = F / (s E*), by
 
-    d = delta(L) + L s,      s = E* (gamma - c)
+    d = delta(L) + L s E* (gamma - c)
 
-(:mod:`avatar_core.contact.effects.tip_law`); a patch by gamma F. delta knows the surface's shape
-alone: the material comes in by E* and gamma, the compliance of a load position with itself. For
-both, no vademecum has to be made at every point of the coordinates. So F is found at Chebyshev's
-points of those that are not known, interpolated as in :mod:`avatar_core.uncertainty.material_grid`,
-drawn, and its quantiles are taken.
+(:mod:`avatar_core.contact.effects.tip_law`); a patch by gamma F. The shape factor s knows the
+surface alone: the material comes in by E* and gamma, the compliance of a load position with itself.
+For both, no vademecum has to be made at every point of the coordinates. So F is found at
+Chebyshev's points of those that are not known, interpolated as in
+:mod:`avatar_core.uncertainty.material_grid`, drawn, and its quantiles are taken.
 
 It takes tissue to be linear and at rest without the tool: forces are then proportional to Young's
 modulus. Beside self-weight and other tools, whose own depths stay as they are, that is nearly so.
@@ -22,6 +22,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.common.splines import evaluate_all
 from avatar_core.contact.effects.tip_law import (
     PATCH_ON_MESH,
     TipLawState,
@@ -30,6 +31,8 @@ from avatar_core.contact.effects.tip_law import (
     tip_law_state,
 )
 from avatar_core.contact.error_map import is_reached
+from avatar_core.contact.kept_factors import factors_of
+from avatar_core.contact.shape_factor import dense
 from avatar_core.contact.tip_response import closest_weights
 from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.tip import Tip
@@ -70,7 +73,8 @@ def log_edges(
     free = [c for c in coordinates if constant[c.name] is None]
     grid = MaterialGrid(tuple(free), young, _n_points(len(free)))
     held = {name: value for name, value in constant.items() if value is not None}
-    found = np.stack([_at(vademecum, tips, held | point, young) for point in grid.points()])
+    shapes = _shape_factors(vademecum, tips)
+    found = np.stack([_at(vademecum, tips, shapes, held | point, young) for point in grid.points()])
     values = drawn(known, draws, seed)
     weights, stiffer = grid.weights(values), np.log(grid.softer(values))[:, None]
     edges = np.empty((*found.shape[1:], 2))
@@ -103,18 +107,23 @@ def force_spread_at(
 def log_forces(vademecum: Vademecum, tips: Sequence[Tip]) -> FloatArray:
     """ln of the forces at the values that a vademecum has, (n_tips, n_positions, n_depths)."""
     compliance = own_compliance(vademecum)
-    return _log_forces(vademecum, tips, compliance, vademecum.material, vademecum.contrast)
+    shapes, v = _shape_factors(vademecum, tips), vademecum
+    return _log_forces(v, tips, shapes, compliance, v.material, v.contrast)
 
 
 def _at(
-    vademecum: Vademecum, tips: Sequence[Tip], values: Mapping[str, float], young: float
+    vademecum: Vademecum,
+    tips: Sequence[Tip],
+    shapes: FloatArray,
+    values: Mapping[str, float],
+    young: float,
 ) -> FloatArray:
     """The same at values of all coordinates, and a Young's modulus [Pa]."""
     poisson = values.get("poisson", vademecum.material.poisson_ratio)
     compliance = own_compliance_at(vademecum, values)
     material = Material(young_modulus=young, poisson_ratio=poisson)
     contrast = values.get("contrast", vademecum.contrast)
-    return _log_forces(vademecum, tips, compliance, material, contrast)
+    return _log_forces(vademecum, tips, shapes, compliance, material, contrast)
 
 
 def _constant(
@@ -140,6 +149,7 @@ def _n_points(n_coordinates: int) -> int:
 def _log_forces(
     vademecum: Vademecum,
     tips: Sequence[Tip],
+    shapes: FloatArray,
     compliance: FloatArray,
     material: Material,
     contrast: float | None,
@@ -147,11 +157,17 @@ def _log_forces(
     surface = vademecum.surface
     normals = surface.normals / np.linalg.norm(surface.normals, axis=1, keepdims=True)
     gamma = np.einsum("ia,iab,ib->i", normals, compliance, normals)
-    return np.log([_pressed(vademecum, tip, gamma, material, contrast) for tip in tips])
+    pairs = zip(tips, shapes, strict=True)
+    return np.log([_pressed(vademecum, *pair, gamma, material, contrast) for pair in pairs])
 
 
 def _pressed(
-    vademecum: Vademecum, tip: Tip, gamma: FloatArray, material: Material, contrast: float | None
+    vademecum: Vademecum,
+    tip: Tip,
+    shape: FloatArray,
+    gamma: FloatArray,
+    material: Material,
+    contrast: float | None,
 ) -> FloatArray:
     """Forces on a tip at ``DEPTHS``, (n_positions, n_depths) [N]; gamma is that of E too."""
     law = _law(tip)
@@ -162,6 +178,7 @@ def _pressed(
         tumour = _tumour_under(vademecum, tip)
         stiffness /= 1.0 - tumour + tumour / contrast
     taken = np.minimum(PATCH_ON_MESH / (stiffness * vademecum.surface.patch_radius), gamma)
+    stiffness *= shape
     softness, load = stiffness * (gamma - taken), np.empty((len(DEPTHS), len(gamma)))
     for depth, found in zip(DEPTHS, load, strict=True):
         at = np.full(len(gamma), depth)
@@ -173,6 +190,18 @@ def _law(tip: Tip) -> TipLawState | None:
     """The law of an upright tip; None of a patch."""
     arrays = tip_law_arrays((tip,), Material(), np.zeros((2, 0, 0, 0)))
     return None if arrays is None else tip_law_state(arrays, 0)
+
+
+def _shape_factors(vademecum: Vademecum, tips: Sequence[Tip]) -> FloatArray:
+    """s where tips press each load position, at the middle of ``DEPTHS``, (n_tips, n_positions)."""
+    field, surface = vademecum.tip_field, vademecum.surface
+    shape = factors_of(field, tips)
+    found = np.empty((len(tips), surface.n_positions))
+    for row, tip, values in zip(found, tips, shape.value, strict=True):
+        at = surface.centers + (tip.offset - np.median(DEPTHS)) * surface.normals
+        whole = dense(values, shape.brick)
+        evaluate_all(whole, field.origin, shape.spacing[0], at, row, np.empty_like(at))
+    return np.exp(found)
 
 
 def _tumour_under(vademecum: Vademecum, tip: Tip) -> FloatArray:
