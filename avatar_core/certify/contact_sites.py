@@ -188,9 +188,7 @@ def draw_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) ->
     surface : that the vademecum was built of
     n : at least 3
     """
-    drawn = draw_contacts(vademecum, max(DRAWN, 2 * n), seed)
-    sites = nearest_sites(vademecum, surface, drawn.place)
-    sites = [site for site in sites if _access(vademecum, site) > OPEN]
+    sites = _open_sites(vademecum, surface, max(DRAWN, 2 * n), seed)
     rest = sites[n - 2 :]
     if len(rest) < 2:
         return sites
@@ -201,16 +199,21 @@ def draw_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) ->
 
 def edge_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) -> list[Site]:
     """At most ``n`` places where the organ is thin, below ``THIN``; the thinnest of those drawn."""
-    drawn = draw_contacts(vademecum, _MANY_DRAWN, seed)
-    sites = nearest_sites(vademecum, surface, drawn.place)
-    sites = [site for site in sites if _access(vademecum, site) > OPEN]
+    sites = _open_sites(vademecum, surface, _MANY_DRAWN, seed)
     thick = np.array([_thickness(surface, site) for site in sites])
     order = np.argsort(thick)[:n]
     return [replace(sites[k], kind="edge") for k in order if thick[k] < THIN]
 
 
+def _open_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) -> list[Site]:
+    """Those of ``n`` places drawn evenly that a tip may press to the largest depth."""
+    drawn = draw_contacts(vademecum, n, seed)
+    sites = nearest_sites(vademecum, surface, drawn.place)
+    return [site for site in sites if _access(vademecum, site) > OPEN]
+
+
 def _thickness(surface: SurfaceMesh, site: Site) -> float:
-    """Of the organ along a site's normal [m]."""
+    """The organ's thickness along a site's normal [m]."""
     faces = surface.faces.astype(np.int64)
     start = site.point - _SKIN * site.normal
     hits = igl.ray_mesh_intersect(start, -site.normal, surface.vertices, faces)

@@ -38,7 +38,7 @@ def factors_of(field: TipField, tips: Sequence[Tip]) -> ShapeFactor:
 
 
 class _Made:
-    """What a factor is made of, equal to what it equals in content."""
+    """The parts that a factor is made of; two are equal where their content is."""
 
     def __init__(self, field: TipField, tip: Tip) -> None:
         self.field, self.tip = field, tip

@@ -60,9 +60,9 @@ PATCH = 0.7665  # c E* R_p on a half-space,
 # 1 / (E* R_p) deeper on elements that resolve it. 0.67 to 0.75 fit resolved contacts alike; with
 # this one, tips on a cube of such elements feel Sneddon's force within 3 %.
 PATCH_ON_MESH = 0.73
-# Of the force, and per |log s|, beside what the gap's slope is off one: with the patch's error they
-# cover 97 % of 87 contacts of balls resolved on LiTS-4, and are 2.2 times the true error in the
-# median.
+# Relative errors of the force, the second per |log s|, beside what the gap's slope is off one: with
+# the patch's error they cover 97 % of 87 contacts of balls resolved on LiTS-4, and are 2.2 times
+# the true error in the median.
 LAW_ERROR, SHAPE_ERROR = 0.006, 0.1
 TUMOUR_ERROR = 0.25  # of the force, per relative change of E* by a tumour underneath
 LEAST_CONTACT = 0.02  # contact radius over the tip's, where the tangent of a light touch is taken

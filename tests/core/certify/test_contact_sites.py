@@ -109,6 +109,19 @@ def test_the_factor_scales_the_laws_part_of_the_error_that_is_said(box: Vademecu
     assert thrice - once == pytest.approx(2.0 * law, rel=1e-5)
 
 
+def test_edges_are_the_thinnest_places_below_a_thickness(
+    box: Vademecum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A box of 0.1 m has none; one that counts as thin is as thick as it is."""
+    surface = outline(box)
+    assert contact_sites.edge_sites(box, surface, 3, seed=0) == []
+    monkeypatch.setattr(contact_sites, "THIN", 0.2)
+    found = contact_sites.edge_sites(box, surface, 3, seed=0)
+    assert [site.kind for site in found] == ["edge"] * 3
+    thick = [contact_sites._thickness(surface, site) for site in found]
+    np.testing.assert_allclose(thick, 0.1, rtol=0.02)
+
+
 def test_an_organ_without_contact_sites_says_the_same_error_as_with_the_factor_one(
     box: Vademecum,
 ) -> None:

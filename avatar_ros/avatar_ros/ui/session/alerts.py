@@ -1,4 +1,4 @@
-"""What must not be missed on the planning page: numbers that are not what they seem."""
+"""Alerts of the planning page: numbers that are not what they seem."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def seen_letters(
 
 
 def _middle(vertices: np.ndarray) -> np.ndarray:
-    """Of the bounding box [m]."""
+    """Middle of the bounding box, shape (3,) [m]."""
     return np.asarray(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)), float)
 
 
