@@ -1,15 +1,31 @@
-"""The errors of an accuracy curve: the displayed displacement on unseen loads."""
+"""The errors of an accuracy curve: of what a step shows and feels at unseen contacts.
+
+A patch is pressed at drawn places by the compiled step itself, with its stencil and its smooth
+compliance, and compared with full finite elements of the same mesh: the force at the same depth,
+the displacement under the same force.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from avatar_core.contact.cloud import BLOCK, CloudArrays, cloud_arrays, rounded
-from avatar_core.contact.cloud_kernels import add_to_field, soft_threshold
-from avatar_core.fem.norms import l2_norm
+from avatar_core.certify.unseen_contacts import HEIGHTS, draw_contacts
+from avatar_core.contact.cloud import shown_vertices
+from avatar_core.contact.layout import lay_out_details
+from avatar_core.contact.model import (
+    ContactModel,
+    Status,
+    deform,
+    estimate_error,
+    make_model,
+    solve,
+)
+from avatar_core.errors import ConvergenceError
+from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.accuracy import (
     AccuracyCurve,
     Cloud,
@@ -18,11 +34,15 @@ from avatar_core.vademecum.accuracy import (
     mode_levels,
     upper_quantile,
 )
+from avatar_core.vademecum.certificate import Certificate
+from avatar_core.vademecum.force_error import ForceError
 
 if TYPE_CHECKING:
+    from avatar_core.fem.elasticity import Elasticity
     from avatar_core.vademecum.model import Vademecum
 
 SHOWN: tuple[Cloud, ...] = ("surface", "volume")
+PATCH_TIP = Tip("patch", HEIGHTS[1] + 2e-3)  # in contact wherever a tip is drawn
 
 
 def details_of(n_modes: int) -> tuple[Detail, ...]:
@@ -31,55 +51,75 @@ def details_of(n_modes: int) -> tuple[Detail, ...]:
     return (*shown, Detail(n_modes, "off"))
 
 
-class DisplayErrors:
-    """Relative errors of the displacement as it would be shown, for every detail.
+@dataclass(frozen=True, eq=False)
+class StepErrors:
+    """Relative errors of a step at unseen contacts, a column for each.
 
-    sizes : bytes that are held to show each
+    shown : ndarray, shape (n_details - 1, n), of the displacement that the step shows, at the force
+        that it feels; no row for no cloud
+    force : ndarray, shape (n,), of the force at the depth of the tip
+    smoothing : ndarray, shape (n,), relative change of the compliance under a tip by smoothing
+    sizes : of what shows each detail [bytes]
     """
 
-    def __init__(self, vademecum: Vademecum) -> None:
-        self._vademecum = vademecum
-        self._levels = mode_levels(vademecum.n_modes)
-        self._shown = [rounded(cloud_arrays(vademecum, cloud)) for cloud in SHOWN]
-        self.sizes = [_size(arrays, n) for arrays in self._shown for n in self._levels] + [0]
-
-    def __call__(self, positions: np.ndarray, weights: np.ndarray, truth: np.ndarray) -> np.ndarray:
-        """Of one load, shape (n_details, 3): unit forces in x, y, z.
-
-        Parameters
-        ----------
-        positions, weights : the load; see :meth:`Vademecum.displacement`
-        truth : ndarray, shape (3 n_vertices, 3)
-        """
-        rows: list[np.ndarray] = []
-        for arrays in self._shown:
-            mass = np.repeat(self._vademecum.mesh.vertex_volumes[arrays.points], 3)
-            wanted = truth.reshape(-1, 3, 3)[arrays.points].reshape(-1, 3)
-            size = l2_norm(wanted, mass)
-            for level in self._levels:
-                left = wanted - self._field(arrays, positions, weights, level)
-                rows.append(l2_norm(left, mass) / size)
-        return np.array(rows)
-
-    def _field(
-        self, arrays: CloudArrays, positions: np.ndarray, weights: np.ndarray, level: int
-    ) -> np.ndarray:
-        """What a step shows under unit forces in x, y, z, shape (3 n_points, 3)."""
-        field = np.zeros((3, (arrays.block_start.shape[1] - 1) * BLOCK), np.float32)
-        region = self._vademecum.regional.region[positions]
-        whole = np.bincount(region, weights, arrays.region_start.size - 1)
-        kept = np.array([soft_threshold(w) for w in whole])
-        part = kept / kept.sum() / np.where(whole == 0.0, 1.0, whole)
-        for r in np.flatnonzero(kept):
-            n, at = np.diff(arrays.region_start[r : r + 2])[0], region == r
-            load = np.tensordot(part[r] * weights[at], arrays.regional_load[positions[at]], 1)
-            for u, amplitude in zip(field, load[:, :n].astype(np.float32), strict=True):
-                modes = (arrays.space, arrays.core, arrays.level, arrays.block_start[1 + r])
-                add_to_field(*modes, amplitude, level, u)
-        return field[:, : 3 * len(arrays.points)].T
+    shown: np.ndarray
+    force: np.ndarray
+    smoothing: np.ndarray
+    sizes: Sequence[int]
 
 
-def _size(arrays: CloudArrays, level: int) -> int:
+def step_errors(
+    vademecum: Vademecum, elasticity: Elasticity, n: int, seed: int, single: bool = False
+) -> StepErrors:
+    """Press a patch at ``n`` unseen places by the compiled step, against full finite elements.
+
+    single : these in single precision
+    """
+    contacts, levels = draw_contacts(vademecum, n, seed), mode_levels(vademecum.n_modes)
+    models = _models(vademecum)
+    points = [np.sort(shown_vertices(vademecum, cloud)) for cloud in SHOWN]
+    volume = [vademecum.mesh.vertex_volumes[p] for p in points]
+    shown = np.empty((len(SHOWN) * len(levels), n))
+    force, smoothing = np.empty((2, n))
+    truth = contacts.solved(vademecum.surface, elasticity, single)
+    for k, (tip, (compliance, field)) in enumerate(zip(contacts.tip, truth, strict=True)):
+        row = iter(shown)
+        for model, p, v in zip(models, points, volume, strict=True):
+            load = pressed(model, tip)
+            for level in levels:
+                model.show(level)
+                deform(model)
+                left = model.out.cloud[:, 3:] + load * field[p]
+                next(row)[k] = np.sqrt(_square(left, v) / _square(load * field[p], v))
+        force[k] = abs(load * compliance / -model.state.gap[0] - 1.0)
+        estimate_error(model)
+        smoothing[k] = model.out.force_error[0] / np.linalg.norm(model.out.force[0])
+    sizes = [_size(model.arrays, level) for model in models for level in levels]
+    return StepErrors(shown, force, smoothing, [*sizes, 0])
+
+
+def _models(vademecum: Vademecum) -> list[ContactModel]:
+    """Of each cloud, without effects; the error that they say is the smoothing alone."""
+    said = replace(Certificate.unknown(), force_error=ForceError(1.0, 0.0))
+    organ = replace(vademecum, certificate=said, display=None, large=None)
+    details = [Detail(vademecum.n_modes, cloud) for cloud in SHOWN]
+    return [make_model(layout) for layout in lay_out_details(organ, (PATCH_TIP,), details, ())]
+
+
+def pressed(model: ContactModel, tip: np.ndarray) -> float:
+    """The force of a patch at a place that it comes to from nowhere [N]."""
+    model.reset()
+    status = solve(model, tip[None])
+    if status != Status.OK:
+        raise ConvergenceError(f"a patch {tip} m has no contact: {Status(status).name}")  # type: ignore[call-arg]
+    return float(model.state.force[0])
+
+
+def _square(field: np.ndarray, volume: np.ndarray) -> float:
+    return float(volume @ (field**2).sum(axis=1))
+
+
+def _size(arrays: Any, level: int) -> int:
     """Bytes of the modes up to a level, of their core and of the loads."""
     share = float(np.mean(arrays.level <= level)) if len(arrays.level) else 0.0
     modes = arrays.space.nbytes + arrays.core.nbytes + arrays.level.nbytes
@@ -93,15 +133,13 @@ def curve_of(
 
     Parameters
     ----------
-    shown : ndarray, shape (n_details - 1, 3 n_loads), relative errors of the displacement, the
-        directions of a load together
-    force : ndarray, shape (m,), of the normal force
+    shown : ndarray, shape (n_details - 1, n), relative errors of the displacement
+    force : ndarray, shape (n,), of the normal force
     sizes : of each detail [bytes]
     """
     details = details_of(vademecum.n_modes)
     force_error = upper_quantile(force)
-    n_loads = shown.shape[1] // 3
-    errors = [*(upper_quantile(row, n_independent=n_loads) for row in shown), float("nan")]
+    errors = [*(upper_quantile(row) for row in shown), float("nan")]
     points = (
         CurvePoint(detail, error, force_error, size)
         for detail, error, size in zip(details, errors, sizes, strict=True)

@@ -1,8 +1,8 @@
 """Errors of a vademecum on unseen loads, and the cost of its build.
 
 The truth is the full finite element solution on the same mesh. Loads are patches centred at face
-centroids, which no part of the build uses, in three directions. The force on a tip is compared
-anywhere on the faces.
+centroids, which no part of the build uses, in three directions. What a step feels and shows is
+compared at contacts anywhere on the faces.
 """
 
 from __future__ import annotations
@@ -13,10 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avatar_core.certify.accuracy_curve import DisplayErrors, curve_of
-from avatar_core.certify.unseen_contacts import HEIGHTS, draw_contacts
-from avatar_core.common.splines import evaluate
-from avatar_core.contact.tip_response import make_tip_response, tip_carriers
+from avatar_core.certify.accuracy_curve import StepErrors, curve_of, step_errors
 from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
 from avatar_core.vademecum.certificate import Certificate
@@ -55,22 +52,17 @@ def certify(
 
 @dataclass(frozen=True, eq=False)
 class UnseenErrors:
-    """Relative errors, a row for each unseen load; see :class:`Certificate`.
+    """Relative errors; see :class:`Certificate`.
 
-    l2 (n, 3); contact, force, tip_force (n,); smoothing (n,), relative change of the compliance
-    under a tip by smoothing; shown (n_details, 3 n), of the displacement as it would be shown;
-    vertex_contact (m,), at load positions of the build; sizes (n_details,), of what shows them
-    [bytes]
+    l2 (n, 3); contact, force (n,), of unseen loads; vertex_contact (m,), at load positions of the
+    build; step, of as many unseen contacts
     """
 
     l2: np.ndarray
     contact: np.ndarray
     force: np.ndarray
-    tip_force: np.ndarray
-    smoothing: np.ndarray
-    shown: np.ndarray
     vertex_contact: np.ndarray
-    sizes: Sequence[int]
+    step: StepErrors
 
 
 def measured(
@@ -91,31 +83,25 @@ def measured(
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(len(surface.corners))[:n_loads]
     normals = patch_normals(elasticity.mesh, surface.centroids, surface.patch_radius)
-    display = DisplayErrors(vademecum)
     mass = vademecum.mesh.lumped_mass
-    l2, shown, contact, force = [], [], [], []
+    l2, contact, force = [], [], []
     for batch in np.array_split(chosen, max(1, len(chosen) // _BATCH)):
         truth, compliance = _reference(elasticity, surface.centroids[batch], vademecum, single)
         for k, triangle in enumerate(batch):
             n, exact = normals[triangle], compliance[k]
             here = _at_centroid(surface, triangle)
             l2.append(relative_l2(vademecum.displacement(*here), truth[k], mass))
-            shown.append(display(*here, truth[k]))
             estimate = vademecum.compliance(*here)
             contact.append(_frobenius(estimate, exact))
             force.append(abs((n @ exact @ n) / (n @ estimate @ n) - 1.0))
         if progress is not None:
             progress(len(l2))
-    tip_force, smoothing = _tip_force(vademecum, elasticity, len(chosen), seed, single)
     return UnseenErrors(
         np.array(l2),
         np.array(contact),
         np.array(force),
-        tip_force,
-        smoothing,
-        np.concatenate(shown, axis=1),
         _vertex_contact(vademecum, elasticity, rng),
-        display.sizes,
+        step_errors(vademecum, elasticity, len(chosen), seed, single),
     )
 
 
@@ -125,36 +111,17 @@ def _single_serves(vademecum: Vademecum, elasticity: Elasticity) -> bool:
     return elasticity.single_serves(some.tocsc())
 
 
-def _tip_force(
-    vademecum: Vademecum, elasticity: Elasticity, n: int, seed: int, single: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Error of the force on tips anywhere, and relative change by smoothing, each (n,)."""
-    contacts = draw_contacts(vademecum, n, seed)
-    surface, field = vademecum.surface, vademecum.tip_field
-    load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
-    carriers = tip_carriers(surface, field, 0.0, HEIGHTS[1])
-    response = make_tip_response(surface, field, carriers, load, vademecum.contact_near)
-    slope = np.zeros(3)
-    compliance, smoothing = (
-        np.array(
-            [evaluate(grid, field.origin, field.spacing[0], p, slope, np.nan) for p in contacts.tip]
-        )
-        for grid in (response.self_compliance, response.smoothing)
-    )
-    true = contacts.true_compliance(surface, elasticity, single)
-    return np.abs(true / compliance - 1.0), smoothing
-
-
 def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: int) -> Certificate:
     """One certificate of all errors: at one choice of the coordinates, or at several."""
 
-    def all_of(name: str) -> np.ndarray:
-        return np.concatenate(
-            [getattr(part, name) for part in parts], axis=-1 if name == "shown" else 0
-        )
-
-    names = ("l2", "contact", "force", "tip_force")
-    l2, contact, force, tip_force = (all_of(name) for name in names)
+    l2, contact, force, vertex = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("l2", "contact", "force", "vertex_contact")
+    )
+    steps = [part.step for part in parts]
+    tip_force = np.concatenate([step.force for step in steps])
+    smoothing = np.concatenate([step.smoothing for step in steps])
+    shown = np.concatenate([step.shown for step in steps], axis=1)
     return Certificate(
         l2_mean=float(l2.mean()),
         l2_worst=float(l2.max()),
@@ -164,12 +131,12 @@ def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: in
         force_worst=float(force.max()),
         tip_force_mean=float(tip_force.mean()),
         tip_force_worst=float(tip_force.max()),
-        vertex_contact_worst=float(all_of("vertex_contact").max()),
+        vertex_contact_worst=float(vertex.max()),
         n_loads=len(contact),
         seed=seed,
         modes=vademecum.n_modes,
-        force_error=calibrated(all_of("smoothing"), tip_force),
-        curve=curve_of(vademecum, all_of("shown"), tip_force, parts[0].sizes),
+        force_error=calibrated(smoothing, tip_force),
+        curve=curve_of(vademecum, shown, tip_force, steps[0].sizes),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,9 +19,9 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
     from avatar_core.vademecum.tip_field import TipField
 
-HEIGHTS = (0.0, 6e-3)  # of a tip's centre above the surface, pressed in or just touching [m]
+HEIGHTS = (0.0, 10e-3)  # of the centre of a ball above the surface, of up to 10 mm [m]
 _OPEN = 0.999  # access from which a tip may touch without the force fading
-_WAY = np.linspace(1 / 3, 7 / 3, 8)  # heights above a tip along its approach [HEIGHTS[1]]
+_WAY = np.linspace(2e-3, 14e-3, 8)  # heights above a tip along its approach [m]
 _BATCH = 200  # patches solved at once
 MAX_DRAWS = 1000  # for one contact, on average; on livers most draws succeed
 
@@ -29,28 +30,36 @@ MAX_DRAWS = 1000  # for one contact, on average; on livers most draws succeed
 class UnseenContacts:
     """Tips and the points that they touch, each (n, 3).
 
-    tip : centre of the sphere [m]; place : closest point of the faces [m]; normal : that the step
-    presses along
+    tip : centre of the sphere [m]; place : of the faces under its contact, the closest to
+    tip - phi n [m]; normal : n, that the step presses along
     """
 
     tip: np.ndarray
     place: np.ndarray
     normal: np.ndarray
 
-    def true_compliance(
+    def solved(
         self, surface: LoadSurface, elasticity: Elasticity, single: bool = False
-    ) -> np.ndarray:
-        """n . C n of full finite elements, for patches at the places (n,) [m/N].
+    ) -> Iterator[tuple[float, np.ndarray]]:
+        """What full finite elements say of each contact, one after the other.
 
+        Parameters
+        ----------
         single : solved in single precision
+
+        Yields
+        ------
+        compliance : n . C n of a patch at the place [m/N]
+        displacement : ndarray, shape (n_vertices, 3), by its unit force along n [m/N]
         """
-        out = np.empty(len(self.tip))
-        for batch in np.array_split(np.arange(len(out)), -(-len(out) // _BATCH)):
+        n = len(self.tip)
+        for batch in np.array_split(np.arange(n), -(-n // _BATCH)):
             loads = patch_loads(elasticity, self.place[batch], surface.patch_radius)
             along = loads @ sp.block_diag(self.normal[batch][:, :, None])
             solution = elasticity.solve(along, single)
-            out[batch] = along.multiply(solution).sum(axis=0).ravel()
-        return out
+            compliance = np.asarray(along.multiply(solution).sum(axis=0)).ravel()
+            vertex = elasticity.at_vertices(solution).T.reshape(len(batch), -1, 3)
+            yield from zip(compliance, vertex, strict=True)
 
 
 def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
@@ -69,7 +78,7 @@ def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
     area = np.linalg.norm(
         np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
     )
-    tips, normals = np.empty((n, 3)), np.empty((n, 3))
+    tips, normals, feet = np.empty((3, n, 3))
     found, draws = 0, 0
     while found < n:
         draws += 1
@@ -84,19 +93,19 @@ def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
         gradient = np.zeros(3)
         if _at(field, field.access, tip, gradient) < _OPEN:
             continue
-        _at(field, field.distance, tip, gradient)
+        phi = _at(field, field.distance, tip, gradient)
         normal = gradient / np.linalg.norm(gradient)
         if _is_obstructed(field, tip, normal):
             continue
-        tips[found], normals[found] = tip, normal
+        tips[found], normals[found], feet[found] = tip, normal, tip - phi * normal
         found += 1
-    place = igl.point_mesh_squared_distance(tips, surface.centers, surface.corners)[2]
+    place = igl.point_mesh_squared_distance(feet, surface.centers, surface.corners)[2]
     return UnseenContacts(tips, np.ascontiguousarray(place), normals)
 
 
 def _is_obstructed(field: TipField, tip: np.ndarray, normal: np.ndarray) -> bool:
     """Whether the organ itself is in the way of a tip along its normal."""
-    way = tip + HEIGHTS[1] * np.outer(_WAY, normal)
+    way = tip + np.outer(_WAY, normal)
     slope = np.zeros(3)
     return min(_at(field, field.distance, p, slope, outside=np.inf) for p in way) <= 0.0
 

@@ -2,7 +2,7 @@
 
 Online: every level of detail of the displacement, timed on this machine, with errors on loads that
 neither the build nor the certificate used. Offline: size of the mesh, and number of solved loads.
-Also whether certified errors, and the estimated error of each force, hold.
+Also whether certified errors, budgets on other livers, and the estimated error of each force hold.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from avatar_core.certify.linear import measured
+from avatar_core.certify.accuracy_curve import StepErrors, step_errors
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.pipeline import OrganOptions, build
-from avatar_core.studies.force_error import ForceErrors, force_errors
+from avatar_core.studies.budgets import budget_rows, budget_table
 from avatar_core.studies.offline_cost import load_rows, mesh_rows
 from avatar_core.studies.online_cost import (
     Promises,
@@ -51,14 +51,17 @@ FRESH = 1001  # seed of loads that no certificate draws
 
 @dataclass(frozen=True)
 class AccuracyTimeSettings:
-    """Numbers of vertices, certified and fresh loads, and contacts; sizes of the offline sweeps."""
+    """Numbers of vertices, of touches: certified, fresh and of the rivals; sizes of the offline
+    sweeps; other livers on which budgets are tried, with so many touches each."""
 
     n_vertices: int = 2850
     n_certified: int = 200
-    n_fresh: int = 100
-    n_contacts: int = 1000
+    n_fresh: int = 1000
+    n_rivals: int = 50
     meshes: tuple[int, ...] = (1200, 1800, 2600)
     projections: tuple[float, ...] = (0.02, 5e-3, 1.5e-3)
+    livers: tuple[str, ...] = ("LiTS-50", "Amos-052", "Amos-086")
+    n_touches: int = 300
 
 
 class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
@@ -66,44 +69,52 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
 
     name = "accuracy-time"
     full = AccuracyTimeSettings()
-    quick = AccuracyTimeSettings(1200, 60, 40, 150, (1200,), (5e-3,))
+    quick = AccuracyTimeSettings(1200, 60, 150, 20, (1200,), (5e-3,), ())
     paper: ClassVar = {"modes_for_10_percent": "11", "rate_hz": "1000, without a table"}
 
     def measure(self, run: Run[AccuracyTimeSettings]) -> None:
         settings, surface = run.settings, read_liver(run.surfaces, "LiTS-4")
-        with ProgressBar(4) as bar:
+        with ProgressBar(5) as bar:
             options = OrganOptions(n_vertices=settings.n_vertices, n_certified=settings.n_certified)
             v = build(surface, options, bar.begin("build"))
             assert v.certificate is not None and v.certificate.curve is not None
             elasticity = Elasticity(v.mesh, v.material, v.regions.clamped, v.element)
             curve = v.certificate.curve
-            bar.begin("fresh loads")
-            fresh = measured(v, elasticity, settings.n_fresh, FRESH)
-            run.kept |= {"organ": v, "promises": promises(curve, fresh)}
-            run.kept["contacts"] = force_errors(v, elasticity, settings.n_contacts, FRESH)
+            bar.begin("fresh touches")
+            fresh = step_errors(v, elasticity, settings.n_fresh, FRESH)
+            run.kept |= {"organ": v, "promises": promises(curve, fresh), "fresh": fresh}
             bar.begin("rivals")
             run.rows += curve_rows(curve)
-            run.rows += rival_rows(v, elasticity, curve, settings.n_fresh // 2, FRESH)
+            run.rows += rival_rows(v, elasticity, curve, settings.n_rivals, FRESH)
             run.rows += cost_of_effects(v)
             bar.begin("mesh and loads")
             run.rows += mesh_rows(surface, settings.meshes)
             run.rows += load_rows(elasticity, v.surface, settings.projections)
-        run.notices += short_table(run.rows)
+            bar.begin("budgets")
+            budgets = budget_rows(v, fresh)
+            for name in settings.livers:
+                other = build(read_liver(run.surfaces, name), options)
+                problem = Elasticity(other.mesh, other.material, other.regions.clamped)
+                budgets += budget_rows(
+                    other, step_errors(other, problem, settings.n_touches, FRESH)
+                )
+        run.rows += budgets
+        run.notices += (*short_table(run.rows), *budget_table(budgets))
 
     def summary(self, run: Run[AccuracyTimeSettings]) -> dict[str, float]:
         rows, v = run.rows, run.kept["organ"]
         kept: Promises = run.kept["promises"]
-        contacts: ForceErrors = run.kept["contacts"]
+        error, said = run.kept["fresh"].force, _said(v, run.kept["fresh"])
         best = _best(rows)
         return {
             "promise_kept_fraction": kept.errors_kept,
             "points_kept_fraction": kept.points_kept,
-            "force_error_coverage": contacts.coverage,
-            "force_error_overestimate": contacts.overestimate,
+            **_force_figures(error, said),
+            "budget_kept_least": _least_kept(rows),
             "front_points": sum(bool(row.get("front")) for row in rows),
             "l2_95": best["error"],
             **_beside_table(rows, v),
-            "force_95": float(np.quantile(contacts.error / contacts.force, 0.95)),
+            "force_95": float(np.quantile(error, 0.95)),
             "step_p50_us": best["p50_us"],
             "step_p99_us": best["p99_us"],
             "vertices": len(v.mesh.vertices),
@@ -115,12 +126,12 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
             f"{run.kept['organ'].name}: a step that shows all {summary['vertices']:.0f} vertices "
             f"takes {summary['step_p50_us']:.0f} us and is within {summary['l2_95']:.1%} for 95 % "
             f"of unseen touches, its force within {summary['force_95']:.1%}; promised errors held "
-            f"for {summary['promise_kept_fraction']:.1%} of fresh loads, the error said with a "
+            f"for {summary['promise_kept_fraction']:.1%} of fresh touches, the error said with a "
             f"force covered {summary['force_error_coverage']:.1%} of contacts"
         )
 
     def draw(self, figure: Figure, run: Run[AccuracyTimeSettings]) -> None:
-        draw_panels(figure, _panels(run.rows, run.kept["contacts"]))
+        draw_panels(figure, _panels(run.rows, run.kept["organ"], run.kept["fresh"]))
 
 
 STUDY = AccuracyTimeStudy()
@@ -146,6 +157,11 @@ def _line(error: str, row: dict[str, Any], by: str) -> str:
     return (
         f"| {error} | {row['p50_us']:.0f} / {row['p99_us']:.0f} | {by} | {row['bytes'] / 1e6:.1f} |"
     )
+
+
+def _least_kept(rows: list[Row]) -> float:
+    """The least part of touches that keep a budget, over livers and budgets."""
+    return min((float(row["kept"]) for row in rows if "kept" in row), default=float("nan"))  # type: ignore[arg-type]
 
 
 def _best(rows: list[Row]) -> dict[str, Any]:
@@ -174,11 +190,11 @@ def _beside_table(rows: list[Row], vademecum: Vademecum) -> dict[str, float]:
 # --- Plots -----------------------------------------------------------------------------------
 
 
-def _panels(rows: list[Row], contacts: ForceErrors) -> tuple[Panel, ...]:
+def _panels(rows: list[Row], vademecum: Vademecum, fresh: StepErrors) -> tuple[Panel, ...]:
     return (
         Panel("online, all vertices: fewer modes are faster", partial(_online, rows, "volume")),
         Panel("online, vertices of the surface alone", partial(_online, rows, "surface")),
-        Panel("error said with a force", partial(_force, contacts)),
+        Panel("error said with a force", partial(_force, fresh.force, _said(vademecum, fresh))),
         Panel("cost of effects: one that is not named costs nothing", partial(_effects, rows)),
         Panel("size of the mesh", partial(_offline, rows, "mesh")),
         Panel(
@@ -209,9 +225,25 @@ def _online(rows: list[Row], cloud: str, axes: Axes) -> None:
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _force(contacts: ForceErrors, axes: Axes) -> None:
-    error, estimate = contacts.error / contacts.force, contacts.estimate / contacts.force
-    axes.scatter(error, estimate, s=6, c="#0072B2", alpha=0.5, label="unseen contacts")
+def _said(vademecum: Vademecum, fresh: StepErrors) -> np.ndarray:
+    """The relative error that is said with the force of each touch."""
+    assert vademecum.certificate is not None
+    return vademecum.certificate.force_error.relative(fresh.smoothing)
+
+
+def _force_figures(error: np.ndarray, said: np.ndarray) -> dict[str, float]:
+    """How many errors are covered by what is said, and by how much more that is in the median;
+    beside one error for all touches that covers as many."""
+    covered = float(np.mean(error <= said))
+    return {
+        "force_error_coverage": covered,
+        "force_error_overestimate": float(np.median(said / error)),
+        "one_error_overestimate": float(np.median(np.quantile(error, covered) / error)),
+    }
+
+
+def _force(error: np.ndarray, said: np.ndarray, axes: Axes) -> None:
+    axes.scatter(error, said, s=6, c="#0072B2", alpha=0.5, label="unseen contacts")
     ends = np.array([1e-4, 1.0])
     axes.plot(ends, ends, "k-", lw=1, label="said = true")
     axes.plot(ends, 3 * ends, "k:", lw=1, label="said = 3 x true")

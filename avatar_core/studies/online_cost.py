@@ -1,6 +1,7 @@
 """Online accuracy against time: every point of the accuracy curve, and rivals, in one run.
 
-Errors are the 95 % quantile over fresh loads; times are whole steps on this machine.
+Errors are the 95 % quantile over fresh contacts, the rivals' where the tip presses and not through
+the stencil of a step; times are whole steps on this machine.
 
     vademecum      global modes and those of the place's region, as a step shows it
     SVD optimum    the best basis for 150 solved loads, judged on others; one for all places
@@ -16,8 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from avatar_core.certify.linear import UnseenErrors
+from avatar_core.certify.accuracy_curve import StepErrors
+from avatar_core.certify.unseen_contacts import UnseenContacts, draw_contacts
 from avatar_core.contact.effects import LargeDeformationEffect
+from avatar_core.contact.tip_response import closest_weights
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm, relative_l2
 from avatar_core.fem.patch_loads import patch_loads
@@ -44,18 +47,18 @@ _BATCH = 40
 
 @dataclass(frozen=True, eq=False)
 class Promises:
-    """How far certified errors held for fresh loads.
+    """How far certified errors held for fresh touches.
 
-    errors_kept : fraction of all pairs of a point and a fresh load within the certified error
-    points_kept : fraction of the points whose certified error holds for 95 % of the fresh loads
+    errors_kept : fraction of all pairs of a point and a fresh touch within the certified error
+    points_kept : fraction of the points whose certified error holds for 95 % of the fresh touches
     """
 
     errors_kept: float
     points_kept: float
 
 
-def promises(curve: AccuracyCurve, fresh: UnseenErrors) -> Promises:
-    """Compare a curve with errors on fresh loads."""
+def promises(curve: AccuracyCurve, fresh: StepErrors) -> Promises:
+    """Compare a curve with errors at fresh touches."""
     shown = [point for point in curve.points if point.detail.cloud != "off"]
     promised = np.array([point.l2 for point in shown])
     kept = fresh.shown <= promised[:, None]
@@ -93,17 +96,15 @@ def rival_rows(
     The table's time is that of all modes on the curve, times the ratio of both in turns: the
     curve was timed minutes before, on a machine with neighbours.
     """
-    surface = vademecum.surface
-    drawn = np.random.default_rng(seed).permutation(len(surface.corners))
-    chosen, others = drawn[:n_loads], drawn[n_loads : n_loads + N_SNAPSHOTS]
-    truth = _solutions(elasticity, surface.centroids[chosen], surface.patch_radius)
-    mass = vademecum.mesh.lumped_mass
-    errors = _table_errors(vademecum, elasticity, chosen, truth, mass)
-    table = upper_quantile(errors, n_independent=n_loads)
+    surface, mass = vademecum.surface, vademecum.mesh.lumped_mass
+    contacts = draw_contacts(vademecum, n_loads, seed)
+    truth = np.stack([u.ravel() for _, u in contacts.solved(surface, elasticity)], axis=1)
+    table = upper_quantile(_table_errors(vademecum, elasticity, contacts, truth, mass))
+    drawn = np.random.default_rng(seed).permutation(len(surface.corners))[:N_SNAPSHOTS]
     return [
         *_optimum_rows(
             curve,
-            _solutions(elasticity, surface.centroids[others], surface.patch_radius),
+            _solutions(elasticity, surface.centroids[drawn], surface.patch_radius),
             truth,
             mass,
         ),
@@ -148,20 +149,19 @@ def _solutions(elasticity: Elasticity, centers: np.ndarray, radius: float) -> np
 def _table_errors(
     vademecum: Vademecum,
     elasticity: Elasticity,
-    faces: np.ndarray,
+    contacts: UnseenContacts,
     truth: np.ndarray,
     mass: np.ndarray,
 ) -> np.ndarray:
-    """Of exact columns at the load positions, interpolated to the centroids of some faces."""
+    """Of exact columns at the load positions, interpolated to the places of some contacts."""
     surface = vademecum.surface
-    middle = np.full((len(faces), 3), 1.0 / 3.0)
-    positions, weights = surface.weights(faces, middle)
+    positions, weights = closest_weights(surface, contacts.place)
     needed, index = np.unique(positions, return_inverse=True)
     columns = _solutions(elasticity, surface.centers[needed], surface.patch_radius)
     columns = columns.reshape(len(columns), len(needed), 3)
-    rows = zip(index.reshape(positions.shape), weights, strict=True)
-    found = np.stack([np.einsum("vid,i->vd", columns[:, row], w) for row, w in rows], axis=1)
-    return relative_l2(found.reshape(truth.shape), truth, mass)
+    rows = zip(index.reshape(positions.shape), weights, contacts.normal, strict=True)
+    found = np.stack([np.einsum("vid,i,d->v", columns[:, row], w, n) for row, w, n in rows], axis=1)
+    return relative_l2(found, truth, mass)
 
 
 def _optimum_rows(
@@ -179,12 +179,7 @@ def _optimum_rows(
         best = basis[:, : point.detail.modes]
         left = np.linalg.norm(scaled - best @ (best.T @ scaled), axis=0)
         fast = CurvePoint(
-            point.detail,
-            upper_quantile(left, n_independent=truth.shape[1] // 3),
-            float("nan"),
-            point.nbytes,
-            point.p50,
-            point.p99,
+            point.detail, upper_quantile(left), float("nan"), point.nbytes, point.p50, point.p99
         )
         rows.append(_row("SVD optimum", fast))
     return rows

@@ -48,8 +48,9 @@ def mode_levels(n_modes: int) -> tuple[int, ...]:
 class CurvePoint:
     """Measured error, size and time of a detail.
 
-    l2, force : relative error that 95 % of unseen loads stay below, of the displacement of the
-        cloud and of the normal force; l2 is NaN where nothing is shown
+    l2, force : relative error that 95 % of unseen contacts stay below, of the displacement of the
+        cloud under the force that is felt, and of that force at the tip's depth; l2 is NaN where
+        nothing is shown
     p50, p99 : time that a step takes of the processor [s]; NaN where it was not timed
     nbytes : of all that is held to show the displacement; a step reads a part
     """
@@ -70,7 +71,7 @@ class CurvePoint:
 class Budget:
     """Limits on the error and the time of a step.
 
-    tolerance : on the relative error of ``quantity``, which 95 % of the loads keep
+    tolerance : on the relative error of ``quantity``, which 95 % of contacts keep
     deadline : on the measured time that a step takes of the processor, which 99 % keep [s]; a
         detail that was not timed keeps any
 
@@ -102,7 +103,7 @@ class Budget:
 class AccuracyCurve:
     """Measured error and time of many details of one vademecum.
 
-    n_errors : unseen loads and directions behind each error; machine : where it was timed
+    n_errors : unseen contacts behind each error; machine : where it was timed
     """
 
     points: tuple[CurvePoint, ...]
@@ -203,24 +204,16 @@ def _first(
     return (min(known, key=key),) if known else ()
 
 
-def upper_quantile(
-    values: np.ndarray, content: float = CONTENT, n_independent: int | None = None
-) -> float:
-    """A bound that holds for a part ``content`` of what the values were drawn from.
+def upper_quantile(values: np.ndarray, content: float = CONTENT) -> float:
+    """A bound that holds for a part ``content`` of what the values (n,) were drawn from.
 
     Distribution-free tolerance bound (Wilks, Annals of Mathematical Statistics 12, 1941): the
     smallest order statistic x_(r) with P[B >= r] <= 1 - confidence, B binomial of n and
-    ``content``; the largest value where the sample is too small for the confidence. Where only
-    some of the values are independent, r / n is that of so many: the errors of the three directions
-    of a load are correlated.
-
-    n_independent : of the values; None for all
+    ``content``; the largest value where the sample is too small for the confidence.
     """
     from scipy.stats import binom
 
-    ordered = np.sort(np.asarray(values, float).ravel())
-    if len(ordered) == 0:
+    if len(values) == 0:
         return float("nan")
-    n = n_independent or len(ordered)
-    rank = min(int(binom.ppf(_CONFIDENCE, n, content)) + 1, n)
-    return float(ordered[math.ceil(rank / n * len(ordered)) - 1])
+    rank = min(int(binom.ppf(_CONFIDENCE, len(values), content)) + 1, len(values))
+    return float(np.sort(values)[rank - 1])

@@ -246,12 +246,16 @@ def test_leave_one_out(conduct: Conduct) -> None:
 
 @pytest.mark.long
 def test_accuracy_time(conduct: Conduct) -> None:
-    settings = accuracy_time.AccuracyTimeSettings(400, 100, 40, 150, (300,), (5e-3,))
+    settings = accuracy_time.AccuracyTimeSettings(
+        400, 100, 150, 20, (300,), (5e-3,), ("another",), 60
+    )
     run = conduct(accuracy_time.STUDY, settings)
     summary = run.summary
     assert summary["promise_kept_fraction"] >= 0.95
+    assert summary["budget_kept_least"] >= 0.93
     assert summary["force_error_coverage"] >= 0.85  # 150 contacts: 90 % less two deviations
-    assert summary["force_error_overestimate"] <= 3.0
+    # it tells touches apart: one error for all of them would have to be larger in most places
+    assert summary["force_error_overestimate"] <= 0.8 * summary["one_error_overestimate"]
     assert summary["front_points"] >= 5
     methods = {row["method"] for row in run.rows}
     assert {"SVD optimum", "dense table", "direct solve", "projected"} <= methods
