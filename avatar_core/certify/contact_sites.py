@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import igl
 import numpy as np
@@ -25,7 +25,7 @@ from avatar_core.errors import ContactError, ConvergenceError, MeshError
 from avatar_core.fem.norms import relative_l2
 from avatar_core.geometry.heights import tangents
 from avatar_core.geometry.tip import Tip
-from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, ResolvedPlace, contacts_at
+from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, contacts_at
 from avatar_core.offline.rule import NO_ERROR, Progress, silent
 from avatar_core.vademecum.certificate import Certificate, ContactSites
 from avatar_core.vademecum.force_error import PROMISED
@@ -128,13 +128,12 @@ def contacts_at_sites(
     """
     contacts: list[SiteContact] = []
     lost: list[str] = []
+    models = [_Models.of(vademecum, tip) for tip in tips]
     for site in sites:
         try:
-            (found,) = compared(vademecum, surface, [site], tips, depths)
+            contacts += compared(vademecum, surface, site, models, depths)
         except (MeshError, ContactError, ConvergenceError) as error:
             lost.append(f"a {site.kind} place: {error}")
-            continue
-        contacts += found
     felt = [contact for contact in contacts if np.isfinite(contact.force)]
     notices = []
     if lost:
@@ -247,19 +246,33 @@ def _access(vademecum: Vademecum, site: Site) -> float:
     return float(evaluate(field.access, field.origin, field.spacing[0], below, np.zeros(3), 0.0))
 
 
+class _Models(NamedTuple):
+    """The step of one tip, that of a patch in its place, and the tip."""
+
+    real: ContactModel
+    patch: ContactModel
+    tip: Tip
+
+    @classmethod
+    def of(cls, vademecum: Vademecum, tip: Tip) -> _Models:
+        real = prepare(vademecum, (tip,), cloud="volume", effects=())
+        patch = prepare(vademecum, (Tip("patch", tip.radius),), cloud="off", effects=())
+        return cls(real, patch, tip)
+
+
 def compared(
     vademecum: Vademecum,
     surface: SurfaceMesh,
-    sites: Sequence[Site],
-    tips: Sequence[Tip] = SPHERES,
+    site: Site,
+    models: Sequence[_Models],
     depths: Sequence[float] = DEPTHS,
-) -> Iterator[list[SiteContact]]:
-    """The contacts of each site, one site after the other.
+) -> list[SiteContact]:
+    """The contacts of several tips at one site.
 
     Parameters
     ----------
     vademecum : linear, at its own material
-    tips : spheres
+    models : of each tip
     depths : of their lowest point below the surface [m]
 
     A tip whose sides touch a hollow before it reaches the place is left out there.
@@ -269,45 +282,21 @@ def compared(
     MeshError, ContactError, ConvergenceError
         As :func:`avatar_core.offline.resolved_contact.contacts_at`.
     """
-    models = [prepare(vademecum, (tip,), cloud="volume", effects=()) for tip in tips]
-    patches = [
-        prepare(vademecum, (Tip("patch", tip.radius),), cloud="off", effects=()) for tip in tips
-    ]
-    for site in sites:
-        truth = contacts_at(
-            surface,
-            vademecum.mesh,
-            vademecum.regions,
-            vademecum.material,
-            site.point,
-            site.normal,
-            tips,
-            depths,
-        )
-        yield _at_site(vademecum, site, truth, models, patches, tips, depths)
-
-
-def _at_site(
-    vademecum: Vademecum,
-    site: Site,
-    truth: ResolvedPlace,
-    models: Sequence[ContactModel],
-    patches: Sequence[ContactModel],
-    tips: Sequence[Tip],
-    depths: Sequence[float],
-) -> list[SiteContact]:
+    organ = (surface, vademecum.mesh, vademecum.regions, vademecum.material)
+    tips = [model.tip for model in models]
+    truth = contacts_at(*organ, site.point, site.normal, tips, depths)
     vertices, mass = vademecum.mesh.vertices, vademecum.mesh.lumped_mass
     far = np.linalg.norm(vertices - site.point, axis=1) > FAR
     kept = np.repeat(far, 3)
     out = []
     fits = truth.condensed.first_depths > -FITS
-    for i, tip in enumerate(tips):
+    for i, (real, patch, tip) in enumerate(models):
         if not fits[i]:
             continue
         moved = truth.condensed.displacements(truth.contacts[i])[:, : len(vertices)]
         for k, depth in enumerate(depths):
-            force, axis = pressed(models[i], site, tip, depth), truth.axes[i, k]
-            shown = models[i].out.cloud[:, 3:].astype(float).ravel()
+            force, axis = pressed(real, site, tip, depth), truth.axes[i, k]
+            shown = real.out.cloud[:, 3:].astype(float).ravel()
             out.append(
                 SiteContact(
                     site,
@@ -316,12 +305,12 @@ def _at_site(
                     float(truth.forces[i, k]),
                     float(force @ axis),
                     _angle(force, axis),
-                    float(models[i].out.force_error[0]),
+                    float(real.out.force_error[0]),
                     float(
-                        law_error(models[i].effects.tip_law, models[i].state.steepness[0], 0)
-                        * np.linalg.norm(models[i].out.force[0])
+                        law_error(real.effects.tip_law, real.state.steepness[0], 0)
+                        * np.linalg.norm(real.out.force[0])
                     ),
-                    float(pressed(patches[i], site, tip, depth) @ axis),
+                    float(pressed(patch, site, tip, depth) @ axis),
                     float(hertz_force(vademecum.material, tip.radius, depth))
                     if tip.shape == "sphere"
                     else np.nan,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,7 +45,7 @@ from tests.helpers.box_organ import UP, organ
 SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
 BALL = Tip("sphere", 3e-3)
 FOUND = ContactSites(36, 3, 0.04, 0.1, 0.15, 0.92, 3.1, 1.4)
-Compared = Callable[..., Iterator[list[SiteContact]]]
+Compared = Callable[..., list[SiteContact]]
 
 
 def contact(force: float, patch: float, law: float, site: Site = SITE) -> SiteContact:
@@ -161,11 +161,11 @@ def test_key_figures_are_those_of_the_contacts() -> None:
 def met(fails: Sequence[str] = ()) -> Compared:
     """In place of resolved contacts: 4 % off, or no mesh at places of some kinds."""
 
-    def compared(*arguments: Any) -> Iterator[list[SiteContact]]:
-        (site,) = arguments[2]
+    def compared(*arguments: Any) -> list[SiteContact]:
+        site = arguments[2]
         if site.kind in fails:
             raise MeshError("too large")
-        yield [contact(2.08, 0.02, 0.04, site) for _ in range(12)]
+        return [contact(2.08, 0.02, 0.04, site) for _ in range(12)]
 
     return compared
 
@@ -200,8 +200,8 @@ def test_an_organ_none_of_whose_places_can_be_resolved_has_no_figures(
 def test_poses_that_the_step_refuses_are_counted_in_a_notice(
     box: Vademecum, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def compared(*arguments: Any) -> Iterator[list[SiteContact]]:
-        yield [contact(force, 0.1, 0.1, arguments[2][0]) for force in (2.0, float("nan"))]
+    def compared(*arguments: Any) -> list[SiteContact]:
+        return [contact(force, 0.1, 0.1, arguments[2]) for force in (2.0, float("nan"))]
 
     monkeypatch.setattr(contact_sites, "compared", compared)
     found = with_contact_sites(box, outline(box), 3, 0)

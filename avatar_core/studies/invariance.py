@@ -1,0 +1,78 @@
+"""The force of a ball on one organ that is given in two ways: turned, or meshed more coarsely.
+
+Nothing that a patient has differs between both, so that the forces should not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avatar_core.certify.contact_sites import Site, draw_sites, pressed
+from avatar_core.contact.model import prepare
+from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.geometry.tip import Tip
+from avatar_core.pipeline import OrganOptions, build
+from avatar_core.vademecum.model import Vademecum
+
+TURN = np.radians(30.0)  # about the axis S
+COARSE = 700  # vertices of the coarser mesh
+BALL, DEPTH = Tip("sphere", 5e-3), 2e-3  # [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """Of the forces at some places of an organ given in two ways, relative to the first.
+
+    difference : ndarray, shape (n,), |F' / F - 1|; said : (n,), the sum of the errors of both as
+    the step says them, over F
+    """
+
+    difference: np.ndarray
+    said: np.ndarray
+
+    def figures(self, name: str) -> dict[str, float]:
+        """Quantiles, and the part of the places that the errors said cover."""
+        return {
+            f"{name}_median": float(np.median(self.difference)),
+            f"{name}_p95": float(np.quantile(self.difference, 0.95)),
+            f"{name}_worst": float(self.difference.max()),
+            f"{name}_coverage": float(np.mean(self.difference <= self.said)),
+            f"{name}_places": float(len(self.difference)),
+        }
+
+
+def differences(surface: SurfaceMesh, options: OrganOptions, n: int) -> dict[str, float]:
+    """Figures of the organ turned, and of its coarser mesh, beside the organ as it is given."""
+    whole = build(surface, options)
+    sites = draw_sites(whole, surface, n + 2, seed=11)[:-2]
+    cosine, sine = np.cos(TURN), np.sin(TURN)
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    turned = build(replace(surface, vertices=surface.vertices @ turn.T), options)
+    coarse = build(surface, replace(options, n_vertices=COARSE))
+    there = [replace(s, point=turn @ s.point, normal=turn @ s.normal) for s in sites]
+    return {
+        **_between(whole, sites, turned, there).figures("turned"),
+        **_between(whole, sites, coarse, sites).figures("coarse"),
+    }
+
+
+def _between(
+    one: Vademecum, here: Sequence[Site], other: Vademecum, there: Sequence[Site]
+) -> Differences:
+    """Where both touch: at the border of the accessible surface, one of them may not."""
+    first, second = (_forces(v, sites) for v, sites in ((one, here), (other, there)))
+    both = np.isfinite(first[0] + second[0])
+    (a, error_a), (b, error_b) = first[:, both], second[:, both]
+    return Differences(np.abs(b / a - 1.0), (error_a + error_b) / a)
+
+
+def _forces(vademecum: Vademecum, sites: Sequence[Site]) -> np.ndarray:
+    """Sizes of the forces, and the errors that are said, shape (2, n) [N]; NaN if refused."""
+    model = prepare(vademecum, (BALL,), cloud="off", effects=())
+    found = np.empty((2, len(sites)))
+    for k, site in enumerate(sites):
+        found[:, k] = np.linalg.norm(pressed(model, site, BALL, DEPTH)), model.out.force_error[0]
+    return found
