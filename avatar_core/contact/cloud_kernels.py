@@ -1,7 +1,7 @@
 """The compiled part of the contact step that deforms the cloud.
 
     u(x) = sum_r sum_k Z_rbk(x) sum_m C_rbkm a_rm,    x in block b of the cloud,
-    a_rm = - sum_t lambda_t a_t sum_j w_j W_m(s_j) . n_t,
+    a_rm = - sum_t lambda_t sum_j w_j W_m(s_j) . n_t,
 
 over the load positions j of region r that carry a tip, with the modes Z and the core C of
 :mod:`avatar_core.contact.cloud`, and for large deformation the terms of
@@ -115,7 +115,7 @@ def _load_regions(model, state, effects, t):  # type: ignore[no-untyped-def]
         region_weight[model.region[state.nodes[t, i]]] += state.weight[t, i, 0]
     for i in range(state.n_nodes[t]):
         kept += _kept_weight(model, state, t, i)
-    n, scale = state.normal[t], state.scale[t] / kept
+    n = state.normal[t]
     f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
     if friction.on:
         f0, f1, f2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
@@ -128,7 +128,7 @@ def _load_regions(model, state, effects, t):  # type: ignore[no-untyped-def]
             r = model.region[j]
             _touch(model, state, large_deformation, r)
             if not viscoelasticity.on:
-                part = w * scale
+                part = w / kept
                 _add_load(model, state, j, part * f0, part * f1, part * f2)
             if large_deformation.on:
                 add_nonlinear_load(state, large_deformation, r, j, w / kept, second, third)

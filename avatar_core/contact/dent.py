@@ -37,14 +37,13 @@ from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Sequence
-from functools import cache
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss
 
 from avatar_core.common.jit import fast
-from avatar_core.contact.effects.tip_law import PATCH, dent
+from avatar_core.contact.effects.tip_law import dent
 from avatar_core.contact.effects.tip_profile import INTERVALS, TAKEN
+from avatar_core.contact.patch_on_plane import PATCH, patch_dent, quarter_turn
 from avatar_core.geometry.tip import Tip
 
 REACH = 2.0  # of the change around a tip, in patch radii
@@ -52,7 +51,6 @@ FADE = 1.5  # in patch radii, where it begins to fade
 NODES = 8  # of the Gauss rule
 _ASIDE = 0.5  # of a tip from the nearest load position, in patch radii; farther, all points count
 _SERIES = 2.0  # contact radii, from where on u_tip is a series, at half the cost
-_FINE = 24  # nodes of the rule behind the table of the patch
 
 DentArrays = namedtuple(
     "DentArrays",
@@ -104,25 +102,6 @@ def dent_arrays(
 def dent_state(arrays: DentArrays) -> DentState:
     """The constant arrays, with scratch for one contact."""
     return DentState(*arrays, np.zeros(NODES, np.float32), np.zeros(NODES, np.float32))
-
-
-def patch_dent(rho: np.ndarray) -> np.ndarray:
-    """E* R_p / F u_patch at distances rho [R_p] on the surface of a half-space."""
-    theta, weight = quarter_turn(_FINE)
-    rho = np.asarray(rho, float)[..., None]
-    end = np.minimum(rho, 1.0)
-    x = end * np.sin(theta)
-    # int_0^end (1 - x^2)^(5/2) / sqrt(rho^2 - x^2) dx, with the limit at rho = 0
-    far = np.sqrt(np.maximum(rho**2 - x**2, 1e-300))
-    step = np.where(rho > 1.0, np.cos(theta) / far, 1.0)
-    return np.asarray(32.0 / (5.0 * np.pi**2) * ((1.0 - x**2) ** 2.5 * step) @ weight)
-
-
-@cache
-def quarter_turn(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of Gauss's rule over theta in [0, pi/2]."""
-    node, weight = leggauss(n)
-    return 0.25 * np.pi * (node + 1.0), 0.25 * np.pi * weight
 
 
 def points_around(

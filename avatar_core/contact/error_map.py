@@ -29,7 +29,8 @@ def force_error_at(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
     field, surface = vademecum.tip_field, vademecum.surface
     load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
     carriers = tip_carriers(surface, field, _SHELL, _SHELL)
-    response = make_tip_response(surface, field, carriers, load, vademecum.contact_near)
+    modulus = vademecum.material.plane_strain_modulus
+    response = make_tip_response(surface, field, carriers, load, vademecum.contact_near, modulus)
     grid = _in_spacings(field, points)
     smoothing = map_coordinates(response.smoothing.astype(float), grid, order=1, mode="nearest")
     error = force_error_grid(vademecum.certificate, vademecum.large, smoothing)

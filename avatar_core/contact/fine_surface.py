@@ -25,8 +25,9 @@ import scipy.sparse as sp
 from scipy.optimize import brentq
 
 from avatar_core.common.splines import evaluate
-from avatar_core.contact.dent import FADE, REACH, patch_dent, quarter_turn
+from avatar_core.contact.dent import FADE, REACH
 from avatar_core.contact.effects.tip_law import PATCH_ON_MESH
+from avatar_core.contact.patch_on_plane import patch_dent, quarter_turn
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum

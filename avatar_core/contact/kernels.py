@@ -52,14 +52,7 @@ from avatar_core.contact.effects.several_tools import (
     couple_near_fields,
     solve_active_set,
 )
-from avatar_core.contact.effects.tip_law import (
-    add_tip_force,
-    advance_tips,
-    law_error,
-    predict_tips,
-    sample_organ,
-    solve_tip,
-)
+from avatar_core.contact.effects.tip_law import add_tip_force, law_error, sample_organ, solve_tip
 from avatar_core.contact.effects.viscoelasticity import (
     advance_history,
     predict_history,
@@ -142,8 +135,7 @@ State = namedtuple(
         "column",  # (T, MAX_STENCIL, 3) near displacement at the nodes by a unit normal force
         "self_compliance",  # (T,) gamma
         "self_slope",  # (T, 3) grad gamma
-        "gram",  # (T, T) f_t . C f_t'
-        "scale",  # (T,) a_t
+        "blurred",  # (T,) gamma - f . C f [m/N]
         "compliance",  # (T, T)
         "shown",  # (1,) level of the modes that are shown
         "amplitude",  # (n_amplitudes,) of global modes that stand apart, and of all regions
@@ -215,9 +207,8 @@ def _solve_period(model, state, out, tips, effects):  # type: ignore[no-untyped-
     e = effects
     to_organ_frame(e.respiration, tips)
     status = _locate_tips(model, state, out, tips, effects)
-    couple_near_fields(model, state, e.several_tools, e.friction)
+    couple_near_fields(model, state, e.several_tools, e.friction, e.tip_law)
     _predict(effects)
-    predict_tips(e.tip_law, e.viscoelasticity)
     _assemble_incremental(model, state, effects)
     converged = solve_contact(model, state, tips, effects)
     if not converged:
@@ -227,7 +218,6 @@ def _solve_period(model, state, out, tips, effects):  # type: ignore[no-untyped-
     superpose_modes(state, e.superposition, e.friction)
     write_forces(model, state, out, tips, e)
     advance_history(state, effects)
-    advance_tips(state, e.tip_law, e.viscoelasticity)
     advance_inertia(e.superposition, e.inertia)
     to_world_frame(e.respiration, out)
     for t in range(tips.shape[0]):
@@ -287,12 +277,12 @@ def _assemble_incremental(model, state, effects):  # type: ignore[no-untyped-def
     for t in range(state.passage.shape[0]):
         if not state.active[t]:
             continue
-        free_tip_displacement(model, state, superposition, viscoelasticity, t)
+        free_tip_displacement(model, state, effects, t)
         if inertia.on:
             far, near = 0.0, near_along_normal(state, t, state.column[t])
             for k in range(state.mode.shape[1]):
                 far += superposition.gain[k] * state.mode[t, k] * state.mode[t, k]
-            incremental = state.scale[t] ** 2 * (far + superposition.near_gain[0] * near)
+            incremental = far + superposition.near_gain[0] * (near + state.blurred[t])
             state.compliance[t, t] += incremental - state.self_compliance[t]
         elif viscoelasticity.on:
             softened = viscoelasticity.gain[0] - 1.0
@@ -302,13 +292,12 @@ def _assemble_incremental(model, state, effects):  # type: ignore[no-untyped-def
 @inlined
 def solve_contact(model, state, tips, effects):  # type: ignore[no-untyped-def]
     """Forces of all tips, by the cheapest solver for the effects; whether it converged."""
-    superposition, several_tools = effects.superposition, effects.several_tools
-    large_deformation, friction = effects.large_deformation, effects.friction
-    tip_law = effects.tip_law
+    several_tools, large_deformation = effects.several_tools, effects.large_deformation
+    friction, tip_law = effects.friction, effects.tip_law
     if friction.on:
         return solve_friction(model, state, tips, effects)
     if several_tools.on:
-        assemble_coupling(state, superposition, several_tools)
+        assemble_coupling(state, effects)
     if several_tools.on or (large_deformation.on and not tip_law.on):
         return solve_together(state, effects)
     return solve_alone(state, effects)

@@ -177,7 +177,9 @@ def lay_out_details(
     padded, softness = _padded(load), float((load**2).sum(axis=(1, 2)).mean() / 3.0)
     field, offset = vademecum.tip_field, np.array([tip.offset for tip in tips])
     shape = shape or _Shape.of(vademecum, tips)
-    response = make_tip_response(surface, field, shape.carriers, load, contact)
+    response = make_tip_response(
+        surface, field, shape.carriers, load, contact, vademecum.material.plane_strain_modulus
+    )
     large = vademecum.large if find(effects, LargeDeformationEffect) is not None else None
     error = force_error_grid(vademecum.certificate, large, response.smoothing)
     tilt = tilt_arrays(leaning, tips, field) if leaning is not None else None
@@ -238,7 +240,8 @@ def lay_out_details(
         yield Layout(
             arrays,
             selected_arrays(
-                vademecum, effects, mass, nonlinear, shape.reach, period, law, dent, tilt, fine
+                *(vademecum, effects, mass, nonlinear, shape.reach, surface.patch_radius, period),
+                *(law, dent, tilt, fine),
             ),
         )
 

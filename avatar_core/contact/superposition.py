@@ -10,13 +10,15 @@ inertia). The near field follows the same equation; its history is a distributio
 has no mass.
 
 The force on a tip is the derivative of the elastic energy at fixed loads and history. With u_j the
-displacement at load position j by all causes, U = a sum_j w_j u_j that of the patch, and g the
-force on the tissue,
+displacement at load position j by all causes, U = sum_j w_j u_j that of the patch, and g the force
+on the tissue,
 
-    F_d = - g . d(target)/dp_d + (da/dp_d / a) g . U + a sum_j dw_j/dp_d g . u_j,
+    F_d = - g . d(target)/dp_d + sum_j dw_j/dp_d g . u_j + g . e / 2 d(gamma - f . C f)/dp_d,
 
 where target is the displacement that contact prescribes for the patch (along n only, unless the tip
-sticks), and a^2 = gamma / (f . C f) from :mod:`avatar_core.contact.tip_response`.
+sticks). gamma - f . C f, what the stencil blurs of the compliance under the tip itself
+(:mod:`avatar_core.contact.tip_response`), is a dent of this tip alone, under the force e on an
+elastic organ that is dented alike.
 """
 
 from __future__ import annotations
@@ -30,10 +32,15 @@ from avatar_core.common.splines import cell_at, second_derivatives
 from avatar_core.contact.effects.friction import (
     add_modal_load,
     add_near_friction,
+    force_squared,
     target_derivative,
 )
-from avatar_core.contact.effects.several_tools import add_near_of_others
-from avatar_core.contact.effects.viscoelasticity import near_free_displacement
+from avatar_core.contact.effects.several_tools import (
+    add_history_beside,
+    add_near_of_others,
+    derivative_beside,
+)
+from avatar_core.contact.effects.viscoelasticity import held_load, near_free_displacement
 
 Superposition = namedtuple(
     "Superposition",
@@ -83,21 +90,25 @@ def modes_at_nodes(model, state, t, amplitude, out):  # type: ignore[no-untyped-
 
 
 @fast
-def free_tip_displacement(model, state, superposition, viscoelasticity, t):  # type: ignore[no-untyped-def]
+def free_tip_displacement(model, state, effects, t):  # type: ignore[no-untyped-def]
     """Displacement of a tip's patch without any load in this period."""
+    superposition, viscoelasticity = effects.superposition, effects.viscoelasticity
+    free = superposition.free_displacement[t]
     modes_at_nodes(model, state, t, superposition.free, superposition.displacement)
     if viscoelasticity.on:
         near_free_displacement(model, state, viscoelasticity, t, superposition.near_free[t])
-    n = state.n_nodes[t]
-    superposition.free_normal[t] = 0.0
+    dent = superposition.near_gain[0] * state.blurred[t] * held_load(viscoelasticity, t)
     for d in range(3):
-        value = 0.0
-        for i in range(n):
+        value = dent * state.normal[t, d]
+        for i in range(state.n_nodes[t]):
             value += state.weight[t, i, 0] * superposition.displacement[i, d]
             if viscoelasticity.on:
                 value += state.weight[t, i, 0] * superposition.near_free[t, i, d]
-        superposition.free_displacement[t, d] = state.scale[t] * value
-        superposition.free_normal[t] += state.normal[t, d] * superposition.free_displacement[t, d]
+        free[d] = value
+    add_history_beside(state, effects, t)
+    superposition.free_normal[t] = 0.0
+    for d in range(3):
+        superposition.free_normal[t] += state.normal[t, d] * free[d]
 
 
 @fast
@@ -113,7 +124,7 @@ def superpose_modes(state, superposition, friction):  # type: ignore[no-untyped-
         if friction.on:
             add_modal_load(state, friction, t, total)
         else:
-            force = state.force[t] * state.scale[t]
+            force = state.force[t]
             for k in range(total.shape[0]):
                 total[k] -= force * state.mode[t, k]
     for k in range(total.shape[0]):
@@ -134,7 +145,7 @@ def _displacement_at_nodes(model, state, effects, t):  # type: ignore[no-untyped
     if friction.on:
         add_near_friction(model, state, effects, t)
     else:
-        near = -state.force[t] * state.scale[t] * superposition.near_gain[0]
+        near = -state.force[t] * superposition.near_gain[0]
         for i in range(state.n_nodes[t]):
             for d in range(3):
                 displacement[i, d] += near * state.column[t, i, d]
@@ -152,7 +163,7 @@ def write_superposed_force(model, state, out, tip, effects, t):  # type: ignore[
     superposition, friction = effects.superposition, effects.friction
     if not superposition.on:
         return
-    n, a, count = state.normal[t], state.scale[t], state.n_nodes[t]
+    n, count, square = state.normal[t], state.n_nodes[t], state.force[t] ** 2
     displacement, unit = superposition.displacement, superposition.unit_displacement
     gradient = superposition.normal_gradient
     _normal_gradient(model, state, superposition, t, tip)
@@ -160,6 +171,8 @@ def write_superposed_force(model, state, out, tip, effects, t):  # type: ignore[
     g0, g1, g2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
     if friction.on:
         g0, g1, g2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
+        square = force_squared(friction, t)
+    held, gain = held_load(effects.viscoelasticity, t), superposition.near_gain[0]
     u0 = u1 = u2 = v0 = v1 = v2 = 0.0
     for i in range(count):
         w, u, v = state.weight[t, i, 0], displacement[i], unit[i]
@@ -170,7 +183,6 @@ def write_superposed_force(model, state, out, tip, effects, t):  # type: ignore[
         v1 += w * v[1]
         v2 += w * v[2]
     for d in range(3):
-        # da / a, from the grids' gamma and the derivative of f . C f
         turn0, turn1, turn2 = gradient[0, d], gradient[1, d], gradient[2, d]
         slope = turn0 * v0 + turn1 * v1 + turn2 * v2
         joint = 0.0
@@ -178,13 +190,15 @@ def write_superposed_force(model, state, out, tip, effects, t):  # type: ignore[
             dw, u, v = state.weight[t, i, 1 + d], displacement[i], unit[i]
             slope += dw * (n[0] * v[0] + n[1] * v[1] + n[2] * v[2])
             joint += dw * (g0 * u[0] + g1 * u[1] + g2 * u[2])
-        change = 0.5 * state.self_slope[t, d] / state.self_compliance[t] - slope / state.gram[t, t]
-        value = a * (joint + change * (g0 * u0 + g1 * u1 + g2 * u2))
+        sharper = 0.5 * state.self_slope[t, d] - slope  # half the derivative of gamma - f . C f
+        value = joint + gain * (square - held * state.force[t]) * sharper
         if friction.on:
+            value += gain * state.blurred[t] * held * (g0 * turn0 + g1 * turn1 + g2 * turn2)
             value -= target_derivative(model, state, effects, t, d)
         else:
             turned = turn0 * u0 + turn1 * u1 + turn2 * u2
-            value += state.force[t] * (state.slope[t, d] - a * turned)
+            value += state.force[t] * (state.slope[t, d] - turned)
+        value += derivative_beside(state, effects, t, tip, d)
         out.force[t, d] = value
 
 

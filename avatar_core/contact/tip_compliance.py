@@ -1,6 +1,6 @@
 """Response to a unit normal force of a tip: of the modes, near the tip, and at the tip itself.
 
-Compiled parts of the contact step; C_tt = a_t^2 f_t . C f_t as in
+Compiled parts of the contact step; f . C f and gamma as in
 :mod:`avatar_core.contact.tip_response`.
 """
 
@@ -77,12 +77,14 @@ def near_gram(model, state, t):  # type: ignore[no-untyped-def]
 
 @fast
 def assemble_own(model, state, t, near):  # type: ignore[no-untyped-def]
-    """Compliance of a single tip on an organ at rest; it grows where access fades."""
+    """Compliance of a single tip on an organ at rest; it grows where access fades.
+
+    What the stencil blurs of it, gamma - f . C f, is a local dent of the tip alone.
+    """
     far = np.float32(0.0)
     for k in range(state.mode.shape[1]):
         far += state.mode[t, k] * state.mode[t, k]
-    state.gram[t, t] = far + near
-    state.scale[t] = np.sqrt(state.self_compliance[t] / state.gram[t, t])
+    state.blurred[t] = state.self_compliance[t] - (far + near)
     fade = model.softness[0] * (1.0 / state.access[t] - 1.0)
     state.compliance[t, t] = state.self_compliance[t] + fade
 

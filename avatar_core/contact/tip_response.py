@@ -11,14 +11,15 @@ same B-splines B_q(p), twice differentiable almost everywhere:
     gamma(p) = sum_q B_q(p) gamma_q             gamma(x_q) = [K gamma_0](x_q)
                                                 gamma_0 = n . C(s, s) n at s = s(x_q)
 
-with n = grad phi / |grad phi| the direction of pressing, K the kernel of the tip field with a tenth
-of the patch radius, and gamma_q such that the splines take those values: a sum of the values
-themselves would blur them. gamma is the compliance of a single
-tip; between tips t and t' it is
+with n = grad phi / |grad phi| the direction of pressing, C(s, s) interpolated from both sides and
+completed by what that misses (:mod:`avatar_core.contact.patch_on_plane`), K the kernel of the tip
+field with a tenth of the patch radius, and gamma_q such that the splines take those values: a sum
+of the values themselves would blur them. gamma is the compliance of a single tip; between tips t
+and t' it is
 
-    C_tt' = a_t a_t' f_t . C f_t',    f_t = w(p_t) n(p_t),    a_t^2 = gamma(p_t) / (f_t . C f_t),
+    C_tt' = f_t . C f_t',    f_t = w(p_t) n(p_t),
 
-a scaled Gram matrix, positive definite as C is, with the diagonal gamma.
+a Gram matrix. What it blurs under a tip itself, gamma - f_t . C f_t, is local: a dent of that tip.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ import numpy as np
 
 from avatar_core.common.jit import compiled, fast
 from avatar_core.common.splines import evaluate_all
+from avatar_core.contact.patch_on_plane import missed_between
 from avatar_core.reduction.near_field import LocalBlocks, find_block, hash_rows
 
 if TYPE_CHECKING:
@@ -42,8 +44,8 @@ MAX_STENCIL = 27 * 6  # load positions that carry one tip, at most: six at each 
 
 # What carries a tip, by the organ's shape alone: shell (nx, ny, nz) bool, the n grid points that a
 # tip may need; normal (n, 3), the direction of pressing; carrier, weight (n, 3 or 6), load
-# positions and their weights
-TipCarriers = namedtuple("TipCarriers", ["shell", "normal", "carrier", "weight"])
+# positions and their weights; missed (n,), E* R_p times what these miss of C(s, s)
+TipCarriers = namedtuple("TipCarriers", ["shell", "normal", "carrier", "weight", "missed"])
 
 # row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
 # 6) int32 load positions and carrier_weight (n_rows, 3 or 6) float32;
@@ -72,7 +74,9 @@ def tip_carriers(surface: LoadSurface, field: TipField, depth: float, height: fl
     points = field.origin + spacing * np.argwhere(shell)
     normal = grid_normals(field.distance, spacing)[shell]
     contact = points - field_at(field, points)[:, None] * normal
-    return TipCarriers(shell, normal, *closest_weights(surface, contact))
+    carrier, weight = closest_weights(surface, contact)
+    missed = missed_between(surface.centers / surface.patch_radius, carrier, weight)
+    return TipCarriers(shell, normal, carrier, weight, missed)
 
 
 def field_at(field: TipField, points: np.ndarray) -> np.ndarray:
@@ -90,6 +94,7 @@ def make_tip_response(
     carriers: TipCarriers,
     load: np.ndarray,
     near: LocalBlocks,
+    modulus: float,
 ) -> TipResponse:
     """Sample the self-compliance where a tip is carried; elsewhere its mean stands in.
 
@@ -98,13 +103,15 @@ def make_tip_response(
     surface, field, carriers : of the organ
     load : ndarray, shape (n_positions, 3, rank), far factor of the contact compliance
     near : LocalBlocks, its near part [m/N]
+    modulus : E* [Pa]
     """
     # Here, because the contact node needs none of it.
     from avatar_core.vademecum.tip_field import smoothed
 
     shell, carrier, weight = carriers.shell, carriers.carrier, carriers.weight
+    missed = carriers.missed / (modulus * surface.patch_radius)
     compliance = np.zeros(shell.shape)
-    compliance[shell] = _self_compliance(
+    compliance[shell] = missed + _self_compliance(
         carrier, weight, carriers.normal, load, *hash_rows(near), near.block
     )
     deviation = SMOOTHING * surface.patch_radius / float(field.spacing[0])

@@ -189,7 +189,7 @@ def _pressed(
 def _law(tip: Tip) -> TipLawState | None:
     """The law of an upright tip; None of a patch."""
     arrays = tip_law_arrays((tip,), Material(), np.zeros((2, 0, 0, 0)))
-    return None if arrays is None else tip_law_state(arrays, 0)
+    return None if arrays is None else tip_law_state(arrays)
 
 
 def _shape_factors(vademecum: Vademecum, tips: Sequence[Tip]) -> FloatArray:

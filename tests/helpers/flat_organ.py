@@ -17,11 +17,12 @@ from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.large_deformation import LargeDeformationArrays
 from avatar_core.contact.effects.selection import find, selected_arrays
 from avatar_core.contact.effects.tilt import Tilt, tilt_arrays
-from avatar_core.contact.effects.tip_law import PATCH, tip_law_arrays
+from avatar_core.contact.effects.tip_law import tip_law_arrays
 from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
 from avatar_core.contact.kernels import ModelArrays
 from avatar_core.contact.layout import LANES, Layout
 from avatar_core.contact.model import ContactModel, make_model, step
+from avatar_core.contact.patch_on_plane import PATCH
 from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.near_field import LocalBlocks, hash_rows
@@ -108,7 +109,9 @@ def flat_organ(
     field = TipField(arrays.distance, arrays.access, origin, arrays.spacing)
     leaning = find(effects, Tilt)
     tilt = tilt_arrays(leaning, (tip,), field) if leaning else None
-    constants = selected_arrays(None, effects, None, large, 0.1, period, law, dent, tilt)  # type: ignore[arg-type]
+    constants = selected_arrays(
+        None, effects, None, large, 0.1, PATCH_RADIUS, period, law, dent, tilt
+    )  # type: ignore[arg-type]
     return make_model(Layout(arrays, constants))
 
 

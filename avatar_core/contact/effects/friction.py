@@ -147,25 +147,30 @@ def _assemble(model, state, effects):  # type: ignore[no-untyped-def]
         for s in range(t + 1):
             if not (state.active[t] and state.active[s]):
                 continue
+            beside = 0.0
             if s != t:
                 friction.near[t, s] = 0.0
                 if several_tools.on and several_tools.near[s, t]:
                     _near_between(model, state, friction, t, s)
-            scale = state.scale[t] * state.scale[s]
+                if several_tools.on:
+                    beside = superposition.near_gain[0] * several_tools.beside[t, s]
             for c in range(3):
                 for d in range(3):
                     far = 0.0
                     one, other = friction.mode[t, c], friction.mode[s, d]
                     for k in range(superposition.gain.shape[0]):
                         far += superposition.gain[k] * one[k] * other[k]
-                    value = scale * (far + superposition.near_gain[0] * friction.near[t, s, c, d])
+                    value = far + superposition.near_gain[0] * friction.near[t, s, c, d]
                     friction.compliance[t, s, c, d] = value
                     if s != t:
+                        value += beside if c == d else 0.0
+                        friction.compliance[t, s, c, d] = value
                         friction.compliance[s, t, d, c] = value
         if state.active[t]:
-            fade = model.softness[0] * (1.0 / state.access[t] - 1.0)
+            own = model.softness[0] * (1.0 / state.access[t] - 1.0)
+            own += superposition.near_gain[0] * state.blurred[t]
             for d in range(3):
-                friction.compliance[t, t, d, d] += fade
+                friction.compliance[t, t, d, d] += own
             if tip_law.on:
                 _press_alone(state, effects, t)
                 _add_tangential_dent(state, friction, tip_law, t)
@@ -372,9 +377,9 @@ def _slide_anchor(state, effects, t):  # type: ignore[no-untyped-def]
 @fast
 def add_modal_load(state, friction, t, total):  # type: ignore[no-untyped-def]
     """Add Y^T of the loads of a tip."""
-    a, g, mode = state.scale[t], friction.push[t], friction.mode[t]
+    g, mode = friction.push[t], friction.mode[t]
     for k in range(total.shape[0]):
-        total[k] += a * (g[0] * mode[0, k] + g[1] * mode[1, k] + g[2] * mode[2, k])
+        total[k] += g[0] * mode[0, k] + g[1] * mode[1, k] + g[2] * mode[2, k]
 
 
 @fast
@@ -387,7 +392,7 @@ def add_near_friction(model, state, effects, t):  # type: ignore[no-untyped-def]
             continue
         if s != t and (not several_tools.on or not several_tools.near[s, t]):
             continue
-        factor, g = state.scale[s] * superposition.near_gain[0], friction.push[s]
+        factor, g = superposition.near_gain[0], friction.push[s]
         for i in range(state.n_nodes[s]):
             w = factor * state.weight[s, i, 0]
             w0, w1, w2 = np.float32(w * g[0]), np.float32(w * g[1]), np.float32(w * g[2])

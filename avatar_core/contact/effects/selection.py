@@ -45,6 +45,7 @@ from avatar_core.contact.effects.self_weight import SelfWeight, SelfWeightArrays
 from avatar_core.contact.effects.several_tools import (
     SeveralTools,
     SeveralToolsArrays,
+    several_tools_arrays,
     several_tools_state,
 )
 from avatar_core.contact.effects.tilt import TiltArrays, tilt_state
@@ -162,6 +163,7 @@ def selected_arrays(
     mass: np.ndarray | None,
     large_deformation: LargeDeformationArrays | None,
     contact_reach: float,
+    patch_radius: float,
     period: float,
     tip_law: TipLawArrays | None = None,
     dent: DentArrays | None = None,
@@ -173,13 +175,14 @@ def selected_arrays(
 
     mass : of each mode, from :func:`adapted_vademecum`
     contact_reach : longest distance that the near field of contact spans [m]
+    patch_radius : of the loads [m]
     """
     several_tools, friction = find(effects, SeveralTools), find(effects, Friction)
     viscoelasticity, inertia = find(effects, Viscoelasticity), find(effects, Inertia)
     self_weight, respiration = find(effects, SelfWeight), find(effects, Respiration)
     softened = 1.0 / (1.0 - sum(viscoelasticity.g)) if viscoelasticity else 1.0
     return Constants(
-        SeveralToolsArrays(np.array([contact_reach])) if several_tools else None,
+        several_tools_arrays(contact_reach, patch_radius) if several_tools else None,
         large_deformation,
         friction_arrays(friction) if friction else None,
         viscoelasticity_arrays(viscoelasticity, period) if viscoelasticity else None,
@@ -197,7 +200,6 @@ def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int)
     """State and scratch around the constant arrays: the organ at rest, no tool near it."""
     several_tools, large_deformation, friction, viscoelasticity, inertia, weight = constants[:6]
     respiration, tip_law, dent, tilt, display = constants[6:]
-    n_terms = len(viscoelasticity.decay) if viscoelasticity else 0
     if weight is not None:
         weight = SelfWeightArrays(np.pad(weight.amplitude, (0, n_modes - len(weight.amplitude))))
     superposed = (several_tools, friction, viscoelasticity, inertia, weight)
@@ -206,11 +208,13 @@ def allocate(constants: Constants, n_tools: int, n_modes: int, n_positions: int)
         several_tools_state(several_tools, n_tools, MAX_STENCIL) if several_tools else None,
         large_deformation_state(large_deformation, n_tools) if large_deformation else None,
         friction_state(friction, n_tools, n_modes) if friction else None,
-        viscoelasticity_state(viscoelasticity, n_modes, n_positions) if viscoelasticity else None,
+        viscoelasticity_state(viscoelasticity, n_tools, n_modes, n_positions)
+        if viscoelasticity
+        else None,
         inertia_state(inertia, n_modes, weight) if inertia else None,
         weight,
         respiration_state(respiration) if respiration else None,
-        tip_law_state(tip_law, n_terms, tilt_state(tilt) if tilt else None) if tip_law else None,
+        tip_law_state(tip_law, tilt_state(tilt) if tilt else None) if tip_law else None,
         dent_state(dent) if dent else None,
         display,
     )
@@ -233,7 +237,7 @@ def every_effect() -> Selection:
         factor_spacing=np.ones(1),
     )
     constants = Constants(
-        SeveralToolsArrays(np.zeros(1)),
+        SeveralToolsArrays(np.zeros(1), np.ones(1), np.zeros((1, 2))),
         LargeDeformationArrays(np.zeros((3, *grid), f4), np.zeros((1, 2, 1), f4), _NONE),
         friction_arrays(Friction()),
         viscoelasticity_arrays(Viscoelasticity((0.5,), (0.1,)), 1e-3),

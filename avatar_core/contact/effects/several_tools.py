@@ -1,9 +1,17 @@
 """Several tools in contact at once, coupled through the compliance of the organ.
 
-    gap_t + sum_t' C_tt' lambda_t' >= 0,    C_tt' = a_t a_t' f_t . C f_t'
+    gap_t + sum_t' C_tt' lambda_t' >= 0,    C_tt' = f_t . C f_t' + D_tt' n_t . n_t'
 
-with the far field between all tips and the near field between tips that are close. Action equals
-reaction because C is symmetric.
+with the far field between all tips and the near field between tips that are close. C is that of
+patches; what a real tip does to the surface beside it is not. As under the tip itself
+(:mod:`avatar_core.contact.effects.tip_law`), what a patch does to another on a half-space is taken
+off, and what a tip does is put in its place: at the distance rho of their contacts
+
+    E* D = 1 / (pi sqrt(rho^2 + b_t^2 + b_t'^2)) - P(rho / R_p) / R_p,
+
+P of :mod:`avatar_core.contact.patch_on_plane`, b a part of the tip's radius, so that tips in one
+place keep C positive definite. Beside a contact that is 1 / (pi rho), within 5 % where two balls
+touch each other. Action equals reaction because C is symmetric.
 """
 
 from __future__ import annotations
@@ -17,11 +25,14 @@ import numpy as np
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.tip_law import added_depth
+from avatar_core.contact.effects.viscoelasticity import held_load
+from avatar_core.contact.patch_on_plane import meeting, meeting_table
 from avatar_core.reduction.near_field import find_block
 
 MAX_EXCHANGES = 4  # of the active set, for each tool
 INSIDE = 1e-9  # [m] of penetration that makes a tip active
 LEAST_PIVOT = 1e-8  # of a tip's own compliance
+WIDTH = 0.36  # b over a tip's radius: two in one place give way less than a contact of 0.8 of it
 
 
 @dataclass(frozen=True)
@@ -32,11 +43,13 @@ class SeveralTools(Effect):
     text: ClassVar[str] = "tools feel each other through the organ"
 
 
-SeveralToolsArrays = namedtuple("SeveralToolsArrays", ["reach"])  # (1,) of the near field [m]
+SeveralToolsArrays = namedtuple("SeveralToolsArrays", ["reach", "patch_radius", "meeting"])
 SeveralToolsState = namedtuple(
     "SeveralToolsState",
     [
         "reach",  # (1,) of the near field [m]
+        "patch_radius",  # (1,) [m]
+        "meeting",  # (n + 1, 2) of meeting_table
         "column",  # (T, T, MAX_STENCIL, 3) near displacement at the nodes of the second tip by a
         # unit normal force of the first
         "near",  # (T, T) whether near fields overlap
@@ -46,6 +59,9 @@ SeveralToolsState = namedtuple(
         "free_gap",  # (T,) gap without any force [m]
         "trial",  # (T,) forces that close the gaps of the active set [N]
         "active_set",  # (T,) tips whose gap is closed
+        "apart",  # (T, T) distance of the contacts [m],
+        "beside",  # (T, T) D [m/N]
+        "beside_slope",  # (T, T) and dD/drho [1/N]; both zero between patches
     ],
 )
 
@@ -64,11 +80,19 @@ def several_tools_state(
         np.zeros(n_tools),
         np.zeros(n_tools),
         np.zeros(n_tools, np.bool_),
+        np.zeros((n_tools, n_tools)),
+        np.zeros((n_tools, n_tools)),
+        np.zeros((n_tools, n_tools)),
     )
 
 
+def several_tools_arrays(reach: float, patch_radius: float) -> SeveralToolsArrays:
+    """Constant arrays; lengths in m."""
+    return SeveralToolsArrays(np.array([reach]), np.array([patch_radius]), meeting_table())
+
+
 @inlined
-def couple_near_fields(model, state, several_tools, friction):  # type: ignore[no-untyped-def]
+def couple_near_fields(model, state, several_tools, friction, tip_law):  # type: ignore[no-untyped-def]
     """Near fields between all pairs of tips in contact; with friction, whether they overlap."""
     if not several_tools.on:
         return
@@ -84,6 +108,73 @@ def couple_near_fields(model, state, several_tools, friction):  # type: ignore[n
                 several_tools.near[t, s] = several_tools.near[s, t] = near
                 if not friction.on and near:
                     _couple_pair(model, state, several_tools, t, s)
+                place_beside(state, several_tools, tip_law, t, s)
+
+
+@fast
+def place_beside(state, several_tools, law, t, s):  # type: ignore[no-untyped-def]
+    """D of two tips in contact, and its slope."""
+    square = 0.0
+    for d in range(3):
+        square += (state.point[t, d] - state.point[s, d]) ** 2
+    rho, value, slope = np.sqrt(square), 0.0, 0.0
+    if law.on:
+        radius = several_tools.patch_radius[0]
+        wide = square + WIDTH**2 * (law.radius[t] ** 2 + law.radius[s] ** 2)
+        met, rise = meeting(several_tools.meeting, rho / radius)
+        point = 1.0 / (np.pi * np.sqrt(wide))
+        value = (point - met / radius) / law.modulus[0]
+        slope = (-point * rho / wide - rise / radius**2) / law.modulus[0]
+    several_tools.apart[t, s] = several_tools.apart[s, t] = rho
+    several_tools.beside[t, s] = several_tools.beside[s, t] = value
+    several_tools.beside_slope[t, s] = several_tools.beside_slope[s, t] = slope
+
+
+@fast
+def add_history_beside(state, effects, t):  # type: ignore[no-untyped-def]
+    """What the others' dents remember, at a tip; into its displacement without load."""
+    superposition, several_tools = effects.superposition, effects.several_tools
+    if not several_tools.on:
+        return
+    for s in range(state.passage.shape[0]):
+        if s != t and state.active[s]:
+            held = held_load(effects.viscoelasticity, s)
+            dent = superposition.near_gain[0] * several_tools.beside[t, s] * held
+            for d in range(3):
+                superposition.free_displacement[t, d] += dent * state.normal[s, d]
+
+
+@fast
+def derivative_beside(state, effects, t, p, d):  # type: ignore[no-untyped-def]
+    """The derivative of what tips do to each other by D, along one axis, at constant forces.
+
+    The contact of a tip is at p - phi n.
+    """
+    superposition, several_tools = effects.superposition, effects.several_tools
+    friction, total = effects.friction, 0.0
+    if not several_tools.on or not effects.tip_law.on:
+        return total
+    n, turn, phi = state.normal[t], superposition.normal_gradient, 0.0
+    for i in range(3):
+        phi += (p[i] - state.point[t, i]) * n[i]
+    for s in range(state.passage.shape[0]):
+        if s == t or state.force[s] <= 0.0 or several_tools.apart[t, s] == 0.0:
+            continue
+        held = held_load(effects.viscoelasticity, s)
+        along = shared = turned = 0.0
+        for i in range(3):
+            moved = (1.0 if i == d else 0.0) - n[i] * state.slope[t, d] - phi * turn[i, d]
+            along += (state.point[t, i] - state.point[s, i]) * moved
+            if friction.on:
+                g = friction.push[s, i] + held * state.normal[s, i]
+                shared += friction.push[t, i] * g
+            else:
+                g = state.force[t] * (state.force[s] - held) * state.normal[s, i]
+                shared += n[i] * g
+                turned += turn[i, d] * g
+        slope = several_tools.beside_slope[t, s] * along / several_tools.apart[t, s]
+        total += slope * shared + several_tools.beside[t, s] * turned
+    return superposition.near_gain[0] * total
 
 
 @fast
@@ -136,8 +227,9 @@ def _couple_pair(model, state, several_tools, t, s):  # type: ignore[no-untyped-
 
 
 @fast
-def assemble_coupling(state, superposition, several_tools):  # type: ignore[no-untyped-def]
+def assemble_coupling(state, effects):  # type: ignore[no-untyped-def]
     """Compliance between the tips."""
+    superposition, several_tools = effects.superposition, effects.several_tools
     for t in range(state.passage.shape[0]):
         for s in range(t):
             if not (state.active[t] and state.active[s]):
@@ -152,8 +244,10 @@ def assemble_coupling(state, superposition, several_tools):  # type: ignore[no-u
                     u = several_tools.column[s, t, i]
                     near += state.weight[t, i, 0] * (n[0] * u[0] + n[1] * u[1] + n[2] * u[2])
                 value += superposition.near_gain[0] * near
-            state.gram[t, s] = state.gram[s, t] = value
-            value *= state.scale[t] * state.scale[s]
+            facing = 0.0
+            for d in range(3):
+                facing += state.normal[t, d] * state.normal[s, d]
+            value += superposition.near_gain[0] * several_tools.beside[t, s] * facing
             state.compliance[t, s] = state.compliance[s, t] = value
 
 
@@ -256,7 +350,7 @@ def add_near_of_others(state, superposition, several_tools, t):  # type: ignore[
     for s in range(state.passage.shape[0]):
         if s == t or state.force[s] <= 0.0 or not several_tools.near[s, t]:
             continue
-        force = -state.force[s] * state.scale[s] * superposition.near_gain[0]
+        force = -state.force[s] * superposition.near_gain[0]
         for i in range(state.n_nodes[t]):
             for d in range(3):
                 superposition.displacement[i, d] += force * several_tools.column[s, t, i, d]

@@ -81,6 +81,9 @@ ViscoelasticityState = namedtuple(
         "near_past",  # (n, TRAIL, 3) h_i [N]
         "near_held",  # (MAX_HISTORY, 3) load that keeps e constant [N]
         "near_load",  # (MAX_HISTORY, 3) f of this period [N]
+        "tip_elastic",  # (T,) e of each tip, which its own dent remembers as long as it touches [N]
+        "tip_past",  # (n, T) h_i [N]
+        "tip_held",  # (T,) load that keeps e constant [N]
     ],
 )
 
@@ -93,7 +96,7 @@ def viscoelasticity_arrays(effect: Viscoelasticity, period: float) -> Viscoelast
 
 
 def viscoelasticity_state(
-    arrays: ViscoelasticityArrays, n_modes: int, n_positions: int
+    arrays: ViscoelasticityArrays, n_tools: int, n_modes: int, n_positions: int
 ) -> ViscoelasticityState:
     """State of an organ that was never touched."""
     n = len(arrays.decay)
@@ -110,12 +113,15 @@ def viscoelasticity_state(
         near_past=np.zeros((n, MAX_HISTORY, 3)),
         near_held=np.zeros((MAX_HISTORY, 3)),
         near_load=np.zeros((MAX_HISTORY, 3)),
+        tip_elastic=np.zeros(n_tools),
+        tip_past=np.zeros((n, n_tools)),
+        tip_held=np.zeros(n_tools),
     )
 
 
 @fast
 def predict_history(viscoelasticity):  # type: ignore[no-untyped-def]
-    """sum_i exp(-dt / tau_i) h_i - e sum_i r_i, of the modes and of the near field."""
+    """sum_i exp(-dt / tau_i) h_i - e sum_i r_i, of the modes, of the near field and of the tips."""
     v, ramp = viscoelasticity, 0.0
     for i in range(v.ramp.shape[0]):
         ramp += v.ramp[i]
@@ -129,6 +135,16 @@ def predict_history(viscoelasticity):  # type: ignore[no-untyped-def]
             v.near_load[m, d] = 0.0
             for i in range(v.decay.shape[0]):
                 v.near_held[m, d] += v.decay[i] * v.near_past[i, m, d]
+    for t in range(v.tip_held.shape[0]):
+        v.tip_held[t] = -ramp * v.tip_elastic[t]
+        for i in range(v.decay.shape[0]):
+            v.tip_held[t] += v.decay[i] * v.tip_past[i, t]
+
+
+@inlined
+def held_load(viscoelasticity, t):  # type: ignore[no-untyped-def]
+    """The load on a tip that would keep its dent as it is [N]."""
+    return viscoelasticity.tip_held[t] if viscoelasticity.on else 0.0
 
 
 @fast
@@ -187,18 +203,31 @@ def advance_history(state, effects):  # type: ignore[no-untyped-def]
     for t in range(state.passage.shape[0]):
         if state.force[t] <= 0.0:
             continue
-        a, n = state.scale[t], state.normal[t]
+        n = state.normal[t]
         f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
         if friction.on:
             f0, f1, f2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
         for i in range(state.n_nodes[t]):
-            w = a * state.weight[t, i, 0]
+            w = state.weight[t, i, 0]
             if w != 0.0:
                 m = _slot_of(v, state.nodes[t, i])
                 v.near_load[m, 0] += w * f0
                 v.near_load[m, 1] += w * f1
                 v.near_load[m, 2] += w * f2
     _advance_near_history(v)
+    _advance_tips(state, v)
+
+
+@fast
+def _advance_tips(state, v):  # type: ignore[no-untyped-def]
+    """The history that each tip carries along; it ends with the contact."""
+    for t in range(v.tip_held.shape[0]):
+        on = state.active[t]
+        new = max(0.0, v.gain[0] * (state.force[t] - v.tip_held[t])) if on else 0.0
+        for i in range(v.decay.shape[0]):
+            past = v.decay[i] * v.tip_past[i, t] + v.ramp[i] * (new - v.tip_elastic[t])
+            v.tip_past[i, t] = past if on else 0.0
+        v.tip_elastic[t] = new
 
 
 @fast

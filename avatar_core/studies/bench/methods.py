@@ -18,6 +18,7 @@ from avatar_core.contact import kernels
 from avatar_core.contact.cloud import shown_vertices
 from avatar_core.contact.display import write_cloud
 from avatar_core.contact.effects.selection import every_effect
+from avatar_core.contact.effects.several_tools import place_beside
 from avatar_core.contact.effects.tip_law import sample_organ
 from avatar_core.contact.locate import locate
 from avatar_core.contact.model import ContactModel, compiled_for, prepare, step
@@ -264,14 +265,14 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
         near = near_along_normal(state, t, state.column[t])
         assemble_own(model, state, t, near)
         sample_organ(model, e.tip_law, t, tips[t])
-    _couple_dense(state, e.several_tools, compliance)
+    _couple_dense(state, e.several_tools, e.tip_law, compliance)
     kernels.solve_contact(model, state, tips, e)
     kernels.write_forces(model, state, out, tips, e)
     u = state.field[: columns.shape[2]]
     u[:] = np.float32(0.0)
     for t in range(tips.shape[0]):
         for i in range(state.n_nodes[t] if state.force[t] > 0.0 else 0):
-            force = -state.weight[t, i, 0] * state.scale[t] * state.force[t]
+            force = -state.weight[t, i, 0] * state.force[t]
             for c in range(3):
                 row, f = columns[state.nodes[t, i], c], np.float32(force * state.normal[t, c])
                 for k in range(u.shape[0]):
@@ -280,13 +281,14 @@ def _dense_step(model, state, out, tips, effects, columns, compliance):  # type:
 
 
 @compiled(fastmath=True)
-def _couple_dense(state, several_tools, compliance):  # type: ignore[no-untyped-def]
+def _couple_dense(state, several_tools, tip_law, compliance):  # type: ignore[no-untyped-def]
     if several_tools.on:
         for t in range(state.passage.shape[0]):
             for s in range(state.passage.shape[0]):
                 several_tools.near[t, s] = s != t
                 if s != t and state.active[t] and state.active[s]:
                     _dense_column(state, t, s, compliance, several_tools.column[t, s])
+                    place_beside(state, several_tools, tip_law, t, s)
 
 
 @compiled(fastmath=True)

@@ -112,7 +112,7 @@ def test_energy_never_grows_in_a_minute_of_swinging() -> None:
     energy = []
     for k in range(60_000):
         step(model, spot.tip(5e-3)[None] if k < 30_000 else AWAY[None])
-        near = model.state.compliance[0, 0] - model.state.scale[0] ** 2 * float(
+        near = model.state.compliance[0, 0] - float(
             model.effects.superposition.gain @ model.state.mode[0].astype(float) ** 2
         )
         held = 0.0

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.optimize import brentq
-from scipy.special import ellipk
 
-from avatar_core.contact.dent import FADE, REACH, patch_dent
+from avatar_core.contact.dent import FADE, REACH
 from avatar_core.contact.effects import SeveralTools, Viscoelasticity
-from avatar_core.contact.effects.tip_law import PATCH, dent
+from avatar_core.contact.effects.tip_law import dent
 from avatar_core.contact.layout import lay_out
 from avatar_core.contact.model import ContactModel, prepare
+from avatar_core.contact.patch_on_plane import patch_dent
 from avatar_core.geometry.tip import Tip
+from tests.core.contact.test_patch_on_plane import patch_rule
 from tests.helpers.box_organ import PATCH_RADIUS, UP, organ, top
 from tests.helpers.flat_organ import E_STAR, ORIGIN, flat_organ, force_at_depth
 from tests.helpers.flat_organ import UP as UPWARDS
@@ -45,41 +45,16 @@ TIPS = [
 ALONG = np.linspace(0.0, 40e-3, 161)  # distances from a tip [m]
 
 
-def ring_dent(rho: float) -> float:
-    """E* R_p / F u of the patch by Boussinesq: its pressure as rings, each an elliptic integral."""
-
-    def ring(s: float) -> float:
-        whole = (rho + s) ** 2
-        return float(3.0 * (1.0 - s * s) ** 2 * s / (rho + s) * ellipk(4.0 * rho * s / whole))
-
-    return 4.0 / np.pi**2 * float(quad(ring, 0.0, 1.0, points=[min(rho, 1.0)], limit=200)[0])
-
-
 def fade(rho: np.ndarray) -> np.ndarray:
     left = np.clip((1.0 - (rho / END) ** 2) / (1.0 - (FADE / REACH) ** 2), 0.0, 1.0)
     return np.asarray(left**2 * (3.0 - 2.0 * left))
 
 
-def test_the_patch_dents_as_boussinesq_says() -> None:
-    rho = np.array([0.0, 0.1, 0.5, 0.9, 1.1, 1.5, 2.0])
-    table = patch_dent(rho)
-    np.testing.assert_allclose(table[1:], [ring_dent(each) for each in rho[1:]], rtol=1e-6)
-    assert table[0] == pytest.approx(16.0 / (5.0 * np.pi), rel=1e-12)
-    assert patch_dent(np.array(30.0)) * 30.0 * np.pi == pytest.approx(1.0, rel=1e-4)
-
-
-def test_the_patch_sinks_in_the_mean_as_the_force_law_says() -> None:
-    """The mean under its own pressure, 3 / pi (1 - r^2)^2; in the step's table too."""
-    node, weight = np.polynomial.legendre.leggauss(40)
-    r = 0.5 * (node + 1.0)
-    load = 0.5 * weight * 6.0 * r * (1.0 - r * r) ** 2
-    assert load.sum() == pytest.approx(1.0)
-    assert load @ patch_dent(r) == pytest.approx(PATCH, rel=1e-4)
+def test_the_table_of_the_patch_has_the_mean_that_the_force_law_takes_off() -> None:
     table = flat_organ(tip=SPHERE).layout.effects.dent.patch
-    part = (r / REACH) ** 2
-    assert load @ np.interp(part, np.linspace(0.0, 1.0, len(table)), table) == pytest.approx(
-        1.0, rel=2e-4
-    )
+    r, load = patch_rule(40)
+    met = np.interp((r / REACH) ** 2, np.linspace(0.0, 1.0, len(table)), table)
+    assert load @ met == pytest.approx(1.0, rel=2e-4)
 
 
 @pytest.mark.parametrize("tip", TIPS)

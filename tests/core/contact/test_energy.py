@@ -14,9 +14,9 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from avatar_core.contact.effects import Effect, LargeDeformationEffect, SeveralTools
-from avatar_core.contact.effects.tip_law import PATCH
 from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
 from avatar_core.contact.model import ContactModel, Status, prepare, step
+from avatar_core.contact.patch_on_plane import PATCH
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip

@@ -8,8 +8,8 @@ from scipy.optimize import brentq
 
 from avatar_core.contact.effects import Friction
 from avatar_core.contact.effects.friction import tangential_force
-from avatar_core.contact.effects.tip_law import PATCH
 from avatar_core.contact.model import ContactModel, Status, step
+from avatar_core.contact.patch_on_plane import PATCH
 from avatar_core.geometry.tip import Tip
 from tests.helpers.coarse_liver import Spot, liver_model, spots
 from tests.helpers.flat_organ import (

@@ -9,8 +9,8 @@ from functools import partial
 
 import pytest
 
-from avatar_core.contact.effects.tip_law import PATCH
 from avatar_core.contact.model import ContactModel
+from avatar_core.contact.patch_on_plane import PATCH
 from avatar_core.geometry.tip import Tip
 from tests.helpers.flat_organ import COMPLIANCE, E_STAR, PATCH_RADIUS, flat_organ, force_at_depth
 from tests.helpers.half_space import on_soft_base, sneddon

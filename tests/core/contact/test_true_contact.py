@@ -36,6 +36,7 @@ from tests.helpers.box_organ import (
     PATCH_RADIUS,
     UP,
     Body,
+    body_mesh,
     organ,
     patch_compliance,
     top,
@@ -162,8 +163,8 @@ def test_two_tips_on_the_phantom_feel_resolved_contacts(phantom_vademecum: Vadem
     v, surface = phantom_vademecum, phantom_liver()
     tips, depths = (Tip("sphere", 3e-3), Tip("sphere", 5e-3)), ((2e-3, 4e-3), (4e-3, 2e-3))
     model = prepare(v, tips, cloud="off", effects=(SeveralTools(),))
-    pairs = pairs_of(draw_sites(v, surface, 60, 0)[:-2])[:2]
-    assert len(pairs) == 2
+    pairs = pairs_of(draw_sites(v, surface, 60, 0)[:-2])[:1]
+    assert len(pairs) == 1
     for pair in pairs:
         points, normals = ([getattr(s, name) for s in pair] for name in ("point", "normal"))
         fine = refined_organ(
@@ -175,3 +176,34 @@ def test_two_tips_on_the_phantom_feel_resolved_contacts(phantom_vademecum: Vadem
             truth = both.solve((0, 1), each).forces
             force = press(model, tips, np.array(points), np.array(normals), each)
             assert (np.abs(force - truth) < 0.1 * np.maximum(truth, 0.1 * truth.max())).all()
+
+
+@cached_on_disk
+def true_forces_beside(apart: float, radii: tuple[float, float]) -> tuple[np.ndarray, ...]:
+    """Of two balls on a cube, resolved together, for each of ``BESIDE`` [N]."""
+    mesh, regions = body_mesh("cube")
+    points, tips = beside(apart), [Tip("sphere", radius) for radius in radii]
+    fine = refined_organ(None, mesh, regions, MATERIAL, points, [UP, UP], tips, np.ravel(BESIDE))
+    pushes = [Push(tip, point, UP) for tip, point in zip(tips, points, strict=True)]
+    both = CondensedContact(fine, pushes, np.max(BESIDE), reach=2.0)
+    return tuple(both.solve((0, 1), depths).forces for depths in BESIDE)
+
+
+BESIDE = ((2e-3, 4e-3), (0.8e-3, 4e-3), (4e-3, 2e-3))  # depths of two balls [m]
+
+
+def beside(apart: float) -> np.ndarray:
+    """Two places on the cube, (2, 3) [m]."""
+    first = top("cube") + np.array([1e-3, 0.0, 2e-3])
+    return np.stack([first, first + apart * np.array([0.8, 0.0, 0.6])])
+
+
+@pytest.mark.parametrize("apart", [14e-3, pytest.param(20e-3, marks=pytest.mark.long)])
+def test_a_ball_in_the_dent_of_another_feels_what_is_left(apart: float) -> None:
+    """Down to a quarter of what it would feel alone; a patch's dent would leave it a sixth."""
+    radii = (3e-3, 5e-3)
+    tips = tuple(Tip("sphere", radius) for radius in radii)
+    model = prepare(organ("cube"), tips, cloud="off", effects=(SeveralTools(),))
+    for depths, truth in zip(BESIDE, true_forces_beside(apart, radii), strict=True):
+        force = press(model, tips, beside(apart), np.array([UP, UP]), depths)
+        np.testing.assert_allclose(force, truth, rtol=0.06)

@@ -321,7 +321,7 @@ def test_cloud_is_the_bent_field(bent: Vademecum, model: ContactModel) -> None:
     step(model, tip_at(v, 12e-3, j))
     positions, weights = load_positions(model)
     linear = replace(v, large=None)
-    force = state.force[0] * state.scale[0]
+    force = state.force[0]
     # along the normal of the step, which is not quite that of the patch
     straight = v.displacement(positions, weights) @ (-state.normal[0] * force)
     felt = state.self_compliance[0] * state.force[0]

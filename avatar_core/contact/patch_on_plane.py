@@ -1,0 +1,104 @@
+"""The patch of a vademecum on an elastic half-space, in closed form.
+
+Its traction is 3 F / (pi R_p^2) (1 - r^2 / R_p^2)^2, of the Hankel transform F 48 J_3(x) / x^3 with
+x = k R_p. The surface moves by 2 / (E* k) times that of a load (Johnson, Contact Mechanics, 1985,
+Sec. 3), so that a patch moves another at the distance rho, in the mean under its own traction, by
+
+    F / (E* R_p) P(rho / R_p),      P(y) = 1 / pi int_0^inf [48 J_3(x) / x^3]^2 J_0(x y) dx,
+
+P(0) = 0.7665, and P -> 1 / (pi y) far off.
+
+Between the load positions of an organ the response is interpolated, from both sides. That is exact
+but for what bends between them, which is local: that of a half-space. What sum_ij w_i w_j C_ij
+misses of C(s, s) is therefore
+
+    1 / (E* R_p) sum_ij w_i w_j [P(0) - P(|x_i - x_j| / R_p)].
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+
+from avatar_core.common.jit import compiled, fast
+
+PATCH = 0.7665  # P(0)
+FAR = 3.0  # patch radii, beyond which P is that of two point loads, and of their widths
+_INTERVALS = 96  # of the table of P
+_WIDTHS = 0.125  # P = (1 + 1 / (8 y^2)) / (pi y) far off, the mean of r^2 / R_p^2 being 1 / 4
+_FINE = 24  # nodes of the rule for the dent of one patch
+_LAST, _NODES = 60.0, 1200  # of the integral over x: [48 J_3 / x^3]^2 falls as x^-7
+
+
+def patch_dent(rho: np.ndarray) -> np.ndarray:
+    """E* R_p / F u_patch at distances rho [R_p] on the surface of a half-space."""
+    theta, weight = quarter_turn(_FINE)
+    rho = np.asarray(rho, float)[..., None]
+    end = np.minimum(rho, 1.0)
+    x = end * np.sin(theta)
+    # int_0^end (1 - x^2)^(5/2) / sqrt(rho^2 - x^2) dx, with the limit at rho = 0
+    far = np.sqrt(np.maximum(rho**2 - x**2, 1e-300))
+    step = np.where(rho > 1.0, np.cos(theta) / far, 1.0)
+    return np.asarray(32.0 / (5.0 * np.pi**2) * ((1.0 - x**2) ** 2.5 * step) @ weight)
+
+
+@cache
+def quarter_turn(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of Gauss's rule over theta in [0, pi/2]."""
+    node, weight = leggauss(n)
+    return 0.25 * np.pi * (node + 1.0), 0.25 * np.pi * weight
+
+
+@cache
+def meeting_table() -> np.ndarray:
+    """P and dP/dy over y in [0, FAR], shape (n + 1, 2)."""
+    # Here, because the contact node needs none of it.
+    from scipy.special import j0, jv
+
+    node, weight = leggauss(_NODES)
+    x, weight = 0.5 * _LAST * (node + 1.0), 0.5 * _LAST * weight
+    square = weight * (48.0 * jv(3, x) / x**3) ** 2 / np.pi
+    y = np.linspace(0.0, FAR, _INTERVALS + 1)[:, None]
+    return np.stack([j0(x * y) @ square, -jv(1, x * y) @ (x * square)], axis=1)
+
+
+@fast
+def meeting(table, y):  # type: ignore[no-untyped-def]
+    """P and dP/dy at a distance of two patches [R_p], by cubic Hermite interpolation."""
+    if y >= FAR:
+        far = 1.0 / (np.pi * y)
+        wide = _WIDTHS / (y * y)
+        return far * (1.0 + wide), -far * (1.0 + 3.0 * wide) / y
+    h = FAR / _INTERVALS
+    k = int(y / h)
+    t = y / h - k
+    p, q, a, b = table[k, 0], table[k + 1, 0], h * table[k, 1], h * table[k + 1, 1]
+    c, d = 3.0 * (q - p) - 2.0 * a - b, 2.0 * (p - q) + a + b
+    return p + t * (a + t * (c + t * d)), (a + t * (2.0 * c + t * 3.0 * d)) / h
+
+
+def missed_between(positions: np.ndarray, carrier: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """E* R_p times what interpolation misses of C(s, s), shape (n,).
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n_positions, 3), of the load positions [R_p]
+    carrier, weight : ndarray, shape (n, k), load positions and weights of each point
+    """
+    return np.asarray(_missed_between(meeting_table(), positions, carrier, weight))
+
+
+@compiled()
+def _missed_between(table, positions, carrier, weight):  # type: ignore[no-untyped-def]
+    out = np.zeros(len(carrier))
+    for q in range(len(carrier)):
+        for i in range(carrier.shape[1]):
+            for m in range(i):
+                square = 0.0
+                for d in range(3):
+                    square += (positions[carrier[q, i], d] - positions[carrier[q, m], d]) ** 2
+                shared, _ = meeting(table, np.sqrt(square))
+                out[q] += 2.0 * weight[q, i] * weight[q, m] * (table[0, 0] - shared)
+    return out
