@@ -7,6 +7,7 @@ this one: it leaves files where it runs, takes Ctrl-C for itself, and crashes on
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -75,7 +76,7 @@ def fill_box(
     with tempfile.TemporaryDirectory() as folder:
         np.savez(Path(folder, "input.npz"), **arguments)
         run = subprocess.run(
-            [sys.executable, "-c", _PROCESS, _compiled()],
+            [sys.executable, "-c", _PROCESS, _compiled(), str(os.getpid())],
             cwd=folder,
             capture_output=True,
             text=True,

@@ -40,9 +40,11 @@ _RELOCATION = np.dtype([("where", "<u8"), ("kind", "<u4"), ("symbol", "<u4"), ("
 
 def main() -> None:
     """Fill the box of the arrays in ``input.npz`` and write ``output.npz``, in this folder."""
-    library = sys.argv[1]
+    library, parent = sys.argv[1], int(sys.argv[2])
     if sys.platform.startswith("linux"):  # nobody waits for the mesh of a command that was killed
         ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+        if os.getppid() != parent:  # before it asked for the signal
+            return
     module = _loaded(library)
     function = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_void_p)(lambda _: _SEED)
     seeded = _replace_import(library, _RANDOM, function)
