@@ -317,6 +317,12 @@ def misplaced(boxes: list[Any], width: int) -> list[str]:
     return found
 
 
+def begins_below_the_top(part: Any) -> bool:
+    """Not while it is drawn anew, when it has no box."""
+    box = part.bounding_box()
+    return box is not None and box["y"] > 0
+
+
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 def test_nothing_overlaps_or_is_cut(page: Any, shots: Path, size: tuple[int, int]) -> None:
     page.set_viewport_size({"width": size[0], "height": size[1]})
@@ -332,7 +338,7 @@ def test_nothing_overlaps_or_is_cut(page: Any, shots: Path, size: tuple[int, int
         page.screenshot(path=shots / f"{tab}-{size[0]}.png")
         page.mouse.move(size[0] - 100, size[1] - 150)  # over the tab, whose end is seen then
         page.mouse.wheel(0, 2000)
-        assert page.locator("#numbers").bounding_box()["y"] > 0
+        until(page, lambda: begins_below_the_top(page.locator("#numbers")), "numbers in view", 10.0)
     assert page.evaluate(CUBE_WHILE_GLIDING)["left"] < 30
     open_tab(page, "Tool")
     record = page.get_by_role("button", name="Record")
