@@ -13,6 +13,9 @@ but for what bends between them, which is local: that of a half-space. What sum_
 misses of C(s, s) is therefore
 
     1 / (E* R_p) sum_ij w_i w_j [P(0) - P(|x_i - x_j| / R_p)].
+
+For weights that spread little it is proportional to the Laplacian of P at 0, and between two points
+at the distance y R_p to that at y: it fades as Q(y) = lap P(y) / lap P(0).
 """
 
 from __future__ import annotations
@@ -53,7 +56,7 @@ def quarter_turn(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def meeting_table() -> np.ndarray:
-    """P and dP/dy over y in [0, FAR], shape (n + 1, 2)."""
+    """P, dP/dy, Q and dQ/dy over y in [0, FAR], shape (n + 1, 4)."""
     # Here, because the contact node needs none of it.
     from scipy.special import j0, jv
 
@@ -61,20 +64,35 @@ def meeting_table() -> np.ndarray:
     x, weight = 0.5 * _LAST * (node + 1.0), 0.5 * _LAST * weight
     square = weight * (48.0 * jv(3, x) / x**3) ** 2 / np.pi
     y = np.linspace(0.0, FAR, _INTERVALS + 1)[:, None]
-    return np.stack([j0(x * y) @ square, -jv(1, x * y) @ (x * square)], axis=1)
+    even, odd, bent = j0(x * y), -jv(1, x * y), x**2 * square / (x**2 @ square)
+    columns = [even @ square, odd @ (x * square), even @ bent, odd @ (x * bent)]
+    return np.stack(columns, axis=1)
 
 
 @fast
 def meeting(table, y):  # type: ignore[no-untyped-def]
-    """P and dP/dy at a distance of two patches [R_p], by cubic Hermite interpolation."""
+    """P and dP/dy at a distance of two patches [R_p]."""
     if y >= FAR:
         far = 1.0 / (np.pi * y)
         wide = _WIDTHS / (y * y)
         return far * (1.0 + wide), -far * (1.0 + 3.0 * wide) / y
+    return _in_table(table, 0, y)
+
+
+@fast
+def shared_blur(table, y):  # type: ignore[no-untyped-def]
+    """Q and dQ/dy at a distance of two points [R_p]; it ends with the table, at -0.3 %."""
+    return (0.0, 0.0) if y >= FAR else _in_table(table, 2, y)
+
+
+@fast
+def _in_table(table, column, y):  # type: ignore[no-untyped-def]
+    """A function and its slope, by cubic Hermite interpolation."""
     h = FAR / _INTERVALS
     k = int(y / h)
     t = y / h - k
-    p, q, a, b = table[k, 0], table[k + 1, 0], h * table[k, 1], h * table[k + 1, 1]
+    p, q = table[k, column], table[k + 1, column]
+    a, b = h * table[k, column + 1], h * table[k + 1, column + 1]
     c, d = 3.0 * (q - p) - 2.0 * a - b, 2.0 * (p - q) + a + b
     return p + t * (a + t * (c + t * d)), (a + t * (2.0 * c + t * 3.0 * d)) / h
 

@@ -198,7 +198,7 @@ def write_superposed_force(model, state, out, tip, effects, t):  # type: ignore[
         else:
             turned = turn0 * u0 + turn1 * u1 + turn2 * u2
             value += state.force[t] * (state.slope[t, d] - turned)
-        value += derivative_beside(state, effects, t, tip, d)
+        value += derivative_beside(state, effects, t, tip, d, sharper)
         out.force[t, d] = value
 
 

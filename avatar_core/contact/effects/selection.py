@@ -237,7 +237,7 @@ def every_effect() -> Selection:
         factor_spacing=np.ones(1),
     )
     constants = Constants(
-        SeveralToolsArrays(np.zeros(1), np.ones(1), np.zeros((1, 2))),
+        SeveralToolsArrays(np.zeros(1), np.ones(1), np.zeros((1, 4))),
         LargeDeformationArrays(np.zeros((3, *grid), f4), np.zeros((1, 2, 1), f4), _NONE),
         friction_arrays(Friction()),
         viscoelasticity_arrays(Viscoelasticity((0.5,), (0.1,)), 1e-3),

@@ -2,16 +2,21 @@
 
     gap_t + sum_t' C_tt' lambda_t' >= 0,    C_tt' = f_t . C f_t' + D_tt' n_t . n_t'
 
-with the far field between all tips and the near field between tips that are close. C is that of
-patches; what a real tip does to the surface beside it is not. As under the tip itself
-(:mod:`avatar_core.contact.effects.tip_law`), what a patch does to another on a half-space is taken
-off, and what a tip does is put in its place: at the distance rho of their contacts
+with the far field between all tips and the near field between tips that are close. What the
+stencils blur of C, b_t = gamma - f_t . C f_t under each tip, they blur between both too: at the
+distance rho of their contacts
 
-    E* D = 1 / (pi sqrt(rho^2 + b_t^2 + b_t'^2)) - P(rho / R_p) / R_p,
+    D = sqrt(b_t b_t') Q(rho / R_p),
 
-P of :mod:`avatar_core.contact.patch_on_plane`, b a part of the tip's radius, so that tips in one
-place keep C positive definite. Beside a contact that is 1 / (pi rho), within 5 % where two balls
-touch each other. Action equals reaction because C is symmetric.
+Q of :mod:`avatar_core.contact.patch_on_plane`. C is that of patches; what a real tip does to the
+surface beside it is not. As under the tip itself (:mod:`avatar_core.contact.effects.tip_law`), what
+a patch does to another on a half-space is taken off, and what a tip does is put in its place,
+
+    D += [1 / (pi sqrt(rho^2 + w_t^2 + w_t'^2)) - P(rho / R_p) / R_p] / E*,
+
+w a part of the tip's radius, so that tips in one place keep C positive definite. Beside a contact
+that is 1 / (pi rho), within 5 % where two balls touch each other. Action equals reaction because C
+is symmetric.
 """
 
 from __future__ import annotations
@@ -26,13 +31,13 @@ from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.tip_law import added_depth
 from avatar_core.contact.effects.viscoelasticity import held_load
-from avatar_core.contact.patch_on_plane import meeting, meeting_table
+from avatar_core.contact.patch_on_plane import meeting, meeting_table, shared_blur
 from avatar_core.reduction.near_field import find_block
 
 MAX_EXCHANGES = 4  # of the active set, for each tool
 INSIDE = 1e-9  # [m] of penetration that makes a tip active
 LEAST_PIVOT = 1e-8  # of a tip's own compliance
-WIDTH = 0.36  # b over a tip's radius: two in one place give way less than a contact of 0.8 of it
+WIDTH = 0.36  # w over a tip's radius: two in one place give way less than a contact of 0.8 of it
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,8 @@ SeveralToolsState = namedtuple(
         "active_set",  # (T,) tips whose gap is closed
         "apart",  # (T, T) distance of the contacts [m],
         "beside",  # (T, T) D [m/N]
-        "beside_slope",  # (T, T) and dD/drho [1/N]; both zero between patches
+        "beside_slope",  # (T, T) and dD/drho [1/N],
+        "blurred",  # (T, T) and sqrt(b_t b_t') Q [m/N]
     ],
 )
 
@@ -80,6 +86,7 @@ def several_tools_state(
         np.zeros(n_tools),
         np.zeros(n_tools),
         np.zeros(n_tools, np.bool_),
+        np.zeros((n_tools, n_tools)),
         np.zeros((n_tools, n_tools)),
         np.zeros((n_tools, n_tools)),
         np.zeros((n_tools, n_tools)),
@@ -117,14 +124,17 @@ def place_beside(state, several_tools, law, t, s):  # type: ignore[no-untyped-de
     square = 0.0
     for d in range(3):
         square += (state.point[t, d] - state.point[s, d]) ** 2
-    rho, value, slope = np.sqrt(square), 0.0, 0.0
+    rho, radius = np.sqrt(square), several_tools.patch_radius[0]
+    blurred = np.sqrt(max(0.0, state.blurred[t]) * max(0.0, state.blurred[s]))
+    part, fall = shared_blur(several_tools.meeting, rho / radius)
+    value, slope = blurred * part, blurred * fall / radius
+    several_tools.blurred[t, s] = several_tools.blurred[s, t] = value
     if law.on:
-        radius = several_tools.patch_radius[0]
         wide = square + WIDTH**2 * (law.radius[t] ** 2 + law.radius[s] ** 2)
         met, rise = meeting(several_tools.meeting, rho / radius)
         point = 1.0 / (np.pi * np.sqrt(wide))
-        value = (point - met / radius) / law.modulus[0]
-        slope = (-point * rho / wide - rise / radius**2) / law.modulus[0]
+        value += (point - met / radius) / law.modulus[0]
+        slope += (-point * rho / wide - rise / radius**2) / law.modulus[0]
     several_tools.apart[t, s] = several_tools.apart[s, t] = rho
     several_tools.beside[t, s] = several_tools.beside[s, t] = value
     several_tools.beside_slope[t, s] = several_tools.beside_slope[s, t] = slope
@@ -145,20 +155,20 @@ def add_history_beside(state, effects, t):  # type: ignore[no-untyped-def]
 
 
 @fast
-def derivative_beside(state, effects, t, p, d):  # type: ignore[no-untyped-def]
+def derivative_beside(state, effects, t, p, d, sharper):  # type: ignore[no-untyped-def]
     """The derivative of what tips do to each other by D, along one axis, at constant forces.
 
-    The contact of a tip is at p - phi n.
+    The contact of a tip is at p - phi n; ``sharper`` is half the derivative of b_t.
     """
     superposition, several_tools = effects.superposition, effects.several_tools
     friction, total = effects.friction, 0.0
-    if not several_tools.on or not effects.tip_law.on:
+    if not several_tools.on:
         return total
     n, turn, phi = state.normal[t], superposition.normal_gradient, 0.0
     for i in range(3):
         phi += (p[i] - state.point[t, i]) * n[i]
     for s in range(state.passage.shape[0]):
-        if s == t or state.force[s] <= 0.0 or several_tools.apart[t, s] == 0.0:
+        if s == t or state.force[s] <= 0.0:
             continue
         held = held_load(effects.viscoelasticity, s)
         along = shared = turned = 0.0
@@ -172,7 +182,9 @@ def derivative_beside(state, effects, t, p, d):  # type: ignore[no-untyped-def]
                 g = state.force[t] * (state.force[s] - held) * state.normal[s, i]
                 shared += n[i] * g
                 turned += turn[i, d] * g
-        slope = several_tools.beside_slope[t, s] * along / several_tools.apart[t, s]
+        slope = several_tools.beside_slope[t, s] * along / max(several_tools.apart[t, s], 1e-12)
+        if state.blurred[t] > 0.0:
+            slope += several_tools.blurred[t, s] * sharper / state.blurred[t]
         total += slope * shared + several_tools.beside[t, s] * turned
     return superposition.near_gain[0] * total
 
@@ -247,7 +259,11 @@ def assemble_coupling(state, effects):  # type: ignore[no-untyped-def]
             facing = 0.0
             for d in range(3):
                 facing += state.normal[t, d] * state.normal[s, d]
-            value += superposition.near_gain[0] * several_tools.beside[t, s] * facing
+            local, blurred = several_tools.beside[t, s], several_tools.blurred[t, s]
+            value += superposition.near_gain[0] * blurred * facing
+            # of patches in one place, single precision may make more than one patch has
+            value = min(value, np.sqrt(state.compliance[t, t] * state.compliance[s, s]))
+            value += superposition.near_gain[0] * (local - blurred) * facing
             state.compliance[t, s] = state.compliance[s, t] = value
 
 

@@ -15,6 +15,7 @@ from avatar_core.contact.patch_on_plane import (
     meeting_table,
     missed_between,
     patch_dent,
+    shared_blur,
 )
 from avatar_core.geometry.tip import Tip
 from tests.helpers.box_organ import MODULUS, PATCH_RADIUS, organ, top
@@ -64,6 +65,22 @@ def test_a_patch_lifts_another_by_the_mean_of_its_dent(y: float) -> None:
 
 def test_a_patch_sinks_in_the_mean_as_the_force_law_says() -> None:
     assert meeting(meeting_table(), 0.0)[0] == pytest.approx(PATCH, rel=1e-4)
+
+
+@pytest.mark.parametrize("y", [0.0, 0.4, 1.0, 1.6])
+def test_what_is_blurred_at_a_point_is_blurred_as_q_says_at_a_distance(y: float) -> None:
+    """Patches spread over eight places on a small circle, around one point and between two."""
+    angle, table = np.arange(8) * np.pi / 4, meeting_table()
+    spread = 0.08 * np.column_stack([np.cos(angle), np.sin(angle)])
+
+    def blurred(y: float) -> float:
+        apart = np.linalg.norm(spread[:, None] - spread + [y, 0.0], axis=2)
+        return meeting(table, y)[0] - float(np.mean([meeting(table, r)[0] for r in apart.flat]))
+
+    value, slope = shared_blur(table, y)
+    assert value == pytest.approx(blurred(y) / blurred(0.0), abs=0.02)
+    rise = shared_blur(table, y + 1e-4)[0] - shared_blur(table, max(0.0, y - 1e-4))[0]
+    assert slope == pytest.approx(rise / (1e-4 if y == 0.0 else 2e-4), abs=2e-3)
 
 
 def test_a_cubes_top_is_as_soft_between_load_positions_as_at_them() -> None:
