@@ -76,7 +76,9 @@ def step_errors(
     single : these in single precision
     """
     contacts, levels = draw_contacts(vademecum, n, seed), mode_levels(vademecum.n_modes)
-    models = _models(vademecum)
+    vademecum = _bare(vademecum)
+    details = [Detail(vademecum.n_modes, cloud) for cloud in SHOWN]
+    models = [make_model(each) for each in lay_out_details(vademecum, (PATCH_TIP,), details, ())]
     points = [np.sort(shown_vertices(vademecum, cloud)) for cloud in SHOWN]
     volume = [vademecum.mesh.vertex_volumes[p] for p in points]
     shown = np.empty((len(SHOWN) * len(levels), n))
@@ -98,12 +100,10 @@ def step_errors(
     return StepErrors(shown, force, smoothing, [*sizes, 0])
 
 
-def _models(vademecum: Vademecum) -> list[ContactModel]:
-    """Of each cloud, without effects; the error that they say is the smoothing alone."""
+def _bare(vademecum: Vademecum) -> Vademecum:
+    """As it is meshed, at small strain; the error that its steps say is the smoothing alone."""
     said = replace(Certificate.unknown(), force_error=ForceError(1.0, 0.0))
-    organ = replace(vademecum, certificate=said, display=None, large=None)
-    details = [Detail(vademecum.n_modes, cloud) for cloud in SHOWN]
-    return [make_model(layout) for layout in lay_out_details(organ, (PATCH_TIP,), details, ())]
+    return replace(vademecum, certificate=said, display=None, large=None)
 
 
 def pressed(model: ContactModel, tip: np.ndarray) -> float:
