@@ -7,11 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from avatar_core.certify.contact_sites import Site, draw_sites, pressed
 from avatar_core.contact.model import prepare
+from avatar_core.geometry.groups import REGIONS
+from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.pipeline import OrganOptions, build
@@ -45,18 +49,35 @@ class Differences:
 
 
 def differences(surface: SurfaceMesh, options: OrganOptions, n: int) -> dict[str, float]:
-    """Figures of the organ turned, and of its coarser mesh, beside the organ as it is given."""
-    whole = build(surface, options)
-    sites = draw_sites(whole, surface, n + 2, seed=11)[:-2]
+    """Figures of the organ turned, and of its coarser mesh, beside the organ as it is given.
+
+    All three are held, and open to tools, at the same points: rules go by the axes.
+    """
     cosine, sine = np.cos(TURN), np.sin(TURN)
     turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    turned = build(replace(surface, vertices=surface.vertices @ turn.T), options)
-    coarse = build(surface, replace(options, n_vertices=COARSE))
-    there = [replace(s, point=turn @ s.point, normal=turn @ s.normal) for s in sites]
+    groups = _groups(tetrahedralize(surface, options.n_vertices))
+    with TemporaryDirectory() as folder:
+        here, there = Path(folder, "here.npz"), Path(folder, "there.npz")
+        np.savez(here, allow_pickle=False, **groups)
+        aside = {name: points @ turn.T for name, points in groups.items()}
+        np.savez(there, allow_pickle=False, **aside)
+        options = replace(options, groups=here)
+        whole, coarse = build(surface, options), build(surface, replace(options, n_vertices=COARSE))
+        moved = replace(surface, vertices=surface.vertices @ turn.T)
+        turned = build(moved, replace(options, groups=there))
+    sites = draw_sites(whole, surface, n + 2, seed=11)[:-2]
+    others = [replace(s, point=turn @ s.point, normal=turn @ s.normal) for s in sites]
     return {
-        **_between(whole, sites, turned, there).figures("turned"),
+        **_between(whole, sites, turned, others).figures("turned"),
         **_between(whole, sites, coarse, sites).figures("coarse"),
     }
+
+
+def _groups(mesh: TetMesh) -> dict[str, np.ndarray]:
+    """Corners and middles of the faces that the rules clamp and open [m]."""
+    regions, corners = regions_by_rule(mesh), mesh.vertices[mesh.boundary_faces]
+    points = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)
+    return {name: points[getattr(regions, name)].reshape(-1, 3) for name in REGIONS}
 
 
 def _between(
