@@ -81,8 +81,11 @@ def meeting(table, y):  # type: ignore[no-untyped-def]
 
 @fast
 def shared_blur(table, y):  # type: ignore[no-untyped-def]
-    """Q and dQ/dy at a distance of two points [R_p]; it ends with the table, at -0.3 %."""
-    return (0.0, 0.0) if y >= FAR else _in_table(table, 2, y)
+    """Q and dQ/dy at a distance of two points [R_p]; far off it falls as lap 1 / y, y^-3."""
+    if y >= FAR:
+        far = table[table.shape[0] - 1, 2] * (FAR / y) ** 3
+        return far, -3.0 * far / y
+    return _in_table(table, 2, y)
 
 
 @fast

@@ -54,7 +54,7 @@ SeveralToolsState = namedtuple(
     [
         "reach",  # (1,) of the near field [m]
         "patch_radius",  # (1,) [m]
-        "meeting",  # (n + 1, 2) of meeting_table
+        "meeting",  # (n + 1, 4) of meeting_table
         "column",  # (T, T, MAX_STENCIL, 3) near displacement at the nodes of the second tip by a
         # unit normal force of the first
         "near",  # (T, T) whether near fields overlap
@@ -142,7 +142,7 @@ def place_beside(state, several_tools, law, t, s):  # type: ignore[no-untyped-de
 
 @fast
 def add_history_beside(state, effects, t):  # type: ignore[no-untyped-def]
-    """What the others' dents remember, at a tip; into its displacement without load."""
+    """Add to a tip's displacement without load what the others' dents remember, at the tip [m]."""
     superposition, several_tools = effects.superposition, effects.several_tools
     if not several_tools.on:
         return

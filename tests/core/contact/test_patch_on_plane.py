@@ -47,7 +47,7 @@ def test_the_patch_dents_as_boussinesq_says() -> None:
 
 
 def mean_under_another(y: float) -> float:
-    """Of what a patch dents, under the pressure of a patch at the distance y."""
+    """The mean of a patch's dent under the pressure of a patch at the distance y."""
     r, load = patch_rule(60)
     angle = (np.arange(120) + 0.5) * np.pi / 120
     apart = np.sqrt(y * y + r[:, None] ** 2 + 2.0 * y * r[:, None] * np.cos(angle))
@@ -81,6 +81,12 @@ def test_what_is_blurred_at_a_point_is_blurred_as_q_says_at_a_distance(y: float)
     assert value == pytest.approx(blurred(y) / blurred(0.0), abs=0.02)
     rise = shared_blur(table, y + 1e-4)[0] - shared_blur(table, max(0.0, y - 1e-4))[0]
     assert slope == pytest.approx(rise / (1e-4 if y == 0.0 else 2e-4), abs=2e-3)
+
+
+def test_what_is_shared_has_no_step_where_its_table_ends() -> None:
+    inside, outside = (shared_blur(meeting_table(), FAR + e) for e in (-1e-9, 1e-9))
+    assert outside[0] == pytest.approx(inside[0], rel=1e-6) and inside[0] != 0.0
+    assert outside[1] == pytest.approx(inside[1], abs=5e-3)
 
 
 def test_a_cubes_top_is_as_soft_between_load_positions_as_at_them() -> None:
