@@ -41,7 +41,7 @@ class UnseenContacts:
     def solved(
         self, surface: LoadSurface, elasticity: Elasticity, single: bool = False
     ) -> Iterator[tuple[float, np.ndarray]]:
-        """What full finite elements say of each contact, one after the other.
+        """Solve each contact by full finite elements, one after the other.
 
         Parameters
         ----------

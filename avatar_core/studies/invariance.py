@@ -28,10 +28,10 @@ BALL, DEPTH = Tip("sphere", 5e-3), 2e-3  # [m]
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Of the forces at some places of an organ given in two ways, relative to the first.
+    """Differences of the forces at some places of an organ given in two ways.
 
-    difference : ndarray, shape (n,), |F' / F - 1|; said : (n,), the sum of the errors of both as
-    the step says them, over F
+    difference : ndarray, shape (n,), |F' / F - 1|, F of the first way
+    said : ndarray, shape (n,), the sum of the errors of both as the step says them, over F
     """
 
     difference: np.ndarray

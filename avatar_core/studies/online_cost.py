@@ -153,7 +153,7 @@ def _table_errors(
     truth: np.ndarray,
     mass: np.ndarray,
 ) -> np.ndarray:
-    """Of exact columns at the load positions, interpolated to the places of some contacts."""
+    """Errors (n,) of exact columns at the load positions, interpolated to places of contacts."""
     surface = vademecum.surface
     positions, weights = closest_weights(surface, contacts.place)
     needed, index = np.unique(positions, return_inverse=True)
