@@ -169,5 +169,5 @@ def _sentence(curve: ForceCurve) -> str:
     step, hertz = (100 * curve.misses(force) for force in (curve.force, curve.hertz))
     return (
         f"On {tip}, the step misses resolved contact\n"
-        f"by at most {step:.0f} %, Hertz by up to {hertz:.0f} %."
+        f"by at most {step:.1f} %, Hertz by up to {hertz:.0f} %."
     )
