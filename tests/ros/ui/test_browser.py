@@ -19,6 +19,7 @@ from avatar_ros.bench.cell import Module
 from avatar_ros.ui.session.shown_period import SILENT
 from avatar_ros.ui.view.organ import Organ
 
+from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.srv import LoadVademecum
 from tests.helpers.slowness import Deadline
@@ -39,6 +40,7 @@ from tests.ros.helpers.browser import (
     until,
 )
 from tests.ros.helpers.doc_pages import parameter_rows
+from tests.ros.helpers.page import image
 from tests.ros.helpers.parameters import parameter_names, parameter_values
 from tests.ros.helpers.sick_organ import sick_organ
 
@@ -102,7 +104,16 @@ def contact() -> list[str]:
 @pytest.fixture(scope="module")
 def folder(folder: Path) -> Path:
     save_vademecum(sick_organ(), folder / "sick.h5")
+    image(folder / "ct.nii.gz", *ct_of(sick_organ()))
     return folder
+
+
+def ct_of(organ: Vademecum) -> tuple[np.ndarray, np.ndarray]:
+    """An image of tissue in fat [HU], on the grid of the distance to the organ, and where it is."""
+    field = organ.tip_field
+    affine = np.diag([*np.full(3, 1e3 * field.spacing[0]), 1.0])
+    affine[:3, 3] = 1e3 * np.asarray(field.origin)
+    return np.where(np.asarray(field.distance) < 0.0, 60, -600).astype(np.int16), affine
 
 
 def test_what_another_client_chose_is_shown(page: Any) -> None:
@@ -268,6 +279,51 @@ def test_a_slider_is_felt(page: Any, shots: Path, lasting_probe: Probe) -> None:
     )
     until(page, lambda: abs(force_of(page) - before) > 0.005, "another force", 30.0)
     page.screenshot(path=shots / "contrast.png")
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+def test_an_image_lies_where_the_organ_is(page: Any, shots: Path, size: tuple[int, int]) -> None:
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    open_tab(page, "Organ")
+    if not page.get_by_label("Image", exact=True).is_visible():
+        page.get_by_text("CT or MR", exact=True).click()
+    choose(page, "Image", "ct.nii.gz")
+    choose(page, "See", "axial")
+    news(page, "Image ct.nii.gz: check that it is of this patient")
+    settle(page, lambda: page.evaluate(PALE), "Organ")
+    page.wait_for_timeout(2000)
+    page.screenshot(path=shots / f"image-axial-{size[0]}.png")
+    choose(page, "See", "all planes")
+    page.mouse.click(60, size[1] - 100)  # nothing is there, but the page listens
+    page.keyboard.press("1")  # from the front
+    page.wait_for_timeout(2000)
+    page.screenshot(path=shots / f"image-{size[0]}.png")
+    choose(page, "Image", "none")
+    page.set_viewport_size({"width": SIZES[0][0], "height": SIZES[0][1]})
+
+
+def test_a_report_is_read_at_any_size(page: Any, shots: Path) -> None:
+    pressed(page)
+    open_tab(page, "Plan")
+    input_of(page, "Note").fill("over the tumour")
+    input_of(page, "Note").press("Enter")
+    press(page, "Keep this state")
+    news(page, "kept in plan-")
+    with page.expect_download() as coming:
+        press(page, "HTML")
+    assert re.fullmatch(r"report-sick-[\d-]+\.html", coming.value.suggested_filename)
+    coming.value.save_as(shots / "report.html")
+    read = page.context.new_page()
+    for size in SIZES:
+        read.set_viewport_size({"width": size[0], "height": size[1]})
+        read.set_content((shots / "report.html").read_text())
+        picture = read.locator("img")
+        assert picture.evaluate("e => e.naturalWidth") >= 1600
+        assert read.evaluate("document.documentElement.scrollWidth") <= size[0]
+        assert "over the tumour" in read.inner_text("body")
+        read.screenshot(path=shots / f"report-{size[0]}.png", full_page=True)
+    read.close()
+    lift(page)
 
 
 def test_a_file_of_the_library_is_loaded_and_shown_without_a_tumour(
