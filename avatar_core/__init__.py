@@ -7,7 +7,8 @@
     av.save(vademecum, "liver.h5")
     moved = vademecum.displacement_at(point, 2.0)   # (n_vertices, 3) [m] under 2 N
     model = av.prepare(vademecum, av.Scene())       # lays out and compiles; may fail
-    status = av.step(model, tips)                   # 1 kHz; never fails: see model.out
+    data = model.data()                             # of one loop
+    status = av.step(model, data, tips)             # 1 kHz; never fails: see data.out
 
 All lengths are in metres, forces in newtons. What users can cause and cure raises
 :class:`AvatarError` with one line that names cause and remedy.
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from avatar_core.atlas.patient import patient_vademecum as patient  # noqa: F401
     from avatar_core.atlas.storage import load_atlas as load_atlas
     from avatar_core.atlas.storage import save_atlas as save_atlas
+    from avatar_core.contact.model import ContactData as ContactData
     from avatar_core.contact.model import ContactModel as ContactModel
     from avatar_core.contact.model import step as step
     from avatar_core.contact.status import Status as Status
@@ -58,6 +60,7 @@ _ORIGIN = {
     "AvatarError": "errors",
     "Budget": "vademecum.accuracy",
     "Certificate": "vademecum.certificate",
+    "ContactData": "contact.model",
     "ContactModel": "contact.model",
     "Material": "fem.elasticity",
     "OrganOptions": "pipeline",

@@ -13,7 +13,7 @@ import numpy as np
 
 from avatar_core.bags.periods import BagPath
 from avatar_core.common.arrays import FloatArray
-from avatar_core.contact.haptics.force_guard import ForceGuard, ForceLimits
+from avatar_core.haptics.force_guard import ForceGuard, ForceLimits
 from avatar_core.scene.replay import REMEMBER_FOR_EVER, Replayed, known_periods, scene_of
 from avatar_core.scene.replay import why_not as why_not_recorded
 

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from avatar_core.bags.read import Bag
 from avatar_core.bags.table import Table
 from avatar_core.common.arrays import FloatArray
+from avatar_core.contact.orientation import composed
 from avatar_core.contact.status import FAR_AWAY, PLACED, Status
 from avatar_core.errors import StorageError
 from avatar_core.scene.file import parse_scene
@@ -81,6 +82,7 @@ def path_of(
     """
     poses, invalid, notes = _valid_poses(bag, transform)
     origin, rotation = _parts(transform or IDENTITY)
+    frame = np.array((transform or IDENTITY)[3:]) / math.hypot(*(transform or IDENTITY)[3:])
     answers, table = _answers(bag, poses)
     rate = rate or (bag.about.rate if bag.about else _rate(table.received))
     row = _pose_of(poses, table, answers)
@@ -101,7 +103,7 @@ def path_of(
     if bag.about is not None or effects & _REMEMBERING:  # a recording's receipts count the periods
         lost = np.ones(len(table), bool)
     number = _numbers(table.received, rate, lost)
-    turn = _turns(poses, row, here) @ rotation.T
+    orientation = np.where(here[:, None], _turned(poses.values[row, 3:], frame), 0.0)
     force = _forces(bag, answers, table, poses, row, rotation)
     recording = Recording(
         vademecum_id=vademecum_id,
@@ -113,7 +115,7 @@ def path_of(
             number=number[kept],
             stamp=table.stamp[kept],
             tip=tip[kept, None],
-            turn=turn[kept, None],
+            orientation=orientation[kept, None],
             status=status[kept, None],
             force=force[kept, None],
             error=_column(answers, table, 4)[kept, None],
@@ -287,16 +289,12 @@ def _moved(points: FloatArray, origin: FloatArray, rotation: FloatArray) -> Floa
     return turned + origin
 
 
-def _turns(poses: Table, row: np.ndarray, here: np.ndarray) -> FloatArray:
-    """Rotation vectors since the pose of the period before, shape (n, 3) [rad], as the loop takes
-    them: twice the vector part of q_now q_before*, zero after a period without a pose."""
-    q = poses.values[np.maximum(row, 0), 3:]
-    before = np.roll(q, 1, axis=0)
-    v, w, u, s = q[:, :3], q[:, 3:], before[:, :3], before[:, 3:]
-    sign = np.where((q * before).sum(axis=1, keepdims=True) >= 0.0, 2.0, -2.0)
-    turn = sign * (s * v - w * u - np.cross(v, u))
-    turned = here & np.r_[False, here[:-1]] & np.r_[False, row[1:] != row[:-1]]
-    return np.where(turned[:, None], turn, 0.0)
+def _turned(orientations: FloatArray, frame: FloatArray) -> FloatArray:
+    """Quaternions (n, 4) in the organ's frame, as the loop finds them; bit by bit the same if both
+    frames are one."""
+    if np.array_equal(frame, IDENTITY[3:]):
+        return orientations
+    return np.stack(composed(frame, orientations.T), axis=1)
 
 
 def _forces(

@@ -83,14 +83,12 @@ class _Messages:
         received = (periods.stamp[0] + since.astype(np.int64)).tolist()
         self._send(ABOUT, received[0], self._make(types.TEXT, about.text()))
         used = np.isin(periods.status, PLACED) & np.isfinite(periods.tip).all(axis=2)
-        orientations = [np.array([0.0, 0.0, 0.0, 1.0]) for _ in self._names]
         written = [-1 for _ in self._names]  # stamp of the last pose
         for k, stamp in enumerate(periods.stamp.tolist()):
             for i, name in enumerate(self._names):
-                orientations[i] = _turned(orientations[i], periods.turn[k, i])
                 if used[k, i] and stamp != written[i]:
                     written[i] = stamp
-                    pose = self._pose(stamp, periods.tip[k, i], orientations[i])
+                    pose = self._pose(stamp, periods.tip[k, i], periods.orientation[k, i])
                     self._send(f"{name}/{POSES}", received[k], pose)
             for i, name in enumerate(self._names):
                 wrench = self._wrench(stamp, periods.force[k, i] * periods.sent_fraction[k, i])
@@ -112,7 +110,8 @@ class _Messages:
         return self._make(f"geometry_msgs/msg/{kind}", *values.tolist())
 
     def _pose(self, stamp: int, tip: FloatArray, orientation: FloatArray) -> Any:
-        quaternion = self._vector(orientation, "Quaternion")
+        known = orientation if orientation.any() else np.array([0.0, 0.0, 0.0, 1.0])
+        quaternion = self._vector(known, "Quaternion")
         pose = self._make("geometry_msgs/msg/Pose", self._vector(tip, "Point"), quaternion)
         return self._make(types.POSE, self._header(stamp), pose)
 
@@ -138,12 +137,3 @@ class _Messages:
             float(periods.error[k, tool]),
             float(periods.sent_fraction[k, tool]),
         )
-
-
-def _turned(orientation: FloatArray, turn: FloatArray) -> FloatArray:
-    """An orientation x y z w after a rotation, of which ``turn`` is twice the vector part."""
-    if not turn.any():
-        return orientation
-    v, u, s = 0.5 * turn, orientation[:3], orientation[3]
-    w = np.sqrt(max(0.0, 1.0 - float(v @ v)))
-    return np.array([*(w * u + s * v + np.cross(v, u)), w * s - v @ u])

@@ -15,13 +15,13 @@ import numpy as np
 
 from avatar_core.certify.unseen_contacts import HEIGHTS, draw_contacts
 from avatar_core.contact.cloud import shown_vertices
-from avatar_core.contact.layout import lay_out_details
+from avatar_core.contact.layout import Shape, lay_out
 from avatar_core.contact.model import (
+    ContactData,
     ContactModel,
     Status,
     deform,
     estimate_error,
-    make_model,
     solve,
 )
 from avatar_core.errors import ConvergenceError
@@ -78,7 +78,9 @@ def step_errors(
     contacts, levels = draw_contacts(vademecum, n, seed), mode_levels(vademecum.n_modes)
     vademecum = _bare(vademecum)
     details = [Detail(vademecum.n_modes, cloud) for cloud in SHOWN]
-    models = [make_model(each) for each in lay_out_details(vademecum, (PATCH_TIP,), details, ())]
+    shape = Shape.of(vademecum, (PATCH_TIP,))
+    layouts = [lay_out(vademecum, (PATCH_TIP,), each, (), shape=shape) for each in details]
+    loops = [ContactModel(layout).data() for layout in layouts]
     points = [np.sort(shown_vertices(vademecum, cloud)) for cloud in SHOWN]
     volume = [vademecum.mesh.vertex_volumes[p] for p in points]
     shown = np.empty((len(SHOWN) * len(levels), n))
@@ -86,17 +88,17 @@ def step_errors(
     truth = contacts.solved(vademecum.surface, elasticity, single)
     for k, (tip, (compliance, field)) in enumerate(zip(contacts.tip, truth, strict=True)):
         row = iter(shown)
-        for model, p, v in zip(models, points, volume, strict=True):
-            load = pressed(model, tip)
+        for data, p, v in zip(loops, points, volume, strict=True):
+            load = pressed(data, tip)
             for level in levels:
-                model.show(level)
-                deform(model)
-                left = model.out.cloud[:, 3:] + load * field[p]
+                data.show(level)
+                deform(data.model, data)
+                left = data.out.cloud[:, 3:] + load * field[p]
                 next(row)[k] = np.sqrt(_square(left, v) / _square(load * field[p], v))
-        force[k] = abs(load * compliance / -model.state.gap[0] - 1.0)
-        estimate_error(model)
-        smoothing[k] = model.out.force_error[0] / np.linalg.norm(model.out.force[0])
-    sizes = [_size(model.arrays, level) for model in models for level in levels]
+        force[k] = abs(load * compliance / -data.state.gap[0] - 1.0)
+        estimate_error(data.model, data)
+        smoothing[k] = data.out.force_error[0] / np.linalg.norm(data.out.force[0])
+    sizes = [_size(layout, level) for layout in layouts for level in levels]
     return StepErrors(shown, force, smoothing, [*sizes, 0])
 
 
@@ -106,13 +108,13 @@ def _bare(vademecum: Vademecum) -> Vademecum:
     return replace(vademecum, certificate=said, display=None, large=None)
 
 
-def pressed(model: ContactModel, tip: np.ndarray) -> float:
+def pressed(data: ContactData, tip: np.ndarray) -> float:
     """The force of a patch at a place that it comes to from nowhere [N]."""
-    model.reset()
-    status = solve(model, tip[None])
+    data.reset()
+    status = solve(data.model, data, tip[None])
     if status != Status.OK:
         raise ConvergenceError(f"a patch {tip} m has no contact: {Status(status).name}")  # type: ignore[call-arg]
-    return float(model.state.force[0])
+    return float(data.state.force[0])
 
 
 def _square(field: np.ndarray, volume: np.ndarray) -> float:

@@ -19,14 +19,14 @@ import numpy as np
 
 from avatar_core.certify.unseen_contacts import draw_contacts
 from avatar_core.common.splines import evaluate
-from avatar_core.contact.effects.tip_law import law_error
-from avatar_core.contact.model import ContactModel, Status, estimate_error, prepare, step
+from avatar_core.contact.model import ContactData, Status, estimate_error, model_of, step
 from avatar_core.errors import ContactError, ConvergenceError, MeshError
 from avatar_core.fem.norms import relative_l2
 from avatar_core.geometry.heights import tangents
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.resolved_contact import DEPTHS, SPHERES, contacts_at
 from avatar_core.offline.rule import NO_ERROR, Progress, silent
+from avatar_core.tips.law import law_error
 from avatar_core.vademecum.certificate import Certificate, ContactSites
 from avatar_core.vademecum.force_error import PROMISED
 
@@ -249,15 +249,15 @@ def _access(vademecum: Vademecum, site: Site) -> float:
 class _Models(NamedTuple):
     """The step of one tip, that of a patch in its place, and the tip."""
 
-    real: ContactModel
-    patch: ContactModel
+    real: ContactData
+    patch: ContactData
     tip: Tip
 
     @classmethod
     def of(cls, vademecum: Vademecum, tip: Tip) -> _Models:
-        real = prepare(vademecum, (tip,), cloud="volume", effects=())
-        patch = prepare(vademecum, (Tip("patch", tip.radius),), cloud="off", effects=())
-        return cls(real, patch, tip)
+        real = model_of(vademecum, (tip,), cloud="volume", effects=())
+        patch = model_of(vademecum, (Tip("patch", tip.radius),), cloud="off", effects=())
+        return cls(real.data(), patch.data(), tip)
 
 
 def compared(
@@ -307,7 +307,7 @@ def compared(
                     _angle(force, axis),
                     float(real.out.force_error[0]),
                     float(
-                        law_error(real.effects.tip_law, real.state.steepness[0], 0)
+                        law_error(real.model.arrays, real.state, 0)
                         * np.linalg.norm(real.out.force[0])
                     ),
                     float(pressed(patch, site, tip, depth) @ axis),
@@ -332,12 +332,12 @@ def _angle(force: np.ndarray, axis: np.ndarray) -> float:
     return float(np.arccos(np.clip(force @ axis / size, -1.0, 1.0))) if size > 0.0 else np.nan
 
 
-def pressed(model: ContactModel, site: Site, tip: Tip, depth: float) -> np.ndarray:
+def pressed(data: ContactData, site: Site, tip: Tip, depth: float) -> np.ndarray:
     """The step's force at a depth below a site, after an approach along its normal, (3,) [N]."""
-    model.reset()
+    data.reset()
     for at in (*np.arange(-0.5e-3, depth, 1e-3), depth):
-        status = step(model, (site.point + (tip.offset - at) * site.normal)[None])
+        status = step(data.model, data, (site.point + (tip.offset - at) * site.normal)[None])
     if status not in (Status.OK, Status.EXTRAPOLATED):
         return np.full(3, np.nan)
-    estimate_error(model)
-    return model.out.force[0].copy()
+    estimate_error(data.model, data)
+    return data.out.force[0].copy()

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from avatar_core.cli.output import require_output
-from avatar_core.cli.progress import build_stages, stage_bar
-from avatar_core.cli.vademecum import Axes, Label, Surface, Unit, Vertices, read_organ, require
+from avatar_core.cli.progress import build_stages, stage_bar, waiting
+from avatar_core.cli.vademecum import Axes, Label, Unit, Vertices, read_organ, require
 from avatar_core.common.dataclass_json import plain
 from avatar_core.errors import AvatarError
 
@@ -72,7 +72,9 @@ def bench_step(
     for n in shown:
         require_displayable(n)
     if is_built:
-        rows, summary = time_organ(load_vademecum(surface))
+        vademecum = load_vademecum(surface)
+        _compile()
+        rows, summary = time_organ(vademecum)
     else:
         organ = read_organ(surface, unit, axes, label)
         with stage_bar(build_stages()) as progress:
@@ -89,7 +91,7 @@ def bench_step(
 
 @bench.command("effects")
 def bench_effects(
-    surface: Surface = "phantom",
+    surface: SurfaceOrVademecum = "phantom",
     unit: Unit = "mm",
     axes: Axes = None,
     label: Label = None,
@@ -97,28 +99,44 @@ def bench_effects(
     modes: Annotated[int, typer.Option(help="modes at a place at most")] = 100,
     output: Json = None,
 ) -> None:
-    """Time the step without effects, with each one, and with all (building takes minutes)."""
+    """Time the step without effects, with each one, and with all (building takes minutes).
+
+    For a vademecum (.h5): with those that it can serve.
+    """
     from avatar_core.studies.bench.effects import build_for_effects, run_effects_bench
     from avatar_core.studies.bench.methods import load_average
+    from avatar_core.vademecum.storage import load_vademecum
 
     require(modes >= 36, f"--modes is {modes}; inertia and self_weight need at least 36")
     _require_json(output, surface)
-    organ = read_organ(surface, unit, axes, label)
-    with stage_bar(build_stages(large=True)) as progress:
-        vademecum = build_for_effects(organ, vertices, modes, progress)
+    if Path(surface).suffix == ".h5":
+        vademecum = load_vademecum(surface)
+    else:
+        organ = read_organ(surface, unit, axes, label)
+        with stage_bar(build_stages(large=True)) as progress:
+            vademecum = build_for_effects(organ, vertices, modes, progress)
+    _compile()
 
     def announce(scene: str) -> None:
         print(f"timing: {scene}", file=sys.stderr, flush=True)
 
     rows, summary = run_effects_bench(vademecum, announce)
     print(
-        f"load average {load_average():.2f}; {vertices} vertices, {modes} modes; 10 mm spheres "
-        "sliding 5 mm deep, field at all vertices at every step"
+        f"load average {load_average():.2f}; {len(vademecum.mesh.vertices)} vertices; 10 mm "
+        "spheres sliding 5 mm deep, field at all vertices at every step"
     )
     print(_effects_table(rows))
     for key, value in summary.items():
         print(f"{key:22s} {value:10.3f}")
     _write(output, "effects", summary, rows)
+
+
+def _compile() -> None:
+    """Say what a first start waits for."""
+    from avatar_core.contact.model import compiled_step
+
+    with waiting("compiling the step, once on this machine"):
+        compiled_step()
 
 
 def _effects_table(rows: list[EffectRow]) -> str:

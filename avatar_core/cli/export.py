@@ -98,7 +98,7 @@ def _export_recording(file: Path, output: Path) -> None:
 
 def _say_load(vademecum: Vademecum, point: Any, newtons: list[float], moved: float) -> None:
     """The load, the largest displacement [m], and what is known of its error."""
-    from avatar_core.contact.locate import MAX_DEPTH
+    from avatar_core.geometry.tip import MAX_DEPTH
 
     place = vademecum.surface.nearest(point)
     x, y, z = place.point

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar_core.certify.contact_sites import Site, hertz_force, nearest_sites, pressed
-from avatar_core.contact.model import ContactModel, prepare
+from avatar_core.contact.model import ContactData, model_of
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import ContactError, ConvergenceError, MeshError
 from avatar_core.geometry.surface import SurfaceMesh
@@ -66,10 +66,10 @@ def palpation_picture(
 
     middle = vademecum.surface.centers[[middle_of_access(vademecum)]]
     (site,) = nearest_sites(vademecum, surface, middle)
-    model = prepare(vademecum, (TIP,))
-    curve = force_curve(vademecum, surface, site, model, progress)
+    data = model_of(vademecum, (TIP,)).data()
+    curve = force_curve(vademecum, surface, site, data, progress)
     figure = plt.figure(figsize=(12, 4.8), layout="constrained")
-    _draw_organ(figure, vademecum, model.out.cloud, site.point)
+    _draw_organ(figure, vademecum, data.out.cloud, site.point)
     _draw_curve(figure, curve)
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -79,15 +79,15 @@ def force_curve(
     vademecum: Vademecum,
     surface: SurfaceMesh,
     site: Site,
-    model: ContactModel,
+    data: ContactData,
     progress: Callable[[float], None] | None = None,
 ) -> ForceCurve:
-    """The forces at a place; the model is left at the largest depth."""
+    """The forces at a place; the data are left at the largest depth."""
     depth = np.linspace(0.0, max(RESOLVED), 51)
     force, error = np.empty_like(depth), np.empty_like(depth)
     for k, at in enumerate(depth):
-        force[k] = np.linalg.norm(pressed(model, site, TIP, at))
-        error[k] = model.out.force_error[0]
+        force[k] = np.linalg.norm(pressed(data, site, TIP, at))
+        error[k] = data.out.force_error[0]
     hertz = hertz_force(vademecum.material, TIP.radius, depth)
     return ForceCurve(depth, force, error, hertz, _resolved(vademecum, surface, site, progress))
 

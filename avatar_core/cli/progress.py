@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -80,6 +82,31 @@ def item_bar(total: int) -> Iterator[Callable[[int, int, str], None]]:
             bar.update(done - bar.n)
 
         yield show
+
+
+@contextmanager
+def waiting(text: str) -> Iterator[None]:
+    """Print a line, on a terminal with a count of the seconds."""
+    if not sys.stderr.isatty():
+        print(f"{text} ...", file=sys.stderr, flush=True)
+        yield
+        return
+    done, start = threading.Event(), time.monotonic()
+
+    def count() -> None:
+        while not done.is_set():
+            seconds = time.monotonic() - start
+            print(f"\r{text} ... {seconds:3.0f} s", end="", file=sys.stderr, flush=True)
+            done.wait(0.5)
+
+    clock = threading.Thread(target=count, daemon=True)
+    clock.start()
+    try:
+        yield
+    finally:
+        done.set()
+        clock.join()
+        print("\r\033[K", end="", file=sys.stderr, flush=True)
 
 
 def _bar(**options: Any) -> Any:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from avatar_core.bags.read import Bag
-    from avatar_core.contact.haptics.force_guard import ForceLimits
+    from avatar_core.haptics.force_guard import ForceLimits
     from avatar_core.scene.recording import Recording
     from avatar_core.scene.replay import Replayed
     from avatar_core.vademecum.model import Vademecum
@@ -62,7 +62,7 @@ def replay(
 ) -> None:
     """Compute the forces along a recorded path again, and compare them with the recorded ones."""
     from avatar_core.bags.files import is_bag
-    from avatar_core.contact.haptics.force_guard import DEVICES
+    from avatar_core.haptics.force_guard import DEVICES
 
     require(rate is None or 100.0 <= rate <= 2000.0, f"--rate is {rate} Hz; give 100 to 2000")
     require(device in DEVICES, f"--device is {device}; choose {', '.join(DEVICES)}")
@@ -143,7 +143,7 @@ def _identity(bag: Bag, organ: Vademecum) -> list[str]:
 
 def _scene_of(bag: Bag, name: str | None, organ: Vademecum) -> str:
     """The scene of one tool that is given, that the bag holds, or the default, as YAML."""
-    from avatar_core.contact.effects.selection import default_effects
+    from avatar_core.contact.layout import default_effects
     from avatar_core.scene.file import read_scene, scene_path, write_scene
     from avatar_core.scene.model import Scene
 

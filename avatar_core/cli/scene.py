@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from avatar_core.cli.progress import waiting
 from avatar_core.errors import SceneError
 
 if TYPE_CHECKING:
@@ -153,7 +149,7 @@ def _show_cost(one: Scene, v: Vademecum) -> None:
     from avatar_core.studies.bench.methods import load_average
     from avatar_core.studies.bench.scene import DEPTH, PUSH, time_scene
 
-    rows = time_scene(v, one, _waiting)
+    rows = time_scene(v, one, waiting)
     print(
         f"  cost of a step here and now (load average {load_average():.2f}): a push of "
         f"{PUSH * 1e3:g} mm and a slide {DEPTH * 1e3:g} mm deep;\n"
@@ -171,28 +167,3 @@ def _show_cost(one: Scene, v: Vademecum) -> None:
         )
     if not one.effects:
         print("    (without effects, this scene is the bare step)")
-
-
-@contextmanager
-def _waiting(text: str) -> Iterator[None]:
-    """Print a line, on a terminal with a count of the seconds."""
-    if not sys.stderr.isatty():
-        print(f"{text} ...", file=sys.stderr, flush=True)
-        yield
-        return
-    done, start = threading.Event(), time.monotonic()
-
-    def count() -> None:
-        while not done.is_set():
-            seconds = time.monotonic() - start
-            print(f"\r{text} ... {seconds:3.0f} s", end="", file=sys.stderr, flush=True)
-            done.wait(0.5)
-
-    clock = threading.Thread(target=count, daemon=True)
-    clock.start()
-    try:
-        yield
-    finally:
-        done.set()
-        clock.join()
-        print("\r\033[K", end="", file=sys.stderr, flush=True)

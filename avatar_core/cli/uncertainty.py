@@ -99,7 +99,7 @@ def given_of(given: list[str]) -> dict[str, Distribution]:
 def _depths(text: str) -> list[float]:
     import numpy as np
 
-    from avatar_core.contact.locate import MAX_DEPTH
+    from avatar_core.geometry.tip import MAX_DEPTH
 
     counts, most = tuple(range(1, 101)), 1e3 * MAX_DEPTH
     found = numbers("--depths", text, counts, f"rising numbers [mm], as {_DEPTHS}")

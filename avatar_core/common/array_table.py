@@ -1,4 +1,8 @@
-"""Named tuples of arrays, handed to compiled code by one address.
+"""Named tuples of arrays: declared once, allocated, and handed to compiled code by one address.
+
+    Contact = kind("Contact", force=array("T"), normal=array("T 3"))      # T tools
+    contact = allocate(Contact, {"T": 2})
+    table = ArrayTable(contact)
 
 By value, numba takes a tuple of n arrays apart into 7 n numbers at every call and puts it together
 again in every function: with the 150 arrays of a step, that was most of what it compiled. An
@@ -7,17 +11,19 @@ compiled code gets the table's address and reads, of the arrays that it names, w
 Attributes read as those of the tuple do. What is read never changes, and the compiler is told so:
 it reads it before a loop, not within.
 
-A tuple may hold None for another tuple. Compiled code then finds a table whose ``on`` is False,
-with empty arrays of the types that a tuple ``like`` it has: one compiled function serves both.
+A member of a kind may be another kind, and None in a tuple of it. Compiled code then finds a table
+whose ``on`` is False: one compiled function serves both.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections import namedtuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
-from numba import typeof, types
+from numba import from_dtype, types
 from numba.core.imputils import impl_ret_untracked
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import (
@@ -34,54 +40,128 @@ from numba.np.arrayobj import make_array, populate_array
 _WORD = ir.IntType(64)
 
 
-class ArrayTable:
-    """Where the arrays of a named tuple lie, and those of the tuples in it.
+class Declared(NamedTuple):
+    """An array of a kind: its dimensions by name or number, and its value at first."""
 
-    arrays : the tuple, kept alive; its members are arrays, or such tuples, or None. All None: a
-        table that is off.
-    like : a tuple of the same kind without any None, for the types of what is None; not needed
-        where nothing is
+    shape: tuple[str, ...]
+    dtype: np.dtype[Any]
+    start: float
+
+
+def array(shape: str, dtype: Any = np.float64, start: float = 0.0) -> Declared:
+    """Declare an array, as ``array("T 3")``; compiled code knows its type and dimensions."""
+    return Declared(tuple(shape.split()), np.dtype(dtype), start)
+
+
+def kind(name: str, **members: Any) -> Any:
+    """A named tuple of arrays, and of other kinds, which may be None in it."""
+    tuple_of: Any = namedtuple(name, members)  # type: ignore[misc]
+    return type(name, (tuple_of,), {"__slots__": (), "members": members})
+
+
+def allocate(of: Any, sizes: Mapping[str, int], **given: Any) -> Any:
+    """A tuple of a kind with all arrays at their first value, but those that are given.
+
+    sizes : of the dimensions that have names; nested kinds are None unless given
+    """
+
+    def made(name: str, member: Any) -> Any:
+        if name in given or not isinstance(member, Declared):
+            return given.get(name)
+        shape = [int(size) if size.isdigit() else sizes[size] for size in member.shape]
+        return np.full(shape, member.start, member.dtype)
+
+    return of(*(made(name, member) for name, member in of.members.items()))
+
+
+def sizes_of(arrays: Any) -> dict[str, int]:
+    """The dimensions of a tuple's arrays by name."""
+    pairs = (
+        zip(member.shape, getattr(arrays, name).shape, strict=True)
+        for name, member in arrays.members.items()
+        if isinstance(member, Declared)
+    )
+    return {name: size for pair in pairs for name, size in pair}
+
+
+def restart(arrays: Any, kept: Iterable[str] = ()) -> None:
+    """Set all arrays to their first value, in other tuples too, but the members to be kept."""
+    for name, member in arrays.members.items():
+        value = getattr(arrays, name)
+        if name in kept or value is None:
+            continue
+        if isinstance(member, Declared):
+            value[...] = member.start
+        else:
+            restart(value)
+
+
+def flat(arrays: Any, prefix: str = "") -> dict[str, np.ndarray]:
+    """All arrays by name, as "distance" or "friction.coefficients"."""
+    found: dict[str, np.ndarray] = {}
+    for name, value in arrays._asdict().items():
+        if isinstance(value, np.ndarray):
+            found[prefix + name] = value
+        elif value is not None:
+            found |= flat(value, f"{prefix}{name}.")
+    return found
+
+
+def gathered(of: Any, arrays: Mapping[str, np.ndarray], prefix: str = "") -> Any:
+    """The inverse of :func:`flat`; None for a kind of which there is no array."""
+    if prefix and not any(name.startswith(prefix) for name in arrays):
+        return None
+    return of(
+        *(
+            arrays[prefix + name]
+            if isinstance(member, Declared)
+            else gathered(member, arrays, f"{prefix}{name}.")
+            for name, member in of.members.items()
+        )
+    )
+
+
+class ArrayTable:
+    """Where the arrays of a tuple lie, and those of the tuples in it.
+
+    arrays : the tuple, kept alive
     numba_type : TableType
     address : of the table, for compiled code
 
     Raises
     ------
     TypeError
-        For an array that is not contiguous, or of another type than in ``like``.
+        For an array that is not contiguous, or of another type than was declared.
     """
 
-    def __init__(self, arrays: Any, like: Any = None) -> None:
+    def __init__(self, arrays: Any) -> None:
         self.arrays = arrays
-        self.numba_type = TableType.of(arrays if like is None else like)
+        self.numba_type = TableType(type(arrays))
         self._words = np.array(_words(self.numba_type, arrays), np.int64)
         self.address = int(self._words.ctypes.data)
 
 
 class TableType(types.Type):
-    """Names and numba types of a table's members, and where the words of each begin.
+    """Names and numba types of a kind's members, and where the words of each begin.
 
     The first word of a table is whether it is on. Compiled code writes to no constant, so that
     arrays that may not be written are of the same type as others.
     """
 
-    def __init__(self, kind: str, members: dict[str, Any]) -> None:
-        self.members = members
+    def __init__(self, of: Any) -> None:
+        self.members = {name: _type_of(member) for name, member in of.members.items()}
         self.start, self.n_words = {}, 1
-        for name, of in members.items():
+        for name, member in self.members.items():
             self.start[name] = self.n_words
-            self.n_words += _n_words(of)
-        super().__init__(f"{kind}({', '.join(f'{name}={of}' for name, of in members.items())})")
-
-    @classmethod
-    def of(cls, arrays: Any) -> TableType:
-        """Of a named tuple."""
-        return cls(type(arrays).__name__, {k: _type_of(v) for k, v in arrays._asdict().items()})
+            self.n_words += _n_words(member)
+        members = ", ".join(f"{name}={member}" for name, member in self.members.items())
+        super().__init__(f"{of.__name__}({members})")
 
 
 def _type_of(member: Any) -> Any:
-    if isinstance(member, np.ndarray):
-        return types.Array(typeof(member).dtype, member.ndim, "C")
-    return TableType.of(member)
+    if isinstance(member, Declared):
+        return types.Array(from_dtype(member.dtype), len(member.shape), "C")
+    return TableType(member)
 
 
 def _n_words(of: Any) -> int:
@@ -92,7 +172,8 @@ def _words(of: Any, member: Any) -> list[int]:
     if member is None:
         return [0] * _n_words(of)
     if isinstance(member, np.ndarray):
-        if _type_of(member) != of or not member.flags.c_contiguous:
+        fits = from_dtype(member.dtype) == of.dtype and member.ndim == of.ndim
+        if not fits or not member.flags.c_contiguous:
             raise TypeError(f"{member.dtype} {member.shape} of strides {member.strides} for {of}")
         return [member.ctypes.data, *member.shape, *member.strides]
     words = [1]

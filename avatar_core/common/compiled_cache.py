@@ -21,7 +21,17 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataC
 
 _PACKAGE = Path(__file__).parents[1]
 # Imports never run back (tests/core/test_rooms.py): compiled code comes from no later room.
-_ROOMS = ("common", "geometry", "fem", "reduction", "shapes", "vademecum", "contact")
+ROOMS = [
+    "common",
+    "geometry",
+    "fem",
+    "reduction",
+    "shapes",
+    "vademecum",
+    "tips",
+    "contact",
+    "haptics",
+]
 _KEPT = 8  # folders of other contents, for the versions that are in use side by side
 
 
@@ -29,7 +39,7 @@ _KEPT = 8  # folders of other contents, for the versions that are in use side by
 def content() -> str:
     """Hash of all sources that compiled functions may be made of."""
     found = hashlib.sha256()
-    for room in _ROOMS:
+    for room in ROOMS:
         for file in sorted((_PACKAGE / room).rglob("*.py")):
             found.update(file.relative_to(_PACKAGE).as_posix().encode() + file.read_bytes())
     return found.hexdigest()[:16]

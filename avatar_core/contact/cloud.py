@@ -29,7 +29,7 @@ _LARGEST = np.float32(32767)  # of int16
 
 
 class CloudArrays(NamedTuple):
-    """The arrays of the same names in :class:`avatar_core.contact.layout.Layout`, and their source;
+    """The arrays of the same names in :class:`avatar_core.contact.layout.MODEL`, and their source;
     the modes in single precision.
 
     points : vertices of the mesh that are shown, in the order of the blocks
@@ -55,7 +55,7 @@ def cloud_arrays(
     """The modes of all regions, and those of large deformation, in the blocks of a cloud.
 
     motion : ndarray, shape (n, n_global), amplitudes that the global modes may have beside those of
-        the loads that are shown; see :func:`avatar_core.contact.effects.selection.own_motion`. None
+        the loads that are shown; see :func:`avatar_core.contact.layout.own_motion`. None
         if there are none
     """
     blocks, regional = _Blocks(vademecum, cloud), vademecum.regional

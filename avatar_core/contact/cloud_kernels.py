@@ -8,7 +8,7 @@ over the load positions j of region r that carry a tip, with the modes Z and the
 :mod:`avatar_core.vademecum.large_deformation`. The global modes are part of every region's field;
 what they move by more than the loads that are shown (vibration, weight, faded history) stands
 apart, as a part of its own. That is an organ under patches; near a tip,
-:mod:`avatar_core.contact.dent` shows the tip's dent.
+:mod:`avatar_core.tips.dent` shows the tip's dent.
 
 A step reads the modes of the regions that are *touched*: those of the load positions that carry a
 tip or hold a history of loads.
@@ -21,6 +21,7 @@ import numpy as np
 from avatar_core.common.jit import entry, fast, inlined
 from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.display import write_cloud
+from avatar_core.contact.effects.friction import force_on_tissue
 from avatar_core.contact.effects.large_deformation import add_nonlinear_load, powers_of_depth
 from avatar_core.contact.effects.respiration import shift_cloud
 from avatar_core.contact.effects.viscoelasticity import least_shown
@@ -31,114 +32,106 @@ MAX_PAST = 4  # regions whose history of loads is shown
 
 
 @fast
-def deform(model, state, out, effects):  # type: ignore[no-untyped-def]
+def deform(model, data):  # type: ignore[no-untyped-def]
     """The cloud under the forces of a period."""
-    e = effects
-    _displace(model, state, out, effects)
-    write_cloud(model, state, out.cloud, e.tip_law, e.dent, e.display)
-    shift_cloud(e.respiration, out.cloud)
+    _displace(model, data)
+    write_cloud(model, data)
+    shift_cloud(model, data)
 
 
 @fast
-def _displace(model, state, out, effects):  # type: ignore[no-untyped-def]
-    """The displacement of all points into ``state.field``."""
-    superposition, large_deformation = effects.superposition, effects.large_deformation
-    viscoelasticity = effects.viscoelasticity
-    if not superposition.on and out.n_contacts[0] == 0:
-        state.field[:] = np.float32(0.0)
+def _displace(model, data):  # type: ignore[no-untyped-def]
+    """The displacement of all points into ``data.field``."""
+    if not model.superposed[0] and data.out.n_contacts[0] == 0:
+        data.field[:] = np.float32(0.0)
         return
-    _release_regions(state)
-    if viscoelasticity.on:
-        _load_past(model, state, large_deformation, viscoelasticity)
-    for t in range(state.passage.shape[0]):
-        if state.force[t] > 0.0:
-            _load_regions(model, state, effects, t)
-    _move_globals(model, state, superposition)
-    _sum_modes(model, state, large_deformation)
+    _release_regions(data)
+    if model.viscoelasticity.on:
+        _load_past(model, data)
+    for t in range(data.passage.shape[0]):
+        if data.force[t] > 0.0:
+            _load_regions(model, data, t)
+    _move_globals(model, data)
+    _sum_modes(model, data)
 
 
 @fast
-def _move_globals(model, state, superposition):  # type: ignore[no-untyped-def]
+def _move_globals(model, data):  # type: ignore[no-untyped-def]
     """Amplitudes that the effects give to the global modes, less those of the touched regions."""
-    if not superposition.on:
+    if not model.superposed[0]:
         return
     for k in range(model.region_start[0]):
-        moved = superposition.total[k]
-        for q in range(state.n_touched[0]):
-            moved -= state.amplitude[model.region_start[state.touched[q]] + k]
-        state.amplitude[k] = np.float32(moved)
+        moved = data.superposition.total[k]
+        for q in range(data.n_touched[0]):
+            moved -= data.amplitude[model.region_start[data.touched[q]] + k]
+        data.amplitude[k] = np.float32(moved)
 
 
 @fast
-def _release_regions(state):  # type: ignore[no-untyped-def]
-    for i in range(state.n_touched[0]):
-        state.is_touched[state.touched[i]] = False
-    state.n_touched[0] = 0
+def _release_regions(data):  # type: ignore[no-untyped-def]
+    for i in range(data.n_touched[0]):
+        data.is_touched[data.touched[i]] = False
+    data.n_touched[0] = 0
 
 
 @inlined
-def _touch(model, state, large_deformation, r):  # type: ignore[no-untyped-def]
+def _touch(model, data, r):  # type: ignore[no-untyped-def]
     """Clear the amplitudes of a region that was not touched before."""
-    if state.is_touched[r]:
+    if data.is_touched[r]:
         return
-    state.is_touched[r] = True
-    state.touched[state.n_touched[0]] = r
-    state.n_touched[0] += 1
-    state.amplitude[model.region_start[r] : model.region_start[r + 1]] = np.float32(0.0)
-    if large_deformation.on:
-        start = large_deformation.start
-        state.amplitude[start[r] : start[r + 1]] = np.float32(0.0)
+    data.is_touched[r] = True
+    data.touched[data.n_touched[0]] = r
+    data.n_touched[0] += 1
+    data.amplitude[model.region_start[r] : model.region_start[r + 1]] = np.float32(0.0)
+    if model.large_deformation.on:
+        start = model.large_deformation.start
+        data.amplitude[start[r] : start[r + 1]] = np.float32(0.0)
 
 
 @fast
-def _add_load(model, state, j, x, y, z):  # type: ignore[no-untyped-def]
+def _add_load(model, data, j, x, y, z):  # type: ignore[no-untyped-def]
     """Amplitudes of a region by a force at one of its load positions."""
     first, end = model.region_start[model.region[j]], model.region_start[model.region[j] + 1]
-    amplitude, load = state.amplitude[first:end], model.regional_load[j]
+    amplitude, load = data.amplitude[first:end], model.regional_load[j]
     f0, f1, f2 = np.float32(x), np.float32(y), np.float32(z)
     for k in range(amplitude.shape[0]):
         amplitude[k] += load[0, k] * f0 + load[1, k] * f1 + load[2, k] * f2
 
 
 @fast
-def _load_regions(model, state, effects, t):  # type: ignore[no-untyped-def]
+def _load_regions(model, data, t):  # type: ignore[no-untyped-def]
     """The force of a tip on the regions of the load positions that carry it.
 
     A region fades out before the tip leaves it, so that few are read; the others take its part.
     """
-    large_deformation, friction = effects.large_deformation, effects.friction
-    viscoelasticity = effects.viscoelasticity
-    region_weight, kept = state.region_weight, 0.0
-    for i in range(state.n_nodes[t]):
-        region_weight[model.region[state.nodes[t, i]]] = 0.0
-    for i in range(state.n_nodes[t]):
-        region_weight[model.region[state.nodes[t, i]]] += state.weight[t, i, 0]
-    for i in range(state.n_nodes[t]):
-        kept += _kept_weight(model, state, t, i)
-    n = state.normal[t]
-    f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
-    if friction.on:
-        f0, f1, f2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
+    region_weight, kept = data.region_weight, 0.0
+    for i in range(data.n_nodes[t]):
+        region_weight[model.region[data.nodes[t, i]]] = 0.0
+    for i in range(data.n_nodes[t]):
+        region_weight[model.region[data.nodes[t, i]]] += data.weight[t, i, 0]
+    for i in range(data.n_nodes[t]):
+        kept += _kept_weight(model, data, t, i)
+    f0, f1, f2 = force_on_tissue(model, data, t)
     second = third = 0.0
-    if large_deformation.on:
-        second, third = powers_of_depth(state, large_deformation, t)
-    for i in range(state.n_nodes[t]):
-        j, w = state.nodes[t, i], _kept_weight(model, state, t, i)
+    if model.large_deformation.on:
+        second, third = powers_of_depth(data, t)
+    for i in range(data.n_nodes[t]):
+        j, w = data.nodes[t, i], _kept_weight(model, data, t, i)
         if w != 0.0:
             r = model.region[j]
-            _touch(model, state, large_deformation, r)
-            if not viscoelasticity.on:
+            _touch(model, data, r)
+            if not model.viscoelasticity.on:
                 part = w / kept
-                _add_load(model, state, j, part * f0, part * f1, part * f2)
-            if large_deformation.on:
-                add_nonlinear_load(state, large_deformation, r, j, w / kept, second, third)
+                _add_load(model, data, j, part * f0, part * f1, part * f2)
+            if model.large_deformation.on:
+                add_nonlinear_load(model, data, r, j, w / kept, second, third)
 
 
 @inlined
-def _kept_weight(model, state, t, i):  # type: ignore[no-untyped-def]
+def _kept_weight(model, data, t, i):  # type: ignore[no-untyped-def]
     """Weight of a load position, less what its region as a whole has faded."""
-    whole = state.region_weight[model.region[state.nodes[t, i]]]
-    return state.weight[t, i, 0] * soft_threshold(whole) / whole if whole != 0.0 else 0.0
+    whole = data.region_weight[model.region[data.nodes[t, i]]]
+    return data.weight[t, i, 0] * soft_threshold(whole) / whole if whole != 0.0 else 0.0
 
 
 @inlined
@@ -150,68 +143,69 @@ def soft_threshold(w):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _load_past(model, state, large_deformation, viscoelasticity):  # type: ignore[no-untyped-def]
+def _load_past(model, data):  # type: ignore[no-untyped-def]
     """The load history on its regions; the weakest loads fade out, and so do weak regions."""
-    least = least_shown(viscoelasticity)
-    for m in range(viscoelasticity.count[0]):
-        e, j = viscoelasticity.near_elastic[m], viscoelasticity.position[m]
+    past = data.viscoelasticity
+    least = least_shown(data)
+    for m in range(past.count[0]):
+        e, j = past.near_elastic[m], past.position[m]
         size = np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
         if size > least:
             part = (size - least) / size
-            _touch(model, state, large_deformation, model.region[j])
-            _add_load(model, state, j, part * e[0], part * e[1], part * e[2])
-    if state.n_touched[0] > MAX_PAST:
-        _fade_regions(model, state)
+            _touch(model, data, model.region[j])
+            _add_load(model, data, j, part * e[0], part * e[1], part * e[2])
+    if data.n_touched[0] > MAX_PAST:
+        _fade_regions(model, data)
 
 
 @fast
-def _fade_regions(model, state):  # type: ignore[no-untyped-def]
+def _fade_regions(model, data):  # type: ignore[no-untyped-def]
     """Keep the ``MAX_PAST`` regions whose own modes move most, less what the next one moves."""
-    norm, n, n_global = state.region_weight, state.n_touched[0], model.region_start[0]
+    norm, n, n_global = data.region_weight, data.n_touched[0], model.region_start[0]
     for i in range(n):
-        r = state.touched[i]
+        r = data.touched[i]
         norm[r] = 0.0
         for k in range(model.region_start[r] + n_global, model.region_start[r + 1]):
-            norm[r] += np.float64(state.amplitude[k]) ** 2  # of modes with a peak of 1
+            norm[r] += np.float64(data.amplitude[k]) ** 2  # of modes with a peak of 1
         norm[r] = np.sqrt(norm[r])
     bound = np.inf  # in the end the norm of the region after the last that is kept
     for _ in range(MAX_PAST + 1):
         largest = 0.0
         for i in range(n):
-            if norm[state.touched[i]] < bound:
-                largest = max(largest, norm[state.touched[i]])
+            if norm[data.touched[i]] < bound:
+                largest = max(largest, norm[data.touched[i]])
         bound = largest
     kept = 0
     for i in range(n):
-        r = state.touched[i]
+        r = data.touched[i]
         if norm[r] > bound:
             factor = np.float32((norm[r] - bound) / norm[r])
             for k in range(model.region_start[r], model.region_start[r + 1]):
-                state.amplitude[k] *= factor
-            state.touched[kept] = r
+                data.amplitude[k] *= factor
+            data.touched[kept] = r
             kept += 1
         else:
-            state.is_touched[r] = False
-    state.n_touched[0] = kept
+            data.is_touched[r] = False
+    data.n_touched[0] = kept
 
 
 @fast
-def _sum_modes(model, state, large_deformation):  # type: ignore[no-untyped-def]
+def _sum_modes(model, data):  # type: ignore[no-untyped-def]
     """The displacement of every block: of global modes that stand apart, and of touched regions."""
-    amplitude, start, shown = state.amplitude, model.region_start, state.shown[0]
+    amplitude, start, shown = data.amplitude, model.region_start, data.shown[0]
     space, core, level, rows = model.space, model.core, model.level, model.block_start
     n_global, n_regions = start[0], start.shape[0] - 1
     for b in range(rows.shape[1] - 1):
-        u = state.field[b * BLOCK : (b + 1) * BLOCK]
+        u = data.field[b * BLOCK : (b + 1) * BLOCK]
         for i in range(BLOCK):
             u[i] = np.float32(0.0)
         add_part(space, core, level, rows[0], amplitude[:n_global], ALL, b, u)
-        for q in range(state.n_touched[0]):
-            r = state.touched[q]
+        for q in range(data.n_touched[0]):
+            r = data.touched[q]
             own = amplitude[start[r] : start[r + 1]]
             add_part(space, core, level, rows[1 + r], own, shown, b, u)
-            if large_deformation.on:
-                first, end = large_deformation.start[r], large_deformation.start[r + 1]
+            if model.large_deformation.on:
+                first, end = model.large_deformation.start[r], model.large_deformation.start[r + 1]
                 bent = rows[1 + n_regions + r]
                 add_part(space, core, level, bent, amplitude[first:end], ALL, b, u)
 

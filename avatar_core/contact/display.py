@@ -2,7 +2,7 @@
 
 A displayed vertex x hangs on four vertices x_i of the mesh
 (:mod:`avatar_core.vademecum.display`). Near a tip the field of a patch bends within a triangle, but
-is known there (:mod:`avatar_core.contact.dent`): with p its displacement on a half-space, faded by
+is known there (:mod:`avatar_core.tips.dent`): with p its displacement on a half-space, faded by
 h, and u_tip that of the tip, along the inward normal,
 
     u(x) = sum_i w_i [u(x_i) + n h p(x_i)]  -  n h u_tip(x),
@@ -12,26 +12,24 @@ so that only what is smooth is interpolated.
 
 from __future__ import annotations
 
-from collections import namedtuple
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast
-from avatar_core.contact.dent import add_dents, points_around
+from avatar_core.tips.dent import add_dents, points_around
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.display import Display
 
-DisplayArrays = namedtuple(
-    "DisplayArrays",
-    [
-        "corner",  # (n, 4) points of the mesh that carry each displayed vertex
-        "weight",  # (n, 4) float32
-        "rest",  # (n_mesh_points, 3) float32, at rest [m]
-        "start",  # (n_positions + 1,) of the mesh's points around each load position, in
-        "around",  # (m,) points that a tip near the load position may move
-    ],
+DISPLAY = kind(
+    "Display",
+    corner=array("v 4", np.int32),  # points of the mesh that carry each displayed vertex
+    weight=array("v 4", np.float32),
+    rest=array("p 3", np.float32),  # of the mesh's points, at rest [m]
+    start=array("q", np.int64),  # of the mesh's points around each load position, in
+    around=array("a", np.int32),  # points that a tip near the load position may move
 )
 
 
@@ -41,7 +39,7 @@ def display_arrays(
     vertices: np.ndarray,
     positions: np.ndarray,
     patch_radius: float,
-) -> DisplayArrays:
+) -> Any:
     """Of what is displayed.
 
     points : vertices of the mesh that are summed from modes, in the order of the blocks
@@ -49,7 +47,7 @@ def display_arrays(
     positions : ndarray, shape (n_positions, 3), of the patches [m]
     """
     rest, order = vertices[points], np.argsort(points)
-    return DisplayArrays(
+    return DISPLAY(
         order[np.searchsorted(points, display.corners, sorter=order)].astype(np.int32),
         display.weights,
         rest.astype(np.float32),
@@ -58,17 +56,18 @@ def display_arrays(
 
 
 @fast
-def write_cloud(model, state, cloud, law, dents, display):  # type: ignore[no-untyped-def]
-    """The cloud, from what the modes displace in ``state.field``: with the dents of tips, at the
+def write_cloud(model, data):  # type: ignore[no-untyped-def]
+    """The cloud, from what the modes displace in ``data.field``: with the dents of tips, at the
     displayed vertices if they are not the mesh's."""
+    cloud, dents, shown = data.out.cloud, model.dent, model.display
     flat = cloud.reshape(6 * cloud.shape[0])
-    if not display.on:
-        _write(model.rest, model.place, state.field, cloud)
-        add_dents(model, state, law, dents, dents, model.rest, flat, 6, 1.0, 1.0)
+    if not model.display.on:
+        _write(model.rest, model.place, data.field, cloud)
+        add_dents(model, data, dents.start, dents.around, model.rest, flat, 6, 1.0, 1.0)
         return
-    add_dents(model, state, law, dents, display, display.rest, state.field, 3, 0.0, 1.0)
-    _interpolate(display, model.rest, state.field, cloud)
-    add_dents(model, state, law, dents, dents, model.rest, flat, 6, 1.0, 0.0)
+    add_dents(model, data, shown.start, shown.around, shown.rest, data.field, 3, 0.0, 1.0)
+    _interpolate(model, model.rest, data.field, cloud)
+    add_dents(model, data, dents.start, dents.around, model.rest, flat, 6, 1.0, 0.0)
 
 
 @fast
@@ -82,9 +81,9 @@ def _write(rest, place, field, cloud):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _interpolate(display, rest, field, cloud):  # type: ignore[no-untyped-def]
+def _interpolate(model, rest, field, cloud):  # type: ignore[no-untyped-def]
     """The same of displayed vertices, from the displacement of the mesh's."""
-    corner, weight = display.corner, display.weight
+    corner, weight = model.display.corner, model.display.weight
     for v in range(corner.shape[0]):
         a, b = 3 * corner[v, 0], 3 * corner[v, 1]
         c, e = 3 * corner[v, 2], 3 * corner[v, 3]

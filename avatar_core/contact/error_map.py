@@ -8,7 +8,7 @@ from scipy.ndimage import map_coordinates
 
 from avatar_core.contact.layout import force_error_grid
 from avatar_core.contact.locate import FULL_ACCESS
-from avatar_core.contact.tip_response import make_tip_response, tip_carriers
+from avatar_core.contact.organ_response import make_tip_response, tip_carriers
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.tip_field import TipField
 

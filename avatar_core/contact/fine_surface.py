@@ -2,7 +2,7 @@
 
 The edges of an organ's mesh are some 9 mm long, a tip's dent a few. Triangles with a corner within
 two patch radii of the tip are split twice, each into four. With D = u_tip - u_patch faded as in
-:mod:`avatar_core.contact.dent`, what is left of a cloud's displacement without it is smooth:
+:mod:`avatar_core.tips.dent`, what is left of a cloud's displacement without it is smooth:
 
     u(x) = I[u + n D](x) - n D(rho(x)),
 
@@ -25,11 +25,11 @@ import scipy.sparse as sp
 from scipy.optimize import brentq
 
 from avatar_core.common.splines import evaluate
-from avatar_core.contact.dent import FADE, REACH
-from avatar_core.contact.effects.tip_law import PATCH_ON_MESH
-from avatar_core.contact.patch_on_plane import patch_dent, quarter_turn
 from avatar_core.errors import AvatarError
+from avatar_core.fem.patch_on_plane import patch_dent, quarter_turn
 from avatar_core.geometry.tip import Tip
+from avatar_core.tips.dent import FADE, REACH
+from avatar_core.tips.law import PATCH_ON_MESH
 from avatar_core.vademecum.model import Vademecum
 
 _LEVELS = 2  # of splitting

@@ -9,56 +9,67 @@ load positions that carry the tip, and between two depths by their logarithm,
 
 from __future__ import annotations
 
-from collections import namedtuple
 from collections.abc import Mapping
-from functools import partial
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
-from avatar_core.common.array_table import ArrayTable
+from avatar_core.common.array_table import ArrayTable, TableType, array, kind
 from avatar_core.common.jit import entry
-from avatar_core.contact.model import ContactModel, compiled_for
+from avatar_core.contact.data import DATA
+from avatar_core.contact.model import ContactData, compiled_for
 
 RATIO, DEPTH = "force_band.ratio", "force_band.depth"  # names of the arrays beside a layout's
 
-# ratio (T, n_positions, n_depths, 2) float32: rho of the low and the high edge; depth (n_depths,)
-# rising by a factor [m], at least two; edges (2, T, 6): forces [N] and torques [N m]
-BandArrays = namedtuple("BandArrays", ["ratio", "depth", "edges"])
+BAND = kind(
+    "Band",
+    ratio=array("T P depths 2", np.float32),  # rho of the low and the high edge
+    depth=array("depths"),  # rising by a factor, at least two [m]
+    edges=array("2 T 6"),  # forces [N] and torques [N m]
+)
 
 
 @entry
-def force_band(state, out, band):  # type: ignore[no-untyped-def]
+def force_band(data, band):  # type: ignore[no-untyped-def]
     """Both edges of the wrench of each tip, of the last solution. Real-time safe.
 
     Beyond the prepared depths the ratios are those of the nearest.
     """
+    out = data.out
     first, last = band.depth[0], band.depth.shape[0] - 2
     scale = 1.0 / np.log(band.depth[1] / first)
     for t in range(out.force.shape[0]):
         low = high = whole = 0.0
-        if state.force[t] > 0.0:
-            place = scale * np.log(max(-state.gap[t], first) / first)
+        if data.force[t] > 0.0:
+            place = scale * np.log(max(-data.gap[t], first) / first)
             k = min(int(min(place, 1e3)), last)
             part = min(place - k, 1.0)
-            for i in range(state.n_nodes[t]):
-                w, at = state.weight[t, i, 0], band.ratio[t, state.nodes[t, i]]
+            for i in range(data.n_nodes[t]):
+                w, at = data.weight[t, i, 0], band.ratio[t, data.nodes[t, i]]
                 low += w * ((1.0 - part) * at[k, 0] + part * at[k + 1, 0])
                 high += w * ((1.0 - part) * at[k, 1] + part * at[k + 1, 1])
                 whole += w
         whole = max(whole, 1e-6)
         low, high = np.exp(low / whole), np.exp(high / whole)
         for d in range(3):
-            band.edges[0, t, d], band.edges[1, t, d] = low * out.force[t, d], high * out.force[t, d]
+            band.edges[0, t, d] = low * out.force[t, d]
+            band.edges[1, t, d] = high * out.force[t, d]
             band.edges[0, t, 3 + d] = low * out.torque[t, d]
             band.edges[1, t, 3 + d] = high * out.torque[t, d]
 
 
+@cache
+def _compiled() -> Any:
+    return compiled_for(force_band, TableType(DATA), TableType(BAND))
+
+
 class ForceBand:
-    """The band of one model's forces.
+    """The band of the forces of one loop.
 
     Parameters
     ----------
-    model : ContactModel
+    data : ContactData of that loop
     ratio : ndarray float32, shape (n_tools, n_positions, n_depths, 2), ln of the low and the high
         edge over the force
     depth : ndarray, shape (n_depths,), n_depths >= 2, rising by a constant factor [m]
@@ -66,16 +77,15 @@ class ForceBand:
     edges : ndarray, shape (2, n_tools, 6), force [N] and torque [N m] of both edges, low first
     """
 
-    def __init__(self, model: ContactModel, ratio: np.ndarray, depth: np.ndarray) -> None:
-        self.edges = np.zeros((2, model.n_tools, 6))
-        self._table = ArrayTable(BandArrays(ratio, depth, self.edges))
-        arguments = model.tables.state, model.tables.out, self._table
-        self._update = partial(compiled_for(force_band, *arguments), *arguments)
+    def __init__(self, data: ContactData, ratio: np.ndarray, depth: np.ndarray) -> None:
+        self.edges = np.zeros((2, data.model.n_tools, 6))
+        table = ArrayTable(BAND(ratio, depth, self.edges))
+        self._update = partial(_compiled(), data.table, table)
 
     @staticmethod
-    def of(model: ContactModel, arrays: Mapping[str, np.ndarray]) -> ForceBand | None:
-        """The band of a model, if its arrays were prepared."""
-        return ForceBand(model, arrays[RATIO], arrays[DEPTH]) if RATIO in arrays else None
+    def of(data: ContactData, arrays: Mapping[str, np.ndarray]) -> ForceBand | None:
+        """The band of a loop, if its arrays were prepared."""
+        return ForceBand(data, arrays[RATIO], arrays[DEPTH]) if RATIO in arrays else None
 
     def update(self) -> None:
         """Write the edges of the forces of the last solution.

@@ -1,122 +1,110 @@
 """The constant arrays of a step: a vademecum, tools and effects laid out flat.
 
-``vademecum -> lay_out -> Layout``; :mod:`avatar_core.contact.model` adds state and compiled code.
+``vademecum -> lay_out -> MODEL``; :mod:`avatar_core.contact.model` adds the compiled step, and what
+a loop keeps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from avatar_core.contact import kernels
-from avatar_core.contact.cloud import CloudArrays, cloud_arrays, rounded
-from avatar_core.contact.dent import dent_arrays
-from avatar_core.contact.display import display_arrays
-from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.large_deformation import (
-    LargeDeformationArrays,
+from avatar_core.common.array_table import array, kind
+from avatar_core.contact.cloud import BLOCK, cloud_arrays, rounded
+from avatar_core.contact.display import DISPLAY, display_arrays
+from avatar_core.contact.effects import (
+    EFFECTS,
+    Effect,
+    Inertia,
     LargeDeformationEffect,
+    SelfWeight,
+    SeveralTools,
+    Tumour,
+    Viscoelasticity,
 )
-from avatar_core.contact.effects.selection import (
-    ARRAYS,
-    Constants,
-    adapted_vademecum,
-    default_effects,
-    find,
-    own_motion,
-    selected_arrays,
-)
-from avatar_core.contact.effects.several_tools import SeveralTools
-from avatar_core.contact.effects.tilt import Tilt, tilt_arrays
-from avatar_core.contact.effects.tip_law import PATCH_ON_MESH, tip_law_arrays
-from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
-from avatar_core.contact.kernels import ModelArrays
-from avatar_core.contact.locate import MAX_DEPTH
-from avatar_core.contact.tip_response import (
-    TipCarriers,
-    TipResponse,
-    make_tip_response,
-    sampled_at_tip,
-    tip_carriers,
-)
+from avatar_core.contact.effects.base import Ground, find
+from avatar_core.contact.organ_response import TipCarriers, make_tip_response, tip_carriers
 from avatar_core.errors import ContactError, SceneError
-from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tip import MAX_DEPTH, MAX_TOOLS, Tip
 from avatar_core.reduction.near_field import hash_rows
+from avatar_core.tips.dent import DENT, dent_arrays
+from avatar_core.tips.law import LAW, PATCH_ON_MESH, law_arrays
+from avatar_core.tips.profile import STIFFNESS, TAKEN
 from avatar_core.vademecum.accuracy import Cloud, Detail
 from avatar_core.vademecum.certificate import Certificate
 
 if TYPE_CHECKING:
-    from avatar_core.contact.effects.tip_law import ShapeFactor
+    from avatar_core.tips.law import ShapeFactor
     from avatar_core.vademecum.large_deformation import LargeDeformation
     from avatar_core.vademecum.model import Vademecum
 
 LANES = 32  # float32 numbers that a vectorised loop processes at once
 PERIOD = 1e-3  # of the steps [s]
 
+# T tools, P load positions, K modes of contact, m of the cloud; on the grid of the tip field x y z.
+MODEL = kind(
+    "Model",
+    # the tip field
+    distance=array("x y z", np.float32),
+    access=array("x y z", np.float32),
+    origin=array("3"),
+    spacing=array("1"),
+    # the organ's response where a tip is
+    row=array("x y z", np.int32),
+    carrier=array("c w", np.int32),
+    carrier_weight=array("c w", np.float32),
+    self_compliance=array("x y z", np.float32),
+    force_error=array("x y z", np.float32),  # relative
+    # load positions [m], their modes, and the blocks of the near field with their hash table
+    position=array("P 3"),
+    load=array("P 3 K", np.float32),
+    contact_start=array("q", np.int64),
+    contact_slot=array("h 2", np.int32),
+    contact_block=array("e 3 3", np.float32),
+    softness=array("1"),  # added where access fades [m/N]
+    superposed=array("1", np.bool_),  # whether all loads and histories add up at each tip
+    # modes of the cloud's blocks; those of each part begin at block_start: of global modes that
+    # move beside the loads, of each region, and of each region's large deformation
+    space=array(f"k {BLOCK}", np.int16),
+    core=array("k m", np.float32),
+    level=array("k", np.int32),
+    block_start=array("parts blocks", np.int64),
+    shown=array("1", np.int64),  # the level that is shown
+    place=array("v", np.int32),  # of each point in the blocks
+    # regions of load positions, whose amplitudes begin at region_start
+    region=array("P", np.int32),
+    region_start=array("r", np.int64),
+    regional_load=array("P 3 m", np.float32),
+    rest=array("V 6", np.float32),  # the cloud without displacement [m]
+    tip_offset=array("T"),  # of a pose above the lowest point of the tip [m]
+    # None where the load is the vademecum's own patch; and where the mesh's vertices are shown
+    law=LAW,
+    dent=DENT,
+    display=DISPLAY,
+    **{name: effect.Constants for name, effect in EFFECTS.items() if effect.Constants is not None},
+)
+
 
 @dataclass(frozen=True)
-class Layout:
-    """The constant arrays of a step: of the organ and its tools, and of the chosen effects.
+class Shape:
+    """What a layout takes of the organ's shape and the tips, whatever the organ is made of.
 
-    arrays : ModelArrays
-        distance, access, origin, spacing: the tip field; row, carrier, carrier_weight,
-        self_compliance: the tip response on its grid; force_error, relative, on the same grid;
-        position (n_positions, 3) [m]; load (n_positions, 3, rank and zeros) and the contact_*
-        blocks with their hash tables: compliance [m/N]; softness (1,), added where access fades
-        [m/N];
-        space (n_modes, BLOCK), core (n_modes, m) and level (n_modes,), the modes of the cloud's
-        blocks; block_start (n_parts, n_blocks + 1), those of each part: global modes that move
-        beside the loads, each region, and each region's large deformation; shown (1,), the level
-        that is shown; place (n_points,), of each point in the blocks; region (n_positions,) and
-        regional_load (n_positions, 3, most), whose amplitudes begin at region_start
-        (n_regions + 1,); rest (n_points, 6), the cloud without displacement [m]; tip_offset
-        (n_tools,), of a pose above the lowest point of the tip [m]
-    effects : Constants, None for each effect that was not chosen
+    reach : longest distance between the two positions of a block [m]
+    factor : of each tip
     """
 
-    arrays: Any
-    effects: Constants
-
-    def flat(self) -> dict[str, np.ndarray]:
-        """All arrays by name, as "distance" or "friction.coefficients"."""
-        out = dict(self.arrays._asdict())
-        for name, chosen in self.effects._asdict().items():
-            if chosen is not None:
-                out |= {f"{name}.{key}": array for key, array in chosen._asdict().items()}
-        return out
-
-    @staticmethod
-    def of(arrays: dict[str, np.ndarray]) -> Layout:
-        """The inverse of :meth:`flat`."""
-        chosen: dict[str, Any] = {}
-        for name, kind in ARRAYS.items():
-            own = [f"{name}.{key}" for key in kind._fields]
-            chosen[name] = kind(*(arrays[key] for key in own)) if own[0] in arrays else None
-        return Layout(
-            ModelArrays(*(arrays[key] for key in ModelArrays._fields)), Constants(**chosen)
-        )
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of all arrays [bytes]."""
-        return int(sum(array.nbytes for array in self.flat().values()))
-
-
-@dataclass(frozen=True)
-class _Shape:
-    """What a layout takes of the organ's shape and the tips, whatever the organ is made of."""
-
     carriers: TipCarriers
-    reach: float  # longest distance between the two positions of a block [m]
-    factor: ShapeFactor  # of each tip
+    reach: float
+    factor: ShapeFactor
 
     @classmethod
-    def of(cls, vademecum: Vademecum, tips: Sequence[Tip]) -> _Shape:
+    def of(cls, vademecum: Vademecum, tips: Sequence[Tip]) -> Shape:
+        """For several materials of an organ, or several clouds, at once."""
         # Here, because the contact node needs none of it.
-        from avatar_core.contact.kept_factors import factors_of
+        from avatar_core.tips.kept_factors import factors_of
 
         surface, field = vademecum.surface, vademecum.tip_field
         height = max(tip.offset for tip in tips)
@@ -134,56 +122,33 @@ def lay_out(
     detail: Detail | None = None,
     effects: Sequence[Effect] | None = None,
     period: float = PERIOD,
-) -> Layout:
-    """The constant arrays of a contact model; see :func:`avatar_core.contact.model.prepare`.
+    shape: Shape | None = None,
+) -> Any:
+    """The arrays of a contact model, a tuple of MODEL; see
+    :func:`avatar_core.contact.model.model_of`.
 
     detail : of the displacement; by default all modes at the surface
+    shape : of the organ and the tips, if it is known
     """
     detail = detail or Detail(vademecum.n_modes)
-    return next(lay_out_details(vademecum, tips, [detail], effects, period))
-
-
-def lay_out_details(
-    vademecum: Vademecum,
-    tips: Sequence[Tip],
-    details: Sequence[Detail],
-    effects: Sequence[Effect] | None = None,
-    period: float = PERIOD,
-    shape: _Shape | None = None,
-) -> Iterator[Layout]:
-    """:func:`lay_out` for one detail after the other; they share what does not depend on it.
-
-    Nothing is checked before the first is asked for.
-
-    shape : of the organ and the tips, if it was found for another material
-    """
-    for detail in details:
-        _check(vademecum, tips, detail)
-    if effects is None:
-        effects = default_effects(vademecum, len(tips))
-    for effect in effects:
-        effect.require(vademecum)
-    if len(tips) > 1 and find(effects, SeveralTools) is None:
-        raise SceneError(
-            f"{len(tips)} tools without several_tools; add it to the effects, or name one tool"
-        )
-    leaning = find(effects, Tilt)
-    if leaning is not None:
-        leaning.require_flat(tips)
-    vademecum, mass = adapted_vademecum(vademecum, effects)
-    surface, contact = vademecum.surface, vademecum.contact_near
+    chosen = default_effects(vademecum, len(tips)) if effects is None else effects
+    _check(vademecum, tips, detail, chosen)
+    without = () if find(chosen, Tumour) else (Tumour(1.0),)  # whose organ has none, if it can
+    for effect in (*without, *chosen):
+        vademecum = effect.adapted(vademecum)
+    shape = shape or Shape.of(vademecum, tips)
+    surface, contact, field = vademecum.surface, vademecum.contact_near, vademecum.tip_field
     contact_start, contact_slot = hash_rows(contact)
     load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
-    padded, softness = _padded(load), float((load**2).sum(axis=(1, 2)).mean() / 3.0)
-    field, offset = vademecum.tip_field, np.array([tip.offset for tip in tips])
-    shape = shape or _Shape.of(vademecum, tips)
-    response = make_tip_response(
-        surface, field, shape.carriers, load, contact, vademecum.material.plane_strain_modulus
+    modulus = vademecum.material.plane_strain_modulus
+    response = make_tip_response(surface, field, shape.carriers, load, contact, modulus)
+    large = vademecum.large if find(chosen, LargeDeformationEffect) else None
+    clouds = cloud_arrays(
+        vademecum, detail.cloud, large.terms if large else None, own_motion(vademecum, chosen)
     )
-    large = vademecum.large if find(effects, LargeDeformationEffect) is not None else None
-    error = force_error_grid(vademecum.certificate, large, response.smoothing)
-    tilt = tilt_arrays(leaning, tips, field) if leaning is not None else None
-    law = tip_law_arrays(
+    shown, display = rounded(clouds), vademecum.display if detail.cloud == "surface" else None
+    points = display.vertices if display else vademecum.mesh.vertices[np.sort(shown.points)]
+    law = law_arrays(
         tips,
         vademecum.material,
         _local(vademecum, response.self_compliance),
@@ -191,69 +156,75 @@ def lay_out_details(
         (vademecum.certificate or Certificate.unknown()).contact_sites.factor,
         large is not None and large.material == "neo-hookean",
     )
-    clouds: dict[Cloud, CloudArrays] = {}
-    for detail in details:
-        if detail.cloud not in clouds:
-            terms = large.terms if large else None
-            clouds[detail.cloud] = cloud_arrays(
-                vademecum, detail.cloud, terms, own_motion(vademecum, effects)
-            )
-        shown = rounded(clouds[detail.cloud])
-        display = vademecum.display if detail.cloud == "surface" else None
-        points = display.vertices if display else vademecum.mesh.vertices[np.sort(shown.points)]
-        arrays = ModelArrays(
-            distance=field.distance,
-            access=field.access,
-            origin=field.origin,
-            spacing=field.spacing,
-            row=response.row,
-            carrier=response.carrier,
-            carrier_weight=response.carrier_weight,
-            self_compliance=response.self_compliance,
-            force_error=error,
-            position=np.ascontiguousarray(surface.centers),
-            load=padded,
-            contact_start=contact_start,
-            contact_slot=contact_slot,
-            contact_block=contact.block,
-            softness=np.array([softness]),
-            space=shown.space,
-            core=shown.core,
-            level=shown.level,
-            block_start=shown.block_start,
-            shown=np.array([detail.modes]),
-            place=np.argsort(shown.points).astype(np.int32),
-            region=vademecum.regional.region,
-            region_start=shown.region_start,
-            regional_load=shown.regional_load,
-            rest=np.pad(points, ((0, 0), (0, 3))).astype(np.float32),
-            tip_offset=offset,
-        )
-        nonlinear = (
-            _nonlinear_arrays(vademecum, large, response, shown.large_start) if large else None
-        )
-        places = (surface.centers, surface.patch_radius)
-        dent = dent_arrays(tips, points, *places) if law else None
-        fine = None
-        if display:
-            fine = display_arrays(display, shown.points, vademecum.mesh.vertices, *places)
-        yield Layout(
-            arrays,
-            selected_arrays(
-                *(vademecum, effects, mass, nonlinear, shape.reach, surface.patch_radius, period),
-                *(law, dent, tilt, fine),
-            ),
-        )
+    places, fine = (surface.centers, surface.patch_radius), None
+    if display:
+        fine = display_arrays(display, shown.points, vademecum.mesh.vertices, *places)
+    padded = _padded(load)
+    n_modes, start = padded.shape[2], shown.large_start
+    ground = Ground(
+        vademecum, tips, chosen, response, n_modes, float(shape.reach), start, float(period)
+    )
+    of_effects = {effect.name: effect.lay_out(ground) for effect in chosen if effect.Constants}
+    return MODEL(
+        distance=field.distance,
+        access=field.access,
+        origin=field.origin,
+        spacing=field.spacing,
+        row=response.row,
+        carrier=response.carrier,
+        carrier_weight=response.carrier_weight,
+        self_compliance=response.self_compliance,
+        force_error=force_error_grid(vademecum.certificate, large, response.smoothing),
+        position=np.ascontiguousarray(surface.centers),
+        load=padded,
+        contact_start=contact_start,
+        contact_slot=contact_slot,
+        contact_block=contact.block,
+        softness=np.array([float((load**2).sum(axis=(1, 2)).mean() / 3.0)]),
+        superposed=np.array([any(effect.superposed for effect in chosen)]),
+        space=shown.space,
+        core=shown.core,
+        level=shown.level,
+        block_start=shown.block_start,
+        shown=np.array([detail.modes]),
+        place=np.argsort(shown.points).astype(np.int32),
+        region=vademecum.regional.region,
+        region_start=shown.region_start,
+        regional_load=shown.regional_load,
+        rest=np.pad(points, ((0, 0), (0, 3))).astype(np.float32),
+        tip_offset=np.array([tip.offset for tip in tips]),
+        law=law,
+        dent=dent_arrays(tips, points, *places) if law else None,
+        display=fine,
+        **{name: of_effects.get(name) for name in EFFECTS if name in MODEL.members},
+    )
 
 
-def lay_out_materials(
-    materials: Iterable[Vademecum], tips: Sequence[Tip], detail: Detail
-) -> Iterator[tuple[Vademecum, Layout]]:
-    """:func:`lay_out` for one material of an organ after the other; they share its shape."""
-    shape = None
-    for vademecum in materials:
-        shape = shape or _Shape.of(vademecum, tips)
-        yield vademecum, next(lay_out_details(vademecum, tips, [detail], shape=shape))
+def default_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
+    """Effects of a scene that names none: those that the vademecum and the tools require."""
+    effects: list[Effect] = []
+    if vademecum.large is not None:
+        effects.append(LargeDeformationEffect())
+    if vademecum.contrast is not None:
+        effects.append(Tumour())
+    if n_tools > 1:
+        effects.append(SeveralTools())
+    return tuple(effects)
+
+
+def own_motion(vademecum: Vademecum, effects: Sequence[Effect]) -> np.ndarray | None:
+    """Amplitudes by which global modes may move beside the loads of the moment, (n, n_global).
+
+    A history may leave those of any load; the weight's count as much as all loads together. None
+    if the effects know neither.
+    """
+    weight = find(effects, SelfWeight)
+    remembers = find(effects, Inertia) or find(effects, Viscoelasticity)
+    motion = [vademecum.far.load.astype(float)] if remembers else []
+    if weight is not None:
+        sag = weight.sag(vademecum)
+        motion.append(np.repeat(sag[None], len(motion[0]) if motion else 1, axis=0))
+    return np.concatenate(motion) if motion else None
 
 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
@@ -272,21 +243,12 @@ def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
     return local
 
 
-def _nonlinear_arrays(
-    vademecum: Vademecum, large: LargeDeformation, response: TipResponse, start: np.ndarray
-) -> LargeDeformationArrays:
-    """Coefficients of large deformation on the grid, and its loads in the modes of the cloud."""
-    values = np.vstack([large.depth, large.reach])
-    grid = sampled_at_tip(vademecum.surface, vademecum.tip_field, response, values)
-    return LargeDeformationArrays(grid, np.ascontiguousarray(large.terms.load), start)
-
-
 def force_error_grid(
     certificate: Certificate | None, large: LargeDeformation | None, smoothing: np.ndarray
 ) -> np.ndarray:
     """The relative error of the force on the grid of the tip field; NaN if it is not known.
 
-    smoothing : of :class:`avatar_core.contact.tip_response.TipResponse`, or values of it
+    smoothing : of :class:`avatar_core.contact.organ_response.TipResponse`, or values of it
     """
     nonlinear = 0.0
     if large is not None:
@@ -299,13 +261,21 @@ def _padded(load: np.ndarray) -> np.ndarray:
     return np.pad(load, ((0, 0), (0, 0), (0, -load.shape[2] % LANES)))
 
 
-def _check(vademecum: Vademecum, tips: Sequence[Tip], detail: Detail) -> None:
-    if not 1 <= len(tips) <= kernels.MAX_TOOLS:
-        raise ContactError(f"{len(tips)} tools; give 1 to {kernels.MAX_TOOLS} tips")
+def _check(
+    vademecum: Vademecum, tips: Sequence[Tip], detail: Detail, effects: Sequence[Effect]
+) -> None:
+    if not 1 <= len(tips) <= MAX_TOOLS:
+        raise ContactError(f"{len(tips)} tools; give 1 to {MAX_TOOLS} tips")
     modes, most = detail.modes, vademecum.n_modes
     if not 1 <= modes <= most:
         raise ContactError(f"{modes} modes asked for; the vademecum has 1 to {most}")
     if detail.cloud not in get_args(Cloud):
         raise ContactError(
             f"cloud '{detail.cloud}' is unknown; choose {', '.join(get_args(Cloud))}"
+        )
+    for effect in effects:
+        effect.require(vademecum)
+    if len(tips) > 1 and find(effects, SeveralTools) is None:
+        raise SceneError(
+            f"{len(tips)} tools without several_tools; add it to the effects, or name one tool"
         )

@@ -17,23 +17,20 @@ on the tissue,
 
 where target is the displacement that contact prescribes for the patch (along n only, unless the tip
 sticks). gamma - f . C f, what the stencil blurs of the compliance under the tip itself
-(:mod:`avatar_core.contact.tip_response`), is a dent of this tip alone, under the force e on an
+(:mod:`avatar_core.contact.organ_response`), is a dent of this tip alone, under the force e on an
 elastic organ that is dented alike.
 """
 
 from __future__ import annotations
 
-from collections import namedtuple
-
-import numpy as np
-
+from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast
 from avatar_core.common.splines import cell_at, second_derivatives
 from avatar_core.contact.effects.friction import (
     add_modal_load,
     add_near_friction,
+    force_on_tissue,
     force_squared,
-    target_derivative,
 )
 from avatar_core.contact.effects.several_tools import (
     add_history_beside,
@@ -41,141 +38,122 @@ from avatar_core.contact.effects.several_tools import (
     derivative_beside,
 )
 from avatar_core.contact.effects.viscoelasticity import held_load, near_free_displacement
+from avatar_core.contact.friction_solver import target_derivative
 
-Superposition = namedtuple(
+SUPERPOSITION = kind(
     "Superposition",
-    [
-        "free",  # (k,) modes at the end of the period without any load
-        "gain",  # (k,) their displacement by a unit load within the period
-        "total",  # (k,) modes at the end of the period
-        "near_gain",  # (1,) gain of the near field
-        "free_normal",  # (T,) its component along n [m]
-        "free_displacement",  # (T, 3) of the patch without any load [m]
-        "near_free",  # (T, MAX_STENCIL, 3) near displacement at the nodes by the load history
-        "unit_displacement",  # (MAX_STENCIL, 3) at the nodes by a unit normal force, at rest
-        "displacement",  # (MAX_STENCIL, 3) at the nodes by all causes
-        "hessian",  # (3, 3) of phi
-        "normal_gradient",  # (3, 3) dn_i / dp_d
-    ],
+    free=array("K"),  # modes at the end of the period without any load
+    gain=array("K", start=1.0),  # their displacement by a unit load within the period
+    total=array("K"),  # modes at the end of the period
+    near_gain=array("1", start=1.0),  # gain of the near field
+    free_normal=array("T"),  # its component along n [m]
+    free_displacement=array("T 3"),  # of the patch without any load [m]
+    near_free=array("T S 3"),  # near displacement at the nodes by the load history
+    unit_displacement=array("S 3"),  # at the nodes by a unit normal force, at rest
+    displacement=array("S 3"),  # at the nodes by all causes
+    hessian=array("3 3"),  # of phi
+    normal_gradient=array("3 3"),  # dn_i / dp_d
 )
 
 
-def make_superposition(n_tools: int, n_modes: int, n_nodes: int) -> Superposition:
-    """State of an organ at rest, and scratch."""
-    return Superposition(
-        free=np.zeros(n_modes),
-        gain=np.ones(n_modes),
-        total=np.zeros(n_modes),
-        near_gain=np.ones(1),
-        free_normal=np.zeros(n_tools),
-        free_displacement=np.zeros((n_tools, 3)),
-        near_free=np.zeros((n_tools, n_nodes, 3)),
-        unit_displacement=np.zeros((n_nodes, 3)),
-        displacement=np.zeros((n_nodes, 3)),
-        hessian=np.zeros((3, 3)),
-        normal_gradient=np.zeros((3, 3)),
-    )
-
-
 @fast
-def modes_at_nodes(model, state, t, amplitude, out):  # type: ignore[no-untyped-def]
+def modes_at_nodes(model, data, t, amplitude, values):  # type: ignore[no-untyped-def]
     """sum_k Y_k(s_j) q_k at the load positions of a tip."""
-    for i in range(state.n_nodes[t]):
-        load = model.load[state.nodes[t, i]]
+    for i in range(data.n_nodes[t]):
+        load = model.load[data.nodes[t, i]]
         for d in range(3):
             value = 0.0
             for k in range(amplitude.shape[0]):
                 value += load[d, k] * amplitude[k]
-            out[i, d] = value
+            values[i, d] = value
 
 
 @fast
-def free_tip_displacement(model, state, effects, t):  # type: ignore[no-untyped-def]
+def free_tip_displacement(model, data, t):  # type: ignore[no-untyped-def]
     """Displacement of a tip's patch without any load in this period."""
-    superposition, viscoelasticity = effects.superposition, effects.viscoelasticity
+    superposition = data.superposition
     free = superposition.free_displacement[t]
-    modes_at_nodes(model, state, t, superposition.free, superposition.displacement)
-    if viscoelasticity.on:
-        near_free_displacement(model, state, viscoelasticity, t, superposition.near_free[t])
-    dent = superposition.near_gain[0] * state.blurred[t] * held_load(viscoelasticity, t)
+    modes_at_nodes(model, data, t, superposition.free, superposition.displacement)
+    if model.viscoelasticity.on:
+        near_free_displacement(model, data, t, superposition.near_free[t])
+    dent = superposition.near_gain[0] * data.blurred[t] * held_load(model, data, t)
     for d in range(3):
-        value = dent * state.normal[t, d]
-        for i in range(state.n_nodes[t]):
-            value += state.weight[t, i, 0] * superposition.displacement[i, d]
-            if viscoelasticity.on:
-                value += state.weight[t, i, 0] * superposition.near_free[t, i, d]
+        value = dent * data.normal[t, d]
+        for i in range(data.n_nodes[t]):
+            value += data.weight[t, i, 0] * superposition.displacement[i, d]
+            if model.viscoelasticity.on:
+                value += data.weight[t, i, 0] * superposition.near_free[t, i, d]
         free[d] = value
-    add_history_beside(state, effects, t)
+    add_history_beside(model, data, t)
     superposition.free_normal[t] = 0.0
     for d in range(3):
-        superposition.free_normal[t] += state.normal[t, d] * free[d]
+        superposition.free_normal[t] += data.normal[t, d] * free[d]
 
 
 @fast
-def superpose_modes(state, superposition, friction):  # type: ignore[no-untyped-def]
+def superpose_modes(model, data):  # type: ignore[no-untyped-def]
     """The modes under the forces that were found."""
-    if not superposition.on:
+    superposition = data.superposition
+    if not model.superposed[0]:
         return
     total = superposition.total
     total[:] = 0.0
-    for t in range(state.passage.shape[0]):
-        if state.force[t] <= 0.0:
+    for t in range(data.passage.shape[0]):
+        if data.force[t] <= 0.0:
             continue
-        if friction.on:
-            add_modal_load(state, friction, t, total)
+        if model.friction.on:
+            add_modal_load(data, t, total)
         else:
-            force = state.force[t]
+            force = data.force[t]
             for k in range(total.shape[0]):
-                total[k] -= force * state.mode[t, k]
+                total[k] -= force * data.mode[t, k]
     for k in range(total.shape[0]):
         total[k] = superposition.free[k] + superposition.gain[k] * total[k]
 
 
 @fast
-def _displacement_at_nodes(model, state, effects, t):  # type: ignore[no-untyped-def]
+def _displacement_at_nodes(model, data, t):  # type: ignore[no-untyped-def]
     """Displacement at the nodes of a tip by all causes, and by its unit normal force at rest."""
-    superposition, several_tools = effects.superposition, effects.several_tools
-    friction, viscoelasticity = effects.friction, effects.viscoelasticity
+    superposition = data.superposition
     displacement, unit = superposition.displacement, superposition.unit_displacement
-    modes_at_nodes(model, state, t, state.mode[t], unit)
-    modes_at_nodes(model, state, t, superposition.total, displacement)
-    for i in range(state.n_nodes[t]):
+    modes_at_nodes(model, data, t, data.mode[t], unit)
+    modes_at_nodes(model, data, t, superposition.total, displacement)
+    for i in range(data.n_nodes[t]):
         for d in range(3):
-            unit[i, d] += state.column[t, i, d]
-    if friction.on:
-        add_near_friction(model, state, effects, t)
+            unit[i, d] += data.column[t, i, d]
+    if model.friction.on:
+        add_near_friction(model, data, t)
     else:
-        near = -state.force[t] * superposition.near_gain[0]
-        for i in range(state.n_nodes[t]):
+        near = -data.force[t] * superposition.near_gain[0]
+        for i in range(data.n_nodes[t]):
             for d in range(3):
-                displacement[i, d] += near * state.column[t, i, d]
-        if several_tools.on:
-            add_near_of_others(state, superposition, several_tools, t)
-    if viscoelasticity.on:
-        for i in range(state.n_nodes[t]):
+                displacement[i, d] += near * data.column[t, i, d]
+        if model.several_tools.on:
+            add_near_of_others(data, t)
+    if model.viscoelasticity.on:
+        for i in range(data.n_nodes[t]):
             for d in range(3):
                 displacement[i, d] += superposition.near_free[t, i, d]
 
 
 @fast
-def write_superposed_force(model, state, out, tip, effects, t):  # type: ignore[no-untyped-def]
+def write_superposed_force(model, data, tip, t):  # type: ignore[no-untyped-def]
     """F of the module's docstring, without the terms of large deformation and fading access."""
-    superposition, friction = effects.superposition, effects.friction
-    if not superposition.on:
+    superposition = data.superposition
+    if not model.superposed[0]:
         return
-    n, count, square = state.normal[t], state.n_nodes[t], state.force[t] ** 2
+    n, count, square = data.normal[t], data.n_nodes[t], data.force[t] ** 2
     displacement, unit = superposition.displacement, superposition.unit_displacement
     gradient = superposition.normal_gradient
-    _normal_gradient(model, state, superposition, t, tip)
-    _displacement_at_nodes(model, state, effects, t)
-    g0, g1, g2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
-    if friction.on:
-        g0, g1, g2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
-        square = force_squared(friction, t)
-    held, gain = held_load(effects.viscoelasticity, t), superposition.near_gain[0]
+    _normal_gradient(model, data, t, tip)
+    _displacement_at_nodes(model, data, t)
+    g0, g1, g2 = force_on_tissue(model, data, t)
+    if model.friction.on:
+        square = force_squared(data, t)
+    held, gain = held_load(model, data, t), superposition.near_gain[0]
     u0 = u1 = u2 = v0 = v1 = v2 = 0.0
     for i in range(count):
-        w, u, v = state.weight[t, i, 0], displacement[i], unit[i]
+        w, u, v = data.weight[t, i, 0], displacement[i], unit[i]
         u0 += w * u[0]
         u1 += w * u[1]
         u2 += w * u[2]
@@ -187,30 +165,30 @@ def write_superposed_force(model, state, out, tip, effects, t):  # type: ignore[
         slope = turn0 * v0 + turn1 * v1 + turn2 * v2
         joint = 0.0
         for i in range(count):
-            dw, u, v = state.weight[t, i, 1 + d], displacement[i], unit[i]
+            dw, u, v = data.weight[t, i, 1 + d], displacement[i], unit[i]
             slope += dw * (n[0] * v[0] + n[1] * v[1] + n[2] * v[2])
             joint += dw * (g0 * u[0] + g1 * u[1] + g2 * u[2])
-        sharper = 0.5 * state.self_slope[t, d] - slope  # half the derivative of gamma - f . C f
-        value = joint + gain * (square - held * state.force[t]) * sharper
-        if friction.on:
-            value += gain * state.blurred[t] * held * (g0 * turn0 + g1 * turn1 + g2 * turn2)
-            value -= target_derivative(model, state, effects, t, d)
+        sharper = 0.5 * data.self_slope[t, d] - slope  # half the derivative of gamma - f . C f
+        value = joint + gain * (square - held * data.force[t]) * sharper
+        if model.friction.on:
+            value += gain * data.blurred[t] * held * (g0 * turn0 + g1 * turn1 + g2 * turn2)
+            value -= target_derivative(model, data, t, d)
         else:
             turned = turn0 * u0 + turn1 * u1 + turn2 * u2
-            value += state.force[t] * (state.slope[t, d] - turned)
-        value += derivative_beside(state, effects, t, tip, d, sharper)
-        out.force[t, d] = value
+            value += data.force[t] * (data.slope[t, d] - turned)
+        value += derivative_beside(model, data, t, tip, d, sharper)
+        data.out.force[t, d] = value
 
 
 @fast
-def _normal_gradient(model, state, superposition, t, p):  # type: ignore[no-untyped-def]
+def _normal_gradient(model, data, t, p):  # type: ignore[no-untyped-def]
     """dn/dp = (I - n n^T) grad g / |g|, g = grad phi."""
-    n, hessian = state.normal[t], superposition.hessian
+    n, hessian = data.normal[t], data.superposition.hessian
     cell = cell_at(model.origin, model.spacing[0], p)
     second_derivatives(model.distance, cell, model.spacing[0], hessian)
     for d in range(3):
         along = n[0] * hessian[0, d] + n[1] * hessian[1, d] + n[2] * hessian[2, d]
         for i in range(3):
-            superposition.normal_gradient[i, d] = (hessian[i, d] - n[i] * along) / state.steepness[
-                t
-            ]
+            data.superposition.normal_gradient[i, d] = (
+                hessian[i, d] - n[i] * along
+            ) / data.steepness[t]

@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from avatar_core.common.machine import processor
-from avatar_core.contact.layout import lay_out_details
-from avatar_core.contact.model import ContactModel, make_model, step
+from avatar_core.contact.layout import Shape, lay_out
+from avatar_core.contact.model import ContactData, ContactModel, step
 from avatar_core.contact.tool_path import slide
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.accuracy import AccuracyCurve, Detail
@@ -36,17 +36,18 @@ def timed(
     not all rounds of some.
     """
     path = slide(vademecum, _TIP.offset, _DEPTH, _STEPS * 1e-4)[:, None]
-    clouds = dict.fromkeys(point.detail.cloud for point in curve.points)
-    details = [Detail(vademecum.n_modes, cloud) for cloud in clouds]
-    layouts = lay_out_details(vademecum, (_TIP,), details)
-    models = {cloud: make_model(layout) for cloud, layout in zip(clouds, layouts, strict=True)}
+    shape, n_modes = Shape.of(vademecum, (_TIP,)), vademecum.n_modes
+    models = {
+        cloud: ContactModel(lay_out(vademecum, (_TIP,), Detail(n_modes, cloud), shape=shape)).data()
+        for cloud in dict.fromkeys(point.detail.cloud for point in curve.points)
+    }
     found = np.empty((_ROUNDS, len(curve.points), 2))
     for k in range(_ROUNDS):
         progress(k / _ROUNDS)
         for i, point in enumerate(curve.points):
-            model = models[point.detail.cloud]
-            model.show(point.detail.modes)
-            times = _step_times(model, path)[_WARM:]
+            data = models[point.detail.cloud]
+            data.show(point.detail.modes)
+            times = _step_times(data, path)[_WARM:]
             found[k, i] = np.median(times), np.quantile(times, 0.99)
     pairs = zip(curve.points, np.median(found, axis=0), strict=True)
     points = tuple(replace(point, p50=float(p50), p99=float(p99)) for point, (p50, p99) in pairs)
@@ -54,12 +55,12 @@ def timed(
     return replace(curve, points=points, machine=processor())
 
 
-def _step_times(model: ContactModel, path: np.ndarray) -> np.ndarray:
+def _step_times(data: ContactData, path: np.ndarray) -> np.ndarray:
     """Of the processor, for each step of a path [s]."""
-    model.reset()
+    data.reset()
     times = np.empty(len(path))
     for k, tips in enumerate(path):
         start = time.thread_time()
-        step(model, tips)
+        step(data.model, data, tips)
         times[k] = time.thread_time() - start
     return times

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any, get_args
 from avatar_core.common.quantities import check_line, check_numbers, quantity
 from avatar_core.common.supports import LEAST_STIFFNESS, MOST_STIFFNESS, SUPPORT
 from avatar_core.contact.effects import Effect, Tilt
-from avatar_core.contact.kernels import MAX_TOOLS
 from avatar_core.errors import CoordinateError, SceneError
-from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tip import MAX_TOOLS, Tip
 from avatar_core.reduction.coordinates import require_known
 from avatar_core.vademecum.accuracy import Cloud
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from avatar_core.contact.effects import Effect, Tumour
-from avatar_core.contact.effects.selection import default_effects
-from avatar_core.contact.layout import PERIOD, Layout, lay_out
-from avatar_core.contact.model import ContactModel, make_model
+from avatar_core.contact.layout import PERIOD, default_effects, lay_out
+from avatar_core.contact.model import ContactModel
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.model import Scene
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget, Cloud, Detail, choose
@@ -51,8 +51,8 @@ class ModelSpec:
         curve = certificate.curve if certificate else None
         return curve and curve.of(self.cloud).up_to(self.finest.modes)
 
-    def layout(self, detail: Detail, period: float) -> Layout:
-        """Constant arrays of a contact model that shows a detail."""
+    def layout(self, detail: Detail, period: float) -> Any:
+        """The arrays of a contact model that shows a detail."""
         return lay_out(self.vademecum, self.tips, detail, self.effects, period)
 
 
@@ -116,4 +116,4 @@ def prepare(
     """
     spec = scene_spec(vademecum, scene) if scene else default_spec(vademecum)
     detail = choose(spec.curve, budget).detail if budget else spec.finest
-    return make_model(spec.layout(detail, period))
+    return ContactModel(spec.layout(detail, period))

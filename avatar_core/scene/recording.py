@@ -1,13 +1,14 @@
 """Recordings of a tool and of the forces on it, on disk: HDF5 with schema version and checksum.
 
-Layout (schema 1.0), attributes at the root: ``format`` = "avatar recording", ``schema``,
+Layout (schema 2.0), attributes at the root: ``format`` = "avatar recording", ``schema``,
 ``vademecum_id``, ``vademecum_name``, ``scene`` (YAML, with the material that was in force),
 ``rate`` [Hz], ``from_rest``, ``checksum``. Datasets, n periods of the contact loop, t tools:
 
     periods/number (n,)          counted by the loop; gaps are lost periods
     periods/stamp (n,) [ns]      time stamp of the first tool's pose
     periods/tip (n, t, 3) [m]    sphere centres as the step used them; far away without a pose
-    periods/turn (n, t, 3) [rad] rotation of the tool since the previous period, for friction
+    periods/orientation (n, t, 4) of the tools' frames in the organ's, quaternions x y z w; zero
+                                 where it is not known
     periods/status (n, t)        of avatar_ros/msg/ContactState
     periods/force (n, t, 3) [N]  force of the organ on the tool, before the force guard
     periods/error (n, t) [N]     estimated error of the force, exceeded by one contact in ten
@@ -29,11 +30,13 @@ from avatar_core.common.hdf5 import replace_file, require_schema, verified
 from avatar_core.errors import StorageError
 
 FORMAT = "avatar recording"
-SCHEMA_VERSION = "1.0"
+SCHEMA_VERSION = "2.0"
 MAX_FILE_BYTES = 4 << 30
 
 _PERIODS = {  # fields of Periods, and their names in the file
-    **{name: name for name in ("number", "stamp", "tip", "turn", "status", "force", "error")},
+    **{
+        name: name for name in ("number", "stamp", "tip", "orientation", "status", "force", "error")
+    },
     "sent_fraction": "share",
 }
 _CLOUDS = ("period", "displacement")
@@ -48,7 +51,7 @@ class Periods:
     number: np.ndarray
     stamp: np.ndarray
     tip: np.ndarray
-    turn: np.ndarray
+    orientation: np.ndarray
     status: np.ndarray
     force: np.ndarray
     error: np.ndarray
@@ -175,7 +178,8 @@ def _fits_together(recording: Recording) -> bool:
     return (
         n > 0
         and p.number.shape == p.stamp.shape == (n,)
-        and all(a.shape == (n, n_tools, 3) for a in (p.tip, p.turn, p.force))
+        and all(a.shape == (n, n_tools, 3) for a in (p.tip, p.force))
+        and p.orientation.shape == (n, n_tools, 4)
         and all(a.shape == (n, n_tools) for a in (p.status, p.error, p.sent_fraction))
         and bool((p.lost >= 0).all())
         and c.displacement.ndim == 3

@@ -4,10 +4,11 @@ The force in a period depends on the tips in it and on the state of the model: w
 through the surface, the previous force, anchors of friction, relaxation, modal velocities, phase of
 the breath. A period is *known* if this state follows from the recording:
 
-- without effects, or with friction, large deformation, self-weight and several tools, the state is
-  reset whenever no tip touches: known from the first such period on, and again after lost periods;
+- without effects, or with friction, large deformation, self-weight, several tools and tilt, the
+  state is reset whenever no tip touches: known from the first such period on, and again after lost
+  periods;
 - with viscoelasticity or inertia, only in a recording from rest, up to the first lost period;
-- with respiration or tilt never: phase of the breath and direction of the tool are not recorded.
+- with respiration never: the phase of the breath is not recorded.
 
 Forces in known periods are identical to the last bit on the machine that recorded them. They are
 compared before the force guard, whose state (limits, ramps, engagement) is not recorded.
@@ -21,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avatar_core.contact import model as contact
-from avatar_core.contact.model import Status, make_model
+from avatar_core.contact.model import ContactModel, Status
 from avatar_core.errors import SceneError, StorageError
 from avatar_core.scene.file import parse_scene
 from avatar_core.scene.model import Scene
@@ -30,7 +31,7 @@ from avatar_core.scene.recording import Periods, Recording
 from avatar_core.vademecum.model import Vademecum
 
 REMEMBER_FOR_EVER = ("viscoelasticity", "inertia")
-_RECORDED_NOWHERE = {"respiration": "phase of the breath", "tilt": "direction of the tool's axis"}
+_RECORDED_NOWHERE = {"respiration": "phase of the breath"}
 _STEP = 500  # periods from one call of ``progress`` to the next
 _MAY_BE_INSIDE = (int(Status.OUT_OF_RANGE), int(Status.INVALID_POSE))
 
@@ -81,14 +82,11 @@ def replay(
             "record again"
         )
     spec = scene_spec(vademecum, replace(scene, cloud="off"))
-    model = make_model(spec.layout(spec.finest, 1.0 / recording.rate))
-    force = np.empty(periods.force.shape)
-    friction = model.effects.friction
+    model = ContactModel(spec.layout(spec.finest, 1.0 / recording.rate))
+    data, force = model.data(), np.empty(periods.force.shape)
     for k in range(len(periods)):
-        if friction is not None:
-            friction.spin[:] = periods.turn[k]
-        contact.solve(model, periods.tip[k])
-        force[k] = model.out.force
+        contact.solve(model, data, periods.tip[k], periods.orientation[k])
+        force[k] = data.out.force
         if progress is not None and k % _STEP == 0:
             progress(k, len(periods))
     if progress is not None:

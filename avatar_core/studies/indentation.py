@@ -4,7 +4,7 @@ F / (E R^2) over depth / R for several Poisson's ratios, by axisymmetric finite 
 (:mod:`avatar_core.fem.sphere_indentation`), beside Sneddon's exact sphere at small strain and
 Hertz's paraboloid. The same elements at small strain show how far they are from Sneddon, elements
 of half the size what they miss at large strain. The coefficients that
-:mod:`avatar_core.contact.effects.large_dent` stores are fitted anew; they are the rows of kind
+:mod:`avatar_core.tips.large_strain` stores are fitted anew; they are the rows of kind
 "coefficients" of the record.
 """
 
@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import brentq
 
-from avatar_core.contact.effects.large_dent import COEFFICIENTS, interpolated
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.sphere_indentation import Domain, Indentation, SphereIndentation
 from avatar_core.geometry.tip import Tip
 from avatar_core.studies.contact import sneddon
 from avatar_core.studies.study import Row, Run, Study, column, follow, where
+from avatar_core.tips.large_strain import COEFFICIENTS, interpolated
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from avatar_core.certify.contact_sites import Site, draw_sites, pressed
-from avatar_core.contact.model import prepare
+from avatar_core.contact.model import model_of
 from avatar_core.geometry.groups import REGIONS
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh
@@ -92,8 +92,8 @@ def _between(
 
 def _forces(vademecum: Vademecum, sites: Sequence[Site]) -> np.ndarray:
     """Sizes of the forces, and the errors that are said, shape (2, n) [N]; NaN if refused."""
-    model = prepare(vademecum, (BALL,), cloud="off", effects=())
+    data = model_of(vademecum, (BALL,), cloud="off", effects=()).data()
     found = np.empty((2, len(sites)))
     for k, site in enumerate(sites):
-        found[:, k] = np.linalg.norm(pressed(model, site, BALL, DEPTH)), model.out.force_error[0]
+        found[:, k] = np.linalg.norm(pressed(data, site, BALL, DEPTH)), data.out.force_error[0]
     return found

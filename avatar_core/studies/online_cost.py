@@ -20,7 +20,7 @@ import numpy as np
 from avatar_core.certify.accuracy_curve import StepErrors
 from avatar_core.certify.unseen_contacts import UnseenContacts, draw_contacts
 from avatar_core.contact.effects import LargeDeformationEffect
-from avatar_core.contact.tip_response import closest_weights
+from avatar_core.contact.organ_response import closest_weights
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm, relative_l2
 from avatar_core.fem.patch_loads import patch_loads

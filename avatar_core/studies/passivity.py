@@ -5,7 +5,7 @@ A tool of 0.3 kg in a hand that pushes with 1 N but does not hold it in place (g
 damping of the tool and delay:
 
 - energy that the port gave to the tool at worst, without and with
-  :mod:`avatar_core.contact.haptics.passivity`;
+  :mod:`avatar_core.haptics.passivity`;
 - border: the damping at which the swings of a tool of 1 kg, pressed in, neither grow nor fade,
   found by bisection without control, beside K (T / 2 + delay T).
 
@@ -21,15 +21,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.contact.haptics.haptic_loop import (
+from avatar_core.contact.layout import PERIOD
+from avatar_core.haptics.haptic_loop import (
     Device,
     Loop,
     expected_border,
     run_loop,
     stability_border,
 )
-from avatar_core.contact.haptics.passivity import Passivity, make_passivity
-from avatar_core.contact.layout import PERIOD
+from avatar_core.haptics.passivity import Passivity, make_passivity
 from avatar_core.studies.study import Row, Run, Study, column, follow, where
 
 if TYPE_CHECKING:

@@ -41,8 +41,8 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.contact.layout import Layout, lay_out_materials
-from avatar_core.contact.model import Status, estimate_error, make_model, step
+from avatar_core.contact.layout import Shape, lay_out
+from avatar_core.contact.model import ContactModel, Status, estimate_error, step
 from avatar_core.errors import ContactError
 from avatar_core.geometry.tip import Tip
 from avatar_core.uncertainty.distributions import Distribution, Fixed, Lognormal
@@ -209,9 +209,10 @@ def touch_table(
     """
     grid, force = MaterialGrid.of(vademecum), []
     error = np.zeros(len(palpation.tip))
-    layouts = lay_out_materials(grid.materials(vademecum), (tip,), Detail(1, "off"))
-    for done, (_, layout) in enumerate(layouts):
-        found, expected = _followed(layout, palpation)
+    shape = Shape.of(vademecum, (tip,))
+    for done, here in enumerate(grid.materials(vademecum)):
+        model = ContactModel(lay_out(here, (tip,), Detail(1, "off"), shape=shape))
+        found, expected = _followed(model, palpation)
         force.append(found)
         error = np.maximum(error, expected)
         progress(done + 1, grid.n_points)
@@ -246,19 +247,19 @@ def _of_felt(
     )
 
 
-def _followed(layout: Layout, palpation: Palpation) -> tuple[FloatArray, FloatArray]:
+def _followed(model: ContactModel, palpation: Palpation) -> tuple[FloatArray, FloatArray]:
     """Force along the paths [N], and its error as a part of it, each (n,)."""
-    model = make_model(layout)
+    data = model.data()
     force, error = np.zeros((2, len(palpation.tip)))
     before = -1
     for k, (touch, at) in enumerate(zip(palpation.touch, palpation.tip, strict=True)):
         if touch != before:
-            model.reset()
-        before, status = touch, step(model, at[None])
-        size = float(np.linalg.norm(model.out.force[0]))
+            data.reset()
+        before, status = touch, step(model, data, at[None])
+        size = float(np.linalg.norm(data.out.force[0]))
         if status in (Status.OK, Status.EXTRAPOLATED) and size > 0.0:
-            estimate_error(model)
-            expected = float(model.out.force_error[0]) / size / NINETY
+            estimate_error(model, data)
+            expected = float(data.out.force_error[0]) / size / NINETY
             force[k], error[k] = size, expected if np.isfinite(expected) else _UNKNOWN
     return force, error
 

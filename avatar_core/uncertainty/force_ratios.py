@@ -4,7 +4,7 @@ A tip d deep that feels the force F on tissue of the modulus E* sinks, with L = 
 
     d = delta(L) + L s E* (gamma - c)
 
-(:mod:`avatar_core.contact.effects.tip_law`); a patch by gamma F. The shape factor s knows the
+(:mod:`avatar_core.tips.law`); a patch by gamma F. The shape factor s knows the
 surface alone: the material comes in by E* and gamma, the compliance of a load position with itself.
 For both, no vademecum has to be made at every point of the coordinates. So F is found at
 Chebyshev's points of those that are not known, interpolated as in
@@ -16,27 +16,26 @@ modulus. Beside self-weight and other tools, whose own depths stay as they are, 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from avatar_core.common.array_table import ArrayTable, allocate, sizes_of
 from avatar_core.common.arrays import FloatArray
 from avatar_core.common.splines import evaluate_all
-from avatar_core.contact.effects.tip_law import (
-    PATCH_ON_MESH,
-    TipLawState,
-    loads_at_depths,
-    tip_law_arrays,
-    tip_law_state,
-)
+from avatar_core.contact.data import DATA
 from avatar_core.contact.error_map import is_reached
-from avatar_core.contact.kept_factors import factors_of
-from avatar_core.contact.shape_factor import dense
-from avatar_core.contact.tip_response import closest_weights
+from avatar_core.contact.layout import MODEL
+from avatar_core.contact.organ_response import closest_weights
+from avatar_core.contact.tip_solver import loads_at_depths
 from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.tips.kept_factors import factors_of
+from avatar_core.tips.law import LAW_STATE, PATCH_ON_MESH, law_arrays
+from avatar_core.tips.shape_factor import dense
 from avatar_core.uncertainty.bands import HIGH, LOW, drawn
 from avatar_core.uncertainty.distributions import Distribution, Fixed
 from avatar_core.uncertainty.material_grid import N_POINTS, MaterialGrid
@@ -182,14 +181,19 @@ def _pressed(
     softness, load = stiffness * (gamma - taken), np.empty((len(DEPTHS), len(gamma)))
     for depth, found in zip(DEPTHS, load, strict=True):
         at = np.full(len(gamma), depth)
-        loads_at_depths(law, softness, at, found)
+        loads_at_depths(*law, softness, at, found)
     return np.asarray((stiffness * load).T)
 
 
-def _law(tip: Tip) -> TipLawState | None:
-    """The law of an upright tip; None of a patch."""
-    arrays = tip_law_arrays((tip,), Material(), np.zeros((2, 0, 0, 0)))
-    return None if arrays is None else tip_law_state(arrays)
+def _law(tip: Tip) -> tuple[ArrayTable, ArrayTable] | None:
+    """The law of an upright tip, as the model and the data of no organ; None of a patch."""
+    law = law_arrays((tip,), Material(), np.zeros((2, 0, 0, 0), np.float32))
+    if law is None:
+        return None
+    nothing: defaultdict[str, int] = defaultdict(int)
+    state = allocate(LAW_STATE, sizes_of(law))
+    model, data = allocate(MODEL, nothing, law=law), allocate(DATA, nothing, law=state)
+    return ArrayTable(model), ArrayTable(data)
 
 
 def _shape_factors(vademecum: Vademecum, tips: Sequence[Tip]) -> FloatArray:

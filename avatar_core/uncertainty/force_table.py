@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.contact.layout import Layout, lay_out_materials
-from avatar_core.contact.model import Status, make_model, step
+from avatar_core.contact.layout import Shape, lay_out
+from avatar_core.contact.model import ContactModel, Status, step
 from avatar_core.errors import ContactError
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.tip import Tip
@@ -72,9 +72,10 @@ def force_table(
         If a tip finds no surface at a place, or is not felt there.
     """
     grid, force, moved = MaterialGrid.of(vademecum), [], []
-    layouts = lay_out_materials(grid.materials(vademecum), (tip,), Detail(1, "off"))
-    for done, (here, layout) in enumerate(layouts):
-        found = _pressed(layout, here.surface, tip, places, depths)
+    shape = Shape.of(vademecum, (tip,))
+    for done, here in enumerate(grid.materials(vademecum)):
+        model = ContactModel(lay_out(here, (tip,), Detail(1, "off"), shape=shape))
+        found = _pressed(model, here.surface, tip, places, depths)
         force.append(found)
         moved.append(found * _motion(here, places, target)[:, None])
         progress(done + 1, grid.n_points)
@@ -83,20 +84,23 @@ def force_table(
 
 
 def _pressed(
-    layout: Layout, surface: LoadSurface, tip: Tip, places: Sequence[int], depths: Sequence[float]
+    model: ContactModel,
+    surface: LoadSurface,
+    tip: Tip,
+    places: Sequence[int],
+    depths: Sequence[float],
 ) -> FloatArray:
     """Forces on a tip that is pressed along the normal, (n_places, n_depths) [N]."""
-    model = make_model(layout)
-    force = np.empty((len(places), len(depths)))
+    data, force = model.data(), np.empty((len(places), len(depths)))
     for i, j in enumerate(places):
-        model.reset()
+        data.reset()
         before = -_ABOVE
         for k, depth in enumerate(depths):
             for part in np.linspace(before, depth, 2 + int((depth - before) / _STEP)):
                 at = surface.centers[j] + (tip.offset - part) * surface.normals[j]
-                status = step(model, at[None])
+                status = step(model, data, at[None])
             felt = status in (Status.OK, Status.EXTRAPOLATED)
-            before, force[i, k] = depth, felt * np.linalg.norm(model.out.force[0])
+            before, force[i, k] = depth, felt * np.linalg.norm(data.out.force[0])
         if not (force[i] > 0.0).all():
             x, y, z = 1e3 * surface.centers[j]
             raise ContactError(

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.contact.layout import lay_out_materials
-from avatar_core.contact.model import Status, make_model, step
+from avatar_core.contact.layout import lay_out
+from avatar_core.contact.model import ContactModel, Status, step
 from avatar_core.errors import StorageError
 from avatar_core.geometry.tip import Tip
 from avatar_core.uncertainty.material_grid import MaterialGrid
@@ -103,15 +103,15 @@ def _followed(
     vademecum: Vademecum, tip: Tip, position: FloatArray
 ) -> tuple[FloatArray, np.ndarray]:
     """Force along a path at one material [N], and whether the tip is clearly off, each (n,)."""
-    materials = MaterialGrid.of(vademecum).materials(vademecum)
-    _, layout = next(iter(lay_out_materials(materials, (tip,), Detail(1, "off"))))
-    model = make_model(layout)
+    here = next(iter(MaterialGrid.of(vademecum).materials(vademecum)))
+    model = ContactModel(lay_out(here, (tip,), Detail(1, "off")))
+    data = model.data()
     force, off = np.zeros(len(position)), np.zeros(len(position), bool)
     for k in np.flatnonzero(np.isfinite(position).all(axis=1)):
-        model.state.gap[0] = np.inf  # which a step leaves alone far away
-        felt = step(model, position[k][None]) in (Status.OK, Status.EXTRAPOLATED)
-        force[k] = felt * np.linalg.norm(model.out.force[0])
-        off[k] = felt and model.state.gap[0] > _CLEAR
+        data.state.gap[0] = np.inf  # which a step leaves alone far away
+        felt = step(model, data, position[k][None]) in (Status.OK, Status.EXTRAPOLATED)
+        force[k] = felt * np.linalg.norm(data.out.force[0])
+        off[k] = felt and data.state.gap[0] > _CLEAR
     return force, off
 
 

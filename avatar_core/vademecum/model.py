@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from avatar_core.errors import ConvergenceError, LoadError
 from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.fem.patch_on_plane import missed_between
 from avatar_core.fem.supports import Support
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.reduction.near_field import LocalBlocks
@@ -271,7 +272,9 @@ class Vademecum:
         """Contact compliance at a point, or between two, shape (3, 3) [m/N].
 
         Entry (i, j) is the mean displacement of the patch at ``point`` along axis i under a unit
-        force along axis j on the patch at ``other``, by default the same.
+        force along axis j on the patch at ``other``, by default the same. Along the normal of one
+        patch, what the interpolation between load positions misses is added
+        (:mod:`avatar_core.fem.patch_on_plane`).
 
         Parameters
         ----------
@@ -284,7 +287,14 @@ class Vademecum:
         """
         here = self.surface.nearest(point)
         there = here if other is None else self.surface.nearest(other)
-        return self.compliance(here.positions, here.weights, there.positions, there.weights)
+        found = self.compliance(here.positions, here.weights, there.positions, there.weights)
+        if other is not None:
+            return found
+        radius = self.surface.patch_radius
+        places = self.surface.centers / radius
+        missed = missed_between(places, here.positions[None], here.weights[None])[0]
+        stiffness = self.material.plane_strain_modulus * radius
+        return found + missed / stiffness * np.outer(here.normal, here.normal)
 
     def with_certificate(self, certificate: Certificate) -> Vademecum:
         """The same vademecum with a certificate of its errors."""

@@ -7,7 +7,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -66,11 +65,12 @@ def test_a_budget_chooses_what_is_shown_and_leaves_the_force(phantom_vademecum: 
         av.prepare(vademecum, scene, av.Budget(tolerance=1e-9, deadline=np.inf))
 
 
-def press(model: Any, vademecum: Vademecum) -> Sequence[float]:
+def press(model: av.ContactModel, vademecum: Vademecum) -> Sequence[float]:
     point, normal = vademecum.surface.centers[100], vademecum.surface.normals[100]
+    data = model.data()
     for depth in np.linspace(-5e-3, 2e-3, 50):
-        av.step(model, point + (5e-3 - depth) * normal)
-    return list(model.out.force[0])
+        av.step(model, data, point + (5e-3 - depth) * normal)
+    return list(data.out.force[0])
 
 
 @cached_on_disk

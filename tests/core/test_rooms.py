@@ -24,9 +24,11 @@ ORDER = {
         "reduction",
         "shapes",
         "vademecum",
+        "tips",
         "registration",
         "offline",  # which knows no step
         "contact",
+        "haptics",
         "certify",
         "pipeline",
         "uncertainty",

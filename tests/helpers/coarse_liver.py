@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 
 from avatar_core.contact.effects import Effect, SeveralTools
 from avatar_core.contact.locate import ENTERED
-from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.contact.model import ContactData
 from avatar_core.contact.tool_path import access, inner_positions
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.tip import Shape, Tip
 from avatar_core.offline.rule import BuildRule
 from avatar_core.pipeline import OrganOptions, build
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.contact import prepare, step
 from tests.helpers.disk_cache import cached_on_disk
 
 RADIUS = 5e-3  # of the tips [m]
@@ -34,7 +35,7 @@ def liver(scale: float = 1.0) -> Vademecum:
 
 
 @cache
-def _prepared(effects: tuple[Effect, ...], n_tools: int, tip: Tip, scale: float) -> ContactModel:
+def _prepared(effects: tuple[Effect, ...], n_tools: int, tip: Tip, scale: float) -> ContactData:
     return prepare(liver(scale), (tip,) * n_tools, effects=effects)
 
 
@@ -44,13 +45,13 @@ def liver_model(
     radius: float = RADIUS,
     scale: float = 1.0,
     shape: Shape = "sphere",
-) -> ContactModel:
+) -> ContactData:
     """The model of the liver, at rest; several tools bring their effect along."""
     if n_tools > 1:
         effects = (SeveralTools(), *effects)
-    model = _prepared(effects, n_tools, Tip(shape, radius), scale)
-    model.reset()
-    return model
+    data = _prepared(effects, n_tools, Tip(shape, radius), scale)
+    data.reset()
+    return data
 
 
 class Spot(NamedTuple):
@@ -89,8 +90,8 @@ def any_spot(margin: float = 20e-3) -> st.SearchStrategy[Spot]:
     return st.integers(0, 10**6).map(lambda k: spots(margin)[k % len(spots(margin))])
 
 
-def press_in(model: ContactModel, spot: Spot, depth: float) -> None:
+def press_in(data: ContactData, spot: Spot, depth: float) -> None:
     """Press a tip into the liver, 1 mm a period."""
     for d in np.append(np.arange(-1e-3, depth, 1e-3), depth):
-        step(model, spot.tip(d)[None])
-    assert model.state.passage[0] == ENTERED
+        step(data, spot.tip(d)[None])
+    assert data.state.passage[0] == ENTERED

@@ -8,25 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from avatar_core.contact.cloud_kernels import BLOCK
-from avatar_core.contact.dent import dent_arrays
-from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.large_deformation import LargeDeformationArrays
-from avatar_core.contact.effects.selection import find, selected_arrays
-from avatar_core.contact.effects.tilt import Tilt, tilt_arrays
-from avatar_core.contact.effects.tip_law import tip_law_arrays
-from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
-from avatar_core.contact.kernels import ModelArrays
-from avatar_core.contact.layout import LANES, Layout
-from avatar_core.contact.model import ContactModel, make_model, step
-from avatar_core.contact.patch_on_plane import PATCH
+from avatar_core.contact.effects import EFFECTS, Effect, LargeDeformationEffect
+from avatar_core.contact.effects.base import Ground
+from avatar_core.contact.layout import LANES, MODEL
+from avatar_core.contact.model import ContactData
 from avatar_core.fem.elasticity import Material
+from avatar_core.fem.patch_on_plane import PATCH
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.near_field import LocalBlocks, hash_rows
+from avatar_core.tips.dent import dent_arrays
+from avatar_core.tips.law import law_arrays
+from avatar_core.tips.profile import STIFFNESS, TAKEN
 from avatar_core.vademecum.tip_field import TipField
+from tests.helpers.contact import data_of, step
 
 FAR, NEAR = 3e-4, 1e-4  # [m/N]
 COMPLIANCE = FAR + NEAR
@@ -47,7 +47,7 @@ def flat_organ(
     points: np.ndarray = ORIGIN,
     neo_hookean: float | None = None,
     is_ball: bool = False,
-) -> ContactModel:
+) -> ContactData:
     """The contact model of the flat organ, one tool.
 
     points : ndarray, shape (n, 3), whose displacement is shown: of the patch's nothing [m]
@@ -68,7 +68,19 @@ def flat_organ(
     )
     start, slot = hash_rows(blocks)
     gamma = float((load[0, 2] ** 2).sum()) + float(single(near))
-    arrays = ModelArrays(
+    local = np.zeros((2, *shape), single)
+    local[STIFFNESS], local[TAKEN] = E_STAR, PATCH / (E_STAR * PATCH_RADIUS)
+    soft = replace(MATERIAL, poisson_ratio=neo_hookean or MATERIAL.poisson_ratio)
+    law = law_arrays((tip,), soft, local, neo_hookean=neo_hookean is not None)
+    field = TipField(distance.astype(single), np.ones(shape, single), origin, np.array([spacing]))
+    constants: dict[str, Any] = {
+        effect.name: effect.lay_out(_ground(field, tip, period)) for effect in effects
+    }
+    if neo_hookean is not None:
+        constants["large_deformation"] = LargeDeformationEffect.Constants(
+            np.zeros((3, *shape), single), np.zeros((1, 2, 0), single), np.zeros(2, np.int64)
+        )
+    arrays = MODEL(
         distance=distance.astype(single),
         access=np.ones(shape, single),
         origin=origin,
@@ -95,24 +107,21 @@ def flat_organ(
         regional_load=np.zeros((1, 3, 0), single),
         rest=np.pad(points, ((0, 0), (0, 3))).astype(single),
         tip_offset=np.array([tip.offset]),
+        superposed=np.array([any(effect.superposed for effect in effects)]),
+        law=law,
+        dent=dent_arrays((tip,), points, np.zeros((1, 3)), PATCH_RADIUS) if law else None,
+        display=None,
+        **dict.fromkeys(EFFECTS.keys() & MODEL.members.keys()) | constants,
     )
-    local = np.zeros((2, *shape), single)
-    local[STIFFNESS], local[TAKEN] = E_STAR, PATCH / (E_STAR * PATCH_RADIUS)
-    law, large = tip_law_arrays((tip,), MATERIAL, local), None
-    if neo_hookean is not None:
-        soft = replace(MATERIAL, poisson_ratio=neo_hookean)
-        law = tip_law_arrays((tip,), soft, local, neo_hookean=True)
-        large = LargeDeformationArrays(
-            np.zeros((3, *shape), single), np.zeros((1, 2, 0), single), np.zeros(2, np.int64)
-        )
-    dent = dent_arrays((tip,), points, arrays.position, PATCH_RADIUS) if law else None
-    field = TipField(arrays.distance, arrays.access, origin, arrays.spacing)
-    leaning = find(effects, Tilt)
-    tilt = tilt_arrays(leaning, (tip,), field) if leaning else None
-    constants = selected_arrays(
-        None, effects, None, large, 0.1, PATCH_RADIUS, period, law, dent, tilt
-    )  # type: ignore[arg-type]
-    return make_model(Layout(arrays, constants))
+    return data_of(arrays)
+
+
+def _ground(field: TipField, tip: Tip, period: float) -> Ground:
+    """What effects see of the organ."""
+    surface = SimpleNamespace(patch_radius=PATCH_RADIUS)
+    organ: Any = SimpleNamespace(surface=surface, tip_field=field)
+    nothing: Any = None
+    return Ground(organ, (tip,), (), nothing, LANES, 0.1, nothing, period)
 
 
 def at_depth(depth: float, x: float = 0.0, y: float = 0.0, offset: float = RADIUS) -> np.ndarray:
@@ -120,7 +129,7 @@ def at_depth(depth: float, x: float = 0.0, y: float = 0.0, offset: float = RADIU
     return np.array([[x, y, offset - depth]])
 
 
-def force_at_depth(model: ContactModel, depth: float, x: float = 0.0) -> float:
+def force_at_depth(data: ContactData, depth: float, x: float = 0.0) -> float:
     """Normal force on the tip in a period at this depth [N]."""
-    step(model, at_depth(depth, x, offset=float(model.arrays.tip_offset[0])))
-    return float(model.out.force[0, 2])
+    step(data, at_depth(depth, x, offset=float(data.model.arrays.tip_offset[0])))
+    return float(data.out.force[0, 2])

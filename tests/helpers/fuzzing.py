@@ -117,9 +117,9 @@ def _step() -> Door:
     """A vademecum that loads is also touched, by compiled code."""
     import numpy as np
 
-    from avatar_core.contact.model import prepare, step
     from avatar_core.geometry.tip import Tip
     from avatar_core.vademecum.storage import load_vademecum
+    from tests.helpers.contact import prepare, step
     from tests.helpers.small_files import RADIUS, small_vademecum
 
     directions = small_vademecum().surface.normals
@@ -133,12 +133,12 @@ def _step() -> Door:
         _require_vademecum(vademecum)
         with np.errstate(all="ignore"):
             try:
-                model = prepare(vademecum, (Tip("sphere", 5e-3),), cloud="volume")
+                data = prepare(vademecum, (Tip("sphere", 5e-3),), cloud="volume")
             except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError):
                 return  # a contact node refuses it with what this says
         for direction in directions:
             for height in (4e-3, 2e-3, -50e-3):
-                step(model, (direction * (RADIUS + height))[None])
+                step(data, (direction * (RADIUS + height))[None])
 
     return _confined(load_vademecum, _vademecum_bytes, touch)
 

@@ -10,12 +10,13 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from avatar_core.contact.dent import REACH
-from avatar_core.contact.model import ContactModel, make_model
+from avatar_core.contact.model import ContactData
 from avatar_core.geometry.tip import Tip
+from avatar_core.tips.dent import REACH
 from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.box_organ import PATCH_RADIUS
+from tests.helpers.contact import data_of
 from tests.helpers.tool_motion import press
 
 SPHERE, DEPTH = Tip("sphere", 3e-3), 2e-3
@@ -24,18 +25,17 @@ END = REACH * PATCH_RADIUS
 
 
 def displaced(
-    model: ContactModel, tips: Sequence[Tip], places: np.ndarray, up: np.ndarray, depth: float
+    data: ContactData, tips: Sequence[Tip], places: np.ndarray, up: np.ndarray, depth: float
 ) -> np.ndarray:
     """Displacements of the cloud under tips at some depth, after an approach, (n, 3) [m]."""
-    press(model, tips, places, up, depth)
-    return np.asarray(model.out.cloud[:, 3:], float)
+    press(data, tips, places, up, depth)
+    return np.asarray(data.out.cloud[:, 3:], float)
 
 
-def with_patch_dents(model: ContactModel) -> ContactModel:
+def with_patch_dents(data: ContactData) -> ContactData:
     """The same model, showing the dents of patches: no point is near a tip."""
-    dents = model.layout.effects.dent
-    effects = model.layout.effects._replace(dent=dents._replace(start=0 * dents.start))
-    return make_model(replace(model.layout, effects=effects))
+    arrays = data.model.arrays
+    return data_of(arrays._replace(dent=arrays.dent._replace(start=0 * arrays.dent.start)))
 
 
 def tip_dent(tip: Tip, depth: float, a: float, rho: float) -> float:

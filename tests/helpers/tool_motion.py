@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar_core.contact.model import FAR_AWAY, ContactModel, Status, step
+from avatar_core.contact.model import FAR_AWAY, ContactData, Status
 from avatar_core.geometry.tip import Tip
+from tests.helpers.contact import step
 from tests.helpers.energies import stored_energy
 
 AWAY = np.full(3, FAR_AWAY)
@@ -30,15 +31,15 @@ class Motion(NamedTuple):
     energy: np.ndarray
 
 
-def follow(model: ContactModel, path: np.ndarray) -> Motion:
+def follow(data: ContactData, path: np.ndarray) -> Motion:
     """Move the tools along a path, shape (n, n_tools, 3), one period each."""
     force, status = np.zeros(path.shape), np.zeros(path.shape[:2], int)
     energy = np.zeros(len(path))
     for k, tips in enumerate(path):
-        step(model, tips)
-        force[k], status[k] = model.out.force, model.out.status
-        if force[k].any() and model.effects.viscoelasticity is None:
-            energy[k] = stored_energy(model)
+        step(data, tips)
+        force[k], status[k] = data.out.force, data.out.status
+        if force[k].any() and data.state.viscoelasticity is None:
+            energy[k] = stored_energy(data)
     power = -0.5 * ((force[1:] + force[:-1]) * np.diff(path, axis=0)).sum(axis=(1, 2))
     return Motion(force, status, np.concatenate([[0.0], np.cumsum(power)]), energy)
 
@@ -61,7 +62,7 @@ def polygon(corners: Sequence[np.ndarray], spacing: float) -> np.ndarray:
 
 
 def press(
-    model: ContactModel,
+    data: ContactData,
     tips: Sequence[Tip],
     points: np.ndarray,
     normals: np.ndarray,
@@ -71,15 +72,17 @@ def press(
 
     points, normals : of the surface, shape (n_tools, 3)
     """
-    model.reset()
+    data.reset()
     height = np.array([tip.offset for tip in tips])
     for part in np.linspace(-0.2, 1.0, 13):
-        status = step(model, points + (height - part * np.array(depths))[:, None] * normals)
+        status = step(data, points + (height - part * np.array(depths))[:, None] * normals)
     assert status == Status.OK
-    return np.asarray((model.out.force * normals).sum(axis=1))
+    return np.asarray((data.out.force * normals).sum(axis=1))
 
 
-def energy_slope(model: ContactModel, tips: np.ndarray, h: float = 1e-6) -> np.ndarray:
+def energy_slope(
+    data: ContactData, tips: np.ndarray, h: float = 1e-6, orientations: np.ndarray | None = None
+) -> np.ndarray:
     """Gradient of the stored energy by the places of all tips, shape (n_tools, 3) [N]."""
     slope = np.empty(tips.shape)
     for t, d in np.ndindex(*tips.shape):
@@ -87,13 +90,13 @@ def energy_slope(model: ContactModel, tips: np.ndarray, h: float = 1e-6) -> np.n
         for change in (h, -h):
             moved = tips.copy()
             moved[t, d] += change
-            step(model, moved)
-            energy.append(stored_energy(model))
+            step(data, moved, orientations)
+            energy.append(stored_energy(data))
         slope[t, d] = (energy[0] - energy[1]) / (2.0 * h)
     return slope
 
 
-def load_positions(model: ContactModel) -> tuple[np.ndarray, np.ndarray]:
+def load_positions(data: ContactData) -> tuple[np.ndarray, np.ndarray]:
     """Load positions that carry the first tip, and their weights."""
-    n = model.state.n_nodes[0]
-    return model.state.nodes[0, :n], model.state.weight[0, :n, 0]
+    n = data.state.n_nodes[0]
+    return data.state.nodes[0, :n], data.state.weight[0, :n, 0]

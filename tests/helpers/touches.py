@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from avatar_core.contact.model import FAR_AWAY, prepare, step
+from avatar_core.contact.model import FAR_AWAY
 from avatar_core.contact.tool_path import palpation as push
 from avatar_core.contact.tool_path import starts_apart
 from avatar_core.geometry.tip import Tip
@@ -12,6 +12,7 @@ from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.recording import Clouds, Periods, Recording
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.contact import prepare, step
 
 RADIUS = 5e-3
 SPHERE = Tip("sphere", RADIUS)
@@ -27,11 +28,11 @@ def path_over(organ: Vademecum, n: int) -> np.ndarray:
 
 def felt(organ: Vademecum, tips: np.ndarray) -> np.ndarray:
     """Force on the tip, shape (n, 3)."""
-    model = prepare(organ, (SPHERE,), cloud="off")
+    data = prepare(organ, (SPHERE,), cloud="off")
     force = np.empty(tips.shape)
     for k, tip in enumerate(tips):
-        step(model, tip[None])
-        force[k] = model.out.force[0]
+        step(data, tip[None])
+        force[k] = data.out.force[0]
     return force
 
 
@@ -41,7 +42,7 @@ def recording_of(organ: Vademecum, tips: np.ndarray, forces: np.ndarray) -> Reco
         number=np.arange(n),
         stamp=np.arange(n) * 1_000_000,
         tip=tips[:, None],
-        turn=np.zeros((n, 1, 3)),
+        orientation=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1, 1)),
         status=np.zeros((n, 1), np.uint8),
         force=forces[:, None],
         error=np.zeros((n, 1)),

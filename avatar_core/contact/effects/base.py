@@ -4,19 +4,49 @@ from __future__ import annotations
 
 import math
 from abc import ABC
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from avatar_core.common.quantities import check_numbers
 from avatar_core.errors import SceneError
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from avatar_core.contact.organ_response import TipResponse
+    from avatar_core.geometry.tip import Tip
     from avatar_core.vademecum.model import Vademecum
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What an effect lays its arrays out on.
+
+    vademecum : as the effects of the scene adapt it
+    n_modes : of the contact compliance, with those of zero that fill up a row
+    reach : longest distance between the two positions of a block of the near field [m]
+    large_start : of the modes of large deformation among those of the cloud, (n_regions + 1,)
+    period : of the steps [s]
+    """
+
+    vademecum: Vademecum
+    tips: Sequence[Tip]
+    effects: Sequence[Effect]
+    response: TipResponse
+    n_modes: int
+    reach: float
+    large_start: np.ndarray
+    period: float
 
 
 @dataclass(frozen=True)
 class Effect(ABC):
     """One physical effect with its parameters, all in SI units.
+
+    Constants : kind of the arrays that a step reads of it; None if it acts through the vademecum
+    State : kind of what it keeps between steps, and of its scratch; None if there is nothing
+    superposed : whether the displacement of a tip follows from all loads and histories together
 
     Raises
     ------
@@ -26,6 +56,9 @@ class Effect(ABC):
 
     name: ClassVar[str]
     text: ClassVar[str]  # what it does, one line
+    Constants: ClassVar[Any] = None
+    State: ClassVar[Any] = None
+    superposed: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_numbers(self, f"{self.name}.")
@@ -38,6 +71,31 @@ class Effect(ABC):
         SceneError
             Naming the command that builds one.
         """
+
+    @classmethod
+    def example(cls) -> Effect:
+        """One to measure and test it by, under which a tip that slides 5 mm deep stays in touch."""
+        return cls()
+
+    def adapted(self, vademecum: Vademecum) -> Vademecum:
+        """The vademecum in the modes, or at the values, that the effect needs."""
+        return vademecum
+
+    def lay_out(self, ground: Ground) -> Any:
+        """The arrays of ``Constants``."""
+        return self.Constants()
+
+    @staticmethod  # noqa: B027 (most begin at zero)
+    def begin(model: Any, state: Any) -> None:
+        """Set what is not its first value in the state of an organ at rest."""
+
+
+_E = TypeVar("_E", bound=Effect)
+
+
+def find(effects: Sequence[Effect], kind: type[_E]) -> _E | None:
+    """The effect of a kind, if it was chosen."""
+    return next((effect for effect in effects if isinstance(effect, kind)), None)
 
 
 def direction(values: tuple[float, ...], owner: str, key: str) -> tuple[float, float, float]:

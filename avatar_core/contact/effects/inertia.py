@@ -17,16 +17,15 @@ mass, nor has its near field: they follow at once.
 
 from __future__ import annotations
 
-from collections import namedtuple
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast
 from avatar_core.common.quantities import quantity
-from avatar_core.contact.effects.base import Effect, require_body
-from avatar_core.contact.effects.self_weight import SelfWeightArrays
+from avatar_core.contact.effects.base import Effect, Ground, require_body
 from avatar_core.reduction.separated import SeparatedField
 
 if TYPE_CHECKING:
@@ -40,87 +39,87 @@ class Inertia(Effect):
     name: ClassVar[str] = "inertia"
     text: ClassVar[str] = "the organ has mass and swings"
 
+    Constants: ClassVar[Any] = kind(
+        "Inertia",
+        mass=array("m"),  # m_k [s^2] of the modes that have mass, the first
+        damping=array("m"),  # d_k [s]
+        period=array("1"),  # dt [s]
+    )
+    State: ClassVar[Any] = kind("InertiaState", modes=array("K"), velocity=array("m"))  # q, q'
+    superposed: ClassVar[bool] = True
+
     density: float = quantity("kg/m^3", 100.0, 5000.0, "of the organ", 1060.0)
     damping: float = quantity("-", 0.0, 2.0, "of every mode, over its critical damping", 0.1)
 
     def require(self, vademecum: Vademecum) -> None:
         require_body(vademecum, self.name)
 
+    def adapted(self, vademecum: Vademecum) -> Vademecum:
+        """In its modes of vibration, slowest first."""
+        far, body = vademecum.far, vademecum.body
+        assert body is not None  # by `require`
+        _, turn = np.linalg.eigh(body.mass)
+        turn = turn[:, ::-1]
+        single = turn.astype(far.space.dtype)
+        turned = SeparatedField(far.space @ single, far.load @ single)
+        return replace(vademecum, far=turned, body=body.mixed(turn))
 
-InertiaArrays = namedtuple("InertiaArrays", ["mass", "damping", "period"])
-InertiaState = namedtuple(
-    "InertiaState",
-    [
-        "mass",  # (n,) m_k [s^2] of the modes that have mass, the first
-        "damping",  # (n,) d_k [s]
-        "period",  # (1,) dt [s]
-        "modes",  # (k,) q
-        "velocity",  # (n,) q'
-    ],
-)
+    def lay_out(self, ground: Ground) -> Any:
+        body = ground.vademecum.body
+        assert body is not None
+        mass = self.density * np.maximum(np.diag(body.mass), 0.0)
+        damping = 2.0 * self.damping * np.sqrt(mass)
+        return self.Constants(mass, damping, np.array([ground.period]))
 
-
-def vibration_modes(vademecum: Vademecum, density: float) -> tuple[Vademecum, np.ndarray]:
-    """The vademecum in its modes of vibration, slowest first, and their masses (k,) [s^2]."""
-    far, body = vademecum.far, vademecum.body
-    assert body is not None  # by `require`
-    values, turn = np.linalg.eigh(body.mass)
-    values, turn = density * np.maximum(values[::-1], 0.0), turn[:, ::-1]
-    single = turn.astype(far.space.dtype)
-    turned = SeparatedField(far.space @ single, far.load @ single)
-    return replace(vademecum, far=turned, body=body.mixed(turn)), values
-
-
-def inertia_arrays(effect: Inertia, mass: np.ndarray, period: float) -> InertiaArrays:
-    """Coefficients of the oscillators."""
-    return InertiaArrays(mass, 2.0 * effect.damping * np.sqrt(mass), np.array([period]))
-
-
-def inertia_state(
-    arrays: InertiaArrays, n_modes: int, self_weight: SelfWeightArrays | None
-) -> InertiaState:
-    """State of an organ at rest, deformed by its weight if that is simulated."""
-    still = np.zeros(n_modes) if self_weight is None else self_weight.amplitude.copy()
-    return InertiaState(*arrays, still, np.zeros(len(arrays.mass)))
+    @staticmethod
+    def begin(model: Any, state: Any) -> None:
+        """Deformed by its weight, if that is simulated."""
+        if model.self_weight is not None:
+            state.modes[:] = model.self_weight.amplitude
 
 
 @fast
-def predict_inertia(effects):  # type: ignore[no-untyped-def]
+def predict_inertia(model, data):  # type: ignore[no-untyped-def]
     """Modes at the end of the period without any load, and their gain by a unit load."""
-    superposition, inertia = effects.superposition, effects.inertia
-    viscoelasticity, self_weight = effects.viscoelasticity, effects.self_weight
-    dt = inertia.period[0]
-    for k in range(inertia.mass.shape[0]):
-        m, q, v = inertia.mass[k], inertia.modes[k], inertia.velocity[k]
+    superposition, past, prony, oscillator = (
+        data.superposition,
+        data.viscoelasticity,
+        model.viscoelasticity,
+        model.inertia,
+    )
+    dt = oscillator.period[0]
+    for k in range(oscillator.mass.shape[0]):
+        m, q, v = oscillator.mass[k], data.inertia.modes[k], data.inertia.velocity[k]
         stiff, before, after = 1.0, q, q  # dR/dq, R now, R at the end for constant q
-        if viscoelasticity.on:
-            stiff = 1.0 / viscoelasticity.gain[0]
-            before, after = viscoelasticity.rest[0] * viscoelasticity.elastic[k], 0.0
-            for i in range(viscoelasticity.decay.shape[0]):
-                before += viscoelasticity.past[i, k]
-            after = viscoelasticity.held[k] + stiff * viscoelasticity.elastic[k]
-        elif self_weight.on:  # R is relative to the sagged organ
-            before -= self_weight.amplitude[k]
-            after -= self_weight.amplitude[k]
-        whole = 2.0 * m / dt + 0.5 * stiff * dt + inertia.damping[k]
+        if model.viscoelasticity.on:
+            stiff = 1.0 / prony.gain[0]
+            before, after = prony.rest[0] * past.elastic[k], 0.0
+            for i in range(prony.decay.shape[0]):
+                before += past.past[i, k]
+            after = past.held[k] + stiff * past.elastic[k]
+        elif model.self_weight.on:  # R is relative to the sagged organ
+            before -= model.self_weight.amplitude[k]
+            after -= model.self_weight.amplitude[k]
+        whole = 2.0 * m / dt + 0.5 * stiff * dt + oscillator.damping[k]
         middle = (2.0 * m * v / dt - 0.5 * (before + after)) / whole
         superposition.free[k] = q + dt * middle
         superposition.gain[k] = dt / whole
-    if viscoelasticity.on:
-        for k in range(inertia.mass.shape[0], superposition.free.shape[0]):
-            superposition.free[k] = -viscoelasticity.gain[0] * viscoelasticity.held[k]
-            superposition.gain[k] = viscoelasticity.gain[0]
+    if model.viscoelasticity.on:
+        for k in range(oscillator.mass.shape[0], superposition.free.shape[0]):
+            superposition.free[k] = -prony.gain[0] * past.held[k]
+            superposition.gain[k] = prony.gain[0]
 
 
 @fast
-def advance_inertia(superposition, inertia):  # type: ignore[no-untyped-def]
+def advance_inertia(model, data):  # type: ignore[no-untyped-def]
     """Complete the period: modes and their velocities at its end."""
-    if not inertia.on:
+    inertia = data.inertia
+    if not model.inertia.on:
         return
-    dt = inertia.period[0]
-    for k in range(superposition.total.shape[0]):
-        new = superposition.total[k]
-        if k < inertia.mass.shape[0]:
+    dt = model.inertia.period[0]
+    for k in range(data.superposition.total.shape[0]):
+        new = data.superposition.total[k]
+        if k < model.inertia.mass.shape[0]:
             speed = 2.0 * (new - inertia.modes[k]) / dt - inertia.velocity[k]
             inertia.velocity[k] = speed if abs(speed) > 1e-30 else 0.0
         inertia.modes[k] = new if abs(new) > 1e-30 else 0.0

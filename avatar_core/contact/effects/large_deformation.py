@@ -4,22 +4,22 @@ See :mod:`avatar_core.vademecum.large_deformation`.
 It adds k h(a_t) to C_tt lambda_t, with a_t = gamma lambda_t, the matching term to the energy, and
 its derivative to the force. Beyond the reach that was computed, h continues as its tangent. k is
 what a tip leaves of the patch's compliance, 1 - c / gamma of
-:mod:`avatar_core.contact.effects.tip_law`, and 1 for the patch itself.
+:mod:`avatar_core.tips.law`, and 1 for the patch itself.
 """
 
 from __future__ import annotations
 
-from collections import namedtuple
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast, inlined
 from avatar_core.common.splines import cell_at, in_cell
-from avatar_core.contact.effects.base import Effect
-from avatar_core.contact.effects.tip_profile import TAKEN
+from avatar_core.contact.effects.base import Effect, Ground
 from avatar_core.errors import SceneError
+from avatar_core.tips.profile import TAKEN
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
@@ -31,6 +31,20 @@ class LargeDeformationEffect(Effect):
 
     name: ClassVar[str] = "large_deformation"
     text: ClassVar[str] = "the response bends with the depth of the push"
+    Constants: ClassVar[Any] = kind(
+        "LargeDeformation",
+        grid=array("3 x y z", np.float32),  # beta_2, beta_3 and the reach where a tip is
+        load=array("P 2 l", np.float32),  # V_2 and V_3 in the modes of a position's region
+        start=array("r", np.int64),  # of the region's modes among those of the cloud
+    )
+    State: ClassVar[Any] = kind(
+        "LargeDeformationState",
+        coefficient=array("T 3"),  # beta_2, beta_3 and the reach
+        coefficient_gradient=array("T 3 3"),
+        added_depth=array("T 4"),  # k h, k dh/da, the integral of k h, k d2h/da2 at the reach
+        kept=array("T", start=1.0),  # k
+        kept_gradient=array("T 3"),
+    )
 
     def require(self, vademecum: Vademecum) -> None:
         if vademecum.large is None:
@@ -39,71 +53,48 @@ class LargeDeformationEffect(Effect):
                 "'avatar vademecum SURFACE --material neo-hookean'"
             )
 
+    def lay_out(self, ground: Ground) -> Any:
+        # Here, because the contact node needs none of it.
+        from avatar_core.contact.organ_response import sampled_at_tip
 
-LargeDeformationArrays = namedtuple(
-    "LargeDeformationArrays",
-    [
-        "grid",  # (3, nx, ny, nz) beta_2, beta_3 and the reach where a tip is
-        "load",  # (n_positions, 2, n) of V_2 and V_3 in the modes of a position's region
-        "start",  # (n_regions + 1,) of the region's modes among those of the cloud
-    ],
-)
-LargeDeformationState = namedtuple(
-    "LargeDeformationState",
-    [
-        "grid",
-        "load",
-        "start",
-        "coefficient",  # (T, 3) beta_2, beta_3 and the reach
-        "coefficient_gradient",  # (T, 3, 3) their gradients
-        "added_depth",  # (T, 4) k h, k dh/da, the integral of k h, k d2h/da2 at the reach
-        "kept",  # (T,) k
-        "kept_gradient",  # (T, 3)
-    ],
-)
-
-
-def large_deformation_state(arrays: LargeDeformationArrays, n_tools: int) -> LargeDeformationState:
-    """The constant arrays, with scratch for the tools."""
-    return LargeDeformationState(
-        *arrays,
-        np.zeros((n_tools, 3)),
-        np.zeros((n_tools, 3, 3)),
-        np.zeros((n_tools, 4)),
-        np.ones(n_tools),
-        np.zeros((n_tools, 3)),
-    )
+        large, vademecum = ground.vademecum.large, ground.vademecum
+        assert large is not None  # by `require`
+        values = np.vstack([large.depth, large.reach])
+        grid = sampled_at_tip(vademecum.surface, vademecum.tip_field, ground.response, values)
+        return self.Constants(grid, np.ascontiguousarray(large.terms.load), ground.large_start)
 
 
 @inlined
-def sample_coefficients(model, state, law, large_deformation, t, tip):  # type: ignore[no-untyped-def]
+def sample_coefficients(model, data, t, tip):  # type: ignore[no-untyped-def]
     """beta_2, beta_3, the reach and k at a tip, with their gradients."""
-    if not large_deformation.on:
+    large = data.large_deformation
+    if not model.large_deformation.on:
         return
-    if law.on:
-        gamma, taken = state.self_compliance[t], law.value[t, TAKEN]
-        large_deformation.kept[t] = 1.0 - taken / gamma
+    if model.law.on:
+        gamma, taken = data.self_compliance[t], data.law.value[t, TAKEN]
+        large.kept[t] = 1.0 - taken / gamma
         for d in range(3):
-            change = taken / gamma * state.self_slope[t, d] - law.gradient[t, TAKEN, d]
-            large_deformation.kept_gradient[t, d] = change / gamma
-    grid, value = large_deformation.grid, large_deformation.coefficient[t]
+            change = taken / gamma * data.self_slope[t, d] - data.law.gradient[t, TAKEN, d]
+            large.kept_gradient[t, d] = change / gamma
+    grid, value = model.large_deformation.grid, large.coefficient[t]
     cell = cell_at(model.origin, model.spacing[0], tip)
     for k in range(3):
-        value[k] = in_cell(grid[k], cell, large_deformation.coefficient_gradient[t, k])
+        value[k] = in_cell(grid[k], cell, large.coefficient_gradient[t, k])
 
 
 @fast
-def evaluate_added_depth(state, large_deformation, t):  # type: ignore[no-untyped-def]
+def evaluate_added_depth(data, t):  # type: ignore[no-untyped-def]
     """h(a) = beta_2 a^2 + beta_3 a^3 at the present force, its derivative and integral."""
-    added, coefficient = large_deformation.added_depth[t], large_deformation.coefficient[t]
-    a = state.self_compliance[t] * state.force[t]
+    large = data.large_deformation
+    added, coefficient = (large.added_depth[t], large.coefficient[t])
+    a = data.self_compliance[t] * data.force[t]
     b2, b3, reach = coefficient[0], coefficient[1], coefficient[2]
     inside = min(a, reach)
     over = a - inside
     h = inside * inside * (b2 + b3 * inside)
     slope = inside * (2.0 * b2 + 3.0 * b3 * inside)
     integral = inside**3 * (b2 / 3.0 + b3 * inside / 4.0)
-    kept = large_deformation.kept[t]
+    kept = large.kept[t]
     added[0] = kept * (h + slope * over)
     added[1] = kept * slope
     added[2] = kept * (integral + over * (h + 0.5 * slope * over))
@@ -111,14 +102,15 @@ def evaluate_added_depth(state, large_deformation, t):  # type: ignore[no-untype
 
 
 @fast
-def add_nonlinear_force(state, large_deformation, out, t):  # type: ignore[no-untyped-def]
+def add_nonlinear_force(model, data, t):  # type: ignore[no-untyped-def]
     """d/dp of the energy H = 1/gamma int_0^a h, at fixed force; whether a exceeds the reach."""
-    if not large_deformation.on:
+    large = data.large_deformation
+    if not model.large_deformation.on:
         return False
-    evaluate_added_depth(state, large_deformation, t)
-    added, gradient = large_deformation.added_depth[t], large_deformation.coefficient_gradient[t]
-    gamma, reach = state.self_compliance[t], large_deformation.coefficient[t, 2]
-    a = gamma * state.force[t]
+    evaluate_added_depth(data, t)
+    added, gradient = (large.added_depth[t], large.coefficient_gradient[t])
+    gamma, reach = data.self_compliance[t], large.coefficient[t, 2]
+    a = gamma * data.force[t]
     inside = min(a, reach)
     over = a - inside
     # derivatives of int h by beta_2, beta_3 and the reach, and of H by gamma
@@ -126,29 +118,31 @@ def add_nonlinear_force(state, large_deformation, out, t):  # type: ignore[no-un
     by3 = inside**4 / 4.0 + over * (inside**3 + 1.5 * inside**2 * over)
     by_reach = 0.5 * added[3] * over * over
     by_gamma = (added[0] * a - added[2]) / gamma
-    kept = large_deformation.kept[t]
+    kept = large.kept[t]
     by_kept = added[2] / max(kept, 1e-12)
     for d in range(3):
         change = kept * (by2 * gradient[0, d] + by3 * gradient[1, d])
-        change += by_reach * gradient[2, d] + by_gamma * state.self_slope[t, d]
-        change += by_kept * large_deformation.kept_gradient[t, d]
-        out.force[t, d] += change / gamma
+        change += by_reach * gradient[2, d] + by_gamma * data.self_slope[t, d]
+        change += by_kept * large.kept_gradient[t, d]
+        data.out.force[t, d] += change / gamma
     return a > reach
 
 
 @fast
-def powers_of_depth(state, large_deformation, t):  # type: ignore[no-untyped-def]
+def powers_of_depth(data, t):  # type: ignore[no-untyped-def]
     """a^2 and a^3 of a tip's linear depth a, continued by their tangents beyond the reach."""
-    a = state.self_compliance[t] * state.force[t]
-    inside = min(a, large_deformation.coefficient[t, 2])
+    a = data.self_compliance[t] * data.force[t]
+    inside = min(a, data.large_deformation.coefficient[t, 2])
     over = a - inside
     return inside * (inside + 2.0 * over), inside * inside * (inside + 3.0 * over)
 
 
 @fast
-def add_nonlinear_load(state, large_deformation, r, j, w, second, third):  # type: ignore[no-untyped-def]
+def add_nonlinear_load(model, data, r, j, w, second, third):  # type: ignore[no-untyped-def]
     """Amplitudes of the nonlinear modes of a region by a part w of a tip at a load position."""
-    amplitude = state.amplitude[large_deformation.start[r] : large_deformation.start[r + 1]]
-    w2, w3, load = np.float32(w * second), np.float32(w * third), large_deformation.load[j]
+    amplitude = data.amplitude[
+        model.large_deformation.start[r] : model.large_deformation.start[r + 1]
+    ]
+    w2, w3, load = np.float32(w * second), np.float32(w * third), model.large_deformation.load[j]
     for k in range(amplitude.shape[0]):
         amplitude[k] += w2 * load[0, k] + w3 * load[1, k]

@@ -8,15 +8,15 @@ starting at the end of exhalation (Lujan et al., Medical Physics 26:715, 1999). 
 
 from __future__ import annotations
 
-from collections import namedtuple
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast, inlined
 from avatar_core.common.quantities import quantity
-from avatar_core.contact.effects.base import Effect, direction
+from avatar_core.contact.effects.base import Effect, Ground, direction
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,17 @@ class Respiration(Effect):
 
     name: ClassVar[str] = "respiration"
     text: ClassVar[str] = "the organ moves with the breath"
+
+    Constants: ClassVar[Any] = kind(
+        "Respiration",
+        stroke=array("3"),  # A e [m]
+        timing=array("3"),  # period of the breath [s], n, period of the step [s]
+    )
+    State: ClassVar[Any] = kind(
+        "RespirationState",
+        clock=array("1"),  # time since the end of exhalation [s]
+        shift=array("3"),  # x(t) [m]
+    )
 
     period: float = quantity("s", 0.5, 60.0, "of a breath", 4.0)
     amplitude: float = quantity("m", 0.0, 0.05, "from breath out to breath in", 0.012)
@@ -37,66 +48,54 @@ class Respiration(Effect):
         super().__post_init__()
         object.__setattr__(self, "axis", direction(self.axis, self.name, "axis"))
 
+    @classmethod
+    def example(cls) -> Respiration:
+        return cls(amplitude=1e-3)
 
-RespirationArrays = namedtuple("RespirationArrays", ["stroke", "timing"])
-RespirationState = namedtuple(
-    "RespirationState",
-    [
-        "stroke",  # (3,) A e [m]
-        "timing",  # (3,) period of the breath [s], n, period of the step [s]
-        "clock",  # (1,) time since the end of exhalation [s]
-        "shift",  # (3,) x(t) [m]
-    ],
-)
-
-
-def respiration_arrays(effect: Respiration, period: float) -> RespirationArrays:
-    """Constant arrays for steps of a period [s]."""
-    return RespirationArrays(
-        effect.amplitude * np.array(effect.axis),
-        np.array([effect.period, float(effect.dwell), period]),
-    )
-
-
-def respiration_state(arrays: RespirationArrays) -> RespirationState:
-    """State at the end of exhalation."""
-    return RespirationState(*arrays, np.zeros(1), np.zeros(3))
+    def lay_out(self, ground: Ground) -> Any:
+        return self.Constants(
+            self.amplitude * np.array(self.axis),
+            np.array([self.period, float(self.dwell), ground.period]),
+        )
 
 
 @inlined
-def to_organ_frame(respiration, tips):  # type: ignore[no-untyped-def]
+def to_organ_frame(model, data):  # type: ignore[no-untyped-def]
     """Advance the breath by a period, and transform the tips to the organ's frame."""
-    if not respiration.on:
+    breath, breathing = data.respiration, model.respiration
+    if not model.respiration.on:
         return
-    period = respiration.timing[0]
-    respiration.clock[0] = (respiration.clock[0] + respiration.timing[2]) % period
-    out = np.cos(np.pi * respiration.clock[0] / period) ** 2
-    inhaled = 1.0 - out ** respiration.timing[1]
+    period = breathing.timing[0]
+    breath.clock[0] = (breath.clock[0] + breathing.timing[2]) % period
+    out = np.cos(np.pi * breath.clock[0] / period) ** 2
+    inhaled = 1.0 - out ** breathing.timing[1]
     for d in range(3):
-        respiration.shift[d] = inhaled * respiration.stroke[d]
-        for t in range(tips.shape[0]):
-            tips[t, d] -= respiration.shift[d]
+        breath.shift[d] = inhaled * breathing.stroke[d]
+        for t in range(data.tip.shape[0]):
+            data.tip[t, d] -= breath.shift[d]
 
 
 @inlined
-def to_world_frame(respiration, out):  # type: ignore[no-untyped-def]
+def to_world_frame(model, data):  # type: ignore[no-untyped-def]
     """Contacts back to the world's frame; the frames do not rotate, so forces stay the same."""
-    if not respiration.on:
+    if not model.respiration.on:
         return
-    for i in range(out.n_contacts[0]):
+    for i in range(data.out.n_contacts[0]):
         for d in range(3):
-            out.contact_position[i, d] += respiration.shift[d]
+            data.out.contact_position[i, d] += data.respiration.shift[d]
 
 
 @fast
-def shift_cloud(respiration, cloud):  # type: ignore[no-untyped-def]
+def shift_cloud(model, data):  # type: ignore[no-untyped-def]
     """Deformed positions to the world's frame; displacements stay relative to the organ."""
-    if not respiration.on:
+    breath = data.respiration
+    if not model.respiration.on:
         return
+    cloud = data.out.cloud
     x, y, z = (
-        np.float32(respiration.shift[0]),
-        np.float32(respiration.shift[1]),
-        np.float32(respiration.shift[2]),
+        np.float32(breath.shift[0]),
+        np.float32(breath.shift[1]),
+        np.float32(breath.shift[2]),
     )
     for v in range(cloud.shape[0]):
         cloud[v, 0] += x

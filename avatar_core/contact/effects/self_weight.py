@@ -6,14 +6,15 @@ the amplitudes X^T M 1 rho g, M the mass matrix of unit density. Viscoelastic ti
 
 from __future__ import annotations
 
-from collections import namedtuple
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from avatar_core.common.array_table import array, kind
 from avatar_core.common.quantities import quantity
-from avatar_core.contact.effects.base import Effect, direction, require_body
+from avatar_core.contact.effects.base import Effect, Ground, direction, find, require_body
+from avatar_core.contact.effects.viscoelasticity import Viscoelasticity
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
@@ -25,6 +26,9 @@ class SelfWeight(Effect):
 
     name: ClassVar[str] = "self_weight"
     text: ClassVar[str] = "the organ sags under gravity"
+
+    Constants: ClassVar[Any] = kind("SelfWeight", amplitude=array("K"))  # of the modes
+    superposed: ClassVar[bool] = True
 
     density: float = quantity("kg/m^3", 100.0, 5000.0, "of the organ", 1060.0)
     gravity: float = quantity("m/s^2", 0.0, 100.0, "acceleration", 9.81)
@@ -39,17 +43,18 @@ class SelfWeight(Effect):
     def require(self, vademecum: Vademecum) -> None:
         require_body(vademecum, self.name)
 
+    @classmethod
+    def example(cls) -> SelfWeight:
+        return cls(gravity=1.0)
 
-SelfWeightArrays = namedtuple("SelfWeightArrays", ["amplitude"])  # (k,) of the modes, under gravity
+    def sag(self, vademecum: Vademecum) -> np.ndarray:
+        """Amplitudes of the global modes, shape (k,), before the tissue relaxes."""
+        assert vademecum.body is not None  # by `require`
+        force = self.density * self.gravity * np.array(self.direction)
+        return np.asarray(vademecum.body.weight @ force)
 
-
-def self_weight_arrays(
-    effect: SelfWeight, vademecum: Vademecum, softened: float
-) -> SelfWeightArrays:
-    """Amplitudes of the modes.
-
-    softened : instantaneous over relaxed Young's modulus
-    """
-    assert vademecum.body is not None  # by `require`
-    force = effect.density * effect.gravity * np.array(effect.direction)
-    return SelfWeightArrays(softened * (vademecum.body.weight @ force))
+    def lay_out(self, ground: Ground) -> Any:
+        prony = find(ground.effects, Viscoelasticity)
+        softened = 1.0 / (1.0 - sum(prony.g)) if prony else 1.0
+        sag = softened * self.sag(ground.vademecum)
+        return self.Constants(np.pad(sag, (0, ground.n_modes - len(sag))))

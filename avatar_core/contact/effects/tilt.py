@@ -21,22 +21,19 @@ tip field: a force made of it does not jump. Other tips do not feel that they le
 
 from __future__ import annotations
 
-from collections import namedtuple
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast
 from avatar_core.common.quantities import quantity
 from avatar_core.common.splines import in_cell
-from avatar_core.contact.effects.base import Effect, direction
+from avatar_core.contact.effects.base import Effect, Ground, direction
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
-
-if TYPE_CHECKING:
-    from avatar_core.vademecum.tip_field import TipField
 
 _UPRIGHT = 1e-9  # sine below which a punch does not lean
 
@@ -47,6 +44,21 @@ class Tilt(Effect):
 
     name: ClassVar[str] = "tilt"
     text: ClassVar[str] = "a flat punch that leans touches with its edge and is righted by a torque"
+
+    Constants: ClassVar[Any] = kind(
+        "Tilt",
+        shaft=array("3"),  # from tip to shaft in the frame of the poses
+        punch=array("T"),  # a, 0 for tips that are not flat [m]
+        normals=array("3 x y z", np.float32),  # of the distance on the grid of the tip field
+    )
+    State: ClassVar[Any] = kind(
+        "TiltState",
+        gradient=array("3 3"),  # scratch
+        sine=array("T"),  # s
+        cosine=array("T", start=1.0),
+        across=array("T 3"),  # axis x normal
+        rise=array("T 3"),  # gradient of the cosine [1/m]
+    )
 
     axis: tuple[float, ...] = quantity(
         "-", -1e3, 1e3, "of the tools in the frame of their poses, from the tip to the shaft",
@@ -63,63 +75,33 @@ class Tilt(Effect):
         if all(tip.shape != "flat" for tip in tips):
             raise SceneError("tilt: no tool has a flat tip; give one, or leave tilt out")
 
+    def lay_out(self, ground: Ground) -> Any:
+        # Here, because the contact node needs none of it.
+        from avatar_core.vademecum.tip_field import grid_normals
 
-TiltArrays = namedtuple("TiltArrays", ["shaft", "punch", "normals"])
-TiltState = namedtuple(
-    "TiltState",
-    [
-        "shaft",  # (3,) from tip to shaft in the frame of the poses
-        "punch",  # (T,) a, 0 for tips that are not flat [m]
-        "normals",  # (3, nx, ny, nz) of the distance on the grid of the tip field
-        "axis",  # (T, 3) the same in the organ's frame, set before each step; 0 for an upright tool
-        "gradient",  # (3, 3) scratch
-        "sine",  # (T,) s
-        "cosine",  # (T,)
-        "across",  # (T, 3) axis x normal
-        "rise",  # (T, 3) gradient of the cosine [1/m]
-    ],
-)
-
-
-def tilt_arrays(effect: Tilt, tips: Sequence[Tip], field: TipField) -> TiltArrays:
-    """Constant arrays of the effect."""
-    # Here, because the contact node needs none of it.
-    from avatar_core.vademecum.tip_field import grid_normals
-
-    normals = grid_normals(field.distance, float(field.spacing[0]))
-    return TiltArrays(
-        np.array(effect.axis),
-        np.array([tip.radius if tip.shape == "flat" else 0.0 for tip in tips]),
-        np.ascontiguousarray(np.moveaxis(normals, -1, 0), np.float32),
-    )
-
-
-def tilt_state(arrays: TiltArrays) -> TiltState:
-    """Of tools that stand upright."""
-    n = len(arrays.punch)
-    return TiltState(
-        *arrays,
-        axis=np.zeros((n, 3)),
-        gradient=np.zeros((3, 3)),
-        sine=np.zeros(n),
-        cosine=np.ones(n),
-        across=np.zeros((n, 3)),
-        rise=np.zeros((n, 3)),
-    )
+        self.require_flat(ground.tips)
+        field = ground.vademecum.tip_field
+        normals = grid_normals(field.distance, float(field.spacing[0]))
+        return self.Constants(
+            np.array(self.axis),
+            np.array([tip.radius if tip.shape == "flat" else 0.0 for tip in ground.tips]),
+            np.ascontiguousarray(np.moveaxis(normals, -1, 0), np.float32),
+        )
 
 
 @fast
-def sample_tilt(tilt, t, cell):  # type: ignore[no-untyped-def]
+def sample_tilt(model, data, t, cell):  # type: ignore[no-untyped-def]
     """How a tip leans; returns how deep its edge is below the centre of its face, a s [m]."""
-    if not tilt.on:
+    tilt, punches = data.tilt, model.tilt
+    if not model.tilt.on:
         return 0.0
     tilt.sine[t], tilt.cosine[t] = 0.0, 1.0
-    e, slope = tilt.axis[t], tilt.gradient
-    if tilt.punch[t] == 0.0 or e[0] ** 2 + e[1] ** 2 + e[2] ** 2 == 0.0:
+    e, slope = data.axis[t], tilt.gradient
+    if punches.punch[t] == 0.0 or e[0] ** 2 + e[1] ** 2 + e[2] ** 2 == 0.0:
         return 0.0
-    x = in_cell(tilt.normals[0], cell, slope[0])
-    y = in_cell(tilt.normals[1], cell, slope[1])
-    z = in_cell(tilt.normals[2], cell, slope[2])
+    x = in_cell(punches.normals[0], cell, slope[0])
+    y = in_cell(punches.normals[1], cell, slope[1])
+    z = in_cell(punches.normals[2], cell, slope[2])
     part = 1.0 / max(np.sqrt(x * x + y * y + z * z), 1e-6)
     x, y, z = part * x, part * y, part * z
     cosine, across = e[0] * x + e[1] * y + e[2] * z, tilt.across[t]
@@ -132,7 +114,7 @@ def sample_tilt(tilt, t, cell):  # type: ignore[no-untyped-def]
     if sine > _UPRIGHT:
         tilt.sine[t] = sine
     tilt.cosine[t] = cosine
-    return tilt.punch[t] * tilt.sine[t]
+    return punches.punch[t] * tilt.sine[t]
 
 
 @fast
@@ -144,12 +126,12 @@ def _righting(ratio):  # type: ignore[no-untyped-def]
 
 
 @fast
-def evaluate_tilt(tilt, t, load):  # type: ignore[no-untyped-def]
+def evaluate_tilt(model, data, t, load):  # type: ignore[no-untyped-def]
     """What leaning adds to the depth of the lowest point [m], to its derivative by the load F / E*
     [1/m], and to the stored energy over E* [m^3]."""
-    if tilt is None or not tilt.on:
+    if not model.tilt.on:
         return 0.0, 0.0, 0.0
-    a, edge = tilt.punch[t], tilt.punch[t] * tilt.sine[t]
+    a, edge = model.tilt.punch[t], model.tilt.punch[t] * data.tilt.sine[t]
     if edge == 0.0 or load <= 0.0:
         return 0.0, 0.0, 0.0
     ratio = 4.0 * a * edge / load
@@ -166,18 +148,19 @@ def evaluate_tilt(tilt, t, load):  # type: ignore[no-untyped-def]
 
 
 @fast
-def add_righting(tilt, out, t, stiffness, elastic, relaxed):  # type: ignore[no-untyped-def]
+def add_righting(model, data, t, stiffness, elastic, relaxed):  # type: ignore[no-untyped-def]
     """The torque that rights a tip, and the force towards where the surface would: -M ds.
 
     stiffness : E* [Pa]; elastic : F on an elastic organ [N]; relaxed : of it, what is left
     """
-    if not tilt.on:
+    tilt = data.tilt
+    if not model.tilt.on:
         return
-    a, sine = tilt.punch[t], tilt.sine[t]
+    a, sine = model.tilt.punch[t], tilt.sine[t]
     if sine == 0.0 or elastic <= 0.0 or tilt.cosine[t] <= 0.0:
         return
     ratio = 4.0 * stiffness * a * a * sine / elastic
     factor = relaxed * elastic * a * _righting(ratio) * tilt.cosine[t] / sine
     for d in range(3):
-        out.force[t, d] += factor * tilt.rise[t, d]
-        out.torque[t, d] += factor * tilt.across[t, d]
+        data.out.force[t, d] += factor * tilt.rise[t, d]
+        data.out.torque[t, d] += factor * tilt.across[t, d]

@@ -44,22 +44,18 @@ class Tumour(Effect):
                 "build one with another --coordinate contrast=LOW:HIGH"
             )
 
+    def adapted(self, vademecum: Vademecum) -> Vademecum:
+        """At the contrast of the effect; unchanged if the vademecum does not cover it."""
+        coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
+        ranges = [(c.low, c.high) for c in coordinates if c.name == "contrast"]
+        contrast = self.contrast
+        if (
+            contrast is None
+            or contrast == vademecum.contrast
+            or not any(low <= contrast <= high for low, high in ranges)
+        ):
+            return vademecum
+        # Here, because the contact node needs none of it.
+        from avatar_core.vademecum.at_values import at_values
 
-def at_contrast(vademecum: Vademecum, effect: Tumour | None) -> Vademecum:
-    """The vademecum at the contrast of the effect; at contrast 1 if there is none.
-
-    Unchanged if the vademecum does not cover that contrast.
-    """
-    coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
-    ranges = [(c.low, c.high) for c in coordinates if c.name == "contrast"]
-    contrast = 1.0 if effect is None else effect.contrast
-    if (
-        contrast is None
-        or contrast == vademecum.contrast
-        or not any(low <= contrast <= high for low, high in ranges)
-    ):
-        return vademecum
-    # Here, because the contact node needs none of it.
-    from avatar_core.vademecum.at_values import at_values
-
-    return at_values(vademecum, {"contrast": contrast})
+        return at_values(vademecum, {"contrast": contrast})

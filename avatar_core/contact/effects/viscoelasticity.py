@@ -19,17 +19,22 @@ weakest are dropped first.
 
 from __future__ import annotations
 
-from collections import namedtuple
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast, inlined
 from avatar_core.common.quantities import quantity
-from avatar_core.contact.effects.base import Effect
+from avatar_core.contact.effects.base import Effect, Ground
+from avatar_core.contact.effects.friction import force_on_tissue
 from avatar_core.errors import SceneError
 from avatar_core.reduction.near_field import find_block
+
+MAX_HISTORY = 160  # load positions whose history is kept for the near field
+_NEGLIGIBLE = 1e-7  # [N] of a history that is dropped
+_SHOWN = 0.04  # of the strongest load, below which near history is left out of the cloud
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,31 @@ class Viscoelasticity(Effect):
 
     name: ClassVar[str] = "viscoelasticity"
     text: ClassVar[str] = "the response relaxes and remembers: generalised Maxwell model"
+
+    Constants: ClassVar[Any] = kind(
+        "Viscoelasticity",
+        decay=array("n"),  # exp(-dt / tau_i)
+        ramp=array("n"),  # r_i
+        rest=array("1"),  # g_inf
+        gain=array("1"),  # 1 / A
+    )
+    State: ClassVar[Any] = kind(
+        "ViscoelasticityState",
+        elastic=array("K"),  # Y^T e
+        past=array("n K"),  # Y^T h_i
+        held=array("K"),  # Y^T of the load that keeps e constant, by `predict_history`
+        slot=array("P", np.int64, -1),  # of a load position in the near history, or -1
+        position=array(f"{MAX_HISTORY}", np.int64),  # load position of a slot
+        count=array("1", np.int64),  # slots in use
+        near_elastic=array(f"{MAX_HISTORY} 3"),  # e [N]
+        near_past=array(f"n {MAX_HISTORY} 3"),  # h_i [N]
+        near_held=array(f"{MAX_HISTORY} 3"),  # load that keeps e constant [N]
+        near_load=array(f"{MAX_HISTORY} 3"),  # f of this period [N]
+        tip_elastic=array("T"),  # e of a tip, which its dent remembers while it touches [N]
+        tip_past=array("n T"),  # h_i [N]
+        tip_held=array("T"),  # load that keeps e constant [N]
+    )
+    superposed: ClassVar[bool] = True
 
     g: tuple[float, ...] = quantity("-", 0.0, 0.999, "part of the modulus lost by each term")
     tau: tuple[float, ...] = quantity("s", 1e-3, 1e5, "relaxation time of each term")
@@ -58,121 +88,71 @@ class Viscoelasticity(Effect):
                 "nothing is left at rest"
             )
 
+    @classmethod
+    def example(cls) -> Viscoelasticity:
+        return cls((0.3, 0.25), (0.5, 8.0))
 
-MAX_HISTORY = 160  # load positions whose history is kept for the near field
-_NEGLIGIBLE = 1e-7  # [N] of a history that is dropped
-_SHOWN = 0.04  # of the strongest load, below which near history is left out of the cloud
-
-ViscoelasticityArrays = namedtuple("ViscoelasticityArrays", ["decay", "ramp", "rest"])
-ViscoelasticityState = namedtuple(
-    "ViscoelasticityState",
-    [
-        "decay",  # (n,) exp(-dt / tau_i)
-        "ramp",  # (n,) r_i
-        "rest",  # (1,) g_inf
-        "gain",  # (1,) 1 / A
-        "elastic",  # (k,) Y^T e
-        "past",  # (n, k) Y^T h_i
-        "held",  # (k,) Y^T of the load that keeps e constant, by `predict_history`
-        "slot",  # (n_positions,) of a load position in the near history, or -1
-        "position",  # (MAX_HISTORY,) load position of a slot
-        "count",  # (1,) slots in use
-        "near_elastic",  # (MAX_HISTORY, 3) e [N]
-        "near_past",  # (n, TRAIL, 3) h_i [N]
-        "near_held",  # (MAX_HISTORY, 3) load that keeps e constant [N]
-        "near_load",  # (MAX_HISTORY, 3) f of this period [N]
-        "tip_elastic",  # (T,) e of each tip, which its own dent remembers as long as it touches [N]
-        "tip_past",  # (n, T) h_i [N]
-        "tip_held",  # (T,) load that keeps e constant [N]
-    ],
-)
-
-
-def viscoelasticity_arrays(effect: Viscoelasticity, period: float) -> ViscoelasticityArrays:
-    """Factors for one period [s]."""
-    g, tau = np.array(effect.g, float), np.array(effect.tau, float)
-    ramp = g * (tau / period) * -np.expm1(-period / tau)
-    return ViscoelasticityArrays(np.exp(-period / tau), ramp, np.array([1.0 - g.sum()]))
-
-
-def viscoelasticity_state(
-    arrays: ViscoelasticityArrays, n_tools: int, n_modes: int, n_positions: int
-) -> ViscoelasticityState:
-    """State of an organ that was never touched."""
-    n = len(arrays.decay)
-    return ViscoelasticityState(
-        *arrays,
-        gain=1.0 / (arrays.rest + arrays.ramp.sum()),
-        elastic=np.zeros(n_modes),
-        past=np.zeros((n, n_modes)),
-        held=np.zeros(n_modes),
-        slot=np.full(n_positions, -1, np.int64),
-        position=np.zeros(MAX_HISTORY, np.int64),
-        count=np.zeros(1, np.int64),
-        near_elastic=np.zeros((MAX_HISTORY, 3)),
-        near_past=np.zeros((n, MAX_HISTORY, 3)),
-        near_held=np.zeros((MAX_HISTORY, 3)),
-        near_load=np.zeros((MAX_HISTORY, 3)),
-        tip_elastic=np.zeros(n_tools),
-        tip_past=np.zeros((n, n_tools)),
-        tip_held=np.zeros(n_tools),
-    )
+    def lay_out(self, ground: Ground) -> Any:
+        g, tau, period = np.array(self.g, float), np.array(self.tau, float), ground.period
+        ramp, rest = g * (tau / period) * -np.expm1(-period / tau), np.array([1.0 - g.sum()])
+        return self.Constants(np.exp(-period / tau), ramp, rest, 1.0 / (rest + ramp.sum()))
 
 
 @fast
-def predict_history(viscoelasticity):  # type: ignore[no-untyped-def]
+def predict_history(model, data):  # type: ignore[no-untyped-def]
     """sum_i exp(-dt / tau_i) h_i - e sum_i r_i, of the modes, of the near field and of the tips."""
-    v, ramp = viscoelasticity, 0.0
-    for i in range(v.ramp.shape[0]):
-        ramp += v.ramp[i]
-    for k in range(v.held.shape[0]):
-        v.held[k] = -ramp * v.elastic[k]
-        for i in range(v.decay.shape[0]):
-            v.held[k] += v.decay[i] * v.past[i, k]
-    for m in range(v.count[0]):
+    memory, prony = data.viscoelasticity, model.viscoelasticity
+    ramp = 0.0
+    for i in range(prony.ramp.shape[0]):
+        ramp += prony.ramp[i]
+    for k in range(memory.held.shape[0]):
+        memory.held[k] = -ramp * memory.elastic[k]
+        for i in range(prony.decay.shape[0]):
+            memory.held[k] += prony.decay[i] * memory.past[i, k]
+    for m in range(memory.count[0]):
         for d in range(3):
-            v.near_held[m, d] = -ramp * v.near_elastic[m, d]
-            v.near_load[m, d] = 0.0
-            for i in range(v.decay.shape[0]):
-                v.near_held[m, d] += v.decay[i] * v.near_past[i, m, d]
-    for t in range(v.tip_held.shape[0]):
-        v.tip_held[t] = -ramp * v.tip_elastic[t]
-        for i in range(v.decay.shape[0]):
-            v.tip_held[t] += v.decay[i] * v.tip_past[i, t]
+            memory.near_held[m, d] = -ramp * memory.near_elastic[m, d]
+            memory.near_load[m, d] = 0.0
+            for i in range(prony.decay.shape[0]):
+                memory.near_held[m, d] += prony.decay[i] * memory.near_past[i, m, d]
+    for t in range(memory.tip_held.shape[0]):
+        memory.tip_held[t] = -ramp * memory.tip_elastic[t]
+        for i in range(prony.decay.shape[0]):
+            memory.tip_held[t] += prony.decay[i] * memory.tip_past[i, t]
 
 
 @inlined
-def held_load(viscoelasticity, t):  # type: ignore[no-untyped-def]
+def held_load(model, data, t):  # type: ignore[no-untyped-def]
     """The load on a tip that would keep its dent as it is [N]."""
-    return viscoelasticity.tip_held[t] if viscoelasticity.on else 0.0
+    return data.viscoelasticity.tip_held[t] if model.viscoelasticity.on else 0.0
 
 
 @fast
-def predict_modes(effects):  # type: ignore[no-untyped-def]
+def predict_modes(model, data):  # type: ignore[no-untyped-def]
     """Modes at the end of the period without any load, and their gain, without inertia."""
-    superposition, viscoelasticity = effects.superposition, effects.viscoelasticity
-    self_weight = effects.self_weight
-    gain = viscoelasticity.gain[0]
+    superposition = data.superposition
+    gain = model.viscoelasticity.gain[0]
     for k in range(superposition.free.shape[0]):
-        free = -gain * viscoelasticity.held[k]
-        if self_weight.on:
-            free += self_weight.amplitude[k]
+        free = -gain * data.viscoelasticity.held[k]
+        if model.self_weight.on:
+            free += model.self_weight.amplitude[k]
         superposition.free[k] = free
         superposition.gain[k] = gain
 
 
 @fast
-def near_free_displacement(model, state, viscoelasticity, t, near_free):  # type: ignore[no-untyped-def]
+def near_free_displacement(model, data, t, near_free):  # type: ignore[no-untyped-def]
     """Near displacement at the nodes of a tip by the load history, into (MAX_STENCIL, 3)."""
-    gain = viscoelasticity.gain[0]
-    for i in range(state.n_nodes[t]):
-        j = state.nodes[t, i]
+    memory = data.viscoelasticity
+    gain = model.viscoelasticity.gain[0]
+    for i in range(data.n_nodes[t]):
+        j = data.nodes[t, i]
         u0 = u1 = u2 = 0.0
-        for m in range(viscoelasticity.count[0]):
-            e = find_block(model.contact_start, model.contact_slot, j, viscoelasticity.position[m])
+        for m in range(memory.count[0]):
+            e = find_block(model.contact_start, model.contact_slot, j, memory.position[m])
             if e < 0:
                 continue
-            b, f = model.contact_block[e], viscoelasticity.near_held[m]
+            b, f = model.contact_block[e], memory.near_held[m]
             u0 -= b[0, 0] * f[0] + b[1, 0] * f[1] + b[2, 0] * f[2]
             u1 -= b[0, 1] * f[0] + b[1, 1] * f[1] + b[2, 1] * f[2]
             u2 -= b[0, 2] * f[0] + b[1, 2] * f[1] + b[2, 2] * f[2]
@@ -182,120 +162,121 @@ def near_free_displacement(model, state, viscoelasticity, t, near_free):  # type
 
 
 @fast
-def advance_history(state, effects):  # type: ignore[no-untyped-def]
+def advance_history(model, data):  # type: ignore[no-untyped-def]
     """Complete the period: e and h_i at its end."""
-    superposition, viscoelasticity = effects.superposition, effects.viscoelasticity
-    friction, self_weight = effects.friction, effects.self_weight
-    if not viscoelasticity.on:
+    if not model.viscoelasticity.on:
         return
-    v = viscoelasticity
-    for k in range(v.elastic.shape[0]):
-        new = superposition.total[k]
-        if self_weight.on:
-            new -= self_weight.amplitude[k]
+    memory, prony = data.viscoelasticity, model.viscoelasticity
+    for k in range(memory.elastic.shape[0]):
+        new = data.superposition.total[k]
+        if model.self_weight.on:
+            new -= model.self_weight.amplitude[k]
         if abs(new) < 1e-30:
             new = 0.0
-        change = new - v.elastic[k]
-        for i in range(v.decay.shape[0]):
-            past = v.decay[i] * v.past[i, k] + v.ramp[i] * change
-            v.past[i, k] = past if abs(past) > 1e-30 else 0.0
-        v.elastic[k] = new
-    for t in range(state.passage.shape[0]):
-        if state.force[t] <= 0.0:
+        change = new - memory.elastic[k]
+        for i in range(prony.decay.shape[0]):
+            past = prony.decay[i] * memory.past[i, k] + prony.ramp[i] * change
+            memory.past[i, k] = past if abs(past) > 1e-30 else 0.0
+        memory.elastic[k] = new
+    for t in range(data.passage.shape[0]):
+        if data.force[t] <= 0.0:
             continue
-        n = state.normal[t]
-        f0, f1, f2 = -state.force[t] * n[0], -state.force[t] * n[1], -state.force[t] * n[2]
-        if friction.on:
-            f0, f1, f2 = friction.push[t, 0], friction.push[t, 1], friction.push[t, 2]
-        for i in range(state.n_nodes[t]):
-            w = state.weight[t, i, 0]
+        f0, f1, f2 = force_on_tissue(model, data, t)
+        for i in range(data.n_nodes[t]):
+            w = data.weight[t, i, 0]
             if w != 0.0:
-                m = _slot_of(v, state.nodes[t, i])
-                v.near_load[m, 0] += w * f0
-                v.near_load[m, 1] += w * f1
-                v.near_load[m, 2] += w * f2
-    _advance_near_history(v)
-    _advance_tips(state, v)
+                m = _slot_of(model, data, data.nodes[t, i])
+                memory.near_load[m, 0] += w * f0
+                memory.near_load[m, 1] += w * f1
+                memory.near_load[m, 2] += w * f2
+    _advance_near_history(model, data)
+    _advance_tips(model, data)
 
 
 @fast
-def _advance_tips(state, v):  # type: ignore[no-untyped-def]
+def _advance_tips(model, data):  # type: ignore[no-untyped-def]
     """The history that each tip carries along; it ends with the contact."""
-    for t in range(v.tip_held.shape[0]):
-        on = state.active[t]
-        new = max(0.0, v.gain[0] * (state.force[t] - v.tip_held[t])) if on else 0.0
-        for i in range(v.decay.shape[0]):
-            past = v.decay[i] * v.tip_past[i, t] + v.ramp[i] * (new - v.tip_elastic[t])
-            v.tip_past[i, t] = past if on else 0.0
-        v.tip_elastic[t] = new
+    memory, prony = data.viscoelasticity, model.viscoelasticity
+    for t in range(memory.tip_held.shape[0]):
+        on = data.active[t]
+        new = max(0.0, prony.gain[0] * (data.force[t] - memory.tip_held[t])) if on else 0.0
+        for i in range(prony.decay.shape[0]):
+            past = prony.decay[i] * memory.tip_past[i, t] + prony.ramp[i] * (
+                new - memory.tip_elastic[t]
+            )
+            memory.tip_past[i, t] = past if on else 0.0
+        memory.tip_elastic[t] = new
 
 
 @fast
-def _advance_near_history(v):  # type: ignore[no-untyped-def]
+def _advance_near_history(model, data):  # type: ignore[no-untyped-def]
+    memory, prony = data.viscoelasticity, model.viscoelasticity
     m = 0
-    while m < v.count[0]:
+    while m < memory.count[0]:
         left = 0.0
         for d in range(3):
-            new = v.gain[0] * (v.near_load[m, d] - v.near_held[m, d])
-            change = new - v.near_elastic[m, d]
-            v.near_elastic[m, d] = new
-            left = max(left, abs(new), abs(v.near_load[m, d]))
-            for i in range(v.decay.shape[0]):
-                past = v.decay[i] * v.near_past[i, m, d] + v.ramp[i] * change
-                v.near_past[i, m, d] = past
+            new = prony.gain[0] * (memory.near_load[m, d] - memory.near_held[m, d])
+            change = new - memory.near_elastic[m, d]
+            memory.near_elastic[m, d] = new
+            left = max(left, abs(new), abs(memory.near_load[m, d]))
+            for i in range(prony.decay.shape[0]):
+                past = prony.decay[i] * memory.near_past[i, m, d] + prony.ramp[i] * change
+                memory.near_past[i, m, d] = past
                 left = max(left, abs(past))
         if left < _NEGLIGIBLE:
-            _remove(v, m)
+            _remove(model, data, m)
         else:
             m += 1
 
 
 @inlined
-def _slot_of(v, position):  # type: ignore[no-untyped-def]
+def _slot_of(model, data, position):  # type: ignore[no-untyped-def]
     """Slot of a load position in the near history, replacing the weakest if all are taken."""
-    m = v.slot[position]
+    memory = data.viscoelasticity
+    m = memory.slot[position]
     if m >= 0:
         return m
-    if v.count[0] == MAX_HISTORY:
+    if memory.count[0] == MAX_HISTORY:
         weakest, least = 0, np.inf
         for q in range(MAX_HISTORY):
-            e, f = v.near_elastic[q], v.near_load[q]
+            e, f = memory.near_elastic[q], memory.near_load[q]
             size = abs(e[0]) + abs(e[1]) + abs(e[2]) + abs(f[0]) + abs(f[1]) + abs(f[2])
             if size < least:
                 weakest, least = q, size
-        _remove(v, weakest)
-    m = v.count[0]
-    v.count[0] = m + 1
-    v.slot[position], v.position[m] = m, position
+        _remove(model, data, weakest)
+    m = memory.count[0]
+    memory.count[0] = m + 1
+    memory.slot[position], memory.position[m] = m, position
     for d in range(3):
-        v.near_elastic[m, d] = v.near_held[m, d] = v.near_load[m, d] = 0.0
-        for i in range(v.decay.shape[0]):
-            v.near_past[i, m, d] = 0.0
+        memory.near_elastic[m, d] = memory.near_held[m, d] = memory.near_load[m, d] = 0.0
+        for i in range(model.viscoelasticity.decay.shape[0]):
+            memory.near_past[i, m, d] = 0.0
     return m
 
 
 @inlined
-def _remove(v, m):  # type: ignore[no-untyped-def]
+def _remove(model, data, m):  # type: ignore[no-untyped-def]
     """Free a slot of the near history; the last one moves there."""
-    last = v.count[0] - 1
-    v.slot[v.position[m]] = -1
+    memory = data.viscoelasticity
+    last = memory.count[0] - 1
+    memory.slot[memory.position[m]] = -1
     if m != last:
-        v.position[m] = v.position[last]
-        v.slot[v.position[m]] = m
+        memory.position[m] = memory.position[last]
+        memory.slot[memory.position[m]] = m
         for d in range(3):
-            v.near_elastic[m, d] = v.near_elastic[last, d]
-            v.near_held[m, d] = v.near_held[last, d]
-            v.near_load[m, d] = v.near_load[last, d]
-            for i in range(v.decay.shape[0]):
-                v.near_past[i, m, d] = v.near_past[i, last, d]
-    v.count[0] = last
+            memory.near_elastic[m, d] = memory.near_elastic[last, d]
+            memory.near_held[m, d] = memory.near_held[last, d]
+            memory.near_load[m, d] = memory.near_load[last, d]
+            for i in range(model.viscoelasticity.decay.shape[0]):
+                memory.near_past[i, m, d] = memory.near_past[i, last, d]
+    memory.count[0] = last
 
 
 @fast
-def least_shown(viscoelasticity):  # type: ignore[no-untyped-def]
+def least_shown(data):  # type: ignore[no-untyped-def]
     """Load below which near history is left out of the cloud [N]."""
     strongest = 0.0
-    for m in range(viscoelasticity.count[0]):
-        e = viscoelasticity.near_elastic[m]
+    for m in range(data.viscoelasticity.count[0]):
+        e = data.viscoelasticity.near_elastic[m]
         strongest = max(strongest, e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
     return _SHOWN * np.sqrt(strongest)

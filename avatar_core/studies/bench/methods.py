@@ -10,23 +10,23 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 
-from avatar_core.common.array_table import ArrayTable
 from avatar_core.common.jit import compiled
-from avatar_core.contact import kernels
 from avatar_core.contact.cloud import shown_vertices
 from avatar_core.contact.display import write_cloud
-from avatar_core.contact.effects.selection import every_effect
 from avatar_core.contact.effects.several_tools import place_beside
-from avatar_core.contact.effects.tip_law import sample_organ
 from avatar_core.contact.locate import locate
-from avatar_core.contact.model import ContactModel, compiled_for, prepare, step
-from avatar_core.contact.tip_compliance import assemble_own, near_along_normal
+from avatar_core.contact.model import ContactData, compiled_for, model_of, step
+from avatar_core.contact.organ_response import assemble_own, near_along_normal
+from avatar_core.contact.solvers import solve_contact
+from avatar_core.contact.step import write_forces
 from avatar_core.contact.tool_path import slide, starts_apart
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.tip import Tip
+from avatar_core.tips.law import sample_law
 from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.model import Vademecum
 
@@ -69,9 +69,9 @@ def time_steps(vademecum: Vademecum, n_tools: int, modes: int | None = None) -> 
 
     modes : that are shown at a place; None for all
     """
-    model = prepare(vademecum, (SPHERE,) * n_tools, modes, shown_cloud(vademecum))
-    shown = model.n_modes
-    return _timed("vademecum", vademecum, model, shown, n_tools, lambda tips: step(model, tips))
+    model = model_of(vademecum, (SPHERE,) * n_tools, modes, shown_cloud(vademecum))
+    data = model.data()
+    return _timed("vademecum", vademecum, data, model.n_modes, _stepped(data))
 
 
 def time_tip_over_patch(
@@ -82,12 +82,13 @@ def time_tip_over_patch(
     Both slide in turn; the median over the pairs of slides.
     """
     tips = tool_paths(vademecum, 1)
-    models = [prepare(vademecum, (tip,), modes, cloud="volume") for tip in (SPHERE, PATCH)]
+    models = [model_of(vademecum, (tip,), modes, cloud="volume") for tip in (SPHERE, PATCH)]
+    sphere, patch = (model.data() for model in models)
 
-    def p50(model: ContactModel) -> float:
-        return float(np.median(one_pass(model, tips, lambda at: step(model, at), clock)[0]))
+    def p50(data: ContactData) -> float:
+        return float(np.median(one_pass(data, tips, _stepped(data), clock)[0]))
 
-    return float(np.median([p50(models[0]) / p50(models[1]) for _ in range(PASSES)]))
+    return float(np.median([p50(sphere) / p50(patch) for _ in range(PASSES)]))
 
 
 def time_dense_table(
@@ -100,8 +101,8 @@ def time_dense_table(
     if size > MAX_TABLE_BYTES:
         nan = float("nan")
         return StepRow("dense table", n_v, 0, n_tools, nan, 0, nan, nan, size)
-    model, call = _dense(vademecum, n_tools)
-    row = _timed("dense table", vademecum, model, 0, n_tools, call, clock)
+    data, call = _dense(vademecum, n_tools)
+    row = _timed("dense table", vademecum, data, 0, call, clock)
     return replace(row, bytes=size)
 
 
@@ -111,33 +112,36 @@ def table_over_steps(vademecum: Vademecum, clock: Clock = time.process_time) -> 
     Both slide in turn, so that a machine that slows down slows both; the median over the pairs.
     """
     tips = tool_paths(vademecum, 1)
-    model = prepare(vademecum, (SPHERE,), cloud=shown_cloud(vademecum))
+    data = model_of(vademecum, (SPHERE,), cloud=shown_cloud(vademecum)).data()
     dense, call = _dense(vademecum, 1)
 
     def ratio() -> float:
         table = np.median(one_pass(dense, tips, call, clock)[0])
-        return float(table / np.median(one_pass(model, tips, lambda at: step(model, at), clock)[0]))
+        return float(table / np.median(one_pass(data, tips, _stepped(data), clock)[0]))
 
     return float(np.median([ratio() for _ in range(PASSES)]))
 
 
+def _stepped(data: ContactData) -> Callable[[np.ndarray], object]:
+    """The step, of tools that do not turn."""
+    return lambda tips: step(data.model, data, tips)
+
+
 def _dense(
     vademecum: Vademecum, n_tools: int
-) -> tuple[ContactModel, Callable[[np.ndarray], object]]:
-    """A model whose state the dense table uses, and its step."""
-    cloud = shown_cloud(vademecum)
-    model = prepare(vademecum, (SPHERE,) * n_tools, cloud=cloud)
+) -> tuple[ContactData, Callable[[np.ndarray], object]]:
+    """The data that the dense table uses, and its step."""
+    cloud, linear = shown_cloud(vademecum), replace(vademecum, large=None)
+    data = model_of(linear, (SPHERE,) * n_tools, cloud=cloud).data()
     columns, compliance = _columns(vademecum, cloud), _compliance(vademecum)
-    arrays, state, out, _ = model.tables
-    effects = ArrayTable(model.effects._replace(large_deformation=None), every_effect())
-    around = (arrays, state, out, model.tips, effects, columns, compliance)
-    compiled_step = compiled_for(_dense_step, *around)
+    around = (data.model.table, data.table, columns, compliance)
+    compiled_step = compiled_for(_dense_step, *map(numba.typeof, around))
 
     def dense(tips: np.ndarray) -> None:
-        model.tips[:] = tips
+        data.state.tip[:] = tips
         compiled_step(*around)
 
-    return model, dense
+    return data, dense
 
 
 def time_direct(
@@ -174,30 +178,30 @@ def load_average() -> float:
 def _timed(
     method: str,
     vademecum: Vademecum,
-    model: ContactModel,
+    data: ContactData,
     modes: int,
-    n_tools: int,
     call: Callable[[np.ndarray], object],
     clock: Clock = time.perf_counter,
 ) -> StepRow:
+    n_tools = data.model.n_tools
     tips = tool_paths(vademecum, n_tools)
-    passes = [one_pass(model, tips, call, clock) for _ in range(PASSES)]
+    passes = [one_pass(data, tips, call, clock) for _ in range(PASSES)]
     contacts = np.concatenate([contacts for _, contacts in passes])
     return StepRow(
         method,
-        len(model.out.cloud),
+        len(data.out.cloud),
         modes,
         n_tools,
         float(contacts.mean()),
         int(contacts.min()),
         float(np.median([np.median(micro) for micro, _ in passes])),
         float(np.median([np.quantile(micro, 0.99) for micro, _ in passes])),
-        model.nbytes,
+        data.model.nbytes,
     )
 
 
 def one_pass(
-    model: ContactModel,
+    data: ContactData,
     tips: np.ndarray,
     call: Callable[[np.ndarray], object],
     clock: Clock = time.perf_counter,
@@ -213,7 +217,7 @@ def one_pass(
         start = clock()
         call(tips[k])
         times[k] = clock() - start
-        contacts[k] = model.out.n_contacts[0]
+        contacts[k] = data.out.n_contacts[0]
     kept = (np.arange(len(tips)) >= 200) & (contacts >= tips.shape[1])  # caches are warm by then
     return times[kept] * 1e6, contacts[kept]
 
@@ -252,52 +256,51 @@ def _compliance(vademecum: Vademecum) -> np.ndarray:
 
 
 @compiled(fastmath=True)
-def _dense_step(model, state, out, tips, effects, columns, compliance):  # type: ignore[no-untyped-def]
+def _dense_step(model, data, columns, compliance):  # type: ignore[no-untyped-def]
     """:func:`avatar_core.contact.model.step` with stored columns instead of modes."""
-    e = effects
-    for t in range(tips.shape[0]):
-        locate(model, state, t, tips[t], e.superposition, e.tip_law)
-        state.mode[t] = np.float32(0.0)
-        if not state.active[t]:
-            state.force[t] = 0.0
+    for t in range(data.tip.shape[0]):
+        locate(model, data, t, data.tip[t])
+        data.mode[t] = np.float32(0.0)
+        if not data.active[t]:
+            data.force[t] = 0.0
             continue
-        _dense_column(state, t, t, compliance, state.column[t])
-        near = near_along_normal(state, t, state.column[t])
-        assemble_own(model, state, t, near)
-        sample_organ(model, e.tip_law, t, tips[t])
-    _couple_dense(state, e.several_tools, e.tip_law, compliance)
-    kernels.solve_contact(model, state, tips, e)
-    kernels.write_forces(model, state, out, tips, e)
-    u = state.field[: columns.shape[2]]
+        _dense_column(data, t, t, compliance, data.column[t])
+        near = near_along_normal(data, t, data.column[t])
+        assemble_own(model, data, t, near)
+        sample_law(model, data, t, data.tip[t])
+    _couple_dense(model, data, compliance)
+    solve_contact(model, data)
+    write_forces(model, data)
+    u = data.field[: columns.shape[2]]
     u[:] = np.float32(0.0)
-    for t in range(tips.shape[0]):
-        for i in range(state.n_nodes[t] if state.force[t] > 0.0 else 0):
-            force = -state.weight[t, i, 0] * state.force[t]
+    for t in range(data.tip.shape[0]):
+        for i in range(data.n_nodes[t] if data.force[t] > 0.0 else 0):
+            force = -data.weight[t, i, 0] * data.force[t]
             for c in range(3):
-                row, f = columns[state.nodes[t, i], c], np.float32(force * state.normal[t, c])
+                row, f = columns[data.nodes[t, i], c], np.float32(force * data.normal[t, c])
                 for k in range(u.shape[0]):
                     u[k] += f * row[k]
-    write_cloud(model, state, out.cloud, e.tip_law, e.dent, e.display)
+    write_cloud(model, data)
 
 
 @compiled(fastmath=True)
-def _couple_dense(state, several_tools, tip_law, compliance):  # type: ignore[no-untyped-def]
-    if several_tools.on:
-        for t in range(state.passage.shape[0]):
-            for s in range(state.passage.shape[0]):
-                several_tools.near[t, s] = s != t
-                if s != t and state.active[t] and state.active[s]:
-                    _dense_column(state, t, s, compliance, several_tools.column[t, s])
-                    place_beside(state, several_tools, tip_law, t, s)
+def _couple_dense(model, data, compliance):  # type: ignore[no-untyped-def]
+    if model.several_tools.on:
+        for t in range(data.passage.shape[0]):
+            for s in range(data.passage.shape[0]):
+                data.several_tools.near[t, s] = s != t
+                if s != t and data.active[t] and data.active[s]:
+                    _dense_column(data, t, s, compliance, data.several_tools.column[t, s])
+                    place_beside(model, data, t, s)
 
 
 @compiled(fastmath=True)
-def _dense_column(state, t, s, compliance, column):  # type: ignore[no-untyped-def]
-    column[: state.n_nodes[s]] = 0.0
-    for i in range(state.n_nodes[t]):
+def _dense_column(data, t, s, compliance, column):  # type: ignore[no-untyped-def]
+    column[: data.n_nodes[s]] = 0.0
+    for i in range(data.n_nodes[t]):
         for c in range(3):
-            row = compliance[state.nodes[t, i], c]
-            f = state.weight[t, i, 0] * state.normal[t, c]
-            for q in range(state.n_nodes[s]):
+            row = compliance[data.nodes[t, i], c]
+            f = data.weight[t, i, 0] * data.normal[t, c]
+            for q in range(data.n_nodes[s]):
                 for d in range(3):
-                    column[q, d] += f * row[state.nodes[s, q], d]
+                    column[q, d] += f * row[data.nodes[s, q], d]

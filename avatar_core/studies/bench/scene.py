@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avatar_core.contact.layout import PERIOD
-from avatar_core.contact.model import ContactModel, make_model, step
+from avatar_core.contact.model import ContactData, ContactModel, step
 from avatar_core.contact.tool_path import push_and_slide, starts_apart
 from avatar_core.scene.model import Scene
 from avatar_core.scene.prepare import scene_spec
@@ -72,17 +72,18 @@ def time_scene(
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """A model and the ways of its tools, shape (n, n_tools, 3)."""
+    """Data of a model and the ways of its tools, shape (n, n_tools, 3)."""
 
     name: str
-    model: ContactModel
+    data: ContactData
     tips: np.ndarray
     layout_seconds: float
 
     def timed(self) -> np.ndarray:
         """Times of one pass from rest [us]."""
-        self.model.reset()
-        return one_pass(self.model, self.tips, lambda tips: step(self.model, tips))[0]
+        data = self.data
+        data.reset()
+        return one_pass(data, self.tips, lambda tips: step(data.model, data, tips))[0]
 
     def cost(self, times: Sequence[np.ndarray]) -> StepCost:
         """The medians over the passes."""
@@ -92,7 +93,7 @@ class _Prepared:
             for q in (0.5, 0.99)
         )
         return StepCost(
-            self.name, p50, p99, sum(map(len, times)), self.model.nbytes, self.layout_seconds
+            self.name, p50, p99, sum(map(len, times)), self.data.model.nbytes, self.layout_seconds
         )
 
 
@@ -101,24 +102,24 @@ def _prepared(vademecum: Vademecum, scene: Scene, name: str) -> _Prepared:
     spec = scene_spec(vademecum, scene)
     layout = spec.layout(spec.finest, PERIOD)
     laid_out = time.perf_counter()
-    model = make_model(layout)
+    data = ContactModel(layout).data()
     starts = starts_apart(vademecum, len(spec.tips))
     paths = [
         push_and_slide(vademecum, tip.offset, PUSH, DEPTH, STEPS, at)
         for tip, at in zip(spec.tips, starts, strict=True)
     ]
-    tips = _followed(model, np.ascontiguousarray(np.stack(paths, axis=1)))
-    return _Prepared(name, model, tips, laid_out - start)
+    tips = _followed(data, np.ascontiguousarray(np.stack(paths, axis=1)))
+    return _Prepared(name, data, tips, laid_out - start)
 
 
-def _followed(model: ContactModel, tips: np.ndarray) -> np.ndarray:
+def _followed(data: ContactData, tips: np.ndarray) -> np.ndarray:
     """The same ways on an organ that breathes: where it is in each period, from rest."""
-    respiration = model.effects.respiration
+    respiration = data.state.respiration
     if respiration is None:
         return tips
-    model.reset()
+    data.reset()
     out = tips.copy()
     for k in range(len(tips)):
-        step(model, tips[k])
+        step(data.model, data, tips[k])
         out[k] += respiration.shift
     return out

@@ -121,24 +121,6 @@ class PoseReader:
         return int(ContactState.STATUS_OK)
 
 
-def rotation_between(
-    before: tuple[float, float, float, float], now: tuple[float, float, float, float]
-) -> tuple[float, float, float]:
-    """Rotation vector from one orientation to another, in the frame of both [rad].
-
-    Twice the vector part of q_now q_before*, with the sign of the shorter rotation: exact to second
-    order in the angle, 4 % too short at 1 rad. Real-time safe.
-    """
-    a, b, c, d = before
-    i, j, k, w = now
-    twice = 2.0 if a * i + b * j + c * k + d * w >= 0.0 else -2.0
-    return (
-        twice * (d * i - w * a - j * c + k * b),
-        twice * (d * j - w * b - k * a + i * c),
-        twice * (d * k - w * c - i * b + j * a),
-    )
-
-
 def rotated(
     vector: tuple[float, float, float], orientation: tuple[float, float, float, float]
 ) -> tuple[float, float, float]:

@@ -3,8 +3,8 @@
 It waits for nothing but poses. Without a model it steps every fifth period, and no pose wakes it:
 there is no force to be late, and the wrench of zero keeps its deadline. While no tool is connected
 either, it steps ten times a second, until the node wakes it. An exception ends it, with a last
-wrench of zero. The node exchanges two references with it: the model in use and the record
-of times.
+wrench of zero. The node exchanges two references with it: the data of the model in use and the
+record of times.
 
 When a model replaces another, the loop steps both for ``BLEND`` seconds and publishes a mean of
 both whose weight moves linearly from the old model to the new one.
@@ -12,7 +12,7 @@ both whose weight moves linearly from the old model to the new one.
 The band of a force is that of the organ's, whatever of it is sent: it is neither limited nor faded.
 
 Before the organ's force is sent to a tool, a guard
-(:mod:`avatar_core.contact.haptics.force_guard`) limits it, fades it out on a fault and lets it come
+(:mod:`avatar_core.haptics.force_guard`) limits it, fades it out on a fault and lets it come
 back gradually. Stopping the loop counts as a fault.
 """
 
@@ -29,9 +29,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 from avatar_core.contact import model as contact
 from avatar_core.contact.force_band import ForceBand
-from avatar_core.contact.haptics import passivity
-from avatar_core.contact.haptics.force_guard import ForceGuard
 from avatar_core.contact.status import FAR_AWAY, Status
+from avatar_core.haptics import passivity
+from avatar_core.haptics.force_guard import ForceGuard
 from avatar_ros.framework import realtime
 from avatar_ros.framework.state_template import StateTemplate
 from avatar_ros.framework.templates import NO_STAMP, CloudTemplate, stamp_nanoseconds
@@ -53,8 +53,9 @@ _NO_ERROR = float("nan")  # of a force that no model gave
 
 
 class ActiveModel:
-    """A contact model with the message templates of its size; the loop exchanges them as one.
+    """Data of a contact model with the message templates of its size; the loop exchanges both.
 
+    data : ContactData; None without a model
     effects : names of the effects that it simulates
     shown_modes : which of its modes are shown, and how accurate these are
     band : of its forces; None without distributions of the material
@@ -63,21 +64,21 @@ class ActiveModel:
     def __init__(
         self,
         vademecum_id: str,
-        model: Any,
+        data: Any,
         settings: LoopSettings,
         effects: tuple[str, ...] = (),
         shown_modes: ShownModes | None = None,
         band: ForceBand | None = None,
     ) -> None:
         self.id = vademecum_id
-        self.model = model
+        self.data = data
         self.effects = effects
         self.shown_modes = shown_modes
         self.band = band
         self.cloud: CloudTemplate | None = None
-        if model is not None and len(model.out.cloud) > 0:
-            self.cloud = CloudTemplate(settings.frame_id, len(model.out.cloud))
-        capacity = 1 if model is None else len(model.out.contact_tool)
+        if data is not None and len(data.out.cloud) > 0:
+            self.cloud = CloudTemplate(settings.frame_id, len(data.out.cloud))
+        capacity = 1 if data is None else len(data.out.contact_tool)
         self.states = [
             StateTemplate(settings.frame_id, tool, vademecum_id, capacity)
             for tool in settings.tools
@@ -119,7 +120,7 @@ class ContactLoop:
         self._forces = np.zeros((len(tools), 3))
         self._publishers = publishers
         self._tips = np.full((len(tools), 3), FAR_AWAY)
-        self._rotations = np.zeros((len(tools), 3))
+        self._orientations = np.zeros((len(tools), 4))
         self._used = self.active  # of the last step
         self._outgoing: Any = None  # the model that it replaces, while both are stepped,
         self._outgoing_band: ForceBand | None = None  # and its band
@@ -210,44 +211,44 @@ class ContactLoop:
         if active is not self._used:
             self._begin_change(active)
         fresh, answered = False, NO_STAMP
-        for tool, tip, turn in zip(self._tools, self._tips, self._rotations, strict=True):
-            if tool.take(start, timeout, tip, turn, settings.safety.leap):
+        for tool, tip, turned in zip(self._tools, self._tips, self._orientations, strict=True):
+            if tool.take(start, timeout, tip, turned, settings.safety.leap):
                 fresh, answered = True, tool.stamp
         record.note_period(start - self._step_start, self._nominal)
         self._step_start = start
-        self._nominal = self._period if active.model is not None else self._idle_period(timeout)
+        self._nominal = self._period if active.data is not None else self._idle_period(timeout)
         self._due = self._next_due(start, fresh)
         if fresh:
             self._answered = start
             record.note_age(time.time_ns() - stamp_nanoseconds(answered))
-        model, outgoing = active.model, self._outgoing
+        data, outgoing = active.data, self._outgoing
         busy = 0
-        if model is not None:
-            self._solve(model)
+        if data is not None:
+            self._solve(data)
             busy = time.monotonic_ns() - start
         if outgoing is not None:
             self._solve(outgoing)
             self._blend = min(1.0, self._blend + self._part_per_step)
             self._blend_bands(active.band, self._outgoing_band)
-            _fade_in(model.out.force, outgoing.out.force, self._blend)
-            _fade_in(model.out.torque, outgoing.out.torque, self._blend)
-        self._publish_wrenches(start * 1e-9, model)
+            _fade_in(data.out.force, outgoing.out.force, self._blend)
+            _fade_in(data.out.torque, outgoing.out.torque, self._blend)
+        self._publish_wrenches(start * 1e-9, data)
         record.note_step(time.monotonic_ns() - start)
         if active.band is not None:
             self._publish_bands(active.band)
-        if model is not None:
-            contact.estimate_error(model)
+        if data is not None:
+            contact.estimate_error(data.model, data)
         for i, tool in enumerate(self._tools):
             self._publish_state(i, tool, active)
         self._cycle += 1
         if active.cloud is not None and self._cycle % settings.cloud_divisor == 0:
             begin = time.monotonic_ns()
-            contact.deform(model)
+            contact.deform(data.model, data)
             record.note_model(busy + time.monotonic_ns() - begin)
-            if outgoing is not None and len(outgoing.out.cloud) == len(model.out.cloud):
-                contact.deform(outgoing)
-                _fade_in(model.out.cloud, outgoing.out.cloud, self._blend)
-            active.cloud.points[:] = model.out.cloud
+            if outgoing is not None and len(outgoing.out.cloud) == len(data.out.cloud):
+                contact.deform(outgoing.model, outgoing)
+                _fade_in(data.out.cloud, outgoing.out.cloud, self._blend)
+            active.cloud.points[:] = data.out.cloud
             stamp = self._tools[0].stamp
             self._publishers.deformation.handle.publish_raw(active.cloud.serialise(stamp))
         if self._blend == 1.0:
@@ -259,22 +260,17 @@ class ContactLoop:
 
         Real-time safe.
         """
-        outgoing = self._used.model
+        outgoing = self._used.data
         if outgoing is not None:
             self._blend = 0.0
             if active.id == self._used.id:
-                active.model.resume(outgoing)
+                active.data.resume(outgoing)
         self._outgoing_band = self._used.band
         self._outgoing, self._used = outgoing, active
 
-    def _solve(self, model: Any) -> None:
+    def _solve(self, data: Any) -> None:
         """Forces at the tips of the moment. Real-time safe."""
-        if model.effects.friction is not None:
-            model.effects.friction.spin[:] = self._rotations
-        if model.axes is not None:
-            for tool, axis in zip(self._tools, model.axes, strict=True):
-                tool.point(model.shaft, axis)
-        contact.solve(model, self._tips)
+        contact.solve(data.model, data, self._tips, self._orientations)
 
     def _blend_bands(self, band: ForceBand | None, outgoing: ForceBand | None) -> None:
         """Fade in the band of a model, of forces that are not faded in yet. Real-time safe."""
@@ -303,23 +299,23 @@ class ContactLoop:
         due = self._due + self._nominal
         return due if due > start else start + self._nominal
 
-    def _publish_wrenches(self, now: float, model: Any) -> None:
+    def _publish_wrenches(self, now: float, data: Any) -> None:
         """Send the guarded forces; zero without a model or a pose. Real-time safe."""
         limits, energies = self.settings.safety.limits, self.energies
-        self._forces[:] = 0.0 if model is None else model.out.force
+        self._forces[:] = 0.0 if data is None else data.out.force
         if energies is not None:
             passivity.limit(energies, self._tips, self._forces)
-            if model is not None and self.settings.safety.passivity == "observe":
-                self._forces[:] = model.out.force
+            if data is not None and self.settings.safety.passivity == "observe":
+                self._forces[:] = data.out.force
         for i, (tool, guard) in enumerate(zip(self._tools, self.guards, strict=True)):
             wrench = tool.wrench
             wrench.force[:] = self._forces[i]
-            wrench.torque[:] = 0.0 if model is None else model.out.torque[i]
+            wrench.torque[:] = 0.0 if data is None else data.out.torque[i]
             guard.limits = limits
             guard.update(now, tool.fault == OK and not self._stopping, wrench.force, wrench.torque)
             if energies is not None:
                 energies.held[i, -1] = wrench.force
-            if model is not None or tool.connected:
+            if data is not None or tool.connected:
                 tool.answer()
 
     def _send_zero(self) -> None:
@@ -336,18 +332,18 @@ class ContactLoop:
         status = tool.fault
         if self._stopping:
             status = INACTIVE
-        elif active.model is None:
+        elif active.data is None:
             status = NO_MODEL
         elif status == OK:
-            status = int(active.model.out.status[i])
+            status = int(active.data.out.status[i])
             tool.note_solved(status)
             if status == OK and not guard.engaged:
                 status = ENGAGING
         n, error = 0, _NO_ERROR
-        if active.model is not None:
+        if active.data is not None:
             n, error = (
-                _write_contacts(template, active.model.out, i),
-                active.model.out.force_error[i],
+                _write_contacts(template, active.data.out, i),
+                active.data.out.force_error[i],
             )
         self._publishers.state.handle.publish_raw(
             template.serialise(tool.stamp, status, n, error, guard.sent_fraction)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from avatar_core.contact.haptics.force_guard import ForceGuard
-from avatar_core.contact.haptics.passivity import Passivity
 from avatar_core.contact.status import Status
+from avatar_core.haptics.force_guard import ForceGuard
+from avatar_core.haptics.passivity import Passivity
 from avatar_ros.framework.ports import ONE_CELL
 from avatar_ros.loop.device import OF_DEVICE
 from avatar_ros.loop.statuses import EXPLANATIONS, explanation

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from avatar_core.contact.haptics.force_guard import DEVICES, ForceLimits
-from avatar_core.contact.haptics.passivity import MAX_DELAY, Passivity, make_passivity
+from avatar_core.haptics.force_guard import DEVICES, ForceLimits
+from avatar_core.haptics.passivity import MAX_DELAY, Passivity, make_passivity
 from avatar_ros.framework.parameters import IDENTITY, Parameter, ParameterError, pose
 
 PASSIVITY = ("off", "observe", "control")

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from avatar_core.contact.haptics.shedding import Shedder
+from avatar_core.haptics.shedding import Shedder
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget, choose, mode_levels
 from avatar_ros.msg import LoopStatistics
 
@@ -28,16 +28,16 @@ class ShownModesReport:
 
 
 class ShownModes:
-    """The shown modes of one model; the node calls it once for each window.
+    """The shown modes of the loop's data; the node calls it once for each window.
 
     Parameters
     ----------
-    model : ContactModel
+    data : ContactData
     curve : of its cloud; None where none was measured
     """
 
-    def __init__(self, model: Any, curve: AccuracyCurve | None) -> None:
-        self._model, self._curve = model, curve
+    def __init__(self, data: Any, curve: AccuracyCurve | None) -> None:
+        self._data, self._curve = data, curve
         self._points = {p.detail.modes: p for p in curve.points} if curve else {}
         self.keep(None)
 
@@ -49,13 +49,13 @@ class ShownModes:
         AccuracyError
             If no number of modes meets the budget; everything then stays as it is.
         """
-        most = self._model.n_modes
+        most = self._data.model.n_modes
         if budget is not None:
             most = choose(self._curve, budget).detail.modes
         self._most = most
         fewer = (n for n in mode_levels(most) if LEAST_SHOWN <= n < most)
         self._shedder = Shedder([*fewer, most], budget.deadline if budget else math.inf)
-        self._model.show(most)
+        self._data.show(most)
 
     @property
     def accuracy(self) -> str:
@@ -76,12 +76,12 @@ class ShownModes:
 
         watched : a tool touches the organ, or somebody receives what is shown; else all modes are
         """
-        before = self._model.n_shown
+        before = self._data.n_shown
         self._describe(statistics, before)
         missed = statistics.missed / max(statistics.periods, 1)
         shedder = self._shedder
         modes = shedder.update(missed, statistics.step_p99) if watched else shedder.rest()
-        self._model.show(modes)
+        self._data.show(modes)
         text = f"{modes} of {self._most} modes shown"
         if shedder.is_shedding:
             text += (

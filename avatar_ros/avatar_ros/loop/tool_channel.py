@@ -8,16 +8,11 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
+from avatar_core.contact.orientation import composed
 from avatar_core.contact.status import FAR_AWAY, Status
 from avatar_ros.framework import qos
 from avatar_ros.framework.ports import PolledSubscriptions, Ports
-from avatar_ros.framework.templates import (
-    NO_STAMP,
-    PoseReader,
-    WrenchTemplate,
-    rotated,
-    rotation_between,
-)
+from avatar_ros.framework.templates import NO_STAMP, PoseReader, WrenchTemplate, rotated
 from avatar_ros.loop.safety import WRENCHES, Safety, band_topics
 from avatar_ros.loop.settings import LoopSettings
 
@@ -46,7 +41,7 @@ _N_STATUS = 32
 class ToolChannel:
     """One tool's subscription, publishers and last pose.
 
-    Poses come in the tool's frame; ``tip`` and ``turn`` of the step are in the organ's.
+    Poses come in the tool's frame; ``tip`` and ``orientation`` of the step are in the organ's.
 
     band_publishers : of the low and the high edge of the band of its force; may be none
     status : OK with a usable pose, otherwise the reason why there is none
@@ -86,7 +81,9 @@ class ToolChannel:
         self.faults = np.zeros(_N_STATUS, np.int64)
         self._edges = [WrenchTemplate(frame) for _ in band]
         self._reader = PoseReader(frame)
-        self._rotation = _rotation(safety.transform[3:])  # of the tool's frame in the organ's
+        i, j, k, w = np.array(safety.transform[3:]) / math.hypot(*safety.transform[3:])
+        self._frame = (float(i), float(j), float(k), float(w))  # of the tool in the organ's
+        self._rotation = _rotation(self._frame)
         self._is_turned = not np.array_equal(self._rotation, np.eye(3))
         self._origin = np.array(safety.transform[:3])
         self._turned = np.zeros(3)
@@ -102,7 +99,6 @@ class ToolChannel:
         self._sender = ""  # GID of the last publisher that was heard alone
         self._replaced: set[str] = set()  # publishers whose stream had ended when another's began
         self._several = False  # publishers, beside those that were replaced
-        self._orientation: tuple[float, float, float, float] | None = None  # of the last valid pose
         self._kind = safety.wrench
         self._axes = (0.0, 0.0, 0.0, 1.0)  # of the last valid pose, as long as the channel exists
 
@@ -122,29 +118,33 @@ class ToolChannel:
         return self.status if self.status != OK else self.device
 
     def take(
-        self, now: int, timeout: int, tip: np.ndarray, turn: np.ndarray, leap: float = math.inf
+        self,
+        now: int,
+        timeout: int,
+        tip: np.ndarray,
+        orientation: np.ndarray,
+        leap: float = math.inf,
     ) -> bool:
         """Take the newest pose, if any; true if a usable one came. Real-time safe.
 
         now, timeout : [ns]
         tip : receives the position [m]
-        turn : receives the rotation vector since the last valid pose [rad]; zero after a gap
+        orientation : receives that of the tool, a quaternion x y z w; zero without a usable pose
         leap : distance in 2 ms, proportionally more in a longer interval, that is a fault [m]
         """
-        turn[:] = 0.0
         taken = self.subscription.handle.take_message(PoseStamped, True)
         status = self._judge(taken, now, timeout, leap)
         if status != self.status:
             self.faults[status] += 1
             self.status = status
         if status != OK:
-            self._orientation = None
+            orientation[:] = 0.0
             held = status == INVALID_POSE and now - self._received <= timeout
             tip[:] = _UNKNOWN if held else FAR_AWAY
             return False
         if taken is None:
             return False
-        self._place(tip, turn)
+        self._place(tip, orientation)
         return True
 
     def note_solved(self, status: int) -> None:
@@ -172,19 +172,6 @@ class ToolChannel:
             (self._sender,) = alive
         self._several = len(alive) > 1
         self.senders, self.publishers, self._counted = senders, len(senders), now
-
-    def point(self, shaft: np.ndarray, axis: np.ndarray) -> None:
-        """Turn a direction in the frame of the last pose into the organ's frame. Real-time safe.
-
-        axis : receives it; zero without a valid pose
-        """
-        if self._orientation is None:
-            axis[:] = 0.0
-            return
-        axis[:] = rotated((shaft[0], shaft[1], shaft[2]), self._orientation)
-        if self._is_turned:
-            np.dot(self._rotation, axis, out=self._turned)
-            axis[:] = self._turned
 
     def answer(self) -> None:
         """Send ``wrench``, given in the organ's frame, as the tool takes it. Real-time safe."""
@@ -266,17 +253,16 @@ class ToolChannel:
         counted = self._several and self._renewed < self._counted
         return counted or self._mixed >= self._counted
 
-    def _place(self, tip: np.ndarray, turn: np.ndarray) -> None:
+    def _place(self, tip: np.ndarray, orientation: np.ndarray) -> None:
         """Transform the last pose into the organ's frame. Real-time safe."""
         tip[:] = self._last
-        if self._orientation is not None:
-            turn[:] = rotation_between(self._orientation, self._reader.orientation)
+        self._axes = self._reader.orientation
+        orientation[:] = self._axes
         if self._is_turned:
-            for part in (tip, turn):
-                np.dot(self._rotation, part, out=self._turned)
-                part[:] = self._turned
+            np.dot(self._rotation, tip, out=self._turned)
+            tip[:] = self._turned
+            orientation[:] = composed(self._frame, self._axes)
         tip += self._origin
-        self._orientation = self._axes = self._reader.orientation
 
 
 def tool_channels(ports: Ports, settings: LoopSettings) -> list[ToolChannel]:
@@ -316,7 +302,7 @@ def _channel(
 
 def _rotation(quaternion: tuple[float, ...]) -> np.ndarray:
     """The matrix of a unit quaternion x, y, z, w."""
-    i, j, k, w = np.array(quaternion) / math.hypot(*quaternion)
+    i, j, k, w = quaternion
     return np.array(
         [
             [1 - 2 * (j * j + k * k), 2 * (i * j - k * w), 2 * (i * k + j * w)],

@@ -23,13 +23,14 @@ from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
 from tf2_msgs.msg import TFMessage
 
+from avatar_core.common.array_table import gathered
 from avatar_core.common.jit import load_compiler
 from avatar_core.common.supports import SUPPORT
 from avatar_core.contact import model as contact
 from avatar_core.contact.force_band import ForceBand
-from avatar_core.contact.haptics import passivity
-from avatar_core.contact.layout import Layout
+from avatar_core.contact.layout import MODEL
 from avatar_core.errors import AccuracyError, CoordinateError, SceneError, one_line
+from avatar_core.haptics import passivity
 from avatar_core.reduction.coordinates import option_of
 from avatar_core.uncertainty.distributions import Distribution, mappings
 from avatar_core.uncertainty.known import Held
@@ -199,18 +200,18 @@ class ContactNode(ManagedNode):
         loop = self._loop
         if loop is None:
             return
-        model = contact.make_model(Layout.of(prepared.arrays))
+        data = contact.ContactModel(gathered(MODEL, prepared.arrays)).data()
         replaced = loop.active
         self._ranges, self._held = prepared.ranges, Held.of_plain(prepared.held)
         curve = AccuracyCurve.of_plain(prepared.curve) if prepared.curve else None
-        shown_modes = ShownModes(model, curve)
+        shown_modes = ShownModes(data, curve)
         try:
             shown_modes.keep(loop.settings.budget)
         except AccuracyError as error:
             self.get_logger().error(f"accuracy.*: {error}; all modes are shown")
-        band = ForceBand.of(model, prepared.arrays)
+        band = ForceBand.of(data, prepared.arrays)
         loop.active = ActiveModel(
-            prepared.id, model, loop.settings, prepared.effects, shown_modes, band
+            prepared.id, data, loop.settings, prepared.effects, shown_modes, band
         )
         loop.wake()
         what = ", ".join(prepared.effects) or "no effects"

@@ -85,7 +85,7 @@ class ContactReports:
     def _is_alone(self) -> bool:
         """Whether there is no vademecum, and nobody whose coming or going would matter."""
         connected = self._devices or any(tool.connected for tool in self._tools)
-        return self._loop.active.model is None and not connected
+        return self._loop.active.data is None and not connected
 
     def publish(self) -> None:
         """Publish statistics and diagnostics of the window that ends now."""
@@ -105,8 +105,8 @@ class ContactReports:
 
     def _is_watched(self) -> bool:
         """Whether a tool touches the organ, or somebody receives the cloud."""
-        model = self._loop.active.model
-        touched = model is not None and model.out.n_contacts[0] > 0
+        data = self._loop.active.data
+        touched = data is not None and data.out.n_contacts[0] > 0
         return touched or self._publishers.deformation.get_subscription_count() > 0
 
     def _publish_diagnostics(

@@ -40,12 +40,12 @@ class BandPreparer:
         notices : on each of the others, a line
         """
         from avatar_core.contact.effects import Tumour
-        from avatar_core.contact.effects.selection import find
-        from avatar_core.contact.effects.tumour import at_contrast
+        from avatar_core.contact.effects.base import find
 
         if not uncertainty:
             return Held.by(spec.vademecum).plain(), {}, ()
-        vademecum = at_contrast(spec.vademecum, find(spec.effects, Tumour))
+        tumour = find(spec.effects, Tumour) or Tumour(1.0)
+        vademecum = tumour.adapted(spec.vademecum)
         held = Held.by(vademecum)
         used, notices = usable_known(vademecum.name, held, of_mappings(uncertainty, "uncertainty"))
         arrays = self._arrays(vademecum, spec.tips, held.known(used)) if used else {}

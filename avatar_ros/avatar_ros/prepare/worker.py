@@ -105,9 +105,10 @@ class ModelPreparer:
         self, vademecum: Any, request: PreparationRequest, number: int, change: Change
     ) -> None:
         """Prepare the model of a vademecum that a request asks for, and send it."""
+        from avatar_core.common.array_table import flat, gathered
         from avatar_core.contact.force_band import ForceBand
-        from avatar_core.contact.layout import Layout
-        from avatar_core.contact.model import make_model
+        from avatar_core.contact.layout import MODEL
+        from avatar_core.contact.model import ContactModel
         from avatar_core.scene.file import parse_scene
         from avatar_core.vademecum.at_values import ranges
         from avatar_ros.prepare.scenes import model_spec, usable_material
@@ -116,13 +117,12 @@ class ModelPreparer:
         material, notices = usable_material(vademecum, request.material)
         spec = model_spec(vademecum, replace(request, material=material), scene)
         held, bands, unused = self._bands.prepare(spec, request.uncertainty)
-        handle, contents = write_shared(spec.layout(spec.finest, request.period).flat() | bands)
+        handle, contents = write_shared(flat(spec.layout(spec.finest, request.period)) | bands)
         try:
             # Compiles the step, if that was never done on this machine: the node then finds it in
             # numba's cache.
             arrays = map_shared(os.dup(handle), contents)
-            model = make_model(Layout.of(arrays))
-            ForceBand.of(model, arrays)
+            ForceBand.of(ContactModel(gathered(MODEL, arrays)).data(), arrays)
             ready = ModelReady(
                 number,
                 change,

@@ -14,14 +14,13 @@ from mcap_ros2.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from avatar_core.contact import model as contact
 from avatar_core.contact.effects import Effect
-from avatar_core.contact.haptics.force_guard import DEVICES, ForceGuard, ForceLimits
-from avatar_core.contact.model import prepare
 from avatar_core.contact.status import Status
 from avatar_core.contact.tool_path import push_and_slide
 from avatar_core.geometry.tip import Tip
+from avatar_core.haptics.force_guard import DEVICES, ForceGuard, ForceLimits
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.contact import prepare, solve
 from tests.helpers.paths import ROOT
 
 MESSAGES = ROOT / "avatar_ros" / "msg"
@@ -118,13 +117,13 @@ def simulated_cell(
     path = push_and_slide(vademecum, RADIUS, 4e-3, 3e-3, 500, 40)
     off = path[0] + 0.05 * (path[0] - path[len(path) // 2]) / np.linalg.norm(path[0] - path[250])
     tips = np.concatenate([np.repeat(off[None], 250, 0), path, np.repeat(off[None], 30, 0)])
-    model = prepare(vademecum, (Tip("sphere", RADIUS),), cloud="off", effects=tuple(effects))
+    data = prepare(vademecum, (Tip("sphere", RADIUS),), cloud="off", effects=tuple(effects))
     guard, n = ForceGuard(limits), len(tips)
     force, sent, share = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
     status = np.zeros(n, int)
     for k, tip in enumerate(tips):
-        contact.solve(model, tip[None])
-        force[k], status[k] = model.out.force[0], int(model.out.status[0])
+        solve(data, tip[None])
+        force[k], status[k] = data.out.force[0], int(data.out.status[0])
         sent[k] = force[k]
         guard.update(k * 1e-3, True, sent[k], np.zeros(3))
         share[k] = guard.sent_fraction

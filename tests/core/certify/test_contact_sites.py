@@ -24,8 +24,6 @@ from avatar_core.certify.contact_sites import (
 )
 from avatar_core.cli import picture
 from avatar_core.contact import timing
-from avatar_core.contact.effects.tip_law import LAW_ERROR
-from avatar_core.contact.model import estimate_error, prepare, step
 from avatar_core.errors import ContactError, MeshError, StorageError
 from avatar_core.fem.elasticity import Elasticity, Material
 from avatar_core.fem.patch_loads import load_surface
@@ -33,6 +31,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
+from avatar_core.tips.law import LAW_ERROR
 from avatar_core.vademecum.certificate import Certificate, ContactSites
 from avatar_core.vademecum.force_error import PROMISED, ForceError
 from avatar_core.vademecum.model import Provenance, Vademecum
@@ -41,6 +40,7 @@ from avatar_core.vademecum.tip_field import make_tip_field
 from tests.core.cli.test_cli import write_obj
 from tests.core.conftest import Command, box_mesh, box_regions
 from tests.helpers.box_organ import UP, organ
+from tests.helpers.contact import estimate_error, prepare, step
 
 SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
 BALL = Tip("sphere", 3e-3)
@@ -92,13 +92,13 @@ def certified(vademecum: Vademecum, found: ContactSites) -> Vademecum:
 def pressed(vademecum: Vademecum) -> tuple[float, float, float]:
     """Force on a sphere 2 mm deep, the error that is said, and sqrt(D) there."""
     tip = Tip("sphere", 5e-3)
-    model = prepare(vademecum, (tip,), cloud="off", effects=())
+    data = prepare(vademecum, (tip,), cloud="off", effects=())
     centre = np.array([0.05, 0.1, 0.05])
     for depth in (-1e-3, 2e-3):
-        step(model, (centre + (tip.offset - depth) * UP)[None])
-    estimate_error(model)
-    force = float(np.linalg.norm(model.out.force[0]))
-    return (force, float(model.out.force_error[0]), float(abs(model.state.steepness[0] - 1.0)))
+        step(data, (centre + (tip.offset - depth) * UP)[None])
+    estimate_error(data)
+    force = float(np.linalg.norm(data.out.force[0]))
+    return (force, float(data.out.force_error[0]), float(abs(data.state.steepness[0] - 1.0)))
 
 
 def test_the_factor_scales_the_laws_part_of_the_error_that_is_said(box: Vademecum) -> None:

@@ -14,7 +14,6 @@ import pytest
 from avatar_core.common import files
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.effects import Respiration
-from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import middle_of_access, push_and_slide
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
@@ -26,6 +25,7 @@ from avatar_core.vademecum import storage
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
 from tests.core.conftest import Command
+from tests.helpers.contact import prepare, step
 from tests.helpers.paths import PARAMS
 
 pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
@@ -253,10 +253,10 @@ def test_tools_push_and_slide_without_a_jump(phantom_vademecum: Vademecum) -> No
     )
     assert path.shape == (600, 3)
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 0.5e-3
-    model = prepare(phantom_vademecum, (Tip("sphere", radius),), cloud="off", effects=())
+    data = prepare(phantom_vademecum, (Tip("sphere", radius),), cloud="off", effects=())
     field, gaps = phantom_vademecum.tip_field, []
     for tip in path:
-        assert step(model, tip[None]) == 0
+        assert step(data, tip[None]) == 0
         place = (field.origin, field.spacing[0], tip, np.zeros(3), np.nan)
         gaps.append(evaluate(field.distance, *place) - radius)
     assert gaps[0] > 0
@@ -272,12 +272,12 @@ def test_tools_follow_the_breath(phantom_vademecum: Vademecum) -> None:
     moved = _prepared(
         phantom_vademecum, Scene(tools=tools, cloud="off", effects=(breath,)), "scene"
     )
-    moved.model.reset()
+    moved.data.reset()
     felt = []
     for one, other in zip(still.tips, moved.tips, strict=True):
-        step(still.model, one)
-        step(moved.model, other)
-        felt.append([still.model.out.force[0].copy(), moved.model.out.force[0].copy()])
+        step(still.data, one)
+        step(moved.data, other)
+        felt.append([still.data.out.force[0].copy(), moved.data.out.force[0].copy()])
     here, there = np.array(felt).transpose(1, 0, 2)
     assert np.abs(moved.tips - still.tips).max() > 0.9 * breath.amplitude
     np.testing.assert_allclose(there, here, atol=1e-6 * np.abs(here).max())

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import avatar_core
+from avatar_core.common import compiled_cache
 
 PACKAGE = Path(avatar_core.__file__).resolve().parent
 
@@ -92,3 +93,10 @@ def test_folders_of_other_contents_do_not_pile_up(tmp_path: Path) -> None:
     ).stdout.strip()
     left = {path.name for path in (tmp_path / "avatar").iterdir()}
     assert left == {Path(made).name} | {f"{i:016d}" for i in range(4, 12)}
+
+
+def test_code_that_is_compiled_into_other_files_is_of_the_rooms_that_are_hashed() -> None:
+    """Studies compile for themselves alone, and their files add their own content."""
+    package = Path(compiled_cache.__file__).parents[1]
+    using = [p for p in package.rglob("*.py") if "avatar_core.common.jit import" in p.read_text()]
+    assert {p.relative_to(package).parts[0] for p in using} <= {*compiled_cache.ROOMS, "studies"}

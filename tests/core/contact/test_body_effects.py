@@ -10,14 +10,14 @@ from skfem import Basis, BilinearForm, ElementTetP1, ElementTetP2, ElementVector
 from skfem.helpers import dot
 
 from avatar_core.contact.effects import Inertia, Respiration, SelfWeight
-from avatar_core.contact.effects.inertia import vibration_modes
-from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.contact.model import ContactData
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.coarse_liver import RADIUS, liver_model, press_in, spots
+from tests.helpers.contact import prepare, step
 from tests.helpers.energies import dent_energy, kinetic_energy
 from tests.helpers.tool_motion import AWAY, follow
 
@@ -58,36 +58,36 @@ def test_free_vibration_has_the_frequencies_of_the_whole_organ(
     free = np.flatnonzero(is_free)
     mass, stiffness = (m[free][:, free].tocsc() for m in (mass_matrix(v), elasticity.stiffness))
     value = sla.eigsh(stiffness, 5, mass, sigma=0.0, return_eigenvectors=False)
-    _, modal = vibration_modes(v, DENSITY)
+    modal = prepare(v, effects=(Inertia(density=DENSITY),)).model.arrays.inertia.mass
     np.testing.assert_allclose(1.0 / np.sqrt(modal[:5]), np.sqrt(np.sort(value)), rtol=0.01)
 
 
-def swing_energy(model: ContactModel) -> float:
-    inertia = model.effects.inertia
-    return kinetic_energy(inertia) + 0.5 * float(inertia.modes @ inertia.modes)
+def swing_energy(data: ContactData) -> float:
+    modes = data.state.inertia.modes
+    return kinetic_energy(data) + 0.5 * float(modes @ modes)
 
 
 @pytest.mark.long
 def test_a_released_organ_swings_out_with_its_frequencies() -> None:
     """The energy only falls, that of each mode as exp(- 2 zeta omega t)."""
     zeta, period, n_decay = 0.05, 1e-3, 400
-    model, spot = liver_model((Inertia(damping=zeta),)), spots()[0]
-    press_in(model, spot, RADIUS + 10e-3)
+    data, spot = liver_model((Inertia(damping=zeta),)), spots()[0]
+    press_in(data, spot, RADIUS + 10e-3)
     for _ in range(3000):
-        step(model, spot.tip(RADIUS + 10e-3)[None])
-    step(model, AWAY[None])
-    assert not model.out.force.any()
-    inertia = model.effects.inertia
-    moving = slice(len(inertia.mass))  # the other modes of contact follow at once
+        step(data, spot.tip(RADIUS + 10e-3)[None])
+    step(data, AWAY[None])
+    assert not data.out.force.any()
+    inertia, mass = data.state.inertia, data.model.arrays.inertia.mass
+    moving = slice(len(mass))  # the other modes of contact follow at once
     energy, modes, slowest = [], [], []
     for _ in range(3000):
-        energy.append(swing_energy(model))
-        modes.append(0.5 * (inertia.mass * inertia.velocity**2 + inertia.modes[moving] ** 2))
+        energy.append(swing_energy(data))
+        modes.append(0.5 * (mass * inertia.velocity**2 + inertia.modes[moving] ** 2))
         slowest.append(inertia.modes[0])
-        step(model, AWAY[None])
+        step(data, AWAY[None])
     assert energy[0] > 1e-3
     assert (np.diff(energy) <= 1e-12 * energy[0]).all()
-    omega = 1.0 / np.sqrt(inertia.mass)
+    omega = 1.0 / np.sqrt(mass)
     away = np.array(slowest)
     crossings = np.flatnonzero((away[:-1] < 0.0) & (away[1:] >= 0.0))
     frequency = (len(crossings) - 1) / (crossings[-1] - crossings[0]) / period
@@ -100,26 +100,26 @@ def test_a_released_organ_swings_out_with_its_frequencies() -> None:
         rate = -np.log(modes[last][k] / modes[0][k]) / (last * period)
         assert rate / (2.0 * zeta * omega[k]) == pytest.approx(1.0, abs=0.1)
     for _ in range(17_000):
-        step(model, AWAY[None])
-    assert np.abs(model.out.cloud[:, 3:]).max() < 1e-9
+        step(data, AWAY[None])
+    assert np.abs(data.out.cloud[:, 3:]).max() < 1e-9
 
 
 @pytest.mark.long
 def test_energy_never_grows_in_a_minute_of_swinging() -> None:
     """Without damping but the rule's own, and with a tip at rest that the organ strikes."""
-    model, spot = liver_model((Inertia(damping=0.0),)), spots()[0]
-    press_in(model, spot, 6e-3)
+    data, spot = liver_model((Inertia(damping=0.0),)), spots()[0]
+    press_in(data, spot, 6e-3)
     energy = []
     for k in range(60_000):
-        step(model, spot.tip(5e-3)[None] if k < 30_000 else AWAY[None])
-        near = model.state.compliance[0, 0] - float(
-            model.effects.superposition.gain @ model.state.mode[0].astype(float) ** 2
+        step(data, spot.tip(5e-3)[None] if k < 30_000 else AWAY[None])
+        near = data.state.compliance[0, 0] - float(
+            data.state.superposition.gain @ data.state.mode[0].astype(float) ** 2
         )
         held = 0.0
-        if model.state.force[0] > 0.0:
-            dent = dent_energy(model.effects.tip_law, 0)
-            held = 0.5 * near * model.state.force[0] ** 2 + dent
-        energy.append(swing_energy(model) + held)
+        if data.state.force[0] > 0.0:
+            dent = dent_energy(data, 0)
+            held = 0.5 * near * data.state.force[0] ** 2 + dent
+        energy.append(swing_energy(data) + held)
     values = np.array(energy)
     assert (np.diff(values) <= 1e-8 * values[0]).all()  # single precision of the near field
     assert (values[100:] - values[:-100] <= 1e-9 * values[0]).all()
@@ -150,12 +150,12 @@ def test_the_organ_sags_as_full_finite_elements_do(
     """Within the certificate's mean error; in truth to single precision."""
     v, down = phantom_vademecum, (0.3, -0.8, 0.5)
     effect = SelfWeight(density=DENSITY, gravity=9.81, direction=down)
-    model = prepare(v, (TIP,), cloud="volume", effects=(effect,))
-    step(model, AWAY[None])
+    data = prepare(v, (TIP,), cloud="volume", effects=(effect,))
+    step(data, AWAY[None])
     unit = np.array(down) / np.linalg.norm(down)
     exact = (sag @ unit)[: 3 * len(v.mesh.vertices)].reshape(-1, 3)
     mass = v.mesh.vertex_volumes[:, None]
-    error = np.sqrt((mass * (model.out.cloud[:, 3:] - exact) ** 2).sum() / (mass * exact**2).sum())
+    error = np.sqrt((mass * (data.out.cloud[:, 3:] - exact) ** 2).sum() / (mass * exact**2).sum())
     assert v.certificate is not None
     assert error < min(v.certificate.l2_mean, 1e-3)
     assert np.abs(exact).max() > 1e-4
@@ -171,12 +171,12 @@ def test_a_tip_meets_the_organ_where_it_hangs(
     ratio = []
     for j in inner[:: max(1, len(inner) // 12)]:
         normal = v.surface.normals[j]
-        model = prepare(v, (TIP,), cloud="off", effects=(SelfWeight(direction=tuple(normal)),))
-        step(model, (v.surface.centers[j] + (TIP.radius - 1e-3) * normal)[None])
+        data = prepare(v, (TIP,), cloud="off", effects=(SelfWeight(direction=tuple(normal)),))
+        step(data, (v.surface.centers[j] + (TIP.radius - 1e-3) * normal)[None])
         patch = patch_loads(elasticity, v.surface.centers[[j]], v.surface.patch_radius)
         exact = float(normal @ (patch.T @ (sag @ normal)))
         assert exact > 0.0
-        ratio.append(model.effects.superposition.free_normal[0] / exact)
+        ratio.append(data.state.superposition.free_normal[0] / exact)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.03)
     np.testing.assert_allclose(ratio, 1.0, atol=0.15)
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avatar_core.contact import kernels
+from avatar_core.common.array_table import flat, gathered
+from avatar_core.contact import step as kernels
 from avatar_core.contact.effects import (
     EFFECTS,
     Effect,
@@ -15,29 +16,25 @@ from avatar_core.contact.effects import (
     Inertia,
     Respiration,
     SelfWeight,
-    SeveralTools,
     Viscoelasticity,
 )
-from avatar_core.contact.layout import Layout, lay_out
-from avatar_core.contact.model import _effects, prepare, step
+from avatar_core.contact.layout import MODEL, lay_out
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.contact import data_of, prepare, step
 from tests.helpers.tool_motion import AWAY
 
 RADIUS = 10e-3
 SPHERE, PATCH = Tip("sphere", RADIUS), Tip("patch", RADIUS)
+OWN = ("large_deformation", "tumour", "tilt")  # tests: they need another organ, or another tip
 CHOICES: dict[str, Effect] = {
+    name: kind.example() for name, kind in EFFECTS.items() if name not in OWN
+}
+CHOICES |= {
     effect.name: effect
-    for effect in (
-        SeveralTools(),
-        Friction(),
-        Viscoelasticity((0.3, 0.2), (0.05, 1.0)),
-        Inertia(),
-        SelfWeight(),
-        Respiration(period=0.5),
-    )
+    for effect in (Viscoelasticity((0.3, 0.2), (0.05, 1.0)), SelfWeight(), Respiration(period=0.5))
 }
 
 
@@ -48,12 +45,12 @@ def test_an_effect_is_absent_from_the_step_when_off(
     """No array in the model: only None."""
     without = lay_out(phantom_vademecum, (PATCH,), effects=())
     with_it = lay_out(phantom_vademecum, (PATCH,), effects=(CHOICES[name],))
-    given, more = _effects(without), _effects(with_it)
-    assert all(value is None for value in given)
-    assert getattr(more, name) is not None
-    assert not [key for key in without.flat() if "." in key]
-    assert [key for key in with_it.flat() if key.startswith(f"{name}.")]
-    assert all(getattr(more, other) is None for other in CHOICES if other != name)
+    given, more = data_of(without).state, data_of(with_it).state
+    assert all(getattr(given, each, None) is None for each in ("superposition", *EFFECTS))
+    assert EFFECTS[name].State is None or getattr(more, name) is not None
+    assert not [key for key in flat(without) if "." in key]
+    assert [key for key in flat(with_it) if key.startswith(f"{name}.")]
+    assert all(getattr(with_it, other) is None for other in CHOICES if other != name)
 
 
 def test_all_scenes_share_one_compiled_step(phantom_vademecum: Vademecum) -> None:
@@ -63,23 +60,19 @@ def test_all_scenes_share_one_compiled_step(phantom_vademecum: Vademecum) -> Non
         assert len(kernel.signatures) == 1
 
 
-def test_the_list_of_effects_is_complete() -> None:
-    assert set(CHOICES) | {"large_deformation", "tumour", "tilt"} == set(EFFECTS)
-
-
 def test_a_layout_survives_being_flat(phantom_vademecum: Vademecum) -> None:
-    layout = lay_out(phantom_vademecum, (SPHERE,), effects=tuple(CHOICES.values()))
-    again = Layout.of(layout.flat())
-    for a, b in zip(layout.effects, again.effects, strict=True):
-        assert (a is None) == (b is None)
-        assert a is None or all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+    for effects in ((), tuple(CHOICES.values())):
+        arrays = flat(lay_out(phantom_vademecum, (SPHERE,), effects=effects))
+        again = flat(gathered(MODEL, arrays))
+        assert again.keys() == arrays.keys()
+        assert all(again[name] is array for name, array in arrays.items())
 
 
 @pytest.mark.long
 def test_everything_at_once_stays_sane(phantom_vademecum: Vademecum) -> None:
     """Two tools, all effects, ten seconds of touching: finite, bounded, and at rest in the end."""
     v = phantom_vademecum
-    model = prepare(v, (SPHERE,) * 2, cloud="surface", effects=tuple(CHOICES.values()))
+    data = prepare(v, (SPHERE,) * 2, cloud="surface", effects=tuple(CHOICES.values()))
     rng = np.random.default_rng(0)
     peak = 0.0
     for _ in range(10):
@@ -88,14 +81,14 @@ def test_everything_at_once_stays_sane(phantom_vademecum: Vademecum) -> None:
             depth = 6e-3 * np.sin(np.pi * k / 500) ** 2 - 1e-3
             drag = 3e-3 * np.sin(4 * np.pi * k / 500)
             centers, normals = v.surface.centers[pair], v.surface.normals[pair]
-            step(model, centers + (RADIUS - depth) * normals + drag * np.roll(normals, 1, axis=1))
-            assert np.isfinite(model.out.force).all()
-            assert np.isfinite(model.out.cloud).all()
-            peak = max(peak, float(np.abs(model.out.force).max()))
+            step(data, centers + (RADIUS - depth) * normals + drag * np.roll(normals, 1, axis=1))
+            assert np.isfinite(data.out.force).all()
+            assert np.isfinite(data.out.cloud).all()
+            peak = max(peak, float(np.abs(data.out.force).max()))
     assert 0.5 < peak < 100.0
     for _ in range(20_000):
-        step(model, np.array([AWAY, AWAY]))
-    memory = model.effects.viscoelasticity
+        step(data, np.array([AWAY, AWAY]))
+    memory = data.state.viscoelasticity
     assert np.abs(memory.past).max() < 1e-3 * peak
     assert np.abs(memory.near_elastic[: memory.count[0]]).max(initial=0.0) < 1e-3
 

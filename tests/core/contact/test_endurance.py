@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 from avatar_core.contact.effects import Effect, Friction, Viscoelasticity
-from avatar_core.contact.model import ContactModel, Status, step
+from avatar_core.contact.model import ContactData, Status
 from tests.helpers.coarse_liver import Spot, liver_model, spots
+from tests.helpers.contact import step
 from tests.helpers.paths import ROOT
 from tests.helpers.tool_motion import AWAY, follow
 
@@ -73,9 +74,9 @@ def wander(spot: Spot, n_tools: int, n: int, rng: np.random.Generator) -> np.nda
     return spot.tip(0.0) + path @ np.array([spot.normal, spot.along, spot.across])
 
 
-def check_energy(model: ContactModel, path: np.ndarray, force: np.ndarray) -> None:
+def check_energy(data: ContactData, path: np.ndarray, force: np.ndarray) -> None:
     """The work so far and what the trapezoidal rule may miss of it are together never negative."""
-    stiff = 1.0 / float(model.arrays.self_compliance[model.arrays.row >= 0].min())
+    stiff = 1.0 / float(data.model.arrays.self_compliance[data.model.arrays.row >= 0].min())
     way, touching = np.diff(path, axis=0), force.any(axis=2)
     work = -0.5 * ((force[1:] + force[:-1]) * way).sum(axis=(1, 2))
     changed = touching[1:] != touching[:-1]
@@ -95,21 +96,21 @@ def test_minutes_change_nothing(scene: str, minutes: float, n_stretches: int) ->
     """So many minutes of contact, between as many rests as there are stretches."""
     without_huge_pages()
     effects, n_tools = SCENES[scene]
-    model = liver_model(effects, n_tools)
+    data = liver_model(effects, n_tools)
     rng, seen, places = np.random.default_rng(7), set[int](), spots(30e-3)
     away, contacts, memory = np.tile(AWAY, (n_tools, 1)), [], []
     for k in range(n_stretches):
-        model.reset()
+        data.reset()
         path = wander(places[k % 3], n_tools, round(minutes * MINUTE / n_stretches), rng)
         path[1998::1999] = np.nan  # poses that are none; the rule spans their periods
-        motion = follow(model, path)
+        motion = follow(data, path)
         seen.update(motion.status.ravel().tolist())
         is_pose = np.isfinite(path[:, 0, 0])
-        check_energy(model, path[is_pose], motion.force[is_pose])
+        check_energy(data, path[is_pose], motion.force[is_pose])
         contacts.append(motion.force.any(axis=2).mean())
         for _ in range(14_000 if n_tools > 1 else 1):  # 18 times the slowest creep
-            seen.add(step(model, away))
-        assert np.abs(model.out.cloud[:, 3:]).max() < 1e-9
+            seen.add(step(data, away))
+        assert np.abs(data.out.cloud[:, 3:]).max() < 1e-9
         if k >= 3:  # the first touch every page of the model once
             memory.append(resident())
     assert np.mean(contacts) > 0.15
@@ -119,6 +120,6 @@ def test_minutes_change_nothing(scene: str, minutes: float, n_stretches: int) ->
     assert grown < 2**20, f"{grown} bytes more"
     path, before = wander(places[0], n_tools, 2000, rng), items()
     for tips in path:
-        step(model, tips)
+        step(data, tips)
     more = items() - before
     assert more < 200, f"{more} more items in lists, dictionaries and sets"

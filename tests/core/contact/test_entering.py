@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from avatar_core.common.splines import evaluate
 from avatar_core.contact.effects import Effect, Friction, Viscoelasticity
 from avatar_core.contact.locate import BARRED, ENTRY_DEPTH, LEAP, MAX_DEPTH
-from avatar_core.contact.model import Status, make_model, step
+from avatar_core.contact.model import Status
 from tests.helpers.coarse_liver import RADIUS, Spot, any_spot, liver, liver_model, press_in, spots
+from tests.helpers.contact import step
 from tests.helpers.examples import examples
 from tests.helpers.tool_motion import follow, line
 
@@ -40,13 +41,13 @@ def farthest(spot: Spot) -> Spot:
 def test_tip_that_starts_inside_gets_no_force_before_it_has_left(
     spot: Spot, depth: float, aside: float
 ) -> None:
-    model = liver_model()
+    data = liver_model()
     outside = spot.tip(-2e-3, along=aside)
-    out = follow(model, line(spot.tip(RADIUS + depth), outside, 0.5e-3))
+    out = follow(data, line(spot.tip(RADIUS + depth), outside, 0.5e-3))
     assert set(out.status.ravel()) == {Status.OK, Status.OUT_OF_RANGE}
     assert out.status[0] == Status.OUT_OF_RANGE and out.status[-1] == Status.OK
     assert not out.force.any()
-    back = follow(model, line(outside, spot.tip(4e-3), 0.5e-3))
+    back = follow(data, line(outside, spot.tip(4e-3), 0.5e-3))
     assert (back.status == Status.OK).all()
     fresh = liver_model()
     step(fresh, spot.tip(4e-3)[None])
@@ -57,10 +58,10 @@ def test_tip_that_starts_inside_gets_no_force_before_it_has_left(
 @pytest.mark.long
 def test_push_through_the_organ_at_5_m_per_s() -> None:
     """The force grows with the depth; beyond 25 mm, and once barred, it is none."""
-    model, spot = liver_model(), spots()[0]
-    stiff = 1.0 / float(model.arrays.self_compliance[model.arrays.row >= 0].min())
+    data, spot = liver_model(), spots()[0]
+    stiff = 1.0 / float(data.model.arrays.self_compliance[data.model.arrays.row >= 0].min())
     path = line(spot.tip(-2e-3), spot.tip(RADIUS + 60e-3), FAST * 1e-3)
-    push = follow(model, path)
+    push = follow(data, path)
     size = np.linalg.norm(push.force[:, 0], axis=1)
     assert 10.0 < size.max() < 1.5 * stiff * (RADIUS + MAX_DEPTH)
     f, unused = liver().tip_field, np.zeros(3)
@@ -75,14 +76,14 @@ def test_push_through_the_organ_at_5_m_per_s() -> None:
 @pytest.mark.parametrize("effects", [(), (FRICTION,)], ids=["bare", "friction"])
 def test_release_at_full_load(effects: tuple[Effect, ...], far: float) -> None:
     """In a period there is no force, no contact and no displacement left, to the bit."""
-    model, spot = liver_model(effects), spots()[0]
-    press_in(model, spot, RADIUS + 15e-3)
-    cloud, rest = model.out.cloud, model.arrays.rest[:, :3]
-    assert model.out.force.any() and cloud[:, 3:].any()
+    data, spot = liver_model(effects), spots()[0]
+    press_in(data, spot, RADIUS + 15e-3)
+    cloud, rest = data.out.cloud, data.model.arrays.rest[:, :3]
+    assert data.out.force.any() and cloud[:, 3:].any()
     np.testing.assert_allclose(cloud[:, :3], rest + cloud[:, 3:], atol=1e-7)
-    assert step(model, (spot.tip(0.0) + far * spot.normal)[None]) == Status.OK
-    assert not model.out.force.any() and not model.out.torque.any()
-    assert model.out.n_contacts[0] == 0
+    assert step(data, (spot.tip(0.0) + far * spot.normal)[None]) == Status.OK
+    assert not data.out.force.any() and not data.out.torque.any()
+    assert data.out.n_contacts[0] == 0
     assert not cloud[:, 3:].any()
 
 
@@ -94,24 +95,24 @@ def test_release_at_full_load(effects: tuple[Effect, ...], far: float) -> None:
 def test_tip_that_leaps_into_the_organ_is_barred(one: Spot, other: Spot, deep: float) -> None:
     inside = other.tip(RADIUS + deep)
     assume(np.linalg.norm(inside - one.tip(RADIUS + 4e-3)) > LEAP)
-    model = liver_model()
-    press_in(model, one, RADIUS + 4e-3)
-    assert model.out.force.any()
-    assert step(model, inside[None]) == Status.OUT_OF_RANGE
-    assert not model.out.force.any() and model.state.passage[0] == BARRED
-    out = follow(model, line(inside, other.tip(-3e-3), 1e-3))
+    data = liver_model()
+    press_in(data, one, RADIUS + 4e-3)
+    assert data.out.force.any()
+    assert step(data, inside[None]) == Status.OUT_OF_RANGE
+    assert not data.out.force.any() and data.state.passage[0] == BARRED
+    out = follow(data, line(inside, other.tip(-3e-3), 1e-3))
     assert not out.force.any()
 
 
 def test_a_leap_between_two_touches_drags_nothing_along() -> None:
-    model, spot = liver_model((FRICTION,)), spots()[0]
+    data, spot = liver_model((FRICTION,)), spots()[0]
     other = farthest(spot).tip(4e-3)[None]
-    press_in(model, spot, 4e-3)
-    assert step(model, other) == Status.OK
-    leapt = model.out.force[0].copy()
-    model.reset()
-    step(model, other)
-    np.testing.assert_allclose(leapt, model.out.force[0], rtol=1e-9, atol=1e-9)
+    press_in(data, spot, 4e-3)
+    assert step(data, other) == Status.OK
+    leapt = data.out.force[0].copy()
+    data.reset()
+    step(data, other)
+    np.testing.assert_allclose(leapt, data.out.force[0], rtol=1e-9, atol=1e-9)
 
 
 # --- Poses that are none --------------------------------------------------------------------------
@@ -124,38 +125,38 @@ def test_invalid_pose_is_forgotten_at_once(effects: tuple[Effect, ...]) -> None:
     press_in(bare, spot, RADIUS + 10e-3)
     before = bare.out.force.copy()
     for broken in ([np.nan] * 3, [np.inf, 0, 0], [0, -np.inf, 0], [np.inf, -np.inf, np.nan]):
-        model = liver_model(effects)
-        press_in(model, spot, RADIUS + 10e-3)
-        assert step(model, np.array([broken], float)) == Status.INVALID_POSE
-        assert not model.out.force.any() and model.out.n_contacts[0] == 0
-        assert step(model, spot.tip(RADIUS + 10e-3)[None]) == Status.OK
-        off = float(np.abs(model.out.force - before).max() / np.abs(before).max())
+        data = liver_model(effects)
+        press_in(data, spot, RADIUS + 10e-3)
+        assert step(data, np.array([broken], float)) == Status.INVALID_POSE
+        assert not data.out.force.any() and data.out.n_contacts[0] == 0
+        assert step(data, spot.tip(RADIUS + 10e-3)[None]) == Status.OK
+        off = float(np.abs(data.out.force - before).max() / np.abs(before).max())
         # without memory nothing has passed; of one, up to g / tau a second in 17 periods of entry
         assert off <= (0.5 / 0.2 * 17e-3 if effects == SELECTIONS["viscoelastic"] else 1e-6)
-        assert np.isfinite(model.out.cloud).all()
+        assert np.isfinite(data.out.cloud).all()
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 def test_invalid_poses_open_no_door(broken: float) -> None:
     """Neither to a tip that is barred, nor to one that went on into the organ unseen."""
     spot, lost = spots()[0], np.full((1, 3), broken)
-    model = liver_model()
+    data = liver_model()
     for depth in (RADIUS + 10e-3, RADIUS + 3e-3):
-        assert step(model, spot.tip(depth)[None]) == Status.OUT_OF_RANGE
-        step(model, lost)
-    assert step(model, spot.tip(RADIUS + 3e-3)[None]) == Status.OUT_OF_RANGE
-    assert not model.out.force.any()
-    model.reset()
-    press_in(model, spot, 1e-3)
+        assert step(data, spot.tip(depth)[None]) == Status.OUT_OF_RANGE
+        step(data, lost)
+    assert step(data, spot.tip(RADIUS + 3e-3)[None]) == Status.OUT_OF_RANGE
+    assert not data.out.force.any()
+    data.reset()
+    press_in(data, spot, 1e-3)
     for _ in range(100):
-        step(model, lost)
-    assert step(model, spot.tip(RADIUS + 12e-3)[None]) == Status.OUT_OF_RANGE
-    assert not model.out.force.any()
+        step(data, lost)
+    assert step(data, spot.tip(RADIUS + 12e-3)[None]) == Status.OUT_OF_RANGE
+    assert not data.out.force.any()
     # as deep as a contact may begin it comes in anew
-    model.reset()
-    press_in(model, spot, 1e-3)
-    step(model, lost)
-    assert step(model, spot.tip(RADIUS + ENTRY_DEPTH - 1e-3)[None]) == Status.OK
+    data.reset()
+    press_in(data, spot, 1e-3)
+    step(data, lost)
+    assert step(data, spot.tip(RADIUS + ENTRY_DEPTH - 1e-3)[None]) == Status.OK
 
 
 def test_each_tool_has_its_own_status() -> None:
@@ -171,11 +172,11 @@ def test_model_that_takes_over_goes_on_where_the_tip_is() -> None:
     other = farthest(spot)
     assert np.linalg.norm(other.center - spot.center) > LEAP + MAX_DEPTH
     for place, status in ((spot, Status.OK), (other, Status.OUT_OF_RANGE)):
-        model, later = liver_model(), liver_model((FRICTION,))
-        press_in(model, spot, RADIUS + 12e-3)
-        later.resume(model)
+        data, later = liver_model(), liver_model((FRICTION,))
+        press_in(data, spot, RADIUS + 12e-3)
+        later.resume(data)
         assert step(later, place.tip(RADIUS + 12e-3)[None]) == status
         assert later.out.force.any() == (status == Status.OK)
-    fresh = make_model(liver_model().layout)
-    fresh.resume(model)
-    np.testing.assert_array_equal(fresh.state.seen, model.state.seen)
+    fresh = data.model.data()
+    fresh.resume(data)
+    np.testing.assert_array_equal(fresh.state.seen, data.state.seen)

@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from avatar_core.contact.effects import SeveralTools
-from avatar_core.contact.effects.tip_law import dent
 from avatar_core.contact.fine_surface import FineSurface, find_touch, fine_surface
-from avatar_core.contact.model import prepare
 from avatar_core.geometry.tip import Tip
+from avatar_core.tips.law import dent
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.box_organ import UP, organ, top
+from tests.helpers.contact import prepare
 from tests.helpers.shown_dent import DEPTH, END, SPHERE, sneddon_dent
 from tests.helpers.tool_motion import press
 
@@ -35,10 +35,10 @@ def cube() -> Vademecum:
 @pytest.fixture(scope="module")
 def clouds(cube: Vademecum) -> list[np.ndarray]:
     """Under the sphere at each of the places."""
-    model, found = prepare(cube, (SPHERE,), effects=()), []
+    data, found = prepare(cube, (SPHERE,), effects=()), []
     for aside in ASIDE:
-        press(model, (SPHERE,), place(aside)[None], UP[None], DEPTH)
-        found.append(model.out.cloud.copy())
+        press(data, (SPHERE,), place(aside)[None], UP[None], DEPTH)
+        found.append(data.out.cloud.copy())
     return found
 
 
@@ -97,22 +97,22 @@ def vector_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("tip", [SPHERE, Tip("flat", 4e-3), Tip("cone", 8e-3, 60.0)])
 def test_the_dent_of_a_cloud_is_found_again(cube: Vademecum, tip: Tip) -> None:
-    model = prepare(cube, (tip,), effects=())
-    press(model, (tip,), place(ASIDE[1])[None], UP[None], DEPTH)
+    data = prepare(cube, (tip,), effects=())
+    press(data, (tip,), place(ASIDE[1])[None], UP[None], DEPTH)
     touch = find_touch(cube, tip, pose(ASIDE[1], tip))
     assert touch is not None
-    delta, _, _, a = dent(model.effects.tip_law, 0)
+    delta, _, _, a = dent(data.model.arrays, data.state, 0)
     assert touch.radius == pytest.approx(a, rel=0.01)
     assert touch.wall + tip.depth(np.array(touch.radius)) == pytest.approx(delta, rel=0.01)
-    np.testing.assert_allclose(touch.point, model.state.point[0], atol=1e-6)
+    np.testing.assert_allclose(touch.point, data.state.point[0], atol=1e-6)
 
 
 def test_two_dents_are_both_drawn(cube: Vademecum) -> None:
     """Far from one another, each as if it were alone; those between them meet in the cloud."""
     far = ((-20e-3, 0.0), (20e-3, 0.0))
-    model = prepare(cube, (SPHERE, SPHERE), effects=(SeveralTools(),))
-    press(model, (SPHERE, SPHERE), np.array([*map(place, far)]), np.array([UP, UP]), DEPTH)
-    cloud, poses = model.out.cloud, np.array([*map(pose, far)])
+    data = prepare(cube, (SPHERE, SPHERE), effects=(SeveralTools(),))
+    press(data, (SPHERE, SPHERE), np.array([*map(place, far)]), np.array([UP, UP]), DEPTH)
+    cloud, poses = data.out.cloud, np.array([*map(pose, far)])
     both = fine_surface(cube, cloud, [SPHERE, SPHERE], poses)
     for k, aside in enumerate(far):
         one = fine_surface(cube, cloud, [SPHERE], poses[[k]])

@@ -10,14 +10,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from avatar_core.contact.effects import Friction, SeveralTools
-from avatar_core.contact.effects.selection import Constants, selected_arrays
-from avatar_core.contact.effects.tip_law import dent
-from avatar_core.contact.effects.tip_profile import STIFFNESS, TAKEN
-from avatar_core.contact.layout import Layout
-from avatar_core.contact.model import ContactModel, Status, make_model, prepare, step
+from avatar_core.contact.model import ContactData, Status
 from avatar_core.geometry.tip import Shape, Tip
+from avatar_core.tips.law import dent
+from avatar_core.tips.profile import STIFFNESS, TAKEN
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.coarse_liver import RADIUS, Spot, any_spot, liver_model, spots
+from tests.helpers.contact import data_of, prepare, step
 from tests.helpers.energies import stored_energy
 from tests.helpers.examples import examples
 from tests.helpers.flat_organ import COMPLIANCE, at_depth, flat_organ
@@ -27,13 +26,15 @@ often = examples(40, least=16)
 CLOSED = 2e-9  # the tolerance of a gap, and of its neighbours' [m]
 
 
-def complementarity(model: ContactModel) -> float:
+def complementarity(data: ContactData) -> float:
     """Of Signorini: deepest penetration, or largest gap under a force [m]."""
-    s, law = model.state, model.effects.tip_law
+    s, law = data.state, data.state.law
     active = np.flatnonzero(s.active)
     left = s.gap[active] + s.compliance[np.ix_(active, active)] @ s.force[active]
     if law is not None:
-        left += [dent(law, t)[0] - law.value[t, TAKEN] * law.elastic[t] for t in active]
+        left += [
+            dent(data.model.arrays, s, t)[0] - law.value[t, TAKEN] * law.elastic[t] for t in active
+        ]
     pressed = s.force[active] > 0.0
     return max(0.0, -left.min(), np.abs(left[pressed]).max(initial=0.0))
 
@@ -80,20 +81,20 @@ def test_tools_in_one_place_press_as_one(
     for t in range(n_tools):
         x, y = rng.uniform(-aside, aside, 2) if t else (0.0, 0.0)
         tips[t] = spot.tip(depth + deeper * t / n_tools, x, y)
-    model, one = liver_model(n_tools=8, shape=shape), liver_model(shape=shape)
+    data, one = liver_model(n_tools=8, shape=shape), liver_model(shape=shape)
     single = np.zeros((n_tools, 2))  # force and energy of each tool by itself
     for t in range(n_tools):
         one.reset()
         step(one, tips[t : t + 1])
         single[t] = one.state.force[0], stored_energy(one)
-    assert step(model, tips) == Status.OK
-    assert complementarity(model) < CLOSED
-    c = model.state.compliance[:n_tools, :n_tools]
+    assert step(data, tips) == Status.OK
+    assert complementarity(data) < CLOSED
+    c = data.state.compliance[:n_tools, :n_tools]
     np.testing.assert_array_equal(c, c.T)
     # coupled, none is pressed harder than by itself; all together store more than any of them
-    force = model.state.force[:n_tools]
+    force = data.state.force[:n_tools]
     assert (force >= 0.0).all() and (force <= single[:, 0] * (1.0 + 1e-6)).all()
-    assert stored_energy(model) >= single[:, 1].max() * (1.0 - 1e-6)
+    assert stored_energy(data) >= single[:, 1].max() * (1.0 - 1e-6)
     # as stiff as one contact, and stiffer only by what they are apart; spheres, which cannot be in
     # one place, dent the tissue each on its own
     total = force.sum() / single[:, 0].max()
@@ -106,22 +107,22 @@ def test_tools_in_one_place_press_as_one(
 @pytest.mark.parametrize("radii", [(RADIUS, RADIUS + 1e-6), (RADIUS + 1e-6, RADIUS)])
 def test_two_radii_around_one_centre(radii: tuple[float, float]) -> None:
     """The larger sphere alone touches, whatever the order; sweeps alone would take thousands."""
-    chosen = selected_arrays(None, (SeveralTools(),), None, None, 0.1, 12e-3, 1e-3)
-    model = make_model(Layout(flat_organ().arrays._replace(tip_offset=np.array(radii)), chosen))
+    arrays = flat_organ((SeveralTools(),)).model.arrays
+    data = data_of(arrays._replace(tip_offset=np.array(radii)))
     larger, centre = int(np.argmax(radii)), at_depth(8e-3)[0]
-    assert step(model, np.array([centre, centre])) == Status.OK
-    assert model.state.force[larger] * COMPLIANCE == pytest.approx(8e-3 + 1e-6, rel=1e-5)
-    assert model.state.force[1 - larger] * COMPLIANCE < 1e-8
+    assert step(data, np.array([centre, centre])) == Status.OK
+    assert data.state.force[larger] * COMPLIANCE == pytest.approx(8e-3 + 1e-6, rel=1e-5)
+    assert data.state.force[1 - larger] * COMPLIANCE < 1e-8
 
 
 # --- A million newton a metre ---------------------------------------------------------------------
 
 
 @cache
-def stiffened(stiffness: float) -> ContactModel:
+def stiffened(stiffness: float) -> ContactData:
     """The liver with eight tools and a Young's modulus that gives this mean stiffness [N/m]."""
     soft, single = liver_model(n_tools=8), np.float32
-    arrays = soft.arrays
+    arrays = soft.model.arrays
     factor = stiffness * float(arrays.self_compliance[arrays.row >= 0].mean())
     scaled = {
         name: getattr(arrays, name) * single(1.0 / factor)
@@ -129,8 +130,7 @@ def stiffened(stiffness: float) -> ContactModel:
     }
     scaled["load"] = arrays.load * single(np.sqrt(1.0 / factor))
     scaled["softness"] = arrays.softness / factor
-    chosen = Constants(several_tools=soft.layout.effects.several_tools)
-    return make_model(Layout(arrays._replace(**scaled), chosen))
+    return data_of(arrays._replace(**scaled, law=None, dent=None))
 
 
 @often
@@ -147,19 +147,19 @@ def test_very_stiff_organs_stay_complementary(
     spot: Spot | None, stiffness: float, n_tools: int, spread: float, seed: int
 ) -> None:
     is_shared, spot = spot is None and spread == 10e-3, spot or spots()[0]
-    rng, model = np.random.default_rng(seed), stiffened(stiffness)
-    model.reset()
+    rng, data = np.random.default_rng(seed), stiffened(stiffness)
+    data.reset()
     tips = np.tile(AWAY, (8, 1))
     for t in range(n_tools):
         tips[t] = spot.tip(rng.uniform(3e-3, 3.2e-3), *rng.uniform(-spread, spread, 2))
-    assert step(model, tips) == Status.OK
-    assert complementarity(model) < CLOSED
-    s = model.state
+    assert step(data, tips) == Status.OK
+    assert complementarity(data) < CLOSED
+    s = data.state
     assert not is_shared or (s.force > 0.0).sum() > 1
     work = -0.5 * s.force @ np.where(s.active, s.gap, 0.0)
-    assert stored_energy(model) == pytest.approx(work, rel=1e-5)
+    assert stored_energy(data) == pytest.approx(work, rel=1e-5)
     # not even a million newton a metre moves more than the tip is deep
-    assert np.abs(model.out.cloud[:, 3:]).max() < 3.0 * -s.gap[s.active].min()
+    assert np.abs(data.out.cloud[:, 3:]).max() < 3.0 * -s.gap[s.active].min()
 
 
 # --- The compliance between tips ------------------------------------------------------------------
@@ -170,7 +170,7 @@ def test_compliance_between_tips_is_symmetric_positive_definite(
 ) -> None:
     """Of 2 to 8 tips at random places."""
     v, rng, seen = phantom_vademecum, np.random.default_rng(0), 0
-    model = prepare(v, (Tip("sphere", RADIUS),) * 8, cloud="off")
+    data = prepare(v, (Tip("sphere", RADIUS),) * 8, cloud="off")
     faces = v.surface.corners
     for _ in range(200):
         chosen = faces[rng.choice(len(faces), 8, replace=False)]
@@ -179,16 +179,16 @@ def test_compliance_between_tips_is_symmetric_positive_definite(
         normals = np.einsum("ck,ckd->cd", weight, v.surface.normals[chosen])
         tips = points + (RADIUS - 2e-3) * normals
         tips[rng.integers(2, 9) :] += 1.0  # the others are out of contact
-        model.reset()
-        step(model, tips)
-        pressed = np.flatnonzero(model.state.active)
+        data.reset()
+        step(data, tips)
+        pressed = np.flatnonzero(data.state.active)
         if len(pressed) < 2:
             continue
         seen += 1
-        c = model.state.compliance[np.ix_(pressed, pressed)].copy()
-        law = model.effects.tip_law
+        c = data.state.compliance[np.ix_(pressed, pressed)].copy()
+        value = data.state.law.value
         for k, t in enumerate(pressed):  # a contact of the tip's radius is the stiffest
-            c[k, k] += 0.5 / (law.value[t, STIFFNESS] * law.radius[t]) - law.value[t, TAKEN]
+            c[k, k] += 0.5 / (value[t, STIFFNESS] * RADIUS) - value[t, TAKEN]
         assert np.linalg.eigvalsh((c + c.T) / 2).min() > 0.0
         assert np.abs(c - c.T).max() < 1e-6 * np.diag(c).mean()
     assert seen > 0.9 * 200
@@ -199,21 +199,21 @@ def test_compliance_between_tips_is_symmetric_positive_definite(
 def test_tools_side_by_side_with_friction_converge(mu: float) -> None:
     """Pressed down and dragged, each a little its own way, 0 to 5 mm apart."""
     friction = Friction(static=mu, kinetic=0.8 * mu)
-    model, spot, lost, n = liver_model((friction,), 2), spots(30e-3)[0], 0, 0
+    data, spot, lost, n = liver_model((friction,), 2), spots(30e-3)[0], 0, 0
     for aside in (0.0, 1e-5, 1e-4, 3e-4, 1e-3, 2e-3, 5e-3):
         for seed in range(2):
             rng = np.random.default_rng(seed)
             offset = rng.uniform(-1.0, 1.0, (2, 3)) * [aside, aside, 2e-5]
             way, phase = rng.uniform(-1.0, 1.0, (2, 3)), rng.uniform(0.0, 6.0, (2, 3))
-            model.reset()
+            data.reset()
             for k in range(300):
                 swing = min(max(0, k - 40) * 1e-5, 1e-3) * (1.0 if seed else 0.1)
                 q = offset + swing * way * np.sin(k / 15 + phase)
                 q[:, 0] += max(0, k - 40) * 2e-5
                 tips = [spot.tip(min(4e-3, k * 1e-4) - z, x, y) for x, y, z in q]
-                step(model, np.array(tips))
-                lost, n = lost + (model.out.status == Status.NOT_CONVERGED).any(), n + 1
-                push, normal = model.effects.friction.push, model.state.normal
+                step(data, np.array(tips))
+                lost, n = lost + (data.out.status == Status.NOT_CONVERGED).any(), n + 1
+                push, normal = data.state.friction.push, data.state.normal
                 pressed = -(push * normal).sum(axis=1)
                 across = np.linalg.norm(push + pressed[:, None] * normal, axis=1)
                 assert (across <= mu * pressed * (1.0 + 1e-9) + 1e-12).all()

@@ -8,14 +8,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from avatar_core.contact.locate import ENTRY_DEPTH
-from avatar_core.contact.model import ContactModel, Status, deform, prepare, solve, step
-from avatar_core.contact.tip_response import closest_weights
+from avatar_core.contact.model import ContactData, Status
+from avatar_core.contact.organ_response import closest_weights
 from avatar_core.contact.tool_path import inner_positions, middle_of_access, slide
 from avatar_core.errors import ContactError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.contact import deform, prepare, solve, step
 from tests.helpers.examples import examples
 from tests.helpers.flat_organ import BALL, COMPLIANCE, flat_organ
 from tests.helpers.tool_motion import follow, load_positions, refined
@@ -80,9 +81,9 @@ def test_force_of_a_ball_points_out_of_it_whatever_the_radius(
 ) -> None:
     assume(np.linalg.norm(direction) > 0.1 and depth - radius < ENTRY_DEPTH - 5e-4)
     n = np.array(direction) / np.linalg.norm(direction)
-    model = flat_organ(tip=Tip("patch", radius), is_ball=True)
-    assert step(model, ((BALL + radius - depth) * n)[None]) == Status.OK
-    force = model.out.force[0]
+    data = flat_organ(tip=Tip("patch", radius), is_ball=True)
+    assert step(data, ((BALL + radius - depth) * n)[None]) == Status.OK
+    force = data.out.force[0]
     # the ball's distance is sampled every 3 mm: splines add h^2 / 8 of its curvature 2 / R
     spline = (3e-3) ** 2 / 8.0 * 2.0 / (BALL + radius - depth)
     assert abs(force @ n * COMPLIANCE - depth) < 1.5 * spline + 1e-2 * depth
@@ -93,7 +94,7 @@ def test_force_of_a_ball_points_out_of_it_whatever_the_radius(
 
 
 def force_steps(
-    v: Vademecum, model: ContactModel, depth: float, position: int | None = None
+    v: Vademecum, data: ContactData, depth: float, position: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Force steps over 200 mm at constant depth, 0.1 mm each, in size alone and in all; and 0.01
     mm where it changes most.
@@ -101,20 +102,20 @@ def force_steps(
     All as part of the peak, and the peak [N].
     """
     path = slide(v, RADIUS, depth, 0.2, position=position)
-    forces = forces_along(model, path)
+    forces = forces_along(data, path)
     size = np.linalg.norm(forces, axis=1)
     peak = size.max()
     steps = np.linalg.norm(np.diff(forces, axis=0), axis=1) / peak
     k = int(steps.argmax())
-    fine = forces_along(model, np.concatenate([path[:k], refined(path[k : k + 2], 10)]))[k:]
+    fine = forces_along(data, np.concatenate([path[:k], refined(path[k : k + 2], 10)]))[k:]
     finer = np.linalg.norm(np.diff(fine, axis=0), axis=1) / peak
     return np.abs(np.diff(size)) / peak, steps, finer, float(peak)
 
 
-def forces_along(model: ContactModel, path: np.ndarray) -> np.ndarray:
+def forces_along(data: ContactData, path: np.ndarray) -> np.ndarray:
     """Force on a tip that goes along a path, without a step that fails, shape (n, 3) [N]."""
-    model.reset()
-    motion = follow(model, path[:, None])
+    data.reset()
+    motion = follow(data, path[:, None])
     assert (motion.status == Status.OK).all()
     return motion.force[:, 0]
 
@@ -122,8 +123,8 @@ def forces_along(model: ContactModel, path: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("depth", [1e-3, 5e-3])
 def test_sliding_force_has_no_steps(phantom_vademecum: Vademecum, depth: float) -> None:
     """200 mm at constant depth in steps of 0.1 mm: no step above 2 % of the peak force."""
-    model = prepare(phantom_vademecum, (SPHERE,), cloud="volume")
-    _, coarse, fine, peak = force_steps(phantom_vademecum, model, depth)
+    data = prepare(phantom_vademecum, (SPHERE,), cloud="volume")
+    _, coarse, fine, peak = force_steps(phantom_vademecum, data, depth)
     assert peak > 0.3  # a sphere on a half-space: 0.6 and 7 N
     assert coarse.max() < 0.02
     assert fine.max() < 0.02 / 4
@@ -137,9 +138,9 @@ def test_sliding_force_on_real_livers_has_no_steps(real_vademecum: Vademecum, de
     Facets meet at edges, over which the normal turns by up to 0.05 a step and the force with it. A
     slope, walked ten times finer, changes by a tenth per step; a step by all of it.
     """
-    v, model = real_vademecum, prepare(real_vademecum, (SPHERE,))
+    v, data = real_vademecum, prepare(real_vademecum, (SPHERE,))
     others = np.random.default_rng(3).choice(inner_positions(v, 20e-3), 4, replace=False)
-    slides = [force_steps(v, model, depth, j) for j in (None, *others)]
+    slides = [force_steps(v, data, depth, j) for j in (None, *others)]
     size, coarse, fine, peak = (np.array(values) for values in zip(*slides, strict=True))
     print(
         f"{v.name}: largest force step {coarse.max():.2%} of the peak per 0.1 mm, 99 % within "
@@ -155,12 +156,12 @@ def test_sliding_force_on_real_livers_has_no_steps(real_vademecum: Vademecum, de
 @pytest.mark.long
 def test_a_tip_may_press_at_every_inner_position(real_vademecum: Vademecum) -> None:
     """5 mm deep, straight in along the normal of the undeformed surface."""
-    v, model = real_vademecum, prepare(real_vademecum, (SPHERE,))
+    v, data = real_vademecum, prepare(real_vademecum, (SPHERE,))
     refused = []
     for j in inner_positions(v, 20e-3):
-        model.reset()
+        data.reset()
         tip = slide(v, RADIUS, 5e-3, 1e-4, position=j)
-        if step(model, tip) != Status.OK:
+        if step(data, tip) != Status.OK:
             refused.append(j)
     assert not refused
 
@@ -169,11 +170,11 @@ def test_a_tip_may_press_at_every_inner_position(real_vademecum: Vademecum) -> N
 
 
 def test_clamped_side_is_out_of_range(phantom_vademecum: Vademecum) -> None:
-    v, model = phantom_vademecum, prepare(phantom_vademecum, (SPHERE,), cloud="volume")
+    v, data = phantom_vademecum, prepare(phantom_vademecum, (SPHERE,), cloud="volume")
     vertices = v.mesh.vertices[v.mesh.surface_vertices]
     back = vertices[np.argmin(vertices[:, 1])] + np.array([0.0, -1e-3, 0.0])
-    assert step(model, back[None].copy()) in (Status.OK, Status.OUT_OF_RANGE)
-    assert not model.out.force.any()
+    assert step(data, back[None].copy()) in (Status.OK, Status.OUT_OF_RANGE)
+    assert not data.out.force.any()
 
 
 @pytest.mark.parametrize(
@@ -194,15 +195,15 @@ def test_impossible_model_is_refused(
 
 
 def test_forces_come_before_the_cloud(phantom_vademecum: Vademecum) -> None:
-    tip, model = at_depth(phantom_vademecum, 4e-3), prepare(phantom_vademecum, cloud="volume")
-    step(model, tip)
-    force, cloud = model.out.force.copy(), model.out.cloud.copy()
-    model.reset()
-    model.out.cloud[:] = 0.0
-    assert solve(model, tip) == Status.OK
-    assert np.array_equal(model.out.force, force) and not model.out.cloud.any()
-    deform(model)
-    assert np.array_equal(model.out.cloud, cloud)
+    tip, data = at_depth(phantom_vademecum, 4e-3), prepare(phantom_vademecum, cloud="volume")
+    step(data, tip)
+    force, cloud = data.out.force.copy(), data.out.cloud.copy()
+    data.reset()
+    data.out.cloud[:] = 0.0
+    assert solve(data, tip) == Status.OK
+    assert np.array_equal(data.out.force, force) and not data.out.cloud.any()
+    deform(data)
+    assert np.array_equal(data.out.cloud, cloud)
 
 
 def test_the_step_cannot_allocate() -> None:

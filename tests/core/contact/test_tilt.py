@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatar_core.contact.effects import Effect, Friction, Tilt, Viscoelasticity
-from avatar_core.contact.model import ContactModel, Status, prepare, step
+from avatar_core.contact.model import ContactData, Status
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
 from avatar_core.fem.elasticity import Elasticity
@@ -17,6 +17,7 @@ from avatar_core.scene.model import Scene, Tool
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers import box_organ
 from tests.helpers.box_organ import MATERIAL, body_mesh, organ, top
+from tests.helpers.contact import prepare, step, turning
 from tests.helpers.energies import stored_energy
 from tests.helpers.flat_organ import E_STAR, ORIGIN, UP, at_depth, flat_organ
 from tests.helpers.tool_motion import energy_slope, press
@@ -24,21 +25,23 @@ from tests.helpers.tool_motion import energy_slope, press
 PUNCH = Tip("flat", 5e-3)
 
 
-def leaning_model(angle: float, about: float = 0.0, *effects: Effect) -> ContactModel:
-    """The flat organ and a tool that leans off its normal, in a direction [rad]."""
-    model = flat_organ((Tilt(), *effects), tip=PUNCH)
-    assert model.axes is not None
+def towards(axis: np.ndarray) -> np.ndarray:
+    """An orientation whose shaft has this direction, shape (1, 4)."""
+    return turning(np.array(Tilt().axis), axis)
+
+
+def leaning(angle: float, about: float = 0.0) -> np.ndarray:
+    """That of a tool that leans off the flat organ's normal, in a direction [rad]."""
     s = np.sin(angle)
-    model.axes[:] = (s * np.cos(about), s * np.sin(about), np.cos(angle))
-    return model
+    return towards(np.array([s * np.cos(about), s * np.sin(about), np.cos(angle)]))
 
 
-def pressed(angle: float, depth: float, about: float = 0.0, *effects: Effect) -> ContactModel:
-    """The same after an approach of the face's centre to a depth."""
-    model = leaning_model(angle, about, *effects)
+def pressed(angle: float, depth: float, about: float = 0.0, *effects: Effect) -> ContactData:
+    """The flat organ after such a tool has approached it, its face's centre to a depth."""
+    data = flat_organ((Tilt(), *effects), tip=PUNCH)
     for at in np.linspace(-3e-3, depth, 50):
-        step(model, at_depth(at, offset=0.0))
-    return model
+        step(data, at_depth(at, offset=0.0), leaning(angle, about))
+    return data
 
 
 @pytest.mark.long
@@ -46,24 +49,23 @@ def pressed(angle: float, depth: float, about: float = 0.0, *effects: Effect) ->
 def test_a_punch_that_touches_all_over_is_righted_by_its_closed_form(about: float) -> None:
     """M = 4/3 E* a^3 sin cos about e x n, and the force of an upright punch."""
     angle, depth = 0.02, 2e-3
-    upright, model = pressed(0.0, depth), pressed(angle, depth, about)
-    assert model.axes is not None
+    upright, data = pressed(0.0, depth), pressed(angle, depth, about)
     exact = 4.0 / 3.0 * E_STAR * PUNCH.radius**3 * np.sin(angle) * np.cos(angle)
-    axis = np.cross(model.axes[0], [0.0, 0.0, 1.0]) / np.sin(angle)
-    np.testing.assert_allclose(model.out.torque[0], exact * axis, atol=1e-5 * exact)
-    np.testing.assert_allclose(model.out.force[0], upright.out.force[0], rtol=1e-9, atol=1e-9)
+    axis = np.cross(data.state.axis[0], [0.0, 0.0, 1.0]) / np.sin(angle)
+    np.testing.assert_allclose(data.out.torque[0], exact * axis, atol=1e-5 * exact)
+    np.testing.assert_allclose(data.out.force[0], upright.out.force[0], rtol=1e-9, atol=1e-9)
     assert not upright.out.torque.any()
 
 
 def test_an_edge_touches_before_the_centre_and_no_force_jumps() -> None:
     """From the first touch of the edge, past the depth where the whole face touches."""
-    model = leaning_model(0.2)
+    data = flat_organ((Tilt(),), tip=PUNCH)
     edge, force, torque = PUNCH.radius * np.sin(0.2), [], []
     depths = np.arange(-edge - 1e-4, 6e-3, 1e-5)
     for depth in depths:
-        step(model, at_depth(depth, offset=0.0))
-        force.append(float(model.out.force[0, 2]))
-        torque.append(float(np.linalg.norm(model.out.torque[0])))
+        step(data, at_depth(depth, offset=0.0), leaning(0.2))
+        force.append(float(data.out.force[0, 2]))
+        torque.append(float(np.linalg.norm(data.out.torque[0])))
     touched = np.array(force) > 0.0
     assert depths[touched][0] == pytest.approx(-edge, abs=2e-5)
     assert (np.diff(force)[touched[1:]] > 0.0).all()
@@ -78,34 +80,30 @@ def test_force_and_torque_are_the_derivatives_of_the_energy(
     straight: Vademecum, angle: float
 ) -> None:
     """On a curved organ, by the place of the tool and by the direction of its axis."""
-    model = prepare(straight, (PUNCH,), cloud="off", effects=(Tilt(),))
-    assert model.axes is not None
+    data = prepare(straight, (PUNCH,), cloud="off", effects=(Tilt(),))
     rng = np.random.default_rng(2)
     for j in rng.choice(inner_positions(straight), 4):
         centre, normal = straight.surface.centers[j], straight.surface.normals[j]
         aside = np.cross(normal, rng.normal(size=3))
         aside /= np.linalg.norm(aside)
         place = (centre - 3e-3 * normal + rng.uniform(-1e-3, 1e-3, 3))[None]
-        model.reset()
-        model.axes[:] = np.cos(angle) * normal + np.sin(angle) * aside
-        step(model, (centre - 0.5e-3 * normal)[None])
-        assert step(model, place) == Status.OK
-        force, torque = model.out.force.copy(), model.out.torque[0].copy()
-        slope, turn = energy_slope(model, place), energy_turn(model, place)
+        data.reset()
+        lean = towards(np.cos(angle) * normal + np.sin(angle) * aside)
+        step(data, (centre - 0.5e-3 * normal)[None], lean)
+        assert step(data, place, lean) == Status.OK
+        force, torque = data.out.force.copy(), data.out.torque[0].copy()
+        slope, turn = energy_slope(data, place, orientations=lean), energy_turn(data, place)
         np.testing.assert_allclose(force, -slope, atol=1e-4 * np.linalg.norm(force))
         np.testing.assert_allclose(torque, -turn, atol=1e-3 * np.linalg.norm(torque))
 
 
-def energy_turn(model: ContactModel, place: np.ndarray, h: float = 1e-4) -> np.ndarray:
+def energy_turn(data: ContactData, place: np.ndarray, h: float = 1e-4) -> np.ndarray:
     """Derivative of the stored energy by a rotation of the tool, shape (3,) [N m]."""
-    assert model.axes is not None
-    axis, energy = model.axes[0].copy(), []
+    axis, energy = data.state.axis[0].copy(), []
     for change in h * np.concatenate([np.eye(3), -np.eye(3)]):
         turned = axis + np.cross(change, axis)
-        model.axes[:] = turned / np.linalg.norm(turned)
-        step(model, place)
-        energy.append(stored_energy(model))
-    model.axes[:] = axis
+        step(data, place, towards(turned / np.linalg.norm(turned)))
+        energy.append(stored_energy(data))
     return (np.array(energy[:3]) - np.array(energy[3:])) / (2.0 * h)
 
 
@@ -113,11 +111,11 @@ def energy_turn(model: ContactModel, place: np.ndarray, h: float = 1e-4) -> np.n
 def test_torque_relaxes_and_friction_leaves_it() -> None:
     """In the end that of the relaxed modulus; on the face itself friction has no arm."""
     soft = Viscoelasticity((0.6,), (0.02,))
-    model, elastic = pressed(0.02, 2e-3, 0.0, soft), pressed(0.02, 2e-3)
+    data, elastic = pressed(0.02, 2e-3, 0.0, soft), pressed(0.02, 2e-3)
     for _ in range(400):
-        step(model, at_depth(2e-3, offset=0.0))
+        step(data, at_depth(2e-3, offset=0.0), leaning(0.02))
     rough = pressed(0.02, 2e-3, 0.0, Friction())
-    np.testing.assert_allclose(model.out.torque, 0.4 * elastic.out.torque, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(data.out.torque, 0.4 * elastic.out.torque, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(rough.out.torque, elastic.out.torque, rtol=1e-6, atol=1e-12)
 
 
@@ -138,14 +136,12 @@ def test_force_and_torque_are_those_of_resolved_contact(angle: float, bound: flo
     centre = top("cube") - depth * up
     push = Push(PUNCH, centre + depth * axis, axis)
     contact = CondensedContact(elasticity, [push], depth, reach=2.0).solve([0], [depth])
-    model = prepare(organ("cube"), (PUNCH,), cloud="off", effects=(Tilt(),))
-    assert model.axes is not None
-    model.axes[:] = axis
+    data = prepare(organ("cube"), (PUNCH,), cloud="off", effects=(Tilt(),))
     for at in np.linspace(-4e-3, depth, 20):
-        step(model, (top("cube") - at * up)[None])
+        step(data, (top("cube") - at * up)[None], towards(axis))
     torque = torque_on_tip(elasticity, contact.loads, centre)
-    assert np.linalg.norm(model.out.force[0]) == pytest.approx(contact.forces[0], rel=0.03)
-    assert model.out.torque[0, 2] == pytest.approx(torque[2], rel=bound)
+    assert np.linalg.norm(data.out.force[0]) == pytest.approx(contact.forces[0], rel=0.03)
+    assert data.out.torque[0, 2] == pytest.approx(torque[2], rel=bound)
 
 
 def torque_on_tip(elasticity: Elasticity, loads: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -160,15 +156,13 @@ def torque_on_tip(elasticity: Elasticity, loads: np.ndarray, centre: np.ndarray)
 def test_a_tool_on_its_side_or_without_an_axis_has_no_torque() -> None:
     for angle in (np.pi / 2.0 + 0.1, np.pi):
         assert not pressed(angle, 2e-3).out.torque.any()
-    model = pressed(0.2, 2e-3)
-    assert model.out.torque.any()
-    model.reset()  # forgets the axis
-    assert model.axes is not None and not model.axes.any()
-    assert press(model, (PUNCH,), ORIGIN, UP, 2e-3) > 0.0 and not model.out.torque.any()
+    data = pressed(0.2, 2e-3)
+    assert data.out.torque.any()
+    assert press(data, (PUNCH,), ORIGIN, UP, 2e-3) > 0.0 and not data.out.torque.any()
 
 
 def test_only_flat_tips_lean() -> None:
-    assert flat_organ((), tip=PUNCH).axes is None
+    assert flat_organ((), tip=PUNCH).state.tilt is None
     with pytest.raises(SceneError, match="tilt: no tool has a flat tip; give one, or leave tilt"):
         Scene(effects=(Tilt(),))
     with pytest.raises(SceneError, match=r"tilt\.axis is .*; give three numbers"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatar_core.common.splines import evaluate_all
-from avatar_core.contact.tip_response import _taking, tip_carriers
+from avatar_core.contact.organ_response import _taking, tip_carriers
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.vademecum.tip_field import make_tip_field
 from tests.core.vademecum.test_tip_field import PATCH, RADIUS, coarse_ball

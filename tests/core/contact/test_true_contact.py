@@ -16,7 +16,6 @@ import pytest
 
 from avatar_core.certify.contact_sites import Site, draw_sites
 from avatar_core.contact.effects import LargeDeformationEffect, SeveralTools
-from avatar_core.contact.model import prepare
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.signorini import CondensedContact, Push
 from avatar_core.fem.sphere_indentation import Domain, SphereIndentation
@@ -41,6 +40,7 @@ from tests.helpers.box_organ import (
     patch_compliance,
     top,
 )
+from tests.helpers.contact import prepare
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.half_space import on_soft_base, sneddon
 from tests.helpers.tool_motion import press
@@ -70,9 +70,9 @@ def depths_of(tip: Tip) -> list[float]:
 
 def on_top(body: Body, tip: Tip, aside: tuple[float, float]) -> Callable[[float], float]:
     """The step's force on a tip at a depth in the top of a box."""
-    model = prepare(organ(body), (tip,), cloud="off", effects=())
+    data = prepare(organ(body), (tip,), cloud="off", effects=())
     point = top(body) + np.array([aside[0], 0.0, aside[1]])
-    return lambda depth: float(press(model, (tip,), point[None], UP[None], (depth,))[0])
+    return lambda depth: float(press(data, (tip,), point[None], UP[None], (depth,))[0])
 
 
 @pytest.mark.parametrize("tip", TIPS)
@@ -107,11 +107,11 @@ def test_a_sphere_feels_the_large_strain_of_a_neo_hookean_cube(radius: float) ->
     problem = hyperelastic_problem(cube, "neo-hookean")
     bent = with_large_deformation(cube, problem, "neo-hookean", rule)
     tip = Tip("sphere", radius)
-    model = prepare(bent, (tip,), cloud="off", effects=(LargeDeformationEffect(),))
+    data = prepare(bent, (tip,), cloud="off", effects=(LargeDeformationEffect(),))
     place = (top("cube")[None], UP[None])
     elements = SphereIndentation(MATERIAL.poisson_ratio, domain=Domain(0.2))
     for each in elements.press([0.25, 0.5, 1.0]):
-        force = press(model, (tip,), *place, (each.depth * radius,))[0]
+        force = press(data, (tip,), *place, (each.depth * radius,))[0]
         truth = each.force * MATERIAL.young_modulus * radius**2
         assert force == pytest.approx(truth, rel=0.04)
 
@@ -138,8 +138,8 @@ def true_force(
 def test_a_tip_on_an_organ_feels_a_resolved_contact(straight: Vademecum) -> None:
     tip, depth = Tip("sphere", 5e-3), 2e-3
     site = draw_sites(straight, phantom_liver(12e-3), 8, 1)[2]
-    model = prepare(straight, (tip,), cloud="off", effects=())
-    force = press(model, (tip,), site.point[None], site.normal[None], (depth,))[0]
+    data = prepare(straight, (tip,), cloud="off", effects=())
+    force = press(data, (tip,), site.point[None], site.normal[None], (depth,))[0]
     truth = true_force(tuple(site.point.tolist()), tuple(site.normal.tolist()), tip.radius, depth)
     assert force == pytest.approx(truth, rel=0.05)
 
@@ -162,7 +162,7 @@ def test_two_tips_on_the_phantom_feel_resolved_contacts(phantom_vademecum: Vadem
     """
     v, surface = phantom_vademecum, phantom_liver()
     tips, depths = (Tip("sphere", 3e-3), Tip("sphere", 5e-3)), ((2e-3, 4e-3), (4e-3, 2e-3))
-    model = prepare(v, tips, cloud="off", effects=(SeveralTools(),))
+    data = prepare(v, tips, cloud="off", effects=(SeveralTools(),))
     pairs = pairs_of(draw_sites(v, surface, 60, 0)[:-2])[:1]
     assert len(pairs) == 1
     for pair in pairs:
@@ -174,7 +174,7 @@ def test_two_tips_on_the_phantom_feel_resolved_contacts(phantom_vademecum: Vadem
         both = CondensedContact(fine, pushes, np.max(depths), reach=2.0)
         for each in depths:
             truth = both.solve((0, 1), each).forces
-            force = press(model, tips, np.array(points), np.array(normals), each)
+            force = press(data, tips, np.array(points), np.array(normals), each)
             assert (np.abs(force - truth) < 0.1 * np.maximum(truth, 0.1 * truth.max())).all()
 
 
@@ -203,7 +203,7 @@ def test_a_ball_in_the_dent_of_another_feels_what_is_left(apart: float) -> None:
     """Down to a quarter of what it would feel alone; a patch's dent would leave it a sixth."""
     radii = (3e-3, 5e-3)
     tips = tuple(Tip("sphere", radius) for radius in radii)
-    model = prepare(organ("cube"), tips, cloud="off", effects=(SeveralTools(),))
+    data = prepare(organ("cube"), tips, cloud="off", effects=(SeveralTools(),))
     for depths, truth in zip(BESIDE, true_forces_beside(apart, radii), strict=True):
-        force = press(model, tips, beside(apart), np.array([UP, UP]), depths)
+        force = press(data, tips, beside(apart), np.array([UP, UP]), depths)
         np.testing.assert_allclose(force, truth, rtol=0.06)

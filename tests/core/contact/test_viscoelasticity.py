@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from avatar_core.contact.effects import Viscoelasticity
-from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import slide
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.contact import prepare, step
 from tests.helpers.flat_organ import COMPLIANCE, at_depth, flat_organ, force_at_depth
 from tests.helpers.tool_motion import AWAY
 
@@ -36,11 +36,11 @@ def test_relaxation_is_exact_for_motion_in_straight_lines(period: float) -> None
     """Down, hold, further down, half back: the closed form to 1e-6 whatever the step."""
     times = np.array([0.0, 0.1, 0.5, 0.6, 0.9, 1.0])
     depths = 1e-3 * np.array([0.0, 3.0, 3.0, 4.0, 4.0, 2.0])
-    model = flat_organ((PRONY,), period)
+    data = flat_organ((PRONY,), period)
     worst, peak = 0.0, 0.0
     for k in range(1, round(1.0 / period) + 1):
         t = k * period
-        force = force_at_depth(model, float(np.interp(t, times, depths)))
+        force = force_at_depth(data, float(np.interp(t, times, depths)))
         exact = relaxed_force(times, depths, t)
         worst, peak = max(worst, abs(force - exact)), max(peak, exact)
     assert worst < 1e-6 * peak
@@ -68,19 +68,19 @@ def creep(t: float) -> float:
 
 def crept(period: float, force: float, end: float) -> float:
     """Depth at the end of a force that grows in RAMP and stays, the tip moved to hold it."""
-    model = flat_organ((PRONY,), period)
+    data = flat_organ((PRONY,), period)
     depth = 0.0
     for k in range(1, round(end / period) + 1):
         wanted = force * min(1.0, k * period / RAMP)
         # the next step is affine in the depth: two trials, of which the memory knows nothing
         found = []
         for trial in (depth + 1e-3, depth + 2e-3):
-            before = [array.copy() for array in model.effects.viscoelasticity]
-            found.append(force_at_depth(model, trial))
-            for array, earlier in zip(model.effects.viscoelasticity, before, strict=True):
+            before = [array.copy() for array in data.state.viscoelasticity]
+            found.append(force_at_depth(data, trial))
+            for array, earlier in zip(data.state.viscoelasticity, before, strict=True):
                 array[...] = earlier
         depth += 1e-3 + 1e-3 * (wanted - found[0]) / (found[1] - found[0])
-        step(model, at_depth(depth))
+        step(data, at_depth(depth))
     return depth
 
 
@@ -97,31 +97,31 @@ def test_creep_under_a_held_force_is_of_second_order() -> None:
 def test_an_organ_that_is_let_go_creeps_back() -> None:
     """Held until relaxed, then let go: e = g e_0 exp(- g_inf t / tau)."""
     g, tau, period, depth = 0.6, 0.1, 1e-3, 4e-3
-    model = flat_organ((Viscoelasticity((g,), (tau,)),))
-    first = force_at_depth(model, depth)
+    data = flat_organ((Viscoelasticity((g,), (tau,)),))
+    first = force_at_depth(data, depth)
     for _ in range(2999):
-        force = force_at_depth(model, depth)
+        force = force_at_depth(data, depth)
     assert force == pytest.approx((1.0 - g) * depth / COMPLIANCE, rel=1e-6)
-    elastic = model.effects.viscoelasticity.elastic
+    elastic = data.state.viscoelasticity.elastic
     held, left = elastic[2], []
     for _ in range(8200):
-        step(model, AWAY[None])
-        assert not model.out.force.any()
+        step(data, AWAY[None])
+        assert not data.out.force.any()
         left.append(elastic[2] / held)
     expected = g * np.exp(-(1.0 - g) * np.arange(200) * period / tau)
     # exact for any period but for the first, in which the load goes
     np.testing.assert_allclose(np.array(left[:200]) / left[0] * g, expected, atol=1e-6)
     assert left[0] == pytest.approx(g, rel=period / tau)
     assert abs(left[-1]) < 1e-10
-    assert force_at_depth(model, depth) == pytest.approx(first, rel=1e-7)
+    assert force_at_depth(data, depth) == pytest.approx(first, rel=1e-7)
 
 
 def test_a_sphere_relaxes_as_the_tissue_does() -> None:
     """In the end the force is that on elastic tissue of the relaxed modulus (Lee & Radok)."""
     soft, sphere = Viscoelasticity((0.6,), (0.02,)), Tip("sphere", 5e-3)
-    model = flat_organ((soft,), tip=sphere)
+    data = flat_organ((soft,), tip=sphere)
     elastic = force_at_depth(flat_organ(tip=sphere), 3e-3)
-    forces = [force_at_depth(model, 3e-3) for _ in range(401)]
+    forces = [force_at_depth(data, 3e-3) for _ in range(401)]
     assert forces[0] == pytest.approx(elastic, rel=0.03)  # a period has relaxed a little
     assert forces[-1] == pytest.approx(0.4 * elastic, rel=1e-6)
 
@@ -129,16 +129,16 @@ def test_a_sphere_relaxes_as_the_tissue_does() -> None:
 def test_a_history_moves_the_cloud_as_its_loads_do(phantom_vademecum: Vademecum) -> None:
     """Of soft tissue that was stroked across more regions than are shown in full."""
     v, tip = phantom_vademecum, Tip("patch", 8e-3)
-    model = prepare(v, (tip,), cloud="volume", effects=(Viscoelasticity((0.9,), (5.0,)),))
+    data = prepare(v, (tip,), cloud="volume", effects=(Viscoelasticity((0.9,), (5.0,)),))
     mass, errors = np.repeat(v.mesh.vertex_volumes, 3), []
     for k, at in enumerate(slide(v, tip.offset, 4e-3, 0.15)):
-        step(model, at[None].copy())
+        step(data, at[None].copy())
         if k % 100 == 99:
-            past = model.effects.viscoelasticity
+            past = data.state.viscoelasticity
             exact = np.zeros(len(mass))
             for m in range(past.count[0]):
                 at_one = v.displacement(past.position[m : m + 1], np.ones(1))
                 exact += at_one @ past.near_elastic[m]
-            wrong = model.out.cloud[:, 3:].ravel() - exact
+            wrong = data.out.cloud[:, 3:].ravel() - exact
             errors.append(np.sqrt((mass * wrong**2).sum() / (mass * exact**2).sum()))
     assert np.mean(errors) < 1e-2

@@ -8,14 +8,6 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from avatar_core.contact.effects.large_dent import (
-    COEFFICIENTS,
-    NONE,
-    evaluate_large_dent,
-    interpolated,
-    large_dent_of,
-    with_least,
-)
 from avatar_core.fem.axisymmetric import AxisymmetricBody
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.hyperelastic_materials import NeoHookean
@@ -23,6 +15,14 @@ from avatar_core.fem.sphere_indentation import Domain, SphereIndentation
 from avatar_core.geometry.tip import Tip
 from avatar_core.studies import indentation
 from avatar_core.studies.indentation import law_force
+from avatar_core.tips.large_strain import (
+    COEFFICIENTS,
+    NONE,
+    evaluate_large_dent,
+    interpolated,
+    large_dent_of,
+    with_least,
+)
 
 COARSE, COARSER, SMALL = Domain(0.2), Domain(0.4), Domain(0.25, 30.0)
 
@@ -130,6 +130,7 @@ def test_a_fit_finds_the_law_of_its_data(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def dent_of(tip: Tip, nu: float) -> SimpleNamespace:
     """What of a tip's law :func:`evaluate_large_dent` reads."""
-    return SimpleNamespace(
+    law = SimpleNamespace(
         large_dent=large_dent_of(tip, nu, True)[None], radius=np.array([tip.radius])
     )
+    return SimpleNamespace(law=law)

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avatar_core.contact.effects.tip_profile import STIFFNESS
-from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.contact.model import ContactData
 from avatar_core.fem.elasticity import Elasticity, Inclusion
 from avatar_core.fem.patch_loads import load_surface
 from avatar_core.geometry.surface import SurfaceMesh
@@ -17,11 +16,13 @@ from avatar_core.geometry.tumour import strained_fraction, volume_fraction_insid
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.resolved_contact import contacts_at
 from avatar_core.offline.rule import BuildRule
+from avatar_core.tips.profile import STIFFNESS
 from avatar_core.vademecum.model import Provenance, Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from avatar_core.vademecum.tip_field import with_tumour
 from tests.core.offline.test_coordinates import ball
 from tests.helpers.box_organ import MATERIAL, PATCH_RADIUS, UP, body_mesh, organ, top
+from tests.helpers.contact import prepare, step
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.tool_motion import press
 
@@ -76,7 +77,7 @@ def _cube_with_tumour() -> Vademecum:
     return replace(built, contrast=CONTRAST)
 
 
-def sphere_on(vademecum: Vademecum, radius: float) -> ContactModel:
+def sphere_on(vademecum: Vademecum, radius: float) -> ContactData:
     return prepare(vademecum, (Tip("sphere", radius),), cloud="off", effects=())
 
 
@@ -86,8 +87,8 @@ def test_a_tip_feels_the_tumour_under_it_and_not_aside() -> None:
     law = sphere_on(harder, RADIUS)
     for aside, low, high in ((0.0, 1.5, CONTRAST), (28e-3, 0.99, 1.02)):
         step(law, (top("cube") + np.array([aside, 1e-3, 0.0]))[None])
-        assert law.effects.tip_law is not None
-        modulus = law.effects.tip_law.value[0, STIFFNESS] / law.effects.tip_law.modulus[0]
+        assert law.state.law is not None
+        modulus = law.state.law.value[0, STIFFNESS] / law.model.arrays.law.modulus[0]
         assert low <= modulus <= high
 
 

@@ -13,7 +13,7 @@ from avatar_core.certify.linear import certify
 from avatar_core.cli.vademecum import show
 from avatar_core.common.supports import SUPPORT
 from avatar_core.contact.effects import Tumour
-from avatar_core.contact.model import Status, prepare, step
+from avatar_core.contact.model import Status
 from avatar_core.contact.tool_path import inner_positions, palpation
 from avatar_core.errors import (
     CoordinateError,
@@ -39,6 +39,7 @@ from avatar_core.scene.prepare import scene_spec
 from avatar_core.vademecum.at_values import at_values, ranges
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.helpers.contact import prepare, step
 from tests.helpers.soft_organ import (
     CONTRAST,
     POISSON,
@@ -207,9 +208,9 @@ def test_a_hard_inclusion_is_felt(
     felt, full = [], []
     for contrast in (1.0, 10.0):
         effects = (Tumour(contrast),) if contrast != 1.0 else ()
-        model = prepare(organ, (Tip("patch", 5e-3),), cloud="off", effects=effects)
-        assert step(model, tip) == Status.OK
-        felt.append(model.state.force[0])
+        data = prepare(organ, (Tip("patch", 5e-3),), cloud="off", effects=effects)
+        assert step(data, tip) == Status.OK
+        felt.append(data.state.force[0])
         here = problem_at(problem, {"poisson": organ.material.poisson_ratio, "contrast": contrast})
         load = patch_loads(here, surface.centers[[j]], surface.patch_radius) @ surface.normals[j]
         full.append(1.0 / float(load @ here.solve(load[:, None])[:, 0]))

@@ -19,7 +19,7 @@ from avatar_core.certify.large_deformation import (
     with_combinations,
 )
 from avatar_core.cli.vademecum import show_text
-from avatar_core.contact.model import ContactModel, Status, prepare, step
+from avatar_core.contact.model import ContactData, Status
 from avatar_core.contact.tool_path import inner_positions, middle_of_access
 from avatar_core.errors import ConvergenceError
 from avatar_core.fem.elasticity import Material
@@ -35,6 +35,7 @@ from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.large_deformation import LargeCertificate, hyperelastic, powers
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.helpers.contact import prepare, step
 from tests.helpers.tool_motion import energy_slope, load_positions
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
@@ -44,7 +45,7 @@ both = pytest.mark.parametrize("material", ["neo-hookean", "st-venant-kirchhoff"
 
 
 @pytest.fixture()
-def model(bent: Vademecum) -> ContactModel:
+def data(bent: Vademecum) -> ContactData:
     return prepare(bent, (PATCH,), cloud="volume")
 
 
@@ -271,27 +272,27 @@ def test_show_tells_what_combinations_cost(
 
 
 @pytest.mark.long
-def test_a_patch_feels_the_bent_force(bent: Vademecum, model: ContactModel) -> None:
+def test_a_patch_feels_the_bent_force(bent: Vademecum, data: ContactData) -> None:
     """As the file says at the load position, but for the smoothing of what a tip feels."""
     middle = bent.surface.centers[middle_of_access(bent)]
     distance = np.linalg.norm(bent.surface.centers - middle, axis=1)
     for j in np.argsort(distance)[:8:2]:
-        model.reset()
-        step(model, tip_at(bent, 4e-3, j))
-        assert step(model, tip_at(bent, 15e-3, j)) in (Status.OK, Status.EXTRAPOLATED)
-        depth = -model.state.gap[0]
-        state = model.state
+        data.reset()
+        step(data, tip_at(bent, 4e-3, j))
+        assert step(data, tip_at(bent, 15e-3, j)) in (Status.OK, Status.EXTRAPOLATED)
+        depth = -data.state.gap[0]
+        state = data.state
         a = state.self_compliance[0] * state.force[0]
-        second, third = powers(a, model.effects.large_deformation.coefficient[0, 2])
+        second, third = powers(a, data.state.large_deformation.coefficient[0, 2])
         felt = (
             a
-            + model.effects.large_deformation.coefficient[0, 0] * second
-            + model.effects.large_deformation.coefficient[0, 1] * third
+            + data.state.large_deformation.coefficient[0, 0] * second
+            + data.state.large_deformation.coefficient[0, 1] * third
         )
         assert felt == pytest.approx(depth, rel=1e-6)
 
 
-def test_a_deep_push_is_as_right_as_a_light_one(bent: Vademecum, model: ContactModel) -> None:
+def test_a_deep_push_is_as_right_as_a_light_one(bent: Vademecum, data: ContactData) -> None:
     """At all depths the step feels what the vademecum itself says of the load position.
 
     A wider kernel would take the response of faces beside and behind into that of a deep tip,
@@ -301,11 +302,11 @@ def test_a_deep_push_is_as_right_as_a_light_one(bent: Vademecum, model: ContactM
     for j in inner_positions(bent)[::4]:
         row = []
         for depth in (2e-3, 15e-3):
-            model.reset()
-            step(model, tip_at(bent, 1e-3, j))
-            step(model, tip_at(bent, depth, j))
-            own, _ = bent.push_to(np.array([j]), np.ones(1), -model.state.gap[0])
-            row.append(model.state.force[0] / own)
+            data.reset()
+            step(data, tip_at(bent, 1e-3, j))
+            step(data, tip_at(bent, depth, j))
+            own, _ = bent.push_to(np.array([j]), np.ones(1), -data.state.gap[0])
+            row.append(data.state.force[0] / own)
         ratio.append(row)
     light, deep = np.array(ratio).T
     assert np.median(light) == pytest.approx(1.0, abs=0.03)
@@ -313,13 +314,13 @@ def test_a_deep_push_is_as_right_as_a_light_one(bent: Vademecum, model: ContactM
     assert np.quantile(np.abs(deep / light - 1.0), 0.8) < 0.1
 
 
-def test_cloud_is_the_bent_field(bent: Vademecum, model: ContactModel) -> None:
+def test_cloud_is_the_bent_field(bent: Vademecum, data: ContactData) -> None:
     """Linear under the force, and bent as at the depth that the tip feels."""
-    v, state = bent, model.state
+    v, state = bent, data.state
     j = middle_of_access(v)
-    step(model, tip_at(v, 4e-3, j))
-    step(model, tip_at(v, 12e-3, j))
-    positions, weights = load_positions(model)
+    step(data, tip_at(v, 4e-3, j))
+    step(data, tip_at(v, 12e-3, j))
+    positions, weights = load_positions(data)
     linear = replace(v, large=None)
     force = state.force[0]
     # along the normal of the step, which is not quite that of the patch
@@ -328,7 +329,7 @@ def test_cloud_is_the_bent_field(bent: Vademecum, model: ContactModel) -> None:
     same = force * felt / linear.push(positions, weights, force).depth  # as deep, on the surface
     bend = v.push(positions, weights, same).displacement
     bend -= linear.push(positions, weights, same).displacement
-    error = np.linalg.norm(model.out.cloud[:, 3:].ravel() - straight - bend)
+    error = np.linalg.norm(data.out.cloud[:, 3:].ravel() - straight - bend)
     assert error < 0.02 * np.linalg.norm(straight + bend)
     assert error < 0.3 * np.linalg.norm(bend)
 
@@ -338,14 +339,14 @@ def test_force_is_the_derivative_of_the_energy(bent: Vademecum, share: float) ->
     """Within the stored range, and where it goes on tangentially."""
     assert bent.large is not None
     short = replace(bent, large=replace(bent.large, reach=np.full_like(bent.large.reach, 8e-3)))
-    model = prepare(short, (PATCH,), cloud="volume")  # the compiled step of the other tests
+    data = prepare(short, (PATCH,), cloud="volume")  # the compiled step of the other tests
     rng = np.random.default_rng(2)
     for j in rng.choice(inner_positions(bent), 4):
-        model.reset()
-        step(model, tip_at(bent, 4e-3, j))
+        data.reset()
+        step(data, tip_at(bent, 4e-3, j))
         tip = tip_at(bent, share * 8e-3, j) + rng.uniform(-1e-3, 1e-3, 3)
-        status = step(model, tip)
+        status = step(data, tip)
         assert status == (Status.OK if share < 1 else Status.EXTRAPOLATED)
-        force = model.out.force[0].copy()
-        slope = energy_slope(model, tip, 1e-5)[0]
+        force = data.out.force[0].copy()
+        slope = energy_slope(data, tip, 1e-5)[0]
         np.testing.assert_allclose(force, -slope, atol=2e-3 * np.linalg.norm(force))

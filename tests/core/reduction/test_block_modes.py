@@ -7,11 +7,11 @@ import pytest
 
 from avatar_core.contact.cloud import POINTS, cloud_arrays
 from avatar_core.contact.effects import SelfWeight
-from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import palpation
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.block_modes import BlockModes, compact_order, load_sizes, separate_blocks
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.contact import prepare, step
 
 N_BLOCKS, SIZE, N_MODES, N_LOADS = 12, 30, 16, 40
 MASS = np.linspace(0.5, 2.0, N_BLOCKS * SIZE).reshape(N_BLOCKS, SIZE)
@@ -132,16 +132,16 @@ def test_a_step_shows_the_displacement_of_the_vademecum(
     """Of the patch under a tip, to a third of a per cent, with a fifth of its modes a point."""
     v, tip = phantom_vademecum, Tip("patch", 8e-3)
     effects = (SelfWeight(),) if history else ()
-    model = prepare(v, (tip,), cloud="volume", effects=effects)
+    data = prepare(v, (tip,), cloud="volume", effects=effects)
     mass, errors = np.repeat(v.mesh.vertex_volumes, 3), []
-    step(model, np.full((1, 3), 1e3))
-    rest = model.out.cloud[:, 3:].astype(float).copy()  # it may sag
+    step(data, np.full((1, 3), 1e3))
+    rest = data.out.cloud[:, 3:].astype(float).copy()  # it may sag
     for at in palpation(v, tip.offset, 4e-3, 41)[15:26]:
-        step(model, at[None].copy())
-        state, n = model.state, model.state.n_nodes[0]
+        step(data, at[None].copy())
+        state, n = data.state, data.state.n_nodes[0]
         weights = state.weight[0, :n, 0]
         exact = v.displacement(state.nodes[0, :n], weights) @ (-state.force[0] * state.normal[0])
-        wrong = (model.out.cloud[:, 3:] - rest).ravel() - exact
+        wrong = (data.out.cloud[:, 3:] - rest).ravel() - exact
         errors.append(np.sqrt((mass * wrong**2).sum() / (mass * exact**2).sum()))
     assert 0.0 < max(errors) < 8e-3
     assert np.mean(errors) < 4e-3

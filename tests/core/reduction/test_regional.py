@@ -9,11 +9,11 @@ import pytest
 
 from avatar_core.contact.cloud_kernels import MAX_PAST, _fade_regions
 from avatar_core.contact.effects import Viscoelasticity
-from avatar_core.contact.model import prepare, step
 from avatar_core.contact.tool_path import slide
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.regional import RegionalField, RegionalRule, regions_of, separate_regions
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.contact import prepare, step
 
 N_VERTICES, N_POSITIONS, N_LOADS = 40, 24, 3
 HALF = 5e-4  # of half precision, in which modes are kept
@@ -106,16 +106,16 @@ def test_displacement_and_force_cross_borders_of_regions_without_a_jump(
 ) -> None:
     """A tenth of a millimetre moves the cloud as little at a border as within a region."""
     v, tip = phantom_vademecum, Tip("sphere", 8e-3)
-    model = prepare(v, (tip,), cloud="volume")
+    data = prepare(v, (tip,), cloud="volume")
     path = slide(v, tip.offset, 4e-3, 0.12)
     quarters = np.arange(0.0, len(path) - 1.0, 0.25)
     fine = np.column_stack([np.interp(quarters, np.arange(len(path)), x) for x in path.T])
     moved, force, regions = [], [], []
     for at in fine:
-        step(model, at[None].copy())
-        moved.append(model.out.cloud[:, 3:].astype(float).copy())
-        force.append(model.out.force[0].copy())
-        regions.append(frozenset(model.state.touched[: model.state.n_touched[0]].tolist()))
+        step(data, at[None].copy())
+        moved.append(data.out.cloud[:, 3:].astype(float).copy())
+        force.append(data.out.force[0].copy())
+        regions.append(frozenset(data.state.touched[: data.state.n_touched[0]].tolist()))
     change = np.array([np.abs(b - a).max() for a, b in pairwise(moved)])
     turns = np.array([a != b for a, b in pairwise(regions)])
     assert turns.sum() >= 4  # the way leads through several regions
@@ -130,34 +130,34 @@ def test_a_history_in_many_regions_is_shown_without_a_jump(phantom_vademecum: Va
     """Of soft tissue that was stroked across many regions, those that moved most stay shown."""
     v, tip = phantom_vademecum, Tip("sphere", 8e-3)
     slow = Viscoelasticity((0.95,), (2.0,))
-    model = prepare(v, (tip,), cloud="volume", effects=(slow,))
+    data = prepare(v, (tip,), cloud="volume", effects=(slow,))
     path = slide(v, tip.offset, 4e-3, 0.4)
     shown, change, turns, before = [], [], [], None
     for at in path:
-        step(model, at[None].copy())
-        cloud = model.out.cloud[:, 3:].astype(float).copy()
-        shown.append(frozenset(model.state.touched[: model.state.n_touched[0]].tolist()))
+        step(data, at[None].copy())
+        cloud = data.out.cloud[:, 3:].astype(float).copy()
+        shown.append(frozenset(data.state.touched[: data.state.n_touched[0]].tolist()))
         if before is not None:
             change.append(np.abs(cloud - before).max())
             turns.append(shown[-1] != shown[-2])
         before = cloud
     seen = frozenset().union(*shown)
     assert len(seen) > MAX_PAST + 2  # more were stroked than are shown
-    step(model, np.full((1, 3), 1e3))  # the tip is gone: what is left is history
-    assert model.state.n_touched[0] == MAX_PAST
+    step(data, np.full((1, 3), 1e3))  # the tip is gone: what is left is history
+    assert data.state.n_touched[0] == MAX_PAST
     assert np.max(change, where=turns, initial=0.0) < 2.0 * np.quantile(change, 0.99)
 
 
 def test_regions_fade_before_they_are_left_out(phantom_vademecum: Vademecum) -> None:
     """Of seven, four stay, each less what the fifth moves: whichever it is, nothing jumps."""
-    model = prepare(phantom_vademecum, cloud="volume")
-    state, start = model.state, model.arrays.region_start
+    data = prepare(phantom_vademecum, cloud="volume")
+    state, start = data.state, data.model.arrays.region_start
     moved = np.arange(7.0, 0.0, -1.0)
     state.n_touched[0], state.touched[:7] = 7, np.arange(7)
     state.is_touched[:7] = True
     state.amplitude[:] = 0.0
     state.amplitude[start[:7]] = moved
-    _fade_regions(model.arrays, state)
+    _fade_regions(data.model.arrays, state)
     assert state.n_touched[0] == MAX_PAST
     assert state.touched[:MAX_PAST].tolist() == [0, 1, 2, 3]
     assert state.is_touched[:7].tolist() == [True] * 4 + [False] * 3

@@ -9,11 +9,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from avatar_core.contact import model as contact
 from avatar_core.contact.effects import Effect, Friction, Respiration, Viscoelasticity
-from avatar_core.contact.effects.selection import default_effects
-from avatar_core.contact.model import FAR_AWAY, prepare
+from avatar_core.contact.layout import default_effects
+from avatar_core.contact.model import FAR_AWAY
 from avatar_core.contact.tool_path import push_and_slide
 from avatar_core.errors import StorageError
 from avatar_core.geometry.tip import Tip
@@ -24,6 +24,7 @@ from avatar_core.scene.replay import replay
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.core.conftest import Command
+from tests.helpers.contact import prepare, solve
 
 RADIUS = 5e-3
 SPHERE = Tip("sphere", RADIUS)
@@ -42,21 +43,19 @@ def recorded(vademecum: Vademecum, effects: Sequence[Effect], skipped: int = 0) 
     tips[200:210] = np.nan
     tips[300:350] = FAR_AWAY
     tips = np.concatenate([np.full((20, 1, 3), FAR_AWAY), tips, np.full((5, 1, 3), FAR_AWAY)])
-    turn = np.zeros(tips.shape)
-    turn[500:600] = [0.0, 1e-3, 0.0]
-    model = prepare(vademecum, (SPHERE,), cloud="off", effects=effects)
+    turn = 1e-3 * np.clip(np.arange(len(tips)) - 500, 0, 100)
+    orientation = Rotation.from_rotvec(turn[:, None] * [0.0, 1.0, 0.0]).as_quat()[:, None]
+    data = prepare(vademecum, (SPHERE,), cloud="off", effects=effects)
     force, status = np.empty(tips.shape), np.empty((len(tips), 1), np.uint8)
     for k, tip in enumerate(tips):
-        if model.effects.friction is not None:
-            model.effects.friction.spin[:] = turn[k]
-        contact.solve(model, tip)
-        force[k], status[k] = model.out.force, model.out.status
+        solve(data, tip, orientation[k])
+        force[k], status[k] = data.out.force, data.out.status
     n = len(tips)
     periods = Periods(
         number=np.arange(n) + 100,
         stamp=np.arange(n) * 1_000_000,
         tip=tips,
-        turn=turn,
+        orientation=orientation,
         status=status,
         force=force,
         error=np.zeros((n, 1)),

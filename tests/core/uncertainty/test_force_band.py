@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from avatar_core.common.array_table import flat
 from avatar_core.contact.effects import SeveralTools
 from avatar_core.contact.force_band import DEPTH, RATIO, ForceBand
 from avatar_core.contact.layout import lay_out
-from avatar_core.contact.model import ContactModel, make_model, prepare, step
+from avatar_core.contact.model import ContactData
 from avatar_core.contact.tool_path import inner_positions, middle_of_access
 from avatar_core.errors import CoordinateError
 from avatar_core.geometry.tip import Tip
@@ -27,6 +28,7 @@ from avatar_core.vademecum.at_values import at_values, own_compliance, own_compl
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers import box_organ
 from tests.helpers.box_organ import UP, top
+from tests.helpers.contact import data_of, prepare, step
 from tests.helpers.soft_organ import organ_on_springs, soft_organ, soft_tumour
 
 pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
@@ -46,24 +48,24 @@ def organ() -> Vademecum:
 
 
 def band_of(
-    vademecum: Vademecum, model: ContactModel, known: dict[str, Distribution], *tips: Tip
+    vademecum: Vademecum, data: ContactData, known: dict[str, Distribution], *tips: Tip
 ) -> ForceBand:
     """Of a model of a vademecum at its values."""
     edges = log_edges(vademecum, tips, known)
     ratio = edges - log_forces(vademecum, tips)[..., None]
-    return ForceBand(model, ratio.astype(np.float32), DEPTHS)
+    return ForceBand(data, ratio.astype(np.float32), DEPTHS)
 
 
-def press(model: ContactModel, tip: Tip, point: np.ndarray, normal: np.ndarray, d: float) -> float:
+def press(data: ContactData, tip: Tip, point: np.ndarray, normal: np.ndarray, d: float) -> float:
     """The force on a tip that comes down to a depth."""
-    model.reset()
+    data.reset()
     for depth in np.append(np.arange(-2e-3, d, 1e-3), d):
-        step(model, (point + (tip.offset - depth) * normal)[None])
-    return float(np.linalg.norm(model.out.force[0]))
+        step(data, (point + (tip.offset - depth) * normal)[None])
+    return float(np.linalg.norm(data.out.force[0]))
 
 
-def model_of(vademecum: Vademecum, tip: Tip) -> ContactModel:
-    return make_model(lay_out(vademecum, (tip,), Detail(1, "off")))
+def model_of(vademecum: Vademecum, tip: Tip) -> ContactData:
+    return data_of(lay_out(vademecum, (tip,), Detail(1, "off")))
 
 
 def spots(vademecum: Vademecum, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -84,10 +86,10 @@ def pressed_bands(
     """Edges of tips that are pressed at every point of the coordinates, (2, n_places, n_depths)."""
     grid, force = MaterialGrid.of(vademecum), []
     for here in grid.materials(vademecum):
-        model = model_of(here, tip)
+        data = model_of(here, tip)
         force.append(
             [
-                [press(model, tip, p, n, d) for d in PRESSED]
+                [press(data, tip, p, n, d) for d in PRESSED]
                 for p, n in zip(points, normals, strict=True)
             ]
         )
@@ -107,12 +109,12 @@ def test_edges_are_those_of_tips_pressed_anywhere(organ: Vademecum, tip: Tip) ->
     known, (points, normals) = known_of(organ, KNOWN), spots(organ, 6)
     truth = pressed_bands(organ, tip, points, normals, known)
     here = at_values(organ, {"young": 20e3, "poisson": 0.4, "contrast": 6.0})
-    model = model_of(here, tip)
-    band = band_of(here, model, known, tip)
+    data = model_of(here, tip)
+    band = band_of(here, data, known, tip)
     found = np.empty_like(truth)
     for i, (point, normal) in enumerate(zip(points, normals, strict=True)):
         for k, depth in enumerate(PRESSED):
-            press(model, tip, point, normal, depth)
+            press(data, tip, point, normal, depth)
             band.update()
             found[:, i, k] = np.linalg.norm(band.edges[:, 0, :3], axis=1)
     print(f"\n{tip.shape}: edges off by {np.abs(found / truth - 1.0).max():.2%} at most")
@@ -128,8 +130,8 @@ def test_a_tip_over_a_tumour_feels_its_modulus(organ: Vademecum) -> None:
     for part in (0.5, 0.0):
         under = np.full(field.distance.shape, part, np.float32)
         v = replace(soft, tip_field=field._replace(tumour=under))
-        model = model_of(v, SPHERE)
-        found.append([press(model, SPHERE, points[j], normals[j], DEPTHS[1]) for j in places])
+        data = model_of(v, SPHERE)
+        found.append([press(data, SPHERE, points[j], normals[j], DEPTHS[1]) for j in places])
         prepared.append(np.exp(log_forces(v, [SPHERE])[0, places, 1]))
     stiffer = np.divide(*found)
     assert (stiffer > 1.05).all()
@@ -155,9 +157,9 @@ def test_the_band_stays_where_it_is_while_the_material_changes(organ: Vademecum)
     bands, forces = [], []
     for values in ({"poisson": 0.33}, {"poisson": 0.47, "contrast": 8.0}, {"young": 50e3}):
         here = at_values(organ, values)
-        model = model_of(here, SPHERE)
-        band = band_of(here, model, known_of(here, KNOWN), SPHERE)
-        forces.append(press(model, SPHERE, point, normal, 3e-3))
+        data = model_of(here, SPHERE)
+        band = band_of(here, data, known_of(here, KNOWN), SPHERE)
+        forces.append(press(data, SPHERE, point, normal, 3e-3))
         band.update()
         bands.append(np.linalg.norm(band.edges[:, 0, :3], axis=1))
     assert max(forces) > 1.5 * min(forces)
@@ -195,28 +197,28 @@ def test_compliances_are_those_of_the_vademecum_at_these_values(organ: Vademecum
 # --- what a step makes of it -------------------------------------------------------------------
 
 
-def ratios_of(model: ContactModel, low: float, high: float) -> np.ndarray:
+def ratios_of(data: ContactData, low: float, high: float) -> np.ndarray:
     """The same everywhere, of each tool its number times as much."""
-    shape = (model.n_tools, len(model.arrays.position), len(DEPTHS))
+    shape = (data.model.n_tools, len(data.model.arrays.position), len(DEPTHS))
     ratio = np.stack([np.full(shape, np.log(low)), np.full(shape, np.log(high))], axis=-1)
-    return (ratio * np.arange(1, model.n_tools + 1)[:, None, None, None]).astype(np.float32)
+    return (ratio * np.arange(1, data.model.n_tools + 1)[:, None, None, None]).astype(np.float32)
 
 
 def test_each_tool_has_the_edges_of_its_own_wrench(phantom_vademecum: Vademecum) -> None:
     v = phantom_vademecum
-    model = prepare(v, (SPHERE, SPHERE), cloud="off", effects=(SeveralTools(),))
-    band = ForceBand(model, ratios_of(model, 0.5, 3.0), DEPTHS)
+    data = prepare(v, (SPHERE, SPHERE), cloud="off", effects=(SeveralTools(),))
+    band = ForceBand(data, ratios_of(data, 0.5, 3.0), DEPTHS)
     j = middle_of_access(v)
     near = v.surface.centers[j] + 3e-3 * v.surface.normals[j]
     away = np.array([1.0, 1.0, 1.0])
     for tips, touching in (([near, away], [True, False]), ([away, near], [False, True])):
-        step(model, np.array(tips))
+        step(data, np.array(tips))
         band.update()
         for t, touches in enumerate(touching):
-            assert model.out.force[t].any() == touches
+            assert data.out.force[t].any() == touches
             np.testing.assert_allclose(
                 band.edges[:, t, :3],
-                np.outer([0.5 ** (t + 1), 3.0 ** (t + 1)], model.out.force[t]),
+                np.outer([0.5 ** (t + 1), 3.0 ** (t + 1)], data.out.force[t]),
                 rtol=1e-5,
             )
             np.testing.assert_array_equal(band.edges[:, t, 3:], 0.0)
@@ -225,15 +227,15 @@ def test_each_tool_has_the_edges_of_its_own_wrench(phantom_vademecum: Vademecum)
 def test_depths_between_those_prepared_are_interpolated_and_others_held(
     phantom_vademecum: Vademecum,
 ) -> None:
-    v, model = phantom_vademecum, model_of(phantom_vademecum, SPHERE)
-    ratio = ratios_of(model, 1.0, 1.0)
+    v, data = phantom_vademecum, model_of(phantom_vademecum, SPHERE)
+    ratio = ratios_of(data, 1.0, 1.0)
     ratio[..., 1] = np.arange(len(DEPTHS), dtype=np.float32)
-    band = ForceBand(model, ratio, DEPTHS)
+    band = ForceBand(data, ratio, DEPTHS)
     j = middle_of_access(v)
     for depth in (0.1e-3, 1e-3, 2e-3, 6e-3, 13e-3):
-        size = press(model, SPHERE, v.surface.centers[j], v.surface.normals[j], depth)
+        size = press(data, SPHERE, v.surface.centers[j], v.surface.normals[j], depth)
         band.update()
-        own = float(-model.state.gap[0])  # of the smooth surface
+        own = float(-data.state.gap[0])  # of the smooth surface
         place = np.clip(np.log(own / DEPTHS[0]) / np.log(3.0), 0.0, len(DEPTHS) - 1.0)
         np.testing.assert_allclose(
             np.linalg.norm(band.edges[:, 0, :3], axis=1), size * np.exp([0.0, place]), rtol=1e-5
@@ -241,10 +243,10 @@ def test_depths_between_those_prepared_are_interpolated_and_others_held(
 
 
 def test_a_step_allocates_nothing_for_the_band(phantom_vademecum: Vademecum) -> None:
-    v, model = phantom_vademecum, model_of(phantom_vademecum, SPHERE)
-    band = ForceBand(model, ratios_of(model, 0.5, 2.0), DEPTHS)
+    v, data = phantom_vademecum, model_of(phantom_vademecum, SPHERE)
+    band = ForceBand(data, ratios_of(data, 0.5, 2.0), DEPTHS)
     j = middle_of_access(v)
-    press(model, SPHERE, v.surface.centers[j], v.surface.normals[j], 3e-3)
+    press(data, SPHERE, v.surface.centers[j], v.surface.normals[j], 3e-3)
     band.update()
     tracemalloc.start()
     try:
@@ -260,10 +262,10 @@ def test_a_step_allocates_nothing_for_the_band(phantom_vademecum: Vademecum) -> 
 
 
 def test_without_prepared_arrays_there_is_no_band(phantom_vademecum: Vademecum) -> None:
-    model = model_of(phantom_vademecum, SPHERE)
-    assert ForceBand.of(model, model.layout.flat()) is None
-    arrays = model.layout.flat() | {RATIO: ratios_of(model, 0.5, 2.0), DEPTH: DEPTHS}
-    assert ForceBand.of(model, arrays) is not None
+    data = model_of(phantom_vademecum, SPHERE)
+    assert ForceBand.of(data, flat(data.model.arrays)) is None
+    arrays = flat(data.model.arrays) | {RATIO: ratios_of(data, 0.5, 2.0), DEPTH: DEPTHS}
+    assert ForceBand.of(data, arrays) is not None
 
 
 # --- what a vademecum holds --------------------------------------------------------------------

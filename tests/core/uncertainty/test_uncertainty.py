@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core.contact.layout import lay_out
+from avatar_core.contact.model import model_of
 from avatar_core.contact.tool_path import starts_apart
 from avatar_core.errors import ContactError, CoordinateError
 from avatar_core.fem.elasticity import Elasticity, Inclusion, Material
@@ -33,7 +33,6 @@ from avatar_core.uncertainty.distributions import (
 )
 from avatar_core.uncertainty.force_table import ForceTable, _pressed, force_table
 from avatar_core.uncertainty.known import known_of
-from avatar_core.vademecum.accuracy import Detail
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
@@ -215,8 +214,8 @@ def values_of(known: dict[str, Distribution], n: int) -> dict[str, np.ndarray]:
 
 def forces_of(vademecum: Vademecum, places: list[int]) -> np.ndarray:
     """Of its own material, (n_places, n_depths) [N]."""
-    layout = lay_out(vademecum, (PATCH,), Detail(1, "off"))
-    return _pressed(layout, vademecum.surface, PATCH, places, DEPTHS)
+    model = model_of(vademecum, (PATCH,), 1, "off")
+    return _pressed(model, vademecum.surface, PATCH, places, DEPTHS)
 
 
 def test_between_its_points_a_table_gives_the_force_of_the_vademecum(

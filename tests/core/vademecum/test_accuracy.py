@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from avatar_core.certify.accuracy_curve import step_errors
 from avatar_core.contact.effects import SelfWeight
 from avatar_core.contact.layout import lay_out
-from avatar_core.contact.model import estimate_error, make_model, prepare, step
 from avatar_core.contact.timing import timed
 from avatar_core.contact.tool_path import palpation
 from avatar_core.errors import AccuracyError
@@ -28,6 +27,7 @@ from avatar_core.vademecum.accuracy import (
 )
 from avatar_core.vademecum.force_error import PROMISED, ForceError, calibrated
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.contact import data_of, estimate_error, prepare, step
 
 
 def some_curve(seed: int) -> AccuracyCurve:
@@ -136,17 +136,17 @@ def test_certified_errors_hold_on_fresh_loads(phantom_vademecum: Vademecum) -> N
 def test_fewer_modes_leave_the_force_as_it_is(phantom_vademecum: Vademecum) -> None:
     """To the bit; the cloud comes nearer to the whole one with every mode."""
     v = phantom_vademecum
-    model = prepare(v, cloud="volume")
+    data = prepare(v, cloud="volume")
     tip = palpation(v, 5e-3, 3e-3, 41)[20]
-    step(model, tip[None])
-    force, cloud = model.out.force.copy(), model.out.cloud[:, 3:].copy()
+    step(data, tip[None])
+    force, cloud = data.out.force.copy(), data.out.cloud[:, 3:].copy()
     errors = []
-    for modes in (1, 2, 4, model.n_modes):
-        model.show(modes)
-        step(model, tip[None])
-        assert model.n_shown == modes
-        assert np.array_equal(model.out.force, force)
-        errors.append(_difference(model.out.cloud[:, 3:], cloud))
+    for modes in (1, 2, 4, data.model.n_modes):
+        data.show(modes)
+        step(data, tip[None])
+        assert data.n_shown == modes
+        assert np.array_equal(data.out.force, force)
+        errors.append(_difference(data.out.cloud[:, 3:], cloud))
     assert errors == sorted(errors, reverse=True)
     assert errors[0] > 0.1 and errors[-1] == 0.0
 
@@ -154,13 +154,13 @@ def test_fewer_modes_leave_the_force_as_it_is(phantom_vademecum: Vademecum) -> N
 @pytest.mark.long
 def test_sag_stays_when_modes_are_left_out(phantom_vademecum: Vademecum) -> None:
     """An organ that hangs must not rise because the machine is busy."""
-    model = prepare(phantom_vademecum, cloud="volume", effects=(SelfWeight(),))
-    step(model, np.full((1, 3), 1e3))
-    sag = model.out.cloud[:, 3:].copy()
+    data = prepare(phantom_vademecum, cloud="volume", effects=(SelfWeight(),))
+    step(data, np.full((1, 3), 1e3))
+    sag = data.out.cloud[:, 3:].copy()
     assert np.abs(sag).max() > 1e-3
-    model.show(1)
-    step(model, np.full((1, 3), 1e3))
-    assert _difference(model.out.cloud[:, 3:], sag) == 0.0
+    data.show(1)
+    step(data, np.full((1, 3), 1e3))
+    assert _difference(data.out.cloud[:, 3:], sag) == 0.0
 
 
 def test_timing_finds_more_modes_slower(phantom_vademecum: Vademecum) -> None:
@@ -208,14 +208,14 @@ def test_error_that_goes_with_the_force_covers_unseen_contacts(
 
 def test_model_without_certificate_knows_no_error(phantom_vademecum: Vademecum) -> None:
     bare = replace(phantom_vademecum, certificate=None)
-    model = make_model(lay_out(bare))
+    data = data_of(lay_out(bare))
     tip = palpation(bare, 5e-3, 3e-3, 41)[20]
-    step(model, tip[None])
-    estimate_error(model)
-    assert np.isnan(model.out.force_error[0])
-    step(model, np.full((1, 3), 1e3))
-    estimate_error(model)
-    assert model.out.force_error[0] == 0.0  # no force, no error
+    step(data, tip[None])
+    estimate_error(data)
+    assert np.isnan(data.out.force_error[0])
+    step(data, np.full((1, 3), 1e3))
+    estimate_error(data)
+    assert data.out.force_error[0] == 0.0  # no force, no error
 
 
 def _difference(found: np.ndarray, wanted: np.ndarray) -> float:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from avatar_core.contact.cloud import TOLERANCE
-from avatar_core.contact.model import prepare
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.resampling import is_manifold, resampled, unified
@@ -22,6 +21,7 @@ from avatar_core.pipeline import OrganOptions, build
 from avatar_core.vademecum.display import boundary, display_of, structure
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.helpers.box_organ import UP, organ, top
+from tests.helpers.contact import prepare
 from tests.helpers.shown_dent import ASIDE, DEPTH, SPHERE, displaced, finer
 from tests.helpers.small_files import ball
 

@@ -76,7 +76,7 @@ def periods(number: np.ndarray, n_tools: int = 1, **given: np.ndarray) -> Period
         "number": number,
         "stamp": number * 1_000_000,
         "tip": np.tile(PLACES[:n_tools], (n, 1, 1)),
-        "turn": np.zeros((n, n_tools, 3)),
+        "orientation": np.tile([0.0, 0.0, 0.0, 1.0], (n, n_tools, 1)),
         "status": np.zeros((n, n_tools), np.uint8),
         "force": np.zeros((n, n_tools, 3)),
         "error": np.full((n, n_tools), 0.1),

@@ -23,9 +23,9 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStampe
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
-from avatar_core.contact.model import prepare
 from avatar_core.geometry.tip import Tip
 from avatar_ros.msg import ContactState
+from tests.helpers.contact import prepare
 from tests.ros.helpers.unlimited_guard import UnlimitedGuard
 
 SECOND = 1_000_000_000
@@ -87,8 +87,8 @@ class SteppedLoop:
         )
         self.loop = ContactLoop(self.settings, self.tools, outlets, context)
         self.loop.guards = [UnlimitedGuard() for _ in names]
-        model = prepare(organ, (Tip("sphere", 5e-3),) * n_tools, cloud="off")
-        self.loop.active = ActiveModel("a", model, self.settings)
+        data = prepare(organ, (Tip("sphere", 5e-3),) * n_tools, cloud="off")
+        self.loop.active = ActiveModel("a", data, self.settings)
         self.loop._used = self.loop.active  # at once, not faded in
 
     def step(self, *messages: bytes | None, after: float = 1e-3) -> tuple[int, np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from avatar_core.contact.haptics.force_guard import DEVICES
+from avatar_core.haptics.force_guard import DEVICES
 
 
 class UnlimitedGuard:

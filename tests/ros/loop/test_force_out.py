@@ -22,10 +22,10 @@ from crtk_msgs.msg import OperatingState
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 
-from avatar_core.contact.haptics.force_guard import ENGAGEMENT, SETTLING, ForceGuard, ForceLimits
-from avatar_core.contact.model import prepare
 from avatar_core.geometry.tip import Tip
+from avatar_core.haptics.force_guard import ENGAGEMENT, SETTLING, ForceGuard, ForceLimits
 from avatar_ros.msg import ContactState
+from tests.helpers.contact import prepare
 from tests.ros.helpers.stepped_loop import SteppedLoop, pose
 
 ENGAGING, BARRED = ContactState.STATUS_ENGAGING, ContactState.STATUS_OUT_OF_RANGE
@@ -183,7 +183,7 @@ def test_a_device_that_is_not_ready_leaves_the_organ_pressed(cell: Cell) -> None
     heard(cell).hear(OperatingState(state="FAULT", is_homed=True))
     found = cell.hold(30)
     assert (found[:, 0] == ContactState.STATUS_NOT_ENABLED).all() and not found[10:, 1:].any()
-    assert np.linalg.norm(cell.loop.active.model.out.force[0]) > 1.0
+    assert np.linalg.norm(cell.loop.active.data.out.force[0]) > 1.0
 
 
 def test_what_the_poses_lack_is_said_before_what_the_device_does(cell: Cell) -> None:
@@ -255,7 +255,7 @@ def test_large_forces_are_limited_and_the_state_says_how_much(
 ) -> None:
     cell = Cell(bench(20e-3), touch, replace(SAFETY, limits=ForceLimits(1.5, 200.0)))
     assert np.linalg.norm(cell.force) == pytest.approx(1.5)
-    whole = np.linalg.norm(cell.loop.active.model.out.force[0])
+    whole = np.linalg.norm(cell.loop.active.data.out.force[0])
     assert cell.loop.guards[0].sent_fraction == pytest.approx(1.5 / whole)
     away = cell.hold(30, lambda: pose(cell.tip + 15e-3 * cell.normal))
     change = np.linalg.norm(np.diff(np.vstack([cell.force, away[:, 1:]]), axis=0), axis=1)
@@ -267,8 +267,8 @@ def test_a_swap_goes_from_old_to_new_within_the_slew(cell: Cell, organ: Any) -> 
     """To a model of half the modes in another organ's name, while the tool is held deep."""
     limits = ForceLimits(20.0, 30.0)
     cell.loop.settings = replace(cell.loop.settings, safety=replace(SAFETY, limits=limits))
-    model = prepare(organ, (Tip("sphere", 5e-3),), modes=3, cloud="off")
-    cell.loop.active = ActiveModel("b", model, cell.loop.settings)
+    data = prepare(organ, (Tip("sphere", 5e-3),), modes=3, cloud="off")
+    cell.loop.active = ActiveModel("b", data, cell.loop.settings)
     found = np.vstack([cell.force, cell.hold(500)[:, 1:]])
     assert np.linalg.norm(np.diff(found, axis=0), axis=1).max() <= 30e-3 * (1 + 1e-9)
 
@@ -285,7 +285,7 @@ def test_poses_in_a_frame_of_the_tool_give_forces_in_it(
     queue = other.poses[0]
     other.tools[0] = ToolChannel(queue, queue, "organ", own)
     other.loop._tools = other.tools
-    expected = cell.loop.active.model.out.force[0].copy()
+    expected = cell.loop.active.data.out.force[0].copy()
     found = None
     for d in [*np.arange(-6e-3, -1e-3, 1e-3), *[-1e-3] * 5]:
         tip = rotation.T @ (touch[0] - d * touch[1] - transform[:3])
@@ -295,7 +295,7 @@ def test_poses_in_a_frame_of_the_tool_give_forces_in_it(
 
 
 def test_a_loop_that_breaks_lets_go(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    def breaks(model: Any) -> None:
+    def breaks(data: Any) -> None:
         raise RuntimeError("broken")
 
     monkeypatch.setattr(cell.loop, "_solve", breaks)

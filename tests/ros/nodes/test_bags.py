@@ -18,7 +18,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from avatar_core.bags.compare import comparable
 from avatar_core.bags.periods import path_of
 from avatar_core.bags.read import Bag, read_bag
-from avatar_core.contact.haptics.force_guard import DEVICES
+from avatar_core.haptics.force_guard import DEVICES
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.replay import replay

@@ -13,10 +13,10 @@ from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
 from avatar_ros.nodes.contact_reports import ShownModesLog
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from avatar_core.contact.model import prepare
 from avatar_core.errors import AccuracyError
 from avatar_core.vademecum.accuracy import Budget
 from avatar_ros.msg import ContactState, LoopStatistics
+from tests.helpers.contact import prepare
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.hand import Hand, felt
 from tests.ros.helpers.parameters import parameter_values, set_parameter
@@ -31,25 +31,25 @@ def window(missed: int, step_p99: float) -> LoopStatistics:
 
 
 def test_missed_periods_leave_out_modes_and_calm_takes_them_back(organ: Any) -> None:
-    model = prepare(organ)
-    accuracy = ShownModes(model, organ.certificate.curve.of("surface"))
+    data = prepare(organ)
+    accuracy = ShownModes(data, organ.certificate.curve.of("surface"))
     report = accuracy.update(window(50, 30e-6))
     assert report.shedding and report.changed
-    assert model.n_shown < model.n_modes
+    assert data.n_shown < data.model.n_modes
     assert "5.0% of the periods missed" in report.text and "force keeps all modes" in report.text
     for _ in range(5):
         report = accuracy.update(window(0, 30e-6))
-    assert not report.shedding and model.n_shown == model.n_modes
+    assert not report.shedding and data.n_shown == data.model.n_modes
 
 
 def test_nobody_looks_and_no_mode_is_left_out(organ: Any) -> None:
-    model = prepare(organ)
-    accuracy = ShownModes(model, organ.certificate.curve.of("surface"))
+    data = prepare(organ)
+    accuracy = ShownModes(data, organ.certificate.curve.of("surface"))
     accuracy.update(window(50, 30e-6), watched=True)
-    assert model.n_shown < model.n_modes
+    assert data.n_shown < data.model.n_modes
     for _ in range(3):
         report = accuracy.update(window(50, 30e-6), watched=False)
-        assert not report.shedding and model.n_shown == model.n_modes
+        assert not report.shedding and data.n_shown == data.model.n_modes
     assert accuracy.update(window(50, 30e-6), watched=True).shedding
 
 
@@ -83,36 +83,36 @@ def test_the_log_names_modes_left_out_once_a_minute(probe: Probe) -> None:
 
 
 def test_statistics_say_how_accurate_the_modes_that_were_shown_are(organ: Any) -> None:
-    model = prepare(organ)
+    data = prepare(organ)
     curve = organ.certificate.curve.of("surface")
-    points, accuracy = {p.detail.modes: p for p in curve.points}, ShownModes(model, curve)
+    points, accuracy = {p.detail.modes: p for p in curve.points}, ShownModes(data, curve)
     first, second = window(50, 30e-6), window(0, 30e-6)
     accuracy.update(first)
     accuracy.update(second)
-    assert first.modes_shown == first.modes == model.n_modes
-    assert first.promised_l2 == points[model.n_modes].l2
-    assert second.modes_shown == model.n_shown
-    assert second.promised_l2 == points[model.n_shown].l2 > first.promised_l2
+    assert first.modes_shown == first.modes == data.model.n_modes
+    assert first.promised_l2 == points[data.model.n_modes].l2
+    assert second.modes_shown == data.n_shown
+    assert second.promised_l2 == points[data.n_shown].l2 > first.promised_l2
     assert second.promised_force == first.promised_force
 
 
 def test_a_budget_chooses_what_keeps_it(organ: Any) -> None:
-    model, curve = prepare(organ), organ.certificate.curve.of("surface")
-    shown, most = ShownModes(model, curve), model.n_modes
+    data, curve = prepare(organ), organ.certificate.curve.of("surface")
+    shown, most = ShownModes(data, curve), data.model.n_modes
     loose = 3.0 * curve.points[-1].l2
     shown.keep(Budget(loose, 1.0))
-    assert model.n_shown < most
-    point = next(p for p in curve.points if p.detail.modes == model.n_shown)
+    assert data.n_shown < most
+    point = next(p for p in curve.points if p.detail.modes == data.n_shown)
     assert point.l2 <= loose and f"within {point.l2:.1%}" in shown.accuracy
-    before = model.n_shown
+    before = data.n_shown
     with pytest.raises(AccuracyError, match="nearest: "):
         shown.keep(Budget(1e-6, 1.0))
-    assert model.n_shown == before
+    assert data.n_shown == before
     shown.keep(None)
-    assert model.n_shown == most
+    assert data.n_shown == most
     shown.keep(Budget(1.0, 1.0))
     with pytest.raises(AccuracyError, match="no accuracy curve"):
-        ShownModes(model, None).keep(Budget(1.0, 1.0))
+        ShownModes(data, None).keep(Budget(1.0, 1.0))
 
 
 # --- In the cell -------------------------------------------------------------------------------

@@ -23,15 +23,15 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 
 from avatar_core.contact.force_band import DEPTH, RATIO, ForceBand
-from avatar_core.contact.haptics.force_guard import ForceGuard, ForceLimits
-from avatar_core.contact.model import prepare
 from avatar_core.geometry.tip import Tip
+from avatar_core.haptics.force_guard import ForceGuard, ForceLimits
 from avatar_core.scene.prepare import default_spec
 from avatar_core.uncertainty import force_ratios
 from avatar_core.uncertainty.distributions import Fixed, Lognormal, Uniform, mappings
 from avatar_core.uncertainty.force_ratios import DEPTHS
 from avatar_core.uncertainty.known import Held
 from avatar_core.vademecum.at_values import at_values
+from tests.helpers.contact import prepare
 from tests.helpers.soft_organ import soft_organ
 from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.stepped_loop import Queue, SteppedLoop, pose
@@ -43,8 +43,8 @@ LOW, HIGH = 0.6, 1.7
 N_BLEND = round(1e3 * BLEND)
 
 
-def ratios(model: Any, low: float = LOW, high: float = HIGH) -> np.ndarray:
-    shape = (model.n_tools, len(model.arrays.position), len(DEPTHS), 1)
+def ratios(data: Any, low: float = LOW, high: float = HIGH) -> np.ndarray:
+    shape = (data.model.n_tools, len(data.model.arrays.position), len(DEPTHS), 1)
     return np.concatenate(
         [np.full(shape, np.log(low)), np.full(shape, np.log(high))], axis=-1
     ).astype(np.float32)
@@ -64,9 +64,9 @@ class Banded:
 
     def use(self, organ: Any, identity: str, **band: float) -> None:
         """Another model, with a band if its ratios are given."""
-        model = prepare(organ, (TIP,), cloud="off")
-        found = ForceBand(model, ratios(model, **band), DEPTHS) if band else None
-        self.loop.active = ActiveModel(identity, model, self.bench.settings, band=found)
+        data = prepare(organ, (TIP,), cloud="off")
+        found = ForceBand(data, ratios(data, **band), DEPTHS) if band else None
+        self.loop.active = ActiveModel(identity, data, self.bench.settings, band=found)
 
     def step(self) -> tuple[np.ndarray, np.ndarray]:
         """Force and band of the next period."""

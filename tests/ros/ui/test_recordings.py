@@ -19,7 +19,7 @@ from avatar_ros.ui.tools.tool_state import N_ROWS, SharedToolState
 from avatar_ros.ui.tools.tools import Tools
 from avatar_ros.ui.view.organ import Organ
 
-from avatar_core.contact.effects.selection import default_effects
+from avatar_core.contact.layout import default_effects
 from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.recording import load_recording, save_recording

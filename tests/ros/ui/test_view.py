@@ -20,12 +20,13 @@ from avatar_ros.ui.view.tool_view import ToolView
 from avatar_ros.ui.view.view import CUT, GLASS, HIDDEN, WHOLE, OrganView
 from viser import ViserServer
 
-from avatar_core.contact.model import ContactModel, prepare, step
+from avatar_core.contact.model import ContactData
 from avatar_core.fem.supports import Support
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.box_organ import UP, organ, top
+from tests.helpers.contact import prepare, step
 from tests.ros.helpers.page import NAMES, PLACES, Noted, face_area
 
 SPHERE, DEPTH = Tip("sphere", 3e-3), 2e-3
@@ -46,15 +47,15 @@ def view(server: ViserServer, cube: Organ) -> OrganView:
     return view
 
 
-def pressing(vademecum: Vademecum) -> ContactModel:
-    model = prepare(vademecum, (SPHERE,), effects=())
+def pressing(vademecum: Vademecum) -> ContactData:
+    data = prepare(vademecum, (SPHERE,), effects=())
     for height in np.linspace(DEPTH, 0.0, 9):
-        step(model, (POSE + height * UP)[None])
-    return model
+        step(data, (POSE + height * UP)[None])
+    return data
 
 
 @pytest.fixture(scope="module")
-def pressed() -> ContactModel:
+def pressed() -> ContactData:
     return pressing(organ("cube"))
 
 
@@ -72,7 +73,7 @@ def area(found: list[Any]) -> float:
 
 
 def test_under_a_tip_that_presses_the_page_draws_its_dent(
-    view: OrganView, pressed: ContactModel
+    view: OrganView, pressed: ContactData
 ) -> None:
     """Deeper than any point of the cloud; and none of it when the tip lets go."""
     cloud, force = pressed.out.cloud, pressed.out.force[0]
@@ -89,7 +90,7 @@ def test_at_rest_the_organ_is_tissue_whole_and_once(view: OrganView, cube: Organ
     assert area(meshes(view, "tissue")) == pytest.approx(exact, rel=0.05)
 
 
-def test_bands_and_tissue_together_cover_the_organ(view: OrganView, pressed: ContactModel) -> None:
+def test_bands_and_tissue_together_cover_the_organ(view: OrganView, pressed: ContactData) -> None:
     cloud = pressed.out.cloud.copy()
     cloud[:, 3:] *= 0.05 * view.top / np.linalg.norm(cloud[:, 3:], axis=1).max() * 4.0
     cloud[:, :3] = organ("cube").surface_vertices + cloud[:, 3:]
@@ -100,7 +101,7 @@ def test_bands_and_tissue_together_cover_the_organ(view: OrganView, pressed: Con
     assert sum(map(area, groups)) == pytest.approx(before, rel=5e-3)
 
 
-def test_the_same_cloud_is_not_sent_twice(view: OrganView, pressed: ContactModel) -> None:
+def test_the_same_cloud_is_not_sent_twice(view: OrganView, pressed: ContactData) -> None:
     """A tool at rest would cost the browser thirty pictures a second.
 
     A cloud may come before the force of its period: the dent is drawn when the force is there.
@@ -235,7 +236,7 @@ def test_little_error_looks_unlike_no_access(view: OrganView, cube: Organ) -> No
     assert tuple(first.color) != tuple(tone.material(np.array(TISSUE)))
 
 
-def test_under_a_patch_the_page_draws_the_cloud(view: OrganView, pressed: ContactModel) -> None:
+def test_under_a_patch_the_page_draws_the_cloud(view: OrganView, pressed: ContactData) -> None:
     view.change_tips((Tip("patch", 3e-3),))
     largest = view.move(pressed.out.cloud, POSE[None], pressed.out.force)
     assert largest == pytest.approx(np.linalg.norm(pressed.out.cloud[:, 3:], axis=1).max())
@@ -255,10 +256,10 @@ def test_a_structure_belongs_to_its_organ_and_moves_with_it(view: OrganView, cub
     parts = view._structures._parts
     before = [np.array(part.mesh.vertices) for part in parts]
     assert sum(len(part.mesh.faces) for part in parts) == 4
-    model = pressing(sick)
-    view.move(model.out.cloud, POSE[None], model.out.force)
+    data = pressing(sick)
+    view.move(data.out.cloud, POSE[None], data.out.force)
     for part, old in zip(parts, before, strict=True):
-        np.testing.assert_array_equal(part.mesh.vertices, model.out.cloud[part.used, :3])
+        np.testing.assert_array_equal(part.mesh.vertices, data.out.cloud[part.used, :3])
         assert np.abs(np.array(part.mesh.vertices) - old).max() > 0.05 * DEPTH
     view.show(cube, (SPHERE,))
     assert view._structures._parts == []

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar_core.contact.effects import Tumour
-from avatar_core.contact.effects.selection import default_effects
+from avatar_core.contact.layout import default_effects
 from avatar_core.reduction.coordinates import stiffness_of
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene, SupportStiffness, Tool
@@ -155,7 +155,7 @@ def _periods(rows: np.ndarray) -> Periods:
         number=rows["number"][:, 0].copy(),
         stamp=rows["stamp"][:, 0].copy(),
         tip=rows["tip"].copy(),
-        turn=np.zeros(rows["tip"].shape),  # the page's tools do not turn
+        orientation=np.tile([0.0, 0.0, 0.0, 1.0], (*rows["tip"].shape[:2], 1)),  # of the page
         status=rows["status"].astype(np.uint8),
         force=rows["force"].copy(),
         error=rows["error"].copy(),

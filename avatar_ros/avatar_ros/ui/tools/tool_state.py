@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 
 from avatar_core.common.child import Child
-from avatar_core.contact.kernels import MAX_TOOLS
+from avatar_core.geometry.tip import MAX_TOOLS
 from avatar_ros.framework import realtime
 
 SECONDS = 600  # of a recording, at most

@@ -69,9 +69,9 @@ def with_least(law: np.ndarray) -> np.ndarray:
 
 
 @fast
-def evaluate_large_dent(law, t, load):  # type: ignore[no-untyped-def]
+def evaluate_large_dent(model, t, load):  # type: ignore[no-untyped-def]
     """eta [m], its derivative by the load F / E* [1/m] and Psi [m^3]."""
-    c, radius = law.large_dent[t], law.radius[t]
+    c, radius = model.law.large_dent[t], model.law.radius[t]
     cube = 0.75 * load / (radius * radius)
     inside = min(cube, c[END])
     s = inside ** (1.0 / 3.0)

@@ -12,7 +12,7 @@ same B-splines B_q(p), twice differentiable almost everywhere:
                                                 gamma_0 = n . C(s, s) n at s = s(x_q)
 
 with n = grad phi / |grad phi| the direction of pressing, C(s, s) interpolated from both sides and
-completed by what that misses (:mod:`avatar_core.contact.patch_on_plane`), K the kernel of the tip
+completed by what that misses (:mod:`avatar_core.fem.patch_on_plane`), K the kernel of the tip
 field with a tenth of the patch radius, and gamma_q such that the splines take those values: a sum
 of the values themselves would blur them. gamma is the compliance of a single tip; between tips t
 and t' it is
@@ -31,7 +31,7 @@ import numpy as np
 
 from avatar_core.common.jit import compiled, fast
 from avatar_core.common.splines import evaluate_all
-from avatar_core.contact.patch_on_plane import missed_between
+from avatar_core.fem.patch_on_plane import missed_between
 from avatar_core.reduction.near_field import LocalBlocks, find_block, hash_rows
 
 if TYPE_CHECKING:
@@ -218,14 +218,14 @@ def _self_compliance(carrier, carrier_weight, normal, load, start, slot, block):
 
 
 @fast
-def gather(model, state, t, cell, superposition):  # type: ignore[no-untyped-def]
+def gather(model, data, t, cell):  # type: ignore[no-untyped-def]
     """Weights of tip t in a cell of the grid, and with ``superposition`` their gradient.
 
     Of ``state`` it fills ``nodes[t]``, the load positions that carry the tip, their number
     ``n_nodes[t]`` and ``weight[t]``: w, dw/dx, dw/dy, dw/dz of each. ``local`` is scratch.
     """
     (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
-    nodes, weight, n = state.nodes[t], state.weight[t], 0
+    nodes, weight, n = data.nodes[t], data.weight[t], 0
     for i in range(3):
         for j in range(3):
             for k in range(3):
@@ -233,7 +233,7 @@ def gather(model, state, t, cell, superposition):  # type: ignore[no-untyped-def
                 if row < 0:
                     continue
                 b = wx[i] * wy[j] * wz[k]
-                if superposition.on:
+                if model.superposed[0]:
                     b0, b1 = dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k]
                     b2 = wx[i] * wy[j] * dz[k]
                 for e in range(model.carrier.shape[1]):
@@ -241,17 +241,104 @@ def gather(model, state, t, cell, superposition):  # type: ignore[no-untyped-def
                     if carrier_weight == 0.0:
                         continue
                     carrier = model.carrier[row, e]
-                    q = state.local[carrier]
+                    q = data.local[carrier]
                     if q < 0:
                         q = n
-                        state.local[carrier], nodes[q] = q, carrier
+                        data.local[carrier], nodes[q] = q, carrier
                         weight[q] = 0.0
                         n += 1
                     weight[q, 0] += b * carrier_weight
-                    if superposition.on:
+                    if model.superposed[0]:
                         weight[q, 1] += b0 * carrier_weight
                         weight[q, 2] += b1 * carrier_weight
                         weight[q, 3] += b2 * carrier_weight
     for q in range(n):
-        state.local[nodes[q]] = -1
-    state.n_nodes[t] = n
+        data.local[nodes[q]] = -1
+    data.n_nodes[t] = n
+
+
+@fast
+def modal_load(model, data, t):  # type: ignore[no-untyped-def]
+    """Y^T f: the modal load of a unit normal force of tip t."""
+    mode, n = data.mode[t], data.normal[t]
+    mode[:] = np.float32(0.0)
+    for i in range(data.n_nodes[t]):
+        w, load = data.weight[t, i, 0], model.load[data.nodes[t, i]]
+        w0, w1, w2 = np.float32(w * n[0]), np.float32(w * n[1]), np.float32(w * n[2])
+        for k in range(mode.shape[0]):
+            mode[k] += w0 * load[0, k] + w1 * load[1, k] + w2 * load[2, k]
+
+
+@fast
+def near_column(model, data, t):  # type: ignore[no-untyped-def]
+    """Near displacement at the nodes of a tip under its own unit normal force.
+
+    By Maxwell and Betti the block from j to m is the transpose of that from m to j: one is read.
+    """
+    column, n = data.column[t], data.normal[t]
+    column[: data.n_nodes[t]] = np.float32(0.0)
+    n0, n1, n2 = np.float32(n[0]), np.float32(n[1]), np.float32(n[2])
+    for i in range(data.n_nodes[t]):
+        j, w = data.nodes[t, i], np.float32(data.weight[t, i, 0])
+        u0 = u1 = u2 = np.float32(0.0)
+        for q in range(i + 1):
+            e = find_block(model.contact_start, model.contact_slot, j, data.nodes[t, q])
+            if e < 0:
+                continue
+            b = model.contact_block[e]
+            column[q, 0] += w * (b[0, 0] * n0 + b[0, 1] * n1 + b[0, 2] * n2)
+            column[q, 1] += w * (b[1, 0] * n0 + b[1, 1] * n1 + b[1, 2] * n2)
+            column[q, 2] += w * (b[2, 0] * n0 + b[2, 1] * n1 + b[2, 2] * n2)
+            if q == i:
+                continue
+            v = np.float32(data.weight[t, q, 0])
+            u0 += v * (b[0, 0] * n0 + b[1, 0] * n1 + b[2, 0] * n2)
+            u1 += v * (b[0, 1] * n0 + b[1, 1] * n1 + b[2, 1] * n2)
+            u2 += v * (b[0, 2] * n0 + b[1, 2] * n1 + b[2, 2] * n2)
+        column[i, 0] += u0
+        column[i, 1] += u1
+        column[i, 2] += u2
+
+
+@fast
+def near_gram(model, data, t):  # type: ignore[no-untyped-def]
+    """Near part of f . C f of one tip."""
+    n, near = data.normal[t], 0.0
+    n0, n1, n2 = n[0], n[1], n[2]
+    for i in range(data.n_nodes[t]):
+        j, w = data.nodes[t, i], data.weight[t, i, 0]
+        for q in range(i + 1):
+            e = find_block(model.contact_start, model.contact_slot, j, data.nodes[t, q])
+            if e < 0:
+                continue
+            b = model.contact_block[e]
+            u0 = b[0, 0] * n0 + b[0, 1] * n1 + b[0, 2] * n2
+            u1 = b[1, 0] * n0 + b[1, 1] * n1 + b[1, 2] * n2
+            u2 = b[2, 0] * n0 + b[2, 1] * n1 + b[2, 2] * n2
+            both = w * data.weight[t, q, 0] * (1.0 if q == i else 2.0)
+            near += both * (n0 * u0 + n1 * u1 + n2 * u2)
+    return near
+
+
+@fast
+def assemble_own(model, data, t, near):  # type: ignore[no-untyped-def]
+    """Compliance of a single tip on an organ at rest; it grows where access fades.
+
+    What the stencil blurs of it, gamma - f . C f, is a local dent of the tip alone.
+    """
+    far = np.float32(0.0)
+    for k in range(data.mode.shape[1]):
+        far += data.mode[t, k] * data.mode[t, k]
+    data.blurred[t] = data.self_compliance[t] - (far + near)
+    fade = model.softness[0] * (1.0 / data.access[t] - 1.0)
+    data.compliance[t, t] = data.self_compliance[t] + fade
+
+
+@fast
+def near_along_normal(data, t, column):  # type: ignore[no-untyped-def]
+    """n . sum_j w_j u_j over the nodes of a tip."""
+    n, near = data.normal[t], 0.0
+    for i in range(data.n_nodes[t]):
+        u = column[i]
+        near += data.weight[t, i, 0] * (n[0] * u[0] + n[1] * u[1] + n[2] * u[2])
+    return near

@@ -1,7 +1,7 @@
 """The dent that is shown near a tip: that of its contact, in the place of the patch's.
 
 A vademecum's cloud shows the organ under a smooth patch of radius R_p. Near a tip that presses with
-the elastic force F over a contact radius a (:mod:`avatar_core.contact.effects.tip_law`), the field
+the elastic force F over a contact radius a (:mod:`avatar_core.tips.law`), the field
 of the patch on a half-space is taken off and that of the contact put in its place,
 
     u(x) -= n h(rho) [u_tip(rho) - u_patch(rho)],      rho = |x - s|,   rho < 2 R_p,
@@ -35,16 +35,17 @@ friction. In viscoelastic tissue the present dent is replaced, not the traces of
 
 from __future__ import annotations
 
-from collections import namedtuple
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
+from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast
-from avatar_core.contact.effects.tip_law import dent
-from avatar_core.contact.effects.tip_profile import INTERVALS, TAKEN
-from avatar_core.contact.patch_on_plane import PATCH, patch_dent, quarter_turn
+from avatar_core.fem.patch_on_plane import PATCH, patch_dent, quarter_turn
 from avatar_core.geometry.tip import Tip
+from avatar_core.tips.law import dent
+from avatar_core.tips.profile import INTERVALS, TAKEN
 
 REACH = 2.0  # of the change around a tip, in patch radii
 FADE = 1.5  # in patch radii, where it begins to fade
@@ -52,35 +53,25 @@ NODES = 8  # of the Gauss rule
 _ASIDE = 0.5  # of a tip from the nearest load position, in patch radii; farther, all points count
 _SERIES = 2.0  # contact radii, from where on u_tip is a series, at half the cost
 
-DentArrays = namedtuple(
-    "DentArrays",
-    [
-        "patch",  # (INTERVALS + 1,) u_patch / (c F) over rho^2 / (2 R_p)^2 in [0, 1]
-        "height",  # (T, INTERVALS + 1) f(r) [m] over 1 - sqrt(1 - r / radius) in [0, 1]
-        "node",  # (2, NODES) sin(theta), and 2 / pi cos(theta) times the weight
-        "patch_radius",  # (1,) R_p [m]
-        "start",  # (n_positions + 1,) of the points around each load position, in
-        "around",  # (n,) points that a tip near the load position may move
-    ],
+DENT = kind(
+    "Dent",
+    patch=array("i"),  # u_patch / (c F) over rho^2 / (2 R_p)^2 in [0, 1]
+    height=array("T i"),  # f(r) [m] over 1 - sqrt(1 - r / radius) in [0, 1]
+    node=array(f"2 {NODES}"),  # sin(theta), and 2 / pi cos(theta) times the weight
+    patch_radius=array("1"),  # R_p [m]
+    start=array("q", np.int64),  # of the points around each load position, in
+    around=array("a", np.int32),  # points that a tip near the load position may move
 )
-DentState = namedtuple(
+DENT_STATE = kind(
     "DentState",
-    [
-        "patch",
-        "height",
-        "node",
-        "patch_radius",
-        "start",
-        "around",
-        "square",  # (NODES,) x^2 of the contact at hand [m^2]
-        "spring",  # (NODES,) 2 / pi w(x) dx [m^2]
-    ],
+    square=array(f"{NODES}", np.float32),  # x^2 of the contact at hand [m^2]
+    spring=array(f"{NODES}", np.float32),  # 2 / pi w(x) dx [m^2]
 )
 
 
 def dent_arrays(
     tips: Sequence[Tip], points: np.ndarray, positions: np.ndarray, patch_radius: float
-) -> DentArrays:
+) -> Any:
     """What replaces the dents of patches by those of tips.
 
     points : ndarray, shape (n_points, 3), of the cloud at rest [m]
@@ -89,7 +80,7 @@ def dent_arrays(
     theta, weight = quarter_turn(NODES)
     start, around = points_around(points, positions, patch_radius)
     part = np.linspace(0.0, 1.0, INTERVALS + 1)
-    return DentArrays(
+    return DENT(
         patch_dent(REACH * np.sqrt(part)) / PATCH,
         np.stack([tip.height(tip.radius * (1.0 - (1.0 - part) ** 2)) for tip in tips]),
         np.stack([np.sin(theta), 2.0 / np.pi * np.cos(theta) * weight]),
@@ -97,11 +88,6 @@ def dent_arrays(
         start,
         around,
     )
-
-
-def dent_state(arrays: DentArrays) -> DentState:
-    """The constant arrays, with scratch for one contact."""
-    return DentState(*arrays, np.zeros(NODES, np.float32), np.zeros(NODES, np.float32))
 
 
 def points_around(
@@ -124,77 +110,75 @@ def points_around(
 
 @fast
 def add_dents(  # type: ignore[no-untyped-def]
-    model, state, law, dents, near, rest, field, width, tip, patch
+    model, data, start, around, rest, field, width, tip, patch
 ):
     """Replace the dent of the patch by that of each tip in contact, in a displacement.
 
-    near : ``start`` and ``around``, of points near load positions; rest : of all points [m]
+    start, around : of points near load positions; rest : of all points [m]
     field : numbers of the points that are changed, ``width`` of each: 3, their displacement, or 6,
         their position and displacement
     tip, patch : 1 or 0, whether the dent of the tip is put in, and that of the patch taken off
     """
-    if not law.on or not dents.on:
+    if not model.law.on or not model.dent.on:
         return
-    for t in range(state.passage.shape[0]):
-        if state.force[t] > 0.0 and law.elastic[t] > 0.0:
-            _add_dent(model, state, law, dents, t, near, rest, field, width, tip, patch)
+    for t in range(data.passage.shape[0]):
+        if data.force[t] > 0.0 and data.law.elastic[t] > 0.0:
+            _add_dent(model, data, t, start, around, rest, field, width, tip, patch)
 
 
 @fast
 def _add_dent(  # type: ignore[no-untyped-def]
-    model, state, law, dents, t, near, rest, field, width, tip, patch
+    model, data, t, start, around, rest, field, width, tip, patch
 ):
     """Of one tip. Far from all load positions, which is rare, every point is tried."""
-    delta, _, _, a = dent(law, t)
-    far = _lay_springs(law, dents, t, delta)
-    s, n = state.point[t], state.normal[t]
+    delta, _, _, a = dent(model, data, t)
+    far = _lay_springs(model, data, t, delta)
+    s, n = data.point[t], data.normal[t]
     # held in registers: what is read from an array is read again after every write to the field
     place, normal = (s[0], s[1], s[2]), (n[0], n[1], n[2])
-    shares = (tip, patch * law.elastic[t] * law.value[t, TAKEN])
-    contact = (a * a, delta, 1.0 / law.radius[t])
-    reach = (REACH * dents.patch_radius[0]) ** 2
-    height = dents.height[t]
-    j, square = _nearest_position(model, state, t)
-    if square <= (_ASIDE * dents.patch_radius[0]) ** 2:
-        for e in range(near.start[j], near.start[j + 1]):
-            v = near.around[e]
-            _move(rest, field, width, dents, v, place, normal, reach, shares, contact, far, height)
+    shares = (tip, patch * data.law.elastic[t] * data.law.value[t, TAKEN])
+    contact = (a * a, delta, 1.0 / model.law.radius[t])
+    under = (place, normal, (REACH * model.dent.patch_radius[0]) ** 2, t)
+    j, square = _nearest_position(model, data, t)
+    if square <= (_ASIDE * model.dent.patch_radius[0]) ** 2:
+        for e in range(start[j], start[j + 1]):
+            _move(model, data, rest, field, width, around[e], under, shares, contact, far)
     else:
         for v in range(rest.shape[0]):
-            _move(rest, field, width, dents, v, place, normal, reach, shares, contact, far, height)
+            _move(model, data, rest, field, width, v, under, shares, contact, far)
 
 
 @fast
-def _nearest_position(model, state, t):  # type: ignore[no-untyped-def]
+def _nearest_position(model, data, t):  # type: ignore[no-untyped-def]
     """The load position nearest to the point under a tip, of those that carry it; its distance
     squared [m^2]."""
     nearest, least = 0, 1e9
-    for i in range(state.n_nodes[t]):
-        p, s = model.position[state.nodes[t, i]], state.point[t]
+    for i in range(data.n_nodes[t]):
+        p, s = model.position[data.nodes[t, i]], data.point[t]
         square = (p[0] - s[0]) ** 2 + (p[1] - s[1]) ** 2 + (p[2] - s[2]) ** 2
         if square < least:
-            nearest, least = state.nodes[t, i], square
+            nearest, least = data.nodes[t, i], square
     return nearest, least
 
 
 @fast
-def _lay_springs(law, dents, t, delta):  # type: ignore[no-untyped-def]
+def _lay_springs(model, data, t, delta):  # type: ignore[no-untyped-def]
     """x^2 and 2 / pi w(x) dx of a contact at the nodes of the rule.
 
     Returns the sums of the latter times 1, x^2 / 2, 3/8 x^4 and 5/16 x^6, of the series of
     1 / sqrt(rho^2 - x^2).
     """
     m0 = m1 = m2 = m3 = 0.0
-    end = min(law.place[t], 1.0)
+    end = min(data.law.place[t], 1.0)
     for i in range(NODES):
-        s = end * dents.node[0, i] * INTERVALS
+        s = end * model.dent.node[0, i] * INTERVALS
         k = min(int(s), INTERVALS - 1)
-        p, q, u = law.profile[t, k], law.profile[t, k + 1], s - k
+        p, q, u = model.law.profile[t, k], model.law.profile[t, k + 1], s - k
         x, g = p[0] + u * (q[0] - p[0]), p[2] + u * (q[2] - p[2])
-        width = end * dents.node[1, i] * (p[1] + u * (q[1] - p[1]))
+        width = end * model.dent.node[1, i] * (p[1] + u * (q[1] - p[1]))
         square = x * x
         spring = width * (delta - g)
-        dents.square[i], dents.spring[i] = square, spring
+        data.dent.square[i], data.dent.spring[i] = square, spring
         m0 += spring
         m1 += 0.5 * spring * square
         m2 += 0.375 * spring * square * square
@@ -204,13 +188,14 @@ def _lay_springs(law, dents, t, delta):  # type: ignore[no-untyped-def]
 
 @fast
 def _move(  # type: ignore[no-untyped-def]
-    rest, field, width, dents, v, place, normal, reach, shares, contact, far, height
+    model, data, rest, field, width, v, under, shares, contact, far
 ):
     """Change the displacement of one point, if it is near enough.
 
-    reach : (2 R_p)^2 [m^2]; shares : 1 or 0, of the tip's dent, and c F or 0 [m]; contact : a^2,
-    delta, 1 / radius; far : sums of the series
+    under : surface point and normal, (2 R_p)^2 [m^2] and number of the tip; shares : 1 or 0, of the
+    tip's dent, and c F or 0 [m]; contact : a^2, delta, 1 / radius; far : sums of the series
     """
+    place, normal, reach, t = under
     at = rest[v]
     x, y, z = at[0] - place[0], at[1] - place[1], at[2] - place[2]
     square = x * x + y * y + z * z
@@ -219,13 +204,13 @@ def _move(  # type: ignore[no-untyped-def]
     part = square / reach
     if square < contact[0]:
         below = -(x * normal[0] + y * normal[1] + z * normal[2])
-        tip = _inside(contact, height, np.sqrt(square), below)
+        tip = _inside(contact, model.dent.height[t], np.sqrt(square), below)
     elif square < _SERIES**2 * contact[0]:
-        tip = _outside(dents, square)
+        tip = _outside(data, square)
     else:
         tip = _far_off(far, square)
     left = min(1.0, (1.0 - part) / (1.0 - (FADE / REACH) ** 2))
-    moved = shares[0] * tip - shares[1] * _in_table(dents.patch, part)
+    moved = shares[0] * tip - shares[1] * _in_table(model.dent.patch, part)
     change = left * left * (3.0 - 2.0 * left) * moved
     for d in range(width):
         field[width * v + d] -= np.float32(change * normal[d % 3])
@@ -247,11 +232,11 @@ def _far_off(far, square):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _outside(dents, square):  # type: ignore[no-untyped-def]
+def _outside(data, square):  # type: ignore[no-untyped-def]
     """u_tip beside the contact [m], at the square of a distance."""
     far, total = np.float32(square), np.float32(0.0)
     for i in range(NODES):
-        total += dents.spring[i] / np.sqrt(far - dents.square[i])
+        total += data.dent.spring[i] / np.sqrt(far - data.dent.square[i])
     return total
 
 

@@ -27,11 +27,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from avatar_core.contact.haptics.haptic_loop import Device, Loop, run_loop
-from avatar_core.contact.haptics.passivity import Passivity, limit, make_passivity
 from avatar_core.contact.layout import PERIOD
-from avatar_core.contact.model import ContactModel, Status, step
+from avatar_core.contact.model import ContactData, Status
+from avatar_core.haptics.haptic_loop import Device, Loop, run_loop
+from avatar_core.haptics.passivity import Passivity, limit, make_passivity
 from avatar_core.studies.passivity import HANDS, hand_push
+from tests.helpers.contact import step
 from tests.helpers.examples import examples
 from tests.helpers.flat_organ import BALL, RADIUS, flat_organ
 
@@ -74,7 +75,7 @@ class Run(NamedTuple):
 
 
 def closed_loop(
-    organ: ContactModel,
+    organ: ContactData,
     device: Device,
     delay: int,
     push: np.ndarray,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avatar_core.contact.haptics.shedding import CALM, OVERLOADED, PATIENCE, Shedder
+from avatar_core.haptics.shedding import CALM, OVERLOADED, PATIENCE, Shedder
 
 LEVELS = (10, 20, 40, 80)
 CALM_WINDOW, BUSY = (0.0, 50e-6), (0.05, 50e-6)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avatar_core.contact.haptics.force_guard import (
+from avatar_core.errors import ContactError
+from avatar_core.haptics.force_guard import (
     DEVICES,
     ENGAGEMENT,
     RAMP,
@@ -17,7 +18,6 @@ from avatar_core.contact.haptics.force_guard import (
     ForceGuard,
     ForceLimits,
 )
-from avatar_core.errors import ContactError
 from tests.helpers.examples import examples
 
 PERIOD = 1e-3

@@ -9,8 +9,8 @@ from functools import partial
 
 import pytest
 
-from avatar_core.contact.model import ContactModel
-from avatar_core.contact.patch_on_plane import PATCH
+from avatar_core.contact.model import ContactData
+from avatar_core.fem.patch_on_plane import PATCH
 from avatar_core.geometry.tip import Tip
 from tests.helpers.flat_organ import COMPLIANCE, E_STAR, PATCH_RADIUS, flat_organ, force_at_depth
 from tests.helpers.half_space import on_soft_base, sneddon
@@ -20,10 +20,10 @@ DENT = PATCH / (E_STAR * PATCH_RADIUS)  # compliance of an organ that has but th
 BASE = COMPLIANCE - DENT  # of the organ beside the dent [m/N]
 
 
-def force_after_touch(model: ContactModel, depth: float) -> float:
+def force_after_touch(data: ContactData, depth: float) -> float:
     """The tip's centre may be below the surface, after a touch [N]."""
-    force_at_depth(model, 1e-4)
-    return force_at_depth(model, depth)
+    force_at_depth(data, 1e-4)
+    return force_at_depth(data, depth)
 
 
 @pytest.mark.parametrize(
@@ -50,10 +50,10 @@ def test_a_sphere_in_a_neo_hookean_half_space_is_that_of_finite_elements(
     nu: float, radius: float, base: float
 ) -> None:
     """Where the organ gives way besides, too."""
-    model = flat_organ(compliance=DENT + base, tip=Tip("sphere", radius), neo_hookean=nu)
+    data = flat_organ(compliance=DENT + base, tip=Tip("sphere", radius), neo_hookean=nu)
     for depth, force in ELEMENTS[nu].items():
         expected = force * (1.0 - nu**2) * E_STAR * radius**2
-        found = force_after_touch(model, depth * radius + base * expected)
+        found = force_after_touch(data, depth * radius + base * expected)
         assert found == pytest.approx(expected, rel=5e-3)
 
 

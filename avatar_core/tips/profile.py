@@ -1,6 +1,6 @@
 """The table of a tip's profile: depth, load and energy of its dent over the contact radius.
 
-On a flat half-space, in the notation of :mod:`avatar_core.contact.effects.tip_law`,
+On a flat half-space, in the notation of :mod:`avatar_core.tips.law`,
 
     M(a) = int_0^a x g'(x) dx,      Phi(a) = int_0^a (g(a) - g(x))^2 dx.
 """
@@ -27,7 +27,7 @@ def _contact_radius(tip: Tip, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def profile_of(tip: Tip) -> np.ndarray:
     """The table of one tip, shape (INTERVALS + 1, 6); see
-    :class:`avatar_core.contact.effects.tip_law.TipLawArrays`."""
+    :class:`avatar_core.tips.law.TipLawArrays`."""
     s = np.linspace(0.0, 1.0, INTERVALS + 1)
     node, weight = leggauss(8)
     inner = s[:-1, None] + (node + 1.0) / (2.0 * INTERVALS)

@@ -19,26 +19,25 @@ from __future__ import annotations
 import numpy as np
 
 from avatar_core.common.jit import fast, inlined
-from avatar_core.contact.effects.tip_law import added_depth
+from avatar_core.contact.tip_solver import added_depth
 
 STEPS = 7
 LEAST_PIVOT = 1e-9
 
 
 @fast
-def patch_displacement(state, effects, t):  # type: ignore[no-untyped-def]
+def patch_displacement(model, data, t):  # type: ignore[no-untyped-def]
     """U of a tip's patch: the displacement by the present pushes and without them."""
-    superposition, several_tools = effects.superposition, effects.several_tools
-    friction = effects.friction
+    superposition = data.superposition
     u0, u1, u2 = (
         superposition.free_displacement[t, 0],
         superposition.free_displacement[t, 1],
         superposition.free_displacement[t, 2],
     )
-    for s in range(state.passage.shape[0]):
-        if s != t and (not several_tools.on or not state.active[s]):
+    for s in range(data.passage.shape[0]):
+        if s != t and (not model.several_tools.on or not data.active[s]):
             continue
-        c, g = friction.compliance[t, s], friction.push[s]
+        c, g = data.friction.compliance[t, s], data.friction.push[s]
         u0 += c[0, 0] * g[0] + c[0, 1] * g[1] + c[0, 2] * g[2]
         u1 += c[1, 0] * g[0] + c[1, 1] * g[1] + c[1, 2] * g[2]
         u2 += c[2, 0] * g[0] + c[2, 1] * g[1] + c[2, 2] * g[2]
@@ -46,25 +45,25 @@ def patch_displacement(state, effects, t):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def newton_steps(state, effects, start):  # type: ignore[no-untyped-def]
+def newton_steps(model, data, start):  # type: ignore[no-untyped-def]
     """Replace all pushes by those of the Newton step with the least residual.
 
     start : 0 from the present pushes, t from tip t - 1 alone
     """
-    superposition, friction = effects.superposition, effects.friction
-    push, best, n_tools = friction.push, friction.best, state.passage.shape[0]
+    friction = data.friction
+    push, best, n_tools = friction.push, friction.best, data.passage.shape[0]
     least = np.inf
     for k in range(STEPS + 1):
         size = 0.0
         for t in range(n_tools):
-            size += _linearise(state, effects, t)
+            size += _linearise(model, data, t)
         if size < least:
             least = size
             for t in range(n_tools):
                 for d in range(3):
                     best[t, d] = push[t, d]
-        if k == 0 and start > 0 and state.active[start - 1]:
-            _start_from_one_tip(state, superposition, friction, start - 1)
+        if k == 0 and start > 0 and data.active[start - 1]:
+            _start_from_one_tip(data, start - 1)
         elif k < STEPS:
             _gauss(friction.matrix, friction.rhs)
             for t in range(n_tools):
@@ -73,17 +72,18 @@ def newton_steps(state, effects, start):  # type: ignore[no-untyped-def]
     for t in range(n_tools):
         for d in range(3):
             push[t, d] = best[t, d]
-        n, g = state.normal[t], push[t]
-        state.force[t] = max(0.0, -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2]))
+        n, g = data.normal[t], push[t]
+        data.force[t] = max(0.0, -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2]))
 
 
 @inlined
-def _start_from_one_tip(state, superposition, friction, t):  # type: ignore[no-untyped-def]
+def _start_from_one_tip(data, t):  # type: ignore[no-untyped-def]
     """Push of a tip if no other is in contact and it slips."""
-    n, y, c = state.normal[t], friction.offset[t], friction.compliance[t, t]
-    gap, stiff, along = state.gap[t], 0.0, 0.0
+    friction = data.friction
+    n, y, c = data.normal[t], friction.offset[t], friction.compliance[t, t]
+    gap, stiff, along = data.gap[t], 0.0, 0.0
     for i in range(3):
-        gap -= n[i] * superposition.free_displacement[t, i]
+        gap -= n[i] * data.superposition.free_displacement[t, i]
         stiff += n[i] * (c[i, 0] * n[0] + c[i, 1] * n[1] + c[i, 2] * n[2])
         along += y[i] * n[i]
     across = 0.0
@@ -97,28 +97,27 @@ def _start_from_one_tip(state, superposition, friction, t):  # type: ignore[no-u
 
 
 @inlined
-def _linearise(state, effects, t):  # type: ignore[no-untyped-def]
+def _linearise(model, data, t):  # type: ignore[no-untyped-def]
     """A tip's rows of the Newton system; returns its squared residual [N^2]."""
-    large_deformation, friction = effects.large_deformation, effects.friction
-    tip_law = effects.tip_law
-    matrix, rhs, n_tools = friction.matrix, friction.rhs, state.passage.shape[0]
+    friction = data.friction
+    matrix, rhs, n_tools = friction.matrix, friction.rhs, data.passage.shape[0]
     for i in range(3):
         rhs[3 * t + i] = 0.0
         for column in range(3 * n_tools):
             matrix[3 * t + i, column] = 1.0 if column == 3 * t + i else 0.0
-    if not state.active[t]:
+    if not data.active[t]:
         return 0.0
-    n, g, y, c = state.normal[t], friction.push[t], friction.offset[t], friction.compliance[t, t]
+    n, g, y, c = data.normal[t], friction.push[t], friction.offset[t], friction.compliance[t, t]
     normal = 0.0
     for i in range(3):
         normal += n[i] * (c[i, 0] * n[0] + c[i, 1] * n[1] + c[i, 2] * n[2])
     across = 0.5 * (c[0, 0] + c[1, 1] + c[2, 2] - normal)
-    u0, u1, u2 = patch_displacement(state, effects, t)
+    u0, u1, u2 = patch_displacement(model, data, t)
     force = -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
-    w, bending = state.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2), 0.0
-    if large_deformation.on or tip_law.on:
-        state.force[t] = max(0.0, force)
-        added, bending = added_depth(state, effects, t)
+    w, bending = data.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2), 0.0
+    if model.large_deformation.on or model.law.on:
+        data.force[t] = max(0.0, force)
+        added, bending = added_depth(model, data, t)
         w += added
     pressed = force - w / (normal + bending)
     x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
@@ -143,7 +142,7 @@ def _linearise(state, effects, t):  # type: ignore[no-untyped-def]
     if pressed <= 0.0:
         return square
     for s in range(n_tools):
-        if not state.active[s]:
+        if not data.active[s]:
             continue
         for d in range(3):
             own = 1.0 if s == t else 0.0

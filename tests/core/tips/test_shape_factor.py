@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 
 from avatar_core.common.splines import evaluate_all
-from avatar_core.contact import kept_factors
-from avatar_core.contact.effects.tip_law import ShapeFactor, of_planes
-from avatar_core.contact.kept_factors import factors_of
-from avatar_core.contact.locate import MAX_DEPTH
-from avatar_core.contact.shape_factor import RETREAT, SPACING, dense
 from avatar_core.fem.half_space_contact import loads_on_heights, ring_radii, sector_angles
 from avatar_core.fem.signorini import half_space_radius
 from avatar_core.geometry.mesh import Regions, TetMesh
-from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tip import MAX_DEPTH, Tip
+from avatar_core.tips import kept_factors
+from avatar_core.tips.kept_factors import factors_of
+from avatar_core.tips.law import ShapeFactor, of_planes
+from avatar_core.tips.shape_factor import RETREAT, SPACING, dense
 from avatar_core.vademecum.tip_field import TipField, make_tip_field
 from tests.core.conftest import box_mesh, box_regions
 from tests.helpers.half_space import sneddon

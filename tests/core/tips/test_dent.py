@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from avatar_core.contact.dent import FADE, REACH
 from avatar_core.contact.effects import SeveralTools, Viscoelasticity
-from avatar_core.contact.effects.tip_law import dent
 from avatar_core.contact.layout import lay_out
-from avatar_core.contact.model import ContactModel, prepare
-from avatar_core.contact.patch_on_plane import patch_dent
+from avatar_core.contact.model import ContactData
+from avatar_core.fem.patch_on_plane import patch_dent
 from avatar_core.geometry.tip import Tip
-from tests.core.contact.test_patch_on_plane import patch_rule
+from avatar_core.tips.dent import FADE, REACH
+from avatar_core.tips.law import dent
+from tests.core.fem.test_patch_on_plane import patch_rule
 from tests.helpers.box_organ import PATCH_RADIUS, UP, organ, top
+from tests.helpers.contact import prepare
 from tests.helpers.flat_organ import E_STAR, ORIGIN, flat_organ, force_at_depth
 from tests.helpers.flat_organ import UP as UPWARDS
 from tests.helpers.shown_dent import (
@@ -51,7 +52,7 @@ def fade(rho: np.ndarray) -> np.ndarray:
 
 
 def test_the_table_of_the_patch_has_the_mean_that_the_force_law_takes_off() -> None:
-    table = flat_organ(tip=SPHERE).layout.effects.dent.patch
+    table = flat_organ(tip=SPHERE).model.arrays.dent.patch
     r, load = patch_rule(40)
     met = np.interp((r / REACH) ** 2, np.linspace(0.0, 1.0, len(table)), table)
     assert load @ met == pytest.approx(1.0, rel=2e-4)
@@ -61,10 +62,10 @@ def test_the_table_of_the_patch_has_the_mean_that_the_force_law_takes_off() -> N
 @pytest.mark.parametrize("depth", [0.3e-3, 2e-3])
 def test_a_tip_shows_its_own_dent_for_the_patchs(tip: Tip, depth: float) -> None:
     points = ALONG[:, None] * np.array([[0.6, 0.8, 0.0]])
-    model = flat_organ(tip=tip, points=points)
-    shown = displaced(model, (tip,), ORIGIN, UPWARDS, depth)
-    delta, _, _, a = dent(model.effects.tip_law, 0)
-    force = model.state.force[0]
+    data = flat_organ(tip=tip, points=points)
+    shown = displaced(data, (tip,), ORIGIN, UPWARDS, depth)
+    delta, _, _, a = dent(data.model.arrays, data.state, 0)
+    force = data.state.force[0]
     patch = force / (E_STAR * PATCH_RADIUS) * patch_dent(ALONG / PATCH_RADIUS)
     exact = fade(ALONG) * ([tip_dent(tip, delta, a, rho) for rho in ALONG] - patch)
     np.testing.assert_allclose(-shown[:, 2], exact, atol=4e-3 * delta)
@@ -76,8 +77,8 @@ def test_the_change_ends_without_a_step_or_a_kink() -> None:
     """A wide punch, of whose dent most is left there."""
     tip, rho = Tip("flat", 10e-3), np.linspace(0.70 * END, END + 1e-3, 80)
     points = rho[:, None] * np.array([[1.0, 0.0, 0.0]])
-    model = flat_organ(tip=tip, points=points)
-    u = displaced(model, (tip,), ORIGIN, UPWARDS, DEPTH)[:, 2]
+    data = flat_organ(tip=tip, points=points)
+    u = displaced(data, (tip,), ORIGIN, UPWARDS, DEPTH)[:, 2]
     slope = np.diff(u) / np.diff(rho)
     assert np.abs(u).max() > 1e-3 * DEPTH
     assert np.abs(np.diff(u)).max() < 0.1 * np.abs(u).max()
@@ -86,8 +87,8 @@ def test_the_change_ends_without_a_step_or_a_kink() -> None:
 
 def test_below_the_surface_the_change_depends_on_the_distance() -> None:
     points = np.concatenate([ALONG[:, None] * axis for axis in ([0.6, 0.0, -0.8], [1.0, 0.0, 0.0])])
-    model = flat_organ(tip=SPHERE, points=points)
-    shown = displaced(model, (SPHERE,), ORIGIN, UPWARDS, DEPTH)
+    data = flat_organ(tip=SPHERE, points=points)
+    shown = displaced(data, (SPHERE,), ORIGIN, UPWARDS, DEPTH)
     below, beside = np.split(shown, 2)
     np.testing.assert_allclose(below, beside, atol=1e-7)
     assert not below[ALONG > END].any()
@@ -95,8 +96,8 @@ def test_below_the_surface_the_change_depends_on_the_distance() -> None:
 
 @pytest.mark.long
 def test_a_patch_shows_what_it_did() -> None:
-    assert lay_out(organ("cube"), (Tip("patch", 3e-3),)).effects.dent is None
-    assert lay_out(organ("cube"), (SPHERE,)).effects.dent is not None
+    assert lay_out(organ("cube"), (Tip("patch", 3e-3),)).dent is None
+    assert lay_out(organ("cube"), (SPHERE,)).dent is not None
 
 
 def test_a_dent_in_relaxing_tissue_keeps_its_shape() -> None:
@@ -117,13 +118,13 @@ def test_a_dent_in_relaxing_tissue_keeps_its_shape() -> None:
 def test_a_cube_shows_sneddons_dent(times: int, limit: float) -> None:
     """Along the normal, within two patch radii of a tip; at the vertices of a coarse mesh, and
     between them where a finer surface is displayed."""
-    model = prepare(finer(organ("cube"), times) if times else organ("cube"), (SPHERE,), effects=())
-    patch, rest = with_patch_dents(model), model.arrays.rest[:, :3].astype(float)
+    data = prepare(finer(organ("cube"), times) if times else organ("cube"), (SPHERE,), effects=())
+    patch, rest = with_patch_dents(data), data.model.arrays.rest[:, :3].astype(float)
     errors = []
     for aside in ASIDE:
         place = top("cube") + np.array([aside[0], 0.0, aside[1]])
         shown, before = (
-            displaced(each, (SPHERE,), place[None], UP[None], DEPTH) for each in (model, patch)
+            displaced(each, (SPHERE,), place[None], UP[None], DEPTH) for each in (data, patch)
         )
         distance = np.linalg.norm(rest - place, axis=1)
         near = (distance < END) & (np.abs(rest[:, 1] - place[1]) < 1e-6)
@@ -143,11 +144,11 @@ def test_a_cube_shows_sneddons_dent(times: int, limit: float) -> None:
 def test_the_changes_of_several_tips_add_up() -> None:
     """Each is that of the tip by itself, pressed until it bears the same force."""
     tips = (SPHERE, Tip("sphere", 5e-3))
-    model = prepare(organ("cube"), tips, effects=(SeveralTools(),))
+    data = prepare(organ("cube"), tips, effects=(SeveralTools(),))
     places = top("cube") + np.array([[1e-3, 0.0, 1e-3], [12e-3, 0.0, -1e-3]])
-    exact = np.zeros((len(model.out.cloud), 3))
-    change = dent_change(model, tips, places, DEPTH)
-    force = model.state.force.copy()
+    exact = np.zeros((len(data.out.cloud), 3))
+    change = dent_change(data, tips, places, DEPTH)
+    force = data.state.force.copy()
     for tip, place, bears in zip(tips, places, force, strict=True):
         one = prepare(organ("cube"), (tip,), effects=())
         depth = brentq(missing_force, 1e-5, DEPTH, args=(one, tip, place, bears), xtol=1e-9)
@@ -157,15 +158,15 @@ def test_the_changes_of_several_tips_add_up() -> None:
 
 
 def missing_force(
-    depth: float, model: ContactModel, tip: Tip, place: np.ndarray, force: float
+    depth: float, data: ContactData, tip: Tip, place: np.ndarray, force: float
 ) -> float:
-    return float(press(model, (tip,), place[None], UP[None], depth)[0]) - force
+    return float(press(data, (tip,), place[None], UP[None], depth)[0]) - force
 
 
 def dent_change(
-    model: ContactModel, tips: Sequence[Tip], places: np.ndarray, depth: float
+    data: ContactData, tips: Sequence[Tip], places: np.ndarray, depth: float
 ) -> np.ndarray:
     """What tips show beside patches of their force, shape (n, 3) [m]."""
     up = np.tile(UP, (len(tips), 1))
-    patch = displaced(with_patch_dents(model), tips, places, up, depth)
-    return displaced(model, tips, places, up, depth) - patch
+    patch = displaced(with_patch_dents(data), tips, places, up, depth)
+    return displaced(data, tips, places, up, depth) - patch

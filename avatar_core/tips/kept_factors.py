@@ -18,10 +18,10 @@ import numpy as np
 from avatar_core.common.compiled_cache import content
 from avatar_core.common.files import FileError, opened
 from avatar_core.common.hdf5 import replace_file, verified
-from avatar_core.contact.effects.tip_law import ShapeFactor, of_planes
-from avatar_core.contact.shape_factor import factor_of, together
 from avatar_core.errors import StorageError
 from avatar_core.geometry.tip import Tip
+from avatar_core.tips.law import ShapeFactor, of_planes
+from avatar_core.tips.shape_factor import factor_of, together
 from avatar_core.vademecum.tip_field import TipField
 
 _IN_MEMORY, _ON_DISK = 4, 64  # factors of some MB each

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from avatar_core.contact.haptics.passivity import Passivity, limit, make_passivity, reset
 from avatar_core.contact.layout import PERIOD
 from avatar_core.errors import ContactError
+from avatar_core.haptics.passivity import Passivity, limit, make_passivity, reset
 
 STIFFNESS = 1000.0  # [N/m]
 

@@ -7,8 +7,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import ellipk
 
-from avatar_core.contact.model import prepare, step
-from avatar_core.contact.patch_on_plane import (
+from avatar_core.fem.patch_on_plane import (
     FAR,
     PATCH,
     meeting,
@@ -19,6 +18,7 @@ from avatar_core.contact.patch_on_plane import (
 )
 from avatar_core.geometry.tip import Tip
 from tests.helpers.box_organ import MODULUS, PATCH_RADIUS, organ, top
+from tests.helpers.contact import prepare, step
 
 
 def patch_rule(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -92,11 +92,11 @@ def test_what_is_shared_has_no_step_where_its_table_ends() -> None:
 def test_a_cubes_top_is_as_soft_between_load_positions_as_at_them() -> None:
     """What sum_ij w_i w_j C_ij lacks there, 2 to 4 %, is known on a half-space."""
     v = organ("cube")
-    model = prepare(v, (Tip("patch", 8e-3),), cloud="off", effects=())
-    rng, state, felt, blurred = np.random.default_rng(0), model.state, [], []
+    data = prepare(v, (Tip("patch", 8e-3),), cloud="off", effects=())
+    rng, state, felt, blurred = np.random.default_rng(0), data.state, [], []
     for _ in range(40):
         x, z = rng.uniform(-10e-3, 10e-3, 2)
-        step(model, (top("cube") + np.array([x, 5e-3, z]))[None])
+        step(data, (top("cube") + np.array([x, 5e-3, z]))[None])
         n = state.n_nodes[0]
         nodes, weight = state.nodes[:1, :n], state.weight[:1, :n, 0]
         lacking = missed_between(v.surface.centers / PATCH_RADIUS, nodes, weight)[0]

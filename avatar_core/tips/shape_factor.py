@@ -1,6 +1,6 @@
 """How much stiffer a tip finds the surface around it than a plane.
 
-The contact law (:mod:`avatar_core.contact.effects.tip_law`) is that of a plane. A tip at p, d deep
+The contact law (:mod:`avatar_core.tips.law`) is that of a plane. A tip at p, d deep
 and d' = (1 - ``RETREAT``) d once the organ has given way, meets bulges, facets, folds and edges as
 they are: on an elastic half-space with the surface that was read, it feels the load F_0
 (:mod:`avatar_core.fem.half_space_contact`), on a plane F_1. The law's modulus is multiplied by the
@@ -25,13 +25,12 @@ import numpy as np
 from scipy.ndimage import map_coordinates, maximum_filter, spline_filter
 
 from avatar_core.common.splines import BRICK, evaluate_all
-from avatar_core.contact.effects.tip_law import ShapeFactor
-from avatar_core.contact.effects.tip_profile import profile_of
-from avatar_core.contact.locate import MAX_DEPTH
 from avatar_core.fem.half_space_contact import loads_on_heights, ring_radii, sector_angles
 from avatar_core.geometry.heights import heights_around
 from avatar_core.geometry.offsets import OffsetGrid
-from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tip import MAX_DEPTH, Tip
+from avatar_core.tips.law import ShapeFactor
+from avatar_core.tips.profile import profile_of
 from avatar_core.vademecum.tip_field import TipField
 
 SPACING = 1.7e-3  # of the splines [m]

@@ -19,9 +19,9 @@ from scipy.linalg import expm
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.common.jit import compiled
-from avatar_core.contact.haptics.passivity import Passivity, limit
 from avatar_core.contact.layout import PERIOD
 from avatar_core.errors import ContactError
+from avatar_core.haptics.passivity import Passivity, limit
 
 MAX_POSITION = 1.0  # [m] from the organ's surface; a run that exceeds it has diverged and ends
 
