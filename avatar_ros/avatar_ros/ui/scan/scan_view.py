@@ -173,6 +173,7 @@ class ScanView:
                         image,
                         found.width,
                         found.height,
+                        format="png",  # JPEG leaves grey blocks along the edges of tissue
                         cast_shadow=False,
                         receive_shadow=False,
                         wxyz=(w, x, y, z),
