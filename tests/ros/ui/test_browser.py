@@ -29,6 +29,7 @@ from tests.ros.helpers.browser import (
     TOKEN,
     WINDOW,
     choose,
+    close_notices,
     drag,
     force_of,
     input_of,
@@ -285,8 +286,7 @@ def test_a_slider_is_felt(page: Any, shots: Path, lasting_probe: Probe) -> None:
 def test_an_image_lies_where_the_organ_is(page: Any, shots: Path, size: tuple[int, int]) -> None:
     page.set_viewport_size({"width": size[0], "height": size[1]})
     open_tab(page, "Organ")
-    if not page.get_by_label("Image", exact=True).is_visible():
-        page.get_by_text("CT or MR", exact=True).click()
+    page.get_by_text("CT or MR", exact=True).click()
     choose(page, "Image", "ct.nii.gz")
     choose(page, "See", "axial")
     news(page, "Image ct.nii.gz: check that it is of this patient")
@@ -299,7 +299,11 @@ def test_an_image_lies_where_the_organ_is(page: Any, shots: Path, size: tuple[in
     page.wait_for_timeout(2000)
     page.screenshot(path=shots / f"image-{size[0]}.png")
     choose(page, "Image", "none")
+    page.get_by_text("CT or MR", exact=True).click()  # closed again, and the tab at its top
+    page.mouse.move(size[0] - 100, size[1] - 150)
+    page.mouse.wheel(0, -4000)
     page.set_viewport_size({"width": SIZES[0][0], "height": SIZES[0][1]})
+    page.wait_for_timeout(1000)
 
 
 def test_a_report_is_read_at_any_size(page: Any, shots: Path) -> None:
@@ -312,6 +316,7 @@ def test_a_report_is_read_at_any_size(page: Any, shots: Path) -> None:
     press(page, "HTML")
     with page.expect_download() as coming:
         page.locator("a[download]").click()
+    close_notices(page)
     assert re.fullmatch(r"report-sick-[\d-]+\.html", coming.value.suggested_filename)
     coming.value.save_as(shots / "report.html")
     read = page.context.new_page()
