@@ -1,4 +1,4 @@
-"""What a loop keeps between the steps of a contact model, and their scratch: the kind DATA."""
+"""State of a loop between the steps of a contact model, and their scratch: the kind DATA."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def display_arrays(
     positions: np.ndarray,
     patch_radius: float,
 ) -> Any:
-    """Of what is displayed.
+    """Corners and weights of the displayed vertices, a tuple of DISPLAY.
 
     points : vertices of the mesh that are summed from modes, in the order of the blocks
     vertices : ndarray, shape (n_vertices, 3), of the mesh [m]

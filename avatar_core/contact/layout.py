@@ -90,8 +90,9 @@ MODEL = kind(
 
 @dataclass(frozen=True)
 class Shape:
-    """What a layout takes of the organ's shape and the tips, whatever the organ is made of.
+    """Shape of the organ and the tips in a layout, whatever the organ is made of.
 
+    carriers : TipCarriers, load positions that carry a tip
     reach : longest distance between the two positions of a block [m]
     factor : of each tip
     """

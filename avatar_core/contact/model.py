@@ -87,7 +87,7 @@ class ContactModel:
 
 
 class ContactData:
-    """What one loop keeps between the steps of a model, and the result of the last.
+    """State of one loop between the steps of a model, and the result of the last.
 
     model : the ContactModel
     state : tuple of :data:`avatar_core.contact.data.DATA`, with one for each effect

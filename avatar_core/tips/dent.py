@@ -72,7 +72,7 @@ DENT_STATE = kind(
 def dent_arrays(
     tips: Sequence[Tip], points: np.ndarray, positions: np.ndarray, patch_radius: float
 ) -> Any:
-    """What replaces the dents of patches by those of tips.
+    """Tables that replace the dents of patches by those of tips, a tuple of DENT.
 
     points : ndarray, shape (n_points, 3), of the cloud at rest [m]
     positions : ndarray, shape (n_positions, 3), of the patches [m]

@@ -207,7 +207,7 @@ def stored_energy(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def tangential_compliance(model, data, t):  # type: ignore[no-untyped-def]
-    """Of the dent for a tangential force, less that of the patch [m/N].
+    """Compliance of the dent for a tangential force, less that of the patch [m/N].
 
     rho / (2 E* a) with rho = (2 - nu) / (2 (1 - nu)), 1 / (8 G a) of Mindlin (J. Appl. Mech.
     16:259, 1949) for a contact that sticks everywhere; the patch's is rho c.

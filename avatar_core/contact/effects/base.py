@@ -21,9 +21,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Ground:
-    """What an effect lays its arrays out on.
+    """Ground on which an effect lays out its arrays.
 
     vademecum : as the effects of the scene adapt it
+    tips, effects : of the scene
+    response : TipResponse of the organ, on the grid of its tip field
     n_modes : of the contact compliance, with those of zero that fill up a row
     reach : longest distance between the two positions of a block of the near field [m]
     large_start : of the modes of large deformation among those of the cloud, (n_regions + 1,)
