@@ -169,23 +169,22 @@ def build(
     elasticity = _elasticity(mesh, regions, supports, options)
     loads = load_surface(mesh, regions, options.patch_radius)
     common = (surface.name, elasticity, regions, loads)
+    display = _display(mesh, surface, options)
     tip_field = make_tip_field(mesh, regions, loads.patch_radius, surface)
+    last = (options.rule, provenance, progress, display)
 
     def count(done: int) -> None:
         progress("certify", done / options.n_certified, NO_ERROR)
 
     if options.all_coordinates:
-        vademecum = build_parametric_vademecum(
-            *common, options.all_coordinates, tip_field, options.rule, provenance, progress
-        )
+        vademecum = build_parametric_vademecum(*common, options.all_coordinates, tip_field, *last)
         certificate = certify_range(vademecum, elasticity, options.n_certified, options.seed, count)
     else:
-        vademecum = build_vademecum(*common, tip_field, options.rule, provenance, progress)
+        vademecum = build_vademecum(*common, tip_field, *last)
         certificate = certify(vademecum, elasticity, options.n_certified, options.seed, count)
     if options.tumour is not None:
         field = with_tumour(vademecum.tip_field, options.tumour, loads.patch_radius)
         vademecum = replace(vademecum, tip_field=field)
-    vademecum = replace(vademecum, display=_display(mesh, surface, options))
     if options.large:
         vademecum = _with_large(vademecum, options, progress)
     if options.with_mesh_error:

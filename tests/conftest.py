@@ -62,7 +62,7 @@ def made_once() -> Iterator[None]:
     """Compiled code, meshes, contact geometry and responses of one organ, whatever asks for them.
 
     Imports never run back (tests/core/test_rooms.py): contact geometry comes from no later room.
-    Models of an organ get copies of their own of its response and of the modes of its cloud.
+    Models of an organ get copies of their own of its response.
     """
     rooms = ("common", "geometry", "fem", "reduction", "shapes", "vademecum", "contact")
     felt = on_disk(make_tip_field, rooms=rooms)
@@ -71,12 +71,8 @@ def made_once() -> Iterator[None]:
         patch.setattr(mesh, "_fill", in_memory(on_disk(mesh._fill, _of_surface), _of_surface))
         for builder in (pipeline, patient):
             patch.setattr(builder, "make_tip_field", felt)
-        for name, told in (
-            ("tip_carriers", of_all),
-            ("make_tip_response", of_all),
-            ("cloud_arrays", _of_cloud),
-        ):
-            patch.setattr(layout, name, copied(in_memory(getattr(layout, name), told, kept=24)))
+        for name in ("tip_carriers", "make_tip_response"):
+            patch.setattr(layout, name, copied(in_memory(getattr(layout, name), of_all, kept=24)))
         yield
 
 
@@ -129,13 +125,6 @@ def _bent() -> Vademecum:
 def _of_surface(surface: SurfaceMesh, edge: float) -> tuple[Any, ...]:
     """What a mesh is made of."""
     return surface.vertices, surface.faces, edge
-
-
-def _of_cloud(vademecum: Vademecum, *others: Any) -> tuple[Any, ...]:
-    """What the modes of a cloud are made of."""
-    v, display = vademecum, vademecum.display
-    corners = None if display is None else display.corners
-    return v.mesh, v.surface.n_positions, v.far, v.regional, corners, *others
 
 
 def _data(name: str) -> Path:

@@ -12,11 +12,14 @@ from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.full_response import remainder
 from avatar_core.offline.rule import BuildRule
+from avatar_core.reduction.block_field import BlockField, Blocks, separate_field
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.reduction.galerkin import residual_compliance_blocks
 from avatar_core.reduction.near_field import LocalBlocks, taper
-from avatar_core.reduction.regional import RegionalField, separate_regions
+from avatar_core.reduction.regional import separate_regions
 from avatar_core.reduction.separated import SeparatedField
+from avatar_core.vademecum.display import Display, blocks_to_display
+from avatar_core.vademecum.modal_mass import motion_beside
 from avatar_core.vademecum.model import Convergence, Provenance, Vademecum
 from avatar_core.vademecum.tip_field import TipField
 
@@ -33,6 +36,7 @@ def assembled(
     convergence: Convergence,
     rule: BuildRule,
     tip_field: TipField,
+    display: Display | None,
 ) -> Vademecum:
     """The vademecum of a compact response: leading modes as global ones, the rest by regions.
 
@@ -41,6 +45,7 @@ def assembled(
     """
     loads, modes = problem.loads, _sorted_by_norm(response, problem.mesh)
     n_global, rank = min(rule.n_global, modes.rank), min(rule.contact_modes, modes.rank)
+    blocks = blocks_to_display(problem.mesh, display)
     reach = rule.contact_support * loads.patch_radius
     residual = residual_compliance_blocks(response.residual_compliance, support, loads, reach)
     return Vademecum(
@@ -51,31 +56,42 @@ def assembled(
         element=problem.elasticity.element,
         surface=loads,
         far=modes.truncate(n_global),
-        regional=_regional(modes, n_global, problem, rule),
+        blocks=blocks,
+        field=_field(modes, n_global, problem, rule, blocks),
         trailing=modes.load[:, n_global:rank],
         contact_near=_with_gram_of(modes.load[:, rank:], residual, loads, reach),
         tip_field=tip_field,
         convergence=convergence,
         provenance=provenance(problem),
         supports=problem.elasticity.supports,
+        display=display,
     )
 
 
-def _regional(
-    modes: SeparatedField, n_global: int, problem: PatientProblem, rule: BuildRule
-) -> RegionalField:
-    """The modes beyond the global ones, separated by regions of the load surface."""
-    mass = problem.mesh.lumped_mass
+def _field(
+    modes: SeparatedField, n_global: int, problem: PatientProblem, rule: BuildRule, blocks: Blocks
+) -> BlockField:
+    """The global modes, and the others separated by regions of the load surface, in blocks."""
+    mass, region = problem.mesh.lumped_mass, rule.regions(problem.loads)
     root = np.asarray(np.linalg.qr(np.sqrt(mass)[:, None] * modes.space, mode="r"))
     size = np.linalg.norm(modes.load @ root.T, axis=1).reshape(-1, 3)
+    far = modes.truncate(n_global)
     space, load = modes.space[:, n_global:], modes.load[:, n_global:].reshape(len(size), 3, -1)
-    return separate_regions(
-        rule.regions(problem.loads),
+    regions, _ = separate_regions(
+        region,
         lambda positions: np.tensordot(space, load[positions], ([1], [2])),
         np.maximum(size, 1e-300),
         mass,
         rule.regional,
-    )[0]
+    )
+    return separate_field(
+        blocks,
+        problem.mesh.vertex_volumes,
+        region,
+        regions,
+        (far.space, far.load.reshape(len(size), 3, -1)),
+        motion_beside(far.load, None),
+    )
 
 
 def _with_gram_of(

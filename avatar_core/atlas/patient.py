@@ -240,7 +240,6 @@ def build_patient(
         else:
             vademecum = solved(problem, options, progress)
             solutions = 3 * problem.loads.n_positions
-    vademecum = replace(vademecum, display=_display(problem, options))
     count = _CERTIFIED[fidelity] if options.n_certified is None else options.n_certified
     with _timed(clock, "certificate"):
         if count:
@@ -277,7 +276,8 @@ def interpolated(
     support = RESIDUAL_SUPPORT * problem.loads.patch_radius
     convergence = Convergence(converged=False, tolerance=float("nan"))
     field_ = make_tip_field(*surroundings(problem))
-    return assembled(problem, response, support, convergence, options.rule, field_)
+    around = (field_, _display(problem, options))
+    return assembled(problem, response, support, convergence, options.rule, *around)
 
 
 def interpolated_response(
@@ -340,7 +340,8 @@ def vademecum_of_reduced(
         rank_errors=tuple(RankError(e.rank, e.mean, e.worst) for e in found.history),
     )
     field_ = make_tip_field(*surroundings(problem))
-    return assembled(problem, found.response, found.support, convergence, options.rule, field_)
+    around = (options.rule, field_, _display(problem, options))
+    return assembled(problem, found.response, found.support, convergence, *around)
 
 
 def solved(
@@ -356,6 +357,7 @@ def solved(
         options.rule,
         provenance(problem),
         lambda stage, fraction, error: progress(f"response: {stage}", fraction, error),
+        _display(problem, options),
     )
 
 

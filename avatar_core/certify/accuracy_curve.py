@@ -81,7 +81,7 @@ def step_errors(
     shape = Shape.of(vademecum, (PATCH_TIP,))
     layouts = [lay_out(vademecum, (PATCH_TIP,), each, (), shape=shape) for each in details]
     loops = [ContactModel(layout).data() for layout in layouts]
-    points = [np.sort(shown_vertices(vademecum, cloud)) for cloud in SHOWN]
+    points = [shown_vertices(vademecum, cloud) for cloud in SHOWN]
     volume = [vademecum.mesh.vertex_volumes[p] for p in points]
     shown = np.empty((len(SHOWN) * len(levels), n))
     force, smoothing = np.empty((2, n))

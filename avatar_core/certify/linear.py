@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 _BATCH = 80  # load positions solved at once
 _TRIED = 2  # of them in single precision first
-_VERTICES = 40  # load positions of the build that are compared
 
 
 def certify(
@@ -54,14 +53,12 @@ def certify(
 class UnseenErrors:
     """Relative errors; see :class:`Certificate`.
 
-    l2 (n, 3); contact, force (n,), of unseen loads; vertex_contact (m,), at load positions of the
-    build; step, of as many unseen contacts
+    l2 (n, 3); contact, force (n,), of unseen loads; step, of as many unseen contacts
     """
 
     l2: np.ndarray
     contact: np.ndarray
     force: np.ndarray
-    vertex_contact: np.ndarray
     step: StepErrors
 
 
@@ -100,7 +97,6 @@ def measured(
         np.array(l2),
         np.array(contact),
         np.array(force),
-        _vertex_contact(vademecum, elasticity, rng),
         step_errors(vademecum, elasticity, len(chosen), seed, single),
     )
 
@@ -114,9 +110,9 @@ def _single_serves(vademecum: Vademecum, elasticity: Elasticity) -> bool:
 def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: int) -> Certificate:
     """One certificate of all errors: at one choice of the coordinates, or at several."""
 
-    l2, contact, force, vertex = (
+    l2, contact, force = (
         np.concatenate([getattr(part, name) for part in parts])
-        for name in ("l2", "contact", "force", "vertex_contact")
+        for name in ("l2", "contact", "force")
     )
     steps = [part.step for part in parts]
     tip_force = np.concatenate([step.force for step in steps])
@@ -131,7 +127,6 @@ def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: in
         force_worst=float(force.max()),
         tip_force_mean=float(tip_force.mean()),
         tip_force_worst=float(tip_force.max()),
-        vertex_contact_worst=float(vertex.max()),
         n_loads=len(contact),
         seed=seed,
         modes=vademecum.n_modes,
@@ -160,21 +155,6 @@ def _reference(
 
 def _frobenius(estimate: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
-
-
-def _vertex_contact(
-    vademecum: Vademecum, elasticity: Elasticity, rng: np.random.Generator
-) -> np.ndarray:
-    """In double precision: here it is the precision of the build that shows."""
-    surface = vademecum.surface
-    some = rng.permutation(len(surface.vertices))[:_VERTICES]
-    _, compliance = _reference(elasticity, surface.centers[some], vademecum)
-    return np.array(
-        [
-            _frobenius(vademecum.compliance(np.array([i]), np.ones(1)), compliance[k])
-            for k, i in enumerate(some)
-        ]
-    )
 
 
 def mesh_error(

@@ -419,6 +419,10 @@ def show_text(v: Vademecum) -> None:
         ("the same, anywhere on the surface", c.tip_force_mean, c.tip_force_worst),
     ):
         print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
+    every = v.convergence
+    if not math.isnan(every.every_mean):
+        name = f"displacement, all {info.n_load_positions} load positions"
+        print(f"    {name:38s} {every.every_mean:8.2%}  {every.every_worst:8.2%}")
     _show_contact_sites(c.contact_sites)
     _show_large(v)
     if c.curve is not None:

@@ -15,9 +15,9 @@ from avatar_core.errors import StorageError
 
 Shapes = dict[str, str]
 
-# f: float32 or float64; h: float16; i: whole numbers; b: truth values
-_KINDS = {"f": "f", "h": "f", "i": "iu", "b": "b"}
-_HALF = 2  # bytes of a float16
+# f: float32 or float64; s: int16; i: whole numbers; b: truth values
+_KINDS = {"f": "f", "s": "i", "i": "iu", "b": "b"}
+_SHORT, _HALF = np.dtype(np.int16), np.dtype(np.float16)
 
 
 def require_shapes(arrays: Mapping[str, np.ndarray], shapes: Shapes) -> dict[str, int]:
@@ -35,15 +35,15 @@ def require_shapes(arrays: Mapping[str, np.ndarray], shapes: Shapes) -> dict[str
             raise StorageError(f"'{key}' is missing; build the file again")
         kind, _, names = wanted.partition(":")
         array = arrays[key]
-        is_half = array.dtype.kind == "f" and array.dtype.itemsize == _HALF
-        if array.dtype.kind not in _KINDS[kind] or is_half != (kind == "h"):
+        fits = array.dtype == _SHORT if kind == "s" else array.dtype.kind in _KINDS[kind]
+        if not fits or array.dtype == _HALF:
             raise StorageError(f"'{key}' holds numbers of another kind; build the file again")
         if not _fits(array.shape, names.split(), sizes):
             raise StorageError(
                 f"'{key}' has the shape {array.shape}, which does not fit the other arrays; build "
                 "the file again"
             )
-        if kind in "fh" and not np.isfinite(array).all():
+        if kind == "f" and not np.isfinite(array).all():
             raise StorageError(f"'{key}' is NaN or infinite; build the file again")
     return sizes
 

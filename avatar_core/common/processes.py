@@ -33,6 +33,12 @@ def cpu_seconds() -> float:
     return sum(os.times()[:4])
 
 
+def n_cores() -> int:
+    """Cores that this process may use, at most those that ``OMP_NUM_THREADS`` allows."""
+    cores, allowed = len(os.sched_getaffinity(0)), os.environ.get("OMP_NUM_THREADS", "")
+    return min(cores, int(allowed)) if allowed.isdigit() and int(allowed) > 0 else cores
+
+
 def return_memory() -> None:
     """Give what this process has freed back to the system, where its C library can (glibc)."""
     with contextlib.suppress(AttributeError, OSError):

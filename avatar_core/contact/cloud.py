@@ -1,9 +1,8 @@
-"""The displacement modes of a cloud of points, laid out for the compiled step.
+"""The displacement of a cloud of points, laid out for the compiled step.
 
-The points are put in compact blocks, and the field of each region is separated once more in each of
-them (:mod:`avatar_core.reduction.block_modes`): a step reads the few modes that move a block, and
-sums them in the first-level cache. Their number and rounding concern the display alone: the force
-comes from the contact compliance, which keeps all its modes in single precision.
+A cloud takes the first blocks of a vademecum's field (:mod:`avatar_core.reduction.block_field`):
+those that hold what is displayed, or all. The modes and their rounding concern the display alone:
+the force comes from the contact compliance, which keeps all its modes in single precision.
 """
 
 from __future__ import annotations
@@ -12,27 +11,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from avatar_core.reduction.block_modes import BlockModes, compact_order, load_sizes, separate_blocks
+from avatar_core.reduction.block_field import POINTS, BlockField
 from avatar_core.vademecum.accuracy import Cloud
 
 if TYPE_CHECKING:
-    from avatar_core.reduction.regional import RegionalField
     from avatar_core.vademecum.model import Vademecum
-
-POINTS = 64  # of a block
-BLOCK = 3 * POINTS  # displacements that are summed together, within the first-level cache
-TOLERANCE = 2e-3  # root mean square of the relative error that blocks add to a load's displacement
-PART = 1e-2  # the same of what is but a part of a displacement: added by large deformation, or
-# moved by the organ's history and weight
-
-_LARGEST = np.float32(32767)  # of int16
 
 
 class CloudArrays(NamedTuple):
-    """The arrays of the same names in :class:`avatar_core.contact.layout.MODEL`, and their source;
-    the modes in single precision.
+    """The arrays of the same names in :class:`avatar_core.contact.layout.MODEL`, and their source.
 
-    points : vertices of the mesh that are shown, in the order of the blocks
+    vertex : of the mesh, in each place of the blocks; -1 where a block is not full
     large_start : as ``region_start``, of the modes of large deformation, which come last
     """
 
@@ -42,122 +31,67 @@ class CloudArrays(NamedTuple):
     block_start: np.ndarray
     region_start: np.ndarray
     regional_load: np.ndarray
-    points: np.ndarray
+    vertex: np.ndarray
     large_start: np.ndarray
 
 
 def cloud_arrays(
-    vademecum: Vademecum,
-    cloud: Cloud,
-    large: RegionalField | None = None,
-    motion: np.ndarray | None = None,
+    vademecum: Vademecum, cloud: Cloud, large: BlockField | None = None
 ) -> CloudArrays:
-    """The modes of all regions, and those of large deformation, in the blocks of a cloud.
-
-    motion : ndarray, shape (n, n_global), amplitudes that the global modes may have beside those of
-        the loads that are shown; see :func:`avatar_core.contact.layout.own_motion`. None
-        if there are none
-    """
-    blocks, regional = _Blocks(vademecum, cloud), vademecum.regional
-    load = _loads(vademecum)
-    apart = 0 if motion is None else vademecum.far.rank
-    parts = [_moved_modes(vademecum, blocks, motion), *_linear_modes(vademecum, blocks, load)]
-    start = apart + np.concatenate([[0], np.cumsum(vademecum.far.rank + np.diff(regional.start))])
+    """The blocks of a cloud, of the vademecum's field and of what large deformation adds."""
+    field, n_blocks = vademecum.field, shown_blocks(vademecum, cloud)
+    parts, start = [_first_blocks(field, n_blocks)], np.cumsum(field.count, dtype=np.int64)
     large_start = np.full_like(start, start[-1])
     if large is not None:
-        large_start = large_start + large.start
-        parts += [_large_modes(large, r, blocks) for r in range(large.n_regions)]
-    load = np.ascontiguousarray(load, np.float32)
-    return CloudArrays(*_joined(parts), start, load, blocks.points, large_start)
-
-
-class _Blocks:
-    """The points of a cloud in compact blocks.
-
-    points : vertices of the mesh; mass : ndarray, shape (n_blocks, BLOCK), lumped
-    """
-
-    def __init__(self, vademecum: Vademecum, cloud: Cloud) -> None:
-        self.points = shown_vertices(vademecum, cloud)
-        volumes = np.repeat(vademecum.mesh.vertex_volumes, 3)
-        self.mass = self.of(volumes[:, None])[:, :, 0]
-
-    def of(self, field: np.ndarray) -> np.ndarray:
-        """Columns (3 n_vertices, n) as (n_blocks, BLOCK, n), the last block filled up by zeros."""
-        rows = field.reshape(len(field) // 3, 3, field.shape[1])[self.points]
-        n_blocks = -(-len(self.points) // POINTS)
-        found = np.zeros((n_blocks * POINTS, 3, field.shape[1]))
-        found[: len(rows)] = rows
-        return found.reshape(n_blocks, BLOCK, field.shape[1])
-
-
-def _loads(vademecum: Vademecum) -> np.ndarray:
-    """Of each position in the global modes and in those of its region, (n_positions, 3, n)."""
-    far, regional = vademecum.far, vademecum.regional
-    shared = far.load.reshape(vademecum.surface.n_positions, 3, far.rank)
-    return np.concatenate([shared, regional.load], axis=2)
-
-
-def _moved_modes(vademecum: Vademecum, blocks: _Blocks, motion: np.ndarray | None) -> BlockModes:
-    """Of the global modes, as far as they move by more than the loads that are shown."""
-    shared = blocks.of(vademecum.far.space)
-    if motion is None:
-        return BlockModes.none(len(shared), BLOCK, 0)
-    size = load_sizes(shared, blocks.mass, motion)
-    return separate_blocks(shared, blocks.mass, motion, size, PART)
-
-
-def _linear_modes(vademecum: Vademecum, blocks: _Blocks, load: np.ndarray) -> list[BlockModes]:
-    """Of every region with the global modes."""
-    regional, shared, parts = vademecum.regional, blocks.of(vademecum.far.space), []
-    for r in range(regional.n_regions):
-        here, own = regional.region == r, slice(*regional.start[r : r + 2])
-        fields = np.concatenate([shared, blocks.of(regional.space[:, own])], axis=2)
-        loads = load[here, :, : fields.shape[2]].reshape(-1, fields.shape[2]).astype(float)
-        size = load_sizes(fields, blocks.mass, loads)
-        parts.append(separate_blocks(fields, blocks.mass, loads, size, TOLERANCE))
-    return parts
-
-
-def _large_modes(large: RegionalField, region: int, blocks: _Blocks) -> BlockModes:
-    """Of what large deformation adds to the loads of a region."""
-    fields = blocks.of(large.space[:, slice(*large.start[region : region + 2])])
-    loads = large.load[large.region == region, :, : fields.shape[2]]
-    loads = loads.reshape(-1, fields.shape[2]).astype(float)
-    sizes = load_sizes(fields, blocks.mass, loads)
-    return separate_blocks(fields, blocks.mass, loads, sizes, PART)
+        large_start += np.cumsum(large.count)
+        parts.append(_first_blocks(large, n_blocks))
+    space, core, level, block_start = _joined(parts)
+    vertex = vademecum.blocks.vertex[: n_blocks * POINTS]
+    return CloudArrays(space, core, level, block_start, start, field.load, vertex, large_start)
 
 
 def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
-    """Vertices of the mesh that a cloud shows, or that carry what it shows, in compact blocks."""
-    mesh, display = vademecum.mesh, vademecum.display
+    """Vertices of the mesh that a cloud shows, or that carry what it shows, ascending."""
+    # Here, because the contact node needs none of it.
+    from avatar_core.vademecum.display import displayed_vertices
+
     if cloud == "off":
         return np.arange(0)
-    shown = np.arange(len(mesh.vertices))
-    if cloud == "surface":
-        shown = mesh.surface_vertices
-        if display is not None:
-            shown = np.union1d(shown, display.corners)
-    return np.asarray(shown[compact_order(mesh.vertices[shown], POINTS)])
+    if cloud == "volume":
+        return np.arange(len(vademecum.mesh.vertices))
+    return displayed_vertices(vademecum.mesh, vademecum.display)
 
 
-def rounded(arrays: CloudArrays) -> CloudArrays:
-    """The same with modes in 16 bits.
-
-    The time of the cloud is that of reading its modes; these take half as long as in single
-    precision. Rounding costs 1 / 65536 of each mode's peak, which is 1.
-    """
-    space = np.rint(arrays.space * _LARGEST).astype(np.int16)
-    return arrays._replace(space=space, core=arrays.core / _LARGEST)
+def shown_blocks(vademecum: Vademecum, cloud: Cloud) -> int:
+    """Blocks that hold these."""
+    return vademecum.blocks.that_hold(shown_vertices(vademecum, cloud))
 
 
-def _joined(parts: list[BlockModes]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """space, core, level and block_start of all parts."""
-    space = np.concatenate([part.space for part in parts])
-    core = np.zeros((len(space), max(part.core.shape[1] for part in parts)), np.float32)
-    before = np.cumsum([0] + [len(part.space) for part in parts])
-    for first, part in zip(before, parts, strict=False):
-        core[first : first + len(part.core), : part.core.shape[1]] = part.core
-    level = np.concatenate([part.level for part in parts])
-    start = np.stack([first + part.start for first, part in zip(before, parts, strict=False)])
-    return space, core, level, start
+_Part = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _first_blocks(field: BlockField, n_blocks: int) -> _Part:
+    """space, core, level and start of the first blocks of a field."""
+    start = field.start[:, : n_blocks + 1]
+    if n_blocks + 1 == field.start.shape[1]:
+        return field.space, field.core, field.level, start
+    rows = np.concatenate([np.arange(part[0], part[-1]) for part in start])
+    before = np.cumsum(start[:, -1] - start[:, 0])
+    moved = start - start[:, :1] + np.concatenate([[0], before[:-1]])[:, None]
+    return field.space[rows], field.core[rows], field.level[rows], moved
+
+
+def _joined(parts: list[_Part]) -> _Part:
+    """The blocks of all fields; of all but the first, those of global modes are left out."""
+    if len(parts) == 1:
+        space, core, level, start = parts[0]
+        return space, np.ascontiguousarray(core), level, np.ascontiguousarray(start)
+    most = max(core.shape[1] for _, core, _, _ in parts)
+    before = np.cumsum([0] + [len(space) for space, _, _, _ in parts])
+    core = np.zeros((before[-1], most), np.float32)
+    for first, (_, own, _, _) in zip(before, parts, strict=False):
+        core[first : first + len(own), : own.shape[1]] = own
+    later = zip(before[1:], parts[1:], strict=False)
+    starts = [parts[0][3], *(first + start[1:] for first, (*_, start) in later)]
+    space, level = (np.concatenate([part[k] for part in parts]) for k in (0, 2))
+    return space, core, level, np.concatenate(starts)

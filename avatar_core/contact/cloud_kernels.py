@@ -4,7 +4,7 @@
     a_rm = - sum_t lambda_t sum_j w_j W_m(s_j) . n_t,
 
 over the load positions j of region r that carry a tip, with the modes Z and the core C of
-:mod:`avatar_core.contact.cloud`, and for large deformation the terms of
+:mod:`avatar_core.reduction.block_field`, and for large deformation the terms of
 :mod:`avatar_core.vademecum.large_deformation`. The global modes are part of every region's field;
 what they move by more than the loads that are shown (vibration, weight, faded history) stands
 apart, as a part of its own. That is an organ under patches; near a tip,
@@ -19,12 +19,12 @@ from __future__ import annotations
 import numpy as np
 
 from avatar_core.common.jit import entry, fast, inlined
-from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.display import write_cloud
 from avatar_core.contact.effects.friction import force_on_tissue
 from avatar_core.contact.effects.large_deformation import add_nonlinear_load, powers_of_depth
 from avatar_core.contact.effects.respiration import shift_cloud
 from avatar_core.contact.effects.viscoelasticity import least_shown
+from avatar_core.reduction.block_field import BLOCK
 
 ALL = 1 << 30  # a level that no mode has
 LEAST_WEIGHT = 0.02  # of the load positions of a region, below which its modes are left out
@@ -42,7 +42,7 @@ def deform(model, data):  # type: ignore[no-untyped-def]
 @fast
 def _displace(model, data):  # type: ignore[no-untyped-def]
     """The displacement of all points into ``data.field``."""
-    if not model.superposed[0] and data.out.n_contacts[0] == 0:
+    if not model.moving[0] and data.out.n_contacts[0] == 0:
         data.field[:] = np.float32(0.0)
         return
     _release_regions(data)
@@ -58,7 +58,7 @@ def _displace(model, data):  # type: ignore[no-untyped-def]
 @fast
 def _move_globals(model, data):  # type: ignore[no-untyped-def]
     """Amplitudes that the effects give to the global modes, less those of the touched regions."""
-    if not model.superposed[0]:
+    if not model.moving[0]:
         return
     for k in range(model.region_start[0]):
         moved = data.superposition.total[k]
@@ -199,7 +199,8 @@ def _sum_modes(model, data):  # type: ignore[no-untyped-def]
         u = data.field[b * BLOCK : (b + 1) * BLOCK]
         for i in range(BLOCK):
             u[i] = np.float32(0.0)
-        add_part(space, core, level, rows[0], amplitude[:n_global], ALL, b, u)
+        if model.moving[0]:
+            add_part(space, core, level, rows[0], amplitude[:n_global], ALL, b, u)
         for q in range(data.n_touched[0]):
             r = data.touched[q]
             own = amplitude[start[r] : start[r + 1]]

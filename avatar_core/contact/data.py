@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from avatar_core.common.array_table import allocate, array, kind, sizes_of
-from avatar_core.contact.cloud import BLOCK
 from avatar_core.contact.effects import EFFECTS
 from avatar_core.contact.layout import MODEL
 from avatar_core.contact.organ_response import MAX_STENCIL
 from avatar_core.contact.superposition import SUPERPOSITION
+from avatar_core.reduction.block_field import BLOCK
 from avatar_core.tips.dent import DENT_STATE
 from avatar_core.tips.law import LAW_STATE
 

@@ -23,6 +23,8 @@ from avatar_core.tips.dent import add_dents, points_around
 if TYPE_CHECKING:
     from avatar_core.vademecum.display import Display
 
+_NOWHERE = 1e3  # farther than any tip reaches [m]
+
 DISPLAY = kind(
     "Display",
     corner=array("v 4", np.int32),  # points of the mesh that carry each displayed vertex
@@ -35,20 +37,22 @@ DISPLAY = kind(
 
 def display_arrays(
     display: Display,
-    points: np.ndarray,
+    vertex: np.ndarray,
+    place: np.ndarray,
     vertices: np.ndarray,
     positions: np.ndarray,
     patch_radius: float,
 ) -> Any:
     """Corners and weights of the displayed vertices, a tuple of DISPLAY.
 
-    points : vertices of the mesh that are summed from modes, in the order of the blocks
+    vertex : of the mesh, in each place of the blocks; -1 where a block is not full
+    place : of each vertex in the blocks
     vertices : ndarray, shape (n_vertices, 3), of the mesh [m]
     positions : ndarray, shape (n_positions, 3), of the patches [m]
     """
-    rest, order = vertices[points], np.argsort(points)
+    rest = np.where(vertex[:, None] < 0, _NOWHERE, vertices[vertex])
     return DISPLAY(
-        order[np.searchsorted(points, display.corners, sorter=order)].astype(np.int32),
+        np.ascontiguousarray(place[display.corners]),
         display.weights,
         rest.astype(np.float32),
         *points_around(rest, positions, patch_radius),

@@ -13,22 +13,20 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from avatar_core.common.array_table import array, kind
-from avatar_core.contact.cloud import BLOCK, cloud_arrays, rounded
+from avatar_core.contact.cloud import cloud_arrays, shown_vertices
 from avatar_core.contact.display import DISPLAY, display_arrays
 from avatar_core.contact.effects import (
     EFFECTS,
     Effect,
-    Inertia,
     LargeDeformationEffect,
-    SelfWeight,
     SeveralTools,
     Tumour,
-    Viscoelasticity,
 )
 from avatar_core.contact.effects.base import Ground, find
 from avatar_core.contact.organ_response import TipCarriers, make_tip_response, tip_carriers
 from avatar_core.errors import ContactError, SceneError
 from avatar_core.geometry.tip import MAX_DEPTH, MAX_TOOLS, Tip
+from avatar_core.reduction.block_field import BLOCK
 from avatar_core.reduction.near_field import hash_rows
 from avatar_core.tips.dent import DENT, dent_arrays
 from avatar_core.tips.law import LAW, PATCH_ON_MESH, law_arrays
@@ -66,6 +64,7 @@ MODEL = kind(
     contact_block=array("e 3 3", np.float32),
     softness=array("1"),  # added where access fades [m/N]
     superposed=array("1", np.bool_),  # whether all loads and histories add up at each tip
+    moving=array("1", np.bool_),  # whether global modes move beside the loads of the moment
     # modes of the cloud's blocks; those of each part begin at block_start: of global modes that
     # move beside the loads, of each region, and of each region's large deformation
     space=array(f"k {BLOCK}", np.int16),
@@ -144,11 +143,10 @@ def lay_out(
     modulus = vademecum.material.plane_strain_modulus
     response = make_tip_response(surface, field, shape.carriers, load, contact, modulus)
     large = vademecum.large if find(chosen, LargeDeformationEffect) else None
-    clouds = cloud_arrays(
-        vademecum, detail.cloud, large.terms if large else None, own_motion(vademecum, chosen)
-    )
-    shown, display = rounded(clouds), vademecum.display if detail.cloud == "surface" else None
-    points = display.vertices if display else vademecum.mesh.vertices[np.sort(shown.points)]
+    shown = cloud_arrays(vademecum, detail.cloud, large.terms if large else None)
+    display = vademecum.display if detail.cloud == "surface" else None
+    vertices = shown_vertices(vademecum, detail.cloud)
+    points = display.vertices if display else vademecum.mesh.vertices[vertices]
     law = law_arrays(
         tips,
         vademecum.material,
@@ -159,7 +157,9 @@ def lay_out(
     )
     places, fine = (surface.centers, surface.patch_radius), None
     if display:
-        fine = display_arrays(display, shown.points, vademecum.mesh.vertices, *places)
+        fine = display_arrays(
+            display, shown.vertex, vademecum.blocks.place, vademecum.mesh.vertices, *places
+        )
     padded = _padded(load)
     n_modes, start = padded.shape[2], shown.large_start
     ground = Ground(
@@ -183,13 +183,14 @@ def lay_out(
         contact_block=contact.block,
         softness=np.array([float((load**2).sum(axis=(1, 2)).mean() / 3.0)]),
         superposed=np.array([any(effect.superposed for effect in chosen)]),
+        moving=np.array([any(effect.moving for effect in chosen)]),
         space=shown.space,
         core=shown.core,
         level=shown.level,
         block_start=shown.block_start,
         shown=np.array([detail.modes]),
-        place=np.argsort(shown.points).astype(np.int32),
-        region=vademecum.regional.region,
+        place=vademecum.blocks.place[vertices],
+        region=vademecum.field.region,
         region_start=shown.region_start,
         regional_load=shown.regional_load,
         rest=np.pad(points, ((0, 0), (0, 3))).astype(np.float32),
@@ -211,21 +212,6 @@ def default_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
     if n_tools > 1:
         effects.append(SeveralTools())
     return tuple(effects)
-
-
-def own_motion(vademecum: Vademecum, effects: Sequence[Effect]) -> np.ndarray | None:
-    """Amplitudes by which global modes may move beside the loads of the moment, (n, n_global).
-
-    A history may leave those of any load; the weight's count as much as all loads together. None
-    if the effects know neither.
-    """
-    weight = find(effects, SelfWeight)
-    remembers = find(effects, Inertia) or find(effects, Viscoelasticity)
-    motion = [vademecum.far.load.astype(float)] if remembers else []
-    if weight is not None:
-        sag = weight.sag(vademecum)
-        motion.append(np.repeat(sag[None], len(motion[0]) if motion else 1, axis=0))
-    return np.concatenate(motion) if motion else None
 
 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
 
-from avatar_core.common.arrays import IntArray
+from avatar_core.common.processes import n_cores
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface, triples
 from avatar_core.offline.rule import NO_ERROR, Progress
+from avatar_core.reduction.block_field import BlockField, Blocks
 from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 from avatar_core.reduction.separated import SeparatedField
 
@@ -43,56 +44,50 @@ class FullResponse:
         smooth = far.space.astype(np.float32) @ far.load[loads].T.astype(np.float32)
         return (self.columns[:, loads] - smooth).reshape(len(smooth), -1, 3)
 
+    def errors(self, blocks: Blocks, field: BlockField, mass: np.ndarray) -> np.ndarray:
+        """Relative L2 errors of a field under each load, shape (n_loads,).
 
-class Solving:
-    """The arrays of a response, filled load position by load position.
+        mass : ndarray, shape (3 n_vertices,), lumped
+        """
+        out = np.empty(len(self.norm))
+        for r in range(field.n_regions):
+            here = triples(np.flatnonzero(field.region == r))
+            load = field.load.reshape(len(out), field.rank)[here, : field.count[1 + r]]
+            shown = blocks.at_vertices(field.of_part(1 + r, load.T))
+            out[here] = l2_norm(shown - self.columns[:, here], mass) / self.norm[here]
+        return out
+
+
+def full_response(elasticity: Elasticity, loads: sp.csr_matrix, progress: Progress) -> FullResponse:
+    """Solve for every load position, in single precision where that serves, on all cores.
+
+    Batches are the same whatever the number of cores, and so are the bits of their solutions.
 
     Parameters
     ----------
     loads : sparse, shape (3 n_nodes, n_loads), three for each position
-    single : solve in single precision where that does, in half the time
-
-    Attributes
-    ----------
-    columns, compliance : of :class:`FullResponse`; columns of other loads are not set yet
     """
+    average, by_column, n = loads.T.tocsr(), loads.tocsc(), loads.shape[1]
+    single = elasticity.single_serves(by_column)
+    columns = np.empty((3 * len(elasticity.mesh.vertices), n), np.float32, order="F")
+    compliance = np.empty((n, n), np.float32, order="F")
+    mass = elasticity.mesh.lumped_mass.astype(np.float32)
+    norm = np.empty(n, np.float32)
 
-    def __init__(self, elasticity: Elasticity, loads: sp.csr_matrix, single: bool) -> None:
-        self._elasticity, self._average = elasticity, loads.T.tocsr()
-        self._by_column, n = loads.tocsc(), loads.shape[1]
-        self._single = single and elasticity.single_serves(self._by_column)
-        self.columns = np.empty((3 * len(elasticity.mesh.vertices), n), np.float32, order="F")
-        self.compliance = np.empty((n, n), np.float32, order="F")
+    def solve(first: int) -> None:
+        batch = slice(first, first + 3 * _BATCH)
+        solution = elasticity.solve(by_column[:, batch], single)
+        columns[:, batch] = elasticity.at_vertices(solution)
+        compliance[:, batch] = average @ solution
+        norm[batch] = l2_norm(columns[:, batch], mass)
 
-    def solve(self, positions: IntArray) -> Iterator[int]:
-        """Solve for some positions, batch by batch; yields how many of them are done."""
-        for first in range(0, len(positions), _BATCH):
-            chosen = triples(positions[first : first + _BATCH])
-            solution = self._elasticity.solve(self._by_column[:, chosen], self._single)
-            self.columns[:, chosen] = self._elasticity.at_vertices(solution)
-            self.compliance[:, chosen] = self._average @ solution
-            yield min(first + _BATCH, len(positions))
-
-    def response(self) -> FullResponse:
-        """The response, once every column is set."""
-        _symmetrize(self.compliance)
-        columns, mass = self.columns, self._elasticity.mesh.lumped_mass.astype(np.float32)
-        batches = range(0, columns.shape[1], 3 * _BATCH)
-        norm = np.concatenate([l2_norm(columns[:, k : k + 3 * _BATCH], mass) for k in batches])
-        return FullResponse(columns, self.compliance, norm)
-
-
-def full_response(
-    elasticity: Elasticity, loads: sp.csr_matrix, progress: Progress, single: bool = False
-) -> FullResponse:
-    """Solve for every load position.
-
-    single : solve in single precision where that does, in half the time
-    """
-    solving, n = Solving(elasticity, loads, single), loads.shape[1] // 3
-    for done in solving.solve(np.arange(n)):
-        progress("solve", done / n, NO_ERROR)
-    return solving.response()
+    elasticity.solve(by_column[:, :1], single)  # the factor, before threads ask for it at once
+    with ThreadPoolExecutor(n_cores()) as pool:
+        first = range(0, n, 3 * _BATCH)
+        for start, _ in zip(first, pool.map(solve, first), strict=True):
+            progress("solve", min(start + 3 * _BATCH, n) / n, NO_ERROR)
+    _symmetrize(compliance)
+    return FullResponse(columns, compliance, norm)
 
 
 def _symmetrize(matrix: np.ndarray) -> None:

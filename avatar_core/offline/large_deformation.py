@@ -25,6 +25,7 @@ from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.offline.rule import NO_ERROR, Progress, silent
 from avatar_core.reduction.asymptotic_series import path_series
+from avatar_core.reduction.block_field import PART, separate_field
 from avatar_core.reduction.regional import RegionalRule, separate_regions
 from avatar_core.vademecum.large_deformation import (
     POWERS,
@@ -94,13 +95,16 @@ def with_large_deformation(
     """
     rule = rule or LargeRule()
     paths = _follow(problem, vademecum.surface, rule, progress)
-    terms, errors = separate_regions(
-        vademecum.regional.region,
+    region = vademecum.field.region
+    regions, errors = separate_regions(
+        region,
         lambda positions: paths.fields[:, positions].transpose(2, 1, 0),
         paths.size[:, None] / paths.reach[:, None] ** np.array(POWERS),
         vademecum.mesh.lumped_mass,
         RegionalRule(rule.mode_tolerance, _WORST_OVER_MEAN * rule.mode_tolerance, rule.max_modes),
     )
+    volumes = vademecum.mesh.vertex_volumes
+    terms = separate_field(vademecum.blocks, volumes, region, regions, tolerance=PART)
     large = LargeDeformation(material, terms, paths.depth, paths.reach)
     provenance = vademecum.provenance
     left = float(errors[-1].mean())

@@ -1,12 +1,11 @@
 """The offline stage: from an organ's mesh to its vademecum.
 
-1. about half of the patches are solved, the others projected on their solutions, see
-   :mod:`avatar_core.offline.completion`;
+1. every patch is solved, in single precision where that serves;
 2. PGD finds the modes that all loads share, and body functions join them; an orthogonal mixing
    sorts them by displacement norm. The first are the global modes of the displacement; the contact
    compliance uses all of them;
 3. what the global modes leave is separated region by region of the load surface, in as many modes
-   as the tolerance asks for;
+   as the tolerance asks for, and all modes together block by block of the mesh;
 4. what the modes leave of the contact compliance is kept near each load, tapered.
 """
 
@@ -20,13 +19,25 @@ import scipy.sparse as sp
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
-from avatar_core.offline.completion import completed_response
-from avatar_core.offline.full_response import FullResponse, contact_blocks, contact_near
+from avatar_core.offline.full_response import (
+    FullResponse,
+    contact_blocks,
+    contact_near,
+    full_response,
+)
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
+from avatar_core.reduction.block_field import separate_field
 from avatar_core.reduction.pgd import EnrichmentReport, PGDRule, SolvedLoads, solve_pgd
-from avatar_core.reduction.regional import RegionalField, separate_regions
+from avatar_core.reduction.regional import RegionModes, separate_regions
 from avatar_core.reduction.separated import SeparatedField
-from avatar_core.vademecum.modal_mass import LEAST_MODES, N_BODY, body_functions, body_response
+from avatar_core.vademecum.display import Display, blocks_to_display
+from avatar_core.vademecum.modal_mass import (
+    LEAST_MODES,
+    N_BODY,
+    body_functions,
+    body_response,
+    motion_beside,
+)
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.tip_field import TipField
 
@@ -60,6 +71,7 @@ def build_vademecum(
     rule: BuildRule,
     provenance: Provenance,
     progress: Progress = silent,
+    display: Display | None = None,
 ) -> Vademecum:
     """Compute the vademecum of one organ; see the module docstring for the stages.
 
@@ -68,7 +80,7 @@ def build_vademecum(
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     elasticity = elasticity.refining()
-    response = completed_response(elasticity, surface, loads, rule.completion, progress)
+    response = full_response(elasticity, loads, progress)
     with_body = rule.max_modes >= LEAST_MODES
     n_body = N_BODY if with_body else 0
     modes = find_modes(elasticity, loads, response, rule.contact_modes - n_body, progress)
@@ -79,7 +91,17 @@ def build_vademecum(
         space, load, trailing = _with_body(elasticity, loads, modes, n_global)
         body = body_response(elasticity, space)
     far = SeparatedField(elasticity.at_vertices(space), load)
-    regional, errors = regional_field(far, response, surface, elasticity, rule, progress)
+    region, blocks = rule.regions(surface), blocks_to_display(elasticity.mesh, display)
+    parts, errors = modes_of_regions(far, response, region, elasticity, rule, _half(progress, 0))
+    field = separate_field(
+        blocks,
+        elasticity.mesh.vertex_volumes,
+        region,
+        parts,
+        (far.space, load.reshape(surface.n_positions, 3, -1)),
+        motion_beside(load, body),
+        progress=lambda fraction: _half(progress, 1)("regions", fraction, NO_ERROR),
+    )
     last = errors[-1]
     support = rule.contact_support * surface.patch_radius
     return Vademecum(
@@ -90,7 +112,8 @@ def build_vademecum(
         element=elasticity.element,
         surface=surface,
         far=SeparatedField(far.space.astype(np.float32), load.astype(np.float32)),
-        regional=regional,
+        blocks=blocks,
+        field=field,
         trailing=trailing.astype(np.float32),
         contact_near=contact_near(
             contact_blocks(response, surface, support),
@@ -102,9 +125,10 @@ def build_vademecum(
         body=body,
         convergence=Convergence(
             rule.is_met(last.mean, last.worst), rule.tolerance, modes.history, errors
-        ),
+        ).with_errors(response.errors(blocks, field, elasticity.mesh.lumped_mass)),
         provenance=provenance,
         supports=elasticity.supports,
+        display=display,
     )
 
 
@@ -162,24 +186,30 @@ def _with_body(
     return np.hstack([first, own]), load, trailing
 
 
-def regional_field(
+def modes_of_regions(
     far: SeparatedField,
     response: FullResponse,
-    surface: LoadSurface,
+    region: np.ndarray,
     elasticity: Elasticity,
     rule: BuildRule,
     progress: Progress = silent,
-) -> tuple[RegionalField, tuple[RankError, ...]]:
+) -> tuple[list[RegionModes], tuple[RankError, ...]]:
     """What the global modes leave, by regions, and the error for numbers of modes at a place."""
-    regional, errors = separate_regions(
-        rule.regions(surface),
+    regions, errors = separate_regions(
+        region,
         lambda positions: response.remainder(far, positions),
         response.norm.reshape(-1, 3),
         elasticity.mesh.lumped_mass,
         rule.regional,
         lambda fraction: progress("regions", fraction, NO_ERROR),
     )
-    return regional, rank_errors(far.rank, errors[: regional.rank + 1])
+    most = max(modes.space.shape[1] for modes in regions)
+    return regions, rank_errors(far.rank, errors[: most + 1])
+
+
+def _half(progress: Progress, k: int) -> Progress:
+    """Progress of the first or the second half of a stage."""
+    return lambda stage, fraction, error: progress(stage, 0.5 * (k + fraction), error)
 
 
 def rank_errors(n_global: int, errors: np.ndarray) -> tuple[RankError, ...]:

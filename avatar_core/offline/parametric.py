@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -33,22 +34,26 @@ from avatar_core.offline.full_response import (
 )
 from avatar_core.offline.linear import Modes, find_modes, rank_errors
 from avatar_core.offline.rule import BuildRule, Progress, silent
+from avatar_core.reduction.block_field import BlockField, Blocks, separate_field
 from avatar_core.reduction.coordinates import Coordinate, node_values, problem_at
 from avatar_core.reduction.near_field import LocalBlocks
-from avatar_core.reduction.regional import RegionalField, separate_regions
+from avatar_core.reduction.regional import RegionModes, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.at_values import at_values
+from avatar_core.vademecum.display import Display, blocks_to_display
 from avatar_core.vademecum.modal_mass import (
     LEAST_MODES,
     N_BODY,
     BodyResponse,
     body_response,
     completed,
+    motion_beside,
 )
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.parametric import (
     GalerkinBasis,
     ParametricResponse,
+    field_at,
     galerkin_field,
     regional_load_of_basis,
     stiffness_root,
@@ -70,6 +75,17 @@ class _Snapshot:
     modes: Modes
 
 
+class _Organ(NamedTuple):
+    """What does not depend on the coordinates."""
+
+    name: str
+    elasticity: Elasticity
+    regions: Regions
+    surface: LoadSurface
+    blocks: Blocks
+    tip_field: TipField
+
+
 def build_parametric_vademecum(
     name: str,
     elasticity: Elasticity,
@@ -80,6 +96,7 @@ def build_parametric_vademecum(
     rule: BuildRule,
     provenance: Provenance,
     progress: Progress = silent,
+    display: Display | None = None,
 ) -> Vademecum:
     """Compute the vademecum of one organ over a range of materials and supports.
 
@@ -97,10 +114,10 @@ def build_parametric_vademecum(
         for k, values in enumerate(nodes)
     ]
     basis = _project(snapshots, _principal(snapshots, rule), loads, rule)
-    vademecum = _assemble(
-        name, elasticity, regions, surface, tuple(coordinates), rule, snapshots, basis, tip_field
-    )
-    vademecum = replace(vademecum, provenance=provenance)
+    blocks = blocks_to_display(elasticity.mesh, display)
+    organ = _Organ(name, elasticity, regions, surface, blocks, tip_field)
+    vademecum = _assemble(organ, tuple(coordinates), rule, snapshots, basis)
+    vademecum = replace(vademecum, provenance=provenance, display=display)
     return at_values(vademecum, _inside(coordinates, elasticity))
 
 
@@ -201,25 +218,23 @@ def _projected_terms(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
 
 
 def _assemble(
-    name: str,
-    elasticity: Elasticity,
-    regions: Regions,
-    surface: LoadSurface,
+    organ: _Organ,
     coordinates: tuple[Coordinate, ...],
     rule: BuildRule,
     snapshots: Sequence[_Snapshot],
     basis: GalerkinBasis,
-    tip_field: TipField,
 ) -> Vademecum:
     """Regional modes of all nodes, near fields at each; the own fields are those of the first."""
+    surface, elasticity = organ.surface, organ.elasticity
     roots = [stiffness_root(basis, s.elasticity.factors) for s in snapshots]
     fields = [galerkin_field(basis, root) for root in roots]
-    regional, load, errors = _regional(snapshots, [far for far, _, _ in fields], surface, rule)
+    region = rule.regions(surface)
+    regions, errors = _regions(snapshots, [far for far, _, _ in fields], region, rule)
+    field, left = _separated(organ, basis, roots, fields, region, regions)
     mass = elasticity.mesh.lumped_mass
-    projection = regional.coefficients(basis.basis.space, mass).astype(np.float32)
-    left = load.copy()
+    projection = _coefficients(basis.basis.space, regions, mass)
     for k, (root, (_, trailing, _)) in enumerate(zip(roots, fields, strict=True)):
-        left[k] -= regional_load_of_basis(basis, projection, root, trailing, regional)
+        left[k] -= regional_load_of_basis(basis, projection, root, trailing, region)
     support = rule.contact_support * surface.patch_radius
     contact = [
         contact_near(s.contact, np.hstack([far.load, trailing]), surface, support)
@@ -228,27 +243,32 @@ def _assemble(
     first, (far, trailing, body) = snapshots[0].elasticity, fields[0]
     last = errors[-1]
     history = tuple(report for snapshot in snapshots for report in snapshot.modes.history)
+    core = field.core[:, : basis.n_global]
+    shared = far.load.reshape(surface.n_positions, 3, -1)
+    load = np.concatenate([shared.astype(np.float32), field.load[:, :3, basis.n_global :]], axis=2)
     return Vademecum(
-        name=name,
+        name=organ.name,
         mesh=elasticity.mesh,
-        regions=regions,
+        regions=organ.regions,
         material=first.material,
         element=elasticity.element,
         surface=surface,
         far=far,
-        regional=replace(regional, load=load[0]),
+        blocks=organ.blocks,
+        field=field_at(field, core, roots[0], load),
         trailing=trailing,
         contact_near=contact[0],
-        tip_field=tip_field,
+        tip_field=organ.tip_field,
         convergence=Convergence(
             rule.is_met(last.mean, last.worst), rule.tolerance, history, errors
-        ),
-        provenance=Provenance(name, ""),
+        ).with_errors(_errors(organ, snapshots, field)),
+        provenance=Provenance(organ.name, ""),
         parametric=ParametricResponse(
             **vars(basis),
             coordinates=coordinates,
             projection=projection,
             regional_load=left,
+            core=np.ascontiguousarray(core),
             contact_near=np.stack([blocks.block for blocks in contact]),
             young_modulus=elasticity.material.young_modulus,
         ),
@@ -258,29 +278,87 @@ def _assemble(
     )
 
 
-def _regional(
+def _regions(
     snapshots: Sequence[_Snapshot],
     fields: Sequence[SeparatedField],
-    surface: LoadSurface,
+    region: np.ndarray,
     rule: BuildRule,
-) -> tuple[RegionalField, np.ndarray, tuple[RankError, ...]]:
-    """What the global modes leave at all nodes, and its loads (n_nodes, n_positions, 3, most)."""
-    n, n_nodes = surface.n_positions, len(snapshots)
+) -> tuple[list[RegionModes], tuple[RankError, ...]]:
+    """What the global modes leave at all nodes, by regions, and the errors by modes at a place."""
 
     def columns(positions: np.ndarray) -> np.ndarray:
         pairs = zip(snapshots, fields, strict=True)
         return np.concatenate([s.response.remainder(f, positions) for s, f in pairs], axis=2)
 
-    regional, errors = separate_regions(
-        rule.regions(surface),
+    regions, errors = separate_regions(
+        region,
         columns,
-        np.hstack([s.response.norm.reshape(n, 3) for s in snapshots]),
+        np.hstack([s.response.norm.reshape(len(region), 3) for s in snapshots]),
         snapshots[0].elasticity.mesh.lumped_mass,
         rule.regional,
     )
-    load = regional.load.reshape(n, n_nodes, 3, -1).transpose(1, 0, 2, 3)
-    found = rank_errors(fields[0].rank, errors[: regional.rank + 1])
-    return regional, np.ascontiguousarray(load), found
+    most = max(modes.space.shape[1] for modes in regions)
+    return regions, rank_errors(fields[0].rank, errors[: most + 1])
+
+
+def _separated(
+    organ: _Organ,
+    basis: GalerkinBasis,
+    roots: Sequence[np.ndarray],
+    fields: Sequence[tuple[SeparatedField, np.ndarray, BodyResponse | None]],
+    region: np.ndarray,
+    regions: Sequence[RegionModes],
+) -> tuple[BlockField, np.ndarray]:
+    """The field of the first functions of the basis and of the regional modes, for all nodes.
+
+    Returns
+    -------
+    field : its loads those of all nodes side by side
+    load : those in the regional modes alone, shape (n_nodes, n_positions, 3, most)
+    """
+    n, n_positions = basis.n_global, len(region)
+    amounts, motion = [], []
+    for root, (far, _, body) in zip(roots, fields, strict=True):
+        inverse = np.linalg.inv(root[:n, :n])  # X = V L^-T moves as V does with amounts a L^-1
+        amounts.append((far.load @ inverse).reshape(n_positions, 3, n))
+        motion.append(motion_beside(far.load, body) @ inverse)
+    field = separate_field(
+        organ.blocks,
+        organ.elasticity.mesh.vertex_volumes,
+        region,
+        regions,
+        (basis.basis.space[:, :n], np.concatenate(amounts, axis=1)),
+        np.concatenate(motion),
+    )
+    load = field.load[:, :, n:].reshape(n_positions, len(roots), 3, -1).transpose(1, 0, 2, 3)
+    return field, np.array(load, order="C")
+
+
+def _errors(organ: _Organ, snapshots: Sequence[_Snapshot], field: BlockField) -> np.ndarray:
+    """Relative L2 errors of a field, its loads those of all nodes, under each of them."""
+    mass, out = organ.elasticity.mesh.lumped_mass, []
+    for k, snapshot in enumerate(snapshots):
+        own = replace(field, load=field.load[:, 3 * k : 3 * k + 3])
+        out.append(snapshot.response.errors(organ.blocks, own, mass))
+    return np.stack(out)
+
+
+def _coefficients(
+    space: np.ndarray, regions: Sequence[RegionModes], mass: np.ndarray
+) -> np.ndarray:
+    """Functions (3 n_vertices, n) in the modes of each region, which are mass-orthogonal.
+
+    Returns
+    -------
+    ndarray of float32, shape (n_regions, most, n), zero beyond a region's modes
+    """
+    most = max(modes.space.shape[1] for modes in regions)
+    out = np.zeros((len(regions), most, space.shape[1]), np.float32)
+    for r, (modes, _) in enumerate(regions):
+        weighted = mass[:, None] * modes
+        size = np.einsum("xk,xk->k", weighted, modes)
+        out[r, : len(size)] = weighted.T @ space / size[:, None]
+    return out
 
 
 def _inside(coordinates: Sequence[Coordinate], elasticity: Elasticity) -> dict[str, float]:

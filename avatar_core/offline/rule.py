@@ -13,35 +13,11 @@ Progress = Callable[[str, float, float], None]  # stage, fraction of it, current
 NO_ERROR = float("nan")
 
 _GLOBAL_PART = 0.4  # of the modes that a place may have
-_COMPLETION_PART = 1.0 / 6.0  # of the tolerance, that loads which are not solved may take
 _REGION_POSITIONS = 30  # load positions of a region at least, in the mean
 
 
 def silent(stage: str, fraction: float, error: float) -> None:
     """Report nothing."""
-
-
-@dataclass(frozen=True)
-class CompletionRule:
-    """How many positions are solved.
-
-    tolerance : mean relative L2 error that projection may add, over all positions
-    worst_over_mean : the same for the worst position, over that
-    least : positions up to which all are solved
-    first, step : parts of the positions that are solved at first, evenly spread, and in each round
-    reach : around a position, of the solutions on which it is projected [patch radii]
-    """
-
-    tolerance: float = 2e-3
-    worst_over_mean: float = 15.0
-    least: int = 600
-    first: float = 0.2
-    step: float = 0.08
-    reach: float = 4.0
-
-    def is_met(self, mean: float, worst: float) -> bool:
-        """Whether estimated errors are as small as asked for."""
-        return mean <= self.tolerance and worst <= self.worst_over_mean * self.tolerance
 
 
 @dataclass(frozen=True)
@@ -71,11 +47,6 @@ class BuildRule:
     def n_global(self) -> int:
         """Global modes."""
         return max(1, min(self.global_modes, round(_GLOBAL_PART * self.max_modes)))
-
-    @property
-    def completion(self) -> CompletionRule:
-        """How many load positions are solved."""
-        return CompletionRule(_COMPLETION_PART * self.tolerance)
 
     @property
     def regional(self) -> RegionalRule:

@@ -1,11 +1,12 @@
-"""A field over the load surface, separated region by region.
+"""Fields over the load surface, separated region by region.
 
-    u(x, s_j) ~ sum_k Z_k(x) W_k(s_j),    k over the modes of the region that holds s_j.
+    u(x, s_j) ~ sum_m Z_m(x) W_m(s_j),    m over the modes of the region that holds s_j.
 
 Loads near one another move an organ alike: some dozen modes for each of some dozen regions leave
 less than hundreds of modes for all loads at once, and a step reads only those of the tip's region.
 Each load position belongs to one region. Between positions the response is interpolated as ever, so
 that it is as smooth where a tip crosses from one region to the next as it is within one.
+:mod:`avatar_core.reduction.block_field` separates these modes once more, in space.
 
 The modes of a region are the principal components of its columns (Eckart & Young, Psychometrika 1,
 1936), each column divided by its own size: they leave the least relative error that so many can.
@@ -14,8 +15,9 @@ The modes of a region are the principal components of its columns (Eckart & Youn
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -25,76 +27,15 @@ from avatar_core.common.arrays import FloatArray, IntArray
 _ITERATIONS = 30  # of k-means
 
 
-@dataclass(frozen=True, eq=False)
-class RegionalField:
-    """A field over space and load, in modes of their own for each region of the load surface.
+class RegionModes(NamedTuple):
+    """The modes of one region of the load surface.
 
-    region : ndarray of int32, shape (n_positions,), region of each load position
-    start : ndarray of int64, shape (n_regions + 1,), columns of ``space`` of each region
-    space : ndarray of float16, shape (3 n_vertices, start[-1]), Z, each with a peak of 1
-    load : ndarray, shape (n_positions, n_loads, most), W of some loads at each position; zero
-        beyond the modes of the position's region
+    space : ndarray, shape (3 n_vertices, n), Z, each with a peak of 1
+    load : ndarray, shape (n positions of the region, n_loads, n), W
     """
 
-    region: IntArray
-    start: IntArray
     space: FloatArray
     load: FloatArray
-
-    @property
-    def n_regions(self) -> int:
-        """Number of regions."""
-        return len(self.start) - 1
-
-    @property
-    def rank(self) -> int:
-        """Modes of the region that has most."""
-        return self.load.shape[2]
-
-    @property
-    def nbytes(self) -> int:
-        """Memory held [bytes]."""
-        return sum(a.nbytes for a in (self.region, self.start, self.space, self.load))
-
-    def modes(self, region: int) -> FloatArray:
-        """Z of one region, shape (3 n_vertices, n), in single precision."""
-        return self.space[:, self.start[region] : self.start[region + 1]].astype(np.float32)
-
-    def combined(self, positions: IntArray, weights: FloatArray) -> FloatArray:
-        """Weighted sum over some load positions, shape (3 n_vertices, n_loads)."""
-        out = np.zeros((len(self.space), self.load.shape[1]), np.float32)
-        regions = self.region[positions]
-        for region in np.unique(regions):
-            at, modes = regions == region, self.modes(region)
-            load = np.tensordot(weights[at], self.load[positions[at]], 1)
-            out += modes @ load[:, : modes.shape[1]].T.astype(np.float32)
-        return out
-
-    def coefficients(self, fields: FloatArray, mass: FloatArray) -> FloatArray:
-        """Fields (3 n_vertices, n) in the modes of each region, (n_modes, n); mass-orthogonal."""
-        out = np.empty((self.space.shape[1], fields.shape[1]))
-        root = np.sqrt(mass)[:, None]
-        for r in range(self.n_regions):
-            modes = self.modes(r).astype(float) * root
-            size = (modes**2).sum(axis=0)[:, None]
-            out[self.start[r] : self.start[r + 1]] = modes.T @ (root * fields) / size
-        return out
-
-    def truncated(self, most: int) -> RegionalField:
-        """The same with the first modes of each region alone."""
-        if most >= self.rank:
-            return self
-        counts = np.minimum(np.diff(self.start), max(most, 0))
-        kept = [np.arange(a, a + n) for a, n in zip(self.start, counts, strict=False)]
-        start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        columns = np.concatenate(kept)
-        return replace(
-            self, start=start, space=self.space[:, columns], load=self.load[:, :, : max(most, 0)]
-        )
-
-    def scaled(self, factor: float) -> RegionalField:
-        """The field times a number."""
-        return replace(self, load=np.float32(factor) * self.load)
 
 
 @dataclass(frozen=True)
@@ -126,7 +67,7 @@ def separate_regions(
     mass: FloatArray,
     rule: RegionalRule,
     progress: Callable[[float], None] = lambda fraction: None,
-) -> tuple[RegionalField, FloatArray]:
+) -> tuple[list[RegionModes], FloatArray]:
     """The modes of every region.
 
     Parameters
@@ -138,11 +79,11 @@ def separate_regions(
 
     Returns
     -------
-    RegionalField
+    modes : of each region
     errors : ndarray, shape (most + 1, n_positions, n_loads), relative L2 error that so many modes
         of its region leave each load; those beyond the modes kept leave what is left
     """
-    parts, n_loads = [], size.shape[1]
+    parts = []
     errors = np.empty((rule.most + 1, *size.shape))
     root = np.sqrt(mass).astype(np.float32)[:, None]
     n_regions = int(region.max()) + 1
@@ -150,10 +91,10 @@ def separate_regions(
         here = np.flatnonzero(region == r)
         scaled = columns(here).reshape(len(mass), -1) * (root / size[here].ravel())
         modes, load, left = _principal(scaled.astype(np.float32), rule)
-        parts.append((modes / root, load.reshape(len(here), n_loads, -1) * size[here][..., None]))
-        errors[:, here] = left.reshape(-1, len(here), n_loads)
+        parts.append(_with_peaks_of_one(modes / root, load, size[here]))
+        errors[:, here] = left.reshape(-1, *size[here].shape)
         progress((r + 1) / n_regions)
-    return _assembled(region, parts), errors
+    return parts, errors
 
 
 def _principal(
@@ -175,15 +116,8 @@ def _principal(
     return columns @ kept.astype(np.float32), kept, left
 
 
-def _assembled(region: IntArray, parts: Sequence[tuple[FloatArray, FloatArray]]) -> RegionalField:
-    """One field of the regions' modes, each scaled to a peak of 1, and their loads."""
-    ranks = [modes.shape[1] for modes, _ in parts]
-    start = np.concatenate([[0], np.cumsum(ranks)]).astype(np.int64)
-    n_loads = parts[0][1].shape[1]
-    space = np.empty((len(parts[0][0]), start[-1]), np.float16)
-    load = np.zeros((len(region), n_loads, max(ranks)), np.float32)
-    for r, (modes, amounts) in enumerate(parts):
-        peak = np.maximum(np.abs(modes).max(axis=0, initial=0.0), 1e-30)
-        space[:, start[r] : start[r + 1]] = modes / peak
-        load[region == r, :, : ranks[r]] = amounts * peak
-    return RegionalField(region, start, space, load)
+def _with_peaks_of_one(modes: FloatArray, amounts: FloatArray, size: FloatArray) -> RegionModes:
+    """Modes (n_dofs, k), by the amounts (n, k) of them in scaled columns of some sizes."""
+    peak = np.maximum(np.abs(modes).max(axis=0, initial=0.0), 1e-30)
+    load = amounts.reshape(*size.shape, -1) * size[..., None] * peak
+    return RegionModes(modes / peak, load.astype(np.float32))

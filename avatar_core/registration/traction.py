@@ -68,7 +68,8 @@ class LoadBasis:
     ) -> FloatArray:
         """Displacement of some vertices by (size, m) coefficients, shape (n_vertices, 3, m) [m]."""
         forces = self.at_positions(coefficients).astype(np.float32)
-        moved = _displacement(vademecum, vertices, forces)
+        whole = vademecum.field.under(np.arange(len(forces)), forces)
+        moved = _rows(vademecum.blocks.at_vertices(whole), vertices).astype(float)
         if self.n_weight and vademecum.body is not None:
             sag = _rows(vademecum.far.space, vertices) @ vademecum.body.weight
             moved += sag @ coefficients[-self.n_weight :]
@@ -103,20 +104,6 @@ def _triangles(surface: LoadSurface) -> IntArray:
     if six.shape[1] == 3:
         return six
     return np.concatenate([six[:, [0, 3, 5]], six[:, [3, 1, 4]], six[:, [5, 4, 2]], six[:, 3:]])
-
-
-def _displacement(vademecum: Vademecum, vertices: IntArray, forces: FloatArray) -> FloatArray:
-    """Displacement under forces (n_positions, 3, m), shape (3 n_vertices, m), in double."""
-    far, regional = vademecum.far, vademecum.regional
-    m = forces.shape[2]
-    moved = _rows(far.space, vertices) @ (far.load.T @ forces.reshape(-1, m))
-    amount = np.empty((regional.space.shape[1], m), np.float32)
-    for r in range(regional.n_regions):
-        here, part = regional.region == r, slice(regional.start[r], regional.start[r + 1])
-        load = regional.load[here][:, :, : part.stop - part.start]
-        amount[part] = np.tensordot(load, forces[here], ((0, 1), (0, 1)))
-    moved += _rows(regional.space, vertices).astype(np.float32) @ amount
-    return np.asarray(moved, float)
 
 
 def _rows(space: FloatArray, vertices: IntArray) -> FloatArray:

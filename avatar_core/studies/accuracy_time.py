@@ -1,7 +1,7 @@
 """Accuracy against time, online and offline, with rivals in the same run.
 
 Online: every level of detail of the displacement, timed on this machine, with errors on loads that
-neither the build nor the certificate used. Offline: size of the mesh, and number of solved loads.
+neither the build nor the certificate used. Offline: size of the mesh.
 Also whether certified errors, budgets on other livers, and the estimated error of each force hold.
 """
 
@@ -17,7 +17,7 @@ from avatar_core.certify.accuracy_curve import StepErrors, step_errors
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.pipeline import OrganOptions, build
 from avatar_core.studies.budgets import budget_rows, budget_table
-from avatar_core.studies.offline_cost import load_rows, mesh_rows
+from avatar_core.studies.offline_cost import mesh_rows
 from avatar_core.studies.online_cost import (
     Promises,
     cost_of_effects,
@@ -51,15 +51,14 @@ FRESH = 1001  # seed of loads that no certificate draws
 
 @dataclass(frozen=True)
 class AccuracyTimeSettings:
-    """Numbers of vertices, of touches: certified, fresh and of the rivals; sizes of the offline
-    sweeps; other livers on which budgets are tried, with so many touches each."""
+    """Numbers of vertices, of touches: certified, fresh and of the rivals; sizes of the meshes;
+    other livers on which budgets are tried, with so many touches each."""
 
     n_vertices: int = 2850
     n_certified: int = 200
     n_fresh: int = 1000
     n_rivals: int = 50
     meshes: tuple[int, ...] = (1200, 1800, 2600)
-    projections: tuple[float, ...] = (0.02, 5e-3, 1.5e-3)
     livers: tuple[str, ...] = ("LiTS-50", "Amos-052", "Amos-086")
     n_touches: int = 300
 
@@ -69,7 +68,7 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
 
     name = "accuracy-time"
     full = AccuracyTimeSettings()
-    quick = AccuracyTimeSettings(1200, 60, 150, 20, (1200,), (5e-3,), ())
+    quick = AccuracyTimeSettings(1200, 60, 150, 20, (1200,), ())
     paper: ClassVar = {"modes_for_10_percent": "11", "rate_hz": "1000, without a table"}
 
     def measure(self, run: Run[AccuracyTimeSettings]) -> None:
@@ -87,9 +86,8 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
             run.rows += curve_rows(curve)
             run.rows += rival_rows(v, elasticity, curve, settings.n_rivals, FRESH)
             run.rows += cost_of_effects(v)
-            bar.begin("mesh and loads")
+            bar.begin("meshes")
             run.rows += mesh_rows(surface, settings.meshes)
-            run.rows += load_rows(elasticity, v.surface, settings.projections)
             bar.begin("budgets")
             budgets = budget_rows(v, fresh)
             for name in settings.livers:
@@ -196,11 +194,7 @@ def _panels(rows: list[Row], vademecum: Vademecum, fresh: StepErrors) -> tuple[P
         Panel("online, vertices of the surface alone", partial(_online, rows, "surface")),
         Panel("error said with a force", partial(_force, fresh.force, _said(vademecum, fresh))),
         Panel("cost of effects: one that is not named costs nothing", partial(_effects, rows)),
-        Panel("size of the mesh", partial(_offline, rows, "mesh")),
-        Panel(
-            "response to every load: solved, or projected on solutions of some",
-            partial(_offline, rows, "loads"),
-        ),
+        Panel("size of the mesh", partial(_offline, rows)),
     )
 
 
@@ -262,8 +256,8 @@ def _effects(rows: list[Row], axes: Axes) -> None:
     axes.legend(loc="upper right", fontsize=8)
 
 
-def _offline(rows: list[Row], stage: str, axes: Axes) -> None:
-    mine = where(rows, stage=stage)
+def _offline(rows: list[Row], axes: Axes) -> None:
+    mine = where(rows, stage="mesh")
     for method in dict.fromkeys(str(row["method"]) for row in mine):
         some = sorted(_of(mine, method), key=lambda row: row["size"])  # type: ignore[arg-type,return-value]
         seconds, errors = column(some, "cpu_seconds"), column(some, "error")
@@ -277,9 +271,8 @@ def _offline(rows: list[Row], stage: str, axes: Axes) -> None:
                 textcoords="offset points",
                 fontsize=7,
             )
-        if stage == "mesh":
-            own = column(some, "vademecum_error")
-            axes.plot(seconds, own, "s--", label="vademecum, on the same mesh")
+        own = column(some, "vademecum_error")
+        axes.plot(seconds, own, "s--", label="vademecum, on the same mesh")
     axes.margins(x=0.15)
     _logarithmic(axes, "CPU time [s]", "error [-]")
 

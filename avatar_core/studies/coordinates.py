@@ -198,16 +198,15 @@ def _parametric(
 
 def _with_modes(vademecum: Vademecum, modes: int) -> Vademecum:
     """The vademecum with so many modes at a place, at any value of its coordinates."""
-    parametric, regional = vademecum.parametric, vademecum.regional
+    parametric = vademecum.parametric
     assert parametric is not None
     most = modes - parametric.n_global
-    kept = np.concatenate([np.arange(n) < most for n in np.diff(regional.start)])
     fewer = replace(
         parametric,
-        projection=parametric.projection[kept],
+        projection=parametric.projection[:, :most],
         regional_load=parametric.regional_load[..., :most],
     )
-    return replace(vademecum, regional=regional.truncated(most), parametric=fewer)
+    return replace(vademecum, field=vademecum.field.with_most(modes), parametric=fewer)
 
 
 def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[Row]:

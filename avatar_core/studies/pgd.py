@@ -248,11 +248,9 @@ def _two_levels_leave(case: Case, shared: SeparatedField, rank: int) -> FloatArr
     rule = BuildRule(tolerance=1e-12, max_modes=rank)
     left = case.exact - shared.truncate(rule.n_global).evaluate()
     most = RegionalRule(0.0, 0.0, rank - rule.n_global)
-    regional, _ = separate_regions(
+    regions, _ = separate_regions(
         case.region, lambda at: left[:, at, None], case.size[:, None], case.mass, most
     )
-    for r in range(regional.n_regions):
-        at = case.region == r
-        modes = regional.modes(r)
-        left[:, at] -= modes @ regional.load[at, 0, : modes.shape[1]].T
+    for r, (modes, load) in enumerate(regions):
+        left[:, case.region == r] -= modes @ load[:, 0].T
     return left

@@ -23,6 +23,7 @@ from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.parametric import (
     combined,
+    field_at,
     galerkin_field,
     galerkin_load,
     regional_load_of_basis,
@@ -71,10 +72,13 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     reference = replace(material, young_modulus=parametric.young_modulus)
     root = stiffness_root(parametric, factors_at(reference, contrast, at_reference))
     far, trailing, body = galerkin_field(parametric, root)
+    field = vademecum.field
     regional_load = regional_load_of_basis(
-        parametric, parametric.projection, root, trailing, vademecum.regional
+        parametric, parametric.projection, root, trailing, field.region
     )
     regional_load += combined(parametric.regional_load, weights)
+    shared = far.load.reshape(len(regional_load), 3, far.rank).astype(np.float32)
+    load = np.concatenate([shared, regional_load], axis=2)
     found = replace(
         vademecum,
         material=reference,
@@ -83,7 +87,7 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
         far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
         trailing=trailing.astype(np.float32),
         body=body,
-        regional=replace(vademecum.regional, load=regional_load),
+        field=field_at(field, parametric.core, root, load),
         contact_near=replace(
             vademecum.contact_near, block=combined(parametric.contact_near, weights)
         ),
@@ -182,7 +186,7 @@ def _with_young_modulus(vademecum: Vademecum, material: Material) -> Vademecum:
         material=material,
         far=SeparatedField(root * far.space, root * far.load),
         body=vademecum.body.mixed(root * np.eye(far.rank)) if vademecum.body else None,
-        regional=vademecum.regional.scaled(softer),
+        field=vademecum.field.softened(softer),
         trailing=root * vademecum.trailing,
         contact_near=replace(contact, block=np.float32(softer) * contact.block),
     )

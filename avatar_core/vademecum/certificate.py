@@ -51,8 +51,6 @@ class Certificate:
     force : |F / F_FE - 1| of the normal force for an imposed normal indentation
     tip_force : the same for a tip anywhere on the accessible faces, with the compliance that the
         contact step uses, smoothed so that the force does not show the edges of the mesh
-    vertex_contact_worst : contact error at load positions of the build, solved or projected, on
-        fresh solutions
     n_loads : unseen load positions; ``seed`` draws them
     build_cpu_seconds : user + system time of everything, meshing and this certificate included
     mesh_l2, mesh_contact : change of the reference when the mesh is refined once (NaN: not asked)
@@ -69,7 +67,6 @@ class Certificate:
     force_worst: float
     tip_force_mean: float
     tip_force_worst: float
-    vertex_contact_worst: float
     n_loads: int
     seed: int
     modes: int
@@ -84,4 +81,4 @@ class Certificate:
     def unknown(cls) -> Certificate:
         """A certificate without any figures."""
         nan = float("nan")
-        return cls(nan, nan, nan, nan, nan, nan, nan, nan, nan, 0, 0, 0)
+        return cls(nan, nan, nan, nan, nan, nan, nan, nan, 0, 0, 0)

@@ -24,6 +24,7 @@ from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.point_location import carriers, closest_points
 from avatar_core.geometry.resampling import is_manifold, resampled, unified
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.reduction.block_field import Blocks, blocks_of
 
 ORGAN = "organ"  # the first part
 # Vertices of a structure. Two triangles of a ball meet at 3 degrees with the fewest, on the mean of
@@ -82,6 +83,18 @@ def _on_boundary(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     faces = mesh.boundary_faces
     _, face, weights = closest_points(mesh.vertices, faces, np.asarray(points, float))
     return faces[face][:, [0, 1, 2, 0]], np.pad(weights, ((0, 0), (0, 1)))
+
+
+def blocks_to_display(mesh: TetMesh, display: Display | None) -> Blocks:
+    """The vertices of a mesh in blocks, of which the first hold what a display needs."""
+    return blocks_of(mesh.vertices, displayed_vertices(mesh, display))
+
+
+def displayed_vertices(mesh: TetMesh, display: Display | None) -> np.ndarray:
+    """Vertices of the mesh that are displayed, or that carry what is displayed, shape (n,)."""
+    if display is None:
+        return mesh.surface_vertices
+    return np.union1d(mesh.surface_vertices, display.corners)
 
 
 def boundary(mesh: TetMesh) -> Triangles:

@@ -31,7 +31,7 @@ from avatar_core.fem.hyperelastic_materials import (
     NeoHookean,
     StVenantKirchhoff,
 )
-from avatar_core.reduction.regional import RegionalField
+from avatar_core.reduction.block_field import BlockField, Blocks
 
 POWERS = (2, 3)
 
@@ -85,14 +85,14 @@ class LargeDeformation:
     """The terms of second and third order; k counts them.
 
     material : of the large strains; its small ones are those of the vademecum
-    terms : RegionalField, V_2 and V_3 as its two loads at a position [m^(1-k)]
+    terms : BlockField, V_2 and V_3 as its two loads at a position [m^(1-k)]
     depth : ndarray, shape (2, n_positions), beta_k [m^(1-k)]
     reach : ndarray, shape (n_positions,), a_max [m]
     certificate : LargeCertificate or None
     """
 
     material: LargeMaterial
-    terms: RegionalField
+    terms: BlockField
     depth: FloatArray
     reach: FloatArray
     certificate: LargeCertificate | None = None
@@ -102,16 +102,20 @@ class LargeDeformation:
         """Memory held [bytes]."""
         return self.terms.nbytes + self.depth.nbytes + self.reach.nbytes
 
-    def added_to(self, linear: Push, positions: np.ndarray, weights: FloatArray) -> Push:
+    def added_to(
+        self, linear: Push, blocks: Blocks, positions: np.ndarray, weights: FloatArray
+    ) -> Push:
         """A linear push with the terms of second and third order at the same point.
 
         Parameters
         ----------
+        blocks : of the vademecum
         positions, weights : ndarray, shape (n,), of the point
         """
         reach = float(self.reach[positions].min())
         power = powers(linear.depth, reach)
-        displacement = linear.displacement + self.terms.combined(positions, weights) @ power
+        bent = blocks.at_vertices(self.terms.combined(positions, weights)) @ power
+        displacement = linear.displacement + bent
         depth = linear.depth + float(power @ (self.depth[:, positions] @ weights))
         return Push(displacement, depth, linear.depth <= reach)
 

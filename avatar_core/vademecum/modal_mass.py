@@ -23,6 +23,7 @@ from avatar_core.fem.norms import require_orthonormal
 
 N_VIBRATIONS = 6
 N_BODY = 3 + N_VIBRATIONS
+_WEIGHT = 1e4  # of a liver [N/m^3]
 LEAST_MODES = 4 * N_BODY  # with fewer, surface loads need them all
 _DEPENDENT = 1e-6  # part of a body function's energy below which the modes already represent it
 _EIGEN_TOLERANCE = 1e-6  # of the slowest vibrations
@@ -85,6 +86,18 @@ def body_functions(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
     tolerance = 10.0 * _EIGEN_TOLERANCE
     require_orthonormal(modes, elasticity.apply(own), "modes and body functions", tolerance)
     return own
+
+
+def motion_beside(load: np.ndarray, body: BodyResponse | None) -> np.ndarray:
+    """Amplitudes by which global modes may move beside the loads of the moment, (n, rank).
+
+    A history may leave those of any load (3 n_positions, rank); each axis of the organ's weight
+    counts as much as all loads together.
+    """
+    if body is None:
+        return load
+    sag = _WEIGHT * body.weight.T
+    return np.concatenate([load, np.repeat(sag, len(load), axis=0)])
 
 
 def _vibrations(elasticity: Elasticity, mass: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:

@@ -1,14 +1,17 @@
 """The computational vademecum: an organ's precomputed response to a load anywhere on its surface.
 
-u(x, s) = global modes, which all loads share + the modes of the region that s lies in. The contact
-compliance C(s, s'), the patch-averaged displacement at s per patch force at s', is the Galerkin one
-of the global modes and further ones, Y Y^T, plus the exact remainder tapered to the neighbourhood:
-symmetric positive definite by construction, exact at the load positions themselves.
+u(x, s) is one field, separated by regions of the load surface and by blocks of the organ, of global
+modes, which all loads share, and modes of the region that s lies in
+(:mod:`avatar_core.reduction.block_field`). The contact compliance C(s, s'), the patch-averaged
+displacement at s per patch force at s', is the Galerkin one of the global modes and further ones,
+Y Y^T, plus the exact remainder tapered to the neighbourhood: symmetric positive definite by
+construction, exact at the load positions themselves.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import dataclasses
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,9 +22,9 @@ from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.fem.patch_on_plane import missed_between
 from avatar_core.fem.supports import Support
 from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.reduction.block_field import BlockField, Blocks
 from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.reduction.pgd import EnrichmentReport
-from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.display import Display
@@ -68,12 +71,20 @@ class Convergence:
     tolerance : asked for, mean relative L2 error over the build's own loads
     enrichments : one report each
     rank_errors : error against number of modes at a place
+    every_mean, every_worst : relative L2 error of the field under every load of the build, in three
+        directions at each position; NaN of a patient whose loads are not all solved
     """
 
     converged: bool
     tolerance: float
     enrichments: tuple[EnrichmentReport, ...] = ()
     rank_errors: tuple[RankError, ...] = ()
+    every_mean: float = float("nan")
+    every_worst: float = float("nan")
+
+    def with_errors(self, errors: np.ndarray) -> Convergence:
+        """The same with the errors of the field, any shape."""
+        return replace(self, every_mean=float(errors.mean()), every_worst=float(errors.max()))
 
 
 @dataclass(frozen=True)
@@ -108,7 +119,7 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "5.0"
+SCHEMA_VERSION = "6.0"
 
 
 @dataclass(frozen=True)
@@ -117,7 +128,8 @@ class Vademecum:
 
     far : SeparatedField, the global modes: space (3 n_vertices, rank) [m], load (3 n_positions,
         rank)
-    regional : RegionalField, what they leave, by regions [m/N]
+    blocks : Blocks of the mesh's vertices; field : BlockField over them, the displacement under
+        unit forces in x, y, z at each load position [m/N]
     trailing : ndarray, shape (3 n_positions, n), load functions of further modes, of which the
         contact compliance alone makes use
     contact_near : LocalBlocks, tapered remainder of the contact compliance at load positions,
@@ -140,7 +152,8 @@ class Vademecum:
     element: Element
     surface: LoadSurface
     far: SeparatedField
-    regional: RegionalField
+    blocks: Blocks
+    field: BlockField
     trailing: np.ndarray
     contact_near: LocalBlocks
     tip_field: TipField
@@ -153,13 +166,13 @@ class Vademecum:
     large: LargeDeformation | None = None
     body: BodyResponse | None = None
     display: Display | None = None
-    id: str = field(default="", compare=False)
-    nbytes: int = field(default=0, compare=False)
+    id: str = dataclasses.field(default="", compare=False)
+    nbytes: int = dataclasses.field(default=0, compare=False)
 
     @property
     def n_modes(self) -> int:
         """Modes that show the displacement at a place: global ones, and those of its region."""
-        return self.far.rank + self.regional.rank
+        return self.field.rank
 
     @property
     def contact_load(self) -> np.ndarray:
@@ -174,9 +187,7 @@ class Vademecum:
         positions, weights : ndarray, shape (n,), a point of the surface as interpolated by
             :meth:`avatar_core.fem.patch_loads.LoadSurface.weights`
         """
-        far = self.far
-        load = np.einsum("i,idk->dk", weights, far.load.reshape(-1, 3, far.rank)[positions])
-        return far.space @ load.T + self.regional.combined(positions, weights)
+        return self.blocks.at_vertices(self.field.combined(positions, weights))
 
     def compliance(
         self,
@@ -218,7 +229,7 @@ class Vademecum:
         linear = Push(moved, depth, within=True)
         if self.large is None:
             return linear
-        return self.large.added_to(linear, positions, weights)
+        return self.large.added_to(linear, self.blocks, positions, weights)
 
     def push_to(
         self, positions: np.ndarray, weights: np.ndarray, depth: float
@@ -375,7 +386,7 @@ class Vademecum:
             n_surface_vertices=len(self.mesh.surface_vertices),
             n_load_positions=self.surface.n_positions,
             n_modes=self.n_modes,
-            n_regions=self.regional.n_regions,
+            n_regions=self.field.n_regions,
             bytes=self.nbytes,
             young_modulus=self.material.young_modulus,
             poisson_ratio=self.material.poisson_ratio,

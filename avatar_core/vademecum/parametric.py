@@ -9,19 +9,20 @@ compliance, C(p) - Y Y^T, is positive semi-definite. It is kept at the nodes of 
 (:mod:`avatar_core.reduction.coordinates`) and combined with weights that are not negative: positive
 semi-definite again. The global modes are those of the first functions of the basis; what they leave
 is written in regional modes that serve the whole range: what the other functions hold of it
-follows from the Galerkin response, the small rest is combined from the nodes. The result is an
-ordinary Vademecum, so that a step costs what it costs without coordinates.
+follows from the Galerkin response, the small rest is combined from the nodes. Blocks are separated
+for the first functions and the regional modes, so that only the amounts depend on p. The result is
+an ordinary Vademecum, so that a step costs what it costs without coordinates.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 
+from avatar_core.reduction.block_field import BlockField
 from avatar_core.reduction.coordinates import Coordinate
-from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.modal_mass import BodyResponse
 
@@ -50,9 +51,12 @@ class ParametricResponse(GalerkinBasis):
     """The data of a vademecum's coordinates, beside its own fields.
 
     coordinates : at least one
-    projection : ndarray, shape (n_regional, n), the functions of the basis in the regional modes
+    projection : ndarray, shape (n_regions, most, n), the functions of the basis in the modes of
+        each region
     regional_load : ndarray, shape (n_nodes, n_positions, 3, most), what the basis leaves at the
-        nodes, in the regional modes
+        nodes, in the modes of each position's region
+    core : ndarray, shape (n_block_modes, n_global), of the vademecum's field for the first
+        functions of the basis
     contact_near : ndarray, shape (n_nodes, n_blocks, 3, 3), blocks at the nodes in the pattern of
         the vademecum's own near field
     young_modulus : that the blocks are computed for [Pa]
@@ -61,6 +65,7 @@ class ParametricResponse(GalerkinBasis):
     coordinates: tuple[Coordinate, ...]
     projection: np.ndarray
     regional_load: np.ndarray
+    core: np.ndarray
     contact_near: np.ndarray
     young_modulus: float
 
@@ -111,23 +116,35 @@ def regional_load_of_basis(
     projection: np.ndarray,
     root: np.ndarray,
     trailing: np.ndarray,
-    field: RegionalField,
+    region: np.ndarray,
 ) -> np.ndarray:
     """The response beyond the global modes in the regional modes, (n_positions, 3, most) [m/N].
 
-    projection : of the functions of the basis in the regional modes
+    projection : of the functions of the basis in the modes of each region
     root, trailing : of :func:`stiffness_root` and :func:`galerkin_field`
-    field : of which the regions and modes are taken
+    region : of each load position
     """
     n, rank = found.n_global, found.rank
-    functions = projection[:, :rank].T
-    modes = scipy.linalg.solve_triangular(root[:rank, :rank], functions, lower=True).T
-    load = trailing.reshape(len(field.region), 3, rank - n).astype(np.float32)
-    out = np.zeros((len(field.region), 3, field.rank), np.float32)
-    for r in range(field.n_regions):
-        at, own = field.region == r, modes[field.start[r] : field.start[r + 1], n:]
-        out[at, :, : len(own)] = load[at] @ own.T.astype(np.float32)
+    load = trailing.reshape(len(region), 3, rank - n).astype(np.float32)
+    out = np.empty((len(region), 3, projection.shape[1]), np.float32)
+    for r, functions in enumerate(projection):
+        modes = scipy.linalg.solve_triangular(
+            root[:rank, :rank], functions[:, :rank].T, lower=True
+        ).T
+        out[region == r] = load[region == r] @ modes[:, n:].T.astype(np.float32)
     return out
+
+
+def field_at(field: BlockField, core: np.ndarray, root: np.ndarray, load: np.ndarray) -> BlockField:
+    """A field whose global modes are X = V L^-T at some values, of the one for V.
+
+    core : of V; root : L of all functions; load : amounts of X and of the regional modes,
+        (n_positions, 3, most)
+    """
+    n = core.shape[1]
+    inverse = scipy.linalg.solve_triangular(root[:n, :n], np.eye(n), lower=True)
+    mixed = np.hstack([core @ inverse.T.astype(np.float32), field.core[:, n:]])
+    return replace(field, core=mixed, load=load)
 
 
 def combined(at_nodes: np.ndarray, weights: np.ndarray) -> np.ndarray:

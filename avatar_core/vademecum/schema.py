@@ -31,10 +31,14 @@ _LINEAR: Shapes = {
     "far/space": "f: 3*vertices rank",
     "far/load": "f: 3*positions rank",
     "trailing": "f: 3*positions trailing",
-    "regional/region": "i: positions",
-    "regional/start": "i: starts",
-    "regional/space": "h: 3*vertices regional",
-    "regional/load": "f: positions 3 most",
+    "blocks/vertex": "i: 64*blocks",
+    "field/region": "i: positions",
+    "field/load": "f: positions 3 most",
+    "field/count": "i: field_parts",
+    "field/space": "s: modes 192",
+    "field/core": "f: modes most",
+    "field/level": "i: modes",
+    "field/start": "i: field_parts block_starts",
     "contact_near/start": "i: rows",
     "contact_near/target": "i: contact_blocks",
     "contact_near/block": "f: contact_blocks 3 3",
@@ -50,8 +54,9 @@ _PARAMETRIC: Shapes = {
     "parametric/n_global": "i:",
     "parametric/rank": "i:",
     "parametric/young_modulus": "f:",
-    "parametric/projection": "f: regional basis",
-    "parametric/regional_load": "f: nodes positions 3 most",
+    "parametric/projection": "f: regions regional basis",
+    "parametric/regional_load": "f: nodes positions 3 regional",
+    "parametric/core": "f: modes global",
     "parametric/contact_near": "f: nodes contact_blocks 3 3",
 }
 _BODY: Shapes = {"body/mass": "f: rank rank", "body/weight": "f: rank 3"}
@@ -66,9 +71,12 @@ _OUTLINE: Shapes = {
 }
 _LARGE: Shapes = {
     "large/terms/region": "i: positions",
-    "large/terms/start": "i: starts",
-    "large/terms/space": "h: 3*vertices large",
     "large/terms/load": "f: positions 2 large_most",
+    "large/terms/count": "i: field_parts",
+    "large/terms/space": "s: large_modes 192",
+    "large/terms/core": "f: large_modes large_most",
+    "large/terms/level": "i: large_modes",
+    "large/terms/start": "i: field_parts block_starts",
     "large/depth": "f: 2 positions",
     "large/reach": "f: positions",
 }
@@ -115,20 +123,24 @@ def require_sound(arrays: Arrays) -> None:
         raise StorageError("the organ has no elements, load positions or modes; build it again")
     _require_mesh(arrays, sizes)
     _require_surface(arrays, sizes)
-    _require_regions(arrays, "regional", sizes["regional"], sizes["most"])
+    _require_blocks(arrays, sizes)
+    _require_field(arrays, "field", sizes["rank"])
     _require_rows(arrays, "contact_near", sizes["positions"], sizes["positions"])
     _require_tip_field(arrays)
     if "basis" in sizes:
         _require_range("parametric/rank", float(arrays["parametric/rank"]), (1, sizes["basis"]))
         rank, n_global = arrays["parametric/rank"], arrays["parametric/n_global"]
         _require_range("parametric/n_global", float(n_global), (1, float(rank)))
+        same = sizes["global"] == sizes["rank"] == int(n_global)
+        if not (same and sizes["regions"] + 1 == sizes["field_parts"]):
+            raise StorageError("'parametric/core' does not fit 'field'; build the file again")
     if "displayed" in sizes:
         _require_display(arrays, sizes)
     if "large/reach" in arrays:
-        _require_regions(arrays, "large/terms", sizes["large"], sizes["large_most"])
-        if not np.array_equal(arrays["large/terms/region"], arrays["regional/region"]):
+        _require_field(arrays, "large/terms", 0)
+        if not np.array_equal(arrays["large/terms/region"], arrays["field/region"]):
             raise StorageError(
-                "'large/terms/region' differs from 'regional/region'; build the file again"
+                "'large/terms/region' differs from 'field/region'; build the file again"
             )
         if arrays["large/reach"].min() < 0.0:
             raise StorageError("'large/reach' is negative; build the file again")
@@ -172,15 +184,28 @@ def _require_display(arrays: Arrays, sizes: Mapping[str, int]) -> None:
         raise StorageError("'display/weights' are no parts of a whole; build the file again")
 
 
-def _require_regions(arrays: Arrays, name: str, n_modes: int, most: int) -> None:
-    """Regions that exist, of modes in order, none with more than its loads have numbers for."""
-    start = arrays[f"{name}/start"].astype(np.int64)
-    if len(start) < 2:
-        raise StorageError(f"'{name}/start' names no region; build the file again")
-    require_indices(f"{name}/region", arrays[f"{name}/region"], len(start) - 1)
+def _require_blocks(arrays: Arrays, sizes: Mapping[str, int]) -> None:
+    """Blocks that hold each vertex once."""
+    vertex = arrays["blocks/vertex"].astype(np.int64)
+    held = np.sort(vertex[vertex >= 0])
+    if not np.array_equal(held, np.arange(sizes["vertices"])) or vertex.min() < -1:
+        raise StorageError("'blocks/vertex' is no order of the vertices; build the file again")
+    if sizes["block_starts"] != sizes["blocks"] + 1:
+        raise StorageError("'field/start' does not fit 'blocks/vertex'; build the file again")
+
+
+def _require_field(arrays: Arrays, name: str, n_shared: int) -> None:
+    """Regions that exist, of modes in order, none with more amplitudes than its loads have."""
+    count, start = (arrays[f"{name}/{key}"].astype(np.int64) for key in ("count", "start"))
+    if len(count) < 2:
+        raise StorageError(f"'{name}/count' names no region; build the file again")
+    require_indices(f"{name}/region", arrays[f"{name}/region"], len(count) - 1)
+    most, n_modes = arrays[f"{name}/core"].shape[1], len(arrays[f"{name}/space"])
+    if not (count[0] == n_shared and count.min() >= n_shared and count.max() <= most):
+        raise StorageError(f"'{name}/count' does not fit its amplitudes; build the file again")
     require_indices(f"{name}/start", start, n_modes + 1)
-    ranks = np.diff(start)
-    if not (start[0] == 0 and start[-1] == n_modes and ranks.min() >= 0 and ranks.max() <= most):
+    joined = (start[1:, 0] == start[:-1, -1]).all() and (np.diff(start, axis=1) >= 0).all()
+    if not joined or start[0, 0] != 0 or start[-1, -1] != n_modes:
         raise StorageError(f"'{name}/start' does not fit its modes; build the file again")
 
 

@@ -1,6 +1,6 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 5.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 6.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
 ``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve; those of the parts
@@ -12,7 +12,9 @@ below are null or empty without them. Datasets:
     surface/vertices                     surface/patch_radius [m]
     far/space (3 n_v, k) [m]             far/load (3 n_s, k)
     trailing (3 n_s, m), of the contact compliance
-    regional/region (n_s,), start (n_regions + 1,), space (3 n_v, n_modes), load (n_s, 3, most)
+    blocks/vertex (64 n_blocks,)         field/region (n_s,), load (n_s, 3, most) [m/N]
+    field/count (n_regions + 1,), start (n_regions + 1, n_blocks + 1), space (n_modes, 192),
+    core (n_modes, most), level (n_modes,)
     contact_near/start, target, block [m/N]: of the symmetric blocks those whose target is their
     position or after it
     tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
@@ -24,7 +26,8 @@ A vademecum with coordinates of the material has the JSON attributes ``coordinat
 
     parametric/basis/space (3 n_v, n)    parametric/basis/load (3 n_s, n)
     parametric/operators (n_terms, n, n) parametric/n_global, rank, young_modulus [Pa]
-    parametric/projection (n_modes, n)   parametric/regional_load (n_nodes, n_s, 3, most)
+    parametric/projection (n_regions, m, n), regional_load (n_nodes, n_s, 3, m)
+    parametric/core (n_modes, n_global)
     parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N], as of contact_near
 
 one with the organ's mass body/mass (rank, rank) and body/weight (rank, 3),
@@ -41,7 +44,7 @@ attribute ``supports``, their names and stiffnesses [N/m^3];
 one with large deformation the JSON attribute
 ``large`` (material, certificate) and, for k = 2, 3,
 
-    large/terms/region, start, space, load (n_s, 2, most) [m^(1-k)], as of regional
+    large/terms/..., load (n_s, 2, most) [m^(1-k)], as of field
     large/depth (2, n_s) [m^(1-k)]       large/reach (n_s,) [m]
 """
 
@@ -52,7 +55,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -67,9 +70,9 @@ from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.fem.supports import Support
 from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.reduction.block_field import BlockField, Blocks
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.reduction.near_field import LocalBlocks, Mirror
-from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.accuracy import AccuracyCurve, Cloud
 from avatar_core.vademecum.certificate import Certificate
@@ -275,7 +278,8 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
             float(arrays["surface/patch_radius"]),
         ),
         far=SeparatedField(arrays["far/space"], arrays["far/load"]),
-        regional=_regional(arrays, "regional"),
+        blocks=Blocks(arrays["blocks/vertex"]),
+        field=_field(arrays, "field"),
         trailing=arrays["trailing"],
         contact_near=LocalBlocks(
             mirror.start, mirror.target, mirror.whole(arrays["contact_near/block"])
@@ -305,8 +309,8 @@ def _display(arrays: dict[str, np.ndarray], stored: Any) -> Display | None:
     return Display(vertices, faces, corners, weights, first_face, names)
 
 
-def _regional(arrays: dict[str, np.ndarray], name: str) -> RegionalField:
-    return RegionalField(*(arrays[f"{name}/{key}"] for key in ("region", "start", "space", "load")))
+def _field(arrays: dict[str, np.ndarray], name: str) -> BlockField:
+    return BlockField(*(arrays[f"{name}/{one.name}"] for one in fields(BlockField)))
 
 
 def _tip_field(arrays: dict[str, np.ndarray]) -> TipField:
@@ -391,7 +395,7 @@ def _large(arrays: dict[str, np.ndarray], stored: Any) -> LargeDeformation | Non
     if LARGE_KEYS[0] not in arrays:
         return None
     said = of_plain(_Large, stored, "large")
-    terms = _regional(arrays, "large/terms")
+    terms = _field(arrays, "large/terms")
     depth, reach = arrays["large/depth"], arrays["large/reach"]
     return LargeDeformation(said.material, terms, depth, reach, said.certificate)
 
@@ -417,6 +421,7 @@ def _parametric(
         operators=part["operators"],
         projection=part["projection"],
         regional_load=part["regional_load"],
+        core=part["core"],
         contact_near=mirror.whole(part["contact_near"]),
         n_global=int(part["n_global"]),
         rank=int(part["rank"]),

@@ -108,6 +108,7 @@ def flat_organ(
         rest=np.pad(points, ((0, 0), (0, 3))).astype(single),
         tip_offset=np.array([tip.offset]),
         superposed=np.array([any(effect.superposed for effect in effects)]),
+        moving=np.array([any(effect.moving for effect in effects)]),
         law=law,
         dent=dent_arrays((tip,), points, np.zeros((1, 3)), PATCH_RADIUS) if law else None,
         display=None,

@@ -102,7 +102,7 @@ def _vademecum_bytes(seed: int) -> tuple[str, bytes]:
 def _require_vademecum(vademecum: Any) -> None:
     import numpy as np
 
-    assert all(np.isfinite(a).all() for a in (vademecum.far.space, vademecum.regional.load))
+    assert all(np.isfinite(a).all() for a in (vademecum.far.space, vademecum.field.load))
     assert vademecum.surface_faces.max() < len(vademecum.surface_vertices)
     assert vademecum.info().name.isprintable()
 

@@ -18,10 +18,10 @@ from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.level_set import GridBox
 from avatar_core.geometry.mesh import MeshQuality, Regions, TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.reduction.block_field import BLOCK, BlockField, blocks_of
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.reduction.near_field import LocalBlocks, Mirror
 from avatar_core.reduction.pgd import EnrichmentReport, EnrichmentStatus
-from avatar_core.reduction.regional import RegionalField
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.shapes.registration import RegistrationQuality, SimilarityTransform, Template
 from avatar_core.vademecum.certificate import Certificate
@@ -66,7 +66,8 @@ def small_vademecum(parametric: bool = False, large: bool = False) -> Vademecum:
             points, points / RADIUS, faces[1:], np.arange(n, dtype=np.int64), 0.012
         ),
         far=_field(rng, 3 * n_vertices, 3 * n, RANK),
-        regional=_regional(rng, n_vertices, region, 3),
+        blocks=blocks_of(vertices, np.arange(n)),
+        field=_block_field(rng, region, 3, RANK),
         trailing=1e-3 * rng.normal(size=(3 * n, 2)).astype(np.float32),
         contact_near=_blocks(n),
         tip_field=_tip_field(),
@@ -141,14 +142,25 @@ def _blocks(n_positions: int) -> LocalBlocks:
     return LocalBlocks(mirror.start, mirror.target, block)
 
 
-def _regional(
-    rng: np.random.Generator, n_vertices: int, region: np.ndarray, n_loads: int
-) -> RegionalField:
-    """Two regions, of two modes and of one."""
-    load = 1e-4 * rng.normal(size=(len(region), n_loads, 2)).astype(np.float32)
-    load[region == 1, :, 1] = 0.0
-    space = rng.uniform(-1.0, 1.0, size=(3 * n_vertices, 3)).astype(np.float16)
-    return RegionalField(region, np.array([0, 2, 3]), space, load)
+def _block_field(
+    rng: np.random.Generator, region: np.ndarray, n_loads: int, n_shared: int
+) -> BlockField:
+    """Two regions, of two modes and of one, in two blocks of two modes each."""
+    count = n_shared + np.array([0, 2, 1], np.int32)
+    load = 1e-4 * rng.normal(size=(len(region), n_loads, n_shared + 2)).astype(np.float32)
+    load[region == 1, :, -1] = 0.0
+    start = np.array([[0, 1, 2], [2, 4, 6], [6, 8, 10]]) - 2 * (n_shared == 0)
+    start = np.maximum(start, 0)
+    n = int(start[-1, -1])
+    return BlockField(
+        region,
+        load,
+        count,
+        rng.integers(-32767, 32767, (n, BLOCK), np.int16),
+        1e-5 * rng.normal(size=(n, n_shared + 2)).astype(np.float32),
+        np.ones(n, np.int32),
+        start,
+    )
 
 
 def _body(rng: np.random.Generator, rank: int) -> BodyResponse:
@@ -174,9 +186,9 @@ def _parametric(rng: np.random.Generator, vademecum: Vademecum) -> ParametricRes
         coordinates=(coordinate,),
         basis=_field(rng, 3 * len(vademecum.mesh.vertices), 3 * n, rank),
         operators=np.tile(np.eye(rank), (2, 1, 1)),
-        projection=1e-2
-        * rng.normal(size=(vademecum.regional.space.shape[1], rank)).astype(np.float32),
-        regional_load=np.tile(vademecum.regional.load, (nodes, 1, 1, 1)),
+        projection=1e-2 * rng.normal(size=(2, 2, rank)).astype(np.float32),
+        regional_load=np.tile(vademecum.field.load[:, :, RANK:], (nodes, 1, 1, 1)),
+        core=vademecum.field.core[:, :RANK],
         contact_near=np.tile(vademecum.contact_near.block, (nodes, 1, 1, 1)),
         n_global=RANK,
         rank=rank,
@@ -187,10 +199,9 @@ def _parametric(rng: np.random.Generator, vademecum: Vademecum) -> ParametricRes
 
 def _large(rng: np.random.Generator, vademecum: Vademecum) -> LargeDeformation:
     n, powers = len(vademecum.surface.centers), len(POWERS)
-    n_vertices = len(vademecum.mesh.vertices)
     return LargeDeformation(
         "neo-hookean",
-        _regional(rng, n_vertices, vademecum.regional.region, powers),
+        _block_field(rng, vademecum.field.region, powers, 0),
         np.zeros((powers, n)),
         np.full(n, 0.01),
         LargeCertificate(0.02, 0.05, 0.01, 0.04, 0.1, 0.1, 3, 9, 0, 0.01, 0.01, 0.01),

@@ -49,6 +49,7 @@ class Effect(ABC):
     Constants : kind of the arrays that a step reads of it; None if it acts through the vademecum
     State : kind of what it keeps between steps, and of its scratch; None if there is nothing
     superposed : whether the displacement of a tip follows from all loads and histories together
+    moving : whether it moves the organ by more than the loads of the moment do
 
     Raises
     ------
@@ -61,6 +62,7 @@ class Effect(ABC):
     Constants: ClassVar[Any] = None
     State: ClassVar[Any] = None
     superposed: ClassVar[bool] = False
+    moving: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_numbers(self, f"{self.name}.")

@@ -47,6 +47,7 @@ class Inertia(Effect):
     )
     State: ClassVar[Any] = kind("InertiaState", modes=array("K"), velocity=array("m"))  # q, q'
     superposed: ClassVar[bool] = True
+    moving: ClassVar[bool] = True
 
     density: float = quantity("kg/m^3", 100.0, 5000.0, "of the organ", 1060.0)
     damping: float = quantity("-", 0.0, 2.0, "of every mode, over its critical damping", 0.1)

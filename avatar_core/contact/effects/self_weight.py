@@ -29,6 +29,7 @@ class SelfWeight(Effect):
 
     Constants: ClassVar[Any] = kind("SelfWeight", amplitude=array("K"))  # of the modes
     superposed: ClassVar[bool] = True
+    moving: ClassVar[bool] = True
 
     density: float = quantity("kg/m^3", 100.0, 5000.0, "of the organ", 1060.0)
     gravity: float = quantity("m/s^2", 0.0, 100.0, "acceleration", 9.81)

@@ -71,6 +71,7 @@ class Viscoelasticity(Effect):
         tip_held=array("T"),  # load that keeps e constant [N]
     )
     superposed: ClassVar[bool] = True
+    moving: ClassVar[bool] = True
 
     g: tuple[float, ...] = quantity("-", 0.0, 0.999, "part of the modulus lost by each term")
     tau: tuple[float, ...] = quantity("s", 1e-3, 1e5, "relaxation time of each term")

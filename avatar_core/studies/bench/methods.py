@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from avatar_core.common.jit import compiled
-from avatar_core.contact.cloud import shown_vertices
+from avatar_core.contact.cloud import shown_blocks
 from avatar_core.contact.display import write_cloud
 from avatar_core.contact.effects.several_tools import place_beside
 from avatar_core.contact.locate import locate
@@ -26,6 +26,7 @@ from avatar_core.contact.tool_path import slide, starts_apart
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.tip import Tip
+from avatar_core.reduction.block_field import BLOCK, POINTS
 from avatar_core.tips.law import sample_law
 from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.model import Vademecum
@@ -96,7 +97,7 @@ def time_dense_table(
 ) -> StepRow:
     """The same contacts and field from stored columns, displayed by the same interpolation."""
     cloud = shown_cloud(vademecum)
-    n_v, n_s = len(shown_vertices(vademecum, cloud)), vademecum.surface.n_positions
+    n_v, n_s = POINTS * shown_blocks(vademecum, cloud), vademecum.surface.n_positions
     size = 4 * 9 * n_s * (n_v + n_s)
     if size > MAX_TABLE_BYTES:
         nan = float("nan")
@@ -232,16 +233,15 @@ def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000, tip: Tip = SPH
 
 
 def _columns(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
-    """Displacement of the mesh's points under every load, shape (n_positions, 3, 3 n_points)."""
-    far, regional = vademecum.far, vademecum.regional
-    n = vademecum.surface.n_positions
-    points = shown_vertices(vademecum, cloud)
-    rows = (3 * points[:, None] + np.arange(3)).ravel()
-    out = (far.load @ far.space[rows].T).reshape(n, 3, -1).astype(np.float32)
-    for r in range(regional.n_regions):
-        at, modes = regional.region == r, regional.modes(r)[rows]
-        out[at] += regional.load[at, :, : modes.shape[1]] @ modes.T
-    return np.ascontiguousarray(out)
+    """Displacement in the blocks of a cloud under every load, shape (n_positions, 3, n)."""
+    field, n_blocks = vademecum.field, shown_blocks(vademecum, cloud)
+    out = np.empty((vademecum.surface.n_positions, 3, n_blocks * BLOCK), np.float32)
+    for r in range(field.n_regions):
+        here = np.flatnonzero(field.region == r)
+        load = field.load[here, :, : field.count[1 + r]]
+        moved = field.of_part(1 + r, load.reshape(-1, load.shape[2]).T)[:n_blocks]
+        out[here] = moved.reshape(-1, 3 * len(here)).T.reshape(len(here), 3, -1)
+    return out
 
 
 def _compliance(vademecum: Vademecum) -> np.ndarray:

@@ -31,7 +31,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
-from avatar_core.tips.law import LAW_ERROR
+from avatar_core.tips.law import SLOPE_ERROR, VARIATION_ERROR
 from avatar_core.vademecum.certificate import Certificate, ContactSites
 from avatar_core.vademecum.force_error import PROMISED, ForceError
 from avatar_core.vademecum.model import Provenance, Vademecum
@@ -90,7 +90,7 @@ def certified(vademecum: Vademecum, found: ContactSites) -> Vademecum:
 
 
 def pressed(vademecum: Vademecum) -> tuple[float, float, float]:
-    """Force on a sphere 2 mm deep, the error that is said, and sqrt(D) there."""
+    """Force on a sphere 2 mm deep, the error that is said, and the law's relative part of it."""
     tip = Tip("sphere", 5e-3)
     data = prepare(vademecum, (tip,), cloud="off", effects=())
     centre = np.array([0.05, 0.1, 0.05])
@@ -98,15 +98,17 @@ def pressed(vademecum: Vademecum) -> tuple[float, float, float]:
         step(data, (centre + (tip.offset - depth) * UP)[None])
     estimate_error(data)
     force = float(np.linalg.norm(data.out.force[0]))
-    return (force, float(data.out.force_error[0]), float(abs(data.state.steepness[0] - 1.0)))
+    s, depth = data.state, -data.state.gap[0]
+    softer = np.linalg.norm(s.self_slope[0]) * depth / s.self_compliance[0]
+    law = SLOPE_ERROR * abs(s.steepness[0] - 1.0) + VARIATION_ERROR * softer
+    return (force, float(data.out.force_error[0]), float(law))
 
 
 def test_the_factor_scales_the_laws_part_of_the_error_that_is_said(box: Vademecum) -> None:
-    force, once, steeper = pressed(box)
+    force, once, law = pressed(box)
     same, thrice, _ = pressed(certified(box, replace(FOUND, factor=3.0)))
     assert force == same > 0.0
-    law = force * (LAW_ERROR + steeper)
-    assert thrice - once == pytest.approx(2.0 * law, rel=1e-5)
+    assert thrice - once == pytest.approx(2.0 * law * force, rel=1e-5)
 
 
 def test_edges_are_the_thinnest_places_below_a_thickness(

@@ -160,8 +160,13 @@ def test_at_a_node_the_contact_is_exact_at_the_load_positions(
     organ: Vademecum, problem: Elasticity
 ) -> None:
     values = {"poisson": float(POISSON.nodes[1]), "contrast": float(CONTRAST.nodes[2])}
-    c = certify(at_values(organ, values), problem_at(problem, values), 5)
-    assert c.vertex_contact_worst < 1e-4
+    v, there = at_values(organ, values), problem_at(problem, values)
+    some = np.arange(0, v.surface.n_positions, 9)
+    loads = patch_loads(there, v.surface.centers[some], v.surface.patch_radius)
+    exact = (loads.T @ there.solve(loads)).reshape(len(some), 3, len(some), 3)
+    for k, j in enumerate(some):
+        found = v.compliance(np.array([j]), np.ones(1))
+        assert np.linalg.norm(found - exact[k, :, k]) < 1e-3 * np.linalg.norm(exact[k, :, k])
 
 
 def test_young_modulus_divides_every_displacement(organ: Vademecum) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.contact.cloud import POINTS, cloud_arrays
 from avatar_core.contact.effects import SelfWeight
 from avatar_core.contact.tool_path import palpation
 from avatar_core.geometry.tip import Tip
+from avatar_core.reduction.block_field import POINTS
 from avatar_core.reduction.block_modes import BlockModes, compact_order, load_sizes, separate_blocks
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.contact import prepare, step
@@ -145,5 +145,5 @@ def test_a_step_shows_the_displacement_of_the_vademecum(
         errors.append(np.sqrt((mass * wrong**2).sum() / (mass * exact**2).sum()))
     assert 0.0 < max(errors) < 8e-3
     assert np.mean(errors) < 4e-3
-    counts = np.diff(cloud_arrays(v, "volume").block_start[1:], axis=1)
+    counts = np.diff(v.field.start[1:], axis=1)
     assert counts.mean() < 0.25 * v.n_modes

@@ -11,12 +11,12 @@ from avatar_core.contact.cloud_kernels import MAX_PAST, _fade_regions
 from avatar_core.contact.effects import Viscoelasticity
 from avatar_core.contact.tool_path import slide
 from avatar_core.geometry.tip import Tip
-from avatar_core.reduction.regional import RegionalField, RegionalRule, regions_of, separate_regions
+from avatar_core.reduction.regional import RegionalRule, RegionModes, regions_of, separate_regions
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.contact import prepare, step
 
 N_VERTICES, N_POSITIONS, N_LOADS = 40, 24, 3
-HALF = 5e-4  # of half precision, in which modes are kept
+SINGLE = 5e-4  # squares of columns in single precision tell of errors above
 
 
 @pytest.fixture
@@ -32,37 +32,42 @@ MASS = np.linspace(0.5, 2.0, 3 * N_VERTICES)
 REGION = np.repeat([0, 1, 2], N_POSITIONS // 3).astype(np.int32)
 
 
-def separated(columns: np.ndarray, rule: RegionalRule) -> tuple[RegionalField, np.ndarray]:
+def separated(columns: np.ndarray, rule: RegionalRule) -> tuple[list[RegionModes], np.ndarray]:
     size = np.sqrt(np.einsum("x,xij->ij", MASS, columns**2))
     return separate_regions(REGION, lambda at: columns[:, at], size, MASS, rule)
 
 
-def true_errors(field: RegionalField, columns: np.ndarray) -> np.ndarray:
-    size = np.sqrt(np.einsum("x,xij->ij", MASS, columns**2))
-    left = np.stack(
-        [columns[:, j] - field.combined(np.array([j]), np.ones(1)) for j in range(N_POSITIONS)], 1
-    )
+def true_errors(regions: list[RegionModes], columns: np.ndarray) -> np.ndarray:
+    size, left = np.sqrt(np.einsum("x,xij->ij", MASS, columns**2)), columns.copy()
+    for r, (space, load) in enumerate(regions):
+        left[:, r == REGION] -= np.einsum("xk,pik->xpi", space, load)
     return np.asarray(np.sqrt(np.einsum("x,xij->ij", MASS, left**2)) / size)
+
+
+def ranks(regions: list[RegionModes]) -> list[int]:
+    return [space.shape[1] for space, _ in regions]
 
 
 def test_errors_that_are_told_are_those_that_are_left(columns: np.ndarray) -> None:
     for most in (2, 4, 7):
-        field, errors = separated(columns, RegionalRule(0.0, 0.0, most))
-        assert field.rank == most and (np.diff(field.start) == most).all()
-        np.testing.assert_allclose(errors[most], true_errors(field, columns), atol=2 * HALF)
+        regions, errors = separated(columns, RegionalRule(0.0, 0.0, most))
+        assert ranks(regions) == [most] * 3
+        np.testing.assert_allclose(errors[most], true_errors(regions, columns), atol=SINGLE)
+        peaks = [np.abs(space).max(axis=0) for space, _ in regions]
+        np.testing.assert_allclose(peaks, 1.0, rtol=1e-6)
 
 
 def test_the_tolerance_is_met_with_as_few_modes_as_do(columns: np.ndarray) -> None:
     rule = RegionalRule(tolerance=0.02, worst=0.06, most=20)
-    field, errors = separated(columns, rule)
-    found = true_errors(field, columns)
-    for region, rank in enumerate(np.diff(field.start)):
+    regions, errors = separated(columns, rule)
+    found = true_errors(regions, columns)
+    for region, rank in enumerate(ranks(regions)):
         here = region == REGION
-        assert found[here].mean() < rule.tolerance + HALF
-        assert found[here].max() < rule.worst + HALF
+        assert found[here].mean() < rule.tolerance + SINGLE
+        assert found[here].max() < rule.worst + SINGLE
         fewer = errors[rank - 1, here]
         assert fewer.mean() > rule.tolerance or fewer.max() > rule.worst
-    assert field.rank < 20
+    assert max(ranks(regions)) < 20
 
 
 def test_no_basis_of_as_many_modes_leaves_less(columns: np.ndarray) -> None:
@@ -76,19 +81,6 @@ def test_no_basis_of_as_many_modes_leaves_less(columns: np.ndarray) -> None:
     for basis in (rng.standard_normal((len(MASS), 3)), scaled[:, ::8][:, :3]):
         q = np.linalg.qr(basis)[0]
         assert ((scaled - q @ (q.T @ scaled)) ** 2).sum() > least
-
-
-def test_truncated_and_scaled_fields_are_those_of_fewer_modes_and_other_loads(
-    columns: np.ndarray,
-) -> None:
-    field, errors = separated(columns, RegionalRule(0.0, 0.0, 6))
-    np.testing.assert_allclose(true_errors(field.truncated(2), columns), errors[2], atol=2 * HALF)
-    assert field.truncated(9) is field
-    assert field.truncated(0).space.shape[1] == 0
-    at, weights = np.array([3, 20]), np.array([0.25, 0.75])
-    np.testing.assert_allclose(
-        field.scaled(3.0).combined(at, weights), 3.0 * field.combined(at, weights), rtol=1e-4
-    )
 
 
 def test_regions_are_compact_and_the_same_every_time() -> None:
@@ -152,13 +144,14 @@ def test_regions_fade_before_they_are_left_out(phantom_vademecum: Vademecum) -> 
     """Of seven, four stay, each less what the fifth moves: whichever it is, nothing jumps."""
     data = prepare(phantom_vademecum, cloud="volume")
     state, start = data.state, data.model.arrays.region_start
+    own = start[:7] + start[0]  # the first of its modes, after the global ones
     moved = np.arange(7.0, 0.0, -1.0)
     state.n_touched[0], state.touched[:7] = 7, np.arange(7)
     state.is_touched[:7] = True
     state.amplitude[:] = 0.0
-    state.amplitude[start[:7]] = moved
+    state.amplitude[own] = moved
     _fade_regions(data.model.arrays, state)
     assert state.n_touched[0] == MAX_PAST
     assert state.touched[:MAX_PAST].tolist() == [0, 1, 2, 3]
     assert state.is_touched[:7].tolist() == [True] * 4 + [False] * 3
-    np.testing.assert_allclose(state.amplitude[start[:4]], moved[:4] - moved[4], rtol=1e-5)
+    np.testing.assert_allclose(state.amplitude[own[:4]], moved[:4] - moved[4], rtol=1e-5)

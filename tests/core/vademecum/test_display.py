@@ -9,7 +9,6 @@ import igl
 import numpy as np
 import pytest
 
-from avatar_core.contact.cloud import TOLERANCE
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.resampling import is_manifold, resampled, unified
@@ -18,6 +17,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.rule import BuildRule
 from avatar_core.pipeline import OrganOptions, build
+from avatar_core.reduction.block_field import TOLERANCE
 from avatar_core.vademecum.display import boundary, display_of, structure
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.helpers.box_organ import UP, organ, top

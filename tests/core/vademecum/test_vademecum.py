@@ -32,7 +32,6 @@ def test_certificate_meets_the_promise_on_the_phantom(phantom_vademecum: Vademec
     assert phantom_vademecum.convergence.converged
     assert c.l2_mean <= 0.05 and c.l2_worst <= 0.12
     assert c.contact_mean <= 0.03 and c.contact_worst <= 0.10
-    assert c.vertex_contact_worst <= 0.02  # of projected positions; solved ones are exact
 
 
 @pytest.mark.long
@@ -40,7 +39,9 @@ def test_certificate_sees_a_damaged_vademecum(phantom_vademecum: Vademecum) -> N
     """A certificate that cannot tell a good from a bad file would certify anything."""
     v = phantom_vademecum
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
-    damaged = replace(v, regional=v.regional.scaled(0.0))
+    field = v.field
+    own = np.arange(field.rank) < field.n_shared  # the global modes are left alone
+    damaged = replace(v, field=replace(field, load=field.load * own))
     good, bad = certify(v, problem, 20), certify(damaged, problem, 20)
     assert good.l2_mean < 0.6 * bad.l2_mean
     assert bad.contact_mean == pytest.approx(good.contact_mean)
@@ -54,17 +55,27 @@ def test_loads_of_the_build_are_answered_within_its_tolerance(phantom_vademecum:
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
     some = np.arange(0, v.surface.n_positions, 7)
     loads = patch_loads(problem, v.surface.centers[some], v.surface.patch_radius)
-    exact = problem.at_vertices(problem.solve(loads)).reshape(-1, len(some), 3)
+    solution = problem.solve(loads)
+    exact = problem.at_vertices(solution).reshape(-1, len(some), 3)
+    average = (loads.T @ solution).reshape(len(some), 3, len(some), 3)
     errors = np.array(
         [
             relative_l2(v.displacement(np.array([j]), np.ones(1)), exact[:, k], v.mesh.lumped_mass)
             for k, j in enumerate(some)
         ]
     )
-    said = v.convergence.rank_errors[-1]
-    assert errors.max() < 1.05 * said.worst
-    assert errors.mean() == pytest.approx(said.mean, rel=0.3)
-    assert errors.mean() < 1.3 * v.convergence.tolerance
+    said = v.convergence
+    assert errors.max() < 1.01 * said.every_worst
+    assert errors.mean() == pytest.approx(said.every_mean, rel=0.3)
+    assert errors.mean() < 1.3 * said.tolerance
+    own = np.array(
+        [
+            np.linalg.norm(v.compliance(np.array([j]), np.ones(1)) - average[k, :, k])
+            / np.linalg.norm(average[k, :, k])
+            for k, j in enumerate(some)
+        ]
+    )
+    assert own.max() < 1e-3  # of single precision: compliances are stored as they were solved
 
 
 def test_file_gives_back_the_same_vademecum(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
@@ -73,7 +84,7 @@ def test_file_gives_back_the_same_vademecum(phantom_vademecum: Vademecum, tmp_pa
     assert repr(v.certificate) == repr(phantom_vademecum.certificate)  # NaN differs from NaN
     assert v.convergence == phantom_vademecum.convergence
     assert v.provenance == phantom_vademecum.provenance
-    for name in ("far", "regional", "contact_near"):
+    for name in ("far", "blocks", "field", "contact_near"):
         a, b = getattr(v, name), getattr(phantom_vademecum, name)
         for field in a.__dataclass_fields__:
             np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
@@ -190,10 +201,15 @@ def test_a_display_is_stored(phantom_vademecum: Vademecum, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("key", "spoil", "message"),
     [
-        ("regional/region", lambda a: a + 1, "points outside"),
-        ("regional/start", lambda a: a[::-1], "does not fit"),
-        ("regional/start", lambda a: a + 1, "points outside"),
-        ("regional/load", lambda a: a[..., :1], "does not fit"),
+        ("blocks/vertex", lambda a: a[::-1] + 1, "no order"),
+        ("blocks/vertex", lambda a: a[:-64], "no order"),
+        ("field/region", lambda a: a + 1, "points outside"),
+        ("field/count", lambda a: a + 1, "does not fit"),
+        ("field/count", lambda a: a[:-1], "does not fit"),
+        ("field/start", lambda a: a[::-1], "does not fit"),
+        ("field/start", lambda a: a + 1, "points outside"),
+        ("field/load", lambda a: a[..., :1], "does not fit"),
+        ("field/space", lambda a: a.astype(np.int32), "another kind"),
         ("tip_field/outline/faces", lambda a: a + 10**6, "points outside"),
         ("tip_field/outline/vertices", lambda a: 1e3 * a, "no organ"),
         ("display/faces", lambda a: a + len(a), "points outside"),
