@@ -36,7 +36,7 @@ from avatar_core.offline.parametric import build_parametric_vademecum
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.offline.supports import SupportOption, held_by
 from avatar_core.reduction.coordinates import Coordinate
-from avatar_core.vademecum.display import Display, boundary, display_of, outline, structure
+from avatar_core.vademecum.display import DISPLAYED, organ_display
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
 from avatar_core.vademecum.tip_field import make_tip_field, with_tumour
@@ -67,7 +67,7 @@ class OrganOptions:
     n_contact_sites : places, 0 or at least 3, at which contacts of real tips are resolved for the
         certificate; ``seed`` draws them too
     with_mesh_error : also solve on the same mesh refined once (slow)
-    n_displayed : vertices of the surface that is displayed, about; None for that of the mesh
+    n_displayed : vertices of the surface that is displayed, about; 0 for that of the mesh
 
     Raises
     ------
@@ -92,7 +92,7 @@ class OrganOptions:
     n_contact_sites: int = 0
     seed: int = 0
     with_mesh_error: bool = False
-    n_displayed: int | None = None
+    n_displayed: int = DISPLAYED
 
     def __post_init__(self) -> None:
         names = [c.name for c in self.all_coordinates]
@@ -136,7 +136,7 @@ class OrganOptions:
                 f"a patch of radius {self.patch_radius:g} m is no tool's; give 1e-3 to 0.1 "
                 "(12e-3: 12 mm)"
             )
-        if self.n_displayed is not None:
+        if self.n_displayed != 0:
             require_displayable(self.n_displayed)
         if self.groups is not None and not self.groups.is_file():
             raise MeshError(f"cannot read node groups from {self.groups}: there is no such file")
@@ -169,7 +169,8 @@ def build(
     elasticity = _elasticity(mesh, regions, supports, options)
     loads = load_surface(mesh, regions, options.patch_radius)
     common = (surface.name, elasticity, regions, loads)
-    display = _display(mesh, surface, options)
+    inside = () if options.tumour is None else (options.tumour,)
+    display = organ_display(mesh, surface, options.n_displayed, inside)
     tip_field = make_tip_field(mesh, regions, loads.patch_radius, surface)
     last = (options.rule, provenance, progress, display)
 
@@ -211,16 +212,6 @@ def _timed(vademecum: Vademecum, progress: Progress) -> Vademecum:
     except AvatarError as error:
         return vademecum.with_notices(f"steps were not timed: {error}")
     return vademecum.with_certificate(replace(certificate, curve=curve))
-
-
-def _display(mesh: TetMesh, surface: SurfaceMesh, options: OrganOptions) -> Display | None:
-    """What is displayed, if it is more than the mesh's own surface."""
-    tumour, n = options.tumour, options.n_displayed
-    if tumour is None and n is None:
-        return None
-    organ = boundary(mesh) if n is None else outline(mesh, surface, n)
-    structures = [] if tumour is None else [(tumour.name, structure(tumour))]
-    return display_of(mesh, organ, structures)
 
 
 def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress) -> Vademecum:

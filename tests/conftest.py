@@ -109,7 +109,11 @@ def bent() -> Vademecum:
 @cached_on_disk
 def _straight() -> Vademecum:
     options = OrganOptions(
-        n_vertices=800, patch_radius=30e-3, rule=BuildRule(max_modes=60), n_certified=10
+        n_displayed=0,
+        n_vertices=800,
+        patch_radius=30e-3,
+        rule=BuildRule(max_modes=60),
+        n_certified=10,
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loads, "MIDPOINTS_FROM", 1.0)

@@ -46,7 +46,7 @@ from avatar_core.reduction.galerkin import (
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import load_map
 from avatar_core.shapes.registration import Registration, register
-from avatar_core.vademecum.display import Display, boundary, display_of, structure
+from avatar_core.vademecum.display import DISPLAYED, Display, organ_display
 from avatar_core.vademecum.model import Convergence, RankError, Vademecum
 from avatar_core.vademecum.tip_field import make_tip_field
 
@@ -71,6 +71,7 @@ class PatientOptions:
         :func:`avatar_core.atlas.patient_problem.patient_problem`
     supports : springs of fixed stiffness that hold the organ instead of the clamp
     inside : what lies inside the organ and is displayed with it, as tumours; as stiff as the organ
+    n_displayed : vertices of the surface that is displayed, about; 0 for that of the mesh
     """
 
     n_vertices: int = 2850
@@ -83,6 +84,7 @@ class PatientOptions:
     groups: Mapping[str, np.ndarray] | None = None
     supports: tuple[SupportOption, ...] = ()
     inside: tuple[SurfaceMesh, ...] = ()
+    n_displayed: int = DISPLAYED
     build: BuildRule = field(default_factory=BuildRule)
     reduction: ReductionRule = field(default_factory=ReductionRule)
 
@@ -362,11 +364,7 @@ def solved(
 
 
 def _display(problem: PatientProblem, options: PatientOptions) -> Display | None:
-    """The mesh's own surface with what lies inside; None if nothing does."""
-    if not options.inside:
-        return None
-    inside = [(one.name, structure(one)) for one in options.inside]
-    return display_of(problem.mesh, boundary(problem.mesh), inside)
+    return organ_display(problem.mesh, problem.outline, options.n_displayed, options.inside)
 
 
 # --- assembly ---------------------------------------------------------------------------------

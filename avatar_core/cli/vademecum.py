@@ -161,8 +161,8 @@ def vademecum(
     displayed: Annotated[
         int | None,
         typer.Option(
-            help="approximate number of vertices of the displayed surface, such as 20000; "
-            "default: that of the mesh"
+            help="approximate number of vertices of the displayed surface; default: 8000; 0: those "
+            "of the mesh"
         ),
     ] = None,
     timings: Timings = None,
@@ -175,6 +175,7 @@ def vademecum(
     from avatar_core.offline.supports import SupportOption
     from avatar_core.pipeline import OrganOptions, build, notices_of
     from avatar_core.reduction.coordinates import Coordinate
+    from avatar_core.vademecum.display import DISPLAYED
     from avatar_core.vademecum.storage import is_vademecum, load_vademecum, save_vademecum
 
     rule = BuildRule()
@@ -221,7 +222,7 @@ def vademecum(
         n_contact_sites=contact_sites,
         seed=seed,
         with_mesh_error=mesh_error,
-        n_displayed=displayed,
+        n_displayed=DISPLAYED if displayed is None else displayed,
     )
     notices = notices_of(organ, options)
     say_notices(notice for notice in notices if notice not in organ.notices)

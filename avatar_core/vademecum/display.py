@@ -27,6 +27,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.block_field import Blocks, blocks_of
 
 ORGAN = "organ"  # the first part
+DISPLAYED = 8000  # vertices: of 24 bytes each, two cores carry a thousand clouds a second
 # Vertices of a structure. Two triangles of a ball meet at 3 degrees with the fewest, on the mean of
 # their edges, and look smooth; at 15 degrees on a lesion of 20 mm by marching cubes.
 FEWEST_OF_STRUCTURE, MOST_OF_STRUCTURE = 2000, 4000
@@ -56,6 +57,21 @@ class Display:
     def faces_of(self, part: int) -> np.ndarray:
         """The triangles of a part, over all displayed vertices."""
         return self.faces[self.first_face[part] : self.first_face[part + 1]]
+
+
+def organ_display(
+    mesh: TetMesh, surface: SurfaceMesh | None, n: int, inside: Sequence[SurfaceMesh] = ()
+) -> Display | None:
+    """What is displayed of an organ; None if that is the boundary of its mesh alone.
+
+    surface : that the mesh was made of; None for the mesh's own boundary, refined
+    n : vertices, about; 0 for those of the mesh
+    inside : structures
+    """
+    if n == 0 and not inside:
+        return None
+    organ = boundary(mesh) if n == 0 else outline(mesh, surface, n)
+    return display_of(mesh, organ, [(one.name, structure(one)) for one in inside])
 
 
 def display_of(
@@ -103,12 +119,13 @@ def boundary(mesh: TetMesh) -> Triangles:
     return mesh.vertices[index], np.searchsorted(index, mesh.boundary_faces)
 
 
-def outline(mesh: TetMesh, surface: SurfaceMesh, n: int) -> Triangles:
+def outline(mesh: TetMesh, surface: SurfaceMesh | None, n: int) -> Triangles:
     """The surface that a mesh was made of, with about n vertices.
 
-    Where triangles of the file cross or do not close, the boundary of the mesh is refined instead.
+    Without one, and where triangles of the file cross or do not close, the boundary of the mesh is
+    refined instead.
     """
-    vertices, faces = unified(*surface.skin.boundary)
+    vertices, faces = boundary(mesh) if surface is None else unified(*surface.skin.boundary)
     if not is_manifold(faces):
         vertices, faces = boundary(mesh)
     return resampled(vertices, faces, n)

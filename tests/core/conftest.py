@@ -59,7 +59,9 @@ def phantom_vademecum() -> Vademecum:
 
 @cached_on_disk
 def _phantom_vademecum() -> Vademecum:
-    options = OrganOptions(n_vertices=900, rule=BuildRule(max_modes=60), n_certified=60)
+    options = OrganOptions(
+        n_displayed=0, n_vertices=900, rule=BuildRule(max_modes=60), n_certified=60
+    )
     return build(phantom_liver(), options)
 
 
@@ -68,7 +70,9 @@ REAL = ("LiTS-60", "Amos-007", "LiTS-23")  # of two sources; one cracked, one ea
 
 @cached_on_disk
 def _vademecum_of_file(path: Path) -> Vademecum:
-    options = OrganOptions(n_vertices=1500, rule=BuildRule(max_modes=60), n_certified=3)
+    options = OrganOptions(
+        n_displayed=0, n_vertices=1500, rule=BuildRule(max_modes=60), n_certified=3
+    )
     return build(read_surface(path), options)
 
 

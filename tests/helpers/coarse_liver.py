@@ -30,7 +30,9 @@ def liver(scale: float = 1.0) -> Vademecum:
     """The phantom, coarse: what matters here is not how exact it is."""
     surface = phantom_liver(12e-3)
     surface = replace(surface, vertices=scale * surface.vertices)
-    options = OrganOptions(n_vertices=600, rule=BuildRule(max_modes=40), n_certified=3)
+    options = OrganOptions(
+        n_displayed=0, n_vertices=600, rule=BuildRule(max_modes=40), n_certified=3
+    )
     return build(surface, options)
 
 

@@ -46,6 +46,7 @@ def soft_tumour() -> SurfaceMesh:
 @cached_on_disk
 def soft_organ() -> Vademecum:
     options = OrganOptions(
+        n_displayed=0,
         n_vertices=450,
         rule=BuildRule(max_modes=60),
         coordinates=(POISSON, CONTRAST),
@@ -59,6 +60,7 @@ def soft_organ() -> Vademecum:
 def organ_on_springs() -> Vademecum:
     """Over the stiffness of its bare area, which alone holds it; loads at vertices alone."""
     options = OrganOptions(
+        n_displayed=0,
         n_vertices=450,
         rule=BuildRule(max_modes=60),
         supports=(SupportOption.parse("bare_area=1e5:1e9:3"),),

@@ -230,7 +230,9 @@ def _organ() -> Any:
     from avatar_core.pipeline import OrganOptions, build
 
     rule = BuildRule(max_modes=30)
-    return build(phantom_liver(12e-3), OrganOptions(n_vertices=800, rule=rule, n_certified=10))
+    return build(
+        phantom_liver(12e-3), OrganOptions(n_displayed=0, n_vertices=800, rule=rule, n_certified=10)
+    )
 
 
 @pytest.fixture(scope="session")

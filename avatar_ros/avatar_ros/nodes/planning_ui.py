@@ -316,9 +316,7 @@ class PlanningNode(ManagedNode):
 
     def _show_played(self, organ: Organ, played: Played) -> None:
         """Update the page from a recording that plays."""
-        tips = np.array([one.tip for one in played.shown])
-        forces = np.array([one.force for one in played.shown])
-        largest = self._view.move(played.cloud, tips, forces)
+        largest = self._view.move(played.cloud)
         self._view.grey(any(one.missing for one in played.shown))
         self._place_tools(played.shown)
         self._panels.recordings.show(self._player.part)

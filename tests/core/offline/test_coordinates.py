@@ -149,7 +149,11 @@ def test_too_few_modes_are_said_not_to_converge(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(loads, "MIDPOINTS_FROM", 1.0)  # fewer load positions
     rule = BuildRule(max_modes=5)
     options = OrganOptions(
-        n_vertices=400, rule=rule, coordinates=(Coordinate("poisson", 0.45, 0.48),), n_certified=8
+        n_displayed=0,
+        n_vertices=400,
+        rule=rule,
+        coordinates=(Coordinate("poisson", 0.45, 0.48),),
+        n_certified=8,
     )
     found = build(phantom_liver(12e-3), options)
     assert found.n_modes == 5
@@ -310,6 +314,7 @@ def test_an_incompressible_organ_with_a_tumour_is_refused(organ: Vademecum) -> N
 def test_towards_incompressibility_on_taylor_hood() -> None:
     """Poisson's ratio up to 0.499, where the canonical separated form stagnates."""
     options = OrganOptions(
+        n_displayed=0,
         n_vertices=800,
         rule=BuildRule(max_modes=60),
         coordinates=(Coordinate("poisson", 0.40, 0.499),),

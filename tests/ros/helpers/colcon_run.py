@@ -53,7 +53,9 @@ def _build(library: Path) -> None:
     from avatar_core.pipeline import OrganOptions, build
     from avatar_core.vademecum.storage import save_vademecum
 
-    options = OrganOptions(n_vertices=600, rule=BuildRule(max_modes=10), n_certified=4)
+    options = OrganOptions(
+        n_displayed=0, n_vertices=600, rule=BuildRule(max_modes=10), n_certified=4
+    )
     save_vademecum(build(phantom_liver(12e-3), options), library / "liver.h5")
 
 

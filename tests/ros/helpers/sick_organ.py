@@ -31,6 +31,7 @@ def sick_organ() -> Vademecum:
         tumour = Path(name, "tumour.stl")
         meshio.write_points_cells(tumour, 1e3 * (center + points), {"triangle": faces})
         options = OrganOptions(
+            n_displayed=0,
             n_vertices=600,
             rule=BuildRule(max_modes=20),
             coordinates=(

@@ -42,6 +42,7 @@ def soft_organ() -> Any:
 @cached_on_disk
 def _soft_organ() -> Any:
     options = OrganOptions(
+        n_displayed=0,
         n_vertices=800,
         rule=BuildRule(max_modes=20),
         coordinates=(Coordinate("poisson", 0.30, 0.49, 2),),

@@ -14,9 +14,7 @@ from avatar_ros.ui.view import tone
 from avatar_ros.ui.view.bands import cut
 from avatar_ros.ui.view.colours import N_BANDS, band_colours, tissue_colours
 from avatar_ros.ui.view.organ import Organ
-from avatar_ros.ui.view.refined import finer, refined
 
-from avatar_core.contact.fine_surface import _LEVELS, FineSurface, _split
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.certificate import Certificate
 from tests.helpers.box_organ import organ
@@ -71,79 +69,6 @@ def test_the_browsers_tone_mapping_is_undone() -> None:
     np.testing.assert_allclose(tone.shown(tone.material(seen)), seen, atol=4.0)
     grey = np.repeat(np.arange(20.0, 230.0, 10.0)[:, None], 3, axis=1)
     np.testing.assert_allclose(tone.shown(tone.material(grey)), grey, atol=1.5)
-
-
-def test_a_refined_ball_is_rounder_and_keeps_its_points() -> None:
-    points, faces = ball(400, RADIUS)
-    shape = refined(len(points), faces)
-    moved = shape.blend @ points
-    np.testing.assert_array_equal(moved[: len(points)], points)
-    middles = moved[len(points) :]
-    flat = points[shape.ends].mean(axis=1)
-    miss = [np.abs(np.linalg.norm(p, axis=1) - RADIUS).mean() for p in (middles, flat)]
-    assert miss[0] < 0.25 * miss[1]
-    np.testing.assert_allclose(shape.blend @ np.ones(len(points)), 1.0)
-    given, fine = areas(points, faces), areas(moved, shape.faces)
-    assert ((given.repeat(4, axis=0) * fine).sum(axis=1) > 0.0).all()
-
-
-def test_what_is_finer_under_a_tip_stays_and_no_gap_opens_beside_it() -> None:
-    points, faces = ball(400, RADIUS)
-    n, split = len(points), faces[:1]
-    a, b, c = split[0]
-    extra = np.array([points[[i, k]].mean(axis=0) for i, k in ((a, b), (b, c), (c, a))])
-    ab, bc, ca = n, n + 1, n + 2
-    four = np.array([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])
-    shown = FineSurface(
-        np.concatenate([points, extra]),
-        np.zeros((n + 3, 3)),
-        np.concatenate([faces[1:], four]),
-        np.concatenate([np.arange(1, len(faces)), np.zeros(4, int)]),
-    )
-    smooth = finer(refined(n, faces), shown)
-    require_closed(smooth)
-
-
-def require_closed(shown: FineSurface) -> None:
-    """Every edge has two sides, which use the same two points."""
-    edges = shown.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, times = np.unique(_ends(shown.positions[edges]), axis=0, return_counts=True)
-    assert (times == 2).all()
-
-
-@pytest.mark.parametrize("size", [1, 2, 6, 40])
-def test_no_point_of_a_finer_part_lies_on_a_side_that_does_not_have_it(size: int) -> None:
-    """Single pixels would stay open there: neighbours of a part are split as it is."""
-    points, faces = ball(400, RADIUS)
-    middle = points[faces].mean(axis=1)
-    chosen = np.argsort(np.linalg.norm(middle - middle[0], axis=1))[:size]
-    is_split = np.isin(np.arange(len(faces)), chosen)
-    blend, finest = _split(faces[is_split], len(points))
-    positions = blend @ points
-    shown = FineSurface(
-        positions,
-        np.zeros_like(positions),
-        np.concatenate([faces[~is_split], finest]),
-        np.concatenate([np.flatnonzero(~is_split), np.tile(np.flatnonzero(is_split), 4**_LEVELS)]),
-    )
-    shape = refined(len(points), faces)
-    smooth = finer(shape, shown)
-    require_closed(smooth)
-    vectors = areas(smooth.positions, smooth.faces)
-    together = np.zeros((len(faces), 3))
-    np.add.at(together, smooth.parents // 4, vectors)
-    beside = ~is_split & (np.linalg.norm(together, axis=1) > 0.0)
-    assert beside.sum() == len(faces) - size
-    outward = (vectors * smooth.positions[smooth.faces].mean(axis=1)).sum(axis=1)
-    assert (outward > 0.0).all()  # none is turned round
-
-
-def _ends(places: np.ndarray) -> np.ndarray:
-    """Both ends of edges (n, 2, 3) in one order, as whole numbers."""
-    whole = np.round(places / 1e-8).astype(np.int64)
-    swap = np.array([tuple(p) > tuple(q) for p, q in whole])
-    whole[swap] = whole[swap][:, ::-1]
-    return whole.reshape(-1, 6)
 
 
 # --- Fields -----------------------------------------------------------------------------------

@@ -72,7 +72,7 @@ def test_pixels_have_the_colours_of_the_legend_and_right_is_on_the_left(
 ) -> None:
     """Seen from the front, the patient's right is at the left: there the field is largest."""
     cloud = ramp(cube)
-    view.move(cloud, np.ones((1, 3)), np.zeros((1, 3)))
+    view.move(cloud)
     pixels, pose = picture(browser), first_pose(cube)
     browser.screenshot(path=shots / "ramp.png")
     low, high = cube.vertices.min(axis=0), cube.vertices.max(axis=0)
@@ -101,7 +101,7 @@ def test_glass_has_no_dark_patch_and_rest_is_tissue(
     view: OrganView, browser: Any, cube: Organ
 ) -> None:
     rest = np.hstack([cube.vertices, np.zeros_like(cube.vertices)])
-    view.move(rest, np.ones((1, 3)), np.zeros((1, 3)))
+    view.move(rest)
     pose = first_pose(cube)
     grid = [
         cube.centre + np.array([u, 0.5, v]) * (np.ptp(cube.vertices, axis=0) * 0.7)

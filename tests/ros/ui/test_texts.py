@@ -248,9 +248,8 @@ def test_a_cloud_is_drawn_with_all_tools_and_one_of_another_organ_is_not(
         shown = live.draw(page)
         assert [one.missing for one in shown] == [missing, missing]
     assert page.of("grey") == [True, True, False]
-    ((_, _, tips, forces),) = [call for call in page.calls if call[0] == "move"]
-    np.testing.assert_array_equal(tips, PLACES)
-    assert forces[:, 1].tolist() == [1.0, 3.0] == [one.size for one in shown]
+    assert len(page.of("move")) == 1
+    assert [one.size for one in shown] == [1.0, 3.0]
     assert shown[0].largest == 1e-3 and live.statuses == (OK, OK)
 
 

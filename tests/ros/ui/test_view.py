@@ -27,6 +27,7 @@ from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.box_organ import UP, organ, top
 from tests.helpers.contact import prepare, step
+from tests.helpers.shown_dent import finer
 from tests.ros.helpers.page import NAMES, PLACES, Noted, face_area
 
 SPHERE, DEPTH = Tip("sphere", 3e-3), 2e-3
@@ -72,19 +73,19 @@ def area(found: list[Any]) -> float:
 # --- The organ --------------------------------------------------------------------------------
 
 
-def test_under_a_tip_that_presses_the_page_draws_its_dent(
-    view: OrganView, pressed: ContactData
-) -> None:
-    """Deeper than any point of the cloud; and none of it when the tip lets go."""
-    cloud, force = pressed.out.cloud, pressed.out.force[0]
-    sizes = np.linalg.norm(cloud[:, 3:], axis=1)
-    assert view.move(cloud, POSE[None], force[None]) > 0.8 * DEPTH > 1.5 * sizes.max()
-    assert len(meshes(view, "bands")) > 0.7 * N_BANDS * 0.8 * DEPTH / view.top
-    assert view.move(0.5 * cloud, POSE[None], 0.0 * force[None]) == pytest.approx(0.5 * sizes.max())
+def test_under_a_tip_that_presses_the_page_draws_the_dent_of_the_cloud(view: OrganView) -> None:
+    fine = finer(organ("cube"))
+    view.show(Organ.of(fine), (SPHERE,))
+    cloud = pressing(fine).out.cloud
+    largest = view.move(cloud)
+    assert largest == pytest.approx(np.linalg.norm(cloud[:, 3:], axis=1).max())
+    assert DEPTH > largest > 0.7 * DEPTH
+    assert len(meshes(view, "bands")) > 0.7 * N_BANDS * largest / view.top
+    assert view.move(0.5 * cloud) == pytest.approx(0.5 * largest)
 
 
 def test_at_rest_the_organ_is_tissue_whole_and_once(view: OrganView, cube: Organ) -> None:
-    """Cut into shades, smoothed, and nothing over it."""
+    """Cut into shades, and nothing over it."""
     assert meshes(view, "bands") == []
     exact = face_area(cube.vertices, cube.faces)
     assert area(meshes(view, "tissue")) == pytest.approx(exact, rel=0.05)
@@ -95,24 +96,18 @@ def test_bands_and_tissue_together_cover_the_organ(view: OrganView, pressed: Con
     cloud[:, 3:] *= 0.05 * view.top / np.linalg.norm(cloud[:, 3:], axis=1).max() * 4.0
     cloud[:, :3] = organ("cube").surface_vertices + cloud[:, 3:]
     before = area(meshes(view, "tissue"))
-    view.move(cloud, POSE[None], np.zeros((1, 3)))
+    view.move(cloud)
     groups = [meshes(view, group) for group in ("tissue", "rim", "bands")]
     assert all(groups)
     assert sum(map(area, groups)) == pytest.approx(before, rel=5e-3)
 
 
 def test_the_same_cloud_is_not_sent_twice(view: OrganView, pressed: ContactData) -> None:
-    """A tool at rest would cost the browser thirty pictures a second.
-
-    A cloud may come before the force of its period: the dent is drawn when the force is there.
-    """
-    cloud, force = pressed.out.cloud, pressed.out.force[0]
-    plain = view.move(cloud, POSE[None], np.zeros((1, 3)))
-    largest = view.move(cloud, POSE[None], force[None])
-    assert largest > 1.5 * plain
+    """A tool at rest would cost the browser thirty pictures a second."""
+    largest = view.move(pressed.out.cloud)
     (first, *_) = meshes(view, "bands")
     first.vertices = np.zeros_like(first.vertices)
-    assert view.move(cloud.copy(), POSE[None], force[None]) == largest
+    assert view.move(pressed.out.cloud.copy()) == largest
     assert not np.any(first.vertices)
     for held in (True, False):  # no number stands beside a shape that is not of now
         view.grey(held)
@@ -236,12 +231,6 @@ def test_little_error_looks_unlike_no_access(view: OrganView, cube: Organ) -> No
     assert tuple(first.color) != tuple(tone.material(np.array(TISSUE)))
 
 
-def test_under_a_patch_the_page_draws_the_cloud(view: OrganView, pressed: ContactData) -> None:
-    view.change_tips((Tip("patch", 3e-3),))
-    largest = view.move(pressed.out.cloud, POSE[None], pressed.out.force)
-    assert largest == pytest.approx(np.linalg.norm(pressed.out.cloud[:, 3:], axis=1).max())
-
-
 def with_lesion() -> Vademecum:
     cube = organ("cube")
     corners = 6e-3 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, -1, -1]], float)
@@ -257,7 +246,7 @@ def test_a_structure_belongs_to_its_organ_and_moves_with_it(view: OrganView, cub
     before = [np.array(part.mesh.vertices) for part in parts]
     assert sum(len(part.mesh.faces) for part in parts) == 4
     data = pressing(sick)
-    view.move(data.out.cloud, POSE[None], data.out.force)
+    view.move(data.out.cloud)
     for part, old in zip(parts, before, strict=True):
         np.testing.assert_array_equal(part.mesh.vertices, data.out.cloud[part.used, :3])
         assert np.abs(np.array(part.mesh.vertices) - old).max() > 0.05 * DEPTH
@@ -297,7 +286,7 @@ def test_the_scale_never_shrinks_during_a_touch_and_begins_anew_at_rest(view: Or
     for largest in (7e-3, 1e-3, 0.0, 1e-3):
         cloud = rest.copy()
         cloud[0, 3:] = 0.0, 0.0, largest
-        view.move(cloud, np.ones((1, 3)), np.zeros((1, 3)))
+        view.move(cloud)
         tops.append(view.top)
     assert tops == [1e-2, 1e-2, 1e-3, 1e-3]
 

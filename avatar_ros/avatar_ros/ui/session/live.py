@@ -85,7 +85,7 @@ class Live:
             return self._without_force(view, sent, OTHER_ORGAN)
         largest = float("nan")
         if self._periods.take(rows) and taken is not None:
-            largest = view.move(taken[1], rows["tip"], rows["force"])
+            largest = view.move(taken[1])
         view.grey(self._periods.is_unknown)
         if taken is not None and self._recorder.is_on:
             self._recorder.note_cloud(taken[1][:, 3:], int(rows["number"][0]))

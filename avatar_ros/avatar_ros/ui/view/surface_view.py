@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import viser
 
-from avatar_core.contact.fine_surface import FineSurface
 from avatar_ros.ui.view import tone
 from avatar_ros.ui.view.bands import cut
 from avatar_ros.ui.view.colours import (
@@ -29,7 +28,6 @@ from avatar_ros.ui.view.colours import (
     tissue_colours,
 )
 from avatar_ros.ui.view.patterns import Patterned, checkered, hatched, striped
-from avatar_ros.ui.view.refined import finer, refined
 
 GLASS = 0.45  # opacity of an organ that is seen through
 OUTLINE = (30, 16, 14)  # of a section
@@ -152,7 +150,7 @@ def section(points: np.ndarray, height: np.ndarray, faces: np.ndarray) -> np.nda
 
 
 class SurfaceView:
-    """Draws the surface into a viser server, more smoothly than it is given.
+    """Draws the surface into a viser server.
 
     root : name of the node above all of its meshes
     is_reach_marked : a pattern is drawn where tools reach
@@ -168,7 +166,7 @@ class SurfaceView:
         self._tissue: Tissue | None = None
         self._sent = _NO_POINT  # cloud's points where the tissue was drawn
         self._shown_faces: dict[int, bytes] = {}
-        self._last: tuple[FineSurface, np.ndarray, float] | None = None
+        self._last: tuple[np.ndarray, np.ndarray, float] | None = None
         self._plane: Plane | None = None
         self._opacity: float | None = None
         self.is_grey = False
@@ -180,17 +178,11 @@ class SurfaceView:
 
     def show(self, vertices: np.ndarray, faces: np.ndarray, marks: Marks) -> None:
         """Show another organ, at rest."""
-        self._shape = refined(len(vertices), faces)
-        self._vertices, self._faces = self._shape.blend @ vertices, self._shape.faces
-        self._coarse = np.asarray(faces, np.uint32)
+        self._vertices, self._faces = np.asarray(vertices), np.asarray(faces, int)
         self._plane, self.is_grey, self._last = None, False, None
         self._light = lightness(self._vertices, self._faces)
-        self._marks = Marks(*(self._of_parts(region) for region in marks))
+        self._marks = marks
         self._make()
-
-    def _of_parts(self, of_face: np.ndarray) -> np.ndarray:
-        """What is given for each face of the organ, for each that is drawn."""
-        return np.repeat(of_face, 4) if self._shape.is_finer else of_face
 
     def mark_reach(self, wanted: bool) -> None:
         """Draw a pattern where tools reach, or none."""
@@ -281,9 +273,8 @@ class SurfaceView:
         """
         if self._opacity is not None:  # of glass, it would be seen
             return
-        if self._plane is None:  # where nobody looks: the surface as coarse as it is given
-            coarse = points[: self._shape.blend.shape[1]]
-            draw(self._nodes["inside", 0], coarse, self._coarse)
+        if self._plane is None:
+            draw(self._nodes["inside", 0], points, self._faces.astype(np.uint32))
             return
         data, faces, _ = _below(points, self._plane.above(self._vertices), self._faces)
         used, local = own(faces) if len(faces) else ([0], _NO_FACE)
@@ -291,61 +282,56 @@ class SurfaceView:
         lines = section(points, self._plane.above(self._vertices), self._faces)
         self._outline.points = lines if len(lines) else _NO_LINE
 
-    def move(self, shown: FineSurface, top: float) -> None:
-        """Draw the displacement over the moved surface; ``top`` ends its scale [m]."""
-        smooth, self._known = finer(self._shape, shown), None
-        self._last = smooth, np.linalg.norm(smooth.displacements, axis=1), top
+    def move(self, points: np.ndarray, top: float) -> None:
+        """Draw the displacement over the moved surface.
+
+        points : ndarray, shape (n, 6), a cloud [m]; top : end of the scale [m]
+        """
+        self._known = None
+        self._last = points, np.linalg.norm(points[:, 3:], axis=1), top
         self.redraw()
 
-    def paint(self, shown: FineSurface, values: np.ndarray, top: float) -> None:
-        """Draw another field, given at the cloud's points, over a surface as coarse as these.
+    def paint(self, points: np.ndarray, values: np.ndarray, top: float) -> None:
+        """Draw another field, given at the cloud's points.
 
         values : ndarray, shape (n,); a face at whose corners one is NaN stays tissue
         """
         is_known = np.isfinite(values)
-        self._known = self._of_parts(is_known[shown.faces].all(axis=1))
-        values = np.where(is_known, values, 0.0)
-        middles = values[self._shape.ends].mean(axis=1)
-        self._last = finer(self._shape, shown), np.concatenate([values, middles]), top
+        self._known = is_known[self._faces].all(axis=1)
+        self._last = points, np.where(is_known, values, 0.0), top
         self.redraw()
 
     def redraw(self) -> None:
         """Draw the last field again."""
         if self._last is None:
             return
-        shown, values, top = self._last
-        faces, parent = shown.faces, shown.parents
-        is_band = np.zeros(len(self._faces), bool)
-        if self._known is not None:
-            is_band = self._known.copy()
-        else:
-            is_band[parent[(values[faces] > top / N_BANDS).any(axis=1)]] = True
-        if self._shape.is_finer:  # under a tip, a triangle stands for all four of its parent
-            under = np.unique(parent[faces[:, 0] >= len(self._vertices)] // 4)
-            is_band[(4 * under[:, None] + np.arange(4)).reshape(-1)] = True
-        faces, parent = faces[is_band[parent]], parent[is_band[parent]]
-        data = np.column_stack([shown.positions, values])
+        points, values, top = self._last
+        known = self._known
+        of_field = (values[self._faces] > top / N_BANDS).any(axis=1)
+        is_band = np.asarray(of_field if known is None else known)
+        parent = np.flatnonzero(is_band)
+        faces = self._faces[parent]
+        data = np.column_stack([points[:, :3], values])
         if self._plane is not None and len(faces):
-            rest = shown.positions - shown.displacements
+            rest = points[:, :3] - points[:, 3:]
             data, faces, parts = _below(data, self._plane.above(rest), faces)
             parent = parent[parts]
         banded = cut(data, data[:, 3], faces, top / N_BANDS, N_BANDS)
         shade = self._shade_of_faces()[parent[banded.parent]]
-        positions = banded.points[:, :3].astype(np.float32)
-        points = np.asarray(shown.positions[: len(self._vertices)])
+        positions, moved = banded.points[:, :3].astype(np.float32), points[:, :3]
         with self._server.atomic():
-            if np.abs(points - self._sent).max() > _MOVED:
-                self._draw_tissue(points)
+            if np.abs(moved - self._sent).max() > _MOVED:
+                self._draw_tissue(moved)
             self._choose_tissue(is_band)
-            is_tissue = (banded.band == 0) & (self._known is None)
+            is_tissue = (banded.band == 0) & (known is None)
             for k in range(N_BANDS):
                 of_band = (banded.band == k) & ~is_tissue
                 self._replace(("bands", k), positions, banded.faces[of_band])
             for k in range(N_SHADES + 1):
                 rim = is_tissue & (shade == k)
                 self._replace(("rim", k), positions, banded.faces[rim])
-            if self._plane is not None or self._sent is points:
-                self._draw_inside(points)
+            if self._plane is not None or self._sent is moved:
+                self._draw_inside(moved)
 
     def _shade_of_faces(self) -> np.ndarray:
         light = self._light[self._faces].mean(axis=1)

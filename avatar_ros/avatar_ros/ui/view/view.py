@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import viser
 
-from avatar_core.contact.fine_surface import FineSurface, fine_surface
 from avatar_core.geometry.tip import Tip
 from avatar_ros.ui.view import tone
 from avatar_ros.ui.view.camera import Cameras
@@ -20,7 +19,7 @@ from avatar_ros.ui.view.orientation import AXES
 from avatar_ros.ui.view.structures_view import StructuresView
 from avatar_ros.ui.view.surface_view import Marks, SurfaceView
 from avatar_ros.ui.view.tip_body import turn_to
-from avatar_ros.ui.view.tool_view import LEAST_FORCE, ToolView
+from avatar_ros.ui.view.tool_view import ToolView
 
 FIELD_TOPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # possible ends of the scale of another field
 LOOKS = WHOLE, GLASS, CUT, HIDDEN = "whole", "glass", "cut open", "hidden"  # how it is shown
@@ -52,12 +51,10 @@ class OrganView:
         self._roots: dict[str, Any] = {}
         self._surface = SurfaceView(server, _SURFACE)
         self._structures = StructuresView(server)
-        self._tips: tuple[Tip, ...] = ()
         self._tools: list[ToolView] = []
         self._beside = 0  # the tool to which a view can be turned
         self._cameras = Cameras(server, on_cube)
         self._drawn: np.ndarray | None = None  # the cloud that is seen
-        self._pressed = _NO_TIPS  # centres of the tips whose dents are seen [m]
         self._largest = 0.0
         self._field: np.ndarray | None = None  # other than the displacement, at the cloud's points
         self.field_top = FIELD_TOPS[0]
@@ -151,7 +148,7 @@ class OrganView:
             self.field_top = next((x for x in FIELD_TOPS if x >= largest), FIELD_TOPS[-1])
         self._field, self._drawn = field, None
         rest = np.hstack([organ.vertices, np.zeros_like(organ.vertices)])
-        self.move(rest if drawn is None else drawn, *np.zeros((2, len(self._tips), 3)))
+        self.move(rest if drawn is None else drawn)
 
     @property
     def is_reach_marked(self) -> bool:
@@ -187,7 +184,7 @@ class OrganView:
 
     def show_tools(self, tips: tuple[Tip, ...], places: np.ndarray) -> None:
         """Show tools, in place of those before, with their tips at places (n, 3) [m]."""
-        self._tips, self._beside = tips, 0
+        self._beside = 0
         if self._organ is None:
             return
         for tool in self._tools[len(tips) :]:
@@ -208,39 +205,30 @@ class OrganView:
         for k, (tool, label) in enumerate(zip(self._tools, labels, strict=False)):
             tool.name(label, k == chosen)
 
-    def move(self, points: np.ndarray, tips: np.ndarray, forces: np.ndarray) -> float:
+    def move(self, points: np.ndarray) -> float:
         """Move the surface as in a cloud, (n, 6) [m]; returns the largest displacement [m].
 
-        Under tips (n_tools, 3) [m] that feel a force [N], smaller triangles show their dents. The
-        same cloud with the same dents is not drawn twice.
+        The same cloud is not drawn twice.
         """
         organ = self._organ
         if organ is None or len(points) != len(organ.vertices):
             return 0.0
-        (pressing,) = np.nonzero(np.linalg.norm(forces, axis=1) > LEAST_FORCE)
-        is_same = self._drawn is not None and np.array_equal(points, self._drawn)
-        if is_same and np.array_equal(tips[pressing], self._pressed):
+        if self._drawn is not None and np.array_equal(points, self._drawn):
             return self._largest
-        self._drawn, self._pressed = points.copy(), tips[pressing].copy()
-        plain = FineSurface(points[:, :3], points[:, 3:], organ.faces, np.arange(len(organ.faces)))
-        if len(pressing):
-            pressed = [self._tips[k] for k in pressing]
-            shown = fine_surface(organ.vademecum, points, pressed, tips[pressing])
-        else:
-            shown = plain
-        size = np.linalg.norm(shown.displacements, axis=1)
+        self._drawn = points.copy()
+        size = np.linalg.norm(points[:, 3:], axis=1)
         outer = np.zeros(len(size), bool)
-        outer[shown.faces] = True
+        outer[organ.faces] = True
         place = int(np.argmax(np.where(outer, size, 0.0)))
         self._largest = float(size[place])
         self.top = top_for(self._largest, self.top if self._largest > _AT_REST else 0.0)
         with self._server.atomic():
             if self._field is None:
-                self._surface.move(shown, self.top)
+                self._surface.move(self._drawn, self.top)
             else:
-                self._surface.paint(plain, self._field, self.field_top)
+                self._surface.paint(self._drawn, self._field, self.field_top)
             self._structures.move(points[:, :3])
-            self._mark(shown.positions[place])
+            self._mark(points[place, :3])
         return self._largest
 
     def _mark(self, place: np.ndarray) -> None:
