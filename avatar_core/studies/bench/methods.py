@@ -31,12 +31,15 @@ from avatar_core.tips.law import sample_law
 from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.model import Vademecum
 
+Clock = Callable[[], float]  # in seconds
+Kind = type[np.float32] | type[np.int16]  # of the numbers of a table
+
 RADIUS, DEPTH = 10e-3, 5e-3  # [m] of the benchmark's tip, and how deep it slides
 SPHERE, PATCH = Tip("sphere", RADIUS), Tip("patch", RADIUS)
 PASSES = 5  # slides that are timed; other processes disturb some of them
 MAX_TABLE_BYTES = 2_000_000_000
-
-Clock = Callable[[], float]  # in seconds
+# Names by the kind of their numbers.
+TABLES: dict[Kind, str] = {np.float32: "dense table", np.int16: "dense table, 16 bits"}
 
 
 @dataclass(frozen=True)
@@ -93,28 +96,33 @@ def time_tip_over_patch(
 
 
 def time_dense_table(
-    vademecum: Vademecum, n_tools: int, clock: Clock = time.perf_counter
+    vademecum: Vademecum, n_tools: int, clock: Clock = time.perf_counter, kind: Kind = np.float32
 ) -> StepRow:
-    """The same contacts and field from stored columns, displayed by the same interpolation."""
-    cloud = shown_cloud(vademecum)
+    """The same contacts and field from stored columns, displayed by the same interpolation.
+
+    kind : of the stored numbers; in 16 bits each column has a factor of its own
+    """
+    cloud, name = shown_cloud(vademecum), TABLES[kind]
     n_v, n_s = POINTS * shown_blocks(vademecum, cloud), vademecum.surface.n_positions
-    size = 4 * 9 * n_s * (n_v + n_s)
+    size = np.dtype(kind).itemsize * 9 * n_s * (n_v + n_s)
     if size > MAX_TABLE_BYTES:
         nan = float("nan")
-        return StepRow("dense table", n_v, 0, n_tools, nan, 0, nan, nan, size)
-    data, call = _dense(vademecum, n_tools)
-    row = _timed("dense table", vademecum, data, 0, call, clock)
+        return StepRow(name, n_v, 0, n_tools, nan, 0, nan, nan, size)
+    data, call = _dense(vademecum, n_tools, kind)
+    row = _timed(name, vademecum, data, 0, call, clock)
     return replace(row, bytes=size)
 
 
-def table_over_steps(vademecum: Vademecum, clock: Clock = time.process_time) -> float:
-    """Median step of the dense table over that of the vademecum with all modes, one tool.
+def table_over_steps(
+    vademecum: Vademecum, clock: Clock = time.process_time, kind: Kind = np.float32
+) -> float:
+    """Median step of a dense table over that of the vademecum with all modes, one tool.
 
     Both slide in turn, so that a machine that slows down slows both; the median over the pairs.
     """
     tips = tool_paths(vademecum, 1)
     data = model_of(vademecum, (SPHERE,), cloud=shown_cloud(vademecum)).data()
-    dense, call = _dense(vademecum, 1)
+    dense, call = _dense(vademecum, 1, kind)
 
     def ratio() -> float:
         table = np.median(one_pass(dense, tips, call, clock)[0])
@@ -129,13 +137,13 @@ def _stepped(data: ContactData) -> Callable[[np.ndarray], object]:
 
 
 def _dense(
-    vademecum: Vademecum, n_tools: int
+    vademecum: Vademecum, n_tools: int, kind: Kind = np.float32
 ) -> tuple[ContactData, Callable[[np.ndarray], object]]:
     """The data that the dense table uses, and its step."""
     cloud, linear = shown_cloud(vademecum), replace(vademecum, large=None)
     data = model_of(linear, (SPHERE,) * n_tools, cloud=cloud).data()
-    columns, compliance = _columns(vademecum, cloud), _compliance(vademecum)
-    around = (data.model.table, data.table, columns, compliance)
+    tables = (*_stored(_columns(vademecum, cloud), kind), *_stored(_compliance(vademecum), kind))
+    around = (data.model.table, data.table, *tables)
     compiled_step = compiled_for(_dense_step, *map(numba.typeof, around))
 
     def dense(tips: np.ndarray) -> None:
@@ -143,6 +151,16 @@ def _dense(
         compiled_step(*around)
 
     return data, dense
+
+
+def _stored(table: np.ndarray, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
+    """A table (n_positions, 3, ...) as numbers of a kind, and the factor of each column."""
+    factor = np.ones(table.shape[:2], np.float32)
+    if kind is np.float32:
+        return table, factor
+    rest = tuple(range(2, table.ndim))
+    factor = np.maximum(np.abs(table).max(axis=rest), np.finfo(np.float32).tiny) / 32767.0
+    return np.rint(table / np.expand_dims(factor, rest)).astype(kind), factor.astype(np.float32)
 
 
 def time_direct(
@@ -256,7 +274,7 @@ def _compliance(vademecum: Vademecum) -> np.ndarray:
 
 
 @compiled(fastmath=True)
-def _dense_step(model, data, columns, compliance):  # type: ignore[no-untyped-def]
+def _dense_step(model, data, columns, size, compliance, softness):  # type: ignore[no-untyped-def]
     """:func:`avatar_core.contact.model.step` with stored columns instead of modes."""
     for t in range(data.tip.shape[0]):
         locate(model, data, t, data.tip[t])
@@ -264,43 +282,45 @@ def _dense_step(model, data, columns, compliance):  # type: ignore[no-untyped-de
         if not data.active[t]:
             data.force[t] = 0.0
             continue
-        _dense_column(data, t, t, compliance, data.column[t])
+        _dense_column(data, t, t, compliance, softness, data.column[t])
         near = near_along_normal(data, t, data.column[t])
         assemble_own(model, data, t, near)
         sample_law(model, data, t, data.tip[t])
-    _couple_dense(model, data, compliance)
+    _couple_dense(model, data, compliance, softness)
     solve_contact(model, data)
     write_forces(model, data)
     u = data.field[: columns.shape[2]]
     u[:] = np.float32(0.0)
     for t in range(data.tip.shape[0]):
         for i in range(data.n_nodes[t] if data.force[t] > 0.0 else 0):
-            force = -data.weight[t, i, 0] * data.force[t]
+            j, force = data.nodes[t, i], -data.weight[t, i, 0] * data.force[t]
             for c in range(3):
-                row, f = columns[data.nodes[t, i], c], np.float32(force * data.normal[t, c])
+                row, f = columns[j, c], np.float32(force * data.normal[t, c] * size[j, c])
                 for k in range(u.shape[0]):
-                    u[k] += f * row[k]
+                    u[k] += f * np.float32(row[k])
     write_cloud(model, data)
 
 
 @compiled(fastmath=True)
-def _couple_dense(model, data, compliance):  # type: ignore[no-untyped-def]
+def _couple_dense(model, data, compliance, softness):  # type: ignore[no-untyped-def]
     if model.several_tools.on:
         for t in range(data.passage.shape[0]):
             for s in range(data.passage.shape[0]):
                 data.several_tools.near[t, s] = s != t
                 if s != t and data.active[t] and data.active[s]:
-                    _dense_column(data, t, s, compliance, data.several_tools.column[t, s])
+                    column = data.several_tools.column[t, s]
+                    _dense_column(data, t, s, compliance, softness, column)
                     place_beside(model, data, t, s)
 
 
 @compiled(fastmath=True)
-def _dense_column(data, t, s, compliance, column):  # type: ignore[no-untyped-def]
+def _dense_column(data, t, s, compliance, softness, column):  # type: ignore[no-untyped-def]
     column[: data.n_nodes[s]] = 0.0
     for i in range(data.n_nodes[t]):
+        j = data.nodes[t, i]
         for c in range(3):
-            row = compliance[data.nodes[t, i], c]
-            f = data.weight[t, i, 0] * data.normal[t, c]
+            row = compliance[j, c]
+            f = data.weight[t, i, 0] * data.normal[t, c] * softness[j, c]
             for q in range(data.n_nodes[s]):
                 for d in range(3):
                     column[q, d] += f * row[data.nodes[s, q], d]

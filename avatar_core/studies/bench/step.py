@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress
 from avatar_core.studies.bench.methods import (
+    TABLES,
     StepRow,
     table_over_steps,
     time_dense_table,
@@ -52,6 +55,7 @@ def time_organ(organ: Vademecum) -> tuple[list[StepRow], dict[str, float]]:
     return rows, {
         "tip_over_patch": time_tip_over_patch(organ, organ.n_modes),
         "table_over_step": table_over_steps(organ),
+        "table_of_16_bits_over_step": table_over_steps(organ, kind=np.int16),
         "step_p50_us": _row(rows, 1).p50_us,
         "step_p99_us": _row(rows, N_TOOLS).p99_us,
         "rival_p99_us": _row(rows, N_TOOLS, "dense table").p99_us,
@@ -59,11 +63,11 @@ def time_organ(organ: Vademecum) -> tuple[list[StepRow], dict[str, float]]:
 
 
 def _rows(vademecum: Vademecum, modes: Sequence[int]) -> list[StepRow]:
-    """A vademecum with so many modes and a dense table, with one tool and with several."""
+    """A vademecum with so many modes and dense tables, with one tool and with several."""
     rows: list[StepRow] = []
     for n_tools in (1, N_TOOLS):
         rows += [time_steps(vademecum, n_tools, some) for some in modes]
-        rows.append(time_dense_table(vademecum, n_tools))
+        rows += [time_dense_table(vademecum, n_tools, kind=kind) for kind in TABLES]
     return rows
 
 
