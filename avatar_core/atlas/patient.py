@@ -1,9 +1,10 @@
 """A new patient's vademecum from a base of anatomies, at three fidelities.
 
-``interpolated`` combines the neighbours' responses (Eq. 18). ``reduced`` uses their load functions
-to span a Galerkin space on the patient's own mesh, and enriches it. ``solved`` is the full build.
-All share the patient's mesh, and the clamp and accessible region transferred from the template, so
-that they differ in the response only. Supports hold a patient that is ``reduced`` or ``solved``.
+``interpolated`` combines the neighbours' responses node by node on the registered template
+(Eq. 18): nothing is meshed or solved. ``reduced`` uses their load functions to span a Galerkin
+space on the patient's own mesh, and enriches it. ``solved`` is the full build. These two share the
+patient's mesh, and the clamp and accessible region transferred from the template. Supports hold a
+patient that is ``reduced`` or ``solved``.
 """
 
 from __future__ import annotations
@@ -18,11 +19,15 @@ import numpy as np
 from avatar_core.atlas.assembly import assembled, provenance, surroundings
 from avatar_core.atlas.base import PatientBase, PatientError, base_of
 from avatar_core.atlas.model import Atlas
-from avatar_core.atlas.patient_problem import PatientProblem, member_problem, patient_problem
+from avatar_core.atlas.patient_problem import (
+    PatientProblem,
+    patient_problem,
+    said_of_missed,
+    template_problem,
+)
 from avatar_core.atlas.transfer import (
     Weighting,
     by_component,
-    carried,
     carried_by_place,
     combine,
     patient_weights,
@@ -208,8 +213,9 @@ def posed_patient(
     )
     progress("mesh", 0.0, np.nan)
     with _timed(clock, "mesh"):
-        if weights.member is not None and fidelity == "interpolated":
-            problem = member_problem(surface, base, weights.member, registration)
+        if fidelity == "interpolated":
+            problem = template_problem(surface, base, registration, weights.member)
+            doubts = (*doubts, said_of_missed(problem))
         else:
             mesh = tetrahedralize(surface, options.n_vertices)
             problem = patient_problem(
@@ -269,9 +275,9 @@ def interpolated(
 ) -> Vademecum:
     """Eq. 18: no equation of the patient is solved.
 
-    ``lle-grid`` combines at common positions, as in the paper, the others nodewise on the template.
-    The contact compliance includes the residual compliance that the base holds for each patch.
-    Balls feel the smooth surface: what facets and folds change is less than the error of the
+    ``lle-paper`` combines at common positions, as in the paper, the others nodewise on the
+    template. The contact compliance includes the residual compliance that the base holds for each
+    patch. Balls feel the smooth surface: what facets and folds change is less than the error of the
     response.
     """
     response = interpolated_response(problem, base, weights, options)
@@ -285,14 +291,11 @@ def interpolated(
 def interpolated_response(
     problem: PatientProblem, base: PatientBase, weights: Barycenter, options: PatientOptions
 ) -> CompactResponse:
-    """The combined response at the patient's vertices and load positions."""
-    registration, elasticity, loads = problem.registration, problem.elasticity, problem.loads
-    if weights.member is not None and problem.mesh is registration.mesh:
-        return base.responses[weights.member]
-    if options.weighting == "lle-grid":
-        return carried_by_place(base, weights, registration, elasticity, loads, options.max_modes)
-    combined = combine(base.responses, weights, options.max_modes)
-    return carried(combined, registration, base.loads, elasticity, loads)
+    """The combined response at the vertices and load positions of the registered template."""
+    if options.weighting == "lle-paper" and weights.member is None:
+        around = (problem.registration, problem.elasticity, problem.loads)
+        return carried_by_place(base, weights, *around, options.max_modes)
+    return combine(base.responses, weights, options.max_modes)
 
 
 def reduced(

@@ -14,6 +14,7 @@ from avatar_core.fem.supports import Support
 from avatar_core.geometry.attachments import attachments_by_rule
 from avatar_core.geometry.groups import faces_of_groups, regions_of_groups
 from avatar_core.geometry.mesh import Regions, TetMesh
+from avatar_core.geometry.point_location import closest_points
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.supports import SupportOption, held_at
 from avatar_core.shapes.correspondence import carry_faces, carry_regions, registered_positions
@@ -83,14 +84,36 @@ def template_places(registration: Registration, mesh: TetMesh) -> dict[str, np.n
     return carry_faces(registration, mesh, parts)
 
 
-def member_problem(
-    surface: SurfaceMesh, base: PatientBase, member: int, registration: Registration
+def template_problem(
+    surface: SurfaceMesh, base: PatientBase, registration: Registration, member: int | None = None
 ) -> PatientProblem:
-    """An anatomy of the base on the registered template, on which its response was computed."""
-    template = base.template
-    mesh = TetMesh(np.asarray(base.vertices[member], float), template.mesh.tets)
-    own = replace(registration, mesh=mesh)
+    """A patient on the registered template: no mesh is made, and responses combine node by node.
+
+    member : an anatomy of the base that the patient is, on whose own template its response is
+    """
+    template, own = base.template, registration
+    if member is not None:
+        mesh = TetMesh(np.asarray(base.vertices[member], float), template.mesh.tets)
+        own = replace(registration, mesh=mesh)
     loads = replace(base.loads, centers=registered_positions(own, base.loads))
-    loads = replace(loads, normals=patch_normals(mesh, loads.centers, loads.patch_radius))
-    elasticity = Elasticity(mesh, base.material, template.regions.clamped)
-    return PatientProblem(surface, own, mesh, template.regions, loads, elasticity)
+    loads = replace(loads, normals=patch_normals(own.mesh, loads.centers, loads.patch_radius))
+    elasticity = Elasticity(own.mesh, base.material, template.regions.clamped)
+    return PatientProblem(surface, own, own.mesh, template.regions, loads, elasticity)
+
+
+def missed(problem: PatientProblem) -> tuple[float, np.ndarray]:
+    """How far the patient's surface is from the mesh at most [m], and where, shape (3,) [m]."""
+    points = problem.surface.vertices
+    closest, _, _ = closest_points(problem.mesh.vertices, problem.mesh.boundary_faces, points)
+    distance = np.linalg.norm(points - closest, axis=1)
+    worst = int(np.argmax(distance))
+    return float(distance[worst]), points[worst]
+
+
+def said_of_missed(problem: PatientProblem) -> str:
+    """What a registered template leaves out of the patient, in one line."""
+    far, (x, y, z) = missed(problem)
+    return (
+        f"interpolated on a registered template, which is up to {1e3 * far:.1f} mm off the surface "
+        f"of the organ, at ({x:.3f}, {y:.3f}, {z:.3f}) m; choose reduced for the organ's own mesh"
+    )

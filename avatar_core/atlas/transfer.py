@@ -31,8 +31,10 @@ from avatar_core.shapes.barycenter import Barycenter, barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix, load_map
 from avatar_core.shapes.registration import Registration
 
-Weighting = Literal["lle-grid", "lle-template", "kriging"]
-GRID_NEIGHBORS = 10  # of the paper, Sec. 3.3
+Weighting = Literal["kriging", "lle-template", "lle-grid", "lle-paper"]
+PAPER_NEIGHBORS = 10  # Sec. 3.3
+# Ridges of LLE with all neighbours: the least leave-one-out error of displacement of 64 livers.
+_RIDGES: dict[str, float] = {"lle-template": 1e-2, "lle-grid": 1e-2}
 _OVERSAMPLING = 20  # random columns beyond the rank of a combination
 # Exponent of kriging: leave-one-out error of displacement of 46 livers 13.7 %, with 1 16.2 %.
 _VARIOGRAM = 1.8
@@ -51,14 +53,15 @@ def patient_weights(
 ) -> Barycenter:
     """Weights of the anatomies of a base for a patient.
 
-    weighting : "lle-grid", Eq. 15 on the distances at the common grid, as in the paper;
-        "lle-template", the same on the centred registered vertices; "kriging", see :func:`kriging`
-    n_neighbors : k; None for 10 on the grid, as in the paper, and all on the template
+    weighting : "kriging", see :func:`kriging`, and "lle-template", Eq. 15, both on the centred
+        registered vertices; "lle-grid", Eq. 15 on the distances at the common grid; "lle-paper",
+        the same as in the paper, with its neighbours and almost no ridge
+    n_neighbors : k; None for all, and for 10 with "lle-paper"
 
     Raises
     ------
     PatientError
-        For an unknown weighting, or "lle-grid" with a base that has no grid distances.
+        For an unknown weighting, or one on the grid with a base that has no grid distances.
     LLEError
         For k <= 0 or a base with no anatomy left.
     """
@@ -67,17 +70,20 @@ def patient_weights(
             f"unknown weighting {weighting!r}; choose one of {', '.join(get_args(Weighting))}"
         )
     left = sorted({*leave_out, *base.copies})
-    if weighting == "lle-grid":
+    k = len(base.names) - len(left) if n_neighbors is None else n_neighbors
+    if weighting in ("lle-grid", "lle-paper"):
         if base.distances is None or base.distance_of is None:
             raise PatientError("the base has no distances on a grid; choose weighting 'kriging'")
-        k = GRID_NEIGHBORS if n_neighbors is None else n_neighbors
-        distances = base.distance_of(surface, registration)
-        return barycenter(base.distances, distances, k, leave_out=left)
-    vectors, point = list(centred(base.vertices)), centred(registration.mesh.vertices)
-    k = len(vectors) - len(left) if n_neighbors is None else n_neighbors
-    if weighting == "lle-template":
+        vectors: Sequence[FloatArray] = base.distances
+        point = base.distance_of(surface, registration)
+    else:
+        vectors, point = list(centred(base.vertices)), centred(registration.mesh.vertices)
+    if weighting == "kriging":
+        return kriging(vectors, point, k, left)
+    if weighting == "lle-paper":
+        k = PAPER_NEIGHBORS if n_neighbors is None else n_neighbors
         return barycenter(vectors, point, k, leave_out=left)
-    return kriging(vectors, point, k, left)
+    return barycenter(vectors, point, k, regularization=_RIDGES[weighting], leave_out=left)
 
 
 def centred(vertices: FloatArray) -> FloatArray:

@@ -30,7 +30,7 @@ from avatar_core.cli.vademecum import (
 if TYPE_CHECKING:
     from avatar_core.atlas.patient import Patient
 
-WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
+WEIGHTINGS = ("kriging", "lle-template", "lle-grid", "lle-paper")
 
 
 def patient(
@@ -51,13 +51,14 @@ def patient(
     weighting: Annotated[
         str,
         typer.Option(
-            help="how known organs are weighted: kriging, lle-template, or lle-grid as in the paper"
+            help="how known organs are weighted: kriging or lle-template, on the registered "
+            "template; lle-grid, on level sets; or lle-paper, as in the paper"
         ),
     ] = "kriging",
     neighbors: Annotated[
         int | None,
         typer.Option(
-            help="number of known organs that are used; default: all, or 10 with lle-grid"
+            help="number of known organs that are used; default: all, or 10 with lle-paper"
         ),
     ] = None,
     leave_out: Annotated[

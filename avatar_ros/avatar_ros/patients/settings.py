@@ -10,7 +10,7 @@ from rclpy.node import Node
 from avatar_ros.framework.parameters import AUTOSTART, Parameter, ParameterError, values
 from avatar_ros.patients.protocol import BuildSettings
 
-WEIGHTINGS = ("kriging", "lle-template", "lle-grid")
+WEIGHTINGS = ("kriging", "lle-template", "lle-grid", "lle-paper")
 
 PATIENT_INTERPOLATION = (
     AUTOSTART,
@@ -28,7 +28,9 @@ PATIENT_INTERPOLATION = (
     ),
     Parameter("modes", 100, "largest number of modes at a place", range=(1, 1000)),
     Parameter(
-        "weighting", "kriging", "weights of the neighbours: kriging, lle-template or lle-grid"
+        "weighting",
+        "kriging",
+        "weights of the neighbours: kriging, lle-template, lle-grid or lle-paper",
     ),
     Parameter(
         "certify",

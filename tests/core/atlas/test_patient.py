@@ -12,8 +12,14 @@ import scipy.sparse as sp
 
 from avatar_core.atlas.base import PatientBase, PatientError, leave_one_out
 from avatar_core.atlas.patient import PatientOptions, build_patient, patient_vademecum
-from avatar_core.atlas.patient_problem import PatientProblem, patient_problem
-from avatar_core.atlas.transfer import combine, kriging, patient_weights
+from avatar_core.atlas.patient_problem import (
+    PatientProblem,
+    missed,
+    patient_problem,
+    said_of_missed,
+    template_problem,
+)
+from avatar_core.atlas.transfer import Weighting, centred, combine, kriging, patient_weights
 from avatar_core.errors import LLEError, SurfaceError
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.reduction.galerkin import (
@@ -25,6 +31,7 @@ from avatar_core.reduction.galerkin import (
     residual_compliance_blocks,
     solve_probes,
 )
+from avatar_core.shapes.barycenter import barycenter
 from tests.helpers.bent_base import bent_phantoms, patient_mesh, registration_of
 from tests.helpers.known_surfaces import ball
 
@@ -265,7 +272,10 @@ def test_probes_are_exact(case: Case) -> None:
 @pytest.mark.parametrize("fidelity", ["interpolated", "reduced"])
 def test_each_fidelity_is_a_certified_vademecum(case: Case, fidelity: str) -> None:
     options = PatientOptions(tolerance=0.05, n_certified=10, reduction=ROOMY)
-    problem = replace(case.problem, notices=("a doubt",))
+    problem = case.problem
+    if fidelity == "interpolated":
+        problem = template_problem(problem.surface, case.base, problem.registration)
+    problem = replace(problem, notices=("a doubt",))
     patient = build_patient(problem, case.base, _weights(case), fidelity, options)  # type: ignore[arg-type]
     assert patient.notices[0] == patient.vademecum.provenance.notices[-1] == "a doubt"
     certificate = patient.vademecum.certificate
@@ -305,6 +315,36 @@ def test_a_tolerance_must_be_a_fraction() -> None:
         PatientOptions(tolerance=0.0)
 
 
-def test_the_paper_weights_need_a_grid(case: Case) -> None:
+@pytest.mark.parametrize("weighting", ["lle-grid", "lle-paper"])
+def test_weights_on_a_grid_need_one(case: Case, weighting: Weighting) -> None:
     with pytest.raises(PatientError, match="kriging"):
-        patient_weights(case.base, case.problem.registration, case.problem.surface, "lle-grid")
+        patient_weights(case.base, case.problem.registration, case.problem.surface, weighting)
+
+
+def test_a_ridge_spreads_the_weights_of_all_neighbours(case: Case) -> None:
+    """What the base cannot tell apart is not told by weights far above one."""
+    around = (case.base, case.problem.registration, case.problem.surface)
+    spread = patient_weights(*around, "lle-template")
+    assert len(spread.weights) == len(case.base.names)
+    assert spread.weights.sum() == pytest.approx(1.0, abs=1e-9)
+    plain = barycenter(
+        list(centred(case.base.vertices)),
+        centred(case.problem.registration.mesh.vertices),
+        len(case.base.names),
+    )
+    assert spread.absolute_sum < plain.absolute_sum
+    assert spread.residual > plain.residual
+
+
+def test_what_a_registered_template_misses_is_measured_and_said(case: Case) -> None:
+    problem = template_problem(case.problem.surface, case.base, case.problem.registration)
+    near, _ = missed(problem)
+    vertices = case.problem.surface.vertices.copy()
+    tip = int(np.argmax(vertices[:, 0]))
+    out = vertices[tip] - vertices.mean(axis=0)
+    vertices[tip] += 0.02 * out / np.linalg.norm(out)
+    longer = replace(problem, surface=replace(case.problem.surface, vertices=vertices))
+    far, place = missed(longer)
+    np.testing.assert_array_equal(place, vertices[tip])
+    assert far == pytest.approx(0.02, abs=near + 2e-3)
+    assert f"{1e3 * far:.1f} mm" in said_of_missed(longer)
