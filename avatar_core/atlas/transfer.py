@@ -27,14 +27,18 @@ from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.compact_response import CompactResponse, positive_part
-from avatar_core.shapes.barycenter import Barycenter, barycenter
+from avatar_core.shapes.barycenter import DEFAULT_REGULARIZATION, Barycenter, barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix, load_map
 from avatar_core.shapes.registration import Registration
 
 Weighting = Literal["kriging", "lle-template", "lle-grid", "lle-paper"]
-PAPER_NEIGHBORS = 10  # Sec. 3.3
-# Ridges of LLE with all neighbours: the least leave-one-out error of displacement of 64 livers.
-_RIDGES: dict[str, float] = {"lle-template": 1e-2, "lle-grid": 1e-2}
+# Neighbours (None: all) and ridge of LLE: the paper's (Sec. 3.3), and those with the least
+# leave-one-out error of 64 livers (`avatar study transport`).
+LLE_SETTINGS: dict[str, tuple[int | None, float]] = {
+    "lle-template": (40, 3e-4),
+    "lle-grid": (None, 3e-4),
+    "lle-paper": (10, DEFAULT_REGULARIZATION),
+}
 _OVERSAMPLING = 20  # random columns beyond the rank of a combination
 # Exponent of kriging: leave-one-out error of displacement of 46 livers 13.7 %, with 1 16.2 %.
 _VARIOGRAM = 1.8
@@ -55,8 +59,8 @@ def patient_weights(
 
     weighting : "kriging", see :func:`kriging`, and "lle-template", Eq. 15, both on the centred
         registered vertices; "lle-grid", Eq. 15 on the distances at the common grid; "lle-paper",
-        the same as in the paper, with its neighbours and almost no ridge
-    n_neighbors : k; None for all, and for 10 with "lle-paper"
+        the same as in the paper, with ten neighbours and almost no ridge
+    n_neighbors : k; None for all, for the 40 nearest with "lle-template", and 10 with "lle-paper"
 
     Raises
     ------
@@ -70,7 +74,7 @@ def patient_weights(
             f"unknown weighting {weighting!r}; choose one of {', '.join(get_args(Weighting))}"
         )
     left = sorted({*leave_out, *base.copies})
-    k = len(base.names) - len(left) if n_neighbors is None else n_neighbors
+    available = len(base.names) - len(left)
     if weighting in ("lle-grid", "lle-paper"):
         if base.distances is None or base.distance_of is None:
             raise PatientError("the base has no distances on a grid; choose weighting 'kriging'")
@@ -78,12 +82,11 @@ def patient_weights(
         point = base.distance_of(surface, registration)
     else:
         vectors, point = list(centred(base.vertices)), centred(registration.mesh.vertices)
+    most, ridge = LLE_SETTINGS.get(weighting, (None, DEFAULT_REGULARIZATION))
+    k = min(most or available, available) if n_neighbors is None else n_neighbors
     if weighting == "kriging":
         return kriging(vectors, point, k, left)
-    if weighting == "lle-paper":
-        k = PAPER_NEIGHBORS if n_neighbors is None else n_neighbors
-        return barycenter(vectors, point, k, leave_out=left)
-    return barycenter(vectors, point, k, regularization=_RIDGES[weighting], leave_out=left)
+    return barycenter(vectors, point, k, regularization=ridge, leave_out=left)
 
 
 def centred(vertices: FloatArray) -> FloatArray:

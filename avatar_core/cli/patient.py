@@ -58,7 +58,8 @@ def patient(
     neighbors: Annotated[
         int | None,
         typer.Option(
-            help="number of known organs that are used; default: all, or 10 with lle-paper"
+            help="number of known organs that are used; default: all, or "
+            "40 with lle-template, 10 with lle-paper"
         ),
     ] = None,
     leave_out: Annotated[

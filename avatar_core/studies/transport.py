@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, ClassVar
@@ -41,15 +42,18 @@ from avatar_core.atlas.transfer import (
     Weighting,
     carried,
     carried_by_place,
+    centred,
     combine,
+    kriging,
     patient_weights,
 )
 from avatar_core.common.processes import cpu_seconds
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads
-from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
+from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.reduction.compact_response import CompactResponse
+from avatar_core.shapes.barycenter import DEFAULT_REGULARIZATION, barycenter
 from avatar_core.shapes.registration import Registration, register
 from avatar_core.studies.shapes import SAME_SUBJECT, read_livers
 from avatar_core.studies.study import Row, Run, Study, column, follow
@@ -60,6 +64,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _BATCH = 40  # load positions solved at once
+_SAMPLED = 60  # load positions of leave-one-out errors
+SETTINGS: tuple[tuple[Weighting, tuple[int, ...], tuple[float, ...]], ...] = (
+    ("kriging", (30, 45, 0), (0.0,)),
+    ("lle-template", (20, 40, 0), (3e-4, 1e-3, 1e-2)),
+    ("lle-grid", (20, 40, 0), (3e-4, 1e-3, 1e-2)),
+    ("lle-paper", (10,), (DEFAULT_REGULARIZATION,)),
+)  # numbers of neighbours (0: all) and ridges that each weighting may choose among
 WEIGHTINGS: tuple[Weighting, ...] = ("lle-paper", "lle-grid", "lle-template", "kriging")
 
 
@@ -102,6 +113,7 @@ class TransportStudy(Study[TransportSettings]):
             for surface in livers.surfaces
             if surface not in members
         ]
+        run.notices += leave_one_out_table(base)
         options = PatientOptions(n_vertices=run.settings.n_vertices)
         for surface in follow(_patients(members, run.settings.n_patients), "patients"):
             if not run.is_known(surface.name):
@@ -175,6 +187,51 @@ def summarized(rows: Sequence[Row]) -> dict[str, float]:
         "estimate_within_2x": mean("within_2x"),
         "clamp_rule_mean": mean("clamp_rule"),
     }
+
+
+def leave_one_out_table(base: PatientBase) -> list[str]:
+    """Errors of each weighting by its settings: all members, each from the others.
+
+    Relative L2 errors of displacement node by node on the template, for some load positions.
+    """
+    lines = ["| weighting | neighbours | ridge | mean | worst |", "|---|---|---|---|---|"]
+    positions = np.random.default_rng(0).permutation(base.loads.n_positions)[:_SAMPLED]
+    rows = (3 * positions[:, None] + np.arange(3)).ravel()
+    moved = np.stack([(one.space @ one.load[rows].T).astype(np.float32) for one in base.responses])
+    on_template, n = list(centred(base.vertices)), len(base.names)
+    for kind, numbers, ridges in SETTINGS:
+        vectors = on_template if kind in ("kriging", "lle-template") else base.distances
+        if vectors is None:
+            continue
+        for k, ridge in product(numbers, ridges):
+            found = [_left_out(base, kind, vectors, i, k or n, ridge, moved) for i in range(n)]
+            said = f"{np.mean(found):.1%} | {np.max(found):.0%}"
+            lines.append(f"| {kind} | {k or 'all'} | {ridge:g} | {said} |")
+    return lines
+
+
+def _left_out(
+    base: PatientBase,
+    kind: Weighting,
+    vectors: Sequence[np.ndarray],
+    i: int,
+    k: int,
+    ridge: float,
+    moved: np.ndarray,
+) -> float:
+    """Mean error of a member from the others; those of the same person are left out."""
+    out = sorted({*leave_one_out(base, base.names[i], SAME_SUBJECT), *base.copies})
+    k = min(k, len(base.names) - len(out))
+    if kind == "kriging":
+        found = kriging(vectors, vectors[i], k, out)
+    else:
+        found = barycenter(vectors, vectors[i], k, regularization=ridge, leave_out=out)
+    mesh = TetMesh(np.asarray(base.vertices[i], float), base.template.mesh.tets)
+    root = np.sqrt(mesh.lumped_mass).astype(np.float32)[:, None]
+    guess = np.tensordot(found.weights.astype(np.float32), moved[found.neighbors], 1)
+    off, size = (((root * field) ** 2).sum(axis=0) for field in (guess - moved[i], moved[i]))
+    by_position = off.reshape(-1, 3).sum(axis=1) / size.reshape(-1, 3).sum(axis=1)
+    return float(np.sqrt(by_position).mean())
 
 
 def _column_of(kind: Weighting) -> str:
