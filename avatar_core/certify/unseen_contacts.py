@@ -10,6 +10,7 @@ import igl
 import numpy as np
 import scipy.sparse as sp
 
+from avatar_core.common.processes import on_all_cores
 from avatar_core.common.splines import evaluate
 from avatar_core.errors import ConvergenceError
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 HEIGHTS = (0.0, 10e-3)  # of the centre of a ball above the surface, of up to 10 mm [m]
 _OPEN = 0.999  # access from which a tip may touch without the force fading
 _WAY = np.linspace(2e-3, 14e-3, 8)  # heights above a tip along its approach [m]
-_BATCH = 200  # patches solved at once
+_BATCH = 40  # patches solved at once
 MAX_DRAWS = 1000  # for one contact, on average; on livers most draws succeed
 
 
@@ -41,7 +42,7 @@ class UnseenContacts:
     def solved(
         self, surface: LoadSurface, elasticity: Elasticity, single: bool = False
     ) -> Iterator[tuple[float, np.ndarray]]:
-        """Solve each contact by full finite elements, one after the other.
+        """Solve each contact by full finite elements, on all cores.
 
         Parameters
         ----------
@@ -53,12 +54,17 @@ class UnseenContacts:
         displacement : ndarray, shape (n_vertices, 3), by its unit force along n [m/N]
         """
         n = len(self.tip)
-        for batch in np.array_split(np.arange(n), -(-n // _BATCH)):
+
+        def solve(batch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             loads = patch_loads(elasticity, self.place[batch], surface.patch_radius)
             along = loads @ sp.block_diag(self.normal[batch][:, :, None])
             solution = elasticity.solve(along, single)
             compliance = np.asarray(along.multiply(solution).sum(axis=0)).ravel()
-            vertex = elasticity.at_vertices(solution).T.reshape(len(batch), -1, 3)
+            return compliance, elasticity.at_vertices(solution).T.reshape(len(batch), -1, 3)
+
+        elasticity.factorize(single)
+        batches = np.array_split(np.arange(n), -(-n // _BATCH))
+        for compliance, vertex in on_all_cores(solve, batches):
             yield from zip(compliance, vertex, strict=True)
 
 

@@ -277,6 +277,10 @@ class Elasticity:
     def _single_factor(self) -> rslab.Ldlt:
         return rslab.ldlt(self._system.astype(np.float32), threads=1)
 
+    def factorize(self, single: bool = False) -> None:
+        """Make the factor that solutions need, before several threads ask for it at once."""
+        _ = self._single_factor if single or self._refines else self._factor
+
     @property
     def _system(self) -> sp.csc_matrix:
         """The matrix over the free degrees of freedom, and the pressures of Taylor-Hood."""

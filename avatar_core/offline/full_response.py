@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
 
-from avatar_core.common.processes import n_cores
+from avatar_core.common.processes import on_all_cores
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm
 from avatar_core.fem.patch_loads import LoadSurface, triples
@@ -81,11 +80,10 @@ def full_response(elasticity: Elasticity, loads: sp.csr_matrix, progress: Progre
         compliance[:, batch] = average @ solution
         norm[batch] = l2_norm(columns[:, batch], mass)
 
-    elasticity.solve(by_column[:, :1], single)  # the factor, before threads ask for it at once
-    with ThreadPoolExecutor(n_cores()) as pool:
-        first = range(0, n, 3 * _BATCH)
-        for start, _ in zip(first, pool.map(solve, first), strict=True):
-            progress("solve", min(start + 3 * _BATCH, n) / n, NO_ERROR)
+    elasticity.factorize(single)
+    first = range(0, n, 3 * _BATCH)
+    for start, _ in zip(first, on_all_cores(solve, first), strict=True):
+        progress("solve", min(start + 3 * _BATCH, n) / n, NO_ERROR)
     _symmetrize(compliance)
     return FullResponse(columns, compliance, norm)
 

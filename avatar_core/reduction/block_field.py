@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.processes import on_all_cores
 from avatar_core.reduction.block_modes import BlockModes, compact_order, load_sizes, separate_blocks
 
 if TYPE_CHECKING:
@@ -207,13 +208,17 @@ def separate_field(
     count = n_shared + np.array([0, *(modes.space.shape[1] for modes in regions)])
     load = np.zeros((len(region), n_loads, count.max()), np.float32)
     load[:, :, :n_shared] = shared[1]
-    for r, modes in enumerate(regions):
-        here = region == r
+
+    def separate(r: int) -> BlockModes:
+        here, modes = region == r, regions[r]
         load[here, :, n_shared : count[1 + r]] = modes.load
         own = np.concatenate([fields, blocks.of(modes.space.astype(float))], axis=2)
         loads = load[here, :, : own.shape[2]].reshape(-1, own.shape[2]).astype(float)
-        parts.append(_separated(own, mass, loads, tolerance))
-        progress((r + 1) / len(regions))
+        return _separated(own, mass, loads, tolerance)
+
+    for part in on_all_cores(separate, range(len(regions))):
+        parts.append(part)
+        progress((len(parts) - 1) / len(regions))
     return BlockField(region, load, count.astype(np.int32), *_joined(parts, load.shape[2]))
 
 

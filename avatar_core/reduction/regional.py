@@ -23,6 +23,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.processes import on_all_cores
 
 _ITERATIONS = 30  # of k-means
 
@@ -87,13 +88,17 @@ def separate_regions(
     errors = np.empty((rule.most + 1, *size.shape))
     root = np.sqrt(mass).astype(np.float32)[:, None]
     n_regions = int(region.max()) + 1
-    for r in range(n_regions):
+
+    def separate(r: int) -> RegionModes:
         here = np.flatnonzero(region == r)
         scaled = columns(here).reshape(len(mass), -1) * (root / size[here].ravel())
         modes, load, left = _principal(scaled.astype(np.float32), rule)
-        parts.append(_with_peaks_of_one(modes / root, load, size[here]))
         errors[:, here] = left.reshape(-1, *size[here].shape)
-        progress((r + 1) / n_regions)
+        return _with_peaks_of_one(modes / root, load, size[here])
+
+    for part in on_all_cores(separate, range(n_regions)):
+        parts.append(part)
+        progress(len(parts) / n_regions)
     return parts, errors
 
 

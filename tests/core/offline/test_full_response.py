@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from avatar_core.common import processes
 from avatar_core.fem import elasticity as module
 from avatar_core.fem.elasticity import SINGLE_ERROR, Elasticity, Material
 from avatar_core.fem.norms import l2_norm
@@ -43,7 +44,7 @@ def test_any_number_of_cores_gives_the_same_bits(
     monkeypatch.setattr(responses, "_BATCH", 7)
     answers = []
     for cores in (1, 3):
-        monkeypatch.setattr(responses, "n_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(processes, "n_cores", lambda cores=cores: cores)
         answers.append(found(elasticity)[0])
     for name in ("columns", "compliance", "norm"):
         np.testing.assert_array_equal(getattr(answers[0], name), getattr(answers[1], name))
