@@ -246,9 +246,7 @@ def test_leave_one_out(conduct: Conduct) -> None:
 
 @pytest.mark.long
 def test_accuracy_time(conduct: Conduct) -> None:
-    settings = accuracy_time.AccuracyTimeSettings(
-        400, 100, 150, 20, (300,), (5e-3,), ("another",), 60
-    )
+    settings = accuracy_time.AccuracyTimeSettings(400, 100, 150, 20, (300,), ("another",), 60)
     run = conduct(accuracy_time.STUDY, settings)
     summary = run.summary
     assert summary["promise_kept_fraction"] >= 0.95

@@ -160,7 +160,12 @@ def test_a_tumour_is_stored_with_its_organ_and_stays_there(tmp_path: Path) -> No
     liver = phantom_liver(12e-3)
     lesion = lesion_at(liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0]), 0.02)
     options = OrganOptions(
-        n_vertices=450, rule=BuildRule(max_modes=20), tumour=lesion, contrast=5.0, n_certified=2
+        n_displayed=0,
+        n_vertices=450,
+        rule=BuildRule(max_modes=20),
+        tumour=lesion,
+        contrast=5.0,
+        n_certified=2,
     )
     save_vademecum(build(liver, options), tmp_path / "sick.h5")
     sick = load_vademecum(tmp_path / "sick.h5")
