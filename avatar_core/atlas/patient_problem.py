@@ -102,7 +102,7 @@ def template_problem(
 
 
 def missed(problem: PatientProblem) -> tuple[float, np.ndarray]:
-    """How far the patient's surface is from the mesh at most [m], and where, shape (3,) [m]."""
+    """Largest distance of the patient's surface to the mesh [m], and its place, shape (3,) [m]."""
     points = problem.surface.vertices
     closest, _, _ = closest_points(problem.mesh.vertices, problem.mesh.boundary_faces, points)
     distance = np.linalg.norm(points - closest, axis=1)
@@ -111,7 +111,7 @@ def missed(problem: PatientProblem) -> tuple[float, np.ndarray]:
 
 
 def said_of_missed(problem: PatientProblem) -> str:
-    """What a registered template leaves out of the patient, in one line."""
+    """Line that says how far a registered template is off the patient."""
     far, (x, y, z) = missed(problem)
     return (
         f"interpolated on a registered template, which is up to {1e3 * far:.1f} mm off the surface "

@@ -76,7 +76,7 @@ class _Snapshot:
 
 
 class _Organ(NamedTuple):
-    """What does not depend on the coordinates."""
+    """Parts of an organ that do not depend on the coordinates."""
 
     name: str
     elasticity: Elasticity
@@ -284,7 +284,7 @@ def _regions(
     region: np.ndarray,
     rule: BuildRule,
 ) -> tuple[list[RegionModes], tuple[RankError, ...]]:
-    """What the global modes leave at all nodes, by regions, and the errors by modes at a place."""
+    """Modes of what the global ones leave at all nodes, by regions; errors by modes at a place."""
 
     def columns(positions: np.ndarray) -> np.ndarray:
         pairs = zip(snapshots, fields, strict=True)

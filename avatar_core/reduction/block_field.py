@@ -52,14 +52,14 @@ class Blocks:
 
     @cached_property
     def place(self) -> IntArray:
-        """Of each vertex, shape (n_vertices,)."""
+        """Place of each vertex, shape (n_vertices,)."""
         full = np.flatnonzero(self.vertex != _NONE)
         out = np.empty(len(full), np.int32)
         out[self.vertex[full]] = full
         return out
 
     def that_hold(self, vertices: IntArray) -> int:
-        """How many of the first blocks hold all of some vertices."""
+        """Number of the first blocks that hold all of some vertices."""
         return int(self.place[vertices].max(initial=-1)) // POINTS + 1
 
     def of(self, field: FloatArray) -> FloatArray:
@@ -128,7 +128,7 @@ class BlockField:
         return sum(a.nbytes for a in arrays)
 
     def of_part(self, part: int, amplitude: FloatArray) -> FloatArray:
-        """What amplitudes (count, n) of a part move, shape (n_blocks, BLOCK, n)."""
+        """Displacement by amplitudes (count, n) of a part, shape (n_blocks, BLOCK, n)."""
         n_blocks = self.start.shape[1] - 1
         out = np.empty((n_blocks, BLOCK, amplitude.shape[1]), np.float32)
         amplitude = amplitude.astype(np.float32)
@@ -139,12 +139,12 @@ class BlockField:
         return out
 
     def amplitude(self, region: int, positions: IntArray, forces: FloatArray) -> FloatArray:
-        """Of a region by forces (n, n_loads, m) at some of its positions, shape (count, m)."""
+        """Amplitudes of a region by forces (n, n_loads, m) at some positions, shape (count, m)."""
         load = self.load[positions, :, : self.count[1 + region]]
         return np.asarray(np.tensordot(load, forces, ((0, 1), (0, 1))))
 
     def under(self, positions: IntArray, forces: FloatArray) -> FloatArray:
-        """What forces (n, n_loads, m) at some positions move, shape (n_blocks, BLOCK, m)."""
+        """Displacement by forces (n, n_loads, m) at some positions, (n_blocks, BLOCK, m)."""
         out = np.zeros((self.start.shape[1] - 1, BLOCK, forces.shape[2]), np.float32)
         regions = self.region[positions]
         for r in np.unique(regions):

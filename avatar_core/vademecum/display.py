@@ -62,7 +62,7 @@ class Display:
 def organ_display(
     mesh: TetMesh, surface: SurfaceMesh | None, n: int, inside: Sequence[SurfaceMesh] = ()
 ) -> Display | None:
-    """What is displayed of an organ; None if that is the boundary of its mesh alone.
+    """Displayed triangles of an organ; None if they are the boundary of its mesh alone.
 
     surface : that the mesh was made of; None for the mesh's own boundary, refined
     n : vertices, about; 0 for those of the mesh
