@@ -194,7 +194,7 @@ def modes_of_regions(
     rule: BuildRule,
     progress: Progress = silent,
 ) -> tuple[list[RegionModes], tuple[RankError, ...]]:
-    """Modes of what the global ones leave, by regions; the error for numbers of modes at a place."""
+    """Modes of what the global ones leave, by regions; errors by numbers of modes at a place."""
     regions, errors = separate_regions(
         region,
         lambda positions: response.remainder(far, positions),
