@@ -161,8 +161,7 @@ def vademecum(
     displayed: Annotated[
         int | None,
         typer.Option(
-            help="approximate number of vertices of the displayed surface; default: 8000; 0: those "
-            "of the mesh"
+            help="vertices of the displayed surface, about; default: 8000; 0: those of the mesh"
         ),
     ] = None,
     timings: Timings = None,
@@ -411,25 +410,23 @@ def show_text(v: Vademecum) -> None:
         "  is not felt. Its errors are under 'contact sites'; those of the patch are of the load\n"
         "  that the vademecum was computed for"
     )
-    where = " and values" if v.parametric else ""
+    where, every = " and values" if v.parametric else "", v.convergence
+    of_all = ("displacement, all load positions", every.every_mean, every.every_worst)
     print(f"  errors on {c.n_loads} unseen loads{where} x 3 directions    mean     worst")
     for name, mean, worst in (
         ("displacement, L2", c.l2_mean, c.l2_worst),
         ("contact compliance", c.contact_mean, c.contact_worst),
         ("force of a patch at a depth", c.force_mean, c.force_worst),
         ("the same, anywhere on the surface", c.tip_force_mean, c.tip_force_worst),
+        *([] if math.isnan(every.every_mean) else [of_all]),
     ):
         print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
-    every = v.convergence
-    if not math.isnan(every.every_mean):
-        name = f"displacement, all {info.n_load_positions} load positions"
-        print(f"    {name:38s} {every.every_mean:8.2%}  {every.every_worst:8.2%}")
     _show_contact_sites(c.contact_sites)
     _show_large(v)
     if c.curve is not None:
         _show_curve(c.curve)
     print(f"  built in {c.build_cpu_seconds:.0f} s of CPU time", end="")
-    tolerance = v.convergence.tolerance
+    tolerance = every.tolerance
     state = "converged" if info.converged else "NOT CONVERGED"
     print(", interpolated" if math.isnan(tolerance) else f", {state} (tolerance {tolerance:.1%})")
     if not math.isnan(c.mesh_l2):

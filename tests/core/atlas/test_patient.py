@@ -322,7 +322,7 @@ def test_weights_on_a_grid_need_one(case: Case, weighting: Weighting) -> None:
 
 
 def test_a_ridge_spreads_the_weights_of_all_neighbours(case: Case) -> None:
-    """What the base cannot tell apart is not told by weights far above one."""
+    """Weights far above one would tell apart what the base cannot."""
     around = (case.base, case.problem.registration, case.problem.surface)
     spread = patient_weights(*around, "lle-template")
     assert len(spread.weights) == len(case.base.names)
