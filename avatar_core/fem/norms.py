@@ -27,11 +27,6 @@ def l2_norm(field: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(np.tensordot(mass, field**2, axes=1)), float)
 
 
-def l2_by_position(columns: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
-    """|u| of the three columns of each load position together, shape (n_positions,)."""
-    return np.asarray(np.linalg.norm(l2_norm(columns, mass).reshape(-1, 3), axis=1))
-
-
 def relative_l2(estimate: FloatArray, truth: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
     """|u - u_ref| / |u_ref| of each column; arguments as of :func:`l2_norm`."""
     return l2_norm(estimate - truth, mass) / l2_norm(truth, mass)
