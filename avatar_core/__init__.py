@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from avatar_core.atlas.patient import PatientOptions as PatientOptions
     from avatar_core.atlas.patient import patient_vademecum as patient  # noqa: F401
     from avatar_core.atlas.storage import load_atlas as load_atlas
-    from avatar_core.atlas.storage import save_atlas as save_atlas
     from avatar_core.contact.model import ContactData as ContactData
     from avatar_core.contact.model import ContactModel as ContactModel
     from avatar_core.contact.model import step as step
@@ -85,7 +84,6 @@ _ORIGIN = {
     "read_scene": "scene.file",
     "read_surface": "geometry.surface",
     "save": "vademecum.storage:save_vademecum",
-    "save_atlas": "atlas.storage",
     "step": "contact.model",
 }
 

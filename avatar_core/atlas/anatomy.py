@@ -8,13 +8,26 @@ from dataclasses import dataclass
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import AvatarError
 from avatar_core.fem.elasticity import Element, Material
-from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.shapes.registration import RegistrationQuality, SimilarityTransform
 
 
 class AtlasError(AvatarError):
     """An atlas cannot do what was asked of it."""
+
+
+@dataclass(frozen=True)
+class ResponseKind:
+    """How a response was computed.
+
+    material, element, patch_radius [m] : of the finite element solutions
+    rank : number of modes
+    """
+
+    material: Material
+    element: Element
+    patch_radius: float
+    rank: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,48 +41,84 @@ class Response(CompactResponse):
     element: Element
     patch_radius: float
 
+    @property
+    def kind(self) -> ResponseKind:
+        """How it was computed."""
+        return ResponseKind(self.material, self.element, self.patch_radius, self.load.shape[1])
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The surface from which an anatomy was made.
+
+    sha256 : of its file; empty for a generated surface
+    unit, axes : of the file
+    n_vertices : of the surface
+    notices : what was changed on reading, one line each
+    """
+
+    sha256: str
+    unit: str
+    axes: str
+    n_vertices: int
+    notices: tuple[str, ...] = ()
+
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """One organ of an atlas.
+    """The shape of one organ of an atlas: what finds it among others.
+
+    Its level set and its response are read when they are used; see
+    :class:`avatar_core.atlas.model.Atlas`.
 
     name : unique in the atlas
-    surface : SurfaceMesh in its own coordinates, with unit, axes and hash of its file
+    key : hash of the surface and its reading
+    origin : Origin
     volume : [m3]
     alignment : SimilarityTransform from the template to the organ
-    distances : ndarray, shape (n_points,), signed distance on the atlas's box [m]
     registered : ndarray, shape (n_template_vertices, 3), the template registered to the organ [m]
     quality : RegistrationQuality
     converged : whether the registration converged
-    response : Response; None if it was not computed
+    response : ResponseKind; None if there is no response
     """
 
     name: str
-    surface: SurfaceMesh
+    key: str
+    origin: Origin
     volume: float
     alignment: SimilarityTransform
-    distances: FloatArray
     registered: FloatArray
     quality: RegistrationQuality
     converged: bool
+    response: ResponseKind | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class WholeAnatomy:
+    """An anatomy with everything that its folder holds.
+
+    shape : Anatomy
+    distances : ndarray, shape (n_points,), signed distance on the atlas's box [m]
+    response : Response; None if it was not computed
+    """
+
+    shape: Anatomy
+    distances: FloatArray
     response: Response | None = None
 
 
 @dataclass(frozen=True)
 class Duplicate:
-    """A member that repeats an earlier one; it has no weight in any barycenter.
+    """A member that has the shape of an earlier one; it has no weight in any barycenter.
 
     name, of : names of the member and of the earlier one
-    same_file : whether their files are identical; otherwise their distances are equal
     """
 
     name: str
     of: str
-    same_file: bool
 
     def __str__(self) -> str:
-        how = "is the same file as" if self.same_file else "has the same shape as"
-        return f"{self.name} {how} {self.of}: kept, but not counted again"
+        return f"{self.name} has the same shape as {self.of}: kept, but not counted again"
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
@@ -80,19 +129,3 @@ def free_name(name: str, taken: Collection[str]) -> str:
     while f"{name}-{number}" in taken:
         number += 1
     return f"{name}-{number}"
-
-
-def require_shapes(anatomy: Anatomy, n_points: int, n_vertices: int) -> None:
-    """Raise AtlasError unless the arrays fit the box, the template and each other."""
-    response = anatomy.response
-    fits = anatomy.distances.shape == (n_points,) and anatomy.registered.shape == (n_vertices, 3)
-    if response is not None:
-        rank = response.space.shape[-1]
-        fits = fits and response.space.shape == (3 * n_vertices, rank)
-        fits = fits and response.load.ndim == 2 and response.load.shape[1] == rank
-        fits = fits and response.residual_compliance.shape == (len(response.load) // 3, 3, 3)
-    if not fits:
-        raise AtlasError(
-            f"{anatomy.name}: its arrays do not fit the atlas's box and template; build it with "
-            "this atlas"
-        )

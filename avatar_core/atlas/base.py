@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-import numpy as np
-
-from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.model import MOST_NEIGHBORS, Atlas, Lazy
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import AvatarError
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.patch_loads import LoadSurface, load_surface
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.compact_response import CompactResponse
+from avatar_core.shapes.barycenter import Vectors
 from avatar_core.shapes.registration import Registration, RegistrationRule, Template
 
 
 class PatientError(AvatarError):
     """A patient's vademecum cannot be made from the base as requested."""
+
+
+def _unknown(sha256: str) -> Registration | None:
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,30 +31,31 @@ class PatientBase:
     template, loads : Template and the load positions of its mesh and regions
     material : Material of all responses
     names : of the anatomies
-    vertices : ndarray, shape (n, n_template, 3) [m], the template registered to each anatomy
+    vertices : n arrays of shape (n_template, 3) [m], the template registered to each anatomy
     responses : one CompactResponse per anatomy; may be a lazy sequence
     copies : numbers of anatomies that repeat an earlier one, and get no weight
-    distances : signed distances of each anatomy on a common grid, shape (n, n_grid), or None
+    distances : signed distances of each anatomy on a common grid, n arrays of shape (n_grid,),
+        or None; may be a lazy sequence
     distance_of : signed distances of a new surface on the same grid, or None
     rule : RegistrationRule of all registrations
-    registrations : of the anatomies, by the hash of their file
+    registration_of : registration of the anatomy with a hash of its file, or None
     """
 
     template: Template
     loads: LoadSurface
     material: Material
     names: tuple[str, ...]
-    vertices: FloatArray
+    vertices: Vectors
     responses: Sequence[CompactResponse]
     copies: tuple[int, ...] = ()
     distances: Sequence[FloatArray] | None = None
     distance_of: Callable[[SurfaceMesh, Registration], FloatArray] | None = None
     rule: RegistrationRule = field(default_factory=RegistrationRule)
-    registrations: dict[str, Registration] = field(default_factory=dict)
+    registration_of: Callable[[str], Registration | None] = _unknown
 
 
 def base_of(atlas: Atlas) -> PatientBase:
-    """The anatomies of an atlas that have a response.
+    """The anatomies of an atlas that have a response; each is read when it is used.
 
     Raises
     ------
@@ -59,39 +63,36 @@ def base_of(atlas: Atlas) -> PatientBase:
         If none has one, or they differ in material, element or patch radius.
     """
     kept = [i for i, anatomy in enumerate(atlas.anatomies) if anatomy.response is not None]
-    responses = [atlas.anatomies[i].response for i in kept]
-    members = [response for response in responses if response is not None]
-    if not members:
+    anatomies = [atlas.anatomies[i] for i in kept]
+    kinds = {replace(one.response, rank=0) for one in anatomies if one.response is not None}
+    if not kinds:
         raise PatientError(
             "no anatomy of the atlas has a response; build it with 'avatar atlas create' and "
             "without --shapes-only"
         )
-    first = members[0]
-    made_with = {(one.material, one.element, one.patch_radius) for one in members}
-    if len(made_with) > 1:
+    if len(kinds) > 1:
         raise PatientError(
             "the atlas's responses were computed for different materials or patches; build it again"
         )
-    anatomies = [atlas.anatomies[i] for i in kept]
-    loads = load_surface(atlas.template.mesh, atlas.template.regions, first.patch_radius)
+    (kind,) = kinds
+    frame, n = atlas.frame, len(kept)
+    by_hash = {one.origin.sha256: one.name for one in anatomies if one.origin.sha256}
     return PatientBase(
-        template=atlas.template,
-        loads=loads,
-        material=first.material,
+        template=frame.template,
+        loads=load_surface(frame.template.mesh, frame.template.regions, kind.patch_radius),
+        material=kind.material,
         names=tuple(anatomy.name for anatomy in anatomies),
-        vertices=np.array([anatomy.registered for anatomy in anatomies]),
-        responses=members,
+        vertices=[anatomy.registered for anatomy in anatomies],
+        responses=Lazy(lambda k: atlas.read_response(anatomies[k]), n, MOST_NEIGHBORS),
         copies=tuple(k for k, i in enumerate(kept) if atlas.same_as[i] != i),
-        distances=[anatomy.distances for anatomy in anatomies],
-        distance_of=lambda surface, registration: atlas.distance_vector(
+        distances=Lazy(lambda k: atlas.read_distances(anatomies[k]), n, MOST_NEIGHBORS),
+        distance_of=lambda surface, registration: frame.distance_vector(
             surface, registration.alignment
         ),
-        rule=atlas.rule,
-        registrations={
-            one.surface.source_sha256: atlas.registration(one.name)
-            for one in anatomies
-            if one.surface.source_sha256
-        },
+        rule=frame.rule,
+        registration_of=lambda sha256: (
+            atlas.registration(by_hash[sha256]) if sha256 in by_hash else None
+        ),
     )
 
 

@@ -1,27 +1,35 @@
-"""Building an atlas from surfaces, on all cores or a cluster; an interrupted build is resumed.
+"""Building an atlas from surfaces, on all cores or a cluster.
 
-Each finished anatomy is saved at once in the folder ``ATLAS.h5.parts``, under a hash of its inputs.
-The atlas itself is written at the end, in one step, and the folder is removed.
+Each finished anatomy is written at once into the atlas's folder, and nothing that is there is
+written again. A surface that is there is not built again: that is how a stopped build is resumed.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import pickle
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from avatar_core.atlas.anatomy import Anatomy, AtlasError, Response
-from avatar_core.atlas.checkpoint import Checkpoint, checkpoint_of
-from avatar_core.atlas.model import LARGEST_ORGAN, SPACING, Atlas, box_around
-from avatar_core.atlas.storage import ATLAS_SCHEMA, load_atlas, save_atlas
+from avatar_core.atlas.anatomy import Anatomy, AtlasError, Origin, Response, WholeAnatomy, free_name
+from avatar_core.atlas.frame import LARGEST_ORGAN, SPACING, Frame, box_around
+from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.storage import (
+    FRAME,
+    load_atlas,
+    load_frame,
+    member_names,
+    save_anatomy,
+    save_frame,
+)
 from avatar_core.atlas.workers import Workers
 from avatar_core.common.processes import repeatable
-from avatar_core.errors import AvatarError
+from avatar_core.errors import AvatarError, StorageError
 from avatar_core.geometry.doubts import size_notice
 from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
@@ -38,6 +46,7 @@ from avatar_core.shapes.registration import (
 Axes = str | tuple[tuple[float, ...], ...]
 SolveResponse = Callable[[Registration], Response]
 Progress = Callable[[int, int, str], None]
+_BATCH = 256  # surfaces that are given to the workers at once, so that not all are in memory
 
 
 @dataclass(frozen=True)
@@ -90,28 +99,28 @@ class Skipped:
 class Growth:
     """Result of a build.
 
-    atlas : with the new members; not on disk if there are none
+    atlas : with the new members
     added : names of the new members
+    known : names of members whose surfaces were given again; nothing was done for them
     skipped : surfaces that were not added
-    resumed : number of new members that an interrupted build had finished
     notices : new members that are duplicates, whose registration did not converge, or whose
         surface was changed on reading, one line each
     """
 
     atlas: Atlas
     added: tuple[str, ...]
+    known: tuple[str, ...]
     skipped: tuple[Skipped, ...]
-    resumed: int
     notices: tuple[str, ...]
 
 
-def new_atlas(template: Template, options: AtlasOptions | None = None) -> Atlas:
-    """An atlas without members.
+def new_frame(template: Template, options: AtlasOptions | None = None) -> Frame:
+    """The frame of an atlas.
 
     Raises AtlasError if the box or the spacing is unreasonable.
     """
     options = options or AtlasOptions()
-    return Atlas(template, box_around(template, options.largest, options.spacing), options.rule)
+    return Frame(template, box_around(template, options.largest, options.spacing), options.rule)
 
 
 def default_template(n_vertices: int = 2500) -> Template:
@@ -130,27 +139,22 @@ def create_atlas(
     solve_response: SolveResponse | None = None,
     progress: Progress | None = None,
 ) -> Growth:
-    """Build an atlas; nothing is written if no surface can be used.
+    """Build an atlas in a new folder, or go on with a build of the same options.
 
+    Nothing is left if no surface can be used.
+
+    path : folder of the atlas
     template : None for the built-in liver with ``options.template_vertices``
     solve_response : computes the Response of each registration; must be picklable
     progress : called with (surfaces done, number of surfaces, name) after each surface
 
-    Raises AtlasError if the file exists or another build is at work on it, StorageError if it
-    cannot be written.
+    Raises AtlasError if the folder holds something else or another build is at work on it,
+    StorageError if it cannot be written.
     """
-    path = Path(path)
-    with checkpoint_of(path) as checkpoint:
-        if path.exists():
-            raise AtlasError(f"{path} exists; grow it by 'avatar atlas add', or remove it first")
-        empty = _empty_atlas(checkpoint, options or AtlasOptions(), template)
-        growth, _ = _grow(
-            empty, sources, checkpoint, workers or Workers(), solve_response, progress
-        )
-        if growth.added:
-            save_atlas(growth.atlas, path)
-            checkpoint.clear()  # what is left belongs to other templates
-    return growth
+    folder, options = Path(path), options or AtlasOptions()
+    with _folder_of(folder):
+        frame = _begun(folder, options, template)
+        return _grow(folder, frame, sources, workers or Workers(), solve_response, progress)
 
 
 def extend_atlas(
@@ -161,158 +165,183 @@ def extend_atlas(
     solve_response: SolveResponse | None = None,
     progress: Progress | None = None,
 ) -> Growth:
-    """Add surfaces to an atlas on disk; the old file stays until the new one is complete.
+    """Add surfaces to an atlas on disk; no file that is there is written.
 
     Arguments are those of `create_atlas`. Raises StorageError if there is no atlas at the path or
     it cannot be written, AtlasError if another build is at work on it.
     """
-    path = Path(path)
-    if not path.is_file():
-        load_atlas(path)  # raises, and says what is missing
-    with checkpoint_of(path) as checkpoint:
-        atlas = load_atlas(path)
-        growth, keys = _grow(
-            atlas, sources, checkpoint, workers or Workers(), solve_response, progress
-        )
-        if growth.added:
-            save_atlas(growth.atlas, path)
-            checkpoint.clear(keys)
-    return growth
+    folder = Path(path)
+    frame, _ = load_frame(folder)
+    with _folder_of(folder):
+        return _grow(folder, frame, sources, workers or Workers(), solve_response, progress)
 
 
-def _empty_atlas(checkpoint: Checkpoint, options: AtlasOptions, template: Template | None) -> Atlas:
-    """The empty atlas that an interrupted build began with, or a new one."""
+# --- the folder -------------------------------------------------------------------------------
+
+
+@contextmanager
+def _folder_of(folder: Path) -> Iterator[None]:
+    """Make the folder and lock it for one build; it is removed again if it has no member then.
+
+    Raises AtlasError if another build holds it, StorageError if it cannot be made.
+    """
+    if folder.is_file():
+        raise AtlasError(f"{folder} is a file, and an atlas is a folder; give another name")
+    try:
+        folder.mkdir(exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise StorageError(
+            f"cannot make {folder} ({error.strerror}); create its folder first, or choose another"
+        ) from error
+    try:
+        _lock(handle, folder)
+        try:
+            yield
+        finally:
+            _remove_if_empty(folder)
+    finally:
+        os.close(handle)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if member_names(folder) or any(one.is_dir() for one in folder.iterdir()):
+        return
+    if all(one.name == FRAME or one.name.startswith(f".{FRAME}") for one in folder.iterdir()):
+        for file in folder.iterdir():
+            file.unlink(missing_ok=True)
+        folder.rmdir()
+
+
+def _lock(handle: int, folder: Path) -> None:
+    """Lock the folder until the handle is closed, by the system if the process is killed."""
+    import fcntl
+
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise AtlasError(
+            f"another build is at work on {folder}; wait until it has finished"
+        ) from error
+
+
+def _begun(folder: Path, options: AtlasOptions, template: Template | None) -> Frame:
+    """The frame of a new atlas, or that of a build that was stopped.
+
+    Meshing a template again would give another mesh: it is made once and kept.
+    """
+    made_from = _hash_of_options(options, template)
+    if (folder / FRAME).exists():
+        frame, before = load_frame(folder)
+        if before != made_from:
+            raise AtlasError(
+                f"{folder} exists, made with other options; grow it by 'avatar atlas add', or "
+                "give another folder"
+            )
+        return frame
+    if any(folder.iterdir()):
+        raise AtlasError(f"{folder} exists and is no atlas; give another folder")
+    frame = new_frame(template or default_template(options.template_vertices), options)
+    save_frame(folder, frame, made_from)
+    return frame
+
+
+def _hash_of_options(options: AtlasOptions, template: Template | None) -> str:
+    digest = hashlib.sha256(json.dumps(asdict(options), sort_keys=True).encode())
     if template is not None:
-        return new_atlas(template, options)
-    asked = json.dumps(asdict(options), sort_keys=True)
-    key = hashlib.sha256(asked.encode()).hexdigest()[:32]
-    atlas = checkpoint.load_empty(key)
-    if atlas is None:
-        atlas = new_atlas(default_template(options.template_vertices), options)
-        checkpoint.save_empty(key, atlas)
-    return atlas
+        for array in (template.mesh.vertices, template.mesh.tets, template.regions.accessible):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:32]
+
+
+# --- growing ----------------------------------------------------------------------------------
 
 
 def _grow(
-    atlas: Atlas,
+    folder: Path,
+    frame: Frame,
     sources: Sequence[Source],
-    checkpoint: Checkpoint,
     workers: Workers,
     solve_response: SolveResponse | None,
     progress: Progress | None,
-) -> tuple[Growth, list[str | None]]:
-    """Result of the build, and the checkpoint keys of the surfaces."""
-    builder = AnatomyBuilder(atlas.without_anatomies(), solve_response)
-    keys = checkpoint_keys(builder, sources)
+) -> Growth:
+    """Build the surfaces that are not there, and write each as soon as it is finished."""
+    there = load_atlas(folder)
+    keys = [key_of(source) for source in sources]
+    names = _names(sources, keys, there)
     results: dict[int, Anatomy | Skipped] = {}
-
-    def keep(number: int, result: Anatomy | Skipped) -> None:
-        results[number] = result
-        if progress is not None:
-            progress(len(results), len(sources), sources[number].name)
-
+    begun = {anatomy.key for anatomy in there.anatomies}
+    todo = []
     for number, key in enumerate(keys):
-        kept = checkpoint.load(key)
-        if kept is not None:
-            keep(number, kept)
-    resumed = len(results)
-    numbers = [number for number in range(len(sources)) if number not in results]
-    todo: list[Source | Skipped] = [sources[number] for number in numbers]
-    if workers.scheduler is not None:  # its workers may not see this machine's files
-        todo = [_read_here(source) for source in todo]
-    for i, result in workers.map(builder, todo):
-        number = numbers[i]
-        if isinstance(result, Exception):
-            result = Skipped(sources[number].name, _in_one_line(result))
-        if isinstance(result, Anatomy):
-            checkpoint.save(keys[number], result)
-        keep(number, result)
-    return _growth(atlas, [results[i] for i in range(len(sources))], resumed), keys
+        if key is None or key not in begun:
+            todo.append(number)
+        begun.add(key or "")
+    done = len(sources) - len(todo)
+    builder = AnatomyBuilder(frame, solve_response)
+    for first in range(0, len(todo), _BATCH):
+        batch = todo[first : first + _BATCH]
+        for i, result in workers.map(builder, _items([sources[k] for k in batch], workers)):
+            number = batch[i]
+            if isinstance(result, WholeAnatomy):
+                shape = replace(result.shape, name=names[number], key=keys[number] or "")
+                save_anatomy(folder, replace(result, shape=shape))
+                results[number] = shape
+            elif isinstance(result, Skipped):
+                results[number] = result
+            else:
+                results[number] = Skipped(sources[number].name, _in_one_line(result))
+            done += 1
+            if progress is not None:
+                progress(done, len(sources), sources[number].name)
+    return _growth(there, results, names)
 
 
-def _growth(atlas: Atlas, results: Sequence[Anatomy | Skipped], resumed: int) -> Growth:
+def _items(sources: Sequence[Source], workers: Workers) -> list[Source | Skipped]:
+    """What the workers get: surfaces and not files, if they may not see this machine's files."""
+    return [_read_here(source) if workers.scheduler else source for source in sources]
+
+
+def _names(sources: Sequence[Source], keys: Sequence[str | None], there: Atlas) -> list[str]:
+    """Name of the member that each surface is or becomes; one that is taken gets a number."""
+    taken = {anatomy.name for anatomy in there.anatomies}
+    by_key = {anatomy.key: anatomy.name for anatomy in there.anatomies}
+    names = []
+    for source, key in zip(sources, keys, strict=True):
+        name = by_key.get(key or "") or free_name(_folder_name(source.name), taken)
+        taken.add(name)
+        if key is not None:
+            by_key[key] = name
+        names.append(name)
+    return names
+
+
+def _folder_name(name: str) -> str:
+    """A name that a folder can have."""
+    return name.replace("/", "_").lstrip(".") or "anatomy"
+
+
+def _growth(there: Atlas, results: Mapping[int, Anatomy | Skipped], names: list[str]) -> Growth:
     """Result with members in the order of the surfaces, whatever the order of completion."""
-    grown = atlas.with_anatomies(one for one in results if isinstance(one, Anatomy))
-    added = grown.names[len(atlas) :]
-    notices = tuple(str(one) for one in grown.duplicates if one.name in added) if added else ()
-    notices += tuple(
-        f"{one.name}: {not_converged(one.quality)}"
-        for one in grown.anatomies[len(atlas) :]
-        if not one.converged
-    )
-    notices += tuple(
-        f"{one.name}: {notice}"
-        for one in grown.anatomies[len(atlas) :]
-        for notice in one.surface.notices + size_notice(one.surface)
-    )
-    skipped = tuple(one for one in results if isinstance(one, Skipped))
-    return Growth(grown, added, skipped, resumed, notices)
-
-
-# --- one anatomy ------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class AnatomyBuilder:
-    """Builds the anatomies of an atlas; picklable, so that workers can do it."""
-
-    atlas: Atlas
-    solve_response: SolveResponse | None = None
-
-    def __call__(self, source: Source | Skipped) -> Anatomy | Skipped:
-        """The anatomy of a surface, or the reason why there is none; never raises."""
-        if isinstance(source, Skipped):
-            return source
-        try:
-            return build_anatomy(self.atlas, source, self.solve_response)
-        except AvatarError as error:
-            return Skipped(source.name, str(error))
-        except Exception as error:  # a singular matrix, memory that ran out
-            return Skipped(source.name, _in_one_line(error))
-
-
-@repeatable
-def build_anatomy(
-    atlas: Atlas, source: Source, solve_response: SolveResponse | None = None
-) -> Anatomy:
-    """Read and register one organ, and compute its distances and, if asked, its response.
-
-    Raises
-    ------
-    AvatarError
-        Of the stage that failed, with the remedy.
-    """
-    surface = source.read() if isinstance(source, SurfaceFile) else source
-    atlas.require_room(surface)
-    registration = register(atlas.template, surface, atlas.rule)
-    return Anatomy(
-        name=surface.name,
-        surface=surface,
-        volume=surface.volume,
-        alignment=registration.alignment,
-        distances=atlas.distance_vector(surface, registration.alignment),
-        registered=registration.mesh.vertices,
-        quality=registration.quality,
-        converged=registration.converged,
-        response=solve_response(registration) if solve_response else None,
+    ordered = [results[number] for number in sorted(results)]
+    new = [one for one in ordered if isinstance(one, Anatomy)]
+    members = sorted((*there.anatomies, *new), key=lambda one: one.name)
+    atlas, added = replace(there, anatomies=tuple(members)), tuple(one.name for one in new)
+    notices = [str(one) for one in atlas.duplicates if one.name in added]
+    for one in new:
+        notices += [] if one.converged else [f"{one.name}: {not_converged(one.quality)}"]
+        notices += [f"{one.name}: {notice}" for notice in one.origin.notices]
+    return Growth(
+        atlas,
+        added,
+        tuple(name for number, name in enumerate(names) if number not in results),
+        tuple(one for one in ordered if isinstance(one, Skipped)),
+        tuple(notices),
     )
 
 
-def checkpoint_keys(builder: AnatomyBuilder, sources: Sequence[Source]) -> list[str | None]:
-    """Hash of all inputs of each anatomy; None for a file that cannot be read."""
-    atlas, mesh = builder.atlas, builder.atlas.template.mesh
-    common = hashlib.sha256()
-    for array in (mesh.vertices, mesh.tets, atlas.template.regions.accessible):
-        common.update(np.ascontiguousarray(array).tobytes())
-    settings = (ATLAS_SCHEMA, asdict(atlas.box), asdict(atlas.rule))
-    common.update(json.dumps(settings).encode())
-    common.update(pickle.dumps(builder.solve_response))
-    return [_checkpoint_key(common.digest(), source) for source in sources]
-
-
-def _checkpoint_key(common: bytes, source: Source) -> str | None:
-    digest = hashlib.sha256(common)
-    digest.update(source.name.encode())
+def key_of(source: Source) -> str | None:
+    """Hash of the content of a surface and how it is read; None for a file that cannot be read."""
+    digest = hashlib.sha256()
     if isinstance(source, SurfaceFile):
         try:
             digest.update(content_of(source.path))
@@ -323,6 +352,64 @@ def _checkpoint_key(common: bytes, source: Source) -> str | None:
         digest.update(source.vertices.tobytes())
         digest.update(source.faces.tobytes())
     return digest.hexdigest()[:32]
+
+
+# --- one anatomy ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class AnatomyBuilder:
+    """Builds the anatomies of an atlas; picklable, so that workers can do it."""
+
+    frame: Frame
+    solve_response: SolveResponse | None = None
+
+    def __call__(self, source: Source | Skipped) -> WholeAnatomy | Skipped:
+        """The anatomy of a surface, or the reason why there is none; never raises."""
+        if isinstance(source, Skipped):
+            return source
+        try:
+            return build_anatomy(self.frame, source, self.solve_response)
+        except AvatarError as error:
+            return Skipped(source.name, str(error))
+        except Exception as error:  # a singular matrix, memory that ran out
+            return Skipped(source.name, _in_one_line(error))
+
+
+@repeatable
+def build_anatomy(
+    frame: Frame, source: Source, solve_response: SolveResponse | None = None
+) -> WholeAnatomy:
+    """Read and register one organ, and compute its distances and, if asked, its response.
+
+    Raises
+    ------
+    AvatarError
+        Of the stage that failed, with the remedy.
+    """
+    surface = source.read() if isinstance(source, SurfaceFile) else source
+    frame.require_room(surface)
+    registration = register(frame.template, surface, frame.rule)
+    response = solve_response(registration) if solve_response else None
+    shape = Anatomy(
+        name=surface.name,
+        key=key_of(source) or "",
+        origin=Origin(
+            surface.source_sha256,
+            surface.unit,
+            surface.axes_name,
+            len(surface.vertices),
+            surface.notices + size_notice(surface),
+        ),
+        volume=surface.volume,
+        alignment=registration.alignment,
+        registered=registration.mesh.vertices,
+        quality=registration.quality,
+        converged=registration.converged,
+        response=response.kind if response else None,
+    )
+    distances = frame.distance_vector(surface, registration.alignment)
+    return WholeAnatomy(shape, distances, response)
 
 
 def _read_here(source: Source | Skipped) -> Source | Skipped:

@@ -206,7 +206,7 @@ def posed_patient(
     doubts = doubts_of(surface, options.inside, options.groups is not None)
     progress("registration", 0.0, np.nan)
     with _timed(clock, "registration"):
-        known = base.registrations.get(surface.source_sha256)
+        known = base.registration_of(surface.source_sha256)
         registration = known or register(base.template, surface, base.rule)
     weights = patient_weights(
         base, registration, surface, options.weighting, options.n_neighbors, options.leave_out

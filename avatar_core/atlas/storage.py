@@ -1,40 +1,40 @@
-"""Atlases on disk: one HDF5 file with schema version and checksum, replaced as a whole or not.
+"""Atlases on disk: a folder that grows, in which no file is ever written again.
 
-Layout (schema 1.0), attributes at the root: ``format`` = "avatar atlas", ``schema``, ``about``
-(JSON: template's name, box, registration rule), ``checksum`` as of vademecums. Datasets:
+Every file is HDF5 with the attributes ``format``, ``schema``, ``about`` (JSON: everything that is
+no array) and ``checksum`` as of vademecums (schema 2.0):
 
-    template/vertices (n_v, 3) [m]      template/tets (n_t, 4)
-    template/clamped, template/accessible over the boundary faces
-    gram/origin (D,) [m]                gram/products (n, n) [m2]
-    anatomies/000000/about              JSON as bytes: everything that is no array
-    anatomies/000000/vertices (., 3) [m]        anatomies/000000/faces (., 3)
-    anatomies/000000/distances (D,) [m]         anatomies/000000/registered (n_v, 3) [m]
-    anatomies/000000/space (3 n_v, k) [m/N]     anatomies/000000/load (3 n_s, k), if computed
+    frame.h5               template/vertices (n_v, 3) [m], template/tets (n_t, 4),
+                           template/clamped and template/accessible over the boundary faces
+    NAME/level_set.h5      distances (D,) [m]
+    NAME/response.h5       space (3 n_v, k) [m/N], load (3 n_s, k), missing (n_s, 3, 3), if computed
+    NAME/shape.h5          registered (n_v, 3) [m]
+
+``about`` of the first two files of an anatomy is the key in its shape. The shape is written last:
+a folder without one is no member. Deleting its folder removes an anatomy.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from avatar_core.atlas.anatomy import Anatomy, Response
+from avatar_core.atlas.anatomy import Anatomy, Origin, Response, ResponseKind, WholeAnatomy
+from avatar_core.atlas.frame import Frame
 from avatar_core.atlas.model import Atlas
 from avatar_core.common.array_shapes import Shapes, require_indices, require_shapes
+from avatar_core.common.arrays import FloatArray
 from avatar_core.common.dataclass_json import of_plain, parsed, require_name
 from avatar_core.common.files import FileError, opened
 from avatar_core.common.hdf5 import replace_file, require_schema, verified
 from avatar_core.errors import AvatarError, StorageError
-from avatar_core.fem.elasticity import Element, Material
 from avatar_core.geometry.level_set import GridBox
 from avatar_core.geometry.mesh import Regions, TetMesh
-from avatar_core.geometry.surface import SurfaceMesh, axes_matrix
-from avatar_core.shapes.lle import Gram
 from avatar_core.shapes.registration import (
     RegistrationQuality,
     RegistrationRule,
@@ -42,45 +42,46 @@ from avatar_core.shapes.registration import (
     Template,
 )
 
-ATLAS_SCHEMA = "1.0"
-ATLAS_FORMAT = "avatar atlas"
-ANATOMY_FORMAT = "avatar anatomy"
-MAX_FILE_BYTES = 64 << 30
+ATLAS_SCHEMA = "2.0"
+MAX_FILE_BYTES = 1 << 30
 MAX_POINTS = 10_000_000  # of the box; an atlas has 50,000
 MOST_STEPS = 1000  # of a registration, in each of its loops
+FRAME, SHAPE, LEVEL_SET, RESPONSE = "frame.h5", "shape.h5", "level_set.h5", "response.h5"
 
 Arrays = dict[str, np.ndarray]
-Made = TypeVar("Made")
 
-_TEMPLATE: Shapes = {
-    "template/vertices": "f: template 3",
-    "template/tets": "i: tets 4",
-    "template/clamped": "b: faces",
-    "template/accessible": "b: faces",
-    "gram/origin": "f: points",
-    "gram/products": "f: n n",
+_ARRAYS: dict[str, Shapes] = {
+    FRAME: {
+        "template/vertices": "f: template 3",
+        "template/tets": "i: tets 4",
+        "template/clamped": "b: faces",
+        "template/accessible": "b: faces",
+    },
+    SHAPE: {"registered": "f: template 3"},
+    LEVEL_SET: {"distances": "f: points"},
+    RESPONSE: {
+        "space": "f: 3*template rank",
+        "load": "f: 3*positions rank",
+        "missing": "f: positions 3 3",
+    },
 }
-_ANATOMY: Shapes = {
-    "about": "i: letters",
-    "vertices": "f: vertices 3",
-    "faces": "i: faces 3",
-    "distances": "f: points",
-    "registered": "f: template 3",
+_FORMATS = {
+    FRAME: "avatar atlas",
+    SHAPE: "avatar anatomy",
+    LEVEL_SET: "avatar level set",
+    RESPONSE: "avatar response",
 }
-_RESPONSE: Shapes = {
-    "space": "f: 3*template rank",
-    "load": "f: 3*positions rank",
-    "missing": "f: positions 3 3",
-}
+_AGAIN = "delete the anatomy's folder and add its surface again"
 
 
 @dataclass(frozen=True)
-class _Surface:
-    name: str
-    unit: str
-    axes: tuple[tuple[float, ...], ...]
-    notices: tuple[str, ...]
-    source_sha256: str
+class _Frame:
+    """Everything of a frame that is no array; made_from: hash of what was asked for."""
+
+    template: str
+    box: GridBox
+    rule: RegistrationRule
+    made_from: str
 
 
 @dataclass(frozen=True)
@@ -91,188 +92,84 @@ class _Alignment:
 
 
 @dataclass(frozen=True)
-class _Response:
-    material: Material
-    element: Element
-    patch_radius: float
+class _Shape:
+    """Everything of a shape that is no array."""
 
-
-@dataclass(frozen=True)
-class _Anatomy:
-    """Everything of an anatomy that is no array."""
-
-    name: str
+    key: str
     volume: float
     converged: bool
     quality: RegistrationQuality
-    surface: _Surface
+    origin: Origin
     alignment: _Alignment
-    response: _Response | None = None
+    response: ResponseKind | None = None
 
 
-@dataclass(frozen=True)
-class _About:
-    """Everything of an atlas that is no array."""
-
-    template: str
-    box: GridBox
-    rule: RegistrationRule
+# --- the atlas --------------------------------------------------------------------------------
 
 
-def save_atlas(atlas: Atlas, path: str | Path) -> None:
-    """Write an atlas; what was at the path stays until the new file is complete.
+def load_atlas(path: str | Path) -> Atlas:
+    """Read and verify an atlas, without level sets and responses.
 
     Raises
     ------
     StorageError
-        If the folder does not exist or the disk is full; the old file is then unharmed.
+        For a folder that is no atlas, and for a truncated, altered or foreign file in it.
     """
-    template, gram = atlas.template, atlas.gram
+    folder = Path(path)
+    frame, _ = load_frame(folder)
+    return Atlas(
+        frame,
+        tuple(_load_shape(folder / name, frame) for name in member_names(folder)),
+        partial(_load_distances, folder, frame),
+        partial(_load_response, folder, frame),
+    )
+
+
+def member_names(folder: Path) -> list[str]:
+    """Names of the members, sorted; nothing is read."""
+    return sorted(file.parent.name for file in folder.glob(f"*/{SHAPE}"))
+
+
+def n_bytes(folder: Path) -> int:
+    """Size of all files of an atlas [bytes]."""
+    return sum(file.stat().st_size for file in (*folder.glob("*.h5"), *folder.glob("*/*.h5")))
+
+
+# --- its frame --------------------------------------------------------------------------------
+
+
+def save_frame(folder: Path, frame: Frame, made_from: str) -> None:
+    """Write the frame of an atlas into its folder; StorageError if it cannot be."""
+    template = frame.template
     arrays: Arrays = {
         "template/vertices": template.mesh.vertices,
         "template/tets": template.mesh.tets,
         "template/clamped": template.regions.clamped,
         "template/accessible": template.regions.accessible,
-        "gram/origin": gram.origin,
-        "gram/products": gram.products,
     }
-    for number, anatomy in enumerate(atlas.anatomies):
-        group = f"anatomies/{number:06d}"
-        arrays |= {f"{group}/{key}": value for key, value in _anatomy_arrays(anatomy).items()}
-    about = {"template": template.name, "box": asdict(atlas.box), "rule": asdict(atlas.rule)}
-    replace_file(Path(path), arrays, _attributes(ATLAS_FORMAT, about))
+    about = _Frame(template.name, frame.box, frame.rule, made_from)
+    _write(folder / FRAME, arrays, asdict(about))
 
 
-def load_atlas(path: str | Path) -> Atlas:
-    """Read and verify an atlas.
+def load_frame(folder: Path) -> tuple[Frame, str]:
+    """The frame of an atlas, and the hash of what it was made from.
 
-    Raises
-    ------
-    StorageError
-        For a missing, truncated, altered or foreign file, and for one of another schema.
+    Raises StorageError unless the folder is an atlas of this version.
     """
-    return _read(Path(path), ATLAS_FORMAT, _atlas)
-
-
-def save_anatomy(anatomy: Anatomy, path: Path) -> None:
-    """Write one anatomy on its own, complete or not at all; StorageError if it cannot be."""
-    replace_file(path, _anatomy_arrays(anatomy), _attributes(ANATOMY_FORMAT, {}))
-
-
-def load_anatomy(path: Path) -> Anatomy:
-    """Read and verify an anatomy on its own; StorageError unless it is as it was written."""
-    return _read(path, ANATOMY_FORMAT, lambda arrays, _: _anatomy(arrays))
-
-
-# --- to arrays and back -----------------------------------------------------------------------
-
-
-def _attributes(kind: str, about: dict[str, Any]) -> dict[str, str]:
-    return {"format": kind, "schema": ATLAS_SCHEMA, "about": json.dumps(about)}
-
-
-def _anatomy_arrays(anatomy: Anatomy) -> Arrays:
-    surface, alignment, response = anatomy.surface, anatomy.alignment, anatomy.response
-    about: dict[str, Any] = {
-        "name": anatomy.name,
-        "volume": anatomy.volume,
-        "converged": anatomy.converged,
-        "quality": asdict(anatomy.quality),
-        "surface": {
-            "name": surface.name,
-            "unit": surface.unit,
-            "axes": surface.axes.tolist(),
-            "notices": surface.notices,
-            "source_sha256": surface.source_sha256,
-        },
-        "alignment": {
-            "scale": alignment.scale,
-            "rotation": alignment.rotation.tolist(),
-            "translation": alignment.translation.tolist(),
-        },
-    }
-    arrays: Arrays = {
-        "vertices": surface.vertices,
-        "faces": surface.faces,
-        "distances": anatomy.distances,
-        "registered": anatomy.registered,
-    }
-    if response is not None:
-        arrays |= {"space": response.space, "load": response.load}
-        arrays["missing"] = response.residual_compliance
-        about["response"] = {
-            "material": asdict(response.material),
-            "element": response.element,
-            "patch_radius": response.patch_radius,
-        }
-    return {**arrays, "about": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)}
-
-
-def _anatomy(arrays: Arrays) -> Anatomy:
-    sizes = require_shapes(arrays, _ANATOMY | (_RESPONSE if "space" in arrays else {}))
-    require_indices("faces", arrays["faces"], sizes["vertices"])
-    text = arrays["about"].astype(np.uint8).tobytes().decode(errors="replace")
-    about = of_plain(_Anatomy, parsed(text, "about"), "about")
-    stored, alignment = about.surface, about.alignment
-    rotation, translation = np.array(alignment.rotation), np.array(alignment.translation)
-    placed = np.isfinite([alignment.scale, about.volume, *rotation.flat, *translation.flat]).all()
-    if rotation.shape != (3, 3) or translation.shape != (3,) or not placed:
-        raise StorageError("'about' has an alignment or a volume that is none; build it again")
-    return Anatomy(
-        name=require_name(about.name, "about.name"),
-        surface=SurfaceMesh(
-            arrays["vertices"],
-            arrays["faces"],
-            require_name(stored.name, "about.surface.name"),
-            stored.unit,
-            axes_matrix(stored.axes),
-            stored.notices,
-            stored.source_sha256,
-        ),
-        volume=about.volume,
-        alignment=SimilarityTransform(alignment.scale, rotation, translation),
-        distances=arrays["distances"],
-        registered=arrays["registered"],
-        quality=about.quality,
-        converged=about.converged,
-        response=_response(arrays, about.response),
-    )
-
-
-def _response(arrays: Arrays, about: _Response | None) -> Response | None:
-    if (about is None) != ("space" not in arrays):
-        raise StorageError("a response is there in part; build the file again")
-    if about is None:
-        return None
-    return Response(
-        space=arrays["space"],
-        load=arrays["load"],
-        residual_compliance=arrays["missing"],
-        material=about.material,
-        element=about.element,
-        patch_radius=about.patch_radius,
-    )
-
-
-def _atlas(arrays: Arrays, about: Any) -> Atlas:
-    require_shapes(arrays, _TEMPLATE)
-    said = of_plain(_About, about, "about")
-    _require_box(said.box)
-    _require_rule(said.rule)
-    return Atlas(
-        template=_template(arrays, require_name(said.template, "about.template")),
-        box=said.box,
-        rule=said.rule,
-        anatomies=tuple(_named(number, group) for number, group in _groups(arrays)),
-        gram=Gram(arrays["gram/origin"], arrays["gram/products"]),
-    )
-
-
-def _named(number: str, group: Arrays) -> Anatomy:
+    if folder.is_file():
+        raise StorageError(
+            f"{folder} is a file, and an atlas is a folder; make one with 'avatar atlas create "
+            "FOLDER SURFACE...'"
+        )
+    arrays, about = _read(folder / FRAME, "make it again with 'avatar atlas create'")
     try:
-        return _anatomy(group)
+        said = of_plain(_Frame, about, "about")
+        _require_box(said.box)
+        _require_rule(said.rule)
+        template = _template(arrays, require_name(said.template, "about.template"))
     except AvatarError as error:
-        raise StorageError(f"anatomies/{number}: {error}") from error
+        raise StorageError(f"{folder / FRAME}: {error}") from error
+    return Frame(template, said.box, said.rule), said.made_from
 
 
 def _template(arrays: Arrays, name: str) -> Template:
@@ -297,45 +194,134 @@ def _require_rule(rule: RegistrationRule) -> None:
         raise StorageError("'about.rule' would register nothing; build the atlas again")
 
 
-def _groups(arrays: Arrays) -> Iterator[tuple[str, Arrays]]:
-    """Number and arrays of each anatomy, in the order of their numbers."""
-    groups: dict[str, Arrays] = {}
-    for key in sorted(arrays):
-        if key.startswith("anatomies/"):
-            _, number, *name = key.split("/")
-            groups.setdefault(number, {})["/".join(name)] = arrays[key]
-    yield from groups.items()
+# --- an anatomy -------------------------------------------------------------------------------
+
+
+def save_anatomy(folder: Path, anatomy: WholeAnatomy) -> None:
+    """Write an anatomy into the folder of an atlas; it is a member once its shape is there.
+
+    Raises
+    ------
+    StorageError
+        If the folder cannot be made or the disk is full; the atlas is then as it was.
+    """
+    shape, response = anatomy.shape, anatomy.response
+    own = folder / shape.name
+    try:
+        own.mkdir(exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make {own} ({error.strerror})") from error
+    _write(own / LEVEL_SET, {"distances": anatomy.distances}, shape.key)
+    if response is not None:
+        arrays = {"space": response.space, "load": response.load}
+        missing = response.residual_compliance
+        _write(own / RESPONSE, {**arrays, "missing": missing}, shape.key)
+    alignment = shape.alignment
+    about = {
+        "key": shape.key,
+        "volume": shape.volume,
+        "converged": shape.converged,
+        "quality": asdict(shape.quality),
+        "origin": asdict(shape.origin),
+        "alignment": {
+            "scale": alignment.scale,
+            "rotation": alignment.rotation.tolist(),
+            "translation": alignment.translation.tolist(),
+        },
+        "response": None if response is None else asdict(response.kind),
+    }
+    _write(own / SHAPE, {"registered": shape.registered}, about)
+
+
+def _load_shape(own: Path, frame: Frame) -> Anatomy:
+    arrays, about = _read(own / SHAPE)
+    try:
+        return _anatomy(require_name(own.name, "the name"), arrays, about, frame)
+    except AvatarError as error:
+        raise StorageError(f"{own / SHAPE}: {error}") from error
+
+
+def _anatomy(name: str, arrays: Arrays, about: Any, frame: Frame) -> Anatomy:
+    said = of_plain(_Shape, about, "about")
+    alignment = said.alignment
+    rotation, translation = np.array(alignment.rotation), np.array(alignment.translation)
+    placed = np.isfinite([alignment.scale, said.volume, *rotation.flat, *translation.flat]).all()
+    if rotation.shape != (3, 3) or translation.shape != (3,) or not placed:
+        raise StorageError(f"'about' has an alignment or a volume that is none; {_AGAIN}")
+    if arrays["registered"].shape != frame.template.mesh.vertices.shape:
+        raise StorageError(f"'registered' does not fit the atlas's template; {_AGAIN}")
+    return Anatomy(
+        name,
+        said.key,
+        said.origin,
+        said.volume,
+        SimilarityTransform(alignment.scale, rotation, translation),
+        arrays["registered"],
+        said.quality,
+        said.converged,
+        said.response,
+    )
+
+
+def _load_distances(folder: Path, frame: Frame, anatomy: Anatomy) -> FloatArray:
+    file = folder / anatomy.name / LEVEL_SET
+    distances = _read_of(file, anatomy)["distances"]
+    if distances.shape != (frame.n_points,):
+        raise StorageError(f"{file} does not fit the atlas's grid; {_AGAIN}")
+    return distances
+
+
+def _load_response(folder: Path, frame: Frame, anatomy: Anatomy) -> Response:
+    file, kind = folder / anatomy.name / RESPONSE, anatomy.response
+    if kind is None:
+        raise StorageError(f"{anatomy.name} has no response; {_AGAIN}")
+    arrays = _read_of(file, anatomy)
+    if len(arrays["space"]) != frame.template.mesh.vertices.size:
+        raise StorageError(f"{file} does not fit the atlas's template; {_AGAIN}")
+    return Response(
+        space=arrays["space"],
+        load=arrays["load"],
+        residual_compliance=arrays["missing"],
+        material=kind.material,
+        element=kind.element,
+        patch_radius=kind.patch_radius,
+    )
+
+
+def _read_of(file: Path, anatomy: Anatomy) -> Arrays:
+    arrays, key = _read(file)
+    if key != anatomy.key:
+        raise StorageError(f"{file} belongs to another anatomy; {_AGAIN}")
+    return arrays
 
 
 # --- files ------------------------------------------------------------------------------------
 
 
-def _read(path: Path, kind: str, assemble: Callable[[Arrays, Any], Made]) -> Made:
-    """What `assemble` makes of the arrays and the JSON, once both are verified."""
-    what = kind.removeprefix("avatar ")
-    try:
-        with opened(path, MAX_FILE_BYTES) as source:
-            attributes, arrays = verified(source, str(path), what, _attributes_of(kind), list)
-    except FileError as error:
-        raise StorageError(
-            f"no {what} at {path} ({error}); make one with 'avatar atlas create'"
-        ) from error
-    try:
-        return assemble(arrays, parsed(attributes["about"], "about"))
-    except AvatarError as error:
-        raise StorageError(f"{path}: {error}") from error
+def _write(file: Path, arrays: Arrays, about: Any) -> None:
+    said = {"format": _FORMATS[file.name], "schema": ATLAS_SCHEMA, "about": json.dumps(about)}
+    replace_file(file, arrays, said)
 
 
-def _attributes_of(kind: str) -> Callable[[dict[str, str], str], dict[str, str]]:
-    """Those that count, of a file of this kind and the present schema."""
+def _read(file: Path, remedy: str = _AGAIN) -> tuple[Arrays, Any]:
+    """Arrays and JSON of a file of an atlas, verified; StorageError with the remedy."""
+    kind, held_keys = _FORMATS[file.name], ("format", "schema", "about")
 
     def choose(held: dict[str, str], origin: str) -> dict[str, str]:
         if held.get("format") != kind:
-            raise StorageError(
-                f"{origin} is HDF5 but no {kind.removeprefix('avatar ')}; make one with 'avatar "
-                "atlas create'"
-            )
-        require_schema(held, ATLAS_SCHEMA, origin, "make it again with 'avatar atlas create'")
-        return {key: held[key] for key in ("format", "schema", "about")}
+            raise StorageError(f"{origin} is HDF5 but no {kind.removeprefix('avatar ')}; {remedy}")
+        require_schema(held, ATLAS_SCHEMA, origin, remedy)
+        return {key: held[key] for key in held_keys}
 
-    return choose
+    what = kind.removeprefix("avatar ")
+    try:
+        with opened(file, MAX_FILE_BYTES) as source:
+            attributes, arrays = verified(source, str(file), what, choose, list, remedy)
+    except FileError as error:
+        where = file.parent if file.name == FRAME else file
+        raise StorageError(f"no {what} at {where} ({error}); {remedy}") from error
+    try:
+        require_shapes(arrays, _ARRAYS[file.name])
+        return arrays, parsed(attributes["about"], "about")
+    except AvatarError as error:
+        raise StorageError(f"{file}: {error}") from error

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from avatar_core.atlas.base import PatientBase, PatientError
+from avatar_core.atlas.model import MOST_NEIGHBORS, centred
 from avatar_core.common.arrays import FloatArray
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface
@@ -32,11 +33,11 @@ from avatar_core.shapes.correspondence import interpolation_matrix, load_map
 from avatar_core.shapes.registration import Registration
 
 Weighting = Literal["kriging", "lle-template", "lle-grid", "lle-paper"]
-# Neighbours (None: all) and ridge of LLE: the paper's (Sec. 3.3), and those with the least
-# leave-one-out error of 64 livers (`avatar study transport`).
-LLE_SETTINGS: dict[str, tuple[int | None, float]] = {
+# Neighbours and ridge of LLE: the paper's (Sec. 3.3), and those with the least leave-one-out error
+# of 64 livers (`avatar study transport`).
+LLE_SETTINGS: dict[str, tuple[int, float]] = {
     "lle-template": (40, 3e-4),
-    "lle-grid": (None, 3e-4),
+    "lle-grid": (MOST_NEIGHBORS, 3e-4),
     "lle-paper": (10, DEFAULT_REGULARIZATION),
 }
 _OVERSAMPLING = 20  # random columns beyond the rank of a combination
@@ -60,7 +61,7 @@ def patient_weights(
     weighting : "kriging", see :func:`kriging`, and "lle-template", Eq. 15, both on the centred
         registered vertices; "lle-grid", Eq. 15 on the distances at the common grid; "lle-paper",
         the same as in the paper, with ten neighbours and almost no ridge
-    n_neighbors : k; None for all, for the 40 nearest with "lle-template", and 10 with "lle-paper"
+    n_neighbors : k; None for the 64 nearest, 40 with "lle-template" and 10 with "lle-paper"
 
     Raises
     ------
@@ -81,19 +82,12 @@ def patient_weights(
         vectors: Sequence[FloatArray] = base.distances
         point = base.distance_of(surface, registration)
     else:
-        vectors, point = list(centred(base.vertices)), centred(registration.mesh.vertices)
-    most, ridge = LLE_SETTINGS.get(weighting, (None, DEFAULT_REGULARIZATION))
-    k = min(most or available, available) if n_neighbors is None else n_neighbors
+        vectors, point = centred(base.vertices), centred([registration.mesh.vertices])[0]
+    most, ridge = LLE_SETTINGS.get(weighting, (MOST_NEIGHBORS, DEFAULT_REGULARIZATION))
+    k = min(most, available) if n_neighbors is None else n_neighbors
     if weighting == "kriging":
         return kriging(vectors, point, k, left)
     return barycenter(vectors, point, k, regularization=ridge, leave_out=left)
-
-
-def centred(vertices: FloatArray) -> FloatArray:
-    """Vertices (..., n, 3) without their translation, as vectors (..., 3 n) [m]."""
-    exact = np.asarray(vertices, dtype=np.float64)
-    moved = exact - exact.mean(axis=-2, keepdims=True)
-    return moved.reshape(*exact.shape[:-2], -1)
 
 
 def kriging(
@@ -118,7 +112,7 @@ def kriging(
     found = barycenter(vectors, point, n_neighbors, leave_out=leave_out)
     if found.member is not None:
         return found
-    chosen = np.asarray(vectors)[found.neighbors]
+    chosen = np.stack([vectors[j] for j in found.neighbors])
     k, scale = len(chosen), float(found.distances.mean())
     squared = (chosen**2).sum(axis=1)
     apart = np.sqrt(np.maximum(squared[:, None] + squared - 2.0 * chosen @ chosen.T, 0.0))

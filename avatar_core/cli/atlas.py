@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from avatar_core.cli.output import EXIT_STOPPED, require_output
+from avatar_core.cli.output import EXIT_STOPPED, require_output_folder
 from avatar_core.cli.progress import item_bar
 from avatar_core.cli.vademecum import AsJson, Axes, Label, Unit, parsed_axes, say_notices
 from avatar_core.errors import AvatarError
@@ -28,7 +28,7 @@ atlas = typer.Typer(
     rich_markup_mode=None,  # which takes units, such as [m], for markup
 )
 
-AtlasFile = Annotated[Path, typer.Argument(metavar="ATLAS.h5", help="file of the atlas")]
+AtlasFolder = Annotated[Path, typer.Argument(metavar="ATLAS", help="folder of the atlas")]
 Surfaces = Annotated[
     list[str],
     typer.Argument(
@@ -52,7 +52,7 @@ Scheduler = Annotated[
 
 @atlas.command()
 def create(
-    file: AtlasFile,
+    folder: AtlasFolder,
     surfaces: Surfaces,
     unit: Unit = "mm",
     axes: Axes = None,
@@ -73,21 +73,21 @@ def create(
 ) -> None:
     """Build an atlas from surfaces. Bad surfaces are skipped, with the reason.
 
-    After an interruption, the same command resumes the build. Exit code 1: no surface could be
-    used, and nothing was written.
+    Each organ is written as soon as it is finished, and the same command goes on after an
+    interruption. Exit code 1: no surface could be used, and nothing was written.
     """
     from avatar_core.atlas.growth import AtlasOptions, create_atlas
 
-    require_output(file, [".h5"], surfaces)
+    require_output_folder(folder)
     sources = _sources(surfaces, unit, axes, label)
     options = AtlasOptions(template_vertices, box, spacing)
-    grow = partial(create_atlas, file, sources, options)
-    _report(file, _grown(grow, len(sources), shapes_only, jobs, scheduler))
+    grow = partial(create_atlas, folder, sources, options)
+    _report(folder, _grown(grow, len(sources), shapes_only, jobs, scheduler))
 
 
 @atlas.command()
 def add(
-    file: AtlasFile,
+    folder: AtlasFolder,
     surfaces: Surfaces,
     unit: Unit = "mm",
     axes: Axes = None,
@@ -96,52 +96,53 @@ def add(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Add surfaces to an atlas. Members that it has are not computed again.
+    """Add surfaces to an atlas. Nothing that is there is computed or written again.
 
-    The old file stays until the new one is complete. Exit code 1: no surface could be used.
+    To remove an organ, delete its folder. Exit code 1: no surface could be used.
     """
     from avatar_core.atlas.growth import extend_atlas
 
     sources = _sources(surfaces, unit, axes, label)
-    grow = partial(extend_atlas, file, sources)
-    _report(file, _grown(grow, len(sources), shapes_only, jobs, scheduler))
+    grow = partial(extend_atlas, folder, sources)
+    _report(folder, _grown(grow, len(sources), shapes_only, jobs, scheduler))
 
 
 @atlas.command()
-def show(file: AtlasFile, as_json: AsJson = False) -> None:
+def show(folder: AtlasFolder, as_json: AsJson = False) -> None:
     """Show the members of an atlas, with the quality of their registrations."""
-    from avatar_core.atlas.storage import load_atlas
+    from avatar_core.atlas.storage import load_atlas, n_bytes
 
-    loaded = load_atlas(file)
+    about = summary(load_atlas(folder), n_bytes(folder))
     if as_json:
-        print(json.dumps(summary(loaded, file.stat().st_size), indent=2))
+        print(json.dumps(about, indent=2))
     else:
-        _show_text(file, loaded)
+        _show_text(folder, about)
 
 
 def summary(atlas: Atlas, nbytes: int) -> dict[str, Any]:
     """What ``avatar atlas show --json`` prints; lengths in metres, volumes in m3."""
     copies = {one.name: one.of for one in atlas.duplicates}
-    quality = atlas.rule.tolerance
+    frame = atlas.frame
     return {
         "n_anatomies": len(atlas),
         "n_duplicates": len(copies),
         "bytes": nbytes,
-        "template": {"name": atlas.template.name, "n_vertices": len(atlas.template.mesh.vertices)},
+        "template": {"name": frame.template.name, "n_vertices": len(frame.template.mesh.vertices)},
         "box": {
-            "origin": list(atlas.box.origin),
-            "spacing": atlas.box.spacing,
-            "shape": list(atlas.box.shape),
-            "n_points": len(atlas.gram.origin),
+            "origin": list(frame.box.origin),
+            "size": list(frame.box.upper - frame.box.origin),
+            "spacing": frame.box.spacing,
+            "shape": list(frame.box.shape),
+            "n_points": frame.n_points,
         },
-        "registration_tolerance": quality,
+        "registration_tolerance": frame.rule.tolerance,
         "anatomies": [
             {
                 "name": one.name,
-                "source_sha256": one.surface.source_sha256,
-                "unit": one.surface.unit,
-                "axes": one.surface.axes_name,
-                "n_vertices": len(one.surface.vertices),
+                "source_sha256": one.origin.sha256,
+                "unit": one.origin.unit,
+                "axes": one.origin.axes,
+                "n_vertices": one.origin.n_vertices,
                 "volume": one.volume,
                 "scale": one.alignment.scale,
                 "angle_degrees": one.alignment.angle,
@@ -150,25 +151,24 @@ def summary(atlas: Atlas, nbytes: int) -> dict[str, Any]:
                 "least_jacobian": one.quality.least_jacobian,
                 "converged": one.converged,
                 "duplicate_of": copies.get(one.name),
-                "response_rank": one.response.load.shape[1] if one.response else None,
-                "notices": list(one.surface.notices),
+                "response_rank": one.response.rank if one.response else None,
+                "notices": list(one.origin.notices),
             }
             for one in atlas.anatomies
         ],
     }
 
 
-def _show_text(file: Path, atlas: Atlas) -> None:
-    about = summary(atlas, file.stat().st_size)
+def _show_text(folder: Path, about: dict[str, Any]) -> None:
     box = about["box"]
     print(
-        f"{file.name}: {len(atlas)} anatomies ({about['n_duplicates']} duplicates), "
+        f"{folder.name}: {about['n_anatomies']} anatomies ({about['n_duplicates']} duplicates), "
         f"{about['bytes'] / 1e6:.1f} MB"
     )
     print(f"  template {about['template']['name']}, {about['template']['n_vertices']} vertices")
     print(
         f"  grid {' x '.join(map(str, box['shape']))} points, {box['spacing'] * 1e3:g} mm apart, "
-        f"{' x '.join(f'{side * 1e3:.0f}' for side in atlas.box.upper - atlas.box.origin)} mm"
+        f"{' x '.join(f'{side * 1e3:.0f}' for side in box['size'])} mm"
     )
     print(f"  {'name':24s} {'ml':>6s} {'scale':>6s} {'turn':>6s} {'off by':>8s}  response")
     for one in about["anatomies"]:
@@ -203,17 +203,17 @@ def _grown(
         raise typer.Exit(EXIT_STOPPED) from None
 
 
-def _report(file: Path, growth: Growth) -> None:
-    """Print what was added and skipped; raises AvatarError if nothing was added."""
+def _report(folder: Path, growth: Growth) -> None:
+    """Print what was added and skipped; raises AvatarError if no surface could be used."""
     for one in growth.skipped:
         print(f"skipped: {one.name}: {one.reason.removeprefix(f'{one.name}: ')}", file=sys.stderr)
     say_notices(growth.notices)
-    n_sources = len(growth.added) + len(growth.skipped)
-    if not growth.added:
+    n_sources = len(growth.added) + len(growth.known) + len(growth.skipped)
+    if len(growth.skipped) == n_sources:
         raise AvatarError(f"none of {n_sources} surface(s) can be used; nothing was written")
-    resumed = f", {growth.resumed} of them from an interrupted build" if growth.resumed else ""
+    known = f", {len(growth.known)} there before" if growth.known else ""
     print(
-        f"{file}: {len(growth.added)} of {n_sources} added{resumed}, {len(growth.skipped)} "
+        f"{folder}: {len(growth.added)} of {n_sources} added{known}, {len(growth.skipped)} "
         f"skipped; {len(growth.atlas)} anatomies"
     )
 

@@ -41,7 +41,7 @@ def cell(
     atlas: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="atlas for the node that builds patients (.h5)"
+            exists=True, file_okay=False, help="atlas for the node that builds patients, a folder"
         ),
     ] = None,
     tools: Annotated[

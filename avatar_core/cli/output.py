@@ -41,10 +41,7 @@ def require_output(
         raise StorageError(f"{output} ends in '{output.suffix}'; choose {' or '.join(suffixes)}")
     if os.path.isdir(output):
         raise StorageError(f"{output} is a folder; give the name of a file")
-    if not os.path.isdir(output.parent):
-        raise StorageError(f"folder {output.parent} does not exist; create it first")
-    if not os.access(output.parent, os.W_OK | os.X_OK):
-        raise StorageError(f"folder {output.parent} cannot be written to; choose another")
+    _require_writable(output.parent)
     for source in inputs:
         if source is not None and same_file(output, source):
             raise StorageError(f"{output} is also read ({source}); give another name")
@@ -53,6 +50,20 @@ def require_output(
         raise StorageError(
             f"{output} exists and is no vademecum; give another name, or --overwrite to replace it"
         )
+
+
+def require_output_folder(output: Path) -> None:
+    """Raise StorageError unless there is a folder of that name, or it can be made."""
+    if os.path.lexists(output) and not os.path.isdir(output):
+        raise StorageError(f"{output} is a file; give the name of a folder")
+    _require_writable(output.parent)
+
+
+def _require_writable(folder: Path) -> None:
+    if not os.path.isdir(folder):
+        raise StorageError(f"folder {folder} does not exist; create it first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise StorageError(f"folder {folder} cannot be written to; choose another")
 
 
 def same_file(one: str | Path, other: str | Path) -> bool:

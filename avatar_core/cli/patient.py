@@ -35,7 +35,7 @@ WEIGHTINGS = ("kriging", "lle-template", "lle-grid", "lle-paper")
 
 def patient(
     surface: Surface,
-    atlas: Annotated[Path, typer.Option(help="atlas (.h5) made by 'avatar atlas create'")],
+    atlas: Annotated[Path, typer.Option(help="folder made by 'avatar atlas create'")],
     output: Output,
     fidelity: Annotated[
         str,
@@ -58,8 +58,8 @@ def patient(
     neighbors: Annotated[
         int | None,
         typer.Option(
-            help="number of known organs that are used; default: all, or "
-            "40 with lle-template, 10 with lle-paper"
+            help="number of known organs that are used; default: 64 at "
+            "most, 40 with lle-template, 10 with lle-paper"
         ),
     ] = None,
     leave_out: Annotated[

@@ -159,13 +159,17 @@ def barycenter(
 
 def _distances(vectors: Vectors, candidates: IntArray, x: FloatArray) -> FloatArray:
     """|x - X_j| of some members, shape (len(candidates),)."""
-    if any(np.shape(vectors[j]) != x.shape for j in candidates):
-        raise LLEError("lle: the vectors differ in length; compute all on one grid")
-    distance = np.array([np.linalg.norm(vectors[j] - x) for j in candidates])
+    distance = np.array([_distance(vectors[j], x) for j in candidates])
     if not np.isfinite(distance).all():
         bad = candidates[~np.isfinite(distance)][0]
         raise LLEError(f"lle: vector {bad} is NaN or infinite; compute its distances again")
     return distance
+
+
+def _distance(vector: FloatArray, x: FloatArray) -> float:
+    if np.shape(vector) != x.shape:
+        raise LLEError("lle: the vectors differ in length; compute all on one grid")
+    return float(np.linalg.norm(vector - x))
 
 
 def _distance_to(x: FloatArray, neighbors: list[FloatArray], weights: FloatArray) -> float:

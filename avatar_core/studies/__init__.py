@@ -18,6 +18,7 @@ NAMES = (
     "samples",
     "leave-one-out",
     "transport",
+    "atlas-size",
     "pgd",
     "coordinates",
     "certainty",

@@ -23,7 +23,7 @@ import numpy as np
 
 from avatar_core.atlas.base import PatientBase, base_of, leave_one_out
 from avatar_core.atlas.growth import AtlasOptions, create_atlas
-from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.model import Atlas, centred
 from avatar_core.atlas.patient import (
     PatientOptions,
     interpolated,
@@ -37,12 +37,10 @@ from avatar_core.atlas.patient_problem import (
     template_problem,
 )
 from avatar_core.atlas.response import ResponseSolver
-from avatar_core.atlas.storage import load_atlas
 from avatar_core.atlas.transfer import (
     Weighting,
     carried,
     carried_by_place,
-    centred,
     combine,
     kriging,
     patient_weights,
@@ -82,7 +80,7 @@ class TransportSettings:
     n_patients : livers of the atlas that are left out, one after another
     n_vertices : of a patient's mesh
     template_vertices, rank : of the atlas
-    atlas : its file in the folder of the study, with which another run begins
+    atlas : its name in the folder of the study, with which another run begins
     """
 
     n_livers: int | None = None
@@ -90,7 +88,7 @@ class TransportSettings:
     n_vertices: int = 2850
     template_vertices: int = 2500
     rank: int = 120
-    atlas: str = "transport_atlas.h5"
+    atlas: str = "transport_atlas"
 
 
 class TransportStudy(Study[TransportSettings]):
@@ -98,7 +96,7 @@ class TransportStudy(Study[TransportSettings]):
 
     name = "transport"
     full = TransportSettings()
-    quick = TransportSettings(12, 3, 700, 700, 60, "transport_quick_atlas.h5")
+    quick = TransportSettings(12, 3, 700, 700, 60, "transport_quick_atlas")
     paper: ClassVar = {"interpolated_lle_paper_mean": 0.19}  # "below 19 %", Sec. 3.3
     key = "name"
 
@@ -239,9 +237,7 @@ def _column_of(kind: Weighting) -> str:
 
 
 def _atlas(surfaces: Sequence[SurfaceMesh], path: Path, settings: TransportSettings) -> Atlas:
-    """The atlas of a folder, or a new one; an interrupted one goes on."""
-    if path.is_file():
-        return load_atlas(path)
+    """The atlas of the study; one that was stopped goes on."""
     from tqdm import tqdm
 
     options = AtlasOptions(template_vertices=settings.template_vertices)

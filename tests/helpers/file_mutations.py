@@ -21,7 +21,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from avatar_core.atlas.storage import save_atlas
+from avatar_core.atlas.storage import FRAME, LEVEL_SET, RESPONSE, SHAPE, save_anatomy, save_frame
 from avatar_core.common.hdf5 import UNREADABLE, checksum, root_attributes
 from avatar_core.vademecum.storage import save_vademecum
 from tests.helpers.byte_mutations import OF_BYTES, pick, some
@@ -36,18 +36,30 @@ _DTYPES = ("f2", "f4", "f8", ">f8", "i1", "i8", ">i4", "u8", "?", "S8", "c16", "
 _VALUES = (0.0, -1.0, 1.0, 1e300, -1e300, 1e-300, np.nan, np.inf, 2.0**31, 2.0**63)
 
 
+ATLAS_FILES = (FRAME, SHAPE, LEVEL_SET, RESPONSE)
+
+
+def write_small_atlas(folder: Path) -> None:
+    """An atlas of two balls in a new folder."""
+    folder.mkdir()
+    frame, anatomies = small_atlas()
+    save_frame(folder, frame, "small")
+    for anatomy in anatomies:
+        save_anatomy(folder, anatomy)
+
+
 @cache
 def pristine(kind: str, variant: int = 0) -> bytes:
-    """The bytes of a small file; variants of a vademecum have ever more parts."""
+    """The bytes of a small vademecum, whose variants have ever more parts, or of ATLAS_FILES."""
     import tempfile
 
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "small.h5"
-        if kind == "atlas":
-            save_atlas(small_atlas(), path)
-        else:
-            save_vademecum(small_vademecum(variant & 1 == 1, variant & 2 == 2), path)
-        return path.read_bytes()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name, "small")
+        if kind == "vademecum":
+            save_vademecum(small_vademecum(variant & 1 == 1, variant & 2 == 2), Path(name, "v.h5"))
+            return Path(name, "v.h5").read_bytes()
+        write_small_atlas(folder)
+        return (folder / kind if kind == FRAME else folder / "ball-1" / kind).read_bytes()
 
 
 def mutant(kind: str, seed: int) -> bytes:
@@ -212,14 +224,9 @@ def _attribute(rng: np.random.Generator, file: h5py.File) -> None:
 
 
 def _json(rng: np.random.Generator, file: h5py.File) -> None:
-    """A value in the JSON of an attribute, or of an anatomy, becomes another."""
+    """A value in the JSON of an attribute becomes another."""
     names = [name for name, value in file.attrs.items() if str(value)[:1] in "{["]
-    if "anatomies" in file and rng.random() < 0.7:
-        dataset = file["anatomies/000000/about"]
-        stored = json.loads(dataset[...].tobytes())
-        text = json.dumps(_changed(rng, stored)).encode()
-        _replaced(file, dataset, data=np.frombuffer(text, np.uint8))
-    elif names:
+    if names:
         name = pick(rng, tuple(names))
         file.attrs[name] = json.dumps(_changed(rng, json.loads(file.attrs[name])))
 

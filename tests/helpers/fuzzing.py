@@ -144,16 +144,39 @@ def _step() -> Door:
 
 
 def _atlas() -> Door:
+    """An atlas of which one file is a mutant; the name of the mutant says which."""
     import numpy as np
 
-    from avatar_core.atlas.storage import load_atlas
-    from tests.helpers.file_mutations import mutant
+    from tests.helpers.file_mutations import ATLAS_FILES, mutant
 
-    def check(atlas: Any) -> None:
-        for anatomy in atlas.anatomies:
+    def make(seed: int) -> tuple[str, bytes]:
+        kind = ATLAS_FILES[seed % len(ATLAS_FILES)]
+        return kind, mutant(kind, seed // len(ATLAS_FILES))
+
+    def check(found: tuple[list[Any], list[Any]]) -> None:
+        anatomies, arrays = found
+        for anatomy in anatomies:
             assert np.isfinite(anatomy.registered).all() and anatomy.name.isprintable()
+        assert all(np.isfinite(array).all() for array in arrays)
 
-    return _confined(load_atlas, lambda seed: ("h5", mutant("atlas", seed)), check)
+    return _confined(_read_atlas_with, make, check)
+
+
+def _read_atlas_with(mutant: Path) -> tuple[list[Any], list[Any]]:
+    """Anatomies, distances and responses of the small atlas with one file in place of its own."""
+    from avatar_core.atlas.storage import FRAME, load_atlas
+    from tests.helpers.file_mutations import write_small_atlas
+
+    kind = mutant.name.partition(".")[2]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name, "atlas")
+        write_small_atlas(folder)
+        own = folder / FRAME if kind == FRAME else folder / "ball-1" / kind
+        own.write_bytes(mutant.read_bytes())
+        atlas = load_atlas(folder)
+        arrays = [atlas.read_distances(one) for one in atlas.anatomies]
+        responses = [atlas.read_response(one) for one in atlas.anatomies if one.response]
+        return list(atlas.anatomies), [*arrays, *(one.space for one in responses)]
 
 
 def _require_surface(surface: Any) -> None:

@@ -11,13 +11,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from avatar_core.atlas.anatomy import Anatomy, Response
-from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.anatomy import Anatomy, Origin, Response, WholeAnatomy
+from avatar_core.atlas.frame import Frame
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.level_set import GridBox
 from avatar_core.geometry.mesh import MeshQuality, Regions, TetMesh
-from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.block_field import BLOCK, BlockField, blocks_of
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.reduction.near_field import LocalBlocks, Mirror
@@ -86,7 +85,7 @@ def small_vademecum(parametric: bool = False, large: bool = False) -> Vademecum:
     return replace(vademecum, large=_large(rng, vademecum)) if large else vademecum
 
 
-def small_atlas(n_anatomies: int = 2) -> Atlas:
+def small_atlas(n_anatomies: int = 2) -> tuple[Frame, list[WholeAnatomy]]:
     """Balls of some sizes, with responses, on a grid of 27 points."""
     rng = np.random.default_rng(1)
     points, faces = ball()
@@ -94,7 +93,6 @@ def small_atlas(n_anatomies: int = 2) -> Atlas:
     mesh = TetMesh(vertices, np.column_stack([np.full(len(faces), len(points)), faces]))
     clamped = np.arange(len(mesh.boundary_faces)) == 0
     box = GridBox((-0.1, -0.1, -0.1), 0.1, (3, 3, 3))
-    empty = Atlas(Template("ball", mesh, Regions(clamped, ~clamped)), box)
     anatomies = []
     for k in range(n_anatomies):
         size = 1.0 + 0.1 * k
@@ -102,27 +100,22 @@ def small_atlas(n_anatomies: int = 2) -> Atlas:
             1e-3, 2e-3, 1e-3, 2e-3, 0.9, 0.01, MeshQuality(30.0, 120.0, 0.5)
         )
         field = _field(rng, vertices.size, 3 * len(points), RANK)
-        anatomies.append(
-            Anatomy(
-                name=f"ball-{k}",
-                surface=SurfaceMesh(size * points, faces, f"ball-{k}", source_sha256=f"{k:064d}"),
-                volume=4e-4 * size**3,
-                alignment=SimilarityTransform(size, np.eye(3), np.zeros(3)),
-                distances=np.linalg.norm(box.points, axis=1) - size * RADIUS,
-                registered=size * vertices,
-                quality=quality,
-                converged=True,
-                response=Response(
-                    field.space,
-                    field.load,
-                    np.tile(np.eye(3), (len(points), 1, 1)) * 1e-4,
-                    Material(),
-                    "P2",
-                    0.012,
-                ),
-            )
+        stiff = np.tile(np.eye(3), (len(points), 1, 1)) * 1e-4
+        response = Response(field.space, field.load, stiff, Material(), "P2", 0.012)
+        shape = Anatomy(
+            name=f"ball-{k}",
+            key=f"key {k}",
+            origin=Origin(f"{k:064d}", "mm", "RAS", len(points)),
+            volume=4e-4 * size**3,
+            alignment=SimilarityTransform(size, np.eye(3), np.zeros(3)),
+            registered=size * vertices,
+            quality=quality,
+            converged=True,
+            response=response.kind,
         )
-    return empty.with_anatomies(anatomies)
+        distances = np.linalg.norm(box.points, axis=1) - size * RADIUS
+        anatomies.append(WholeAnatomy(shape, distances, response))
+    return Frame(Template("ball", mesh, Regions(clamped, ~clamped)), box), anatomies
 
 
 def _field(rng: np.random.Generator, n_dofs: int, n_loads: int, rank: int) -> SeparatedField:

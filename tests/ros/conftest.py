@@ -295,7 +295,7 @@ def _patients() -> dict[str, bytes]:
             files.append(Path(name, f"{liver.name}.obj"))
             files[-1].write_text("\n".join(lines) + "\n")
         growth = create_atlas(
-            Path(name, "atlas.h5"),
+            Path(name, "atlas"),
             [SurfaceFile(path) for path in files[:N_ATLAS]],
             AtlasOptions(spacing=0.02, rule=rough),
             template=Template("phantom", mesh, regions_by_rule(mesh)),
@@ -303,19 +303,24 @@ def _patients() -> dict[str, bytes]:
             solve_response=ResponseSolver(rank=30),
         )
         assert len(growth.added) == N_ATLAS
-        return {path.name: path.read_bytes() for path in (*files, Path(name, "atlas.h5"))}
+        stored = [*files, *Path(name, "atlas").rglob("*.h5")]
+        return {str(path.relative_to(name)): path.read_bytes() for path in stored}
 
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A library with surfaces, good and bad, and an atlas of all but the last one."""
+    from avatar_core.common.hdf5 import replace_file
+
     folder = tmp_path_factory.mktemp("patients")
     outside = tmp_path_factory.mktemp("elsewhere") / "liver.obj"
     for name, content in _patients().items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
     outside.write_bytes((folder / "liver0.obj").read_bytes())
     (folder / "link.obj").symlink_to(outside)
     (folder / "text.obj").write_text("not a surface")
+    replace_file(folder / "foreign.h5", {}, {"format": "something else"})
     (folder / "large.obj").write_bytes(b"#" * 1_100_000)
     return folder
 

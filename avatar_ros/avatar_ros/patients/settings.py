@@ -15,7 +15,7 @@ WEIGHTINGS = ("kriging", "lle-template", "lle-grid", "lle-paper")
 PATIENT_INTERPOLATION = (
     AUTOSTART,
     Parameter(
-        "atlas", "", "atlas of anatomies with responses (.h5), made by 'avatar atlas create'"
+        "atlas", "", "atlas of anatomies with responses, a folder made by 'avatar atlas create'"
     ),
     Parameter(
         "library_dir",
@@ -62,7 +62,7 @@ def read_interpolation(node: Node) -> InterpolationSettings:
     value = values(node, PATIENT_INTERPOLATION)
     if not value["atlas"]:
         raise ParameterError(
-            "parameter atlas: give the file of an atlas, made by 'avatar atlas create'"
+            "parameter atlas: give the folder of an atlas, made by 'avatar atlas create'"
         )
     if value["weighting"] not in WEIGHTINGS:
         raise ParameterError(f"parameter weighting: give one of {', '.join(WEIGHTINGS)}")

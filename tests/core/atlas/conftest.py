@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import pytest
 
 from avatar_core.atlas import growth as atlas_build
-from avatar_core.atlas.anatomy import Anatomy
-from avatar_core.atlas.growth import AtlasOptions, build_anatomy, new_atlas
+from avatar_core.atlas.anatomy import WholeAnatomy
+from avatar_core.atlas.frame import Frame
+from avatar_core.atlas.growth import AtlasOptions, build_anatomy, new_frame
 from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.storage import load_atlas
 from avatar_core.cli import main as cli
 from avatar_core.geometry.mesh import TetMesh, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import RegistrationRule, Template
-from tests.core.atlas.rough import OPTIONS, Command, N, make_livers, make_template
+from tests.core.atlas.rough import OPTIONS, Command, N, make_livers, make_template, written
 from tests.helpers.disk_cache import cached_on_disk
 
 
@@ -30,24 +33,34 @@ def livers() -> list[SurfaceMesh]:
 
 
 @pytest.fixture(scope="session")
-def empty(template: Template) -> Atlas:
-    return new_atlas(template, OPTIONS)
+def frame(template: Template) -> Frame:
+    return new_frame(template, OPTIONS)
 
 
 @pytest.fixture(scope="session")
-def members() -> list[Anatomy]:
+def members() -> list[WholeAnatomy]:
     return _members(OPTIONS, N)
 
 
 @cached_on_disk
-def _members(options: AtlasOptions, n: int) -> list[Anatomy]:
-    empty = new_atlas(make_template(tetrahedralize(phantom_liver(), 700)), options)
-    return [build_anatomy(empty, liver) for liver in make_livers(n)]
+def _members(options: AtlasOptions, n: int) -> list[WholeAnatomy]:
+    frame = new_frame(make_template(tetrahedralize(phantom_liver(), 700)), options)
+    return [build_anatomy(frame, liver) for liver in make_livers(n)]
 
 
 @pytest.fixture(scope="session")
-def atlas(empty: Atlas, members: list[Anatomy]) -> Atlas:
-    return empty.with_anatomies(members)
+def folder(
+    frame: Frame, members: list[WholeAnatomy], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """An atlas on disk that no test changes."""
+    folder = tmp_path_factory.mktemp("atlas") / "atlas"
+    written(folder, frame, members)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def atlas(folder: Path) -> Atlas:
+    return load_atlas(folder)
 
 
 @pytest.fixture

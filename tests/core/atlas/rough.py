@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from avatar_core.atlas.growth import AtlasOptions
+from avatar_core.atlas.anatomy import WholeAnatomy
+from avatar_core.atlas.frame import Frame
+from avatar_core.atlas.growth import AtlasOptions, _hash_of_options
 from avatar_core.atlas.model import Atlas
+from avatar_core.atlas.storage import load_atlas, save_anatomy, save_frame
 from avatar_core.atlas.workers import Workers
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule
 from avatar_core.geometry.phantom import phantom_liver, population
@@ -44,17 +47,33 @@ def write_obj(path: Path, surface: SurfaceMesh) -> Path:
     return path
 
 
+def written(folder: Path, frame: Frame, members: Sequence[WholeAnatomy]) -> Atlas:
+    """An atlas on disk, as `create_atlas` with the same options begins and fills it."""
+    folder.mkdir()
+    save_frame(folder, frame, _hash_of_options(OPTIONS, frame.template))
+    for member in members:
+        save_anatomy(folder, member)
+    return load_atlas(folder)
+
+
 def same(one: Atlas, other: Atlas) -> bool:
     """Whether two atlases hold the same, bit for bit."""
     return one.names == other.names and all(
-        np.array_equal(a.distances, b.distances)
+        np.array_equal(one.vectors[i], other.vectors[i])
         and np.array_equal(a.registered, b.registered)
-        and np.array_equal(a.surface.vertices, b.surface.vertices)
         and np.array_equal(a.alignment.rotation, b.alignment.rotation)
-        and a.quality == b.quality
-        and a.surface.source_sha256 == b.surface.source_sha256
-        for a, b in zip(one.anatomies, other.anatomies, strict=True)
+        and (a.quality, a.origin, a.key) == (b.quality, b.origin, b.key)
+        for i, (a, b) in enumerate(zip(one.anatomies, other.anatomies, strict=True))
     )
+
+
+def files_of(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """Time of writing and content of every file of an atlas."""
+    return {
+        str(file.relative_to(folder)): (file.stat().st_mtime_ns, file.read_bytes())
+        for file in sorted(folder.rglob("*"))
+        if file.is_file()
+    }
 
 
 class StopError(Exception):

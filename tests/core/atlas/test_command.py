@@ -12,11 +12,9 @@ import pytest
 
 from avatar_core.atlas import growth as atlas_build
 from avatar_core.atlas.growth import AtlasOptions
-from avatar_core.atlas.model import Atlas
-from avatar_core.atlas.storage import save_atlas
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import RegistrationRule, Template
-from tests.core.atlas.rough import ROUGH, Command, write_obj
+from tests.core.atlas.rough import ROUGH, Command, files_of, write_obj
 
 
 @pytest.fixture
@@ -29,7 +27,7 @@ def run(monkeypatch: pytest.MonkeyPatch, avatar: Command, template: Template) ->
 
 @pytest.mark.long
 def test_create_add_and_show(run: Command, livers: list[SurfaceMesh], tmp_path: Path) -> None:
-    file, folder = tmp_path / "a.h5", tmp_path / "livers"
+    file, folder = tmp_path / "atlas", tmp_path / "livers"
     folder.mkdir()
     for liver in livers[:2]:
         write_obj(folder / f"{liver.name}.obj", liver)
@@ -39,15 +37,16 @@ def test_create_add_and_show(run: Command, livers: list[SurfaceMesh], tmp_path: 
     assert code == 0 and "2 of 3 added, 1 skipped; 2 anatomies" in out
     assert "skipped: empty:" in err and "Traceback" not in err
 
-    shutil.copy(folder / "liver0.obj", tmp_path / "twin.obj")
-    code, out, err = run("add", file, tmp_path / "twin.obj", "--jobs", 1)
-    assert code == 0 and "1 of 1 added, 0 skipped; 3 anatomies" in out
-    assert "notice: twin is the same file as liver0" in err
+    twin = tmp_path / "twin.obj"
+    twin.write_text((folder / "liver0.obj").read_text() + "\n")  # the same shape in another file
+    code, out, err = run("add", file, folder / "liver1.obj", twin, "--jobs", 1)
+    assert code == 0 and "1 of 2 added, 1 there before, 0 skipped; 3 anatomies" in out
+    assert "notice: twin has the same shape as liver0" in err
 
     code, out, _ = run("show", file, "--json")
     shown = json.loads(out)
     assert code == 0 and shown["n_anatomies"] == 3 and shown["n_duplicates"] == 1
-    assert shown["bytes"] == file.stat().st_size
+    assert shown["bytes"] == sum(one.stat().st_size for one in file.rglob("*.h5"))
     assert shown["box"]["spacing"] == 0.02
     assert shown["box"]["n_points"] == np.prod(shown["box"]["shape"])
     assert [one["duplicate_of"] for one in shown["anatomies"]] == [None, None, "liver0"]
@@ -74,7 +73,7 @@ def test_a_stopped_command_goes_on(
     more: tuple[str, ...],
 ) -> None:
     options = ("--spacing", 0.02, "--jobs", 1, *more)
-    file = tmp_path / "a.h5"
+    file = tmp_path / "atlas"
     files = [write_obj(tmp_path / f"{liver.name}.obj", liver) for liver in livers[:2]]
     register = atlas_build.register
 
@@ -85,38 +84,39 @@ def test_a_stopped_command_goes_on(
 
     monkeypatch.setattr(atlas_build, "register", stopped)
     code, _, err = run("create", file, *files, *options)
-    assert code == 130 and "run the same command again" in err and not file.exists()
+    assert code == 130 and "run the same command again" in err
     monkeypatch.setattr(atlas_build, "register", register)
     code, out, _ = run("create", file, *files, *options)
-    assert code == 0 and "1 of them from an interrupted build" in out
+    assert code == 0 and "1 of 2 added, 1 there before" in out
 
 
 def test_the_command_refuses_clearly(
-    run: Command, atlas: Atlas, livers: list[SurfaceMesh], tmp_path: Path
+    run: Command, folder: Path, livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:
-    file, liver = tmp_path / "a.h5", write_obj(tmp_path / "liver0.obj", livers[0])
-    hollow = tmp_path / "hollow"
+    file, liver = tmp_path / "atlas", write_obj(tmp_path / "liver0.obj", livers[0])
+    hollow, new = tmp_path / "hollow", tmp_path / "new"
     hollow.mkdir()
-    save_atlas(atlas, file)
-    before = file.read_bytes()
+    shutil.copytree(folder, file)
+    before = files_of(file)
     for arguments, remedy in [
         (["create", file, liver], "avatar atlas add"),
-        (["create", tmp_path / "b.h5", hollow], "should hold"),
-        (["create", tmp_path / "b.h5", tmp_path / "missing.obj", "--jobs", 1], "nothing was"),
-        (["create", tmp_path / "no" / "b.h5", liver], "create it first"),
-        (["create", tmp_path / "b.obj", liver], "choose .h5"),
-        (["create", tmp_path / "b.h5", liver, "--spacing", 0], "spacing"),
-        (["create", tmp_path / "b.h5", liver, "--unit", "inch"], "--unit"),
-        (["create", tmp_path / "b.h5", liver, "--axes", "XYZ"], "axes"),
-        (["create", tmp_path / "b.h5", liver, "--box", 0.1, 0.1, 0.1, "--jobs", 1], "--box"),
-        (["add", tmp_path / "b.h5", liver], "avatar atlas create"),
+        (["create", new, hollow], "should hold"),
+        (["create", new, tmp_path / "missing.obj", "--jobs", 1], "nothing was"),
+        (["create", tmp_path / "no" / "new", liver], "create it first"),
+        (["create", liver, liver], "give the name of a folder"),
+        (["create", tmp_path, liver], "is no atlas"),
+        (["create", new, liver, "--spacing", 0], "spacing"),
+        (["create", new, liver, "--unit", "inch"], "--unit"),
+        (["create", new, liver, "--axes", "XYZ"], "axes"),
+        (["create", new, liver, "--box", 0.1, 0.1, 0.1, "--jobs", 1], "--box"),
+        (["add", new, liver], "avatar atlas create"),
         (["add", file, liver, "--jobs", 0], "--jobs"),
         (["add", file, liver, "--unit", "m", "--jobs", 1], "--unit"),
-        (["show", tmp_path / "b.h5"], "avatar atlas create"),
+        (["show", new], "avatar atlas create"),
         (["show", liver], "atlas"),
     ]:
         code, _, err = run(*arguments)
         assert code == 1, arguments
         assert remedy in err and "Traceback" not in err, (arguments, err)
-    assert file.read_bytes() == before
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.h5", "hollow", "liver0.obj"]
+    assert files_of(file) == before
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["atlas", "hollow", "liver0.obj"]

@@ -8,75 +8,87 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core.atlas.anatomy import Anatomy, AtlasError, Response
+from avatar_core.atlas.anatomy import AtlasError, Response, WholeAnatomy
+from avatar_core.atlas.frame import Frame, box_around
 from avatar_core.atlas.growth import (
     SurfaceFile,
     build_anatomy,
     create_atlas,
     extend_atlas,
-    new_atlas,
+    new_frame,
 )
-from avatar_core.atlas.model import Atlas, box_around
-from avatar_core.atlas.storage import load_atlas, save_atlas
+from avatar_core.atlas.model import Atlas, first_equal
+from avatar_core.atlas.storage import RESPONSE, load_atlas
+from avatar_core.errors import StorageError
 from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.level_set import DistanceGrid
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.lle import fit
 from avatar_core.shapes.registration import Template
-from tests.core.atlas.rough import ALONE, OPTIONS, N, same, write_obj
+from tests.core.atlas.rough import ALONE, OPTIONS, files_of, same, write_obj, written
 
 
 def grid_of(atlas: Atlas, vector: np.ndarray) -> DistanceGrid:
     """A distance vector as a grid on the box."""
-    box = atlas.box
+    box = atlas.frame.box
     return DistanceGrid(np.array(box.origin), box.spacing, vector.reshape(box.shape))
 
 
 # --- growing ----------------------------------------------------------------------------------
 
 
-def test_growing_one_by_one_equals_all_at_once(
-    empty: Atlas, atlas: Atlas, members: list[Anatomy], tmp_path: Path
+def test_adding_computes_and_writes_the_newcomer_alone(
+    frame: Frame,
+    atlas: Atlas,
+    members: list[WholeAnatomy],
+    livers: list[SurfaceMesh],
+    calls: list[str],
+    tmp_path: Path,
 ) -> None:
-    grown = empty
-    for member in members:
-        grown = grown.with_anatomies([member])
-        save_atlas(grown, tmp_path / "a.h5")
-        grown = load_atlas(tmp_path / "a.h5")
-    assert same(grown, atlas)
-    assert grown.template.mesh.tets.tolist() == atlas.template.mesh.tets.tolist()
-    assert (grown.box, grown.rule) == (atlas.box, atlas.rule)
-    # the origins of the products differ, so it is rounding that may differ
-    assert not np.array_equal(grown.gram.origin, atlas.gram.origin)
-    for k in (2, N - 1):
-        one, other = (fit(a.vectors, k, gram=a.gram) for a in (grown, atlas))
-        np.testing.assert_allclose(one.weight_matrix, other.weight_matrix, rtol=0, atol=1e-10)
-        assert np.abs(other.weight_matrix.sum(axis=1) - 1).max() < 1e-12
-
-
-def test_adding_computes_the_newcomer_alone(
-    atlas: Atlas, livers: list[SurfaceMesh], calls: list[str], tmp_path: Path
-) -> None:
-    file = tmp_path / "a.h5"
-    save_atlas(atlas.without_anatomies().with_anatomies(atlas.anatomies[:-1]), file)
-    growth = extend_atlas(file, livers[-1:], workers=ALONE)
+    folder = tmp_path / "atlas"
+    written(folder, frame, members[:-1])
+    before = files_of(folder)
+    growth = extend_atlas(folder, livers[-1:], workers=ALONE)
     assert calls == [livers[-1].name] and growth.added == (livers[-1].name,)
-    assert same(load_atlas(file), atlas)
-    assert list(tmp_path.iterdir()) == [file]
+    assert same(load_atlas(folder), atlas) and same(growth.atlas, atlas)
+    assert files_of(folder).items() > before.items()
+    loaded = load_atlas(folder)
+    assert loaded.frame.template.mesh.tets.tolist() == frame.template.mesh.tets.tolist()
+    assert (loaded.frame.box, loaded.frame.rule) == (frame.box, frame.rule)
+    assert [one.name for one in tmp_path.iterdir()] == ["atlas"]
+
+
+def test_a_surface_that_is_there_is_not_built_again(
+    frame: Frame,
+    members: list[WholeAnatomy],
+    livers: list[SurfaceMesh],
+    calls: list[str],
+    tmp_path: Path,
+) -> None:
+    """A stream of scans can be given as a folder again and again."""
+    folder = tmp_path / "atlas"
+    written(folder, frame, members[:2])
+    twin = replace(livers[1], name="twin")
+    new = replace(livers[2], name="liver0")  # another organ of the same name
+    growth = extend_atlas(folder, [livers[0], twin, new, new], workers=ALONE)
+    assert calls == ["liver0"] and growth.added == ("liver0-2",)
+    assert growth.known == ("liver0", "liver1", "liver0-2") and not growth.skipped
+    assert growth.atlas.names == ("liver0", "liver0-2", "liver1")
 
 
 def test_distances_are_those_of_the_placed_organ_at_its_own_size(
     atlas: Atlas, livers: list[SurfaceMesh]
 ) -> None:
     for one, liver in zip(atlas.anatomies, livers, strict=True):
-        placed = atlas.place(liver, one.alignment)
+        placed = atlas.frame.place(liver, one.alignment)
         assert placed.volume == pytest.approx(liver.volume, rel=1e-9)
         # the interior of the grid at 20 mm: two-lobed organs of 1.5 l, measured 0.4 to 4 %
-        assert grid_of(atlas, one.distances).volume == pytest.approx(one.volume, rel=0.08)
+        assert grid_of(atlas, atlas.read_distances(one)).volume == pytest.approx(
+            one.volume, rel=0.08
+        )
     # elsewhere in the scanner it is the same organ, but for where the alignment's iteration ends
     shifted = replace(livers[0], vertices=livers[0].vertices + np.array([0.4, -0.2, 0.1]))
-    again = build_anatomy(atlas, shifted)
-    difference = again.distances - atlas.anatomies[0].distances
+    again = build_anatomy(atlas.frame, shifted)
+    difference = again.distances - atlas.vectors[0]
     assert np.sqrt(np.mean(difference**2)) < 1e-3
 
 
@@ -88,48 +100,55 @@ def test_registrations_come_back(atlas: Atlas, livers: list[SurfaceMesh]) -> Non
         atlas.registration("nobody")
 
 
-def with_response(atlas: Atlas, name: str, response: Response) -> Atlas:
-    members = list(atlas.anatomies)
-    members[atlas.index(name)] = replace(atlas[name], response=response)
-    return replace(atlas, anatomies=tuple(members))
-
-
-def test_responses_are_kept_and_must_fit(atlas: Atlas, tmp_path: Path) -> None:
-    n = len(atlas.template.mesh.vertices)
+def test_responses_are_kept_and_must_fit(
+    frame: Frame, members: list[WholeAnatomy], tmp_path: Path
+) -> None:
+    n = len(frame.template.mesh.vertices)
     random = np.random.default_rng(0)
     space, load = (random.random((3 * m, 4)).astype(np.float32) for m in (n, 50))
     response = Response(space, load, np.zeros((50, 3, 3)), Material(), "P2", 0.012)
-    save_atlas(with_response(atlas, "liver3", response), tmp_path / "a.h5")
-    loaded = load_atlas(tmp_path / "a.h5")
-    kept = loaded["liver3"].response
-    assert kept is not None and loaded["liver2"].response is None
+    loaded = written(tmp_path / "a", frame, [members[2], replace(members[3], response=response)])
+    assert loaded["liver2"].response is None
+    assert loaded["liver3"].response == response.kind and response.kind.rank == 4
+    kept = loaded.read_response(loaded["liver3"])
     assert kept.space.dtype == np.float32 and np.array_equal(kept.space, space)
     assert np.array_equal(kept.load, load) and not kept.residual_compliance.any()
-    assert (kept.material, kept.element, kept.patch_radius) == (Material(), "P2", 0.012)
-    with pytest.raises(AtlasError, match="liver1: its arrays do not fit"):
-        with_response(atlas, "liver1", replace(response, load=load[:, :3]))
+    assert kept.kind == response.kind
+    with pytest.raises(StorageError, match="liver2 has no response"):
+        loaded.read_response(loaded["liver2"])
+    for name, spoiled in (
+        ("load", replace(response, load=load[:, :3])),
+        ("template", replace(response, space=space[:-3])),
+    ):
+        bad = written(tmp_path / name, frame, [replace(members[1], response=spoiled)])
+        with pytest.raises(StorageError, match=f"{RESPONSE}.*{name}"):
+            bad.read_response(bad.anatomies[0])
 
 
 # --- one, the same, too large -----------------------------------------------------------------
 
 
 def test_duplicates_are_kept_and_reported(
-    atlas: Atlas, empty: Atlas, members: list[Anatomy]
+    frame: Frame, members: list[WholeAnatomy], tmp_path: Path
 ) -> None:
-    hashed = [
-        replace(one, surface=replace(one.surface, source_sha256=f"hash {i}"))
-        for i, one in enumerate(members)
-    ]
-    other_shape = replace(hashed[1], distances=hashed[1].distances + 1e-3)
-    renamed = replace(members[0], name="copy")
-    doubled = empty.with_anatomies([*hashed, renamed, other_shape])
-    assert doubled.names[-2:] == ("copy", "liver1-2")
-    assert [(d.name, d.of, d.same_file) for d in doubled.duplicates] == [
-        ("copy", "liver0", False),
-        ("liver1-2", "liver1", True),
-    ]
+    copy = members[0].shape
+    moved = replace(
+        copy, name="moved", registered=copy.registered + 0.1
+    )  # elsewhere in the scanner
+    doubled = written(tmp_path / "atlas", frame, [*members, replace(members[0], shape=moved)])
+    assert [(one.name, one.of) for one in doubled.duplicates] == [("moved", "liver0")]
     assert "same shape as liver0" in str(doubled.duplicates[0])
-    assert doubled.with_anatomies([members[1]]).names[-1] == "liver1-3"
+
+
+def test_equal_vectors_are_found_among_those_of_equal_length() -> None:
+    random = np.random.default_rng(0)
+    vectors = random.normal(size=(40, 12))
+    vectors /= np.linalg.norm(vectors, axis=1)[:, None]  # all next to each other
+    vectors[[7, 30]] = vectors[3]
+    vectors[9] = vectors[5] * (1 + 1e-8)
+    same = first_equal(vectors)
+    assert {i: int(same[i]) for i in np.flatnonzero(same != np.arange(40))} == {7: 3, 30: 3, 9: 5}
+    assert len(first_equal([])) == 0
 
 
 def test_what_is_doubtful_of_a_file_is_said(
@@ -140,7 +159,7 @@ def test_what_is_doubtful_of_a_file_is_said(
     file = write_obj(tmp_path / "liver0.obj", small)
     file.write_text("# SPACE=LPS\n" + file.read_text())
     source = SurfaceFile(file, axes="RAS")
-    growth = create_atlas(tmp_path / "a.h5", [source], OPTIONS, template=template, workers=ALONE)
+    growth = create_atlas(tmp_path / "atlas", [source], OPTIONS, template=template, workers=ALONE)
     (said,) = (line for line in growth.notices if "SPACE=LPS" in line)
     assert said.startswith("liver0: axes RAS")
     assert any(line.startswith("liver0: the organ holds") for line in growth.notices)
@@ -168,7 +187,7 @@ def test_unreasonable_boxes_are_refused(
 
 
 def test_an_organ_that_sticks_out_is_refused(template: Template, livers: list[SurfaceMesh]) -> None:
-    narrow = new_atlas(template, replace(OPTIONS, largest=(0.1, 0.3, 0.3)))
+    narrow = new_frame(template, replace(OPTIONS, largest=(0.1, 0.3, 0.3)))
     with pytest.raises(AtlasError, match="larger --box"):
         build_anatomy(narrow, livers[0])
 
@@ -176,7 +195,7 @@ def test_an_organ_that_sticks_out_is_refused(template: Template, livers: list[Su
 def test_an_organ_longer_than_the_box_is_not_even_registered(
     template: Template, livers: list[SurfaceMesh], calls: list[str]
 ) -> None:
-    tiny = new_atlas(template, replace(OPTIONS, largest=(0.12, 0.12, 0.12)))
+    tiny = new_frame(template, replace(OPTIONS, largest=(0.12, 0.12, 0.12)))
     with pytest.raises(AtlasError, match="larger --box"):
         build_anatomy(tiny, livers[0])
     assert calls == []

@@ -12,75 +12,84 @@ from pathlib import Path
 import pytest
 
 from avatar_core.atlas import growth as atlas_build
-from avatar_core.atlas.anatomy import Anatomy, AtlasError
-from avatar_core.atlas.checkpoint import checkpoint_of
-from avatar_core.atlas.growth import (
-    AnatomyBuilder,
-    SurfaceFile,
-    checkpoint_keys,
-    create_atlas,
-    extend_atlas,
-    new_atlas,
-)
-from avatar_core.atlas.model import Atlas
-from avatar_core.atlas.storage import load_atlas, save_atlas
+from avatar_core.atlas.anatomy import AtlasError, WholeAnatomy
+from avatar_core.atlas.frame import Frame
+from avatar_core.atlas.growth import SurfaceFile, _folder_of, create_atlas, extend_atlas, key_of
+from avatar_core.atlas.storage import SHAPE, load_atlas
 from avatar_core.errors import StorageError
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import Template
-from tests.core.atlas.rough import ALONE, OPTIONS, ROUGH, StopError, same, stop_after, write_obj
+from tests.core.atlas.rough import (
+    ALONE,
+    OPTIONS,
+    ROUGH,
+    StopError,
+    files_of,
+    same,
+    stop_after,
+    write_obj,
+    written,
+)
 from tests.helpers.paths import ROOT
 
 
 def test_an_interrupted_build_goes_on_where_it_stopped(
-    template: Template,
+    frame: Frame,
     livers: list[SurfaceMesh],
-    members: list[Anatomy],
+    members: list[WholeAnatomy],
     calls: list[str],
     tmp_path: Path,
 ) -> None:
-    file, folder = tmp_path / "a.h5", tmp_path / "a.h5.parts"
-    build = partial(create_atlas, file, livers[:4], OPTIONS, template=template, workers=ALONE)
+    folder = tmp_path / "atlas"
+    build = partial(
+        create_atlas, folder, livers[:4], OPTIONS, template=frame.template, workers=ALONE
+    )
     with pytest.raises(StopError):
         build(progress=stop_after(3))
-    assert not file.exists() and len(list(folder.iterdir())) == 3
-    damaged = max(folder.iterdir())
-    content = bytearray(damaged.read_bytes())
-    content[len(content) // 2] ^= 1
-    damaged.write_bytes(content)
+    assert load_atlas(folder).names == ("liver0", "liver1", "liver2")
+    (folder / "liver1" / SHAPE).unlink()  # the last file of an anatomy: a kill before it
+    before = files_of(folder)
     calls.clear()
     seen: list[tuple[int, int]] = []
     growth = build(progress=lambda done, total, name: seen.append((done, total)))
-    assert growth.resumed == 2 and len(calls) == 2  # the fourth, and the damaged one
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    assert not folder.exists()
-    assert same(load_atlas(file), new_atlas(template, OPTIONS).with_anatomies(members[:4]))
+    assert growth.known == ("liver0", "liver2") and calls == ["liver1", "liver3"]
+    assert seen == [(3, 4), (4, 4)]
+    kept = {name: file for name, file in before.items() if not name.startswith("liver1")}
+    assert files_of(folder).items() > kept.items()
+    assert same(load_atlas(folder), written(tmp_path / "other", frame, members[:4]))
 
 
-def test_parts_of_another_template_or_rule_are_not_used(
+def test_other_options_are_another_atlas(
     template: Template, livers: list[SurfaceMesh], calls: list[str], tmp_path: Path
 ) -> None:
-    build = partial(create_atlas, tmp_path / "a.h5", livers[:2], template=template, workers=ALONE)
+    folder = tmp_path / "atlas"
+    build = partial(create_atlas, folder, livers[:2], template=template, workers=ALONE)
     with pytest.raises(StopError):
         build(OPTIONS, progress=stop_after(1))
-    other = replace(OPTIONS, rule=replace(ROUGH, n_stages=6))
-    calls.clear()
-    assert build(other).resumed == 0 and len(calls) == 2
-    assert [one.name for one in tmp_path.iterdir()] == ["a.h5"]
+    before = files_of(folder)
+    with pytest.raises(AtlasError, match="avatar atlas add"):
+        build(replace(OPTIONS, rule=replace(ROUGH, n_stages=6)))
+    assert files_of(folder) == before
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    (mixed / "thesis.txt").touch()
+    with pytest.raises(AtlasError, match="is no atlas"):
+        create_atlas(mixed, livers[:1], OPTIONS, template=template, workers=ALONE)
+    assert [one.name for one in mixed.iterdir()] == ["thesis.txt"]
 
 
-def test_a_part_belongs_to_the_bytes_and_the_reading_of_a_file(
-    empty: Atlas, livers: list[SurfaceMesh], tmp_path: Path
+def test_a_key_is_of_the_bytes_and_the_reading_of_a_file(
+    livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:
-    builder, path = AnatomyBuilder(empty), write_obj(tmp_path / "liver.obj", livers[0])
-    file = SurfaceFile(path)
+    file = SurfaceFile(write_obj(tmp_path / "liver.obj", livers[0]))
+    renamed = SurfaceFile(write_obj(tmp_path / "other.obj", livers[0]))
     readings = [file, replace(file, unit="cm"), replace(file, axes="LPS"), replace(file, label=1)]
-    keys = checkpoint_keys(builder, readings) + checkpoint_keys(
-        AnatomyBuilder(empty, print), [file]
-    )
-    write_obj(path, livers[1])
-    keys += checkpoint_keys(builder, [file])
-    assert len({*keys}) == 6 and None not in keys
-    assert checkpoint_keys(builder, [SurfaceFile(tmp_path / "missing.obj")]) == [None]
+    keys = [key_of(one) for one in readings]
+    assert key_of(renamed) == keys[0]
+    write_obj(file.path, livers[1])
+    keys.append(key_of(file))
+    assert len({*keys}) == 5 and None not in keys
+    assert key_of(SurfaceFile(tmp_path / "missing.obj")) is None
 
 
 def test_a_template_that_was_made_is_made_once(
@@ -92,68 +101,71 @@ def test_a_template_that_was_made_is_made_once(
 ) -> None:
     made: list[int] = []
     monkeypatch.setattr(atlas_build, "default_template", lambda n: made.append(n) or template)
-    build = partial(create_atlas, tmp_path / "a.h5", livers[:2], OPTIONS, workers=ALONE)
+    build = partial(create_atlas, tmp_path / "atlas", livers[:2], OPTIONS, workers=ALONE)
     with pytest.raises(StopError):
         build(progress=stop_after(1))
-    assert build().resumed == 1 and made == [OPTIONS.template_vertices]
+    assert build().known == ("liver0",) and made == [OPTIONS.template_vertices]
 
 
 @pytest.mark.parametrize("broken", ["fsync", "replace"])
-def test_a_crash_during_add_leaves_the_file_as_it_was(
-    atlas: Atlas,
+@pytest.mark.parametrize("at", [1, 2])  # the level set; the shape
+def test_a_full_disk_leaves_the_atlas_as_it_was(
+    frame: Frame,
+    members: list[WholeAnatomy],
     livers: list[SurfaceMesh],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    calls: list[str],
     broken: str,
+    at: int,
 ) -> None:
-    file = tmp_path / "a.h5"
-    save_atlas(atlas.without_anatomies().with_anatomies(atlas.anatomies[:2]), file)
-    before = file.read_bytes()
+    folder = tmp_path / "atlas"
+    atlas = written(folder, frame, members[:2])
+    before = files_of(folder)
     working, n_calls = getattr(os, broken), 0
 
-    def fails_at_the_atlas(*arguments: object) -> None:
+    def fails(*arguments: object) -> None:
         nonlocal n_calls
         n_calls += 1
-        if n_calls == 2:  # the first is the part's
+        if n_calls == at:
             raise OSError(28, "No space left on device")
         working(*arguments)
 
-    monkeypatch.setattr(os, broken, fails_at_the_atlas)
+    monkeypatch.setattr(os, broken, fails)
     with pytest.raises(StorageError, match="free disk space"):
-        extend_atlas(file, livers[2:3], workers=ALONE)
-    assert file.read_bytes() == before
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.h5", "a.h5.parts"]
+        extend_atlas(folder, livers[2:3], workers=ALONE)
+    assert files_of(folder).items() >= before.items() and same(load_atlas(folder), atlas)
     monkeypatch.setattr(os, broken, working)
-    (tmp_path / "a.h5.parts" / ".killed.h5.tmp").touch()
-    calls.clear()
-    assert extend_atlas(file, livers[2:3], workers=ALONE).resumed == 1 and calls == []
-    assert load_atlas(file).names == atlas.names[:3]
-    assert list(tmp_path.iterdir()) == [file]
+    assert extend_atlas(folder, livers[2:3], workers=ALONE).added == ("liver2",)
 
 
-def test_killed_in_the_middle_of_a_write(atlas: Atlas, tmp_path: Path) -> None:
-    file = tmp_path / "a.h5"
-    save_atlas(atlas, file)
-    before = file.read_bytes()
+def test_killed_in_the_middle_of_a_write(
+    frame: Frame, members: list[WholeAnatomy], tmp_path: Path
+) -> None:
+    folder = tmp_path / "atlas"
+    atlas = written(folder, frame, members[:2])
+    before = files_of(folder)
     script = (
         "import os, signal, sys\n"
-        "from avatar_core.atlas.storage import load_atlas, save_atlas\n"
+        "from dataclasses import replace\n"
+        "from pathlib import Path\n"
+        "from avatar_core.atlas.anatomy import WholeAnatomy\n"
+        "from avatar_core.atlas.storage import load_atlas, save_anatomy\n"
         "os.fsync = lambda handle: os.kill(os.getpid(), signal.SIGKILL)\n"
         "atlas = load_atlas(sys.argv[1])\n"
-        "save_atlas(atlas.with_anatomies(atlas.anatomies[:1]), sys.argv[1])\n"
+        "shape = replace(atlas.anatomies[0], name='third')\n"
+        "save_anatomy(Path(sys.argv[1]), WholeAnatomy(shape, atlas.vectors[0]))\n"
     )
-    killed = subprocess.run([sys.executable, "-c", script, str(file)], cwd=ROOT, check=False)
+    killed = subprocess.run([sys.executable, "-c", script, str(folder)], cwd=ROOT, check=False)
     assert killed.returncode == -9
-    assert file.read_bytes() == before and same(load_atlas(file), atlas)
+    assert files_of(folder).items() >= before.items() and same(load_atlas(folder), atlas)
 
 
 def test_two_builds_of_one_atlas_at_once_are_refused(
     template: Template, livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:
-    file = tmp_path / "a.h5"
-    with checkpoint_of(file):
+    folder = tmp_path / "atlas"
+    with _folder_of(folder):
         with pytest.raises(AtlasError, match="another build"):
-            create_atlas(file, livers[:1], OPTIONS, template=template, workers=ALONE)
-        assert (tmp_path / "a.h5.parts").is_dir()
+            create_atlas(folder, livers[:1], OPTIONS, template=template, workers=ALONE)
+        assert folder.is_dir()
     assert not any(tmp_path.iterdir())

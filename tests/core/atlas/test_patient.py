@@ -11,6 +11,7 @@ import pytest
 import scipy.sparse as sp
 
 from avatar_core.atlas.base import PatientBase, PatientError, leave_one_out
+from avatar_core.atlas.model import centred
 from avatar_core.atlas.patient import PatientOptions, build_patient, patient_vademecum
 from avatar_core.atlas.patient_problem import (
     PatientProblem,
@@ -19,7 +20,7 @@ from avatar_core.atlas.patient_problem import (
     said_of_missed,
     template_problem,
 )
-from avatar_core.atlas.transfer import Weighting, centred, combine, kriging, patient_weights
+from avatar_core.atlas.transfer import Weighting, combine, kriging, patient_weights
 from avatar_core.errors import LLEError, SurfaceError
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.reduction.galerkin import (
@@ -328,8 +329,8 @@ def test_a_ridge_spreads_the_weights_of_all_neighbours(case: Case) -> None:
     assert len(spread.weights) == len(case.base.names)
     assert spread.weights.sum() == pytest.approx(1.0, abs=1e-9)
     plain = barycenter(
-        list(centred(case.base.vertices)),
-        centred(case.problem.registration.mesh.vertices),
+        centred(case.base.vertices),
+        centred([case.problem.registration.mesh.vertices])[0],
         len(case.base.names),
     )
     assert spread.absolute_sum < plain.absolute_sum

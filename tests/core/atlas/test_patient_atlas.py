@@ -10,13 +10,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from avatar_core.atlas.anatomy import Anatomy
+from avatar_core.atlas.anatomy import WholeAnatomy
 from avatar_core.atlas.base import PatientError, base_of, numbers_of
-from avatar_core.atlas.growth import build_anatomy, new_atlas
+from avatar_core.atlas.frame import Frame
+from avatar_core.atlas.growth import build_anatomy, new_frame
 from avatar_core.atlas.model import Atlas
 from avatar_core.atlas.patient import PatientOptions, patient_vademecum
 from avatar_core.atlas.response import ResponseSolver
-from avatar_core.atlas.storage import load_atlas, save_atlas
+from avatar_core.atlas.storage import load_atlas
 from avatar_core.errors import RegistrationError
 from avatar_core.fem.norms import relative_l2
 from avatar_core.geometry.mesh import tetrahedralize
@@ -25,7 +26,7 @@ from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.reduction.galerkin import ReductionRule
 from avatar_core.studies.transport import summarized, transport_row
 from avatar_core.vademecum.storage import load_vademecum
-from tests.core.atlas.rough import OPTIONS, Command, make_livers, make_template, write_obj
+from tests.core.atlas.rough import OPTIONS, Command, make_livers, make_template, write_obj, written
 from tests.helpers.disk_cache import cached_on_disk
 
 pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
@@ -41,25 +42,25 @@ def files(livers: list[SurfaceMesh], tmp_path_factory: pytest.TempPathFactory) -
 
 
 @pytest.fixture(scope="module")
-def atlas(empty: Atlas) -> Atlas:
-    """Members with their responses."""
-    return empty.with_anatomies(_with_responses())
-
-
-@cached_on_disk
-def _with_responses() -> list[Anatomy]:
-    with TemporaryDirectory() as folder:
-        files = [write_obj(Path(folder) / f"{one.name}.obj", one) for one in make_livers(N)]
-        surfaces = [read_surface(file) for file in files]
-    empty = new_atlas(make_template(tetrahedralize(phantom_liver(), 700)), OPTIONS)
-    return [build_anatomy(empty, surface, ResponseSolver(rank=30)) for surface in surfaces]
+def file(frame: Frame, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An atlas of members with their responses."""
+    path = tmp_path_factory.mktemp("atlas") / "atlas"
+    written(path, frame, _with_responses())
+    return path
 
 
 @pytest.fixture(scope="module")
-def file(atlas: Atlas, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("atlas") / "atlas.h5"
-    save_atlas(atlas, path)
-    return path
+def atlas(file: Path) -> Atlas:
+    return load_atlas(file)
+
+
+@cached_on_disk
+def _with_responses() -> list[WholeAnatomy]:
+    with TemporaryDirectory() as folder:
+        files = [write_obj(Path(folder) / f"{one.name}.obj", one) for one in make_livers(N)]
+        surfaces = [read_surface(file) for file in files]
+    frame = new_frame(make_template(tetrahedralize(phantom_liver(), 700)), OPTIONS)
+    return [build_anatomy(frame, surface, ResponseSolver(rank=30)) for surface in surfaces]
 
 
 def test_a_member_gets_its_own_vademecum_bit_for_bit(
@@ -72,8 +73,7 @@ def test_a_member_gets_its_own_vademecum_bit_for_bit(
     )
     assert member.neighbours[0] == "liver2" and member.weights[0] == 1.0
     assert member.weights[1:].any() == np.False_
-    own, response = member.vademecum, atlas["liver2"].response
-    assert response is not None
+    own, response = member.vademecum, atlas.read_response(atlas["liver2"])
     assert np.array_equal(own.mesh.vertices, atlas["liver2"].registered)
     np.testing.assert_allclose(  # modes are sorted by worth, which rotates them
         own.contact_load @ own.contact_load.T, response.load @ response.load.T, atol=1e-8
@@ -90,25 +90,26 @@ def test_a_member_gets_its_own_vademecum_bit_for_bit(
 
 
 @pytest.mark.long
-def test_copies_count_once(atlas: Atlas, files: list[Path]) -> None:
-    doubled = atlas.with_anatomies([atlas["liver1"]])
-    base = base_of(doubled)
+def test_copies_count_once(frame: Frame, files: list[Path], tmp_path: Path) -> None:
+    members = _with_responses()
+    copy = replace(members[1], shape=replace(members[1].shape, name="liver9"))
+    base = base_of(written(tmp_path / "atlas", frame, [*members, copy]))
     assert base.copies == (N,)
     patient = patient_vademecum(read_surface(files[N]), base, "interpolated", QUICK)
-    assert "liver1-2" not in patient.neighbours
+    assert "liver9" not in patient.neighbours
     assert patient.weights.sum() == pytest.approx(1.0, abs=1e-9)
 
 
 @pytest.mark.long
-def test_an_atlas_of_one_answers(atlas: Atlas, files: list[Path]) -> None:
-    alone = atlas.without_anatomies().with_anatomies([atlas["liver0"]])
+def test_an_atlas_of_one_answers(frame: Frame, files: list[Path], tmp_path: Path) -> None:
+    alone = written(tmp_path / "atlas", frame, _with_responses()[:1])
     options = replace(QUICK, n_certified=0)
     patient = patient_vademecum(read_surface(files[N]), base_of(alone), "interpolated", options)
     assert patient.neighbours == ("liver0",) and patient.weights.tolist() == [1.0]
 
 
-def test_shapes_without_responses_are_refused(atlas: Atlas) -> None:
-    bare = replace(atlas, anatomies=tuple(replace(one, response=None) for one in atlas.anatomies))
+def test_shapes_without_responses_are_refused(atlas: Atlas, folder: Path) -> None:
+    bare = load_atlas(folder)
     with pytest.raises(PatientError, match="--shapes-only"):
         base_of(bare)
     with pytest.raises(PatientError, match="nobody"):

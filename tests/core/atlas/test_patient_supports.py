@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -99,8 +99,7 @@ def test_a_patient_on_supports_is_that_of_full_finite_elements(
         supports=HELD,
         reduction=ReductionRule(n_start=20, n_block=6, n_probes=8, max_solution_fraction=0.6),
     )
-    base = bent.base
-    base.registrations[bent.surface.source_sha256] = bent.registration
+    base = replace(bent.base, registration_of=lambda _: bent.registration)
     found = patient_vademecum(bent.surface, base, fidelity, options).vademecum  # type: ignore[arg-type]
     assert found.certificate is not None and found.certificate.l2_mean < 0.1
     file = tmp_path_factory.mktemp("held") / f"{fidelity}.h5"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from avatar_core.atlas import growth as atlas_build
-from avatar_core.atlas.anatomy import Anatomy, AtlasError
+from avatar_core.atlas.anatomy import AtlasError, WholeAnatomy
 from avatar_core.atlas.growth import SurfaceFile, create_atlas
 from avatar_core.atlas.storage import load_atlas
 from avatar_core.atlas.workers import Workers
@@ -44,8 +44,8 @@ def test_bad_surfaces_are_skipped(
         replace(livers[2], vertices=3 * livers[2].vertices),
         livers[3],
     ]
-    growth = create_atlas(tmp_path / "a.h5", sources, OPTIONS, template=template, workers=ALONE)
-    assert growth.added == ("liver3",) == load_atlas(tmp_path / "a.h5").names
+    growth = create_atlas(tmp_path / "atlas", sources, OPTIONS, template=template, workers=ALONE)
+    assert growth.added == ("liver3",) == load_atlas(tmp_path / "atlas").names
     assert [one.name for one in growth.skipped] == ["half", "liver1", "missing", "liver2"]
     reasons = [one.reason for one in growth.skipped]
     words = ("open", "LinAlgError", "check the path", "--box")
@@ -57,10 +57,10 @@ def test_bad_surfaces_are_skipped(
 
 
 def test_processes_give_the_same_atlas(
-    template: Template, livers: list[SurfaceMesh], members: list[Anatomy], tmp_path: Path
+    template: Template, livers: list[SurfaceMesh], members: list[WholeAnatomy], tmp_path: Path
 ) -> None:
     threads = os.environ.get("OMP_NUM_THREADS")
-    file = tmp_path / "a.h5"
+    file = tmp_path / "atlas"
     growth = create_atlas(file, livers[:2], OPTIONS, template=template, workers=Workers(jobs=2))
     assert growth.added == ("liver0", "liver1")
     # sums in other orders when threads are more or fewer: rounding, through a converged iteration
@@ -90,7 +90,7 @@ def cluster() -> Iterator[Any]:
 def test_a_cluster_builds_too_though_a_worker_is_killed(
     template: Template,
     livers: list[SurfaceMesh],
-    members: list[Anatomy],
+    members: list[WholeAnatomy],
     tmp_path: Path,
     cluster: Any,
 ) -> None:
@@ -104,7 +104,7 @@ def test_a_cluster_builds_too_though_a_worker_is_killed(
             os.kill(killed[0], signal.SIGKILL)
 
     growth = create_atlas(
-        tmp_path / "a.h5",
+        tmp_path / "atlas",
         [source, *livers[1:4], missing],
         OPTIONS,
         template=template,
@@ -143,5 +143,5 @@ def test_without_dask_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "distributed", None)
     workers = Workers(scheduler="tcp://127.0.0.1:1")
     with pytest.raises(AtlasError, match=r"\.\[cluster\]"):
-        create_atlas(tmp_path / "a.h5", livers[:1], OPTIONS, template=template, workers=workers)
+        create_atlas(tmp_path / "atlas", livers[:1], OPTIONS, template=template, workers=workers)
     assert not any(tmp_path.iterdir())

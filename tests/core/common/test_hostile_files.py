@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from avatar_core.atlas.storage import load_atlas
+from avatar_core.atlas.storage import FRAME, load_atlas
 from avatar_core.common.files import FileError, content_of, opened
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.geometry.surface import read_surface
@@ -117,7 +117,7 @@ def test_hostile_structure_is_refused_before_it_is_read(what: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("read", [load_vademecum, load_atlas, read_surface, read_distributions])
+@pytest.mark.parametrize("read", [load_vademecum, read_surface, read_distributions])
 def test_only_ordinary_files_are_opened(tmp_path: Path, read: Callable[[Path], object]) -> None:
     pipe = tmp_path / "pipe.obj"
     os.mkfifo(pipe)  # opening it would wait for a writer
@@ -125,6 +125,13 @@ def test_only_ordinary_files_are_opened(tmp_path: Path, read: Callable[[Path], o
         with pytest.raises(AvatarError, match="not a file"):
             read(path)
     assert not is_vademecum(pipe)
+
+
+def test_only_ordinary_files_of_an_atlas_are_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / FRAME)
+    for path in (tmp_path, tmp_path / FRAME):
+        with pytest.raises(AvatarError, match=r"not a file|Not a directory"):
+            load_atlas(path)
 
 
 def test_a_file_is_no_larger_than_allowed(tmp_path: Path) -> None:

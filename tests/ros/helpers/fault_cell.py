@@ -165,7 +165,7 @@ class FaultCell:
         """Start a process anew."""
         kept = [f"state_dir:={self._state_dir}"] if self._state_dir else []
         files = [f"library_dir:={self.library}", "vademecum:=liver.h5", *kept]
-        rough = [f"library_dir:={self.patients}", f"atlas:={self.patients / 'atlas.h5'}"]
+        rough = [f"library_dir:={self.patients}", f"atlas:={self.patients / 'atlas'}"]
         modules = {
             "loader": ("vademecum_loader", files),
             "contact": ("contact", [f"safety.max_force:={MOST}", *self._contact, *kept]),

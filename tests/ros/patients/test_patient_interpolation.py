@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,8 @@ from rcl_interfaces.srv import DescribeParameters
 from rclpy.action import ActionClient, get_action_server_names_and_types_by_node
 from shape_msgs.msg import Mesh
 
-from avatar_core.atlas.storage import load_atlas, save_atlas
+from avatar_core.atlas.anatomy import WholeAnatomy
+from avatar_core.atlas.storage import load_atlas, save_anatomy, save_frame
 from avatar_core.common.child import computed_by
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.vademecum.storage import load_vademecum
@@ -49,7 +49,7 @@ INTERPOLATED = 30.0  # processor time from file to file, as the README says [s]
 
 
 def _values(folder: Path, *more: str) -> list[str]:
-    return [f"atlas:={folder / 'atlas.h5'}", f"library_dir:={folder}", "vertices:=350", *more]
+    return [f"atlas:={folder / 'atlas'}", f"library_dir:={folder}", "vertices:=350", *more]
 
 
 def _start(environment: dict[str, str], folder: Path, *more: str, remap: str = "") -> Module:
@@ -272,7 +272,7 @@ BAD_REQUESTS: list[tuple[dict[str, Any], str]] = [
     ({"surface": "missing.obj"}, "No such file"),
     ({"surface": "large.obj"}, "raise max_megabytes"),
     ({"surface": "text.obj"}, "text.obj"),
-    ({"surface": "atlas.h5"}, "atlas.h5"),
+    ({"surface": "foreign.h5"}, "foreign.h5"),
     ({**PATIENT, "neighbors": -1}, "neighbors is -1"),
     ({**PATIENT, "tolerance": math.nan}, "tolerance is nan"),
     ({**PATIENT, "fidelity": "exact"}, "unknown fidelity 'exact'"),
@@ -284,7 +284,7 @@ BAD_REQUESTS: list[tuple[dict[str, Any], str]] = [
     ({**PATIENT, "fidelity": "reduced", "supports": ["nowhere"]}, "NAME alone for one of"),
     ({**PATIENT, "name": "../escaped"}, "plain file name"),
     ({**PATIENT, "name": "x" * 300}, "shorter"),
-    ({**PATIENT, "name": "atlas.h5"}, "is no vademecum; choose another name"),
+    ({**PATIENT, "name": "foreign.h5"}, "is no vademecum; choose another name"),
     ({"mesh": _box(0.2), "unit": "mm"}, "given in m and RAS"),
     ({"mesh": _without(_box(0.2), "lid")}, "open"),
     ({"mesh": _without(_box(0.2), "number")}, "mesh-interpolated"),
@@ -323,7 +323,7 @@ def test_a_wrong_parameter_ends_the_node(own_domain: dict[str, str], folder: Pat
     ("arguments", "reason"),
     [
         (["atlas:=''"], "parameter atlas"),
-        (["atlas:=/nowhere.h5"], "no atlas at /nowhere.h5"),
+        (["atlas:=/nowhere"], "no atlas at /nowhere"),
         (["atlas:=SHAPES"], "no anatomy of the atlas has a response"),
         (["library_dir:=/nowhere"], "is no directory"),
         (["weighting:=nearest"], "kriging"),
@@ -335,10 +335,12 @@ def test_a_wrong_parameter_is_refused(
     own_domain: dict[str, str], folder: Path, tmp_path: Path, arguments: list[str], reason: str
 ) -> None:
     if "atlas:=SHAPES" in arguments:
-        atlas = load_atlas(folder / "atlas.h5")
-        shapes = tuple(replace(anatomy, response=None) for anatomy in atlas.anatomies)
-        save_atlas(replace(atlas, anatomies=shapes), tmp_path / "shapes.h5")
-        arguments = [f"atlas:={tmp_path / 'shapes.h5'}"]
+        atlas, shapes = load_atlas(folder / "atlas"), tmp_path / "shapes"
+        shapes.mkdir()
+        save_frame(shapes, atlas.frame, "")
+        for shape, distances in zip(atlas.anatomies, atlas.vectors, strict=True):
+            save_anatomy(shapes, WholeAnatomy(shape, distances))
+        arguments = [f"atlas:={shapes}"]
     assert reason in refusal(NODE, *_values(folder, *arguments))
 
 

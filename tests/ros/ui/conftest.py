@@ -121,7 +121,7 @@ def nodes(
     from tests.ros.helpers.browser import TOKEN, nodes_of_a_page
 
     library = ["-p", f"library_dir:={folder}"]
-    patients = ["-p", f"atlas:={folder / 'atlas.h5'}", "-p", "vertices:=350"]
+    patients = ["-p", f"atlas:={folder / 'atlas'}", "-p", "vertices:=350"]
     arguments = {
         "vademecum_loader": [*library, "-p", "vademecum:=liver.h5"],
         "contact": [*PATIENT[1:], *contact],

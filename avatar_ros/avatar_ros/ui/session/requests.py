@@ -27,7 +27,7 @@ START = {
     "vademecum_loader": "the loader is not running, so no organ can be chosen: "
     "start it with `ros2 run avatar_ros vademecum_loader`",
     "patient_interpolation": "the node that builds patients is not running: "
-    "start it with an atlas, `avatar cell --atlas FILE.h5`",
+    "start it with an atlas, `avatar cell --atlas FOLDER`",
 }
 _PARAMETERS = {name: key for key, name in MATERIAL.items()}  # of the contact node, by coordinate
 
