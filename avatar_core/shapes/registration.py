@@ -5,7 +5,8 @@
 W is the distortion of the tetrahedra against the aligned template, c_i the point of the target
 nearest to surface vertex i, and p_j(x) the point of the template's surface nearest to target sample
 q_j. Distances count along the surface normal, and in both directions, so that thin lobes are
-filled. The stiffness falls stage by stage. As W is infinite on a flat tetrahedron and every step
+filled; in the last stages, samples that are not reached pull the template towards them, as the
+normals of a tip's two faces lengthen nothing. The stiffness falls stage by stage. As W is infinite on a flat tetrahedron and every step
 lowers the sum, no tetrahedron inverts.
 """
 
@@ -50,13 +51,14 @@ class RegistrationRule:
     first_stiffness, last_stiffness : of the distortion against the distances, both made
         dimensionless with the cube root of the target's volume
     n_stages, sweeps : the stiffness falls by equal factors in ``n_stages`` of ``sweeps`` steps
-    last_sweeps : of steps that follow in the last stage, until the tolerance is met
+    last_sweeps : of steps that follow in the last stage, until the tolerance and the reach are met
     tolerance : mean node-to-surface distance at which the registration has converged [m]
+    reach : distance from a target sample beyond which the template is pulled straight to it [m]
     largest_mean, largest_reverse_mean : mean distance beyond which a registration has failed, from
         the template's vertices to the target and from the target to the template's faces [m]
     least_jacobian : volume of a tetrahedron over its aligned one below which it has failed
-    largest_distortion : W above which the target is not of the template's kind; livers measure
-        0.16 to 0.55, a torus 1.7
+    largest_distortion : W above which the target is not of the template's kind; 64 livers measure
+        0.21 to 0.85, a torus 2.4
     n_samples : springs from the target; three times as many samples are searched for the nearest
     normal_length : distance that a normal turned by one radian counts as [m]
     tangential : stiffness of springs along the surface over that across it in the first stage;
@@ -69,12 +71,13 @@ class RegistrationRule:
     last_stiffness: float = 2e-4
     n_stages: int = 14
     sweeps: int = 1
-    last_sweeps: int = 4
-    tolerance: float = 0.2e-3
+    last_sweeps: int = 8
+    tolerance: float = 0.3e-3
+    reach: float = 4e-3
     largest_mean: float = 0.5e-3
     largest_reverse_mean: float = 2.5e-3
     least_jacobian: float = 0.01
-    largest_distortion: float = 1.0
+    largest_distortion: float = 1.3
     n_samples: int = 4000
     normal_length: float = 0.03
     tangential: float = 0.1
@@ -203,7 +206,7 @@ def register(
     for stiffness in rule.stiffnesses:
         positions, step = fit.step(positions, float(stiffness))
         history.append(step)
-        if history[-1].mean_distance <= rule.tolerance:
+        if step.mean_distance <= rule.tolerance and fit.missed(positions) <= rule.reach:
             break
     reached = measure(fit.distortion, template.mesh, positions, target)
     _require_close(reached, surface.name, rule)
@@ -246,6 +249,7 @@ class _Fit:
         """Update the springs, then take a Newton step with Armijo's line search."""
         exact, length = stiffness < self.rule.exact_stiffness, self.rule.normal_length
         springs = surface_springs(x, self.mesh, self.target, None if exact else length)
+        springs = springs.straightened(x, self.rule.reach) if exact else springs
         size = self.target.volume ** (1.0 / 3.0)
         springs = replace(springs, weights=springs.weights / size**2)
         A, b = springs.system(len(x), 0.0 if exact else self._tangential(stiffness))
@@ -264,6 +268,10 @@ class _Fit:
         distance, _ = self.target.closest(x[self.mesh.surface_vertices])
         jacobian = float(self.distortion.jacobians(x).min())
         return x, RegistrationStep(stiffness, value, length, float(distance.mean()), jacobian)
+
+    def missed(self, x: FloatArray) -> float:
+        """Largest distance of a target sample from the template [m]."""
+        return float(self.target.distance_to(x, self.mesh.boundary_faces).max())
 
     @cached_property
     def _analysis(self) -> rslab.LdltSymbolic:

@@ -6,7 +6,7 @@ the two faces of a thin lobe apart; without a length, it is the closest point.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import igl
 import numpy as np
@@ -124,6 +124,15 @@ class Springs:
     def points(self, positions: FloatArray) -> FloatArray:
         """Ends of the springs on the template, shape (m, 3) [m]."""
         return np.einsum("ik,ikd->id", self.barycentric, positions[self.nodes])
+
+    def straightened(self, positions: FloatArray, reach: float) -> Springs:
+        """The same, but those longer than ``reach`` [m] pull along their gap."""
+        gap = self.anchors - self.points(positions)
+        length = np.linalg.norm(gap, axis=1)
+        far = length > reach
+        normals = self.normals.copy()
+        normals[far] = gap[far] / length[far, None]
+        return replace(self, normals=normals)
 
     def system(self, n_vertices: int, tangential: float) -> tuple[sp.csr_matrix, FloatArray]:
         """A and b with |A x - b|^2 = sum w (gap . n)^2 + tangential w |gap - (gap . n) n|^2."""

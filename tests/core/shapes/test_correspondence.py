@@ -179,7 +179,7 @@ def test_template_lies_on_an_affinely_warped_organ_without_inversion(warped, pha
     target = replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT)
     distance = distance_to(target, warped.mesh)
     assert warped.converged
-    assert distance.mean() < RegistrationRule().tolerance  # 0.2 mm: where it stops
+    assert distance.mean() < RegistrationRule().tolerance
     assert distance.mean() == pytest.approx(warped.quality.mean_distance)
     assert warped.mesh.tet_volumes.min() > 0
     assert warped.quality.least_jacobian > 0.2  # the warp itself: 1.21 in every tetrahedron
@@ -356,10 +356,12 @@ def test_points_are_located_where_the_winding_number_says_inside(warped):
 
 
 def assert_fits(template: Template, surface: SurfaceMesh) -> None:
+    """On the surface in the mean, and near its thin tips: without reach 8 to 13 mm off."""
     registration = register(template, surface)
-    assert distance_to(surface, registration.mesh).mean() < 0.3e-3
+    assert distance_to(surface, registration.mesh).mean() < 0.45e-3
     assert registration.mesh.tet_volumes.min() > 0
-    assert registration.quality.reverse_mean_distance < 2e-3
+    assert registration.quality.reverse_mean_distance < 0.9e-3
+    assert registration.quality.reverse_max_distance < 9e-3
 
 
 def test_template_lies_on_a_real_liver(template, livers_dir: Path):
