@@ -20,6 +20,8 @@ from avatar_core.offline.supports import SupportOption, held_at
 from avatar_core.shapes.correspondence import carry_faces, carry_regions, registered_positions
 from avatar_core.shapes.registration import Registration
 
+MISSED = 3e-3  # distance from a mesh, of parts that it does not reach [m]
+
 
 @dataclass(frozen=True, eq=False)
 class PatientProblem:
@@ -101,13 +103,26 @@ def template_problem(
     return PatientProblem(surface, own, own.mesh, template.regions, loads, elasticity)
 
 
-def missed(problem: PatientProblem) -> tuple[float, np.ndarray]:
-    """Largest distance of the patient's surface to the mesh [m], and its place, shape (3,) [m]."""
+def distances_to_mesh(problem: PatientProblem) -> np.ndarray:
+    """Distances of the vertices of the patient's surface from the mesh, shape (n,) [m]."""
     points = problem.surface.vertices
     closest, _, _ = closest_points(problem.mesh.vertices, problem.mesh.boundary_faces, points)
-    distance = np.linalg.norm(points - closest, axis=1)
+    return np.asarray(np.linalg.norm(points - closest, axis=1))
+
+
+def missed(problem: PatientProblem) -> tuple[float, np.ndarray]:
+    """Largest distance of the patient's surface to the mesh [m], and its place, shape (3,) [m]."""
+    distance = distances_to_mesh(problem)
     worst = int(np.argmax(distance))
-    return float(distance[worst]), points[worst]
+    return float(distance[worst]), problem.surface.vertices[worst]
+
+
+def missed_part(problem: PatientProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [m] and faces of the patient's surface with a corner ``MISSED`` off the mesh."""
+    faces = problem.surface.faces
+    far = faces[(distances_to_mesh(problem) > MISSED)[faces].any(axis=1)]
+    used, local = np.unique(far, return_inverse=True)
+    return problem.surface.vertices[used], local.reshape(-1, 3)
 
 
 def said_of_missed(problem: PatientProblem) -> str:

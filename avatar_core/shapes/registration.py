@@ -5,9 +5,9 @@
 W is the distortion of the tetrahedra against the aligned template, c_i the point of the target
 nearest to surface vertex i, and p_j(x) the point of the template's surface nearest to target sample
 q_j. Distances count along the surface normal, and in both directions, so that thin lobes are
-filled; in the last stages, samples that are not reached pull the template towards them, as the
-normals of a tip's two faces lengthen nothing. The stiffness falls stage by stage. As W is infinite on a flat tetrahedron and every step
-lowers the sum, no tetrahedron inverts.
+filled. In the last stages, samples that are not reached pull the template straight to them, as the
+normals of a tip's two faces lengthen nothing. The stiffness falls stage by stage. As W is infinite
+on a flat tetrahedron and every step lowers the sum, no tetrahedron inverts.
 """
 
 from __future__ import annotations

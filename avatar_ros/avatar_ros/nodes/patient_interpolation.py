@@ -62,6 +62,12 @@ def patient_request(request: Any, settings: InterpolationSettings) -> PatientReq
             f"tolerance is {request.tolerance:g}; give a fraction between 0 and 1, or 0 for the "
             "default"
         )
+    first = getattr(request, "interpolated_first", False)
+    if first and (request.groups or request.supports):
+        raise RefusedError(
+            "interpolated_first: an interpolated organ is clamped as the template; ask without it, "
+            "or without groups and supports"
+        )
     fidelity = request.fidelity or _DEFAULT_FIDELITY
     made_of = "mesh" if inline else stem(Path(request.surface).name) or "surface"
     if request.label:
@@ -91,6 +97,7 @@ def patient_request(request: Any, settings: InterpolationSettings) -> PatientReq
         groups=groups,
         supports=tuple(request.supports),
         preview=getattr(request, "preview", False),
+        interpolated_first=first,
         leave_out=tuple(request.leave_out),
         neighbors=request.neighbors,
         fidelity=fidelity,
@@ -233,6 +240,7 @@ def _fill(answer: Any, built: Built | Previewed) -> None:
     if isinstance(built, Previewed):
         answer.boundary = conversions.surface_mesh(built.vertices, built.faces)
         answer.regions = array("B", built.regions.tobytes())
+        answer.missed = conversions.surface_mesh(*built.missed)
         answer.notices, answer.seconds = built.notices, built.seconds
         answer.displacement_error = math.nan
         answer.message = "previewed; no file was written"

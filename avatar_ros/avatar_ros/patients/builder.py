@@ -31,6 +31,7 @@ from avatar_ros.patients.protocol import (
 )
 
 _LATENCY = 0.05  # longest until a cancellation is noticed [s]
+_NOTHING = "; no file was written"
 _REPEAT = 0.5  # after which a stage is reported again, for clients that came late [s]
 _STOP_TIMEOUT = 5.0  # for writing a file, which is not interrupted [s]
 
@@ -132,13 +133,13 @@ class PatientBuilder:
                 elif isinstance(note, Built | Previewed):
                     return note
                 elif isinstance(note, BuildRefused):
-                    raise BuildError(note.reason)
+                    raise BuildError(f"{note.reason}{_of_first(stage)}")
         except EndedError as error:
             if ending:
-                raise CancelledError("cancelled; no file was written") from error
+                raise CancelledError(f"cancelled{_of_first(stage) or _NOTHING}") from error
             raise BuildError(
-                f"the building process ended ({error}), perhaps for want of memory; no "
-                "file was written: ask again, or for fewer vertices"
+                f"the building process ended ({error}), perhaps for want of memory"
+                f"{_of_first(stage) or _NOTHING}: ask again, or for fewer vertices"
             ) from error
         finally:
             if ending or not self._worker.is_running:
@@ -161,3 +162,8 @@ class PatientBuilder:
         if not self._stop.is_set():
             with contextlib.suppress(EndedError):  # the next request says so
                 self._worker.start()
+
+
+def _of_first(stage: Stage) -> str:
+    """What is said of the interpolated vademecum that was written first, if there is one."""
+    return f"; {stage.file} holds the interpolated one" if stage.file else ""

@@ -53,6 +53,7 @@ class PatientRequest:
     groups : file of clamped, accessible and held points; empty for the template's
     supports : as on the command line; empty for the clamp
     preview : only register, mesh and clamp
+    interpolated_first : write an interpolated vademecum to the file, before a better one
     neighbors : 0 for all
     tolerance : 0 for the default
     output : file to write
@@ -68,6 +69,7 @@ class PatientRequest:
     groups: str
     supports: tuple[str, ...]
     preview: bool
+    interpolated_first: bool
     leave_out: tuple[str, ...]
     neighbors: int
     fidelity: str
@@ -78,11 +80,15 @@ class PatientRequest:
 
 @dataclass(frozen=True)
 class Stage:
-    """The finished ``fraction`` of a ``stage``, and the ``error`` so far (NaN: unknown)."""
+    """The finished ``fraction`` of a ``stage``, and the ``error`` so far (NaN: unknown).
+
+    file : interpolated vademecum that was written first; empty if there is none
+    """
 
     stage: str
     fraction: float
     error: float
+    file: str = ""
 
 
 @dataclass(frozen=True)
@@ -106,11 +112,13 @@ class Previewed:
     vertices : ndarray, shape (n, 3) [m]; faces : (m, 3)
     regions : ndarray of uint8, shape (m,): 0 free, 1 clamped, 2 accessible, 3 on the first of the
         springs, and so on
+    missed : vertices [m] and faces of the patient's own surface that the mesh does not reach
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     regions: np.ndarray
+    missed: tuple[np.ndarray, np.ndarray]
     notices: list[str]
     seconds: float = 0.0
 

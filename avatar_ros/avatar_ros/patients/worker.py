@@ -23,16 +23,18 @@ from avatar_core.atlas.patient import (
     Fidelity,
     Patient,
     PatientOptions,
+    build_patient,
     patient_vademecum,
     posed_patient,
     require_fidelity,
 )
-from avatar_core.atlas.patient_problem import PatientProblem
+from avatar_core.atlas.patient_problem import PatientProblem, missed_part
 from avatar_core.atlas.storage import load_atlas
 from avatar_core.common.child import line_to_starter
 from avatar_core.errors import one_line
 from avatar_core.geometry.groups import read_groups
 from avatar_core.geometry.surface import SurfaceMesh
+from avatar_core.offline.rule import Progress
 from avatar_core.offline.supports import SupportOption
 from avatar_core.vademecum import storage
 from avatar_core.vademecum.display import boundary
@@ -87,8 +89,10 @@ def build(
     AvatarError, OSError : nothing was written
     """
 
+    first, base = "", atlas.base
+
     def report(stage: str, fraction: float, error: float) -> None:
-        connection.send(Stage(stage, min(float(fraction), 1.0), float(error)))
+        connection.send(Stage(stage, min(float(fraction), 1.0), float(error), first))
 
     require_fidelity(request.fidelity)
     options = _options(request, atlas.base, settings)
@@ -104,7 +108,10 @@ def build(
         connection.send(previewed)
         return previewed
     options = replace(options, inside=read_inside(request, reader))
-    patient = patient_vademecum(surface, atlas.base, fidelity, options, report)
+    if request.interpolated_first and fidelity != "interpolated":
+        base = write_first(surface, base, options, Path(request.output), report)
+        first = os.path.basename(request.output)
+    patient = patient_vademecum(surface, base, fidelity, options, report)
     report("save", 0.0, math.nan)
     with _uninterrupted():
         require_replaceable(Path(request.output), reader)
@@ -112,6 +119,17 @@ def build(
         built = _result_of(patient, identity, surface, atlas, request)
         connection.send(built)
     return built
+
+
+def write_first(
+    surface: SurfaceMesh, base: PatientBase, options: PatientOptions, file: Path, report: Progress
+) -> PatientBase:
+    """Write an interpolated vademecum; returns the base, which then knows the registration."""
+    problem, weights = posed_patient(surface, base, "interpolated", options, report)
+    patient = build_patient(problem, base, weights, "interpolated", options, report)
+    with _uninterrupted():
+        storage.save_vademecum(patient.vademecum, file)
+    return replace(base, registration_of=lambda _: problem.registration)
 
 
 def preview_of(problem: PatientProblem, supports: Sequence[SupportOption]) -> Previewed:
@@ -124,7 +142,7 @@ def preview_of(problem: PatientProblem, supports: Sequence[SupportOption]) -> Pr
         if support.name in springs:
             regions[springs[support.name]] = FIRST_SPRING + k
     notices = [*problem.surface.notices, *problem.notices, *problem.registration.notices]
-    return Previewed(vertices, faces, regions.astype(np.uint8), notices)
+    return Previewed(vertices, faces, regions.astype(np.uint8), missed_part(problem), notices)
 
 
 def _groups(request: PatientRequest, reader: Reader) -> dict[str, np.ndarray] | None:

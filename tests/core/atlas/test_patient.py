@@ -16,6 +16,7 @@ from avatar_core.atlas.patient import PatientOptions, build_patient, patient_vad
 from avatar_core.atlas.patient_problem import (
     PatientProblem,
     missed,
+    missed_part,
     patient_problem,
     said_of_missed,
     template_problem,
@@ -345,6 +346,9 @@ def test_what_a_registered_template_misses_is_measured_and_said(case: Case) -> N
     out = vertices[tip] - vertices.mean(axis=0)
     vertices[tip] += 0.02 * out / np.linalg.norm(out)
     longer = replace(problem, surface=replace(case.problem.surface, vertices=vertices))
+    points, faces = missed_part(longer)
+    assert len(missed_part(problem)[1]) < len(faces) < 20  # those around the tip
+    assert (np.linalg.norm(points - vertices[tip], axis=1) < 0.06).all()
     far, place = missed(longer)
     np.testing.assert_array_equal(place, vertices[tip])
     assert far == pytest.approx(0.02, abs=near + 2e-3)

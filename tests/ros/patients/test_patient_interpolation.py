@@ -206,6 +206,44 @@ def test_springs_are_previewed_and_hold_what_is_built(
     np.testing.assert_array_equal(vademecum.regions.clamped, regions == 1)
 
 
+def test_an_interpolated_patient_is_there_first(node: Module, probe: Any, folder: Path) -> None:
+    """It can be loaded while the better one is solved, which then has its name."""
+    asked = PATIENT | {"fidelity": "reduced", "tolerance": 0.2, "name": "first"}
+    pursuit = Pursuit(probe, **asked, interpolated_first=True)
+    probe.until(lambda: any(told.file for told in pursuit.told), TIMEOUT)
+    first = load_vademecum(folder / "first.h5")
+    assert {told.file for told in pursuit.told} == {"", "first.h5"}
+    status, built = pursuit.result()
+    assert (status, built.file) == (GoalStatus.STATUS_SUCCEEDED, "first.h5"), built.message
+    better = load_vademecum(folder / "first.h5")
+    assert better.certificate.l2_mean < first.certificate.l2_mean
+    assert len(first.mesh.vertices) != len(better.mesh.vertices)  # that of the template
+    registered = [told.stage for told in pursuit.told if told.file].count("registration")
+    assert registered <= 1  # begun, but known: the template is registered once
+    held = {"interpolated_first": True, "supports": ["bare_area"], "fidelity": "reduced"}
+    status, refused = Pursuit(probe, **PATIENT, **held).result()
+    assert status == GoalStatus.STATUS_ABORTED and "interpolated_first" in refused.message
+
+
+def test_a_preview_shows_what_the_template_does_not_reach(
+    node: Module, probe: Any, folder: Path
+) -> None:
+    """A thin tip of 2 cm."""
+    lines = (folder / "liver0.obj").read_text().splitlines()
+    points = np.array([line.split()[1:] for line in lines if line.startswith("v")], float)
+    tip = int(np.argmax(points[:, 0]))
+    x, y, z = points[tip] + [20.0, 0.0, 0.0]
+    lines[tip] = f"v {x} {y} {z}"
+    (folder / "pointed.obj").write_text("\n".join(lines))
+    asked = {"surface": "pointed.obj", "fidelity": "interpolated", "preview": True}
+    _, found = Pursuit(probe, **asked).result()
+    assert found.success, found.message
+    shown = np.array([[point.x, point.y, point.z] for point in found.missed.vertices])
+    assert len(found.missed.triangles) > 2
+    assert np.linalg.norm(shown - 1e-3 * np.array([x, y, z]), axis=1).min() < 1e-6
+    assert any("off the surface" in line for line in found.notices)
+
+
 # --- what the pages say -----------------------------------------------------------------------
 
 

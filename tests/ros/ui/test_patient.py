@@ -36,12 +36,19 @@ class Cell(Noted):
 
     def __init__(self, result: Any) -> None:
         super().__init__(
-            build_patient=lambda wanted, progress, report, then: then(result),
-            show=lambda points, faces, regions: self.drawn.append(regions),
-            show_preview=self._show_preview,
+            build_patient=self._build, show=self._show, show_preview=self._show_preview
         )
         self.result, self.drawn = result, list[np.ndarray]()
         self.springs: dict[str, float] = {}
+
+    def _build(self, wanted: Wanted, progress: Any, report: Any, then: Any, first: Any) -> None:
+        if wanted.interpolated_first:
+            first("first.h5")
+        then(self.result)
+
+    def _show(self, points: Any, faces: Any, regions: np.ndarray, missed: Any) -> None:
+        self.drawn.append(regions)
+        self.missed = missed
 
     def _show_preview(self, is_shown: bool, springs: dict[str, float] | None = None) -> None:
         self.springs = springs or {}
@@ -59,7 +66,8 @@ def cell(cube: Organ) -> Cell:
     regions = np.where(at.accessible, ACCESSIBLE, 0)
     regions[at.clamped] = CLAMPED
     boundary = surface_mesh(cube.vertices, cube.faces)
-    return Cell(SimpleNamespace(boundary=boundary, regions=regions, file="x.h5"))
+    missed = surface_mesh(cube.vertices[cube.faces[0]] + 0.01, np.array([[0, 1, 2]]))
+    return Cell(SimpleNamespace(boundary=boundary, regions=regions, missed=missed, file="x.h5"))
 
 
 @pytest.fixture
@@ -83,6 +91,9 @@ def test_painted_regions_reach_the_next_build_of_that_organ_alone(
     new.build(wanted)
     assert new.is_previewing and cell.of("show_preview") == [True]
     assert "hidden" in new.alerts("liver")[0]
+    points, faces = cell.missed
+    np.testing.assert_allclose(points, cube.vertices[cube.faces[0]] + 0.01)
+    assert faces.tolist() == [[0, 1, 2]]
     free = int(np.flatnonzero(cell.drawn[-1] == 0)[0])
     ray = towards(cube, free)
     new.paint(*ray)  # without a brush
@@ -93,8 +104,9 @@ def test_painted_regions_reach_the_next_build_of_that_organ_alone(
     assert (cell.drawn[-1] == CLAMPED).sum() > (cell.drawn[0] == CLAMPED).sum()
     new.build(Wanted("other.stl", fidelity="reduced"))
     assert cell.asked.groups == ""
-    new.build(wanted._replace(preview=False))
+    new.build(wanted._replace(preview=False, interpolated_first=True))
     assert cell.asked.groups == "cube-groups.npz"
+    assert not cell.asked.interpolated_first  # its clamp is the template's
     painted = regions_of_groups(cube.vademecum.mesh, read_groups(tmp_path / "cube-groups.npz"))
     np.testing.assert_array_equal(painted.clamped, cell.drawn[-1] == CLAMPED)
     new.end_preview()
@@ -157,6 +169,31 @@ def test_a_patient_that_was_built_is_offered_and_the_organ_in_use_stays(
     assert not tab._use.visible
 
 
+def test_an_interpolated_organ_in_use_gives_way_to_the_better_one(
+    new: NewPatient, cell: Cell, server: ViserServer, user: Noted
+) -> None:
+    tab = PatientTab(server.gui, user, user.load, tuple(BRUSHES))  # type: ignore[arg-type]
+    new._tab = lambda: tab
+    (use,) = tab._use._impl.update_cb
+
+    def build(used: bool) -> None:
+        def working(wanted: Wanted, progress: Any, report: Any, then: Any, first: Any) -> None:
+            first("first.h5")
+            assert tab._use.visible and tab._use.label == "Use first.h5 so far"
+            if used:
+                use(None)
+            then(cell.result)
+
+        new._requests = SimpleNamespace(build_patient=working)  # type: ignore[assignment]
+        new.build(Wanted("cube.stl", fidelity="reduced", interpolated_first=True))
+
+    build(used=False)
+    assert not user.calls and tab._use.visible and tab._use.label == "Use x.h5"
+    build(used=True)
+    assert user.of("load") == ["first.h5", "x.h5"] and not tab._use.visible
+    assert cell.of("built") == ["first.h5", "x.h5"] * 2
+
+
 def test_labels_are_offered_of_a_label_map_alone(
     new: NewPatient, cell: Cell, tmp_path: Path
 ) -> None:
@@ -212,7 +249,9 @@ def test_labels_of_a_file_reach_the_build(tab: PatientTab, user: Noted) -> None:
 
 def test_springs_are_asked_for_by_stiffness(tab: PatientTab, user: Noted) -> None:
     assert tab._wanted().supports == () and not tab._stiffness.visible
+    assert tab._wanted().interpolated_first and not tab._wanted(preview=True).interpolated_first
     tab._held.value = SPRUNG
+    assert not tab._wanted().interpolated_first
     assert tab._stiffness.visible
     for name in ATTACHMENTS:
         tab._springs[name].value = FREE

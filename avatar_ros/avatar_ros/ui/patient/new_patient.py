@@ -31,13 +31,16 @@ class Preview:
 
     wanted : what it is a preview of
     points : ndarray, shape (n, 3) [m]; faces : (m, 3)
-    regions : ndarray of uint8, shape (m,); is_painted : they are not the template's
+    regions : ndarray of uint8, shape (m,)
+    missed : points [m] and faces of parts of the organ that the surface does not reach
+    is_painted : the regions are not the template's
     """
 
     wanted: Wanted
     points: np.ndarray
     faces: np.ndarray
     regions: np.ndarray
+    missed: tuple[np.ndarray, np.ndarray]
     is_painted: bool = False
 
     def painted(self, place: np.ndarray, radius: float, region: int) -> Preview:
@@ -133,8 +136,9 @@ class NewPatient:
                 tab.end("not built")
             elif wanted.preview:
                 tab.end(f"previewed in {spent:.0f} s")
-                points, faces = mesh_arrays(result.boundary)
-                self._show(Preview(wanted, points, faces, np.array(result.regions, np.uint8)))
+                regions = np.array(result.regions, np.uint8)
+                around = (*mesh_arrays(result.boundary), regions, mesh_arrays(result.missed))
+                self._show(Preview(wanted, *around))
             else:
                 tab.end(f"built in {spent:.0f} s", result.file)
                 self._built(result.file)
@@ -145,8 +149,14 @@ class NewPatient:
         except AvatarError as error:
             self._say(str(error))
             return
+
+        def first(file: str) -> None:
+            self._tab().offer_first(file)
+            self._built(file)
+
         self._tab().begin()
-        self._requests.build_patient(wanted, self._tab().show_progress, self._say, finished)
+        tell = (self._tab().show_progress, self._say, finished, first)
+        self._requests.build_patient(wanted, *tell)
 
     def cancel(self) -> None:
         """Cancel the build that is under way, if any."""
@@ -162,7 +172,7 @@ class NewPatient:
         np.savez_compressed(content, allow_pickle=False, **preview.groups())
         with replaced(self._folder / name) as file:
             file.write_bytes(content.getvalue())
-        return wanted._replace(groups=name)
+        return wanted._replace(groups=name, interpolated_first=False)
 
     # --- The preview -------------------------------------------------------------------------
 
@@ -172,7 +182,7 @@ class NewPatient:
 
     def _show(self, preview: Preview) -> None:
         self._preview = preview
-        self._view.show(preview.points, preview.faces, preview.regions)
+        self._view.show(preview.points, preview.faces, preview.regions, preview.missed)
         self._tab().show_preview(True, preview.springs)
 
     def end_preview(self) -> None:

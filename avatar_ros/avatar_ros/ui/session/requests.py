@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -44,6 +45,7 @@ class Wanted(NamedTuple):
     groups : file of the library with clamp, access and springs; empty for those of the template
     supports : springs instead of the clamp, as on the command line; empty for the clamp
     preview : show what would hold it, and build nothing
+    interpolated_first : write an interpolated one to the file first
     """
 
     surface: str
@@ -56,13 +58,16 @@ class Wanted(NamedTuple):
     groups: str = ""
     supports: tuple[str, ...] = ()
     preview: bool = False
+    interpolated_first: bool = False
 
 
-class _Build(NamedTuple):
-    """Who hears of a build: in words, and its result."""
+@dataclass
+class _Build:
+    """Who hears of a build: in words, and its result; has_first: the interpolated one is there."""
 
     report: Report
     then: Callable[[Any], None]
+    has_first: bool = False
 
 
 class Requests:
@@ -195,9 +200,16 @@ class Requests:
         self._get.call_async(GetParameters.Request(names=list(names))).add_done_callback(answered)
 
     def build_patient(
-        self, wanted: Wanted, progress: Progress, report: Report, then: Callable[[Any], None]
+        self,
+        wanted: Wanted,
+        progress: Progress,
+        report: Report,
+        then: Callable[[Any], None],
+        first: Callable[[str], None] = lambda file: None,
     ) -> None:
         """Build or preview a patient; calls ``then`` with the result, None if there is none.
+
+        first : hears once of the interpolated file, if that was asked for
 
         One at a time: another is refused until then.
         """
@@ -214,6 +226,9 @@ class Requests:
         def note(message: Any) -> None:
             stage = message.feedback
             progress(stage.stage, stage.fraction, stage.error)
+            if stage.file and not pending.has_first:
+                pending.has_first = True
+                first(stage.file)
 
         def finished(done: Any) -> None:
             result = done.result().result

@@ -12,7 +12,7 @@ from avatar_core.common.supports import ATTACHMENTS
 from avatar_ros.ui.patient.new_patient import NewPatient
 from avatar_ros.ui.session.requests import Wanted
 from avatar_ros.ui.tabs.choices import NOTHING, set_options
-from avatar_ros.ui.view.legend import key_of_access, key_of_clamp, key_of_springs
+from avatar_ros.ui.view.legend import key_of_access, key_of_clamp, key_of_missed, key_of_springs
 
 ORGAN, INSIDE = "organ", "inside it"
 ROLES = (NOTHING, ORGAN, INSIDE)
@@ -48,6 +48,12 @@ class PatientTab:
         self._tolerance = gui.add_slider(
             "Tolerance [%]", min=0.5, max=20.0, step=0.5, initial_value=3.0
         )
+        self._first = gui.add_checkbox(
+            "Interpolate first",
+            initial_value=True,
+            hint="an interpolated organ in seconds, replaced by the better one when that is there; "
+            "with the clamp of the template alone",
+        )
         self._held = gui.add_dropdown("Held by", (CLAMPED, SPRUNG))
         self._stiffness = gui.add_folder("Stiffness per area [N/m\u00b3]", visible=False)
         with self._stiffness:
@@ -58,7 +64,8 @@ class PatientTab:
         ).on_click(lambda _: self._ask(preview=True))
         self._preview = [
             gui.add_html(
-                f'<div style="{_SECTION}">{key_of_clamp()}{key_of_access()} to tools</div>',
+                f'<div style="{_SECTION}">{key_of_clamp()}{key_of_access()} to tools '
+                f"{key_of_missed()}</div>",
                 visible=False,
             ),
             areas := gui.add_html("", visible=False),
@@ -85,6 +92,7 @@ class PatientTab:
         self._built = ""
         self._use = gui.add_button("", visible=False, hint="in place of the organ in use")
         self._use.on_click(lambda _: self._on_use())
+        self._is_first_used = False
         self._began = {"": 0.0}
 
     def _ask(self, preview: bool = False) -> None:
@@ -112,6 +120,7 @@ class PatientTab:
             self._named(INSIDE),
             supports=self._supports() if self._held.value == SPRUNG else (),
             preview=preview,
+            interpolated_first=self._first.value and self._held.value == CLAMPED and not preview,
         )
 
     def _supports(self) -> tuple[str, ...]:
@@ -161,19 +170,31 @@ class PatientTab:
 
     def _on_use(self) -> None:
         self._use.visible = False
+        self._is_first_used = self._progress.visible  # the better one is still being built
         self._load(self._built)
 
     def begin(self) -> None:
         """A build or a preview begins; it can be cancelled."""
+        self._is_first_used = False
         self._use.visible = False
         self._progress.visible = self._cancel.visible = True
         self.show_progress("begins", 0.0, float("nan"))
 
+    def offer_first(self, file: str) -> None:
+        """Offer the interpolated organ while a better one is being built."""
+        self._built, self._use.label, self._use.visible = file, f"Use {file} so far", True
+
     def end(self, how: str, file: str = "") -> None:
-        """A build or a preview has ended; the file that was built is offered."""
+        """A build or a preview has ended; the file that was built is offered.
+
+        Where the interpolated one is in use, the better one takes its place.
+        """
         self._progress.visible = self._cancel.visible = False
         self._stage.content = how
-        self._built, self._use.label, self._use.visible = file, f"Use {file}", bool(file)
+        self._built, self._use.label = file, f"Use {file}"
+        self._use.visible = bool(file) and not self._is_first_used
+        if file and self._is_first_used:
+            self._load(file)
 
     def show_progress(self, stage: str, fraction: float, error: float) -> None:
         """Show how far a stage is, and how long it takes yet at this pace."""

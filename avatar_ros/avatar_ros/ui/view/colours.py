@@ -20,6 +20,7 @@ TISSUE = (196, 112, 99)
 CLAMP = ((70, 70, 70), (165, 165, 165))  # checks where the organ is held
 SPRINGS = (70, 70, 70)  # hatching where springs hold the organ
 ACCESS = (38, 84, 124)  # stripes where tools reach
+MISSED = (240, 228, 66)  # parts of an organ that a template does not reach
 HELD = (170, 170, 170)  # of a shape that is not that of now
 _DARKEST, _LIGHTEST = 0.42, 1.15  # over the colour of tissue
 _LIGHT = np.array([0.35, 0.75, 0.55])  # towards the lamp: from the front, above, a bit right

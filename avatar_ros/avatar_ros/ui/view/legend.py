@@ -5,6 +5,7 @@ from __future__ import annotations
 from avatar_ros.ui.view.colours import (
     ACCESS,
     CLAMP,
+    MISSED,
     N_BANDS,
     SPRINGS,
     TISSUE,
@@ -69,3 +70,8 @@ def key_of_access() -> str:
     """The pattern of what tools reach, and its name."""
     stripes = f"repeating-linear-gradient(135deg, rgb{ACCESS} 0 2px, rgb{TISSUE} 2px 6px)"
     return f'<span style="{_KEY};background:{stripes}"></span>access'
+
+
+def key_of_missed() -> str:
+    """The colour of what a registered template does not reach, and its name."""
+    return f'<span style="{_KEY};background:rgb{MISSED}"></span>not reached'
