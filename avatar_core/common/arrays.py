@@ -10,6 +10,12 @@ IntArray = NDArray[np.integer]
 Soup = tuple[FloatArray, IntArray]  # points and triangles
 
 
+def short(values: FloatArray) -> NDArray[np.float32]:
+    """Values of 12 significant bits, which compress: off by 1.2e-4 of each at most."""
+    bits = np.asarray(values, np.float32).view(np.uint32)
+    return ((bits + np.uint32(1 << 11)) & np.uint32(0xFFFFF000)).view(np.float32)
+
+
 def farthest_points(points: FloatArray, n: int, first: int = 0) -> IntArray:
     """Some points far from one another: each the farthest from all before it.
 

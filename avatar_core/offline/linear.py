@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
+from avatar_core.common.arrays import short
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface, patch_loads
 from avatar_core.geometry.mesh import Regions
@@ -90,6 +91,7 @@ def build_vademecum(
     if with_body:
         space, load, trailing = _with_body(elasticity, loads, modes, n_global)
         body = body_response(elasticity, space)
+    trailing = short(trailing)  # what is near takes up the difference
     far = SeparatedField(elasticity.at_vertices(space), load)
     region, blocks = rule.regions(surface), blocks_to_display(elasticity.mesh, display)
     parts, errors = modes_of_regions(far, response, region, elasticity, rule, _half(progress, 0))
@@ -114,7 +116,7 @@ def build_vademecum(
         far=SeparatedField(far.space.astype(np.float32), load.astype(np.float32)),
         blocks=blocks,
         field=field,
-        trailing=trailing.astype(np.float32),
+        trailing=trailing,
         contact_near=contact_near(
             contact_blocks(response, surface, support),
             np.hstack([load, trailing]),
