@@ -1,7 +1,9 @@
 """Parts of an organ's boundary from groups of points, as a segmentation of the images gives them.
 
-A boundary face belongs to a group if all three of its corners lie closer to a point of that group
-than the mesh's mean surface edge.
+A boundary face belongs to a group if half of it lies between the group's points: seen from there
+along the surface, they stand on all sides. Nodes of another mesh and voxels of a segmentation so
+give the area that they cover, and not one that is wider by an edge. Up to three points stand for
+the faces whose corners are all within the mesh's mean surface edge of one.
 """
 
 from __future__ import annotations
@@ -14,7 +16,14 @@ from scipy.spatial import cKDTree
 
 from avatar_core.errors import MeshError, one_line
 from avatar_core.geometry.mesh import Regions, TetMesh, checked, touching
+from avatar_core.geometry.point_location import barycentric_centroids
 
+_FEW = 4  # points of a group, from which on they cover an area
+_AROUND = 8  # nearest points that are looked at
+_PIECES = 3  # a face is sampled at the centroids of this number squared of triangles
+_HALF_TURN = 1.05 * np.pi  # between two points in sight, above which a place lies beside them
+_REACH = 1.5  # of the nearest point, over the spacing of a group
+_OFF = 0.35  # of points from the surface that they mean, over its mean edge
 REGIONS = ("clamped", "accessible")  # groups that are no supports
 
 
@@ -38,7 +47,7 @@ def read_groups(path: str | Path) -> dict[str, np.ndarray]:
 
 def faces_of_groups(mesh: TetMesh, points: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Faces of each group of points [m], ndarrays of bool, shape (n_faces,)."""
-    return {name: _near(mesh, group) for name, group in points.items()}
+    return {name: _covered(mesh, group) for name, group in points.items()}
 
 
 def regions_of_groups(
@@ -51,7 +60,7 @@ def regions_of_groups(
     for name in REGIONS:
         if name not in points:
             raise _unreadable(f"{source} ('{name}' is not in it)")
-    clamped, accessible = (_near(mesh, points[name]) for name in REGIONS)
+    clamped, accessible = (_covered(mesh, points[name]) for name in REGIONS)
     return checked(Regions(clamped, accessible & ~touching(mesh, clamped)))
 
 
@@ -60,9 +69,26 @@ def regions_from_groups(mesh: TetMesh, path: str | Path) -> Regions:
     return regions_of_groups(mesh, read_groups(path), path)
 
 
-def _near(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
-    near = cKDTree(points).query(mesh.vertices)[0] < mesh.mean_surface_edge
-    return np.asarray(near[mesh.boundary_faces].all(axis=1))
+def _covered(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
+    """Faces that a group of points covers, shape (n_faces,)."""
+    points, corners = np.unique(points, axis=0), mesh.vertices[mesh.boundary_faces]
+    tree = cKDTree(points)
+    if len(points) < _FEW:
+        near = tree.query(mesh.vertices)[0] < mesh.mean_surface_edge
+        return np.asarray(near[mesh.boundary_faces].all(axis=1))
+    places = np.einsum("qk,fkd->fqd", barycentric_centroids(_PIECES), corners)
+    distance, around = tree.query(places, k=min(_AROUND, len(points)))
+    along = corners[:, 1] - corners[:, 0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(mesh.face_area_normals / mesh.face_areas[:, None], along)
+    arm = points[around] - places[:, :, None]
+    angle = np.arctan2(*(np.einsum("fqkd,fd->fqk", arm, axis) for axis in (across, along)))
+    angle.sort(axis=2)
+    gap = np.diff(np.concatenate([angle, angle[:, :, :1] + 2.0 * np.pi], axis=2)).max(axis=2)
+    spacing = np.median(tree.query(points, k=_FEW)[0][:, -1])  # to the third neighbour
+    reach = max(_REACH * spacing, _OFF * mesh.mean_surface_edge)
+    is_between = (gap < _HALF_TURN) & (distance[:, :, 0] < reach)
+    return np.asarray(is_between.mean(axis=1) >= 0.5)
 
 
 def _unreadable(what: str) -> MeshError:

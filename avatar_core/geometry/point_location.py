@@ -78,3 +78,11 @@ def closest_points(
     a, b, c = (np.ascontiguousarray(vertices[faces[face, k]]) for k in range(3))
     barycentric = np.clip(igl.barycentric_coordinates(nearest, a, b, c), 0.0, 1.0)
     return nearest, face, barycentric / barycentric.sum(axis=1, keepdims=True)
+
+
+def barycentric_centroids(n: int) -> FloatArray:
+    """Barycentric coordinates of the centroids of n^2 equal pieces of a triangle, (n^2, 3)."""
+    up = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
+    down = [(i + 2 / 3, j + 2 / 3) for i in range(n) for j in range(n - 1 - i)]
+    second = np.array(up + down) / n
+    return np.column_stack([1.0 - second.sum(axis=1), second])

@@ -20,9 +20,8 @@ from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import RegistrationError
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.mesh import Regions, TetMesh, without_islands
-from avatar_core.geometry.point_location import carriers, closest_points
+from avatar_core.geometry.point_location import barycentric_centroids, carriers, closest_points
 from avatar_core.shapes.registration import Registration
-from avatar_core.shapes.springs import barycentric_centroids
 
 _PIECES = 3  # a patient's face is split into 3^2 pieces, whose majority decides on its region
 

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import RegistrationError
 from avatar_core.geometry.mesh import TetMesh
+from avatar_core.geometry.point_location import barycentric_centroids
 from avatar_core.geometry.surface import SurfaceMesh, winding_number
 
 RETURN_NORMAL_LENGTH = 0.03  # of springs from samples when those from vertices use none [m]
@@ -200,14 +201,6 @@ def _nearest(
     """Indices of the nearest pairs of position and normal, shape (k,)."""
     tree = cKDTree(np.hstack([among[0], length * among[1]]))
     return tree.query(np.hstack([of[0], length * of[1]]))[1]
-
-
-def barycentric_centroids(n: int) -> FloatArray:
-    """Barycentric coordinates of the centroids of n^2 equal pieces of a triangle, (n^2, 3)."""
-    up = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
-    down = [(i + 2 / 3, j + 2 / 3) for i in range(n) for j in range(n - 1 - i)]
-    second = np.array(up + down) / n
-    return np.column_stack([1.0 - second.sum(axis=1), second])
 
 
 def _area_normals(vertices: FloatArray, faces: NDArray[np.integer]) -> FloatArray:

@@ -16,6 +16,7 @@ from avatar_core.common.files import replaced
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.label_files import is_label_map
 from avatar_core.geometry.label_maps import labels_of
+from avatar_core.geometry.point_location import barycentric_centroids
 from avatar_core.geometry.volumes import MAX_VOXEL_BYTES
 from avatar_ros.framework.conversions import mesh_arrays
 from avatar_ros.framework.reader import Reader
@@ -23,6 +24,8 @@ from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING, stem
 from avatar_ros.ui.patient.preview_view import BRUSHES, PreviewView
 from avatar_ros.ui.session.requests import Requests, Wanted
 from avatar_ros.ui.view.measuring import hit
+
+_PIECES = 4  # a painted face is written as the centroids of this number squared of triangles
 
 
 @dataclass(frozen=True)
@@ -73,9 +76,13 @@ class Preview:
         }
 
     def groups(self) -> dict[str, np.ndarray]:
-        """Middles of the faces of each region, by name, as a file of groups has them."""
-        middle = self.points[self.faces].mean(axis=1)
-        return {name: middle[self.regions == region] for name, region in self.named.items()}
+        """Points all over the faces of each region, by name, as a file of groups has them."""
+        within = barycentric_centroids(_PIECES)
+        places = np.einsum("qk,fkd->fqd", within, self.points[self.faces].astype(float))
+        return {
+            name: places[self.regions == region].reshape(-1, 3)
+            for name, region in self.named.items()
+        }
 
     def is_of(self, wanted: Wanted) -> bool:
         """Whether it shows the organ of a request, however exactly or firmly that asks for it."""
