@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +14,7 @@ import typer
 
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import require_output
-from avatar_core.cli.vademecum import AsJson, Axes, File, Unit, parsed_axes, say_notices
+from avatar_core.cli.vademecum import AsJson, Axes, File, Unit, parsed_axes, require, say_notices
 from avatar_core.common.dataclass_json import plain
 from avatar_core.geometry.surface_formats import MESH_NAMES
 
@@ -21,6 +23,14 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
 EXIT_NOT_EXPLAINED = 3
+EXIT_NOT_DETERMINED = 4
+FRAMES = ("camera", "known")
+KINDS = ("smooth", "few", "pressure")
+LARGE = 0.01  # displacement from which small strains are spoken of [m]
+HELP = (
+    "what would help: a known frame (--frame known), where the tool presses (--forces near), a "
+    "second view"
+)
 
 
 def register(
@@ -46,6 +56,37 @@ def register(
     noise: Annotated[
         float, typer.Option(help="standard deviation of the points along the normal, about [m]")
     ] = 1e-3,
+    correlation: Annotated[
+        float, typer.Option(help="length over which errors are alike, as of a stereo camera [m]")
+    ] = 0.0,
+    frame: Annotated[
+        str,
+        typer.Option(
+            help="camera: the organ may have moved rigidly, by about --shift and --turn; known: "
+            "it deformed alone, and the cloud is in its own frame"
+        ),
+    ] = "camera",
+    shift: Annotated[float, typer.Option(help="root mean square of a rigid shift [m]")] = 0.01,
+    turn: Annotated[float, typer.Option(help="root mean square of a rigid turn [degrees]")] = 10.0,
+    kind: Annotated[
+        str | None,
+        typer.Option(
+            help="what deformed the organ: smooth (tractions all over), few (forces at up to three "
+            "places, as tools make them), pressure; default: smooth or few, whichever predicts "
+            "patches of the cloud that are left out"
+        ),
+    ] = None,
+    forces: Annotated[
+        str,
+        typer.Option(
+            help="where forces may act: accessible, seen, or near X,Y,Z,RADIUS at rest [m], as of "
+            "a tool that is tracked"
+        ),
+    ] = "accessible",
+    within: Annotated[
+        float,
+        typer.Option(help="a place is determined if its 90 % interval is no wider to a side [m]"),
+    ] = 5e-3,
     at: Annotated[
         str | None,
         typer.Option(
@@ -55,7 +96,11 @@ def register(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Bring an organ to a cloud of points on its deformed surface: where is the tumour now?"""
+    """Bring an organ to a cloud of points on its deformed surface: where is the tumour now?
+
+    Exit code 3: the model does not explain the cloud, and nothing is written. 4: written, but what
+    is not seen, or a target, is not determined.
+    """
     from avatar_core.registration.cloud import read_cloud
     from avatar_core.registration.fit import RegistrationRule
     from avatar_core.registration.register import register as registered_to
@@ -65,24 +110,41 @@ def register(
     from avatar_core.vademecum.storage import load_vademecum
 
     require_output(output, [*SURFACE_FORMATS, *FORMATS], [file, points])
-    rule = RegistrationRule(noise=noise)
+    require(frame in FRAMES, f"--frame is {frame}; choose {' or '.join(FRAMES)}")
+    require(kind is None or kind in KINDS, f"--kind is {kind}; choose {', '.join(KINDS)}")
+    known = frame == "known"
+    rule = RegistrationRule(
+        noise=noise,
+        turn=0.0 if known else math.radians(turn),
+        shift=0.0 if known else shift,
+        kind=kind,  # type: ignore[arg-type]
+        forces=forces.replace(",", " "),
+        correlation=correlation,
+        within=within,
+    )
     target = None if at is None else numbers("--at", at, (3,), "three numbers, as 0,0.07,0.005")
     cloud = read_cloud(points, unit, parsed_axes(axes))
     say_notices(cloud.notices)
     vademecum = load_vademecum(file)
     found = registered_to(vademecum, cloud, rule)
+    say_notices(tuple(line for line in found.notices if line not in cloud.notices))
     given = [] if target is None else [target_at(vademecum, found, target)]  # type: ignore[arg-type]
     estimates = given or _shown(vademecum, found)
-    if vademecum.large is not None:
-        print("notice: the response is that of small strains", file=sys.stderr)
+    largest_move = float(abs(found.displacement).max())
+    if largest_move > LARGE and not found.problems:
+        said = f"notice: displaced by up to {1e3 * largest_move:.0f} mm: small strains leave out "
+        print(f"{said}some {found.model_error:.0%}, which is in the intervals", file=sys.stderr)
+    missing = found.undetermined(estimates)
     if as_json:
         print(json.dumps(plain(_summary(vademecum, found, estimates)), indent=2))
     if found.problems:  # no place is told, nor written
-        print(_verdict(found), file=sys.stderr if as_json else sys.stdout)
+        print(_verdict(found, missing), file=sys.stderr if as_json else sys.stdout)
         raise typer.Exit(EXIT_NOT_EXPLAINED)
     _write(vademecum, found, output)
     if not as_json:
-        print("; ".join([*map(_sentence, estimates), _verdict(found)]))
+        print("; ".join([*map(_sentence, estimates), _verdict(found, missing)]))
+    if missing:
+        raise typer.Exit(EXIT_NOT_DETERMINED)
 
 
 def _shown(vademecum: Vademecum, found: Registered) -> list[Estimate]:
@@ -107,8 +169,8 @@ def _sentence(one: Estimate) -> str:
     )
 
 
-def _verdict(found: Registered) -> str:
-    """Residual, rigid motion and whether the model explains the cloud."""
+def _verdict(found: Registered, missing: Sequence[str]) -> str:
+    """Residual, rigid motion, and whether the model explains the cloud and it determines places."""
     import numpy as np
 
     motion = found.motion
@@ -116,8 +178,11 @@ def _verdict(found: Registered) -> str:
     fit = "the fit is good"
     if found.problems:
         fit = f"NOT EXPLAINED: {', '.join(found.problems)}; nothing is written"
+    elif missing:
+        fit = f"NOT DETERMINED: {', '.join(missing)}; {HELP}"
+    loads = {"few": f"{found.fit.loads.size // 3} force(s)"}.get(found.fit.kind, found.fit.kind)
     return (
-        f"residual {1e3 * found.rms:.2f} mm rms; rigid motion {shift:.1f} mm, "
+        f"residual {1e3 * found.rms:.2f} mm rms by {loads}; rigid motion {shift:.1f} mm, "
         f"{motion.angle:.1f} degrees; {fit}"
     )
 
@@ -135,6 +200,8 @@ def _write(vademecum: Vademecum, found: Registered, output: Path) -> None:
             found.displacement_deviation, axis=1
         ),
         "standard deviation of place [m]": np.linalg.norm(found.place_deviation, axis=1),
+        "half of the 90 % interval of place [m]": found.interval,
+        "decided by the cloud [-]": found.by_data,
     }
     if output.suffix in FORMATS:
         cells = [("tetra", vademecum.mesh.tets)]
@@ -152,7 +219,8 @@ def _summary(vademecum: Vademecum, found: Registered, estimates: list[Estimate])
     from avatar_core.registration.register import strongest_forces
 
     fit = found.fit
-    traction, length, noise, mismatch = fit.scales.tolist()
+    scale, length, noise, mismatch = fit.scales.tolist()
+    of_loads = "displacement" if fit.kind == "few" else "traction_pascal"
     return {
         "targets": [asdict(one) for one in estimates],
         "residual_rms": found.rms,
@@ -161,11 +229,14 @@ def _summary(vademecum: Vademecum, found: Registered, estimates: list[Estimate])
             "rotation_degrees": np.degrees(found.motion.turn),
             "translation": found.motion.shift,
         },
+        "kind": fit.kind,
         "explained": not found.problems,
+        "undetermined": list(found.undetermined(estimates)),
+        "determined_unseen": float(np.mean(found.is_determined[np.logical_not(found.seen)])),
         "problems": list(found.problems),
         "forces": [asdict(one) for one in strongest_forces(vademecum, found)],
         "scales": {
-            "traction_pascal": traction,
+            of_loads: scale,
             "traction_length": length,
             "noise": noise,
             "surface_mismatch": mismatch,

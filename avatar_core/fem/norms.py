@@ -39,10 +39,26 @@ def mean_strain(mesh: TetMesh, displacement: FloatArray) -> float:
     ----------
     displacement : ndarray, shape (n_vertices, 3) [m], linear in each tetrahedron
     """
+    gradient = _gradients(mesh, displacement)
+    return _mean(mesh, (gradient + gradient.swapaxes(1, 2)) / 2.0)
+
+
+def mean_gradient(mesh: TetMesh, displacement: FloatArray) -> float:
+    """Root mean square of |grad u| over an organ, strain and rotation together.
+
+    displacement : as of :func:`mean_strain`
+    """
+    return _mean(mesh, _gradients(mesh, displacement))
+
+
+def _gradients(mesh: TetMesh, displacement: FloatArray) -> FloatArray:
+    """grad u of each tetrahedron, shape (n_tets, 3, 3)."""
     at, moved = mesh.vertices[mesh.tets], displacement[mesh.tets]
-    gradient = np.linalg.solve(at[:, 1:] - at[:, :1], moved[:, 1:] - moved[:, :1])
-    strain = (gradient + gradient.swapaxes(1, 2)) / 2.0
-    square = (strain**2).sum(axis=(1, 2))
+    return np.asarray(np.linalg.solve(at[:, 1:] - at[:, :1], moved[:, 1:] - moved[:, :1]))
+
+
+def _mean(mesh: TetMesh, tensors: FloatArray) -> float:
+    square = (tensors**2).sum(axis=(1, 2))
     return float(np.sqrt(mesh.tet_volumes @ square / mesh.volume))
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 
@@ -21,8 +22,9 @@ from avatar_core.geometry.surface_formats import MESHES, kind_of
 COLUMNS = (".xyz", ".csv", ".txt")  # x, y, z in each line
 LEAST_POINTS = 50
 MOST_POINTS = 3000  # that are used; of more a random part, always the same
-FARTHEST = 0.03  # of the middle point of a cloud from the organ's surface [m]
+FARTHEST = 0.06  # of the middle point of a cloud from the organ's surface [m]
 MOST_BYTES = 1 << 30
+_BACKGROUND = 0.1  # distance of a point from the organ at rest beyond which it is none of it [m]
 _DOUBTED = 0.015  # distance of a cloud beyond which its axes are doubted [m]
 _TRIED = 300  # points of a cloud whose distances are looked at
 _MOST_EXTENT = 1.3  # of a cloud over that of the organ; a deformed organ is hardly larger
@@ -126,10 +128,31 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
     return Cloud(METRES[unit] * points, path.name, unit, (notice,) if empty.any() else ())
 
 
-def require_on_organ(cloud: Cloud, vertices: FloatArray, faces: IntArray) -> None:
+def without_background(cloud: Cloud, vertices: FloatArray, faces: IntArray) -> Cloud:
+    """The cloud without points far off the organ, such as a table, with a notice.
+
+    vertices, faces : of the organ's surface at rest, shapes (n, 3) [m] and (m, 3)
+    """
+    feet, _, _ = closest_points(vertices, faces, cloud.points)
+    far = np.linalg.norm(cloud.points - feet, axis=1) > _BACKGROUND
+    if not far.any() or far.mean() > 0.5:
+        return cloud
+    off = f"{far.sum()} points over {1e3 * _BACKGROUND:.0f} mm off the organ"
+    said = f"{cloud.name}: {off} are left out"
+    return Cloud(cloud.points[~far], cloud.name, cloud.unit, (*cloud.notices, said))
+
+
+def require_on_organ(
+    cloud: Cloud,
+    vertices: FloatArray,
+    faces: IntArray,
+    moved_off: Callable[[Cloud], float] | None = None,
+) -> None:
     """Raise RegistrationError, naming unit or axes, unless a cloud may lie on an organ.
 
     vertices, faces : of the organ's surface at rest, shapes (n, 3) [m] and (m, 3)
+    moved_off : median distance of a cloud from the organ moved rigidly to it [m]: other axes are
+        suspected only if that, too, is smaller with x and y reversed, as a deformation is no turn
     """
     ratio = cloud.extent / float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not _LEAST_EXTENT <= ratio <= _MOST_EXTENT:
@@ -145,7 +168,7 @@ def require_on_organ(cloud: Cloud, vertices: FloatArray, faces: IntArray) -> Non
 
     given = off(few)
     turned = off(few * [-1.0, -1.0, 1.0]) if given > _DOUBTED else given
-    if turned < 0.5 * given:
+    if turned < 0.5 * given and _fits_turned(cloud, moved_off):
         raise RegistrationError(
             f"{cloud.name}: half of the cloud is {1e3 * given:.0f} mm or more off the organ, but "
             f"{1e3 * turned:.0f} mm with x and y reversed; give its axes (--axes LPS or RAS)"
@@ -155,6 +178,14 @@ def require_on_organ(cloud: Cloud, vertices: FloatArray, faces: IntArray) -> Non
             f"{cloud.name}: half of the cloud is {1e3 * given:.0f} mm or more off the organ; give "
             "its axes (--axes), or align it to about 10 mm and 10 degrees first"
         )
+
+
+def _fits_turned(cloud: Cloud, moved_off: Callable[[Cloud], float] | None) -> bool:
+    """Whether a rigid motion brings the cloud to the organ with x and y reversed alone."""
+    if moved_off is None:
+        return True
+    turned = replace(cloud, points=cloud.points * [-1.0, -1.0, 1.0])
+    return moved_off(turned) < 0.5 * moved_off(cloud)
 
 
 def _unit_hint(ratio: float, unit: str) -> str:

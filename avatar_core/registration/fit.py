@@ -1,11 +1,12 @@
 """From a vademecum and a cloud to loads and rigid motion: iterated closest points.
 
 With x' = c + R (x + u(x) - c) + t for the organ's surface, each point of the cloud is at a signed
-distance from the surface as it lies now; its derivatives by the coefficients of the loads and by R
-and t are those of its foot along the normal there (point to plane; Chen & Medioni, Image and Vision
-Computing 10, 1992). A Gauss-Newton step is the mean of the linearised posterior
+distance from the surface as it lies now; its derivatives by the displacement and by R and t are
+those of its foot along the normal there (point to plane; Chen & Medioni, Image and Vision Computing
+10, 1992). A Gauss-Newton step is the mean of the linearised posterior
 (:mod:`avatar_core.registration.posterior`); points weigh as Student's distribution has it, so that
-some strays do no harm. The first steps move the organ rigidly alone.
+some strays do no harm. Smooth loads begin with steps that move the organ rigidly alone; the places
+of a few forces (:mod:`avatar_core.registration.sites`) are sought anew in each step.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import igl
 import numpy as np
 import scipy.sparse as sp
 
-from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import RegistrationError
 from avatar_core.geometry.point_location import closest_points
-from avatar_core.registration.cloud import Cloud, require_on_organ
+from avatar_core.registration.cloud import Cloud
+from avatar_core.registration.loads import Kind, LoadBasis, PointForces, allowed_at, smooth_loads
 from avatar_core.registration.posterior import (
     Equations,
     Posterior,
@@ -29,10 +31,9 @@ from avatar_core.registration.posterior import (
     cells_of,
     equations,
     likeliest,
-    posterior,
 )
 from avatar_core.registration.rigid import RigidMotion
-from avatar_core.registration.traction import LoadBasis, load_basis
+from avatar_core.registration.sites import Found, Noise, find_sites
 from avatar_core.vademecum.model import Vademecum
 
 
@@ -41,7 +42,13 @@ class RegistrationRule:
     """Prior knowledge and stopping.
 
     noise : standard deviation of a point of the cloud along the normal, about [m]
-    turn, shift : prior root mean squares of the rigid motion, all axes together [rad, m]
+    turn, shift : prior root mean squares of the rigid motion, all axes together [rad, m]; nearly 0
+        where the cloud's frame is the organ's
+    kind : of the loads, see :mod:`avatar_core.registration.loads`; None for smooth or few, by what
+        each predicts of patches that are left out
+    forces : where they may act, see :func:`avatar_core.registration.loads.allowed_at`
+    correlation : length over which errors of the points are alike [m]; at least the mesh's edge
+    within : a place counts as determined if its interval of 90 % is no wider to either side [m]
     freedom : degrees of freedom of Student's distribution, from which points are weighed
     tolerance : step of a point of the surface that ends the iteration [m]
     rigid_steps, most_steps : iterations that move rigidly alone, and all, at most
@@ -51,6 +58,10 @@ class RegistrationRule:
     noise: float = 1e-3
     turn: float = float(np.radians(10.0))
     shift: float = 10e-3
+    kind: Kind | None = None
+    forces: str = "accessible"
+    correlation: float = 0.0
+    within: float = 5e-3
     freedom: float = 10.0
     tolerance: float = 1e-4
     rigid_steps: int = 8
@@ -63,210 +74,357 @@ class RegistrationRule:
                 f"a noise of {self.noise:g} m; give the standard deviation of the points in metres "
                 "(1e-3: 1 mm)"
             )
+        if not (0.0 <= self.shift <= 0.2 and 0.0 <= self.turn <= np.pi):
+            raise RegistrationError(
+                f"a shift of {self.shift:g} m and a turn of {np.degrees(self.turn):g} degrees; "
+                "give up to 0.2 m and 180 degrees"
+            )
 
-    def scales(self, young_modulus: float) -> Scales:
-        """Of traction, length, noise and mismatch, before the cloud is seen."""
-        middle = np.log([0.02 * young_modulus, 0.03, self.noise, 0.2 * self.noise])
-        return Scales(middle, np.array([2.0, 0.7, 0.3, 0.7]))
+    def scales(self, kind: Kind, young_modulus: float) -> Scales:
+        """Of loads, length, noise and mismatch, before the cloud is seen."""
+        loads = 0.02 if kind == "few" else 0.02 * young_modulus  # displacement [m], traction [Pa]
+        mismatch = 0.5 if kind == "few" else 0.2  # of the noise
+        middle = np.log([loads, 0.03, self.noise, mismatch * self.noise])
+        return Scales(middle, np.array([0.7 if kind == "few" else 2.0, 0.7, 0.3, 0.7]))
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """Another place of a force that explains the cloud: its weight, all places, all displaced.
+
+    displacement, place : ndarray, shape (n_vertices, 3) [m]
+    """
+
+    weight: float
+    displacement: FloatArray
+    place: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The end of the iteration.
 
+    kind : of the loads
     loads : LoadBasis; motion : RigidMotion
-    columns : ndarray, shape (n_vertices, 3, n) [m], displacement by each coefficient of the loads
     coefficients : ndarray, shape (n,), of the loads
     covariance : ndarray, shape (n + 6, n + 6), of coefficients, turn and shift
     residuals : ndarray, signed distances of the points that were used [m]
     outlying : part of the points that the robust weights hold for strays
-    scales : ndarray, (traction [Pa], length [m], noise [m], mismatch [m])
+    scales : ndarray, (traction [Pa] or displacement [m], length [m], noise [m], mismatch [m])
+    alternatives : of the place of the strongest force; empty for smooth loads
+    prior_deviation : ndarray, shape (n_vertices,) [m], of a place before the cloud is seen
     n_steps, converged : of the iteration
     """
 
+    kind: Kind
     loads: LoadBasis
     motion: RigidMotion
-    columns: FloatArray
     coefficients: FloatArray
     covariance: FloatArray
     residuals: FloatArray
     outlying: float
     scales: FloatArray
+    alternatives: tuple[Alternative, ...]
+    prior_deviation: FloatArray
     n_steps: int
     converged: bool
 
 
-def fit(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None) -> Fit:
-    """Loads and rigid motion that bring the organ's surface to a cloud.
+_STRAY = 0.5  # weight of a point some four standard deviations off, below which it is a stray
+_UNDAMPED = 14  # steps; the closest points of some clouds swing to and fro after so many
+_SHORTEST_SEARCH, _LONGEST_SEARCH = 4, 16  # steps in which places of forces are sought
+_SETTLED = 0.5e-3  # step of the surface that ends the search [m]
+_TRIES = 60  # of scales, the first time; a half of it later
+_MOST_ALTERNATIVES = 12
+_LEAST_WEIGHT = 0.01  # of an alternative, over that of the likeliest
+_LEAST_SPREAD = 1e-7  # prior deviation of a turn [rad] and a shift [m] that are known
+
+
+def fit(problem: Problem, kind: Kind) -> Fit:
+    """Loads of a kind and rigid motion that bring the organ's surface to a cloud.
 
     Raises
     ------
     RegistrationError
-        If the cloud cannot be one of this organ, or the iteration leads away from it.
+        If the iteration leads away from the cloud.
     """
-    rule = rule or RegistrationRule()
-    problem = _problem(vademecum, cloud, rule)
-    state, n_rigid = _rigidly(problem)
-    logarithms = problem.prior.middle
+    rule, prior = problem.rule, problem.rule.scales(kind, problem.young_modulus)
+    logarithms, at = prior.middle, problem.start(rule.rigid_steps if kind != "few" else 0)
+    sites, settled = Found([], np.zeros(0)), 0 if kind != "few" else _LONGEST_SEARCH
     for step in range(rule.most_steps):
-        found = problem.equations_at(state, np.exp(logarithms), first=step == 0)
-        if step in rule.rescaled:
-            logarithms = problem.rescaled(found, logarithms, step == rule.rescaled[0])
-        mean = problem.solved(found, np.exp(logarithms)).mean
-        moved = problem.largest_move(state, mean)
-        state = state + (1.0 if step < _UNDAMPED else 0.5) * (mean - state)
-        if converged := moved < rule.tolerance and step > rule.rescaled[-1]:
+        scales = np.exp(logarithms)
+        seen = problem.linearised(at, scales, first=step < (2 if kind == "few" else 1))
+        if kind != "few":
+            loads = problem.field(kind)
+        elif step < settled:
+            wide = problem.widened(scales, seen) if step < 2 else scales
+            sites = problem.sites(seen, wide)
+            loads = problem.point_forces.basis(sites.chosen)
+        found = problem.equations(seen, loads)
+        spread = problem.spread_of(loads)
+        if step - settled in rule.rescaled:
+            tries = _TRIES if step - settled == rule.rescaled[0] else _TRIES // 2
+            logarithms = likeliest(found, spread, prior, logarithms, tries)
+        solved_at = wide if step < settled else np.exp(logarithms)
+        mean = at_scales(found, spread, solved_at).mean
+        aim = problem.state(loads, mean)
+        moved = at.far_from(aim, problem)
+        at = at.towards(aim, 1.0 if step < settled + _UNDAMPED else 0.5)
+        if step < settled and step >= _SHORTEST_SEARCH and moved < _SETTLED:
+            settled = step + 1
+        if converged := moved < rule.tolerance and step - settled > rule.rescaled[-1]:
             break
-    found, residuals, weights = problem.linearised(state, np.exp(logarithms))
-    mean, covariance = averaged(found, problem.spread, problem.prior, logarithms)
-    n = problem.loads.size
+    scales = np.exp(logarithms)
+    seen = problem.linearised(at, scales)
+    found = problem.equations(seen, loads)
+    mean, covariance = averaged(found, problem.spread_of(loads), prior, logarithms)
+    at_last = problem.state(loads, mean)
+    n = loads.size
     return Fit(
-        problem.loads,
-        problem.motion(mean),
-        problem.all_columns,
+        kind,
+        loads,
+        problem.motion(at_last),
         mean[:n],
         covariance,
-        residuals,
-        float((weights < _STRAY).mean()),
-        np.exp(logarithms),
-        n_rigid + step + 1,
+        seen.distance,
+        float((seen.weights < _STRAY).mean()),
+        scales,
+        problem.alternatives(seen, sites, scales) if kind == "few" else (),
+        problem.prior_deviation(kind, loads, scales),
+        step + 1,
         bool(converged),
     )
-
-
-_STRAY = 0.5  # weight of a point some four standard deviations off, below which it is a stray
-_UNDAMPED = 14  # steps; the closest points of some clouds swing to and fro after so many
-_TRIES = 60  # of scales, the first time; a half of it later
 
 
 def rigid_motion(
     vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
 ) -> RigidMotion:
-    """What rigid steps alone make of a cloud; arguments and errors as of :func:`fit`."""
-    problem = _problem(vademecum, cloud, rule or RegistrationRule())
-    return problem.motion(_rigidly(problem)[0])
-
-
-def _problem(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule) -> _Problem:
-    """The problem, with the displacement of all vertices by each coefficient."""
-    loads = load_basis(vademecum)
-    every = np.arange(len(vademecum.mesh.vertices))
-    columns = loads.displacement(vademecum, every, np.eye(loads.size))
-    return _Problem.of(vademecum, cloud, rule, loads, columns)
-
-
-def _rigidly(problem: _Problem) -> tuple[FloatArray, int]:
-    """Unknowns after the rigid steps, and their number."""
-    rule, step, moved = problem.rule, 0, np.inf
-    state: FloatArray = np.zeros(problem.loads.size + 6)
-    while moved > 5.0 * rule.tolerance and step < rule.rigid_steps:
-        found = problem.equations_at(state, np.exp(problem.prior.middle), first=True)
-        mean = problem.solved_rigidly(found)
-        moved, state, step = problem.largest_move(state, mean), mean, step + 1
-    return state, step
+    """What rigid steps alone make of a cloud."""
+    rule = rule or RegistrationRule()
+    problem = Problem(vademecum, cloud.thinned(), rule)
+    return problem.motion(problem.start(rule.rigid_steps))
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    """What the steps work on: the organ's surface at rest and its displacement by each unknown."""
+class State:
+    """Where the organ is: displacement of the vertices (n, 3) [m], turn and shift (6,)."""
 
-    rule: RegistrationRule
-    prior: Scales
-    loads: LoadBasis
-    vertices: FloatArray
-    faces: IntArray
-    columns: FloatArray
-    all_columns: FloatArray
-    points: FloatArray
-    cell: float
+    displacement: FloatArray
+    rigid: FloatArray
 
-    @classmethod
-    def of(
-        cls,
-        vademecum: Vademecum,
-        cloud: Cloud,
-        rule: RegistrationRule,
-        loads: LoadBasis,
-        columns: FloatArray,
-    ) -> _Problem:
-        mesh = vademecum.mesh
-        on_surface = mesh.surface_vertices
-        vertices = np.ascontiguousarray(mesh.vertices[on_surface])
-        faces = np.searchsorted(on_surface, mesh.boundary_faces).astype(np.int64)
-        points = np.ascontiguousarray(cloud.thinned())
-        require_on_organ(cloud, vertices, faces)
-        own = columns[on_surface].reshape(-1, loads.size)
-        prior = rule.scales(vademecum.material.young_modulus)
-        edge = mesh.mean_surface_edge
-        return cls(rule, prior, loads, vertices, faces, own, columns, points, edge)
+    def towards(self, other: State, part: float) -> State:
+        """A part of the way to another state."""
+        return State(
+            self.displacement + part * (other.displacement - self.displacement),
+            self.rigid + part * (other.rigid - self.rigid),
+        )
 
-    def motion(self, unknowns: FloatArray) -> RigidMotion:
-        """The rigid part of the unknowns."""
-        centre = self.vertices.mean(axis=0)
-        return RigidMotion(centre).with_unknowns(unknowns[self.loads.size :])
-
-    def surface(self, unknowns: FloatArray) -> FloatArray:
-        """The organ's surface, shape (n_vertices, 3) [m]."""
-        moved = self.columns @ unknowns[: self.loads.size]
-        return self.motion(unknowns)(self.vertices + moved.reshape(-1, 3))
-
-    def largest_move(self, before: FloatArray, after: FloatArray) -> float:
-        """Of a point of the surface between two states [m]."""
-        change = self.surface(after) - self.surface(before)
+    def far_from(self, other: State, problem: Problem) -> float:
+        """Largest move of a point of the surface between two states [m]."""
+        change = problem.surface(other) - problem.surface(self)
         return float(np.sqrt((change**2).sum(axis=1).max()))
 
-    def spread(self, scales: FloatArray) -> FloatArray:
-        """Prior standard deviations of all unknowns at scales."""
-        rule = self.rule
-        rigid = np.repeat([rule.turn, rule.shift], 3) / np.sqrt(3.0)
-        return np.concatenate([self.loads.spread(scales[0], scales[1]), rigid])
 
-    def equations_at(self, state: FloatArray, scales: FloatArray, first: bool) -> Equations:
-        """Linearised at a state; the first time with the noise that the distances show."""
-        return self.linearised(state, scales, first)[0]
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The cloud at a state: derivatives of distances, and their weights.
 
-    def linearised(
-        self, state: FloatArray, scales: FloatArray, first: bool = False
-    ) -> tuple[Equations, FloatArray, FloatArray]:
-        """Equations, distances and robust weights of the points at a state."""
-        J, distance = self._distances(state)
+    by_surface : sparse, shape (n_points, 3 n_surface), by the displacement of the surface
+    by_motion : ndarray, shape (n_points, 6); distance : shape (n_points,) [m]
+    data : distances that the organ at rest would have, in the linearisation [m]
+    weights : robust, shape (n_points,); cells : sparse, (n_cells, n_points)
+    """
+
+    by_surface: sp.csr_matrix
+    by_motion: FloatArray
+    distance: FloatArray
+    data: FloatArray
+    weights: FloatArray
+    cells: sp.csr_matrix
+
+
+class Problem:
+    """What the steps work on: the organ's surface at rest, the cloud, and the kinds of loads."""
+
+    def __init__(self, vademecum: Vademecum, points: FloatArray, rule: RegistrationRule) -> None:
+        mesh = vademecum.mesh
+        self.vademecum, self.rule = vademecum, rule
+        self.points = np.ascontiguousarray(points)
+        self.on_surface = mesh.surface_vertices
+        self.vertices = np.ascontiguousarray(mesh.vertices[self.on_surface])
+        self.faces = np.searchsorted(self.on_surface, mesh.boundary_faces).astype(np.int64)
+        self.cell = max(mesh.mean_surface_edge, rule.correlation)
+        self.centre = self.vertices.mean(axis=0)
+        self.young_modulus = vademecum.material.young_modulus
+        self._kinds: dict[str, LoadBasis | PointForces] = {}
+
+    def with_points(self, points: FloatArray) -> Problem:
+        """The same organ and loads for other points."""
+        other = Problem(self.vademecum, points, self.rule)
+        other._kinds = self._kinds
+        return other
+
+    def with_field(self, loads: LoadBasis) -> Problem:
+        """The same with other loads in place of the smooth ones."""
+        other = self.with_points(self.points)
+        other._kinds = {"smooth": loads}
+        return other
+
+    # --- loads --------------------------------------------------------------------------------
+
+    @property
+    def allowed(self) -> FloatArray:
+        """Load positions where forces may act."""
+        at_rest = RigidMotion(self.centre)
+        if self.rule.forces == "seen":
+            at_rest = self.motion(self.start(self.rule.rigid_steps))
+        return allowed_at(self.vademecum.surface, self.rule.forces, at_rest.back(self.points))
+
+    def field(self, kind: Kind) -> LoadBasis:
+        """Tractions all over where forces may act."""
+        if kind not in self._kinds:
+            self._kinds[kind] = smooth_loads(self.vademecum, self.allowed, kind == "pressure")
+        found = self._kinds[kind]
+        assert isinstance(found, LoadBasis)
+        return found
+
+    @property
+    def point_forces(self) -> PointForces:
+        """Places where a few forces may act."""
+        if "few" not in self._kinds:
+            self._kinds["few"] = PointForces.of(self.vademecum, self.allowed)
+        found = self._kinds["few"]
+        assert isinstance(found, PointForces)
+        return found
+
+    # --- states -------------------------------------------------------------------------------
+
+    def start(self, rigid_steps: int) -> State:
+        """The organ at rest after some rigid steps."""
+        at = State(np.zeros_like(self.vademecum.mesh.vertices), np.zeros(6))
+        scales = np.exp(self.rule.scales("smooth", self.young_modulus).middle)
+        none = LoadBasis(np.zeros((1, 3, 0)), np.zeros((*at.displacement.shape, 0)), _no_loads)
+        for _ in range(rigid_steps):
+            found = self.equations(self.linearised(at, scales, first=True), none)
+            aim = State(at.displacement, at_scales(found, self.spread_of(none), scales).mean)
+            moved, at = at.far_from(aim, self), aim
+            if moved <= 5.0 * self.rule.tolerance:
+                break
+        return at
+
+    def state(self, loads: LoadBasis, unknowns: FloatArray) -> State:
+        """Where coefficients, turn and shift bring the organ."""
+        n = loads.size
+        return State(loads.displacement(unknowns[:n]), unknowns[n:])
+
+    def motion(self, at: State) -> RigidMotion:
+        """The rigid part of a state."""
+        return RigidMotion(self.centre).with_unknowns(at.rigid)
+
+    def surface(self, at: State) -> FloatArray:
+        """The organ's surface, shape (n_surface, 3) [m]."""
+        return self.motion(at)(self.vertices + at.displacement[self.on_surface])
+
+    def place(self, at: State) -> FloatArray:
+        """All vertices in the cloud's frame, shape (n_vertices, 3) [m]."""
+        return self.motion(at)(self.vademecum.mesh.vertices + at.displacement)
+
+    @property
+    def rigid_spread(self) -> FloatArray:
+        """Prior standard deviations of turn and shift, shape (6,)."""
+        each = np.repeat([self.rule.turn, self.rule.shift], 3) / np.sqrt(3.0)
+        return np.maximum(each, _LEAST_SPREAD)
+
+    def spread_of(self, loads: LoadBasis):  # type: ignore[no-untyped-def]
+        """Prior standard deviations of all unknowns, as a function of the scales."""
+        return lambda scales: np.concatenate(
+            [loads.spread(float(scales[0]), float(scales[1])), self.rigid_spread]
+        )
+
+    def prior_deviation(self, kind: Kind, loads: LoadBasis, scales: FloatArray) -> FloatArray:
+        """Root mean square of a place before the cloud is seen, over the axes, (n_vertices,)."""
+        if kind == "few":
+            places = self.point_forces
+            columns = places.columns * (scales[0] * places.per_metre)[None, None, :, None]
+            square = (columns**2).sum(axis=(1, 3)).mean(axis=1) / 3.0
+        else:
+            each = loads.spread(float(scales[0]), float(scales[1]))
+            square = ((loads.columns * each) ** 2).sum(axis=(1, 2)) / 3.0
+        arm = ((self.vademecum.mesh.vertices - self.centre) ** 2).sum(axis=1)
+        turn, shift = self.rigid_spread[0], self.rigid_spread[3]
+        return np.sqrt(square + shift**2 + turn**2 * arm * 2.0 / 3.0)
+
+    # --- equations ----------------------------------------------------------------------------
+
+    def linearised(self, at: State, scales: FloatArray, first: bool = False) -> Seen:
+        """The cloud at a state; the first times with the noise that the distances show."""
+        surface, motion = self.surface(at), self.motion(at)
+        feet, face, where = closest_points(surface, self.faces, self.points)
+        corners = self.faces[face]
+        normals = igl.per_vertex_normals(surface, self.faces)[corners]
+        normal = np.einsum("nk,nkd->nd", where, normals)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        own = normal @ motion.matrix  # in the axes of the organ
+        along = np.einsum("nk,nd->nkd", where, own).reshape(len(feet), 9)
+        column = (3 * corners[:, :, None] + np.arange(3)).reshape(len(feet), 9)
+        starts = np.arange(0, 9 * len(feet) + 1, 9)
+        shape = (len(feet), 3 * len(self.vertices))
+        by_surface = sp.csr_matrix((along.ravel(), column.ravel(), starts), shape=shape)
+        by_motion = motion.rows(feet, normal)
+        distance = ((self.points - feet) * normal).sum(axis=1)
+        moved = at.displacement[self.on_surface].ravel()
         square = float(scales[2] ** 2 + scales[3] ** 2)
         if first:
             square = max(square, (1.4826 * float(np.median(np.abs(distance)))) ** 2)
         freedom = self.rule.freedom
-        weights = (freedom + 1.0) / (freedom + distance**2 / square)
-        cells = cells_of(self.motion(state).back(self.points), self.cell)
-        return equations(J, distance + J @ state, weights, cells), distance, weights
+        return Seen(
+            by_surface,
+            by_motion,
+            distance,
+            distance + by_surface @ moved + by_motion @ at.rigid,
+            (freedom + 1.0) / (freedom + distance**2 / square),
+            cells_of(motion.back(self.points), self.cell),
+        )
 
-    def _distances(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Derivatives (n_points, n_unknowns) and values of the points' signed distances [m]."""
-        surface, motion = self.surface(state), self.motion(state)
-        feet, face, at = closest_points(surface, self.faces, self.points)
-        corners = self.faces[face]
-        normals = igl.per_vertex_normals(surface, self.faces)[corners]
-        normal = np.einsum("nk,nkd->nd", at, normals)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        own = normal @ motion.matrix  # in the axes of the organ
-        along = np.einsum("nk,nd->nkd", at, own).reshape(len(feet), 9)
-        column = (3 * corners[:, :, None] + np.arange(3)).reshape(len(feet), 9)
-        first = np.arange(0, 9 * len(feet) + 1, 9)
-        shape = (len(feet), 3 * len(self.vertices))
-        J = sp.csr_matrix((along.ravel(), column.ravel(), first), shape=shape) @ self.columns
-        distance = ((self.points - feet) * normal).sum(axis=1)
-        return np.hstack([J, motion.rows(feet, normal)]), distance
+    def equations(self, seen: Seen, loads: LoadBasis) -> Equations:
+        """The equations of a cloud for coefficients, turn and shift."""
+        columns = loads.columns[self.on_surface].reshape(3 * len(self.on_surface), loads.size)
+        rows = np.hstack([seen.by_surface @ columns, seen.by_motion])
+        return equations(rows, seen.data, seen.weights, seen.cells)
 
-    def rescaled(self, found: Equations, logarithms: FloatArray, first: bool) -> FloatArray:
-        """The likeliest scales of linearised equations."""
-        tries = _TRIES if first else _TRIES // 2
-        return likeliest(found, self.spread, self.prior, logarithms, tries)
+    def sites(self, seen: Seen, scales: FloatArray) -> Found:
+        """Places of a few forces, likeliest first."""
+        places = self.point_forces
+        columns = places.columns[self.on_surface].reshape(3 * len(self.on_surface), -1)
+        size = np.repeat(scales[0] * places.per_metre, 3).astype(np.float32)
+        rows = (seen.by_surface.astype(np.float32) @ columns) * size
+        common = seen.by_motion * self.rigid_spread
+        error = Noise(seen.weights, seen.cells, float(scales[2]), float(scales[3]))
+        return find_sites(common, rows.reshape(len(rows), -1, 3), seen.data, error)
 
-    def solved(self, found: Equations, scales: FloatArray) -> Posterior:
-        """The posterior of all unknowns."""
-        return at_scales(found, self.spread, scales)
+    def widened(self, scales: FloatArray, seen: Seen) -> FloatArray:
+        """The scales with noise and mismatch as large as the distances are."""
+        off = 1.4826 * float(np.median(np.abs(seen.distance)))
+        larger = max(1.0, off / float(np.hypot(scales[2], scales[3])))
+        return np.asarray(scales * [1.0, 1.0, larger, larger])
 
-    def solved_rigidly(self, found: Equations) -> FloatArray:
-        """The most likely unknowns without loads."""
-        scales = np.exp(self.prior.middle)
-        spread = self.spread(scales)
-        spread[: self.loads.size] = 1e-12 * spread[: self.loads.size]
-        return posterior(found, spread, scales[2], scales[3]).mean
+    def alternatives(self, seen: Seen, found: Found, scales: FloatArray) -> tuple[Alternative, ...]:
+        """Other places of the strongest force, by how likely they make the cloud."""
+        order = np.argsort(-found.gain)[:_MOST_ALTERNATIVES]
+        weight = np.exp(found.gain[order] - found.gain[order[0]])
+        kept = weight > _LEAST_WEIGHT
+        weight = weight[kept] / weight[kept].sum()
+        alternatives = []
+        for part, place in zip(weight, order[kept], strict=True):
+            chosen = [int(place), *(k for k in found.chosen[1:] if k != place)]
+            loads = self.point_forces.basis(chosen)
+            solved: Posterior = at_scales(
+                self.equations(seen, loads), self.spread_of(loads), scales
+            )
+            at = self.state(loads, solved.mean)
+            alternatives.append(Alternative(float(part), at.displacement, self.place(at)))
+        return tuple(alternatives)
+
+
+def _no_loads(scale: float, length: float) -> FloatArray:
+    return np.zeros(0)

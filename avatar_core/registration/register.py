@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import RegistrationError
-from avatar_core.fem.norms import mean_strain
+from avatar_core.fem.norms import mean_gradient, mean_strain
 from avatar_core.geometry.point_location import carriers
+from avatar_core.registration.choice import chosen, posed
 from avatar_core.registration.cloud import Cloud
-from avatar_core.registration.fit import Fit, RegistrationRule, fit
+from avatar_core.registration.fit import Fit, RegistrationRule
 from avatar_core.registration.rigid import RigidMotion
 from avatar_core.vademecum.model import Vademecum
 
@@ -19,6 +21,9 @@ from avatar_core.vademecum.model import Vademecum
 # loads are no Gaussian field, supports move, meshes differ. `avatar study registration` measures
 # what is covered.
 UNDERSTATED = 1.5
+# Relative error of small strains over the mean gradient of a displacement: point forces on a
+# neo-Hookean organ, up to 60 mm (`avatar study registration`).
+SMALL_STRAINS_OFF = 1.0
 INTERVAL_90 = 1.645  # half of a 90 % interval, in standard deviations
 _KEPT = 1e-4  # of the largest variance over the surface, below which directions are dropped
 _EVERY = 7  # vertices of the surface by which directions are judged
@@ -28,6 +33,8 @@ _MOST_MISMATCH = 0.6  # of the surface, over the noise expected; meshes that dif
 # Of the deformation that is found. Right answers have up to 0.07 at displacements of 20 mm; where
 # loads have to explain what none of them caused, those that look like the cloud have 0.3.
 _MOST_STRAIN = 0.15
+_SEEN = 0.015  # of a vertex from the nearest point of the cloud, at most [m]
+_MOST_HIDDEN = 0.1  # part of what is not seen that may be undetermined in a good answer
 _INSIDE = 5e-3  # of a target from the organ at most [m]
 
 
@@ -60,8 +67,11 @@ class Registered:
     place : ndarray, shape (n_vertices, 3) [m], of the vertices in the cloud's frame
     displacement_spread, place_spread : ndarray, shape (n_vertices, 3, k) [m], square roots of the
         posterior covariance, S S^T of any vertices together
-    model_error : relative, of the vademecum's certificate; 0 without one
+    model_error : relative, by the vademecum's certificate and by what small strains leave out
+    seen : ndarray of bool, shape (n_vertices,), less than 15 mm from a point of the cloud
+    within : bound of the rule, within which a place is determined [m]
     problems : why the model does not explain the cloud, one line each; empty if it does
+    notices : what else there is to know, one line each
     """
 
     fit: Fit
@@ -70,7 +80,10 @@ class Registered:
     displacement_spread: FloatArray
     place_spread: FloatArray
     model_error: float
+    seen: FloatArray
+    within: float
     problems: tuple[str, ...]
+    notices: tuple[str, ...] = ()
 
     @property
     def motion(self) -> RigidMotion:
@@ -96,7 +109,43 @@ class Registered:
     def model_deviation(self) -> FloatArray:
         """Standard deviation along each axis by the vademecum's own error, (n_vertices,) [m]."""
         size = np.linalg.norm(self.displacement, axis=1)
-        return np.asarray(self.model_error * size / np.sqrt(3.0))
+        mean = float(np.sqrt(np.mean(size**2)))
+        return np.asarray(self.model_error * np.hypot(size, mean) / np.sqrt(6.0))
+
+    @property
+    def interval(self) -> FloatArray:
+        """Half of the 90 % interval of the place along the axis where it is widest, (n,) [m]."""
+        return np.asarray(INTERVAL_90 * self.place_deviation.max(axis=1))
+
+    @property
+    def is_determined(self) -> FloatArray:
+        """Vertices whose place is known within the bound, ndarray of bool, (n_vertices,)."""
+        return np.asarray(self.interval <= self.within)
+
+    @property
+    def by_data(self) -> FloatArray:
+        """How far the cloud and not the prior decides on a place, 0 to 1, (n_vertices,) [-]."""
+        variance = (self.place_spread**2).sum(axis=2).mean(axis=1) / UNDERSTATED**2
+        return np.asarray(np.clip(1.0 - variance / self.fit.prior_deviation**2, 0.0, 1.0))
+
+    def undetermined(self, estimates: Sequence[Estimate] = ()) -> tuple[str, ...]:
+        """What is not determined, one line each: of the part that is not seen, and targets."""
+        lines = []
+        hidden = np.logical_not(self.seen)
+        if (
+            hidden.any()
+            and (part := 1.0 - float(np.mean(self.is_determined[hidden]))) > _MOST_HIDDEN
+        ):
+            width = 1e3 * float(np.quantile(self.interval[hidden], 0.9))
+            lines.append(
+                f"{part:.0%} of what is not seen is not determined within {1e3 * self.within:.0f} "
+                f"mm (+- {width:.0f} mm)"
+            )
+        for one in estimates:
+            width = INTERVAL_90 * float(one.place_deviation.max())
+            if width > self.within:
+                lines.append(f"{one.name} is not determined (+- {1e3 * width:.0f} mm)")
+        return tuple(lines)
 
     def _deviation(self, spread: FloatArray) -> FloatArray:
         square = (spread**2).sum(axis=2) + self.model_deviation[:, None] ** 2
@@ -133,7 +182,7 @@ def register(
     """Bring an organ to a cloud of points on its deformed surface.
 
     The response is that of small strains, also where a vademecum has the load's magnitude as a
-    coordinate: loads that are fitted make up for what that leaves out.
+    coordinate; what that leaves out is part of the standard deviations.
 
     Raises
     ------
@@ -141,29 +190,46 @@ def register(
         If the cloud cannot be one of this organ.
     """
     rule = rule or RegistrationRule()
-    found = fit(vademecum, cloud, rule)
-    n = found.loads.size
+    problem, notices = posed(vademecum, cloud, rule)
+    found, rival = chosen(problem)
+    n, motion, mesh = found.loads.size, found.motion, vademecum.mesh
     roots = UNDERSTATED * _roots(vademecum, found)
-    unknown = np.hstack([found.coefficients[:, None], roots[:n]])
-    fields = (found.columns.reshape(-1, n) @ unknown).reshape(*found.columns.shape[:2], -1)
-    displacement, spread = fields[:, :, 0], fields[:, :, 1:]
-    motion = found.motion
-    place = motion(vademecum.mesh.vertices + displacement)
+    displacement = found.loads.displacement(found.coefficients)
+    place = motion(mesh.vertices + displacement)
+    spread = (found.loads.columns.reshape(-1, n) @ roots[:n]).reshape(*displacement.shape, -1)
     turned = np.einsum("ab,nbk->nak", motion.matrix, spread)
     arms = place - motion.centre - motion.shift
     turned += np.cross(roots[n : n + 3].T[None], arms[:, None], axis=2).swapaxes(1, 2)
     turned += roots[n + 3 :]
+    for one in (*found.alternatives, *rival):
+        root = np.sqrt(one.weight)
+        spread = _beside(spread, root * (one.displacement - displacement))
+        turned = _beside(turned, root * (one.place - place))
     certificate = vademecum.certificate
-    error = certificate.l2_mean if certificate is not None else 0.0
+    error = 0.0 if certificate is None else float(np.nan_to_num(certificate.l2_mean))
+    error = float(np.hypot(error, SMALL_STRAINS_OFF * mean_gradient(mesh, displacement)))
+    apart = np.linalg.norm(place[:, None] - cloud_part(problem.points)[None], axis=2).min(axis=1)
     return Registered(
         found,
         displacement,
         place,
         spread,
         turned,
-        0.0 if np.isnan(error) else float(error),
-        _problems(found, rule, mean_strain(vademecum.mesh, displacement)),
+        error,
+        apart < _SEEN,
+        rule.within,
+        _problems(found, rule, mean_strain(mesh, displacement)),
+        notices,
     )
+
+
+def _beside(spread: FloatArray, column: FloatArray) -> FloatArray:
+    return np.concatenate([spread, column[:, :, None]], axis=2)
+
+
+def cloud_part(points: FloatArray) -> FloatArray:
+    """Some 500 points of a cloud, by which distances to it are judged."""
+    return points[:: max(1, len(points) // 500)]
 
 
 def targets(vademecum: Vademecum, registered: Registered) -> list[Estimate]:
@@ -213,13 +279,13 @@ def strongest_forces(
     vademecum: Vademecum, registered: Registered, n: int = 3
 ) -> tuple[PlaceForce, ...]:
     """Forces within two patch radii of the places that are pressed or pulled hardest."""
-    surface, loads = vademecum.surface, registered.fit.loads
-    forces = loads.at_positions(registered.fit.coefficients[:, None])[:, :, 0]
+    surface, found = vademecum.surface, registered.fit
+    forces = found.loads.at_positions(found.coefficients)
     reach = 2.0 * surface.patch_radius
     apart = np.linalg.norm(surface.centers[:, None] - surface.centers[None], axis=2)
     sums = (apart < reach) @ forces
-    chosen = surface.largest_apart(np.linalg.norm(sums, axis=1), n, 2.0 * reach)
-    return tuple(PlaceForce(surface.centers[k], sums[k]) for k in chosen)
+    strongest = surface.largest_apart(np.linalg.norm(sums, axis=1), n, 2.0 * reach)
+    return tuple(PlaceForce(surface.centers[k], sums[k]) for k in strongest)
 
 
 def _roots(vademecum: Vademecum, found: Fit) -> FloatArray:
@@ -227,7 +293,7 @@ def _roots(vademecum: Vademecum, found: Fit) -> FloatArray:
     half = np.linalg.cholesky(found.covariance + 1e-12 * np.diag(np.diagonal(found.covariance)))
     some = vademecum.mesh.surface_vertices[::_EVERY]
     n = found.loads.size
-    moved = found.columns[some] @ half[:n]
+    moved = found.loads.columns[some] @ half[:n]
     arms = vademecum.mesh.vertices[some] - found.motion.centre
     moved += np.cross(half[n : n + 3].T[None], arms[:, None], axis=2).swapaxes(1, 2)
     moved += half[n + 3 :]

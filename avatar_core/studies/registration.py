@@ -25,6 +25,7 @@ from avatar_core.registration.fit import RegistrationRule, rigid_motion
 from avatar_core.registration.register import INTERVAL_90, register
 from avatar_core.registration.rigid import RigidMotion
 from avatar_core.studies.certainty_section import CertaintySettings, Section
+from avatar_core.studies.registration_others import other_rows, table_of
 from avatar_core.studies.registration_truth import CLASSES, Case, RegistrationSettings, Truth
 from avatar_core.studies.shapes import DEFAULT_FOLDER
 from avatar_core.studies.study import Panel, ProgressBar, Row, Run, Study, column, follow
@@ -64,12 +65,15 @@ class RegistrationStudy(Study[RegistrationSettings]):
             vademecum = build(organ, options)
             for row in case_rows(vademecum, Truth.of(organ, settings.n_true), settings):
                 run.add(row)
+            others = other_rows(organ, settings)
+            run.kept.setdefault("others", []).extend(others)
+        run.notices += table_of(run.kept["others"])
         run.notices.append(
             "the paper registers no clouds: there is no figure of its own beside ours"
         )
 
     def summary(self, run: Run[RegistrationSettings]) -> dict[str, float]:
-        return summarise(run.rows)
+        return summarise(run.rows) | others_summed_up(run.kept["others"])
 
     def sentence(self, run: Run[RegistrationSettings]) -> str:
         settings, summary = run.settings, run.summary
@@ -154,6 +158,24 @@ def summarise(rows: Sequence[Row]) -> dict[str, float]:
         summary[f"registration_error_{name}"] = mean("vademecum_error", kind)
         summary[f"registration_coverage_{name}"] = mean("coverage", kind)
     return summary
+
+
+def others_summed_up(rows: Sequence[Row]) -> dict[str, float]:
+    """Mean errors of point forces by prior, of packing, and of a pneumoperitoneum."""
+
+    def mean(kind: str, prior: str, key: str = "error") -> float:
+        some = [r for r in rows if str(r["class"]).startswith(kind) and r["prior"] == prior]
+        return float(np.mean([float(r[key]) for r in some if key in r]))  # type: ignore[arg-type]
+
+    return {
+        "point_force_error": mean("point", "nothing said"),
+        "point_force_error_frame_known": mean("point", "frame known"),
+        "point_force_error_zone_known": mean("point", "frame and zone known"),
+        "point_force_error_full_elements": mean("point", "rival: full elements, zone known"),
+        "point_force_coverage_unseen": mean("point", "nothing said", "coverage_unseen"),
+        "packing_error": mean("packing", "nothing said"),
+        "pneumoperitoneum_error": mean("pneumo", "pressure, shift 30 mm"),
+    }
 
 
 def measured(vademecum: Vademecum, case: Case) -> Row:

@@ -4,10 +4,15 @@ Loads act on a neo-Hookean organ of another mesh than the vademecum's: several d
 the accessible surface, a pressure over a large patch, and what the vademecum's loads do not hold:
 pushes elsewhere, a support that moves and bends, a weight that turned. Some 30 % of the surface is
 seen from the front, with noise, moved rigidly by up to 10 mm and 10 degrees.
+
+Beyond these stand three that others measure by: a force at one place of an organ that hangs on a
+small clamp, up to 60 mm, linear or neo-Hookean, of which 20 % are seen without noise; packing, a
+wide pressure from behind; and a pneumoperitoneum, a pressure all over with a shift of 10 to 45 mm.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +31,15 @@ from avatar_core.registration.cloud import Cloud
 from avatar_core.registration.rigid import RigidMotion
 
 CLASSES = ("pushes", "pressure", "pushes elsewhere", "moved support", "turned weight")
+OTHERS = ("point force", "point force, neo-Hookean", "packing", "pneumoperitoneum")
+POINT_PEAK = (5e-3, 60e-3)  # displacement where a point force acts [m]
+SMALL_CLAMP = 0.026  # its radius: 21 cm2 [m]
+_POINT = 6e-3  # radius of the patch of a point force [m]
+_SHIFT = (10e-3, 45e-3)  # of an organ under a pneumoperitoneum [m]
 _FRONT = 0.25  # least cosine between the normal of a face that is seen and the view
 _PARTS = (1.0, 0.7, 0.5, 0.35)  # of a load, one of which has an equilibrium
+_DRAWS = 6  # of loads, one of which has an equilibrium
+SOFT = Material(20e3, 0.45)  # of the organ on a small clamp
 _STEPS = 4  # in which a support moves
 _MOST_ITERATIONS = 8  # of Newton's method in each
 
@@ -60,6 +72,7 @@ class Case:
         shape (n, 3) [m]; volume : of each, summing to one
     small_strains : displacement by the same loads at small strains, shape (n, 3) [m]
     cloud : Cloud
+    force_at : middle of the faces that are loaded, shape (3,) [m] at rest; None if all over
     """
 
     rest: FloatArray
@@ -68,6 +81,7 @@ class Case:
     volume: FloatArray
     small_strains: FloatArray
     cloud: Cloud
+    force_at: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +101,71 @@ class Truth:
         """On a mesh, with the clamp of the anatomical rule."""
         regions = regions_by_rule(mesh)
         return cls(Hyperelasticity(mesh, NeoHookean(Material()), regions.clamped), regions)
+
+    @classmethod
+    def on_small_clamp(cls, mesh: TetMesh) -> Truth:
+        """Held by a disc in the middle of the usual clamp, and accessible everywhere else."""
+        usual = regions_by_rule(mesh).clamped
+        centre = mesh.vertices[mesh.boundary_faces].mean(axis=1)
+        off = np.linalg.norm(centre - centre[usual].mean(axis=0), axis=1)
+        middle = centre[usual][np.argmin(off[usual])]
+        held = np.linalg.norm(centre - middle, axis=1) < SMALL_CLAMP
+        return cls(Hyperelasticity(mesh, NeoHookean(SOFT), held), Regions(held, ~held))
+
+    def groups(self) -> dict[str, FloatArray]:
+        """Nodes of clamp and accessible surface, as a file of groups has them."""
+        faces = self.mesh.boundary_faces
+        regions = {"clamped": self.regions.clamped, "accessible": ~self.regions.clamped}
+        return {name: self.mesh.vertices[np.unique(faces[at])] for name, at in regions.items()}
+
+    def other_case(
+        self, kind: str, settings: RegistrationSettings, rng: np.random.Generator
+    ) -> Case:
+        """A deformation of OTHERS; without noise, and without rigid motion but for a shift.
+
+        Loads without an equilibrium are drawn again.
+        """
+        for _ in range(_DRAWS):
+            with suppress(EquilibriumError):
+                return self._drawn(kind, settings, rng)
+        raise EquilibriumError(f"no equilibrium under {_DRAWS} loads; take a smaller peak")
+
+    def _drawn(self, kind: str, settings: RegistrationSettings, rng: np.random.Generator) -> Case:
+        mesh, linear = self.mesh, self.elasticity
+        load, face = self._other_load(kind, rng)
+        moved = linear.solve(load)
+        peak = POINT_PEAK if kind.startswith("point") else settings.peak
+        size = rng.uniform(*peak) / np.linalg.norm(moved.reshape(-1, 3), axis=1).max()
+        seen = _seen_faces(mesh, 0.2, rng)
+        part, solved = 1.0, size * moved[:, 0]
+        if kind != "point force":
+            part, solved = _loaded(self.problem, size * load[:, 0])
+        both = linear.at_vertices(np.stack([solved, part * size * moved[:, 0]], axis=1))
+        u, small = both.T.reshape(2, -1, 3)
+        shift: FloatArray = np.zeros(3)
+        if kind == "pneumoperitoneum":
+            shift = rng.uniform(*_SHIFT) * _in_ball(rng, on_sphere=True)
+        motion = RigidMotion(mesh.vertices.mean(axis=0), shift=shift)
+        place = motion(mesh.vertices + u)
+        still = RegistrationSettings(n_points=settings.n_points, noise=0.0)
+        points = _seen_points(TetMesh(place, mesh.tets), seen, still, rng)
+        at = None if face is None else mesh.vertices[mesh.boundary_faces[face]].mean(axis=0)
+        volume = mesh.vertex_volumes / mesh.volume
+        return Case(mesh.vertices, u, place, volume, small, Cloud(points), at)
+
+    def _other_load(self, kind: str, rng: np.random.Generator) -> tuple[FloatArray, int | None]:
+        """Nodal forces (3 n_nodes, 1) of any size, and the face where they act, if at one."""
+        mesh, free = self.mesh, np.flatnonzero(~self.regions.clamped)
+        unit = mesh.face_area_normals / mesh.face_areas[:, None]
+        if kind.startswith("point"):
+            face = int(rng.choice(free, p=mesh.face_areas[free] / mesh.face_areas[free].sum()))
+            force = rng.choice([-1.0, -1.0, 1.0]) * unit[face] + 0.7 * _in_ball(rng, True)
+            centre = mesh.vertices[mesh.boundary_faces[face]].mean(axis=0)
+            return patch_loads(self.elasticity, centre[None], _POINT) @ force[:, None], face
+        if kind == "packing":
+            behind = np.flatnonzero(~self.regions.clamped & (unit[:, 1] < -0.3))
+            return self._pressure(rng, rng.choice(behind)), None
+        return self._pressure(rng, None), None
 
     @property
     def elasticity(self) -> Elasticity:
@@ -142,7 +221,7 @@ class Truth:
             total = np.asarray(self.elasticity.mass.sum(axis=0)).ravel()
             return np.outer(total, rng.standard_normal(3)).reshape(-1, 1)
         if kind == "pressure":
-            return self._pressure(rng)
+            return self._pressure(rng, rng.choice(np.flatnonzero(self.regions.accessible)))
         here = self.regions.accessible
         if kind == "pushes elsewhere":
             here = ~(here | self.regions.clamped)
@@ -160,14 +239,15 @@ class Truth:
             load[:, 0] += patch @ force
         return load
 
-    def _pressure(self, rng: np.random.Generator) -> FloatArray:
-        """A constant pressure within 50 to 80 mm of an accessible face: a third for each edge."""
+    def _pressure(self, rng: np.random.Generator, face: int | None) -> FloatArray:
+        """A constant pressure within 50 to 80 mm of a face, or all over: a third for each edge."""
         mesh = self.mesh
         centre = mesh.vertices[mesh.boundary_faces].mean(axis=1)
         unit = mesh.face_area_normals / mesh.face_areas[:, None]
-        face = rng.choice(np.flatnonzero(self.regions.accessible))
-        near = np.linalg.norm(centre - centre[face], axis=1) < rng.uniform(0.05, 0.08)
-        near &= unit @ unit[face] > 0.2
+        near = ~self.regions.clamped
+        if face is not None:
+            near = np.linalg.norm(centre - centre[face], axis=1) < rng.uniform(0.05, 0.08)
+            near &= unit @ unit[face] > 0.2
         load = np.zeros((self.elasticity.n_nodes, 3))
         for k in range(3, 6):
             np.add.at(

@@ -16,15 +16,18 @@ import scipy.sparse as sp
 
 from avatar_core.cli import main as cli
 from avatar_core.errors import AvatarError, RegistrationError
-from avatar_core.geometry.mesh import TetMesh
+from avatar_core.geometry.mesh import TetMesh, tetrahedralize
 from avatar_core.geometry.point_location import carriers
+from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.registration.cloud import Cloud, read_cloud
 from avatar_core.registration.fit import RegistrationRule, rigid_motion
+from avatar_core.registration.loads import PointForces, allowed_at, smooth_loads
 from avatar_core.registration.posterior import Scales, averaged, cells_of, equations, posterior
 from avatar_core.registration.register import register, target_at, targets
 from avatar_core.registration.rigid import RigidMotion
-from avatar_core.registration.traction import load_basis
+from avatar_core.registration.sites import Noise, find_sites
 from avatar_core.studies.registration import measured
+from avatar_core.studies.registration_others import POINT, answers, on_small_clamp
 from avatar_core.studies.registration_truth import Case, RegistrationSettings, Truth
 from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
@@ -92,27 +95,75 @@ def test_a_rigid_motion_and_its_derivatives() -> None:
         np.testing.assert_allclose(rows[:, k], (moved * normals).sum(axis=1) / 1e-6, atol=1e-5)
 
 
+def everywhere(vademecum: Vademecum) -> np.ndarray:
+    return np.ones(vademecum.surface.n_positions, bool)
+
+
 def test_loads_displace_as_the_vademecum_does(phantom_vademecum: Vademecum) -> None:
     v = phantom_vademecum
-    basis = load_basis(v)
-    coefficient = np.zeros((basis.size, 1))
-    coefficient[[1, 4]] = [[30.0], [-20.0]]  # along x
-    every = np.arange(len(v.mesh.vertices))
-    found = basis.displacement(v, every, coefficient)[:, :, 0]
-    force = basis.at_positions(coefficient)[:, 0, 0]
-    expected = v.displacement(np.arange(v.surface.n_positions), force)[:, 0].reshape(-1, 3)
+    basis = smooth_loads(v, everywhere(v))
+    coefficient = np.zeros(basis.size)
+    coefficient[[1, 4]] = [30.0, -20.0]  # along x
+    forces = basis.at_positions(coefficient)
+    assert not forces[:, 1:].any()
+    expected = v.displacement(np.arange(v.surface.n_positions), forces[:, 0])[:, 0].reshape(-1, 3)
+    found = basis.displacement(coefficient)
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_a_pressure_acts_along_normals(phantom_vademecum: Vademecum) -> None:
+    v = phantom_vademecum
+    basis = smooth_loads(v, everywhere(v), along_normals=True)
+    coefficient = np.zeros(basis.size)
+    coefficient[3] = 1.0
+    force = basis.at_positions(coefficient)
+    across = force - (force * v.surface.normals).sum(axis=1)[:, None] * v.surface.normals
+    assert np.abs(across).max() < 1e-9 * np.abs(force).max()
+    assert basis.size == len(basis.spread(1.0, 0.03)) == 50 + 3
+
+
+def test_point_forces_displace_as_the_vademecum_does(phantom_vademecum: Vademecum) -> None:
+    v = phantom_vademecum
+    places = PointForces.of(v, everywhere(v))
+    basis = places.basis([3, 8])
+    z = np.array([0.1, -0.2, 0.3, 0.0, 0.4, 0.0])
+    force = basis.at_positions(z)
+    assert np.flatnonzero(force.any(axis=1)).tolist() == sorted(places.positions[[3, 8]])
+    one = force[places.positions[8]]
+    expected = v.field.under(places.positions[[8]], one[None, :, None].astype(np.float32))
+    moved = v.blocks.at_vertices(expected).reshape(-1, 3)
+    np.testing.assert_allclose(
+        basis.displacement(np.r_[np.zeros(3), z[3:]]), moved, atol=1e-5 * np.abs(moved).max()
+    )
+    size = np.linalg.norm(places.columns[:, :, 8], axis=1).max(axis=0)
+    assert places.per_metre[8] * np.sqrt((size**2).mean()) == pytest.approx(1.0, rel=1e-5)
+
+
+def test_forces_act_where_that_is_said(phantom_vademecum: Vademecum) -> None:
+    surface = phantom_vademecum.surface
+    assert allowed_at(surface, "accessible").all()
+    x, y, z = surface.centers[5]
+    near = allowed_at(surface, f"near {x},{y},{z},0.02")
+    away = np.linalg.norm(surface.centers - surface.centers[5], axis=1)
+    assert (near == (away < 0.02)).all() and near.any()
+    seen = allowed_at(surface, "seen", surface.centers[away < 0.04])
+    assert seen[away < 0.04].all() and not seen[away > 0.1].any()
+    for wrong in ("inside", "near 1 2", "near a b c d"):
+        with pytest.raises(RegistrationError, match="give accessible"):
+            allowed_at(surface, wrong)
+    with pytest.raises(RegistrationError, match="larger radius"):
+        allowed_at(surface, "near 9 9 9 0.01")
 
 
 def test_a_weight_that_turned_sags_as_body_forces_do(
     phantom_vademecum: Vademecum, truth: Truth
 ) -> None:
     v, problem = phantom_vademecum, truth.elasticity
-    basis = load_basis(v)
-    coefficient = np.zeros((basis.size, 1))
+    basis = smooth_loads(v, everywhere(v))
+    coefficient = np.zeros(basis.size)
     coefficient[-1] = 1e4
     corners, weights = carriers(v.mesh, truth.mesh.vertices)
-    moved = basis.displacement(v, np.arange(len(v.mesh.vertices)), coefficient)[:, :, 0]
+    moved = basis.displacement(coefficient)
     total = np.asarray(problem.mass.sum(axis=0)).ravel()
     load = np.outer(total, [0.0, 0.0, 1e4]).reshape(-1, 1)
     expected = problem.at_vertices(problem.solve(load)).reshape(-1, 3)
@@ -125,9 +176,8 @@ def test_traction_is_correlated_over_the_length_that_is_asked_for(
     phantom_vademecum: Vademecum,
 ) -> None:
     surface, length = phantom_vademecum.surface, 0.04
-    basis = load_basis(phantom_vademecum, 120)
-    n = len(basis.eigenvalues)
-    field = basis.forces * basis.spread(2.0, length)[:n]
+    basis = smooth_loads(phantom_vademecum, everywhere(phantom_vademecum), n=120)
+    field = basis.forces[:, 0, :120] * basis.spread(2.0, length)[:120]
     field /= np.linalg.norm(field, axis=1, keepdims=True)  # the area of a position cancels
     apart = np.linalg.norm(surface.centers[:, None] - surface.centers[None], axis=2)
     facing = surface.normals @ surface.normals.T > 0.8  # where the surface is nearly flat
@@ -136,6 +186,45 @@ def test_traction_is_correlated_over_the_length_that_is_asked_for(
         pairs = facing & (np.abs(apart - distance) < 0.05 * distance)
         expected = np.exp(-(distance**2) / (2.0 * length**2))
         assert np.median(correlation[pairs]) == pytest.approx(expected, abs=0.06)
+
+
+def test_places_of_forces_are_sought_by_the_likelihood_of_the_dense_gaussian() -> None:
+    rng = np.random.default_rng(0)
+    n, places = 40, 5
+    common, rows = rng.standard_normal((n, 2)), rng.standard_normal((n, places, 3))
+    data, W = rng.standard_normal(n), rng.uniform(0.5, 2.0, n)
+    cells = cells_of(rng.uniform(0.0, 3.0, (n, 3)), 1.0)
+    error = np.diag(0.7**2 / W) + 0.4**2 * (cells.T @ cells).toarray()
+
+    def log_likelihood(J: np.ndarray) -> float:
+        cov = error + J @ J.T
+        return -0.5 * (data @ np.linalg.solve(cov, data) + np.linalg.slogdet(cov)[1])
+
+    found = find_sites(common, rows, data, Noise(W, cells, 0.7, 0.4), most=1)
+    expected = [
+        log_likelihood(np.hstack([common, rows[:, j]])) - log_likelihood(common)
+        for j in range(places)
+    ]
+    np.testing.assert_allclose(found.gain, expected, rtol=1e-3, atol=1e-3)
+    assert found.chosen == [int(np.argmax(expected))]
+
+
+def test_two_places_are_found_among_many(phantom_vademecum: Vademecum) -> None:
+    v = phantom_vademecum
+    places = PointForces.of(v, everywhere(v))
+    rng = np.random.default_rng(1)
+    some = v.mesh.surface_vertices
+    columns = places.columns[some].reshape(3 * len(some), -1, 3)
+    columns = columns * (0.01 * places.per_metre)[None, :, None]
+    true = [10, 200]
+    data = sum(columns[:, k] @ rng.standard_normal(3) for k in true)
+    data = data + 1e-4 * rng.standard_normal(len(data))
+    error = Noise(np.ones(len(data)), sp.identity(len(data), format="csr"), 1e-4, 1e-6)
+    found = find_sites(np.zeros((len(data), 1)), columns, data, error)
+    centres = v.surface.centers[places.positions]
+    assert len(found.chosen) <= 3  # two neighbours may stand for one
+    for k in true:
+        assert np.linalg.norm(centres[found.chosen] - centres[k], axis=1).min() < 0.02
 
 
 @pytest.mark.long
@@ -169,12 +258,76 @@ def test_the_standard_deviation_grows_away_from_what_is_seen(
     assert deviation[seen > 0.07].mean() > 1.5 * deviation[seen < 0.01].mean()
 
 
+def test_a_force_at_one_place_of_a_small_clamp_is_found(phantom: SurfaceMesh) -> None:
+    """An organ that swings by centimetres, of which a fifth is seen; smooth loads are of no use."""
+    truth = Truth.on_small_clamp(tetrahedralize(phantom, 1400))
+    vademecum = on_small_clamp(phantom, truth, 900)
+    settings = RegistrationSettings(n_points=1500)
+    case = truth.other_case("point force", settings, np.random.default_rng(0))
+    rows = {str(row["prior"]): row for row in answers(vademecum, case, POINT)}
+    assert rows["nothing said"]["error"] < 0.4 and rows["nothing said"]["kind"] == "few"
+    known, rival = (
+        rows[name] for name in ("frame and zone known", "rival: full elements, zone known")
+    )
+    assert known["error"] < max(0.15, 1.5 * float(rival["error"]))
+    assert known["coverage_unseen"] > 0.8
+    smooth = rows["frame known, smooth"]
+    assert smooth["error"] > 3.0 * known["error"] and not smooth["good"]
+
+
+def test_what_the_cloud_does_not_decide_is_not_called_determined(
+    phantom_vademecum: Vademecum, case: Case
+) -> None:
+    """A few points at one end leave the other to the prior, whose width the interval has."""
+    points = case.cloud.points
+    end = points[np.argsort(points[:, 0])[:600]]
+    rule = RegistrationRule(kind="smooth", within=1e-3)
+    found = register(phantom_vademecum, Cloud(end), rule)
+    missing = found.undetermined()
+    assert missing and "not determined within 1 mm" in missing[0]
+    assert found.interval[~found.seen].mean() > 1.3 * found.interval[found.seen].mean()
+    assert found.by_data[found.seen].mean() > found.by_data[~found.seen].mean()
+    far = ~found.is_determined
+    assert (found.by_data[far] < 1.0).all() and far[~found.seen].mean() > 0.1
+    wide = register(phantom_vademecum, Cloud(end), replace(rule, within=0.2))
+    assert not wide.undetermined()
+
+
+def test_background_is_left_out_and_a_deformation_is_no_other_frame(
+    phantom_vademecum: Vademecum, case: Case
+) -> None:
+    table = np.random.default_rng(0).uniform(-0.3, 0.3, (300, 3)) * [1.0, 0.0, 1.0] - [0, 0.4, 0]
+    rule = RegistrationRule(kind="smooth")
+    found = register(phantom_vademecum, Cloud(np.vstack([case.cloud.points, table])), rule)
+    assert any("300 points over 100 mm off" in line for line in found.notices)
+    clean = register(phantom_vademecum, case.cloud, rule)
+    assert np.linalg.norm(found.place - clean.place, axis=1).mean() < 0.3e-3
+
+
+def test_alike_errors_of_neighbours_widen_the_intervals(
+    phantom_vademecum: Vademecum, case: Case
+) -> None:
+    """1 mm over 20 mm, as of a stereo camera: 1500 points are no 1500 measurements."""
+    points, rng = case.cloud.points, np.random.default_rng(0)
+    waves = rng.standard_normal((30, 3)) / 0.02
+    phase, size = rng.uniform(0, 2 * np.pi, 30), np.sqrt(2.0 / 30.0)
+    ripple = 1e-3 * size * np.cos(points @ waves.T + phase).sum(axis=1)
+    bent = Cloud(points + ripple[:, None] * [0.0, 1.0, 0.0])
+    rule = RegistrationRule(kind="smooth")
+    alone, alike = (
+        register(phantom_vademecum, bent, replace(rule, correlation=length))
+        for length in (0.0, 0.02)
+    )
+    assert alike.interval.mean() > alone.interval.mean()
+
+
 def test_strays_do_no_harm(phantom_vademecum: Vademecum, case: Case) -> None:
     points = case.cloud.points.copy()
     rng = np.random.default_rng(3)
     strays = rng.choice(len(points), len(points) // 25, replace=False)
     points[strays] += [0.0, 0.03, 0.0] + 5e-3 * rng.standard_normal((len(strays), 3))
-    clean, dirty = (register(phantom_vademecum, c) for c in (case.cloud, Cloud(points)))
+    rule = RegistrationRule(kind="smooth")
+    clean, dirty = (register(phantom_vademecum, c, rule) for c in (case.cloud, Cloud(points)))
     assert np.linalg.norm(dirty.place - clean.place, axis=1).mean() < 0.4e-3
     assert dirty.fit.outlying == pytest.approx(0.04, abs=0.015)
 
@@ -192,15 +345,16 @@ def test_a_deformation_beyond_small_strains_is_not_called_good(
 ) -> None:
     """The model fits it, as it is its own; no organ gives way like this."""
     v = phantom_vademecum
-    basis, mesh = load_basis(v), v.mesh
-    coefficient = np.zeros((basis.size, 1))
+    basis, mesh = smooth_loads(v, everywhere(v)), v.mesh
+    coefficient = np.zeros(basis.size)
     coefficient[2] = 1.0
-    moved = basis.displacement(v, np.arange(len(mesh.vertices)), coefficient)[:, :, 0]
+    moved = basis.displacement(coefficient)
     seen = mesh.vertex_normals[:, 1] > 0.3
     size = np.linalg.norm(moved, axis=1).max()
     for peak, is_good in ((0.01, True), (0.08, False)):
         place = mesh.vertices + moved * peak / size
-        problems = register(v, Cloud(place[seen])).problems
+        rule = RegistrationRule(kind="smooth")
+        problems = register(v, Cloud(place[seen]), rule).problems
         assert not problems if is_good else "strained by" in " ".join(problems)
 
 
@@ -368,6 +522,8 @@ def test_the_command_writes_the_surface_with_its_deviation(
         "displacement [m]",
         "standard deviation of displacement [m]",
         "standard deviation of place [m]",
+        "half of the 90 % interval of place [m]",
+        "decided by the cloud [-]",
     ]
     assert (tmp_path / "out_lesion.vtp").is_file()
     assert run(monkeypatch, *given, "-o", tmp_path / "out.vtu", "--json") == 0
