@@ -25,7 +25,7 @@ from avatar_core.registration.fit import RegistrationRule, rigid_motion
 from avatar_core.registration.register import INTERVAL_90, register
 from avatar_core.registration.rigid import RigidMotion
 from avatar_core.studies.certainty_section import CertaintySettings, Section
-from avatar_core.studies.registration_others import other_rows, table_of
+from avatar_core.studies.registration_others import Shown, other_rows, table_of
 from avatar_core.studies.registration_truth import CLASSES, Case, RegistrationSettings, Truth
 from avatar_core.studies.shapes import DEFAULT_FOLDER
 from avatar_core.studies.study import Panel, ProgressBar, Row, Run, Study, column, follow
@@ -65,15 +65,17 @@ class RegistrationStudy(Study[RegistrationSettings]):
             vademecum = build(organ, options)
             for row in case_rows(vademecum, Truth.of(organ, settings.n_true), settings):
                 run.add(row)
-            others = other_rows(organ, settings)
-            run.kept.setdefault("others", []).extend(others)
-        run.notices += table_of(run.kept["others"])
+            rows, run.kept["shown"] = other_rows(organ, settings)
+            for row in rows:
+                run.add(row)
+        run.notices += table_of(_others(run.rows))
         run.notices.append(
             "the paper registers no clouds: there is no figure of its own beside ours"
         )
 
     def summary(self, run: Run[RegistrationSettings]) -> dict[str, float]:
-        return summarise(run.rows) | others_summed_up(run.kept["others"])
+        own = [row for row in run.rows if row["class"] in CLASSES]
+        return summarise(own) | others_summed_up(_others(run.rows))
 
     def sentence(self, run: Run[RegistrationSettings]) -> str:
         settings, summary = run.settings, run.summary
@@ -83,13 +85,17 @@ class RegistrationStudy(Study[RegistrationSettings]):
             f"the mean displacement off ({summary['registration_rigid_error']:.0%} rigidly, "
             f"{summary['registration_splines_error']:.0%} by splines), 90 % intervals hold "
             f"{summary['registration_coverage']:.0%}, in "
-            f"{summary['registration_seconds']:.2f} s"
+            f"{summary['registration_seconds']:.2f} s. Point forces, a fifth seen: "
+            f"{summary['point_force_error']:.0%}, "
+            f"{summary['point_force_error_zone_known']:.0%} with frame and zone known "
+            f"({summary['point_force_error_full_elements']:.0%} by full elements)"
         )
 
     def draw(self, figure: Figure, run: Run[RegistrationSettings]) -> None:
-        left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+        left, middle, right = figure.subplots(1, 3, width_ratios=(3, 2, 2))
         draw_errors(left, run.rows)
-        draw_coverage(right, run.rows)
+        draw_coverage(middle, run.rows)
+        draw_determined(right, run.kept["shown"])
 
 
 STUDY = RegistrationStudy()
@@ -158,6 +164,23 @@ def summarise(rows: Sequence[Row]) -> dict[str, float]:
         summary[f"registration_error_{name}"] = mean("vademecum_error", kind)
         summary[f"registration_coverage_{name}"] = mean("coverage", kind)
     return summary
+
+
+def _others(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if row["class"] not in CLASSES]
+
+
+def draw_determined(axes: Axes, shown: Shown) -> None:
+    """Half of the 90 % interval over the organ, from the front, and the cloud."""
+    x, _, z = 1e3 * shown.place.T
+    drawn = axes.scatter(x, z, c=1e3 * shown.interval, s=9, cmap="viridis", vmin=0.0)
+    axes.plot(*(1e3 * shown.cloud[::20, [0, 2]].T), "k.", markersize=1.5, label="cloud")
+    axes.figure.colorbar(drawn, ax=axes, label="half of the 90 % interval of the place [mm]")
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [mm]")
+    axes.set_ylabel("z [mm]")
+    axes.legend(loc="upper right", fontsize=8)
+    axes.set_title("a point force, nothing said", fontsize=9)
 
 
 def others_summed_up(rows: Sequence[Row]) -> dict[str, float]:

@@ -70,18 +70,33 @@ PRIORS: dict[str, tuple[Prior, ...]] = {
 }
 
 
-def other_rows(organ: SurfaceMesh, settings: RegistrationSettings) -> list[Row]:
-    """A row for each case and prior of an organ, and for each rival."""
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """An answer to draw: place and interval of the surface's vertices [m], and the cloud [m]."""
+
+    place: FloatArray
+    interval: FloatArray
+    cloud: FloatArray
+
+
+def other_rows(organ: SurfaceMesh, settings: RegistrationSettings) -> tuple[list[Row], Shown]:
+    """A row for each case and prior of an organ, and for each rival; the first case to draw."""
     truth = Truth.on_small_clamp(tetrahedralize(organ, settings.n_true))
     vademecum = on_small_clamp(organ, truth, settings.n_vertices)
     rows: list[Row] = []
+    shown = _shown(vademecum, truth.other_case(OTHERS[0], settings, np.random.default_rng(0)))
     for kind in OTHERS:
         rng = np.random.default_rng(OTHERS.index(kind))
         for _ in follow(range(settings.n_cases), f"{organ.name}, {kind}"):
             case = truth.other_case(kind, settings, rng)
             about: Row = {"organ": organ.name, "class": kind}
             rows += [about | one for one in answers(vademecum, case, PRIORS[kind])]
-    return rows
+    return rows, shown
+
+
+def _shown(vademecum: Vademecum, case: Case) -> Shown:
+    found, at = register(vademecum, case.cloud), vademecum.mesh.surface_vertices
+    return Shown(found.place[at], found.interval[at], case.cloud.points)
 
 
 def on_small_clamp(organ: SurfaceMesh, truth: Truth, n_vertices: int) -> Vademecum:
