@@ -7,7 +7,7 @@ seen from the front, with noise, moved rigidly by up to 10 mm and 10 degrees.
 
 Beyond these stand three that others measure by: a force at one place of an organ that hangs on a
 small clamp, up to 60 mm, linear or neo-Hookean, of which 20 % are seen without noise; packing, a
-wide pressure from behind; and a pneumoperitoneum, a pressure all over with a shift of 10 to 45 mm.
+wide pressure from behind; and a pneumoperitoneum, a pressure of 1 to 2 kPa all over with a shift of 10 to 45 mm.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ OTHERS = ("point force", "point force, neo-Hookean", "packing", "pneumoperitoneu
 POINT_PEAK = (5e-3, 60e-3)  # displacement where a point force acts [m]
 SMALL_CLAMP = 0.026  # its radius: 21 cm2 [m]
 _POINT = 6e-3  # radius of the patch of a point force [m]
+_LINEAR = ("point force", "pneumoperitoneum")  # a dead pressure all over would turn the organ
+_GAS = (1e3, 2e3)  # pressure of a pneumoperitoneum, 8 to 15 mmHg [Pa]
 _SHIFT = (10e-3, 45e-3)  # of an organ under a pneumoperitoneum [m]
 _FRONT = 0.25  # least cosine between the normal of a face that is seen and the view
 _PARTS = (1.0, 0.7, 0.5, 0.35)  # of a load, one of which has an equilibrium
@@ -136,9 +138,10 @@ class Truth:
         moved = linear.solve(load)
         peak = POINT_PEAK if kind.startswith("point") else settings.peak
         size = rng.uniform(*peak) / np.linalg.norm(moved.reshape(-1, 3), axis=1).max()
+        size = rng.uniform(*_GAS) if kind == "pneumoperitoneum" else size
         seen = _seen_faces(mesh, 0.2, rng)
         part, solved = 1.0, size * moved[:, 0]
-        if kind != "point force":
+        if kind not in _LINEAR:
             part, solved = _loaded(self.problem, size * load[:, 0])
         both = linear.at_vertices(np.stack([solved, part * size * moved[:, 0]], axis=1))
         u, small = both.T.reshape(2, -1, 3)
