@@ -7,7 +7,7 @@ seen from the front, with noise, moved rigidly by up to 10 mm and 10 degrees.
 
 Beyond these stand three that others measure by: a force at one place of an organ that hangs on a
 small clamp, up to 60 mm, linear or neo-Hookean, of which 20 % are seen without noise; packing, a
-wide pressure from behind; and a pneumoperitoneum, a pressure of 1 to 2 kPa all over with a shift of 10 to 45 mm.
+wide pressure from behind; and a pneumoperitoneum, 1 to 2 kPa all over and a shift of 10 to 45 mm.
 """
 
 from __future__ import annotations
