@@ -68,6 +68,10 @@ def register(
     ] = "camera",
     shift: Annotated[float, typer.Option(help="root mean square of a rigid shift [m]")] = 0.01,
     turn: Annotated[float, typer.Option(help="root mean square of a rigid turn [degrees]")] = 10.0,
+    support_shift: Annotated[
+        float,
+        typer.Option(help="by how much each support of the vademecum may have moved, about [m]"),
+    ] = 0.0,
     kind: Annotated[
         str | None,
         typer.Option(
@@ -117,6 +121,7 @@ def register(
         noise=noise,
         turn=0.0 if known else math.radians(turn),
         shift=0.0 if known else shift,
+        support_shift=support_shift,
         kind=kind,  # type: ignore[arg-type]
         forces=forces.replace(",", " "),
         correlation=correlation,

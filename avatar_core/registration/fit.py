@@ -21,7 +21,14 @@ from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import RegistrationError
 from avatar_core.geometry.point_location import closest_points
 from avatar_core.registration.cloud import Cloud
-from avatar_core.registration.loads import Kind, LoadBasis, PointForces, allowed_at, smooth_loads
+from avatar_core.registration.loads import (
+    Kind,
+    LoadBasis,
+    PointForces,
+    allowed_at,
+    moved_supports,
+    smooth_loads,
+)
 from avatar_core.registration.posterior import (
     Equations,
     Posterior,
@@ -47,6 +54,8 @@ class RegistrationRule:
     kind : of the loads, see :mod:`avatar_core.registration.loads`; None for smooth or few, by what
         each predicts of patches that are left out
     forces : where they may act, see :func:`avatar_core.registration.loads.allowed_at`
+    support_shift : prior root mean square by which each support of the vademecum moves [m]; 0: none
+        does
     correlation : length over which errors of the points are alike [m]; at least the mesh's edge
     within : a place counts as determined if its interval of 90 % is no wider to either side [m]
     freedom : degrees of freedom of Student's distribution, from which points are weighed
@@ -60,6 +69,7 @@ class RegistrationRule:
     shift: float = 10e-3
     kind: Kind | None = None
     forces: str = "accessible"
+    support_shift: float = 0.0
     correlation: float = 0.0
     within: float = 5e-3
     freedom: float = 10.0
@@ -159,7 +169,7 @@ def fit(problem: Problem, kind: Kind) -> Fit:
         elif step < settled:
             wide = problem.widened(scales, seen) if step < 2 else scales
             sites = problem.sites(seen, wide)
-            loads = problem.point_forces.basis(sites.chosen)
+            loads = problem.forces_at(sites.chosen)
         found = problem.equations(seen, loads)
         spread = problem.spread_of(loads)
         if step - settled in rule.rescaled:
@@ -283,10 +293,28 @@ class Problem:
     def field(self, kind: Kind) -> LoadBasis:
         """Tractions all over where forces may act."""
         if kind not in self._kinds:
-            self._kinds[kind] = smooth_loads(self.vademecum, self.allowed, kind == "pressure")
+            smooth = smooth_loads(self.vademecum, self.allowed, kind == "pressure")
+            self._kinds[kind] = smooth.beside(self.supports) if self.supports else smooth
         found = self._kinds[kind]
         assert isinstance(found, LoadBasis)
         return found
+
+    @property
+    def supports(self) -> LoadBasis | None:
+        """Motions of the supports, if they may move."""
+        if not self.vademecum.supports or not self.rule.support_shift:
+            return None
+        if "supports" not in self._kinds:
+            moved = moved_supports(self.vademecum, self.rule.support_shift)
+            self._kinds["supports"] = moved
+        found = self._kinds["supports"]
+        assert isinstance(found, LoadBasis)
+        return found
+
+    def forces_at(self, chosen: list[int]) -> LoadBasis:
+        """A few forces, beside motions of the supports."""
+        forces = self.point_forces.basis(chosen)
+        return forces.beside(self.supports) if self.supports else forces
 
     @property
     def point_forces(self) -> PointForces:
@@ -399,6 +427,9 @@ class Problem:
         size = np.repeat(scales[0] * places.per_metre, 3).astype(np.float32)
         rows = (seen.by_surface.astype(np.float32) @ columns) * size
         common = seen.by_motion * self.rigid_spread
+        if self.supports:
+            moved = self.supports.columns[self.on_surface].reshape(3 * len(self.on_surface), -1)
+            common = np.hstack([common, seen.by_surface @ moved * self.supports.spread(0.0, 0.0)])
         error = Noise(seen.weights, seen.cells, float(scales[2]), float(scales[3]))
         return find_sites(common, rows.reshape(len(rows), -1, 3), seen.data, error)
 
@@ -417,7 +448,7 @@ class Problem:
         alternatives = []
         for part, place in zip(weight, order[kept], strict=True):
             chosen = [int(place), *(k for k in found.chosen[1:] if k != place)]
-            loads = self.point_forces.basis(chosen)
+            loads = self.forces_at(chosen)
             solved: Posterior = at_scales(
                 self.equations(seen, loads), self.spread_of(loads), scales
             )

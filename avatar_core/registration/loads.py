@@ -25,6 +25,7 @@ import scipy.sparse.linalg as sla
 
 from avatar_core.common.arrays import FloatArray, IntArray, farthest_points
 from avatar_core.errors import RegistrationError
+from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.vademecum.model import Vademecum
 
@@ -55,9 +56,21 @@ class LoadBasis:
         """Number of coefficients."""
         return self.columns.shape[2]
 
+    def beside(self, other: LoadBasis) -> LoadBasis:
+        """These loads and others together."""
+
+        def spread(scale: float, length: float) -> FloatArray:
+            return np.concatenate([self.spread(scale, length), other.spread(scale, length)])
+
+        forces, columns = (
+            np.concatenate(pair, axis=2)
+            for pair in ((self.forces, other.forces), (self.columns, other.columns))
+        )
+        return LoadBasis(forces, columns, spread)
+
     def at_positions(self, coefficients: FloatArray) -> FloatArray:
         """Forces at load positions, shape (n_positions, 3) [N]."""
-        return np.asarray(self.forces @ coefficients[: self.forces.shape[2]])
+        return np.asarray(self.forces @ coefficients)
 
     def displacement(self, coefficients: FloatArray) -> FloatArray:
         """Displacement of the vertices, shape (n_vertices, 3) [m]."""
@@ -82,15 +95,17 @@ def smooth_loads(
     )
     forces = forces.reshape(len(area), 3, -1)
     columns = displaced_by(vademecum, np.arange(len(area)), forces)
+    n_tractions = forces.shape[2]
     n_weight = 0 if vademecum.body is None else 3
     if n_weight and vademecum.body is not None:
         sag = vademecum.far.space.astype(float) @ vademecum.body.weight
         columns = np.concatenate([columns, sag.reshape(len(columns), 3, 3)], axis=2)
+        forces = np.concatenate([forces, np.zeros((len(area), 3, n_weight))], axis=2)
 
     def spread(traction: float, length: float) -> FloatArray:
         decay = np.exp(-(length**2) * eigenvalues / 4.0)
         each = traction * np.sqrt(2.0 * np.pi) * length * decay
-        times = forces.shape[2] // len(each)
+        times = n_tractions // len(each)
         return np.concatenate([np.tile(each, times), np.full(n_weight, WEIGHT_SPREAD)])
 
     return LoadBasis(forces, columns, spread)
@@ -149,6 +164,42 @@ def displaced_by(vademecum: Vademecum, positions: IntArray, forces: FloatArray) 
         moved = vademecum.field.under(positions[active], part[active])
         out[:, :, some] = vademecum.blocks.at_vertices(moved).reshape(n_vertices, 3, -1)
     return out
+
+
+# --- what holds the organ ------------------------------------------------------------------------
+
+
+def moved_supports(vademecum: Vademecum, shift: float) -> LoadBasis:
+    """Springs whose other ends move rigidly, six unknowns each: packing, a diaphragm that rises.
+
+    On a support the traction is k (d - u), so that a motion d of its other end loads the organ by
+    k int d . v da; its response is solved for by finite elements. The clamp alone moves as the
+    frame does.
+
+    shift : prior root mean square of a shift [m]; a turn moves the rim of a support as far
+    """
+    mesh, supports = vademecum.mesh, vademecum.supports
+    elasticity = Elasticity(mesh, vademecum.material, vademecum.regions.clamped, supports=supports)
+    n_material = len(elasticity.factors) - len(supports)
+    loads, spreads = [], []
+    for k, support in enumerate(supports):
+        corners = mesh.vertices[mesh.boundary_faces[support.faces]]
+        at = np.concatenate([corners, (corners + np.roll(corners, -1, axis=1)) / 2.0], axis=1)
+        nodes = elasticity.face_nodes[support.faces]
+        arms = at[:, : nodes.shape[1]] - corners.mean(axis=(0, 1))
+        reach = float(np.linalg.norm(arms, axis=2).max())
+        for axis in np.eye(3):
+            for field in (np.broadcast_to(axis, arms.shape), np.cross(axis, arms)):
+                moved = np.zeros((elasticity.n_nodes, 3))
+                moved[nodes] = field
+                force = elasticity.apply_term(n_material + k, moved.reshape(-1, 1))
+                loads.append(support.stiffness * force[:, 0])
+            spreads += [shift / np.sqrt(3.0), shift / reach / np.sqrt(3.0)]
+    solved = elasticity.at_vertices(elasticity.solve(np.stack(loads, axis=1)))
+    columns = solved.reshape(len(mesh.vertices), 3, -1)
+    forces = np.zeros((vademecum.surface.n_positions, 3, columns.shape[2]))
+    each = np.array(spreads)
+    return LoadBasis(forces, columns, lambda scale, length: each)
 
 
 # --- where loads may act ----------------------------------------------------------------------

@@ -290,7 +290,9 @@ def strongest_forces(
 
 def _roots(vademecum: Vademecum, found: Fit) -> FloatArray:
     """R with R R^T ~ the covariance, shape (n + 6, k): what moves the surface alone."""
-    half = np.linalg.cholesky(found.covariance + 1e-12 * np.diag(np.diagonal(found.covariance)))
+    size = np.sqrt(np.maximum(np.diagonal(found.covariance), np.finfo(float).tiny))
+    value, vector = np.linalg.eigh(found.covariance / np.outer(size, size))  # alike in unit
+    half = size[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
     some = vademecum.mesh.surface_vertices[::_EVERY]
     n = found.loads.size
     moved = found.loads.columns[some] @ half[:n]

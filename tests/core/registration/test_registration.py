@@ -16,12 +16,13 @@ import scipy.sparse as sp
 
 from avatar_core.cli import main as cli
 from avatar_core.errors import AvatarError, RegistrationError
+from avatar_core.fem.supports import Support
 from avatar_core.geometry.mesh import TetMesh, tetrahedralize
 from avatar_core.geometry.point_location import carriers
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.registration.cloud import Cloud, read_cloud
 from avatar_core.registration.fit import RegistrationRule, rigid_motion
-from avatar_core.registration.loads import PointForces, allowed_at, smooth_loads
+from avatar_core.registration.loads import PointForces, allowed_at, moved_supports, smooth_loads
 from avatar_core.registration.posterior import Scales, averaged, cells_of, equations, posterior
 from avatar_core.registration.register import register, target_at, targets
 from avatar_core.registration.rigid import RigidMotion
@@ -186,6 +187,43 @@ def test_traction_is_correlated_over_the_length_that_is_asked_for(
         pairs = facing & (np.abs(apart - distance) < 0.05 * distance)
         expected = np.exp(-(distance**2) / (2.0 * length**2))
         assert np.median(correlation[pairs]) == pytest.approx(expected, abs=0.06)
+
+
+def test_the_only_support_takes_the_organ_with_it(phantom_vademecum: Vademecum) -> None:
+    """Whatever its stiffness; two supports that part strain it, and are found by their motion."""
+    v, mesh = phantom_vademecum, phantom_vademecum.mesh
+    faces = v.regions.clamped
+    free = replace(v.regions, clamped=np.zeros_like(faces))
+    held = replace(v, regions=free, supports=(Support("bare_area", faces, 3e5),))
+    moved = moved_supports(held, 0.02)
+    assert moved.size == 6 and not moved.forces.any()
+    corners = mesh.vertices[mesh.boundary_faces[faces]].reshape(-1, 3)
+    arms = mesh.vertices - corners.mean(axis=0)
+    for k, axis in enumerate(np.eye(3)):
+        np.testing.assert_allclose(moved.columns[:, :, 2 * k] - axis, 0.0, atol=1e-5)
+        turned = np.cross(axis, arms)
+        np.testing.assert_allclose(moved.columns[:, :, 2 * k + 1] - turned, 0.0, atol=1e-5)
+
+
+def test_supports_that_moved_are_found_where_that_is_said(phantom_vademecum: Vademecum) -> None:
+    v, mesh = phantom_vademecum, phantom_vademecum.mesh
+    held = np.flatnonzero(v.regions.clamped)
+    middle = mesh.vertices[mesh.boundary_faces[held]].mean(axis=(0, 1))[0]
+    left = v.regions.clamped.copy()
+    left[held] = mesh.vertices[mesh.boundary_faces[held]].mean(axis=1)[:, 0] < middle
+    free = replace(v.regions, clamped=np.zeros_like(left))
+    parts = (Support("a", left, 1e7), Support("b", v.regions.clamped & ~left, 1e7))
+    v = replace(v, regions=free, supports=parts)
+    moved = moved_supports(v, 0.02)
+    truth = moved.displacement(np.eye(moved.size)[2] * 0.01)  # the first shifts along y
+    seen = mesh.vertex_normals[:, 1] > 0.3
+    cloud = Cloud((mesh.vertices + truth)[seen])
+    rule = RegistrationRule(turn=0.0, shift=0.0, kind="smooth")
+    off = [
+        np.linalg.norm(register(v, cloud, one).displacement - truth, axis=1).mean()
+        for one in (rule, replace(rule, support_shift=0.02))
+    ]
+    assert off[1] < 0.1 * np.linalg.norm(truth, axis=1).mean() and off[1] < 0.3 * off[0]
 
 
 def test_places_of_forces_are_sought_by_the_likelihood_of_the_dense_gaussian() -> None:
