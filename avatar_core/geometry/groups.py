@@ -19,7 +19,7 @@ from avatar_core.geometry.mesh import Regions, TetMesh, checked, touching
 from avatar_core.geometry.point_location import barycentric_centroids
 
 _FEW = 4  # points of a group, from which on they cover an area
-_AROUND = 8  # nearest points that are looked at
+_AROUND = 16  # nearest points that are looked at
 _PIECES = 3  # a face is sampled at the centroids of this number squared of triangles
 _HALF_TURN = 1.05 * np.pi  # between two points in sight, above which a place lies beside them
 _REACH = 1.5  # of the nearest point, over the spacing of a group
