@@ -34,6 +34,7 @@ _MOST_MISMATCH = 0.6  # of the surface, over the noise expected; meshes that dif
 # loads have to explain what none of them caused, those that look like the cloud have 0.3.
 _MOST_STRAIN = 0.15
 _SEEN = 0.015  # of a vertex from the nearest point of the cloud, at most [m]
+_OUT_OF_SIGHT = 0.05  # from which on nothing makes up for the model's error [m]
 _MOST_HIDDEN = 0.1  # part of what is not seen that may be undetermined in a good answer
 _INSIDE = 5e-3  # of a target from the organ at most [m]
 
@@ -68,7 +69,7 @@ class Registered:
     displacement_spread, place_spread : ndarray, shape (n_vertices, 3, k) [m], square roots of the
         posterior covariance, S S^T of any vertices together
     model_error : relative, by the vademecum's certificate and by what small strains leave out
-    seen : ndarray of bool, shape (n_vertices,), less than 15 mm from a point of the cloud
+    away : ndarray, shape (n_vertices,), of each place from the nearest point of the cloud [m]
     within : bound of the rule, within which a place is determined [m]
     problems : why the model does not explain the cloud, one line each; empty if it does
     notices : what else there is to know, one line each
@@ -80,7 +81,7 @@ class Registered:
     displacement_spread: FloatArray
     place_spread: FloatArray
     model_error: float
-    seen: FloatArray
+    away: FloatArray
     within: float
     problems: tuple[str, ...]
     notices: tuple[str, ...] = ()
@@ -106,11 +107,20 @@ class Registered:
         return self._deviation(self.place_spread)
 
     @property
+    def seen(self) -> FloatArray:
+        """Vertices less than 15 mm from a point of the cloud, ndarray of bool, (n_vertices,)."""
+        return np.asarray(self.away < _SEEN)
+
+    @property
     def model_deviation(self) -> FloatArray:
-        """Standard deviation along each axis by the vademecum's own error, (n_vertices,) [m]."""
+        """Standard deviation along each axis by the model's own error, (n_vertices,) [m].
+
+        The cloud makes up for it where it is near.
+        """
         size = np.linalg.norm(self.displacement, axis=1)
         mean = float(np.sqrt(np.mean(size**2)))
-        return np.asarray(self.model_error * np.hypot(size, mean) / np.sqrt(6.0))
+        hidden = np.clip(self.away / _OUT_OF_SIGHT, 0.4, 1.0)
+        return np.asarray(self.model_error * hidden * np.hypot(size, mean) / np.sqrt(6.0))
 
     @property
     def interval(self) -> FloatArray:
@@ -216,7 +226,7 @@ def register(
         spread,
         turned,
         error,
-        apart < _SEEN,
+        apart,
         rule.within,
         _problems(found, rule, mean_strain(mesh, displacement)),
         notices,

@@ -294,4 +294,4 @@ def _of(rows: Sequence[Row], kind: str | None) -> Sequence[Row]:
 
 def _name_classes(axes: Axes) -> None:
     names = [kind.replace(" ", "\n") for kind in CLASSES]
-    axes.set_xticks(np.arange(len(CLASSES)), names, fontsize=8)
+    axes.set_xticks(np.arange(len(CLASSES)), names, fontsize=7)
