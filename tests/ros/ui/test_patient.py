@@ -249,6 +249,8 @@ def test_labels_of_a_file_reach_the_build(tab: PatientTab, user: Noted) -> None:
 
 def test_springs_are_asked_for_by_stiffness(tab: PatientTab, user: Noted) -> None:
     assert tab._wanted().supports == () and not tab._stiffness.visible
+    assert not tab._wanted().interpolated_first
+    tab._first.value = True
     assert tab._wanted().interpolated_first and not tab._wanted(preview=True).interpolated_first
     tab._held.value = SPRUNG
     assert not tab._wanted().interpolated_first

@@ -50,7 +50,7 @@ class PatientTab:
         )
         self._first = gui.add_checkbox(
             "Interpolate first",
-            initial_value=True,
+            initial_value=False,
             hint="an interpolated organ in seconds, replaced by the better one when that is there; "
             "with the clamp of the template alone",
         )
