@@ -20,7 +20,7 @@ SLACK = 0.018  # on every side, since organs are aligned by shape and not by the
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What all anatomies of an atlas share; fixed when it is created.
+    """Template, grid and rule that all anatomies of an atlas share; fixed when it is created.
 
     template : Template, registered to every anatomy
     box : GridBox around the template, at whose points signed distances are taken

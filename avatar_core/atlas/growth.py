@@ -297,7 +297,7 @@ def _grow(
 
 
 def _items(sources: Sequence[Source], workers: Workers) -> list[Source | Skipped]:
-    """What the workers get: surfaces and not files, if they may not see this machine's files."""
+    """Tasks of the workers: surfaces and not files, if they may not see this machine's files."""
     return [_read_here(source) if workers.scheduler else source for source in sources]
 
 

@@ -28,7 +28,7 @@ _ALIKE = 2.0  # scores within this factor leave both kinds in question
 def posed(
     vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule
 ) -> tuple[Problem, tuple[str, ...]]:
-    """What is to be fitted, without background, and what was left out, one line each.
+    """Problem to be fitted, without background, and notices of what was left out, one line each.
 
     Raises RegistrationError if the cloud cannot be one of this organ.
     """

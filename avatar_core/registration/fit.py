@@ -33,6 +33,7 @@ from avatar_core.registration.posterior import (
     Equations,
     Posterior,
     Scales,
+    Spread,
     at_scales,
     averaged,
     cells_of,
@@ -91,7 +92,7 @@ class RegistrationRule:
             )
 
     def scales(self, kind: Kind, young_modulus: float) -> Scales:
-        """Of loads, length, noise and mismatch, before the cloud is seen."""
+        """Prior scales of loads, length, noise and mismatch."""
         loads = 0.02 if kind == "few" else 0.02 * young_modulus  # displacement [m], traction [Pa]
         mismatch = 0.5 if kind == "few" else 0.2  # of the noise
         middle = np.log([loads, 0.03, self.noise, mismatch * self.noise])
@@ -100,8 +101,9 @@ class RegistrationRule:
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """Another place of a force that explains the cloud: its weight, all places, all displaced.
+    """Another answer that explains the cloud about as well.
 
+    weight : by its likelihood, of all answers together at most 1
     displacement, place : ndarray, shape (n_vertices, 3) [m]
     """
 
@@ -209,7 +211,10 @@ def fit(problem: Problem, kind: Kind) -> Fit:
 def rigid_motion(
     vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
 ) -> RigidMotion:
-    """What rigid steps alone make of a cloud."""
+    """Rigid motion from the organ to a cloud, by the rigid steps alone.
+
+    Arguments and errors as of :func:`avatar_core.registration.register.register`.
+    """
     rule = rule or RegistrationRule()
     problem = Problem(vademecum, cloud.thinned(), rule)
     return problem.motion(problem.start(rule.rigid_steps))
@@ -363,7 +368,7 @@ class Problem:
         each = np.repeat([self.rule.turn, self.rule.shift], 3) / np.sqrt(3.0)
         return np.maximum(each, _LEAST_SPREAD)
 
-    def spread_of(self, loads: LoadBasis):  # type: ignore[no-untyped-def]
+    def spread_of(self, loads: LoadBasis) -> Spread:
         """Prior standard deviations of all unknowns, as a function of the scales."""
         return lambda scales: np.concatenate(
             [loads.spread(float(scales[0]), float(scales[1])), self.rigid_spread]

@@ -33,7 +33,7 @@ _MOST_MISMATCH = 0.6  # of the surface, over the noise expected; meshes that dif
 # Of the deformation that is found. Right answers have up to 0.07 at displacements of 20 mm; where
 # loads have to explain what none of them caused, those that look like the cloud have 0.3.
 _MOST_STRAIN = 0.15
-_SEEN = 0.015  # of a vertex from the nearest point of the cloud, at most [m]
+SEEN = 0.015  # of a vertex from the nearest point of the cloud, at most [m]
 _OUT_OF_SIGHT = 0.05  # from which on nothing makes up for the model's error [m]
 _MOST_HIDDEN = 0.1  # part of what is not seen that may be undetermined in a good answer
 _INSIDE = 5e-3  # of a target from the organ at most [m]
@@ -109,7 +109,7 @@ class Registered:
     @property
     def seen(self) -> FloatArray:
         """Vertices less than 15 mm from a point of the cloud, ndarray of bool, (n_vertices,)."""
-        return np.asarray(self.away < _SEEN)
+        return np.asarray(self.away < SEEN)
 
     @property
     def model_deviation(self) -> FloatArray:

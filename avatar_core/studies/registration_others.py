@@ -24,13 +24,12 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.pipeline import OrganOptions, build
 from avatar_core.registration.fit import Problem, RegistrationRule, fit, rigid_motion
 from avatar_core.registration.loads import LoadBasis
-from avatar_core.registration.register import INTERVAL_90, register
+from avatar_core.registration.register import INTERVAL_90, SEEN, cloud_part, register
 from avatar_core.studies.registration_truth import OTHERS, SOFT, Case, RegistrationSettings, Truth
 from avatar_core.studies.study import Row, follow
 from avatar_core.vademecum.model import Vademecum
 
 ZONE = 0.03  # radius of the zone in which a force is known to act [m]
-_SEEN = 0.015  # of a vertex from the nearest point of the cloud, at most [m]
 _MOST_NODES = 40  # of the rival, in the zone
 _MILD = 1e-3  # prior displacement of the rival's nodal forces, over which it is not regularised [m]
 
@@ -115,8 +114,8 @@ def answers(vademecum: Vademecum, case: Case, priors: tuple[Prior, ...]) -> list
     def carried(values: FloatArray) -> FloatArray:
         return np.asarray(np.einsum("nk,nk...->n...", weights, values[corners]))
 
-    some = case.cloud.points[:: max(1, len(case.cloud.points) // 500)]
-    seen = np.linalg.norm(case.place[:, None] - some[None], axis=2).min(axis=1) < _SEEN
+    some = cloud_part(case.cloud.points)
+    seen = np.linalg.norm(case.place[:, None] - some[None], axis=2).min(axis=1) < SEEN
     rows: list[Row] = []
     for prior in priors:
         start = time.process_time()
