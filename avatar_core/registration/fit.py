@@ -49,7 +49,8 @@ from avatar_core.vademecum.model import Vademecum
 class RegistrationRule:
     """Prior knowledge and stopping.
 
-    noise : standard deviation of a point of the cloud along the normal, about [m]
+    noise : least standard deviation of a point of the cloud along the normal [m]; it stands as well
+        for what small strains and meshes leave out
     turn, shift : prior root mean squares of the rigid motion, all axes together [rad, m]; nearly 0
         where the cloud's frame is the organ's
     kind : of the loads, see :mod:`avatar_core.registration.loads`; None for smooth or few, by what
@@ -57,7 +58,8 @@ class RegistrationRule:
     forces : where they may act, see :func:`avatar_core.registration.loads.allowed_at`
     support_shift : prior root mean square by which each support of the vademecum moves [m]; 0: none
         does
-    correlation : length over which errors of the points are alike [m]; at least the mesh's edge
+    correlation : length over which errors of the points, as large as the noise, are alike [m]; 0
+        if each has its own. Those of the mesh are alike over an edge at least
     within : a place counts as determined if its interval of 90 % is no wider to either side [m]
     freedom : degrees of freedom of Student's distribution, from which points are weighed
     tolerance : step of a point of the surface that ends the iteration [m]
@@ -94,9 +96,15 @@ class RegistrationRule:
     def scales(self, kind: Kind, young_modulus: float) -> Scales:
         """Prior scales of loads, length, noise and mismatch."""
         loads = 0.02 if kind == "few" else 0.02 * young_modulus  # displacement [m], traction [Pa]
-        mismatch = 0.5 if kind == "few" else 0.2  # of the noise
+        mismatch = 1.0 if self.correlation else 0.5 if kind == "few" else 0.2  # of the noise
         middle = np.log([loads, 0.03, self.noise, mismatch * self.noise])
         return Scales(middle, np.array([0.7 if kind == "few" else 2.0, 0.7, 0.3, 0.7]))
+
+    @property
+    def least_scales(self) -> FloatArray:
+        """Logarithms below which scales are not sought: what is said of the noise stands."""
+        alike = np.log(self.noise) if self.correlation else -np.inf
+        return np.array([-np.inf, -np.inf, np.log(self.noise), alike])
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +151,8 @@ class Fit:
 
 
 _STRAY = 0.5  # weight of a point some four standard deviations off, below which it is a stray
-_UNDAMPED = 14  # steps; the closest points of some clouds swing to and fro after so many
+_UNDAMPED = 6  # steps; the closest points of some clouds swing to and fro after so many
+_DAMPED = 0.3  # part of a step that is taken then
 _SHORTEST_SEARCH, _LONGEST_SEARCH = 4, 16  # steps in which places of forces are sought
 _SETTLED = 0.5e-3  # step of the surface that ends the search [m]
 _TRIES = 60  # of scales, the first time; a half of it later
@@ -177,11 +186,12 @@ def fit(problem: Problem, kind: Kind) -> Fit:
         if step - settled in rule.rescaled:
             tries = _TRIES if step - settled == rule.rescaled[0] else _TRIES // 2
             logarithms = likeliest(found, spread, prior, logarithms, tries)
+            logarithms = np.maximum(logarithms, rule.least_scales)
         solved_at = wide if step < settled else np.exp(logarithms)
         mean = at_scales(found, spread, solved_at).mean
         aim = problem.state(loads, mean)
         moved = at.far_from(aim, problem)
-        at = at.towards(aim, 1.0 if step < settled + _UNDAMPED else 0.5)
+        at = at.towards(aim, 1.0 if step < settled + _UNDAMPED else _DAMPED)
         if step < settled and step >= _SHORTEST_SEARCH and moved < _SETTLED:
             settled = step + 1
         if converged := moved < rule.tolerance and step - settled > rule.rescaled[-1]:
@@ -268,7 +278,7 @@ class Problem:
         self.on_surface = mesh.surface_vertices
         self.vertices = np.ascontiguousarray(mesh.vertices[self.on_surface])
         self.faces = np.searchsorted(self.on_surface, mesh.boundary_faces).astype(np.int64)
-        self.cell = max(mesh.mean_surface_edge, rule.correlation)
+        self.cells = cells_of(self.points, max(mesh.mean_surface_edge, rule.correlation))
         self.centre = self.vertices.mean(axis=0)
         self.young_modulus = vademecum.material.young_modulus
         self._kinds: dict[str, LoadBasis | PointForces] = {}
@@ -416,7 +426,7 @@ class Problem:
             distance,
             distance + by_surface @ moved + by_motion @ at.rigid,
             (freedom + 1.0) / (freedom + distance**2 / square),
-            cells_of(motion.back(self.points), self.cell),
+            self.cells,
         )
 
     def equations(self, seen: Seen, loads: LoadBasis) -> Equations:

@@ -325,7 +325,7 @@ def _problems(found: Fit, rule: RegistrationRule, strain: float) -> tuple[str, .
             f"the points scatter by {1e3 * noise:.1f} mm, not the {1e3 * rule.noise:.1f} mm "
             "expected (--noise)"
         )
-    if mismatch > _MOST_MISMATCH * rule.noise:
+    if mismatch > (_MOST_NOISE if rule.correlation else _MOST_MISMATCH) * rule.noise:
         problems.append(
             f"neighbouring points lie off the surface together, by {1e3 * mismatch:.1f} mm"
         )
