@@ -144,13 +144,14 @@ def _identity(bag: Bag, organ: Vademecum) -> list[str]:
 def _scene_of(bag: Bag, name: str | None, organ: Vademecum) -> str:
     """The scene of one tool that is given, that the bag holds, or the default, as YAML."""
     from avatar_core.contact.layout import default_effects
+    from avatar_core.geometry.tip import Tip
     from avatar_core.scene.file import read_scene, scene_path, write_scene
     from avatar_core.scene.model import Scene
 
     if name is None and bag.about is not None:
         return bag.about.scene
     if name is None:
-        return write_scene(Scene(effects=default_effects(organ, 1)))
+        return write_scene(Scene(effects=default_effects(organ, (Tip(),))))
     scene = read_scene(scene_path(name))
     require(
         len(scene.tools) == 1,

@@ -37,6 +37,7 @@ DATA = kind(
     # what a step is given
     tip=array("T 3"),  # sphere centres [m]
     orientation=array("T 4"),  # of the tools, x y z w; zero if it is not known
+    jaw=array("T", np.bool_),  # whether that of a tool is closed
     shown=array("1", np.int64),  # level of the modes that are shown
     # what is kept between steps
     passage=array("T", np.int64),  # whether the tip entered through the surface

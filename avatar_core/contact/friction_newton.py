@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from avatar_core.common.jit import fast, inlined
+from avatar_core.contact.effects.grasp import is_held
 from avatar_core.contact.tip_solver import added_depth
 
 STEPS = 7
@@ -62,7 +63,7 @@ def newton_steps(model, data, start):  # type: ignore[no-untyped-def]
             for t in range(n_tools):
                 for d in range(3):
                     best[t, d] = push[t, d]
-        if k == 0 and start > 0 and data.active[start - 1]:
+        if k == 0 and start > 0 and data.active[start - 1] and not is_held(model, data, start - 1):
             _start_from_one_tip(data, start - 1)
         elif k < STEPS:
             _gauss(friction.matrix, friction.rhs)
@@ -73,7 +74,10 @@ def newton_steps(model, data, start):  # type: ignore[no-untyped-def]
         for d in range(3):
             push[t, d] = best[t, d]
         n, g = data.normal[t], push[t]
-        data.force[t] = max(0.0, -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2]))
+        if is_held(model, data, t):
+            data.force[t] = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+        else:
+            data.force[t] = max(0.0, -(g[0] * n[0] + g[1] * n[1] + g[2] * n[2]))
 
 
 @inlined
@@ -107,6 +111,8 @@ def _linearise(model, data, t):  # type: ignore[no-untyped-def]
             matrix[3 * t + i, column] = 1.0 if column == 3 * t + i else 0.0
     if not data.active[t]:
         return 0.0
+    if is_held(model, data, t):
+        return _linearise_held(model, data, t)
     n, g, y, c = data.normal[t], friction.push[t], friction.offset[t], friction.compliance[t, t]
     normal = 0.0
     for i in range(3):
@@ -158,6 +164,27 @@ def _linearise(model, data, t):  # type: ignore[no-untyped-def]
                 dz -= (b[i, d] - n[i] * lifted) / across
                 new = -n[i] * a + e[i] * limit * a + part * (dz - e[i] * slid)
                 matrix[3 * t + i, 3 * s + d] -= new
+    return square
+
+
+@inlined
+def _linearise_held(model, data, t):  # type: ignore[no-untyped-def]
+    """The same of a tool that holds tissue: g + K sum_s C_ts g_s = K (y - u) but for its own."""
+    friction, k = data.friction, data.grasp.stiffness[t]
+    u0, u1, u2 = patch_displacement(model, data, t)
+    y, square = friction.offset[t], 0.0
+    x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
+    for i in range(3):
+        residual = k[i, 0] * x0 + k[i, 1] * x1 + k[i, 2] * x2
+        friction.rhs[3 * t + i] = residual
+        square += residual * residual
+        for s in range(data.passage.shape[0]):
+            if s != t and data.active[s]:
+                b = friction.compliance[t, s]
+                for d in range(3):
+                    friction.matrix[3 * t + i, 3 * s + d] = (
+                        k[i, 0] * b[0, d] + k[i, 1] * b[1, d] + k[i, 2] * b[2, d]
+                    )
     return square
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.effects.friction import NONE, SLIPS, STICKS, near_between, tangential_force
+from avatar_core.contact.effects.grasp import is_held, place_jaw, pull, stiffen_jaw
 from avatar_core.contact.friction_newton import newton_steps, patch_displacement
 from avatar_core.contact.tip_solver import added_depth, solve_tip
 from avatar_core.tips.law import tangential_compliance
@@ -32,6 +33,11 @@ def solve_friction(model, data):  # type: ignore[no-untyped-def]
             friction.motion[t] = NONE
             friction.push[t] = 0.0
             continue
+        if is_held(model, data, t):
+            friction.motion[t] = NONE
+            u0, u1, u2 = patch_displacement(model, data, t)
+            place_jaw(data, t, u0, u1, u2)
+            continue
         if data.force[t] <= 0.0:  # no contact before, or a discontinuous motion
             friction.motion[t] = NONE
             friction.push[t] = 0.0
@@ -50,7 +56,7 @@ def solve_friction(model, data):  # type: ignore[no-untyped-def]
     if again:
         converged = _sweep(model, data)
     for t in range(data.passage.shape[0]):
-        if data.active[t]:
+        if data.active[t] and not is_held(model, data, t):
             _slide_anchor(model, data, t)
     return converged
 
@@ -87,7 +93,9 @@ def _assemble(model, data):  # type: ignore[no-untyped-def]
             own += superposition.near_gain[0] * data.blurred[t]
             for d in range(3):
                 friction.compliance[t, t, d, d] += own
-            if model.law.on:
+            if is_held(model, data, t):
+                stiffen_jaw(model, data, t)
+            elif model.law.on:
                 _press_alone(model, data, t)
                 _add_tangential_dent(model, data, t)
 
@@ -149,7 +157,11 @@ def _sweep(model, data):  # type: ignore[no-untyped-def]
             newton_steps(model, data, start)
         worst = 0.0
         for t in range(data.passage.shape[0]):
-            if data.active[t]:
+            if is_held(model, data, t):
+                u0, u1, u2 = patch_displacement(model, data, t)
+                change = pull(data, t, u0, u1, u2)
+                worst = max(worst, change)
+            elif data.active[t]:
                 change = _update_normal(model, data, t)
                 worst = max(worst, change)
                 change = _update_tangential(model, data, t)

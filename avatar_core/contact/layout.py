@@ -18,6 +18,8 @@ from avatar_core.contact.display import DISPLAY, display_arrays
 from avatar_core.contact.effects import (
     EFFECTS,
     Effect,
+    Friction,
+    Grasp,
     LargeDeformationEffect,
     SeveralTools,
     Tumour,
@@ -131,8 +133,10 @@ def lay_out(
     shape : of the organ and the tips, if it is known
     """
     detail = detail or Detail(vademecum.n_modes)
-    chosen = default_effects(vademecum, len(tips)) if effects is None else effects
+    chosen = default_effects(vademecum, tips) if effects is None else effects
     _check(vademecum, tips, detail, chosen)
+    if find(chosen, Grasp) and not find(chosen, Friction):
+        chosen = (*chosen, Friction(0.0, 0.0))  # whose solver has forces of any direction
     without = () if find(chosen, Tumour) else (Tumour(1.0),)  # whose organ has none, if it can
     for effect in (*without, *chosen):
         vademecum = effect.adapted(vademecum)
@@ -202,15 +206,17 @@ def lay_out(
     )
 
 
-def default_effects(vademecum: Vademecum, n_tools: int) -> tuple[Effect, ...]:
+def default_effects(vademecum: Vademecum, tips: Sequence[Tip]) -> tuple[Effect, ...]:
     """Effects of a scene that names none: those that the vademecum and the tools require."""
     effects: list[Effect] = []
     if vademecum.large is not None:
         effects.append(LargeDeformationEffect())
     if vademecum.contrast is not None:
         effects.append(Tumour())
-    if n_tools > 1:
+    if len(tips) > 1:
         effects.append(SeveralTools())
+    if any(tip.grasp for tip in tips):
+        effects.append(Grasp())
     return tuple(effects)
 
 

@@ -126,6 +126,10 @@ class ContactData:
         if mine.friction is not None and theirs.friction is not None:
             for name in ("anchor", "motion", "push"):
                 getattr(mine.friction, name)[:] = getattr(theirs.friction, name)
+        if mine.grasp is not None and theirs.grasp is not None:
+            for name in ("held", "begun", "shut", "slipped", "place", "start", "now"):
+                getattr(mine.grasp, name)[:] = getattr(theirs.grasp, name)
+            mine.grasp.fresh[:] = mine.grasp.held
         if mine.respiration is not None and theirs.respiration is not None:
             mine.respiration.clock[:] = theirs.respiration.clock
 
@@ -165,7 +169,11 @@ def model_of(
 
 
 def step(
-    model: ContactModel, data: ContactData, tips: np.ndarray, orientations: np.ndarray | None = None
+    model: ContactModel,
+    data: ContactData,
+    tips: np.ndarray,
+    orientations: np.ndarray | None = None,
+    jaws: np.ndarray | None = None,
 ) -> int:
     """Advance one period.
 
@@ -178,6 +186,7 @@ def step(
     tips : ndarray, shape (n_tools, 3), sphere centres [m]
     orientations : ndarray, shape (n_tools, 4), unit quaternions x y z w of the tools' frames in the
         organ's, zero for one that is not known; None if no tool turns. For friction and tilt.
+    jaws : ndarray of bool, shape (n_tools,), which are closed; None: as before. For grasp.
 
     Returns
     -------
@@ -185,21 +194,28 @@ def step(
         The worst :class:`Status` of the tools; ``out.status`` has each. INVALID_POSE: not
         finite; OUT_OF_RANGE: off the accessible surface, too deep, or not entered through the
         surface; these tools have no force or a fading one. NOT_CONVERGED: the contact forces are
-        those of the last iteration. EXTRAPOLATED: deeper than the computed large deformation.
+        those of the last iteration. EXTRAPOLATED: deeper than the computed large deformation, or
+        pulled too far. SLIPPED: the jaw lost what it held.
     """
-    status = solve(model, data, tips, orientations)
+    status = solve(model, data, tips, orientations, jaws)
     deform(model, data)
     return status
 
 
 def solve(
-    model: ContactModel, data: ContactData, tips: np.ndarray, orientations: np.ndarray | None = None
+    model: ContactModel,
+    data: ContactData,
+    tips: np.ndarray,
+    orientations: np.ndarray | None = None,
+    jaws: np.ndarray | None = None,
 ) -> int:
     """The first half of :func:`step`: forces and contacts. Real-time safe, as :func:`step`."""
     state = data.state
     state.tip[:] = tips
     if data.turns:
         state.orientation[:] = 0.0 if orientations is None else orientations
+    if jaws is not None:
+        state.jaw[:] = jaws
     return model.compiled.solve(model.table, data.table)
 
 

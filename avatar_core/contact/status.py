@@ -14,8 +14,8 @@ FAR_AWAY = 1e3  # coordinate of a tool without a pose [m]
 class Status(IntEnum):
     """Number, name and ``meaning`` of each status.
 
-    ``step`` returns OK, INVALID_POSE, NOT_CONVERGED, TOO_MANY_CONTACTS, OUT_OF_RANGE or
-    EXTRAPOLATED; the loop of the contact node gives the others.
+    ``step`` returns OK, INVALID_POSE, NOT_CONVERGED, TOO_MANY_CONTACTS, OUT_OF_RANGE,
+    EXTRAPOLATED or SLIPPED; the loop of the contact node gives the others.
     """
 
     meaning: str
@@ -34,7 +34,7 @@ class Status(IntEnum):
     TOO_MANY_CONTACTS = 6, "more contacts than the model was prepared for"
     OUT_OF_RANGE = 7, "outside what the vademecum covers: depth, region or force"
     UNKNOWN_FRAME = 8, "pose in another frame than tool_frame: refused, never used"
-    EXTRAPOLATED = (9, "pushed beyond the range of large deformation: force goes on tangentially")
+    EXTRAPOLATED = 9, "pushed or pulled beyond the range of the response: the force goes on"
     LEAP = 10, "the pose leapt farther than a tool can move"
     SEVERAL_PUBLISHERS = 11, "more than one node sends poses of this tool"
     LOST_TOOL = 12, "no node sends poses of this tool any more"
@@ -44,6 +44,7 @@ class Status(IntEnum):
     NO_OPERATING_STATE = 16, "the tool's device has not said that it is enabled and homed"
     NOT_ENABLED = 17, "the tool's device says that it is disabled, paused or in fault"
     NOT_HOMED = 18, "the tool's device says that it is not homed"
+    SLIPPED = 19, "the jaw lost the tissue: open it, and close it again"
 
 
 # With these, the step used the pose of the stamp; with INVALID_POSE none; with others FAR_AWAY.
@@ -59,5 +60,6 @@ PLACED = tuple(
         Status.NO_OPERATING_STATE,
         Status.NOT_ENABLED,
         Status.NOT_HOMED,
+        Status.SLIPPED,
     )
 )

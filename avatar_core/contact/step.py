@@ -34,6 +34,13 @@ from avatar_core.common.jit import entry, fast, inlined
 from avatar_core.common.splines import cell_at, value_in_cell
 from avatar_core.contact.cloud_kernels import deform
 from avatar_core.contact.effects.friction import add_torque, force_squared, gather_friction
+from avatar_core.contact.effects.grasp import (
+    held_error,
+    hold_or_slip,
+    is_held,
+    work_jaw,
+    write_held_force,
+)
 from avatar_core.contact.effects.inertia import advance_inertia, predict_inertia
 from avatar_core.contact.effects.large_deformation import add_nonlinear_force, sample_coefficients
 from avatar_core.contact.effects.respiration import to_organ_frame, to_world_frame
@@ -89,7 +96,9 @@ def force_error(model, data):  # type: ignore[no-untyped-def]
         force = out.force[t]
         size = np.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
         out.force_error[t] = 0.0
-        if size > 0.0:
+        if size > 0.0 and is_held(model, data, t):
+            out.force_error[t] = size * held_error(model, data, t)
+        elif size > 0.0:
             cell = cell_at(model.origin, model.spacing[0], data.tip[t])
             relative = value_in_cell(model.force_error, cell)
             if model.law.on:
@@ -113,6 +122,7 @@ def _solve_period(model, data):  # type: ignore[no-untyped-def]
         for t in range(data.tip.shape[0]):
             if data.active[t]:
                 data.out.status[t] = NOT_CONVERGED
+    hold_or_slip(model, data)
     superpose_modes(model, data)
     write_forces(model, data)
     advance_history(model, data)
@@ -128,7 +138,11 @@ def _locate_tips(model, data):  # type: ignore[no-untyped-def]
     """Gap and compliance of each tip on its own; returns the worst status."""
     status = OK
     for t in range(data.tip.shape[0]):
-        data.out.status[t] = locate(model, data, t, data.tip[t])
+        if work_jaw(model, data, t):  # nothing of its place has changed
+            status = max(status, data.out.status[t])
+            continue
+        tip = data.grasp.place[t] if is_held(model, data, t) else data.tip[t]
+        data.out.status[t] = locate(model, data, t, tip)
         status = max(status, data.out.status[t])
         if not data.active[t]:
             data.force[t] = 0.0
@@ -140,8 +154,8 @@ def _locate_tips(model, data):  # type: ignore[no-untyped-def]
         else:
             near = near_gram(model, data, t)
         assemble_own(model, data, t, near)
-        sample_law(model, data, t, data.tip[t])
-        sample_coefficients(model, data, t, data.tip[t])
+        sample_law(model, data, t, tip)
+        sample_coefficients(model, data, t, tip)
         gather_friction(model, data, t)
     return status
 
@@ -190,6 +204,12 @@ def write_forces(model, data):  # type: ignore[no-untyped-def]
     for t in range(data.passage.shape[0]):
         out.force[t] = 0.0
         out.torque[t] = 0.0
+        if is_held(model, data, t):
+            out.contact_tool[n] = t
+            write_held_force(model, data, t, n)
+            add_torque(model, data, t)
+            n += 1
+            continue
         if data.force[t] <= 0.0:
             continue
         _write_force_at_rest(data, t)

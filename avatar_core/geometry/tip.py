@@ -10,7 +10,7 @@ the tip touches over a circle of radius a. Beyond ``radius`` is the shaft, which
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
@@ -26,6 +26,23 @@ MAX_TOOLS = 8  # that touch at once
 
 
 @dataclass(frozen=True)
+class Jaw:
+    """The jaws of a grasper at a tip: a disc of tissue that they hold when they close.
+
+    Raises
+    ------
+    SceneError
+        For a number out of its range.
+    """
+
+    radius: float = quantity("m", 5e-4, 20e-3, "of the disc that is held", 3e-3)
+    slip: float = quantity("N", 0.05, 100.0, "force at which tissue slips out", 4.0)
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "grasp: ")
+
+
+@dataclass(frozen=True)
 class Tip:
     """The part of a tool that touches; its axis is taken along the surface's normal, but for a
     flat punch with :class:`avatar_core.contact.effects.Tilt`.
@@ -33,6 +50,8 @@ class Tip:
     A pose is that of the centre of a sphere, of the sphere that rounds a cone, of the face of a
     flat punch, or of the apex of a cone. A "patch" is no tool: it is the load that a vademecum
     was computed for, whatever the radius, under which its certificate's compliance is felt.
+
+    grasp : jaws that close at the lowest point of the tip; None for a tool that only pushes
 
     Raises
     ------
@@ -44,6 +63,7 @@ class Tip:
     radius: float = quantity("m", 1e-3, 20e-3, "of the sphere, the punch or the cone's base", 5e-3)
     half_angle: float | None = quantity("deg", *ANGLES, "between a cone's axis and its side", None)
     rounding: float | None = quantity("m", 2e-4, 2e-2, "radius of a rounded cone's apex", None)
+    grasp: Jaw | None = field(default=None, repr=False)  # what it touches does not depend on it
 
     def __post_init__(self) -> None:
         if self.shape not in get_args(Shape):

@@ -20,7 +20,7 @@ from avatar_core.common.files import shipped
 from avatar_core.common.quantities import check_line, is_whole, lies_in
 from avatar_core.contact.effects import EFFECTS, Effect, Viscoelasticity
 from avatar_core.errors import SceneError
-from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tip import Jaw, Tip
 from avatar_core.scene.model import Scene, SupportStiffness, Tool
 from avatar_core.scene.prony import parse_prony
 from avatar_core.scene.yaml_lines import (
@@ -126,13 +126,17 @@ def write_scene(scene: Scene) -> str:
         document[section] = {key: plain(value) for key, value in chosen.items()}
     if scene.supports:
         document["material"]["supports"] = {s.name: float(s.stiffness) for s in scene.supports}
-    document["tools"] = [
-        {"name": tool.name, "tip": _plain_fields(tool.tip)} for tool in scene.tools
-    ]
+    document["tools"] = [_plain_tool(tool) for tool in scene.tools]
     document["effects"] = {effect.name: _plain_fields(effect) for effect in scene.effects}
     return yaml.safe_dump(
         document, sort_keys=False, allow_unicode=True, default_flow_style=None, width=math.inf
     )
+
+
+def _plain_tool(tool: Tool) -> dict[str, Any]:
+    tip = _plain_fields(tool.tip)
+    jaw = tip.pop("grasp", None)
+    return {"name": tool.name, "tip": tip} | ({"grasp": jaw} if jaw else {})
 
 
 def _plain_fields(one: Any) -> dict[str, Any]:
@@ -212,7 +216,7 @@ def _choice(node: Node, path: str, choices: Sequence[str]) -> str:
 
 
 def _tools(node: Node) -> tuple[Tool, ...]:
-    known = [field.name for field in fields(Tool)]
+    known = [*(field.name for field in fields(Tool)), "grasp"]
     if not isinstance(node, SequenceNode):
         raise refused(node, f"tools is {shown(node)}; write a list of {{{': , '.join(known)}: }}")
     return tuple(_tool(item, f"tools[{i}]", known) for i, item in enumerate(node.value))
@@ -221,17 +225,25 @@ def _tools(node: Node) -> tuple[Tool, ...]:
 def _tool(node: Node, path: str, known: Sequence[str]) -> Tool:
     entries = entries_of(node, path, known)
     _, tip = entries.pop("tip", (None, None))
+    _, jaw = entries.pop("grasp", (None, None))
     values = _fields(Tool, entries, path)
+    of_tip: dict[str, Any] = {}
+    if jaw is not None:
+        of_tip["grasp"] = Jaw() if is_nothing(jaw) else _part(Jaw, jaw, below(path, "grasp"))
     if tip is not None and not is_nothing(tip):
-        values["tip"] = _tip(tip, below(path, "tip"))
+        values["tip"] = _part(Tip, tip, below(path, "tip"), **of_tip)
+    elif of_tip:
+        values["tip"] = Tip(**of_tip)
     with placed_at(node):
         return Tool(**values)
 
 
-def _tip(node: Node, path: str) -> Tip:
-    values = _fields(Tip, entries_of(node, path, [field.name for field in fields(Tip)]), path)
+def _part(kind: type, node: Node, path: str, **given: Any) -> Any:
+    """A tip or a jaw: its numbers, and what is given beside them."""
+    known = [field.name for field in fields(kind) if field.name not in ("grasp", *given)]
+    values = _fields(kind, entries_of(node, path, known), path)
     with placed_at(node):
-        return Tip(**values)
+        return kind(**values, **given)
 
 
 def _effects(node: Node, folder: Path | None) -> tuple[Effect, ...]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from avatar_core.common.quantities import check_line, check_numbers, quantity
 from avatar_core.common.supports import LEAST_STIFFNESS, MOST_STIFFNESS, SUPPORT
-from avatar_core.contact.effects import Effect, Tilt
+from avatar_core.contact.effects import Effect, Grasp, Tilt
 from avatar_core.errors import CoordinateError, SceneError
 from avatar_core.geometry.tip import MAX_TOOLS, Tip
 from avatar_core.reduction.coordinates import require_known
@@ -85,7 +85,7 @@ class Scene:
     young_modulus, poisson_ratio, modes : None for those of the vademecum
     supports : stiffnesses per area that are not those of the vademecum
     cloud : vertices that are sent
-    effects : each at most once, in any order
+    effects : each at most once, in any order; a tool with a jaw brings grasp along
 
     Raises
     ------
@@ -113,6 +113,8 @@ class Scene:
             check_line(key, getattr(self, key))
         if self.cloud not in get_args(Cloud):
             raise SceneError(f"cloud is '{self.cloud}'; choose {', '.join(get_args(Cloud))}")
+        if any(tool.tip.grasp for tool in self.tools) and self.effect("grasp") is None:
+            object.__setattr__(self, "effects", (*self.effects, Grasp()))
         self._check_effects()
         self._check_tools()
 
@@ -138,8 +140,11 @@ class Scene:
             raise SceneError(
                 f"tools: {n_tools} tools without several_tools: add it to effects, or name one tool"
             )
+        tips = [tool.tip for tool in self.tools]
         if self.effect("tilt") is not None:
-            Tilt.require_flat([tool.tip for tool in self.tools])
+            Tilt.require_flat(tips)
+        if self.effect("grasp") is not None:
+            Grasp.require_jaw(tips)
 
     def effect(self, name: str) -> Effect | None:
         """The effect of a name, if the scene has it."""
@@ -196,6 +201,7 @@ _WITH_LARGE = (
     ("friction", "forces off the normal are added linearly", "oblique_contact_mean"),
     ("several_tools", "the way from tip to tip stays linear", "two_tools_contact_mean"),
     ("self_weight", "the sag is added linearly", "gravity_contact_mean"),
+    ("grasp", "what a jaw pulls is added linearly", "oblique_contact_mean"),
     (
         "viscoelasticity",
         "quasi-linear: the relaxation acts on the elastic force (Fung, Biomechanics, 1993)",

@@ -68,7 +68,7 @@ def default_spec(
     values : of the material, by coordinate
     """
     chosen = at_values(vademecum, values or {})
-    return ModelSpec(chosen, tips, modes, cloud, default_effects(chosen, len(tips)))
+    return ModelSpec(chosen, tips, modes, cloud, default_effects(chosen, tips))
 
 
 def scene_spec(

@@ -26,6 +26,7 @@ NAMES = (
     "passivity",
     "contact",
     "indentation",
+    "grasp",
     "registration",
 )
 

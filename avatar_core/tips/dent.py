@@ -31,6 +31,9 @@ falling with the depth as 1 / rho, as the field of Boussinesq's point force does
 twice as large right under the force. Only the displacement along n changes. That along the surface,
 which is slight in tissue that hardly changes its volume, stays the patch's, and so does that of
 friction. In viscoelastic tissue the present dent is replaced, not the traces of earlier ones.
+
+A disc of radius a that is bonded to the surface (:mod:`avatar_core.contact.effects.grasp`) moves
+with all of its force g, by L g / (2 E* a) within, and 2 / pi asin(a / rho) times that beside it.
 """
 
 from __future__ import annotations
@@ -45,7 +48,7 @@ from avatar_core.common.jit import fast
 from avatar_core.fem.patch_on_plane import PATCH, patch_dent, quarter_turn
 from avatar_core.geometry.tip import Tip
 from avatar_core.tips.law import dent
-from avatar_core.tips.profile import INTERVALS, TAKEN
+from avatar_core.tips.profile import INTERVALS, STIFFNESS, TAKEN
 
 REACH = 2.0  # of the change around a tip, in patch radii
 FADE = 1.5  # in patch radii, where it begins to fade
@@ -124,6 +127,8 @@ def add_dents(  # type: ignore[no-untyped-def]
     for t in range(data.passage.shape[0]):
         if data.force[t] > 0.0 and data.law.elastic[t] > 0.0:
             _add_dent(model, data, t, start, around, rest, field, width, tip, patch)
+        elif model.grasp.on and data.grasp.held[t]:
+            _add_disc(model, data, t, start, around, rest, field, width, tip, patch)
 
 
 @fast
@@ -146,6 +151,42 @@ def _add_dent(  # type: ignore[no-untyped-def]
     else:
         for v in range(rest.shape[0]):
             _move(model, data, rest, field, width, v, under, shares, contact, far)
+
+
+@fast
+def _add_disc(  # type: ignore[no-untyped-def]
+    model, data, t, start, around, rest, field, width, tip, patch
+):
+    """The dent of a jaw that holds tissue, along L g."""
+    n, g, s, value = data.normal[t], data.friction.push[t], data.point[t], data.law.value[t]
+    a, reach = model.grasp.radius[t], (REACH * model.dent.patch_radius[0]) ** 2
+    along, aside = g[0] * n[0] + g[1] * n[1] + g[2] * n[2], model.law.mindlin[0]
+    way = (
+        aside * g[0] + (1.0 - aside) * along * n[0],
+        aside * g[1] + (1.0 - aside) * along * n[1],
+        aside * g[2] + (1.0 - aside) * along * n[2],
+    )
+    disc, own = tip * 0.5 / (value[STIFFNESS] * a), patch * value[TAKEN]
+    j, _ = _nearest_position(model, data, t)
+    for e in range(start[j], start[j + 1]):
+        at = rest[around[e]]
+        square = (at[0] - s[0]) ** 2 + (at[1] - s[1]) ** 2 + (at[2] - s[2]) ** 2
+        if square >= reach:
+            continue
+        part = square / reach
+        beside = 1.0
+        if square > a * a:
+            beside = 2.0 / np.pi * np.arcsin(a / np.sqrt(square))
+        moved = _fading(part) * (disc * beside - own * _in_table(model.dent.patch, part))
+        for d in range(width):
+            field[width * around[e] + d] += np.float32(moved * way[d % 3])
+
+
+@fast
+def _fading(part):  # type: ignore[no-untyped-def]
+    """h at the square of a distance over that of the reach."""
+    left = min(1.0, (1.0 - part) / (1.0 - (FADE / REACH) ** 2))
+    return left * left * (3.0 - 2.0 * left)
 
 
 @fast
@@ -209,9 +250,7 @@ def _move(  # type: ignore[no-untyped-def]
         tip = _outside(data, square)
     else:
         tip = _far_off(far, square)
-    left = min(1.0, (1.0 - part) / (1.0 - (FADE / REACH) ** 2))
-    moved = shares[0] * tip - shares[1] * _in_table(model.dent.patch, part)
-    change = left * left * (3.0 - 2.0 * left) * moved
+    change = _fading(part) * (shares[0] * tip - shares[1] * _in_table(model.dent.patch, part))
     for d in range(width):
         field[width * v + d] -= np.float32(change * normal[d % 3])
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.friction import Friction
+from avatar_core.contact.effects.grasp import Grasp
 from avatar_core.contact.effects.inertia import Inertia
 from avatar_core.contact.effects.large_deformation import LargeDeformationEffect
 from avatar_core.contact.effects.respiration import Respiration
@@ -30,6 +31,7 @@ EFFECTS: dict[str, type[Effect]] = {
         Tumour,
         SeveralTools,
         Tilt,
+        Grasp,
     )
 }
 
@@ -37,6 +39,7 @@ __all__ = [
     "EFFECTS",
     "Effect",
     "Friction",
+    "Grasp",
     "Inertia",
     "LargeDeformationEffect",
     "Respiration",

@@ -29,6 +29,7 @@ from avatar_core.common.jit import fast, inlined
 from avatar_core.common.quantities import quantity
 from avatar_core.contact.effects.base import Effect, Ground
 from avatar_core.contact.effects.friction import force_on_tissue
+from avatar_core.contact.effects.grasp import is_held
 from avatar_core.errors import SceneError
 from avatar_core.reduction.near_field import find_block
 
@@ -196,10 +197,11 @@ def advance_history(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _advance_tips(model, data):  # type: ignore[no-untyped-def]
-    """The history that each tip carries along; it ends with the contact."""
+    """The history that each tip carries along; it ends with the contact. A bonded disc has none:
+    its dent is elastic, as fast contact is."""
     memory, prony = data.viscoelasticity, model.viscoelasticity
     for t in range(memory.tip_held.shape[0]):
-        on = data.active[t]
+        on = data.active[t] and not is_held(model, data, t)
         new = max(0.0, prony.gain[0] * (data.force[t] - memory.tip_held[t])) if on else 0.0
         for i in range(prony.decay.shape[0]):
             past = prony.decay[i] * memory.tip_past[i, t] + prony.ramp[i] * (

@@ -104,7 +104,7 @@ def test_the_forces_are_the_same(
 @pytest.mark.long
 def test_large_pushes_too(bent: Vademecum, tmp_path: Path) -> None:
     organ = stored(bent, tmp_path)
-    made = recorded(organ, default_effects(organ, 1))
+    made = recorded(organ, default_effects(organ, (Tip(),)))
     assert replay(made, organ).difference(made) <= SAME
 
 

@@ -20,6 +20,7 @@ from avatar_ros.ui.tools.tools import Tools
 from avatar_ros.ui.view.organ import Organ
 
 from avatar_core.contact.layout import default_effects
+from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.scene.recording import load_recording, save_recording
@@ -104,7 +105,7 @@ def test_a_recording_says_what_it_lacks(cube: Organ) -> None:
 
 def then(cube: Organ) -> Scene:
     """What ran when it was recorded."""
-    effects = default_effects(cube.vademecum, 1)
+    effects = default_effects(cube.vademecum, (Tip(),))
     return Scene(name="then", tools=(Tool(),), effects=effects, young_modulus=50e3)
 
 

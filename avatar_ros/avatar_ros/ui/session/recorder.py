@@ -39,7 +39,7 @@ def scene_in_force(
         tools=tools,
         cloud=cloud,
         cloud_divisor=cloud_divisor,
-        effects=default_effects(vademecum, len(tools)),
+        effects=default_effects(vademecum, [tool.tip for tool in tools]),
     )
     effects = scene.effects
     if "contrast" in material:

@@ -1,0 +1,266 @@
+"""A jaw that holds a point of the surface: a bilateral contact on the organ's compliance.
+
+A jaw that closes near the surface takes the material point s under it. From then on the patch at s
+moves with the tool, by y since the force was zero, as a bonded disc of the jaw's radius a does,
+
+    g = [C(s, s) - c L + L / (2 E* a)]^-1 (y - u),      L = n n^T + rho (I - n n^T),
+
+g the force on the tissue, C the organ's compliance for a patch, c what a patch dents its own
+neighbourhood (:mod:`avatar_core.tips.law`), and u the displacement by all other causes. A disc that
+is bonded to a half-space yields by 1 / (2 E* a) along n, and along the surface by
+(2 - nu) / (8 G a) = rho / (2 E* a), rho = (2 - nu) / (2 (1 - nu)) (Mindlin, J. Appl. Mech. 16:259,
+1949; exact without friction, and for nu = 1/2). All tools are solved for together, which is the
+capacitance matrix of James & Pai (SIGGRAPH 1999). As C is symmetric and s stays, the force is the
+derivative of one energy: no closed path gains.
+
+It lets go when the jaw opens, or for good until then when the force exceeds what its friction
+holds. The tool touches nothing then until it has been outside: at depth, it would release energy
+that no tool has put in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from avatar_core.common.array_table import array, kind
+from avatar_core.common.jit import fast, inlined
+from avatar_core.common.splines import cell_at, in_cell, on_grid, value_in_cell
+from avatar_core.contact.effects.base import Effect, Ground
+from avatar_core.contact.organ_response import gather
+from avatar_core.contact.status import Status
+from avatar_core.errors import SceneError
+from avatar_core.tips.profile import STIFFNESS, TAKEN
+
+OK, INVALID_POSE = int(Status.OK), int(Status.INVALID_POSE)  # numba takes plain numbers
+EXTRAPOLATED, SLIPPED = int(Status.EXTRAPOLATED), int(Status.SLIPPED)
+
+REACH = 2e-3  # of a jaw that closes above the surface, and
+DEEPEST = 5e-3  # below it [m]
+FARTHEST = 5e-3  # displacement up to which the response was found to be linear within 2 % [m]
+# Relative error of the force that nine in ten pulls keep (`avatar study grasp`), beside that of the
+# patch; and what the displacement of the held point adds to it [1/m].
+LAW_ERROR, STRETCH_ERROR = 0.05, 5.0
+_TOUCHING = 1e-6  # gap at which the held point is looked up [m]
+_STEPS = 4  # to the point that has come under the jaw
+_LEAST_ACCESS = 0.5  # of a point that can be taken
+_LEAST_ACROSS = 0.05  # part of the patch's compliance along the surface that a large jaw leaves
+
+
+@dataclass(frozen=True)
+class Grasp(Effect):
+    """Jaws hold tissue; each tool's tip has its own radius and slip."""
+
+    name: ClassVar[str] = "grasp"
+    text: ClassVar[str] = "jaws that close hold tissue, pull it, and let go where it slips"
+
+    Constants: ClassVar[Any] = kind("Grasp", radius=array("T"), slip=array("T"))  # 0: no jaw
+    State: ClassVar[Any] = kind(
+        "GraspState",
+        held=array("T", np.bool_),  # whether a jaw holds tissue,
+        fresh=array("T", np.bool_),  # and has yet to be looked up where that is,
+        begun=array("T", np.bool_),  # or has been pulled from where it was taken;
+        shut=array("T", np.bool_),  # was closed before, with or without tissue,
+        slipped=array("T", np.bool_),  # and lost it
+        place=array("T 3"),  # of a tip that touches s [m]
+        start=array("T 3"),  # of the tool at zero force, less u there,
+        now=array("T 3"),  # and of the tool when that was last known [m]
+        stiffness=array("T 3 3"),  # the inverse of the law's matrix [N/m]
+    )
+    superposed: ClassVar[bool] = True
+
+    @staticmethod
+    def require_jaw(tips: Any) -> None:
+        """Raise SceneError if no tip has a jaw, or a jaw has no tip of its own."""
+        if all(tip.grasp is None for tip in tips):
+            raise SceneError(
+                "grasp: no tool has a jaw; write grasp: {radius: 0.003, slip: 4} beside its tip, "
+                "or leave grasp out"
+            )
+        if any(tip.shape == "patch" for tip in tips):
+            raise SceneError("grasp: a patch has no jaw; give the tool a sphere or another tip")
+
+    def lay_out(self, ground: Ground) -> Any:
+        self.require_jaw(ground.tips)
+        jaws = [tip.grasp for tip in ground.tips]
+        return self.Constants(
+            np.array([jaw.radius if jaw else 0.0 for jaw in jaws]),
+            np.array([jaw.slip if jaw else 0.0 for jaw in jaws]),
+        )
+
+
+@inlined
+def is_held(model, data, t):  # type: ignore[no-untyped-def]
+    """Whether a tool holds tissue."""
+    return model.grasp.on and data.grasp.held[t]
+
+
+@inlined
+def work_jaw(model, data, t):  # type: ignore[no-untyped-def]
+    """Open or close a jaw; whether it goes on holding what it held in the last period."""
+    if not model.grasp.on or model.grasp.radius[t] == 0.0:
+        return False
+    grasp, tip = data.grasp, data.tip[t]
+    valid = np.isfinite(tip[0] + tip[1] + tip[2])
+    if not data.jaw[t]:
+        if grasp.held[t]:
+            let_go(data, t)
+        grasp.shut[t] = grasp.slipped[t] = False
+        return False
+    if grasp.held[t]:
+        data.out.status[t] = OK if valid else INVALID_POSE
+        if valid:
+            for d in range(3):
+                grasp.now[t, d] = tip[d]
+        return not grasp.fresh[t]
+    if not grasp.shut[t]:
+        grasp.shut[t] = True
+        if valid and _find_point(model, data, t):
+            grasp.held[t] = grasp.fresh[t] = True
+            grasp.begun[t] = False
+            data.passage[t] = 0  # as if it came from outside
+            data.force[t] = data.law.elastic[t] = 0.0
+            for d in range(3):
+                grasp.start[t, d] = grasp.now[t, d] = tip[d]
+    return False
+
+
+@fast
+def _find_point(model, data, t):  # type: ignore[no-untyped-def]
+    """The material point X with X + u(X) under the tool, into ``place``; whether it can be held."""
+    place, tip, slope = data.grasp.place[t], data.tip[t], data.slope[t]
+    for d in range(3):
+        place[d] = tip[d]
+    for _ in range(_STEPS):
+        if not on_grid(model.distance.shape, model.origin, model.spacing[0], place):
+            return False
+        gather(model, data, t, cell_at(model.origin, model.spacing[0], place))
+        for d in range(3):
+            moved = 0.0
+            for i in range(data.n_nodes[t]):
+                load, u = model.load[data.nodes[t, i], d], 0.0
+                for k in range(data.superposition.total.shape[0]):
+                    u += load[k] * data.superposition.total[k]
+                moved += data.weight[t, i, 0] * u
+            place[d] = tip[d] - moved
+    if not on_grid(model.distance.shape, model.origin, model.spacing[0], place):
+        return False
+    cell = cell_at(model.origin, model.spacing[0], place)
+    gap = in_cell(model.distance, cell, slope) - model.tip_offset[t]
+    if not -DEEPEST < gap < REACH or value_in_cell(model.access, cell) < _LEAST_ACCESS:
+        return False
+    square = max(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2, 1e-6)
+    for d in range(3):
+        place[d] -= (gap + _TOUCHING) * slope[d] / square
+    return True
+
+
+@fast
+def let_go(data, t):  # type: ignore[no-untyped-def]
+    """Hold nothing, and touch nothing before the tool has been outside."""
+    data.grasp.held[t] = data.grasp.fresh[t] = data.active[t] = False
+    data.passage[t] = 2  # barred
+    data.force[t] = 0.0
+    data.friction.push[t] = 0.0
+
+
+@fast
+def stiffen_jaw(model, data, t):  # type: ignore[no-untyped-def]
+    """Complete C of a held tool by its disc, and invert it."""
+    n, c, value = data.normal[t], data.friction.compliance[t, t], data.law.value[t]
+    gain = data.superposition.near_gain[0]
+    added = gain * (0.5 / (value[STIFFNESS] * model.grasp.radius[t]) - value[TAKEN])
+    across = 0.0
+    for i in range(3):
+        across += 0.5 * c[i, i]
+        for j in range(3):
+            across -= 0.5 * n[i] * c[i, j] * n[j]
+    aside = max(model.law.mindlin[0] * added, (_LEAST_ACROSS - 1.0) * across)
+    for i in range(3):
+        for j in range(3):
+            c[i, j] += (added - aside) * n[i] * n[j] + (aside if i == j else 0.0)
+    _invert(c, data.grasp.stiffness[t])
+
+
+@fast
+def _invert(c, out):  # type: ignore[no-untyped-def]
+    """The inverse of a 3 x 3 matrix, by cofactors."""
+    for i in range(3):
+        for j in range(3):
+            a, b, p, q = (j + 1) % 3, (j + 2) % 3, (i + 1) % 3, (i + 2) % 3
+            out[i, j] = c[a, p] * c[b, q] - c[a, q] * c[b, p]
+    whole = c[0, 0] * out[0, 0] + c[0, 1] * out[1, 0] + c[0, 2] * out[2, 0]
+    for i in range(3):
+        for j in range(3):
+            out[i, j] /= whole
+
+
+@fast
+def place_jaw(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
+    """y of a held tool. In its first period, y is the displacement u that it finds: no force."""
+    grasp, y = data.grasp, data.friction.offset[t]
+    grasp.fresh[t] = False
+    if not grasp.begun[t]:
+        grasp.begun[t] = True
+        grasp.start[t, 0] -= u0
+        grasp.start[t, 1] -= u1
+        grasp.start[t, 2] -= u2
+    for d in range(3):
+        y[d] = grasp.now[t, d] - grasp.start[t, d]
+
+
+@fast
+def pull(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
+    """Correct g by what the patch misses y; returns the largest part of that [m]."""
+    k, y, g = data.grasp.stiffness[t], data.friction.offset[t], data.friction.push[t]
+    x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
+    square = 0.0
+    for i in range(3):
+        g[i] += k[i, 0] * x0 + k[i, 1] * x1 + k[i, 2] * x2
+        square += g[i] * g[i]
+    data.force[t] = np.sqrt(square)
+    return max(abs(x0), abs(x1), abs(x2))
+
+
+@fast
+def hold_or_slip(model, data):  # type: ignore[no-untyped-def]
+    """Let go what is pulled harder than its jaw can hold."""
+    if not model.grasp.on:
+        return
+    for t in range(data.tip.shape[0]):
+        if data.grasp.held[t] and data.force[t] > model.grasp.slip[t]:
+            let_go(data, t)
+            data.grasp.slipped[t] = True
+        if data.grasp.slipped[t]:
+            data.out.status[t] = SLIPPED
+
+
+@fast
+def write_held_force(model, data, t, n):  # type: ignore[no-untyped-def]
+    """The force on a tool that holds tissue, and its contact, number n."""
+    out, g, y = data.out, data.friction.push[t], data.friction.offset[t]
+    square = 0.0
+    for d in range(3):
+        out.contact_position[n, d] = data.point[t, d] + y[d]
+        out.contact_normal[n, d] = data.normal[t, d]
+        if out.status[t] != INVALID_POSE:
+            out.force[t, d] = -g[d]
+        out.contact_force[n, d] = out.force[t, d]
+        square += y[d] * y[d]
+    out.contact_penetration[n] = 0.0
+    if out.status[t] == OK and square > FARTHEST * FARTHEST:
+        out.status[t] = EXTRAPOLATED
+
+
+@fast
+def held_error(model, data, t):  # type: ignore[no-untyped-def]
+    """Relative error of the force of a held tool: of the patch, the disc, and small strains."""
+    y, c = data.friction.offset[t], data.friction.compliance[t, t]
+    patch = value_in_cell(
+        model.force_error, cell_at(model.origin, model.spacing[0], data.grasp.place[t])
+    )
+    part = min(data.self_compliance[t] * 3.0 / (c[0, 0] + c[1, 1] + c[2, 2]), 1.0)
+    moved = np.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
+    return part * patch + model.law.error_factor[0] * LAW_ERROR + STRETCH_ERROR * moved
