@@ -13,7 +13,7 @@ from avatar_core.errors import SceneError
 
 if TYPE_CHECKING:
     from avatar_core.contact.effects import Effect
-    from avatar_core.geometry.tip import Tip
+    from avatar_core.geometry.tip import Jaw, Tip
     from avatar_core.scene.model import Scene
     from avatar_core.vademecum.model import Vademecum
 
@@ -61,7 +61,9 @@ def check(
     print(f"  {path}")
     print(f"  organ: {_organ(one, vademecum)}; {_material(one)}")
     for tool in one.tools:
-        print(f"  tool {tool.name}: {_tip(tool.tip)}")
+        jaw = tool.tip.grasp
+        grasp = f"; jaw: {', '.join(_numbers(jaw))}" if jaw else ""
+        print(f"  tool {tool.name}: {_tip(tool.tip)}{grasp}")
     print(f"  outputs: {_outputs(one)}")
     print("  effects" if one.effects else "  effects: none")
     for effect in one.effects:
@@ -92,12 +94,15 @@ def _material(one: Scene) -> str:
 
 def _tip(tip: Tip) -> str:
     """Its shape, and the numbers that the shape uses."""
-    numbers = [
+    return ", ".join([tip.shape, *_numbers(tip)])
+
+
+def _numbers(one: Tip | Jaw) -> list[str]:
+    return [
         f"{field.name} {_number(value, field.metadata['quantity'].unit)}"
-        for field in fields(tip)
-        if "quantity" in field.metadata and (value := getattr(tip, field.name)) is not None
+        for field in fields(one)
+        if "quantity" in field.metadata and (value := getattr(one, field.name)) is not None
     ]
-    return ", ".join([tip.shape, *numbers])
 
 
 def _outputs(one: Scene) -> str:

@@ -77,7 +77,7 @@ DATA = kind(
     dent=DENT_STATE,
     **{name: effect.State for name, effect in EFFECTS.items() if effect.State is not None},
 )
-RESUMED = ("passage", "seen", "active", "force", "before")  # by another model of an organ
+RESUMED = ("passage", "seen", "active", "force", "before", "jaw")  # by another model of an organ
 
 
 def at_rest(model: Any) -> Any:

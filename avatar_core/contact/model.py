@@ -104,6 +104,15 @@ class ContactData:
         self.reset()
 
     @property
+    def grasps(self) -> bool:
+        """Whether jaws are simulated."""
+        return self.state.grasp is not None
+
+    def holds(self, tool: int) -> bool:
+        """Whether the jaw of a tool holds tissue. Real-time safe."""
+        return self.state.grasp is not None and bool(self.state.grasp.held[tool])
+
+    @property
     def n_shown(self) -> int:
         """Modes that the cloud shows."""
         return int(self.state.shown[0])

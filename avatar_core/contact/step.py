@@ -38,6 +38,7 @@ from avatar_core.contact.effects.grasp import (
     held_error,
     hold_or_slip,
     is_held,
+    let_go,
     work_jaw,
     write_held_force,
 )
@@ -146,6 +147,8 @@ def _locate_tips(model, data):  # type: ignore[no-untyped-def]
         status = max(status, data.out.status[t])
         if not data.active[t]:
             data.force[t] = 0.0
+            if is_held(model, data, t):
+                let_go(data, t)
             continue
         modal_load(model, data, t)
         if model.superposed[0]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -134,9 +134,9 @@ def write_scene(scene: Scene) -> str:
 
 
 def _plain_tool(tool: Tool) -> dict[str, Any]:
-    tip = _plain_fields(tool.tip)
-    jaw = tip.pop("grasp", None)
-    return {"name": tool.name, "tip": tip} | ({"grasp": jaw} if jaw else {})
+    jaw = tool.tip.grasp
+    found = {"name": tool.name, "tip": _plain_fields(replace(tool.tip, grasp=None))}
+    return found | ({"grasp": _plain_fields(jaw)} if jaw else {})
 
 
 def _plain_fields(one: Any) -> dict[str, Any]:

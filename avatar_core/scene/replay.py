@@ -31,7 +31,7 @@ from avatar_core.scene.recording import Periods, Recording
 from avatar_core.vademecum.model import Vademecum
 
 REMEMBER_FOR_EVER = ("viscoelasticity", "inertia")
-_RECORDED_NOWHERE = {"respiration": "phase of the breath"}
+_RECORDED_NOWHERE = {"respiration": "phase of the breath", "grasp": "jaw"}
 _STEP = 500  # periods from one call of ``progress`` to the next
 _MAY_BE_INSIDE = (int(Status.OUT_OF_RANGE), int(Status.INVALID_POSE))
 

@@ -48,7 +48,7 @@ class GraspSettings:
 
     livers: tuple[str, ...] = ("LiTS-20", "Amos-052")
     n_places: int = 6
-    radii: tuple[float, ...] = (2e-3, 3e-3, 5e-3)
+    radii: tuple[float, ...] = (2e-3, 5e-3)
     options: OrganOptions = field(default_factory=OrganOptions)
 
 

@@ -166,7 +166,8 @@ def _add_disc(  # type: ignore[no-untyped-def]
         aside * g[1] + (1.0 - aside) * along * n[1],
         aside * g[2] + (1.0 - aside) * along * n[2],
     )
-    disc, own = tip * 0.5 / (value[STIFFNESS] * a), patch * value[TAKEN]
+    plane = value[STIFFNESS] * np.exp(-data.law.shape[t])  # as of disc_compliance
+    disc, own = tip * 0.5 / (plane * a), patch * value[TAKEN]
     j, _ = _nearest_position(model, data, t)
     for e in range(start[j], start[j + 1]):
         at = rest[around[e]]

@@ -44,7 +44,7 @@ FARTHEST = 5e-3  # displacement up to which the response was found to be linear 
 # patch; and what the displacement of the held point adds to it [1/m].
 LAW_ERROR, STRETCH_ERROR = 0.05, 5.0
 _TOUCHING = 1e-6  # gap at which the held point is looked up [m]
-_STEPS = 4  # to the point that has come under the jaw
+_STEPS = 4  # to the point that has come under the jaw, and from there to the surface
 _LEAST_ACCESS = 0.5  # of a point that can be taken
 _LEAST_ACROSS = 0.05  # part of the patch's compliance along the surface that a large jaw leaves
 
@@ -151,9 +151,12 @@ def _find_point(model, data, t):  # type: ignore[no-untyped-def]
     gap = in_cell(model.distance, cell, slope) - model.tip_offset[t]
     if not -DEEPEST < gap < REACH or value_in_cell(model.access, cell) < _LEAST_ACCESS:
         return False
-    square = max(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2, 1e-6)
-    for d in range(3):
-        place[d] -= (gap + _TOUCHING) * slope[d] / square
+    for _ in range(_STEPS):
+        square = max(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2, 1e-6)
+        for d in range(3):
+            place[d] -= (gap + _TOUCHING) * slope[d] / square
+        cell = cell_at(model.origin, model.spacing[0], place)
+        gap = in_cell(model.distance, cell, slope) - model.tip_offset[t]
     return True
 
 
@@ -169,9 +172,9 @@ def let_go(data, t):  # type: ignore[no-untyped-def]
 @fast
 def stiffen_jaw(model, data, t):  # type: ignore[no-untyped-def]
     """Complete C of a held tool by its disc, and invert it."""
-    n, c, value = data.normal[t], data.friction.compliance[t, t], data.law.value[t]
-    gain = data.superposition.near_gain[0]
-    added = gain * (0.5 / (value[STIFFNESS] * model.grasp.radius[t]) - value[TAKEN])
+    n, c = data.normal[t], data.friction.compliance[t, t]
+    added = disc_compliance(model, data, t) - data.law.value[t, TAKEN]
+    added *= data.superposition.near_gain[0]
     across = 0.0
     for i in range(3):
         across += 0.5 * c[i, i]
@@ -182,6 +185,14 @@ def stiffen_jaw(model, data, t):  # type: ignore[no-untyped-def]
         for j in range(3):
             c[i, j] += (added - aside) * n[i] * n[j] + (aside if i == j else 0.0)
     _invert(c, data.grasp.stiffness[t])
+
+
+@inlined
+def disc_compliance(model, data, t):  # type: ignore[no-untyped-def]
+    """1 / (2 E* a) [m/N]. The disc is as large on a curved surface: the shape factor of a tip, whose
+    contact is not, does not count."""
+    stiffness = data.law.value[t, STIFFNESS] * np.exp(-data.law.shape[t])
+    return 0.5 / (stiffness * model.grasp.radius[t])
 
 
 @fast

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from avatar_core.contact.effects import EFFECTS, Effect, SeveralTools, Tilt, Tumour
+from avatar_core.contact.effects import EFFECTS, Effect, Grasp, SeveralTools, Tilt, Tumour
 from avatar_core.contact.effects.base import find
 from avatar_core.contact.model import ContactData, model_of, step
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import SceneError
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tip import Jaw, Tip
 from avatar_core.offline.large_deformation import (
     LargeRule,
     hyperelastic_problem,
@@ -33,8 +33,12 @@ ROUNDS = 7  # pairs of slides; other processes disturb some of them
 N_STEPS = 1500
 
 PUNCH = Tip("flat", SPHERE.radius)
+GRASPER = replace(SPHERE, grasp=Jaw(3e-3, 100.0))
 
+PULLED = 0.05  # part of a slide by which a jaw pulls what it holds
 LEAN = np.radians(20.0)  # of the punch off the surface where it sets out
+
+TWO_JAWS = "grasp, two jaws"
 
 Case = tuple[str, int, tuple[Effect, ...]]  # name, tools, effects
 
@@ -75,7 +79,8 @@ def run_effects_bench(
     Everything at once leaves out what needs another tip, and what excludes large deformation.
     """
     cases = cases_on(vademecum)
-    together = [effects for name, _, effects in cases if name not in (Tilt.name, Tumour.name)]
+    apart = (Tilt.name, Tumour.name, Grasp.name, TWO_JAWS)
+    together = [effects for name, _, effects in cases if name not in apart]
     every = tuple(effect for effects in together for effect in effects)
     rows = effect_rows(vademecum, (*cases, ("everything", 2, every)), progress)
     summary = {
@@ -93,7 +98,7 @@ def cases_on(vademecum: Vademecum) -> tuple[Case, ...]:
         with suppress(SceneError):  # what this vademecum lacks
             effect.require(vademecum)
             cases.append((name, 2 if kind is SeveralTools else 1, (effect,)))
-    return tuple(cases)
+    return (*cases, (TWO_JAWS, 2, (Grasp(), SeveralTools())))
 
 
 def _leaning(vademecum: Vademecum) -> Tilt:
@@ -115,9 +120,13 @@ def effect_rows(
     rows = [_row("bare", bare, bare, bare_path, bare_path)]
     for name, n_tools, effects in cases:
         progress(name)
-        tip = PUNCH if find(effects, Tilt) is not None else SPHERE
+        tip = PUNCH if find(effects, Tilt) else GRASPER if find(effects, Grasp) else SPHERE
         model = model_of(vademecum, (tip,) * n_tools, cloud="volume", effects=effects)
-        path = tool_paths(linear, n_tools, N_STEPS, tip)
+        if tip is GRASPER:
+            path = tool_paths(linear, n_tools, N_STEPS, tip, depth=0.0)
+            path = path[0] + PULLED * (path - path[0])
+        else:
+            path = tool_paths(linear, n_tools, N_STEPS, tip)
         rows.append(_row(name, model.data(), bare, path, bare_path))
     return rows
 
@@ -147,4 +156,5 @@ def _slide(data: ContactData, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Times [us] and contacts of one slide over an organ at rest, of tools that do not turn."""
     data.reset()
     still = np.tile([0.0, 0.0, 0.0, 1.0], (data.model.n_tools, 1))
-    return one_pass(data, path, lambda tips: step(data.model, data, tips, still))
+    jaws = np.ones(data.model.n_tools, bool) if data.grasps else None
+    return one_pass(data, path, lambda tips: step(data.model, data, tips, still, jaws))

@@ -241,11 +241,13 @@ def one_pass(
     return times[kept] * 1e6, contacts[kept]
 
 
-def tool_paths(vademecum: Vademecum, n_tools: int, n: int = 4000, tip: Tip = SPHERE) -> np.ndarray:
-    """Slides of a tip that start far apart, shape (n, n_tools, 3)."""
+def tool_paths(
+    vademecum: Vademecum, n_tools: int, n: int = 4000, tip: Tip = SPHERE, depth: float | None = None
+) -> np.ndarray:
+    """Slides of a tip at a depth [m] that start far apart, shape (n, n_tools, 3)."""
     starts = starts_apart(vademecum, n_tools)
-    # A flat face that is found 5 mm inside may have been set there, and is not felt.
-    depth = DEPTH if tip.offset > 0.0 else DEPTH / 2.0
+    if depth is None:  # a flat face that is found 5 mm inside may have been set there: not felt
+        depth = DEPTH if tip.offset > 0.0 else DEPTH / 2.0
     paths = [slide(vademecum, tip.offset, depth, n * 1e-4, position=start) for start in starts]
     return np.ascontiguousarray(np.stack(paths, axis=1))
 

@@ -52,6 +52,7 @@ class StateTemplate:
         self._tail = bytearray(serialised[end:])
         self._error = find_number(message, lambda x: setattr(message, "force_error", x)) - end
         self._force_share = find_number(message, lambda x: setattr(message, "force_share", x)) - end
+        self._held = _find_flag(message) - end
         self._block = bytearray(8 * _CONTACT_NUMBERS * capacity)
         self.contacts = np.frombuffer(self._block, dtype=np.float64).reshape(capacity, -1)
         if last != start + 72 or not all(self._reads_back(n) for n in {0, 1, capacity}):
@@ -64,6 +65,7 @@ class StateTemplate:
         n_contacts: int,
         force_error: float,
         force_share: float = 1.0,
+        held: bool = False,
     ) -> bytes:
         """The message with its first ``n_contacts`` contacts. Real-time safe."""
         head = self._head
@@ -73,12 +75,13 @@ class StateTemplate:
         used = 8 * _CONTACT_NUMBERS * n_contacts
         struct.pack_into("=d", self._tail, self._error, force_error)
         struct.pack_into("=d", self._tail, self._force_share, force_share)
+        self._tail[self._held] = held
         return bytes(head) + bytes(memoryview(self._block)[:used]) + bytes(self._tail)
 
     def _reads_back(self, n_contacts: int) -> bool:
         """Whether the middleware reads what was written; padding bytes may have any value."""
         self.contacts[:] = np.arange(self.contacts.size).reshape(self.contacts.shape)
-        sent = self.serialise(struct.pack("=iI", 3, 4), 5, n_contacts, 0.25, 0.5)
+        sent = self.serialise(struct.pack("=iI", 3, 4), 5, n_contacts, 0.25, 0.5, True)
         read = deserialize_message(sent, ContactState)
         numbers = [_contact_numbers(contact) for contact in read.contacts]
         written = self.contacts[:n_contacts].tolist()
@@ -87,13 +90,26 @@ class StateTemplate:
         return (
             numbers == written
             and (stamp.sec, stamp.nanosec, read.status) == (3, 4, 5)
-            and (read.force_error, read.force_share) == (0.25, 0.5)
+            and (read.force_error, read.force_share, read.held) == (0.25, 0.5, True)
         )
 
 
 def _contact_numbers(contact: Contact) -> list[float]:
     p, n, f = contact.position, contact.normal, contact.force
     return [p.x, p.y, p.z, n.x, n.y, n.z, f.x, f.y, f.z, contact.penetration]
+
+
+def _find_flag(message: ContactState) -> int:
+    """Byte offset of ``held``, the last byte that is other with it than without."""
+    message.held = True
+    with_it = serialize_message(message)
+    message.held = False
+    without = serialize_message(message)
+    pairs = enumerate(zip(with_it, without, strict=True))
+    found = [i for i, pair in pairs if pair == (1, 0)]
+    if not found:
+        raise LayoutError("a truth value is not stored in a byte: use rmw_fastrtps_cpp")
+    return found[-1]
 
 
 def _find_byte(

@@ -121,6 +121,7 @@ class ContactLoop:
         self._publishers = publishers
         self._tips = np.full((len(tools), 3), FAR_AWAY)
         self._orientations = np.zeros((len(tools), 4))
+        self._jaws = np.zeros(len(tools), np.bool_)
         self._used = self.active  # of the last step
         self._outgoing: Any = None  # the model that it replaces, while both are stepped,
         self._outgoing_band: ForceBand | None = None  # and its band
@@ -224,6 +225,8 @@ class ContactLoop:
         data, outgoing = active.data, self._outgoing
         busy = 0
         if data is not None:
+            if data.grasps:
+                self._take_jaws()
             self._solve(data)
             busy = time.monotonic_ns() - start
         if outgoing is not None:
@@ -270,7 +273,13 @@ class ContactLoop:
 
     def _solve(self, data: Any) -> None:
         """Forces at the tips of the moment. Real-time safe."""
-        contact.solve(data.model, data, self._tips, self._orientations)
+        contact.solve(data.model, data, self._tips, self._orientations, self._jaws)
+
+    def _take_jaws(self) -> None:
+        """Which jaws are closed. Real-time safe."""
+        for i, tool in enumerate(self._tools):
+            if tool.jaw is not None:
+                self._jaws[i] = tool.jaw.take()
 
     def _blend_bands(self, band: ForceBand | None, outgoing: ForceBand | None) -> None:
         """Fade in the band of a model, of forces that are not faded in yet. Real-time safe."""
@@ -339,14 +348,15 @@ class ContactLoop:
             tool.note_solved(status)
             if status == OK and not guard.engaged:
                 status = ENGAGING
-        n, error = 0, _NO_ERROR
+        n, error, held = 0, _NO_ERROR, False
         if active.data is not None:
+            held = active.data.holds(i)
             n, error = (
                 _write_contacts(template, active.data.out, i),
                 active.data.out.force_error[i],
             )
         self._publishers.state.handle.publish_raw(
-            template.serialise(tool.stamp, status, n, error, guard.sent_fraction)
+            template.serialise(tool.stamp, status, n, error, guard.sent_fraction, held)
         )
 
 

@@ -18,6 +18,7 @@ from avatar_core.uncertainty.distributions import (
 from avatar_core.vademecum.accuracy import Budget, Cloud, Quantity
 from avatar_ros.framework.parameters import AUTOSTART, FRAME_ID, IDENTITY, Parameter, ParameterError
 from avatar_ros.framework.saved_state import STATE_DIR
+from avatar_ros.loop.jaw import JAW
 from avatar_ros.loop.safety import SAFETY, Safety
 
 
@@ -175,6 +176,7 @@ CONTACT = (
     ),
     Parameter("realtime.cpu", -1, "core the loop is bound to; -1: any", range=(-1, 1023)),
     Parameter("realtime.lock_memory", True, "keep the process in memory; needs a priority"),
+    *JAW,
     *SAFETY,
     *THRESHOLDS,
     STATE_DIR,
@@ -201,6 +203,7 @@ class LoopSettings:
     budget : of error and time; None for none
     known : what is known of the material, by name of the coordinate; empty for no bands
     software_tools : those of ``tools`` that are no devices
+    jaw : positions below which a jaw is closed, and above which it is open
     """
 
     tools: tuple[str, ...]
@@ -222,6 +225,7 @@ class LoopSettings:
     parent_transform: tuple[float, ...] = IDENTITY
     known: dict[str, Distribution] = field(default_factory=dict)
     software_tools: tuple[str, ...] = ()
+    jaw: tuple[float, float] = (0.1, 0.2)
 
     def safety_of(self, tool: str) -> Safety:
         """That of one of the tools."""

@@ -33,9 +33,10 @@ EXPLANATIONS: dict[int, tuple[str, str]] = {
         "set tool_frame and tool_transform of the contact node, or publish in the organ's frame",
     ),
     Status.EXTRAPOLATED: (
-        "the tool presses deeper than the vademecum was built for; the force is extrapolated",
-        "press less deeply",
+        "the tool presses deeper or pulls farther than the response is known; the force goes on",
+        "press less deeply, or pull less far",
     ),
+    Status.SLIPPED: ("the jaw lost the tissue", "open it, and close it again"),
     Status.LEAP: ("the tool's pose jumped", "check its driver, or raise safety.leap"),
     Status.SEVERAL_PUBLISHERS: ("several nodes send poses of the tool", "stop all but one"),
     Status.LOST_TOOL: ("no node sends poses of the tool any more", "start its driver again"),

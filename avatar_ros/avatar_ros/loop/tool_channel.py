@@ -13,6 +13,7 @@ from avatar_core.contact.status import FAR_AWAY, Status
 from avatar_ros.framework import qos
 from avatar_ros.framework.ports import PolledSubscriptions, Ports
 from avatar_ros.framework.templates import NO_STAMP, PoseReader, WrenchTemplate, rotated
+from avatar_ros.loop.jaw import JawChannel, jaw_channel
 from avatar_ros.loop.safety import WRENCHES, Safety, band_topics
 from avatar_ros.loop.settings import LoopSettings
 
@@ -44,6 +45,7 @@ class ToolChannel:
     Poses come in the tool's frame; ``tip`` and ``orientation`` of the step are in the organ's.
 
     band_publishers : of the low and the high edge of the band of its force; may be none
+    jaw : whether it is closed; None if nobody can say
     status : OK with a usable pose, otherwise the reason why there is none
     stamp : of the last valid pose, eight bytes; zero before the first
     publishers : of its poses, as the node last counted them; one that was killed counts for a while
@@ -62,6 +64,7 @@ class ToolChannel:
         frame_id: str,
         safety: Safety | None = None,
         band: tuple[Any, ...] = (),
+        jaw: JawChannel | None = None,
     ) -> None:
         safety = safety or Safety()
         frame = safety.frame or frame_id
@@ -75,6 +78,7 @@ class ToolChannel:
         self.listeners = 0
         self.band_listeners = 0
         self.band_publishers = band
+        self.jaw = jaw
         self.device = OK
         self.operating_state = ""
         self.solved = OK
@@ -105,7 +109,8 @@ class ToolChannel:
     @property
     def ports(self) -> tuple[Any, ...]:
         """Its subscription and publishers."""
-        return (self.subscription, self.publisher, *self.band_publishers)
+        jaw = () if self.jaw is None else (self.jaw.subscription,)
+        return (self.subscription, self.publisher, *self.band_publishers, *jaw)
 
     @property
     def connected(self) -> bool:
@@ -297,6 +302,7 @@ def _channel(
             ports.publisher(WrenchStamped, f"{name}/{edge}", qos.bands(period))
             for edge in band_topics(safety.wrench)
         ),
+        jaw_channel(ports, name, settings.jaw, period, polled),
     )
 
 

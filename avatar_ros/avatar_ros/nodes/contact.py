@@ -182,7 +182,8 @@ class ContactNode(ManagedNode):
             self._supplier = None
             self._scene = ""
         self._loop = None
-        ends: list[Any] = [*self._tools, *self._devices]
+        jaws = [tool.jaw for tool in self._tools if tool.jaw is not None]
+        ends: list[Any] = [*self._tools, *self._devices, *jaws]
         for end in ends:
             self.destroy_subscription(end.subscription)
             self.destroy_publisher(end.publisher)

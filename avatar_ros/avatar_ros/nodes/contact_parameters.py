@@ -13,6 +13,7 @@ from avatar_core.scene.file import parse_scene, read_scene, write_scene
 from avatar_core.scene.model import Scene, Tool
 from avatar_core.vademecum.accuracy import Cloud
 from avatar_ros.framework.parameters import ParameterError, frame, pose, values
+from avatar_ros.loop.jaw import chosen_jaw
 from avatar_ros.loop.safety import chosen_safety
 from avatar_ros.loop.settings import (
     CONTACT,
@@ -70,6 +71,7 @@ def read_contact(node: Node, saved_scene: str = "") -> LoopSettings:
         parent_transform=pose("parent_transform", value["parent_transform"]),
         known=chosen_known(value["uncertainty"]),
         software_tools=chosen_software_tools(value["software_tools"], tools),
+        jaw=chosen_jaw(value),
     )
     if saved_scene:
         kept = _with_scene(settings, lambda: parse_scene(saved_scene, "kept"))

@@ -312,7 +312,8 @@ class PlanningNode(ManagedNode):
 
     def _place_tools(self, shown: Sequence[ShownPeriod]) -> None:
         forces = [(not one.missing) * one.force for one in shown]
-        self._view.place_tools(np.array([one.tip for one in shown]), np.array(forces))
+        holds = [one.holds for one in shown]
+        self._view.place_tools(np.array([one.tip for one in shown]), np.array(forces), holds)
 
     def _show_played(self, organ: Organ, played: Played) -> None:
         """Update the page from a recording that plays."""

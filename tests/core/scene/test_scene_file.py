@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from avatar_core.contact.effects import (
     EFFECTS,
     Effect,
     Friction,
+    Grasp,
     Inertia,
     SelfWeight,
     SeveralTools,
@@ -24,7 +25,7 @@ from avatar_core.contact.effects import (
     Viscoelasticity,
 )
 from avatar_core.errors import SceneError
-from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tip import Jaw, Tip
 from avatar_core.scene.file import parse_scene, read_scene, write_scene
 from avatar_core.scene.model import CONFLICTS, Scene, Tool
 from avatar_core.scene.yaml_lines import MAX_BYTES
@@ -374,7 +375,7 @@ def test_the_shipped_scenes_are_those_and_show_every_effect() -> None:
     scenes = {path.stem: read_scene(path) for path in SHIPPED}
     names = {stem: {effect.name for effect in scene.effects} for stem, scene in scenes.items()}
     # without what excludes large deformation, and what needs another tip
-    assert names["everything"] == set(EFFECTS) - {"tumour", "tilt"}
+    assert names["everything"] == set(EFFECTS) - {"tumour", "tilt", "grasp"}
     assert set().union(*names.values()) == set(EFFECTS)
     assert scenes["palpation"] == Scene(text=scenes["palpation"].text)
     assert scenes["needle_probe"].tools[0].tip == Tip("rounded_cone", 4e-3, 30.0, 1.5e-3)
@@ -444,6 +445,12 @@ def scenes(draw: st.DrawFn) -> Scene:
     tips = [draw(TIPS) for _ in names]
     if Tilt in kinds:
         tips[0] = Tip("flat", draw(RADII))
+    if Grasp in kinds:
+        jaw = draw(st.builds(Jaw, st.floats(5e-4, 20e-3), st.floats(0.05, 100.0)))
+        tips = [replace(tip, grasp=jaw) for tip in tips if tip.shape != "patch"]
+        kinds = kinds if tips else [kind for kind in kinds if kind is not Grasp]
+        names = names[: len(tips)] if tips else names
+        tips = tips or [Tip() for _ in names]
     return Scene(
         name=draw(LINES.filter(bool)),
         text=draw(LINES),

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from avatar_core.contact.effects import EFFECTS
-from avatar_core.geometry.tip import Tip
+from avatar_core.geometry.tip import Jaw, Tip
 from avatar_core.scene.file import SECTIONS, parse_scene
 from avatar_core.scene.model import Scene, SupportStiffness, Tool
 from tests.helpers.paths import ROOT
@@ -41,7 +41,10 @@ def keys() -> Iterator[tuple[str, Field[Any] | None]]:
         if each.name != "tip":
             yield f"tools.{each.name}", each
     for each in fields(Tip):
-        yield f"tools.tip.{each.name}", each
+        if each.name != "grasp":  # beside the tip in a file
+            yield f"tools.tip.{each.name}", each
+    for each in fields(Jaw):
+        yield f"tools.grasp.{each.name}", each
     for name, effect in EFFECTS.items():
         yield name, None
         for each in fields(effect):

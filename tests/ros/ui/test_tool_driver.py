@@ -110,6 +110,7 @@ def answer(tool: str, step: int, force: float) -> Any:
         contacts=[contact],
         force_error=0.1,
         force_share=1.0,
+        held=False,
         vademecum_id="a" * 64,
     )
 

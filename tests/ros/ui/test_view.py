@@ -320,13 +320,13 @@ def test_all_tools_are_drawn_with_their_names_and_forces(server: ViserServer, cu
     starts = cube.starts((Tip(), Tip("flat", 2e-3)))
     np.testing.assert_allclose([tool.position for tool in view._tools], starts, atol=1e-6)
     view.name_tools(NAMES, 1)
-    view.place_tools(PLACES, np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 0.0]]))
+    view.place_tools(PLACES, np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 0.0]]), [False, False])
     left, right = view._tools
     assert (left._text.text, right._text.text) == ("left 2.0 N", "[right]")
     assert left._arrow.visible and not right._arrow.visible
     view.show_tools((Tip(),), PLACES[:1])
     view.name_tools(("",), 0)
-    view.place_tools(PLACES[:1], np.zeros((1, 3)))
+    view.place_tools(PLACES[:1], np.zeros((1, 3)), [False])
     assert len(view._tools) == 1 and not view._tools[0]._text.visible
 
 

@@ -34,6 +34,7 @@ class ShownPeriod(NamedTuple):
     missing : why there is no force; empty if there is one
     is_held : there is none, and force and displacement are those of the last valid period
     status : of avatar_ros/msg/ContactState
+    holds : whether its jaw holds tissue
     band : that holds 90 % of what is known of the material, of the force [N]; None if not asked for
     """
 
@@ -45,6 +46,7 @@ class ShownPeriod(NamedTuple):
     is_held: bool = False
     status: int = ContactState.STATUS_OK
     band: tuple[float, float] | None = None
+    holds: bool = False
 
     @staticmethod
     def without_force(tip: np.ndarray, missing: str) -> ShownPeriod:
@@ -113,4 +115,5 @@ def why_missing(status: np.ndarray) -> list[str]:
 
 def _of_tool(row: np.ndarray, tip: np.ndarray, largest: float) -> ShownPeriod:
     error = float(row["error"]) if int(row["touches"]) > 0 else 0.0
-    return ShownPeriod(tip, row["force"].copy(), error, largest, status=int(row["status"]))
+    status, holds = int(row["status"]), bool(row["held"])
+    return ShownPeriod(tip, row["force"].copy(), error, largest, status=status, holds=holds)

@@ -82,12 +82,15 @@ class ToolTab:
             group = gui.add_button_group(name, labels)
             group.on_click(lambda event: self._nudge(event.target.value))
         gui.add_button("Lift off the organ").on_click(lambda _: tools.lift())
+        jaw = gui.add_button("Close or open the jaw", hint="of a tool that a scene gives one")
+        jaw.on_click(lambda _: tools.work_jaw())
         self._recording = gui.add_button("Record", hint="poses, forces and shapes, from rest")
         self._recording.on_click(lambda _: recordings.record(self._recording.label == "Record"))
         gui.add_markdown(
             "Click on the organ to put the tip there. Drag the tip, with Shift along its shaft; "
-            "or use the keys J L I K, U to press, O to lift."
+            "or use the keys J L I K, U to press, O to lift, G to close or open its jaw."
         )
+        gui.add_command("Close or open the jaw", hotkey="G").on_trigger(lambda _: tools.work_jaw())
         for key, (label, side) in KEYS.items():
             way = -STEP if key == "U" else STEP
             command = gui.add_command(f"{label}, 1 mm", hotkey=key)

@@ -22,6 +22,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_rmw_implementation_identifier
+from sensor_msgs.msg import JointState
 
 from avatar_core.contact.status import FAR_AWAY, PLACED
 from avatar_ros.framework import discovery, qos, realtime
@@ -38,6 +39,8 @@ _N_SENT = 4096  # recent poses of each tool, one of which a state answers
 _LATE = 20 * PERIOD  # delay from which missed poses are skipped
 # Of each tool, deeper than the publisher's queue: a recording that lost periods is no path.
 _N_STATES = 200
+_JAW_EVERY = 20  # periods; and at once when it closes or opens
+_OPEN = 0.5  # position of an open jaw [rad]
 
 
 class ToolDriver:
@@ -55,6 +58,11 @@ class ToolDriver:
         self._publishers = [
             node.create_publisher(PoseStamped, f"{tool}/measured_cp", qos.NEWEST) for tool in tools
         ]
+        self._jaws = [
+            node.create_publisher(JointState, f"{tool}/jaw/measured_js", qos.NEWEST)
+            for tool in tools
+        ]
+        self._shut = self._each["shut"].copy()
         self._states = node.create_subscription(
             ContactState,
             "contact_state",
@@ -80,6 +88,7 @@ class ToolDriver:
             number = (tick + offset - self._first) // PERIOD
             self._sent[number % _N_SENT] = self._tips
             self._publish(stamp_bytes(tick + offset))
+            self._work_jaws(number)
             self._each["tip"] = self._tips
             self._all["n_poses"] += 1
             while (taken := self._states.handle.take_message(ContactState, True)) is not None:
@@ -102,6 +111,15 @@ class ToolDriver:
             messages.append(self._pose.serialise(stamp))
         for publisher, message in zip(self._publishers, messages, strict=True):
             publisher.handle.publish_raw(message)
+
+    def _work_jaws(self, number: int) -> None:
+        """Say of each jaw now and then whether it is closed, and at once if that changes."""
+        for tool, publisher in enumerate(self._jaws):
+            shut = int(self._each["shut"][tool])
+            if shut == self._shut[tool] and number % _JAW_EVERY:
+                continue
+            self._shut[tool] = shut
+            publisher.publish(JointState(name=["jaw"], position=[0.0 if shut else _OPEN]))
 
     def _used(self, tool: int, status: int, stamp: int) -> Any:
         """Position of a tip that the step used [m]."""
@@ -158,7 +176,7 @@ class PeriodCollector:
         row["stamp"], row["tip"] = stamp, self._used(tool, state.status, stamp)
         row["force"], row["error"] = force, state.force_error
         row["sent_fraction"], row["status"] = state.force_share, state.status
-        row["touches"] = len(state.contacts)
+        row["touches"], row["held"] = len(state.contacts), state.held
         row["organ"] = organ_number(state.vademecum_id)
 
     def _write(self) -> None:

@@ -38,6 +38,7 @@ ALL = np.dtype(
 EACH = np.dtype(
     [
         ("target", np.float64, 3),  # from the node: centre of the tip [m]
+        ("shut", np.int64),  # and whether its jaw is closed
         ("tip", np.float64, 3),  # from the driver: as sent last [m]
     ],
     align=True,
@@ -52,6 +53,7 @@ ROW = np.dtype(
         ("sent_fraction", np.float64),
         ("status", np.int64),  # of avatar_ros/msg/ContactState
         ("touches", np.int64),
+        ("held", np.int64),  # whether its jaw holds tissue
         ("organ", np.uint64),  # that the contact node used, by :func:`organ_number`
     ],
     align=True,
@@ -114,6 +116,7 @@ class SharedToolState:
         """Other tools, (n_tools, 3) [m], of which nothing was heard yet; while no driver runs."""
         self.n_tools = len(targets)
         self.each["target"] = targets
+        self.each["shut"] = 0
         self.all["n_poses"] = self.all["n_recent"] = 0
         self._recent["stamp"] = 0
 

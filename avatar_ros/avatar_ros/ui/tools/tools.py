@@ -112,6 +112,10 @@ class Tools:
         if organ is not None:
             self._move([organ.lifted(self.targets[self.chosen], LIFT)], "lift")
 
+    def work_jaw(self) -> None:
+        """Close the jaw of the chosen tool, or open it; nothing to it without one."""
+        self._state.each["shut"][self.chosen] ^= 1
+
     def put_over(self, place: np.ndarray, normal: np.ndarray, offset: float) -> None:
         """Move the chosen tool over a clicked place of the surface, around the organ; [m].
 

@@ -17,6 +17,7 @@ from avatar_ros.ui.view.tip_body import along_shaft, shaft_body, tip_body, turne
 
 TOOL, SHAFT = (0, 114, 178), (150, 160, 170)
 ARROW = (213, 94, 0)
+HELD = (0, 0, 0)  # of the mark where a jaw holds tissue
 LEAST_FORCE = 1e-3  # that is shown [N]
 _UNSEEN = 1e-5  # change of positions [m], turns and forces [N] that nobody sees
 _SCALE = 0.004  # length of the arrow per force [m/N]
@@ -45,6 +46,8 @@ class ToolView:
         self._node = server.scene.add_frame(self._root, show_axes=False)
         self._tool: Any = None
         self._arrow: Any = None
+        self._mark: Any = None
+        self._below = 0.0  # of the jaw from the tip's pose [m]
         self._text: Any = None
         self._label = ""
         self._placed: np.ndarray | None = None  # tip, turn and force that are seen
@@ -75,6 +78,11 @@ class ToolView:
             head_length=0.008,
             visible=False,
         )
+        self._mark, self._below = None, tip.offset
+        if tip.grasp is not None:
+            self._mark = scene.add_icosphere(
+                f"{root}/held", tip.grasp.radius, HELD, subdivisions=2, visible=False
+            )
         self._text = scene.add_label(
             f"{root}/force_number",
             "",
@@ -112,12 +120,14 @@ class ToolView:
         tip, begin = self._taken
         self._on_drag(self._number, tip, mouse - begin, along_shaft)
 
-    def place(self, tip: np.ndarray, wxyz: np.ndarray, force: np.ndarray) -> None:
-        """Show the tool at its tip [m], with the force on it [N].
+    def place(
+        self, tip: np.ndarray, wxyz: np.ndarray, force: np.ndarray, holds: bool = False
+    ) -> None:
+        """Show the tool at its tip [m], with the force on it [N], and what its jaw holds.
 
         Nothing is sent where nothing changes: a browser draws only then.
         """
-        now = np.concatenate([tip, wxyz, force])
+        now = np.concatenate([tip, wxyz, force, [holds]])
         if self._placed is not None and np.abs(now - self._placed).max() < _UNSEEN:
             return
         self._placed = now
@@ -129,7 +139,11 @@ class ToolView:
             end = tip + force * (np.clip(_SCALE * size, *_LENGTHS) / size)
             self._arrow.points = np.stack([tip, end])[None]
         _set(self._arrow, "visible", is_felt)
-        text = f"{self._label} {size:.1f} N".strip() if is_felt else self._label
+        if self._mark is not None:
+            self._mark.position = tuple(tip - self._below * along_shaft(wxyz))
+            _set(self._mark, "visible", holds)
+        words = [self._label, "holds" if holds else "", f"{size:.1f} N" if is_felt else ""]
+        text = " ".join(word for word in words if word)
         if text:
             self._text.position = tuple(end)
             _set(self._text, "text", text)

@@ -251,9 +251,10 @@ class OrganView:
         if self._organ is not None:
             self._show_mark()
 
-    def place_tools(self, tips: np.ndarray, forces: np.ndarray) -> None:
-        """Show the tools at their tips, (n, 3) [m], with the forces on them [N]."""
+    def place_tools(self, tips: np.ndarray, forces: np.ndarray, holds: Sequence[bool]) -> None:
+        """Show the tools at their tips, (n, 3) [m], with the forces on them [N], and which of them
+        hold tissue."""
         self._cameras.tips = tips
         with self._server.atomic():
-            for tool, tip, force in zip(self._tools, tips, forces, strict=False):
-                tool.place(tip, self._upright(tip), force)
+            for tool, tip, force, holds_it in zip(self._tools, tips, forces, holds, strict=False):
+                tool.place(tip, self._upright(tip), force, holds_it)

@@ -1,0 +1,256 @@
+"""A jaw that closes, pulls and lets go: its law, its energy, and what it does to other tools."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from avatar_core.contact.effects import Effect, Grasp, SelfWeight, SeveralTools
+from avatar_core.contact.effects.grasp import FARTHEST, REACH
+from avatar_core.contact.model import ContactData, Status, model_of, step
+from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Jaw, Tip
+from avatar_core.vademecum.model import Vademecum
+from tests.helpers.coarse_liver import RADIUS, Spot, liver, spots
+
+OPEN, SHUT = np.array([False]), np.array([True])
+ABOVE = 0.5e-3  # of a jaw that closes over the surface [m]
+
+
+def jaw_of(slip: float = 100.0, radius: float = 3e-3) -> Tip:
+    return Tip("sphere", RADIUS, grasp=Jaw(radius, slip))
+
+
+def holding(
+    spot: Spot, tip: Tip | None = None, effects: tuple[Effect, ...] = (Grasp(),)
+) -> tuple[ContactData, np.ndarray]:
+    """A tool that has closed its jaw over a spot, and where it is, shape (1, 3) [m]."""
+    data = model_of(liver(), (tip or jaw_of(),), effects=effects).data()
+    at = spot.tip(-ABOVE)[None]
+    step(data.model, data, at, None, OPEN)
+    step(data.model, data, at, None, SHUT)
+    return data, at
+
+
+def middle() -> Spot:
+    return spots()[len(spots()) // 2]
+
+
+def test_a_jaw_that_closes_pulls_nothing_and_then_like_a_spring() -> None:
+    data, at = holding(middle())
+    assert data.holds(0) and not data.out.force.any() and data.out.n_contacts[0] == 1
+    pull = np.array([[1e-3, -0.5e-3, 1.5e-3]])
+    forces = []
+    for part in (1.0, 2.0, -1.0):
+        step(data.model, data, at + part * pull)
+        forces.append(data.out.force[0].copy())
+    np.testing.assert_allclose(forces[1], 2.0 * forces[0], rtol=1e-9)
+    np.testing.assert_allclose(forces[2], -forces[0], rtol=1e-9)
+    assert forces[0] @ pull[0] < 0.0  # back to where it was taken
+
+
+def test_the_stiffness_is_that_of_the_organ_and_of_a_bonded_disc() -> None:
+    """1 / (2 E* a) along the normal, (2 - nu) / (8 G a) along the surface, in series with C - c."""
+    v, spot = liver(), middle()
+    young, nu = v.material.young_modulus, v.material.poisson_ratio
+    shear = young / (2.0 * (1.0 + nu))
+    inverse = []
+    for radius in (2e-3, 4e-3):
+        data, _ = holding(spot, jaw_of(radius=radius))
+        inverse.append(np.linalg.inv(data.state.grasp.stiffness[0]))
+    n = data.state.normal[0]
+    assert abs(data.state.law.shape[0]) > 1e-3  # of the tip: a disc is as large on a curved surface
+    less = (inverse[0] - inverse[1]) / (1.0 / 2e-3 - 1.0 / 4e-3)
+    t = np.cross(n, np.eye(3)[np.argmin(abs(n))])
+    t /= np.linalg.norm(t)
+    assert n @ less @ n == pytest.approx((1.0 - nu**2) / (2.0 * young), rel=1e-6)
+    assert t @ less @ t == pytest.approx((2.0 - nu) / (8.0 * shear), rel=1e-6)
+
+
+def test_no_closed_path_gains_energy() -> None:
+    data, at = holding(middle())
+    turn = np.linspace(0.0, 2.0 * np.pi, 400)
+    way = np.stack([np.sin(turn), np.sin(2.0 * turn), 1.0 - np.cos(3.0 * turn)], axis=1)
+    path, force = at[0] + 4e-3 * way, []
+    for place in path:
+        step(data.model, data, place[None])
+        force.append(data.out.force[0].copy())
+    mean = 0.5 * (np.array(force)[1:] + np.array(force)[:-1])
+    work = -(mean * np.diff(path, axis=0)).sum(axis=1)
+    assert abs(work.sum()) < 1e-9 * np.abs(work).sum()
+
+
+def test_two_graspers_feel_each_other_alike() -> None:
+    """By Maxwell: what a pull of one does to the other is what the other's does to it."""
+    one, other = (
+        spots()[3],
+        min(spots(), key=lambda spot: abs(np.linalg.norm(spot.center - spots()[3].center) - 25e-3)),
+    )
+    effects = (Grasp(), SeveralTools())
+    data = model_of(liver(), (jaw_of(), jaw_of()), effects=effects).data()
+    at = np.array([one.tip(-ABOVE), other.tip(-ABOVE)])
+    step(data.model, data, at, None, np.array([False, False]))
+    step(data.model, data, at, None, np.array([True, True]))
+    across = np.zeros((2, 3, 3))
+    for tool in (0, 1):
+        for d in range(3):
+            moved = at.copy()
+            moved[tool, d] += 1e-3
+            step(data.model, data, moved)
+            across[tool, :, d] = data.out.force[1 - tool]
+    size = np.abs(across).max()
+    assert size > 1e-3
+    np.testing.assert_allclose(across[0], across[1].T, atol=1e-6 * size)
+
+
+def test_a_tool_beside_presses_into_tissue_that_is_held() -> None:
+    """A held point beside a push does not give way as the free one does, and feels it."""
+    spot = spots()[3]
+    other = min(spots(), key=lambda s: abs(np.linalg.norm(s.center - spot.center) - 20e-3))
+    data = model_of(liver(), (jaw_of(), Tip("sphere", RADIUS)), effects=(Grasp(), SeveralTools()))
+    data = data.data()
+    away, there = other.tip(-5e-3), other.tip(3e-3)
+    forces = []
+    for shut in (False, True):
+        step(data.model, data, np.array([spot.tip(-ABOVE), away]), None, np.zeros(2, bool))
+        step(data.model, data, np.array([spot.tip(-ABOVE), away]), None, np.array([shut, False]))
+        step(data.model, data, np.array([spot.tip(-ABOVE), there]))
+        forces.append(data.out.force.copy())
+    free, held = forces
+    assert np.linalg.norm(held[1]) > np.linalg.norm(free[1]) > 0.0
+    assert not free[0].any() and held[0].any()
+
+
+def test_it_lets_go_what_is_pulled_too_hard_until_the_jaw_opens() -> None:
+    data, at = holding(middle(), jaw_of(slip=0.3))
+    normal = data.state.normal[0].copy()
+    for way in np.linspace(0.0, 3e-3, 30):
+        status = step(data.model, data, at + way * normal)
+        assert np.linalg.norm(data.out.force[0]) <= 0.3
+    assert status == Status.SLIPPED and not data.holds(0)
+    assert step(data.model, data, at) == Status.SLIPPED  # closed, and back over the organ
+    step(data.model, data, at, None, OPEN)
+    step(data.model, data, at, None, SHUT)
+    assert data.holds(0)
+
+
+def test_a_jaw_that_opens_at_depth_gives_nothing_back() -> None:
+    data, at = holding(middle())
+    normal = data.state.normal[0].copy()
+    step(data.model, data, at - 4e-3 * normal)
+    assert np.linalg.norm(data.out.force[0]) > 0.5
+    step(data.model, data, at - 4e-3 * normal, None, OPEN)
+    step(data.model, data, at - 4e-3 * normal)
+    assert not data.out.force.any()
+    step(data.model, data, at + 4e-3 * normal)
+    step(data.model, data, at - 2e-3 * normal)  # from outside, it presses again
+    assert data.out.force[0] @ normal > 0.1
+
+
+def test_a_jaw_beyond_reach_or_closed_before_holds_nothing() -> None:
+    data = model_of(liver(), (jaw_of(),), effects=(Grasp(),)).data()
+    far = middle().tip(-REACH - 1e-3)[None]
+    step(data.model, data, far, None, OPEN)
+    step(data.model, data, far, None, SHUT)
+    assert not data.holds(0)
+    step(data.model, data, middle().tip(-ABOVE)[None])  # comes near with its jaw closed
+    assert not data.holds(0) and data.out.status[0] == Status.OK
+
+
+def test_tissue_that_hangs_is_taken_where_it_hangs() -> None:
+    """Closed on the sagged surface, it pulls nothing; on the surface at rest, it misses."""
+    effects = (Grasp(), SelfWeight(gravity=9.81))
+    data, _ = holding(middle(), effects=effects)
+    cloud = data.out.cloud
+    vertex = np.argmin(np.linalg.norm(cloud[:, :3] - cloud[:, 3:] - middle().center, axis=1))
+    sag = cloud[vertex, 3:].astype(float)
+    assert np.linalg.norm(sag) > 1e-3
+    data.reset()
+    at = (middle().tip(-ABOVE) + sag)[None]
+    for _ in range(2):
+        step(data.model, data, at, None, OPEN)
+    step(data.model, data, at, None, SHUT)
+    assert data.holds(0)
+    assert np.linalg.norm(data.out.force[0]) < 1e-9
+    step(data.model, data, at + np.array([[0.0, 2e-3, 0.0]]))
+    assert data.out.force[0, 1] < -0.1
+
+
+def test_what_is_held_moves_with_the_jaw_on_the_screen() -> None:
+    data, at = holding(middle(), jaw_of(radius=8e-3))
+    pull = np.array([1e-3, 2e-3, 1e-3])
+    step(data.model, data, at + pull)
+    rest = data.out.cloud[:, :3] - data.out.cloud[:, 3:]
+    vertex = np.argmin(np.linalg.norm(rest - data.state.point[0], axis=1))
+    assert np.linalg.norm(rest[vertex] - data.state.point[0]) < 8e-3
+    np.testing.assert_allclose(data.out.cloud[vertex, 3:], pull, atol=0.15 * 2.5e-3)
+
+
+def test_a_pull_beyond_the_linear_range_is_said() -> None:
+    data, at = holding(middle())
+    assert step(data.model, data, at + np.array([[0.0, 0.9 * FARTHEST, 0.0]])) == Status.OK
+    assert (
+        step(data.model, data, at + np.array([[0.0, 1.1 * FARTHEST, 0.0]])) == Status.EXTRAPOLATED
+    )
+
+
+def test_a_pose_that_is_lost_lets_go_and_a_bad_one_holds_without_force() -> None:
+    data, at = holding(middle())
+    step(data.model, data, at + np.array([[0.0, 2e-3, 0.0]]))
+    assert step(data.model, data, np.full((1, 3), np.nan)) == Status.INVALID_POSE
+    assert data.holds(0) and not data.out.force.any()
+    assert step(data.model, data, np.full((1, 3), 1e3)) == Status.SLIPPED
+    assert not data.holds(0)
+
+
+def test_another_model_of_the_organ_goes_on_holding() -> None:
+    data, at = holding(middle())
+    pulled = at + np.array([[0.0, 2e-3, 1e-3]])
+    step(data.model, data, pulled)
+    force = data.out.force.copy()
+    other = model_of(liver(), (jaw_of(),), effects=(Grasp(),)).data()
+    other.resume(data)
+    step(other.model, other, pulled)
+    np.testing.assert_allclose(other.out.force, force, rtol=1e-9)
+
+
+def test_a_tool_that_holds_nothing_presses_as_without_a_jaw() -> None:
+    bare = model_of(liver(), (Tip("sphere", RADIUS),), effects=()).data()
+    jaw = model_of(liver(), (jaw_of(),), effects=(Grasp(),)).data()
+    spot = middle()
+    aside = np.cross(spot.normal, np.eye(3)[np.argmin(abs(spot.normal))])
+    for part in np.linspace(0.0, 1.0, 20):
+        tip = (spot.tip(4e-3 * part - ABOVE) + 3e-3 * part * aside)[None]
+        step(bare.model, bare, tip)
+        step(jaw.model, jaw, tip, None, OPEN)
+    np.testing.assert_allclose(jaw.out.force, bare.out.force, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("tip", "said"),
+    [
+        (Tip("sphere", RADIUS), "no tool has a jaw"),
+        (Tip("patch", RADIUS, grasp=Jaw()), "a patch has no jaw"),
+    ],
+)
+def test_what_cannot_hold_is_refused(tip: Tip, said: str) -> None:
+    with pytest.raises(SceneError, match=said):
+        model_of(liver(), (tip,), effects=(Grasp(),))
+
+
+def test_a_jaw_without_size_is_refused() -> None:
+    with pytest.raises(SceneError, match=r"grasp: radius is 0; it must lie in 0.0005 to 0.02 m"):
+        Jaw(radius=0)
+
+
+@pytest.mark.long  # it builds an organ and resolves a disc on it
+def test_a_pull_is_that_of_a_resolved_disc(phantom_vademecum: Vademecum) -> None:
+    from avatar_core.certify.contact_sites import draw_sites
+    from avatar_core.geometry.phantom import phantom_liver
+    from avatar_core.studies.grasp import pulls_at
+
+    organ = phantom_liver()
+    site = draw_sites(phantom_vademecum, organ, 1, seed=11)[0]
+    rows = list(pulls_at(phantom_vademecum, organ, site, 4e-3))
+    assert len(rows) == 3
+    assert all(row["error"] < 0.15 and row["patch_error"] > 0.2 for row in rows)
