@@ -189,8 +189,11 @@ def stiffen_jaw(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def disc_compliance(model, data, t):  # type: ignore[no-untyped-def]
-    """1 / (2 E* a) [m/N]. The disc is as large on a curved surface: the shape factor of a tip, whose
-    contact is not, does not count."""
+    """1 / (2 E* a) [m/N].
+
+    A disc is as large on a curved surface: the shape factor of tips, whose contact is not, is left
+    out.
+    """
     stiffness = data.law.value[t, STIFFNESS] * np.exp(-data.law.shape[t])
     return 0.5 / (stiffness * model.grasp.radius[t])
 
