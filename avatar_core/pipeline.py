@@ -17,7 +17,10 @@ from avatar_core.contact.timing import timed
 from avatar_core.errors import AvatarError, ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
 from avatar_core.fem.patch_loads import load_surface
+from avatar_core.fem.resection import Resection, require_parts_held
 from avatar_core.fem.supports import Support
+from avatar_core.geometry.cut_surface import CutSurface
+from avatar_core.geometry.cutting import cut, snapped
 from avatar_core.geometry.doubts import doubts_of
 from avatar_core.geometry.groups import regions_from_groups
 from avatar_core.geometry.level_set import orientation_offset
@@ -35,7 +38,7 @@ from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.parametric import build_parametric_vademecum
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.offline.supports import SupportOption, held_by
-from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.reduction.coordinates import RESECTION, Coordinate
 from avatar_core.vademecum.display import DISPLAYED, organ_display
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Provenance, Vademecum
@@ -55,6 +58,7 @@ class OrganOptions:
     patch_radius : of the tool's traction [m]; None for max(12 mm, 1.2 x surface edge)
     groups : file of node groups for clamp, accessible region and supports; None for the rules
     supports : springs that hold the organ instead of the clamp
+    resection : surface that the organ is cut along, whose opening is a coordinate; None for none
     rule : BuildRule
     coordinates : of the material, that stay free in the vademecum;
         :mod:`avatar_core.reduction.coordinates`
@@ -81,6 +85,7 @@ class OrganOptions:
     patch_radius: float | None = None
     groups: Path | None = None
     supports: tuple[SupportOption, ...] = ()
+    resection: CutSurface | None = None
     rule: BuildRule = field(default_factory=BuildRule)
     coordinates: tuple[Coordinate, ...] = ()
     tumour: SurfaceMesh | None = None
@@ -101,6 +106,13 @@ class OrganOptions:
         if any(c.kind == "support" for c in self.coordinates):
             raise CoordinateError(
                 "the stiffness of a support is chosen with --support NAME=LOW:HIGH"
+            )
+        if any(c.kind == RESECTION for c in self.coordinates):
+            raise CoordinateError("a resection needs its surface; give it with --resection FILE")
+        if self.resection and (self.large or self.n_contact_sites or self.with_mesh_error):
+            raise CoordinateError(
+                "a resection is for small strains on one mesh; leave out large deformation, "
+                "contact sites and the mesh error, or the resection"
             )
         held = [s.name for s in self.supports]
         if len(set(held)) < len(held):
@@ -143,8 +155,10 @@ class OrganOptions:
 
     @property
     def all_coordinates(self) -> tuple[Coordinate, ...]:
-        """Of the material, then of the supports."""
-        return (*self.coordinates, *(s.coordinate for s in self.supports if s.coordinate))
+        """Those of the material, of the supports and of the resection."""
+        supports = (s.coordinate for s in self.supports if s.coordinate)
+        cut = (Coordinate(RESECTION, 0.0, 1.0),) if self.resection else ()
+        return (*self.coordinates, *supports, *cut)
 
 
 @repeatable
@@ -163,10 +177,9 @@ def build(
     options = options or OrganOptions()
     provenance = _provenance(surface, options)
     progress("mesh", 0.0, NO_ERROR)
-    mesh = tetrahedralize(surface, options.n_vertices)
+    elasticity, regions = _problem(surface, options)
+    mesh = elasticity.mesh
     progress("mesh", 1.0, NO_ERROR)
-    regions, supports = _held(mesh, options)
-    elasticity = _elasticity(mesh, regions, supports, options)
     loads = load_surface(mesh, regions, options.patch_radius)
     common = (surface.name, elasticity, regions, loads)
     inside = () if options.tumour is None else (options.tumour,)
@@ -247,6 +260,25 @@ def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress)
     return vademecum.with_large_certificate(with_combinations(certificate, rows))
 
 
+def _problem(surface: SurfaceMesh, options: OrganOptions) -> tuple[Elasticity, Regions]:
+    """The elastic problem of an organ, and its regions.
+
+    Raises MaterialError if the opened resection leaves a part loose.
+    """
+    mesh = tetrahedralize(surface, options.n_vertices)
+    if options.resection is None:
+        regions, supports = _held(mesh, options)
+        return _elasticity(mesh, regions, supports, options), regions
+    whole, second = snapped(mesh, options.resection)
+    regions, supports = _held(whole, options)  # a cut leaves the boundary's faces as they were
+    mesh = cut(whole, second)
+    young = options.material.young_modulus
+    resection = Resection.of(mesh, options.resection, young)
+    opened = replace(resection, opened=1.0)
+    require_parts_held(mesh, opened, regions.clamped, supports, young)
+    return _elasticity(mesh, regions, supports, options, resection), regions
+
+
 def _held(mesh: TetMesh, options: OrganOptions) -> tuple[Regions, tuple[Support, ...]]:
     """Clamp, accessible region and supports."""
     if options.supports:
@@ -257,7 +289,11 @@ def _held(mesh: TetMesh, options: OrganOptions) -> tuple[Regions, tuple[Support,
 
 
 def _elasticity(
-    mesh: TetMesh, regions: Regions, supports: tuple[Support, ...], options: OrganOptions
+    mesh: TetMesh,
+    regions: Regions,
+    supports: tuple[Support, ...],
+    options: OrganOptions,
+    resection: Resection | None = None,
 ) -> Elasticity:
     """The elastic problem, on one element that serves the whole range of Poisson's ratio."""
     ratios = [c.high for c in options.coordinates if c.name == "poisson"]
@@ -266,9 +302,11 @@ def _elasticity(
     if options.tumour is not None:
         inclusion = Inclusion(volume_fraction_inside(mesh, options.tumour), options.contrast)
     element = options.element or stiffest.element
-    problem = Elasticity(mesh, options.material, regions.clamped, element, inclusion, supports)
+    problem = Elasticity(
+        mesh, options.material, regions.clamped, element, inclusion, supports, resection
+    )
     # One factor then serves build and certificate; a range of values has one for each.
-    return problem if options.coordinates else problem.refining()
+    return problem if options.coordinates or resection else problem.refining()
 
 
 @lru_cache(maxsize=1)  # a command says them before it builds
@@ -292,6 +330,7 @@ def _provenance(surface: SurfaceMesh, options: OrganOptions) -> Provenance:
     parameters["coordinates"] = " ".join(map(str, options.coordinates)) or None
     parameters["supports"] = " ".join(map(str, options.supports)) or None
     parameters["tumour"] = options.tumour and options.tumour.name
+    parameters["resection"] = options.resection and str(options.resection)
     return Provenance(
         source=surface.name,
         source_sha256=surface.source_sha256,

@@ -11,8 +11,8 @@ are there for timing very large meshes, never as a default.
 
 With an inclusion, a tumour say, Young's modulus is (1 + (c - 1) chi) E, with the contrast c and the
 volume fraction chi of each tetrahedron inside. The stiffness is then affine in mu, lambda, c mu and
-c lambda, and in the stiffness of every support (:mod:`avatar_core.fem.supports`), of which the
-coordinates of a vademecum make use.
+c lambda, in the stiffness of every support (:mod:`avatar_core.fem.supports`) and of every strip of
+a cut (:mod:`avatar_core.fem.resection`), of which the coordinates of a vademecum make use.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ import numpy as np
 import rslab
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
-from skfem import MeshTet
 
 from avatar_core.errors import ConvergenceError, MaterialError, MeshError
+from avatar_core.fem.resection import Resection, opened_to, require_parts_held
 from avatar_core.fem.stiffness_terms import StiffnessTerms
 from avatar_core.fem.supports import Support, require_held, with_stiffness
 from avatar_core.geometry.mesh import TetMesh, make_mesh
@@ -84,12 +84,16 @@ class Material:
 
 
 def factors_at(
-    material: Material, contrast: float | None, supports: Sequence[Support] = ()
+    material: Material,
+    contrast: float | None,
+    supports: Sequence[Support] = (),
+    resection: Resection | None = None,
 ) -> np.ndarray:
     """theta_q of K = sum_q theta_q K_q: mu, lambda; c mu, c lambda with an inclusion; each k."""
     lam, mu = material.lame
     theta = [mu, lam] if contrast is None else [mu, lam, contrast * mu, contrast * lam]
-    return np.array([*theta, *(support.stiffness for support in supports)])
+    ties = () if resection is None else resection.factors
+    return np.array([*theta, *(support.stiffness for support in supports), *ties])
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +129,7 @@ class Elasticity:
     element : "P1", "P2", "Taylor-Hood" or None for ``material.element``
     inclusion : Inclusion or None; not with Taylor-Hood
     supports : springs beside the clamp; where two overlap, both act
+    resection : how far the cut of the mesh is opened; None for a mesh without one
 
     Raises
     ------
@@ -140,9 +145,10 @@ class Elasticity:
         element: Element | None = None,
         inclusion: Inclusion | None = None,
         supports: Sequence[Support] = (),
+        resection: Resection | None = None,
     ) -> None:
         self.mesh, self.material, self.inclusion = mesh, material, inclusion
-        self.supports = tuple(supports)
+        self.supports, self.resection = tuple(supports), resection
         self._clamped_faces, self._refines = clamped, False
         self.element: Element = element or material.element
         if inclusion is not None and self.element == "Taylor-Hood":
@@ -150,15 +156,14 @@ class Elasticity:
                 f"an inclusion with Poisson's ratio above {POISSON_RATIO_P2} is not supported; "
                 f"take at most {POISSON_RATIO_P2}"
             )
-        self._skfem_mesh = MeshTet(
-            np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
-        )
         self._terms = StiffnessTerms(
-            self._skfem_mesh,
+            mesh,
             self.element != "P1",
             inclusion.volume_fraction if inclusion else None,
             [mesh.boundary_faces[support.faces] for support in self.supports],
+            resection,
         )
+        self._skfem_mesh = self._terms.mesh
         self.n_nodes = self._terms.n_nodes
         self.clamped_nodes = np.unique(self.face_nodes[clamped])
 
@@ -196,16 +201,19 @@ class Elasticity:
         material: Material,
         contrast: float | None = None,
         stiffness: Mapping[str, float] | None = None,
+        opened: float | None = None,
     ) -> Elasticity:
         """The same problem and element at other values; matrices are shared.
 
         stiffness : of supports, by name [N/m^3]; those not given keep theirs
+        opened : of the cut, 0 to 1
         """
         other = copy(self)
         other.material = material
         other.supports = with_stiffness(self.supports, stiffness or {})
         if self.inclusion is not None and contrast is not None:
             other.inclusion = replace(self.inclusion, contrast=contrast)
+        other.resection = opened_to(self.resection, opened)
         for name in ("stiffness", "_factor", "_single_factor"):
             other.__dict__.pop(name, None)
         return other
@@ -213,48 +221,43 @@ class Elasticity:
     @cached_property
     def face_nodes(self) -> np.ndarray:
         """Nodes of each boundary face: 3 (P1) or 6 (corners, then edges 01, 12, 20) columns."""
-        faces = self.mesh.boundary_faces
-        if self.element == "P1":
-            return faces
-        n_vertices = len(self.mesh.vertices)
-        edges = np.sort(self._skfem_mesh.edges, axis=0).astype(np.int64)
-        key = edges[0] * n_vertices + edges[1]
-        order = np.argsort(key)
-        pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
-        found = np.searchsorted(key[order], pairs[..., 0] * n_vertices + pairs[..., 1])
-        return np.concatenate([faces, n_vertices + order[found]], axis=1)
+        return self._terms.nodes_of(self.mesh.boundary_faces)
 
     @property
     def factors(self) -> np.ndarray:
         """theta_q at this problem's material, :func:`factors_at`."""
         contrast = self.inclusion.contrast if self.inclusion else None
-        return factors_at(self.material, contrast, self.supports)
+        return factors_at(self.material, contrast, self.supports, self.resection)
+
+    @property
+    def n_material(self) -> int:
+        """How many of :attr:`factors` are the material's; those of springs follow."""
+        return 2 if self.inclusion is None else 4
 
     @cached_property
     def stiffness(self) -> sp.csr_matrix:
-        """K with supports and without the clamp, shape (3 n_nodes,) * 2 [N/m] (P1 and P2)."""
-        matrices = self._terms.unit_stiffness + self._terms.support_mass
+        """K with springs and without the clamp, shape (3 n_nodes,) * 2 [N/m] (P1 and P2)."""
+        matrices = self._terms.unit_stiffness + self._terms.spring_mass
         return sum(t * matrix for t, matrix in zip(self.factors, matrices, strict=True)).tocsr()
 
     @property
     def diagonal(self) -> np.ndarray:
         """Diagonal of K, with Taylor-Hood without its volumetric part, (3 n_nodes,) [N/m]."""
         if self.element == "Taylor-Hood":
-            return np.asarray(self._shear_and_supports.diagonal())
+            return np.asarray(self._shear_and_springs.diagonal())
         return np.asarray(self.stiffness.diagonal())
 
     @property
-    def _shear_and_supports(self) -> sp.csr_matrix:
-        """What Taylor-Hood has of K without pressures."""
-        springs = zip(self.supports, self._terms.support_mass, strict=True)
+    def _shear_and_springs(self) -> sp.csr_matrix:
+        """K of Taylor-Hood without its pressures."""
+        springs = zip(self.factors[self.n_material :], self._terms.spring_mass, strict=True)
         shear = self.material.lame[1] * self._terms.mixed[0]
-        return sum((support.stiffness * mass for support, mass in springs), shear).tocsr()
+        return sum((stiffness * mass for stiffness, mass in springs), shear).tocsr()
 
     def apply_term(self, q: int, displacement: np.ndarray) -> np.ndarray:
-        """K_q u of one of :attr:`factors`, shape (3 n_nodes, n) [m^2], of a support [m^3]."""
-        n_material = len(self.factors) - len(self.supports)
-        if q >= n_material:
-            return np.asarray(self._terms.support_mass[q - n_material] @ displacement)
+        """K_q u of one of :attr:`factors`, shape (3 n_nodes, n) [m^2], of springs [m^3]."""
+        if q >= self.n_material:
+            return np.asarray(self._terms.spring_mass[q - self.n_material] @ displacement)
         if self.element != "Taylor-Hood":
             return np.asarray(self._terms.unit_stiffness[q] @ displacement)
         shear, coupling, _ = self._terms.mixed
@@ -293,7 +296,7 @@ class Elasticity:
         if self.element == "Taylor-Hood":
             _, coupling, mass = self._terms.mixed
             coupling = coupling[:, free]
-            shear = self._shear_and_supports[free][:, free]
+            shear = self._shear_and_springs[free][:, free]
             system = sp.bmat([[shear, -coupling.T], [-coupling, -mass / self.material.lame[0]]])
         else:
             system = self.stiffness[free][:, free]
@@ -304,13 +307,16 @@ class Elasticity:
 
         The factorization of such a system need not fail, and loads elsewhere do not reveal it.
         """
-        mesh = self.mesh
+        mesh, young = self.mesh, self.material.young_modulus
         piece = mesh.pieces[mesh.boundary_tets]
         clamped, n_pieces = np.unique(piece[self._clamped_faces]), int(mesh.pieces.max()) + 1
         loose = np.setdiff1d(np.arange(n_pieces), clamped)
-        if self.supports:
+        if self.resection is not None:
+            held = (self._clamped_faces, self.supports, young)
+            require_parts_held(mesh, self.resection, *held)
+        elif self.supports:
             for k in loose:
-                require_held(mesh, self.supports, self.material.young_modulus, piece == k)
+                require_held(mesh, self.supports, young, piece == k)
         elif len(loose):
             raise MeshError(
                 f"{len(loose)} of {n_pieces} pieces connected by faces are not clamped; "

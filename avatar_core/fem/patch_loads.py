@@ -23,11 +23,10 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
-from skfem.quadrature import get_quadrature
-from skfem.refdom import RefTri
 
 from avatar_core.errors import LoadError, MeshError
 from avatar_core.fem.elasticity import Elasticity
+from avatar_core.fem.triangles import subdivided_rule, triangle_shape
 from avatar_core.geometry.mesh import Regions, TetMesh
 
 LEAST_PATCH_RADIUS = 12e-3  # [m]
@@ -171,21 +170,6 @@ class LoadSurface:
         return SurfacePoint(positions[0], weights[0], on_surface, normal / np.linalg.norm(normal))
 
 
-def triangle_shape(barycentric: np.ndarray) -> np.ndarray:
-    """Shape functions of the six-node triangle, the trace of a P2 element.
-
-    Parameters
-    ----------
-    barycentric : ndarray, shape (..., 3), coordinates (l0, l1, l2) that sum to one
-
-    Returns
-    -------
-    ndarray, shape (..., 6): l(2l - 1) at the corners, 4 l l' at edges 01, 12, 20
-    """
-    corner = barycentric * (2.0 * barycentric - 1.0)
-    return np.concatenate([corner, 4.0 * barycentric * np.roll(barycentric, -1, axis=-1)], axis=-1)
-
-
 def default_patch_radius(mesh: TetMesh, regions: Regions) -> float:
     """R = max(12 mm, 1.2 x mean edge of the accessible surface) [m]."""
     corners = mesh.vertices[mesh.boundary_faces[regions.accessible]]
@@ -209,7 +193,8 @@ def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = N
             f"a patch of radius {patch_radius:g} m reaches around the organ, wherever it presses; "
             "take a smaller radius (12e-3: 12 mm)"
         )
-    vertices, corner = np.unique(faces, return_inverse=True)
+    # both sides of a cut share their load positions
+    vertices, corner = np.unique(mesh.joined[faces], return_inverse=True)
     corner = corner.reshape(-1, 3)
     a, b = np.unique(np.sort(corner[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0).T
     point = mesh.vertices[vertices]
@@ -362,22 +347,6 @@ def scaled_gram(elasticity: Elasticity, loads: sp.spmatrix) -> sp.csr_matrix:
 def triples(positions: np.ndarray) -> np.ndarray:
     """Numbers of the three loads of each position, shape (3 n,)."""
     return np.asarray((3 * np.asarray(positions)[:, None] + np.arange(3)).ravel())
-
-
-def subdivided_rule(pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """A rule of degree 5 on each of pieces^2 equal sub-triangles; weights sum to one."""
-    local, weight = get_quadrature(RefTri, 5)
-    bary = np.stack([1.0 - local[0] - local[1], local[0], local[1]], axis=1)
-    corners = []
-    for i in range(pieces):
-        for j in range(pieces - i):
-            corners.append([(i, j), (i + 1, j), (i, j + 1)])
-            if i + j < pieces - 1:
-                corners.append([(i + 1, j + 1), (i, j + 1), (i + 1, j)])
-    tri = np.array(corners, float) / pieces
-    tri = np.concatenate([1.0 - tri.sum(axis=2, keepdims=True), tri], axis=2)
-    points = np.einsum("qk,tkd->tqd", bary, tri).reshape(-1, 3)
-    return points, np.tile(weight / weight.sum() / len(tri), len(tri))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

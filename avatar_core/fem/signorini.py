@@ -30,7 +30,7 @@ from scipy.optimize import brentq, nnls
 
 from avatar_core.errors import ContactError, ConvergenceError
 from avatar_core.fem.elasticity import Elasticity
-from avatar_core.fem.patch_loads import subdivided_rule, triangle_shape
+from avatar_core.fem.triangles import subdivided_rule, triangle_shape
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.tip import Tip
 

@@ -1,6 +1,8 @@
 """The matrices of which the stiffness is a sum, with factors that are the material's.
 
-K = sum_q theta_q K_q,    theta = mu, lambda; c mu, c lambda of an inclusion; k of each support
+K = sum_q theta_q K_q,    theta = mu, lambda; c mu, c lambda of an inclusion; k of each spring
+
+Springs are those of each support, then those of each strip of a cut.
 """
 
 from __future__ import annotations
@@ -14,8 +16,10 @@ import scipy.sparse as sp
 from skfem import Basis, BilinearForm, ElementTetP1, ElementTetP2, ElementVector, MeshTet
 from skfem.helpers import div
 
+from avatar_core.fem.resection import Resection
 from avatar_core.fem.stiffness import unit_stiffness
 from avatar_core.fem.supports import boundary_mass
+from avatar_core.geometry.mesh import TetMesh
 
 
 @BilinearForm
@@ -39,23 +43,28 @@ def scalar_mass(u, v, w):  # type: ignore[no-untyped-def]
 class StiffnessTerms:
     """The constant matrices that a stiffness is made of, shared by all values of the material.
 
-    mesh : scikit-fem's
+    mesh : TetMesh
     quadratic : whether displacements are (P2, Taylor-Hood), or linear (P1)
     volume_fraction : ndarray, shape (n_tets,), of an inclusion in each tetrahedron, or None
     supported : vertices of the faces of each support, ndarrays of shape (n, 3)
+    resection : that ties the sides of a cut, or None
     """
 
     def __init__(
         self,
-        mesh: MeshTet,
+        mesh: TetMesh,
         quadratic: bool,
         volume_fraction: np.ndarray | None,
         supported: Sequence[np.ndarray],
+        resection: Resection | None,
     ) -> None:
-        self._mesh, self._quadratic, self._volume_fraction = mesh, quadratic, volume_fraction
-        self._supported = supported
+        self._organ, self._quadratic, self._volume_fraction = mesh, quadratic, volume_fraction
+        self._supported, self._resection = supported, resection
+        self._mesh = MeshTet(
+            np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.tets.T)
+        )
         self._shape = ElementTetP2() if quadratic else ElementTetP1()
-        self._basis = Basis(mesh, self._shape, intorder=2)
+        self._basis = Basis(self._mesh, self._shape, intorder=2)
         self.n_nodes = self._basis.N
 
     @cached_property
@@ -70,14 +79,38 @@ class StiffnessTerms:
         outside = unit_stiffness(self._basis, node, 1.0 - self._volume_fraction)
         return outside + unit_stiffness(self._basis, node, self._volume_fraction)
 
+    @property
+    def mesh(self) -> MeshTet:
+        """scikit-fem's."""
+        return self._mesh
+
     @cached_property
-    def support_mass(self) -> tuple[sp.csr_matrix, ...]:
-        """int u.v da over each support, shape (3 n_nodes, 3 n_nodes) [m^2]."""
+    def spring_mass(self) -> tuple[sp.csr_matrix, ...]:
+        """int u.v da over each support, int [u].[v] da over each strip of a cut.
+
+        Shapes (3 n_nodes, 3 n_nodes) [m^2].
+        """
         order = self.nodes_first(self._basis)
         masses = (boundary_mass(self._mesh, self._shape, faces) for faces in self._supported)
-        return tuple(
+        grounded = tuple(
             sp.kron(mass[order][:, order], sp.identity(3), format="csr") for mass in masses
         )
+        if self._resection is None:
+            return grounded
+        nodes = np.stack([self.nodes_of(side) for side in self._organ.cut_faces])
+        return grounded + self._resection.jump_mass(self._organ, nodes, self.n_nodes)
+
+    def nodes_of(self, faces: np.ndarray) -> np.ndarray:
+        """Nodes of faces (n, 3): 3 (P1) or 6 (corners, then edges 01, 12, 20) columns."""
+        if not self._quadratic:
+            return faces
+        n_vertices = self._mesh.nvertices
+        edges = np.sort(self._mesh.edges, axis=0).astype(np.int64)
+        key = edges[0] * n_vertices + edges[1]
+        order = np.argsort(key)
+        pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
+        found = np.searchsorted(key[order], pairs[..., 0] * n_vertices + pairs[..., 1])
+        return np.concatenate([faces, n_vertices + order[found]], axis=1)
 
     @cached_property
     def mixed(self) -> tuple[sp.csr_matrix, sp.csr_matrix, sp.csr_matrix]:

@@ -107,6 +107,10 @@ class RigidMotion:
     resistance: float
     text: str
 
+    def holds(self, length: float, young_modulus: float) -> bool:
+        """Whether an organ of a length [m] and Young's modulus [Pa] counts as held."""
+        return self.resistance * length >= LEAST_HELD * young_modulus
+
 
 def require_held(
     mesh: TetMesh, supports: Sequence[Support], young_modulus: float, part: np.ndarray
@@ -122,7 +126,7 @@ def require_held(
     """
     least = least_resisted(mesh, supports, part)
     length = float(np.ptp(mesh.vertices[mesh.boundary_faces[part]], axis=(0, 1)).max())
-    if least.resistance * length < LEAST_HELD * young_modulus:
+    if not least.holds(length, young_modulus):
         raise MaterialError(
             f"nothing holds the organ against {least.text} (supports resist it by "
             f"{least.resistance:.2g} N/m^3); clamp some faces, or give a support a stiffness of "
@@ -130,22 +134,33 @@ def require_held(
         )
 
 
-def least_resisted(mesh: TetMesh, supports: Sequence[Support], part: np.ndarray) -> RigidMotion:
+def least_resisted(
+    mesh: TetMesh,
+    supports: Sequence[Support],
+    part: np.ndarray,
+    springs: tuple[FloatArray, FloatArray] | None = None,
+) -> RigidMotion:
     """The least Rayleigh quotient of the six rigid motions, and its motion.
 
     Rotations are about the centroid of the boundary and scaled by its radius of gyration.
+
+    springs : points (n, 3) [m] and stiffnesses (n,) [N/m] of further springs
     """
     corners = mesh.vertices[mesh.boundary_faces[part]]
-    points = np.einsum("qk,fkd->fqd", IN_FACE, corners)
-    weight = np.repeat(mesh.face_areas[part][:, None] / 3.0, 3, axis=1)
-    away = points - np.average(points.reshape(-1, 3), axis=0, weights=weight.ravel())
-    size = float(np.sqrt((weight * (away**2).sum(axis=2)).sum() / weight.sum()))
-    motions = _rigid_motions(away / size)
-    stiffness = np.zeros(len(away))
+    points = np.einsum("qk,fkd->fqd", IN_FACE, corners).reshape(-1, 3)
+    weight = np.repeat(mesh.face_areas[part] / 3.0, 3)
+    centre = np.average(points, axis=0, weights=weight)
+    size = float(np.sqrt(weight @ ((points - centre) ** 2).sum(axis=1) / weight.sum()))
+    motions = _rigid_motions((points - centre) / size)
+    stiffness = np.zeros(len(mesh.boundary_faces))
     for support in supports:
-        stiffness += np.where(support.faces[part], support.stiffness, 0.0)
-    whole = np.einsum("fq,fqcm,fqcn->mn", weight, motions, motions)
-    held = np.einsum("f,fq,fqcm,fqcn->mn", stiffness, weight, motions, motions)
+        stiffness += np.where(support.faces, support.stiffness, 0.0)
+    whole = np.einsum("q,qcm,qcn->mn", weight, motions, motions)
+    weight = weight * np.repeat(stiffness[part], 3)
+    held = np.einsum("q,qcm,qcn->mn", weight, motions, motions)
+    if springs is not None:
+        motions = _rigid_motions((springs[0] - centre) / size)
+        held += np.einsum("q,qcm,qcn->mn", springs[1], motions, motions)
     value, vector = scipy.linalg.eigh(held, whole)
     return RigidMotion(max(float(value[0]), 0.0), _described(vector[:, 0]))
 

@@ -38,10 +38,13 @@ class TetMesh:
 
     vertices : ndarray, shape (n_vertices, 3) [m]
     tets : ndarray of int, shape (n_tets, 4)
+    pairs : ndarray of int, shape (n_pairs, 2), vertices of the two sides of a cut that lie at one
+        place; None for a whole organ. Faces between the sides are no boundary.
     """
 
     vertices: np.ndarray
     tets: np.ndarray
+    pairs: np.ndarray | None = None
 
     @cached_property
     def tet_volumes(self) -> np.ndarray:
@@ -62,9 +65,35 @@ class TetMesh:
     @cached_property
     def _boundary(self) -> np.ndarray:
         """4 element + face of those that no other element has, ascending."""
-        faces = np.sort(self.tets[:, _TET_FACES].reshape(-1, 3), axis=1)
-        _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
-        return np.sort(first[count == 1])
+        return _single_faces(self.joined[self.tets])
+
+    @cached_property
+    def joined(self) -> np.ndarray:
+        """Number of each vertex in the whole organ, where pairs are one, shape (n_vertices,)."""
+        number = np.arange(len(self.vertices))
+        if self.pairs is not None:
+            number[self.pairs[:, 1]] = self.pairs[:, 0]
+        return number
+
+    @cached_property
+    def is_second_side(self) -> np.ndarray:
+        """Which elements lie on the second side of the cut, shape (n_tets,)."""
+        if self.pairs is None:
+            return np.zeros(len(self.tets), bool)
+        second = np.isin(self.tets, self.pairs[:, 1]).any(axis=1)
+        return np.isin(self.pieces, self.pieces[second])
+
+    @cached_property
+    def cut_faces(self) -> np.ndarray:
+        """Triangles of the cut's two sides, vertex by vertex in pairs, shape (2, n, 3)."""
+        if self.pairs is None:
+            return np.empty((2, 0, 3), np.int64)
+        single = np.setdiff1d(_single_faces(self.tets), self._boundary)
+        first = single[~self.is_second_side[single // 4]]
+        faces = self.tets[:, _TET_FACES].reshape(-1, 3)[first]
+        other = np.arange(len(self.vertices))
+        other[self.pairs[:, 0]] = self.pairs[:, 1]
+        return np.stack([faces, other[faces]])
 
     @cached_property
     def face_area_normals(self) -> np.ndarray:
@@ -105,7 +134,7 @@ class TetMesh:
     @cached_property
     def pieces(self) -> np.ndarray:
         """Face-connected component of each element, shape (n_tets,)."""
-        return _components(self.tets[:, _TET_FACES])
+        return components(self.tets)
 
     @property
     def volume(self) -> float:
@@ -267,10 +296,22 @@ def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
     return make_mesh(vertices, _largest_component(solid))
 
 
+def _single_faces(tets: np.ndarray) -> np.ndarray:
+    """4 element + face of the faces that one element alone has, ascending."""
+    faces = np.sort(tets[:, _TET_FACES].reshape(-1, 3), axis=1)
+    _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
+    return np.sort(first[count == 1])
+
+
 def _largest_component(tets: np.ndarray) -> np.ndarray:
     """Elements of the largest face-connected component."""
-    label = _components(tets[:, _TET_FACES])
+    label = components(tets)
     return tets[label == np.bincount(label).argmax()]
+
+
+def components(tets: np.ndarray) -> np.ndarray:
+    """Face-connected component of each element, shape (n_tets,)."""
+    return _components(tets[:, _TET_FACES])
 
 
 def _components(sides: np.ndarray) -> np.ndarray:

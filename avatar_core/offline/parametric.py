@@ -35,9 +35,9 @@ from avatar_core.offline.full_response import (
 from avatar_core.offline.linear import Modes, find_modes, rank_errors
 from avatar_core.offline.rule import BuildRule, Progress, silent
 from avatar_core.reduction.block_field import BlockField, Blocks, separate_field
-from avatar_core.reduction.coordinates import Coordinate, node_values, problem_at
+from avatar_core.reduction.coordinates import RESECTION, Coordinate, node_values, problem_at
 from avatar_core.reduction.near_field import LocalBlocks
-from avatar_core.reduction.regional import RegionModes, separate_regions
+from avatar_core.reduction.regional import RegionalRule, RegionModes, separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.display import Display, blocks_to_display
@@ -48,6 +48,8 @@ from avatar_core.vademecum.modal_mass import (
     body_response,
     completed,
     motion_beside,
+    principal_sags,
+    sag_of,
 )
 from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
 from avatar_core.vademecum.parametric import (
@@ -60,6 +62,8 @@ from avatar_core.vademecum.parametric import (
 )
 from avatar_core.vademecum.tip_field import TipField
 
+_LEAST_SAG = 1e-3  # relative, of what is left of a unit sag, that gets a function of its own
+
 
 @dataclass(frozen=True, eq=False)
 class _Snapshot:
@@ -67,12 +71,14 @@ class _Snapshot:
 
     response : without its compliance, of which ``contact`` is what lies near [m/N]
     modes : Modes, their space (3 n_nodes, n) in single precision
+    sag : under unit weights along x, y and z, shape (3 n_nodes, 3)
     """
 
     elasticity: Elasticity
     response: FullResponse
     contact: LocalBlocks
     modes: Modes
+    sag: np.ndarray
 
 
 class _Organ(NamedTuple):
@@ -145,12 +151,14 @@ def _solved(
     response = full_response(elasticity, loads, first)
     modes = find_modes(elasticity, loads, response, rule.contact_modes, second)
     contact = contact_blocks(response, surface, rule.contact_support * surface.patch_radius)
+    _, sag = sag_of(elasticity)
     elasticity = elasticity.at(elasticity.material)  # drops the factorization, 0.5 GB
     return _Snapshot(
         elasticity,
         replace(response, compliance=np.empty((0, 0), np.float32)),
         contact,
         replace(modes, space=modes.space.astype(np.float32)),
+        sag,
     )
 
 
@@ -171,7 +179,19 @@ def _principal(snapshots: Sequence[_Snapshot], rule: BuildRule) -> np.ndarray:
     b = np.asarray(scipy.linalg.block_diag(*roots))
     _, _, right = np.linalg.svd(a @ b.T, full_matrices=False)
     n = min(rule.contact_modes, len(right))
-    return space @ np.linalg.qr(b.T @ right[:n].T)[0].astype(np.float32)
+    space = space @ np.linalg.qr(b.T @ right[:n].T)[0].astype(np.float32)
+    sags = np.hstack([snapshot.sag for snapshot in snapshots])
+    return np.hstack([space, _beside(space, sags, mass)])
+
+
+def _beside(space: np.ndarray, sags: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Functions of what a space leaves of sags, (3 n_nodes, n): surface loads hold 95 %."""
+    n = len(mass)  # vertices alone are weighted
+    root = np.sqrt(mass)[:, None]
+    sags = sags / np.linalg.norm(root * sags[:n], axis=0)
+    left = sags - space @ np.linalg.lstsq(root * space[:n], root * sags[:n], rcond=None)[0]
+    _, value, right = np.linalg.svd(root * left[:n], full_matrices=False)
+    return np.asarray(left @ right[value > _LEAST_SAG].T)
 
 
 def _project(
@@ -187,7 +207,12 @@ def _project(
     n_global, body = min(rule.n_global, space.shape[1]), None
     if rule.max_modes >= LEAST_MODES:
         body = body_response(middle, space)
-        order, n_global = _body_among_first(body, n_global)
+        every = [
+            np.linalg.solve(np.tensordot(s.elasticity.factors, operators, axes=1), body.weight)
+            for s in snapshots
+        ]
+        sags = principal_sags(np.hstack(every))
+        order, n_global = _body_among_first(body, sags, n_global)
         space, operators, body = space @ order, order.T @ operators @ order, body.mixed(order)
     vertices, load = middle.at_vertices(space), loads.T @ space
     return GalerkinBasis(
@@ -199,13 +224,15 @@ def _project(
     )
 
 
-def _body_among_first(body: BodyResponse, n_global: int) -> tuple[np.ndarray, int]:
+def _body_among_first(
+    body: BodyResponse, sags: np.ndarray, n_global: int
+) -> tuple[np.ndarray, int]:
     """A rotation of a basis by which the functions of the body complete its first, (n, n).
 
     Returns the number of the first too, as some functions of the body may depend on others.
     """
     identity = np.eye(len(body.mass))
-    first = completed(body, identity[:, : n_global - N_BODY])
+    first = completed(body, sags, identity[:, : n_global - N_BODY])
     rotation, triangle = np.linalg.qr(np.hstack([first, identity[:, n_global - N_BODY :]]))
     signs = np.where(np.diagonal(triangle) < 0.0, -1.0, 1.0)
     return rotation * signs[: rotation.shape[1]], first.shape[1]
@@ -229,7 +256,8 @@ def _assemble(
     roots = [stiffness_root(basis, s.elasticity.factors) for s in snapshots]
     fields = [galerkin_field(basis, root) for root in roots]
     region = rule.regions(surface)
-    regions, errors = _regions(snapshots, [far for far, _, _ in fields], region, rule)
+    own = replace(rule.regional, most=max(1, rule.max_modes - basis.n_global))
+    regions, errors = _regions(snapshots, [far for far, _, _ in fields], region, own)
     field, left = _separated(organ, basis, roots, fields, region, regions)
     mass = elasticity.mesh.lumped_mass
     projection = _coefficients(basis.basis.space, regions, mass)
@@ -274,6 +302,7 @@ def _assemble(
         ),
         contrast=first.inclusion.contrast if first.inclusion else None,
         supports=first.supports,
+        resection=first.resection,
         body=body,
     )
 
@@ -282,7 +311,7 @@ def _regions(
     snapshots: Sequence[_Snapshot],
     fields: Sequence[SeparatedField],
     region: np.ndarray,
-    rule: BuildRule,
+    rule: RegionalRule,
 ) -> tuple[list[RegionModes], tuple[RankError, ...]]:
     """Modes of what the global ones leave at all nodes, by regions; errors by modes at a place."""
 
@@ -295,7 +324,7 @@ def _regions(
         columns,
         np.hstack([s.response.norm.reshape(len(region), 3) for s in snapshots]),
         snapshots[0].elasticity.mesh.lumped_mass,
-        rule.regional,
+        rule,
     )
     most = max(modes.space.shape[1] for modes in regions)
     return regions, rank_errors(fields[0].rank, errors[: most + 1])
@@ -368,5 +397,6 @@ def _inside(coordinates: Sequence[Coordinate], elasticity: Elasticity) -> dict[s
         "poisson": elasticity.material.poisson_ratio,
         "contrast": inclusion.contrast if inclusion else 1.0,
         **{SUPPORT + support.name: support.stiffness for support in elasticity.supports},
+        RESECTION: elasticity.resection.opened if elasticity.resection else 0.0,
     }
     return {c.name: float(np.clip(here[c.name], c.low, c.high)) for c in coordinates}

@@ -8,6 +8,7 @@ those of (multi)linear interpolation in
     poisson   -log(1 - 2 nu), in which the response varies evenly towards incompressibility
     contrast   log c
     support.NAME    log k, of the stiffness per area of a support
+    resection   r, the part of a cut that is opened (:mod:`avatar_core.fem.resection`)
 
 Canonical PGD, one product of functions of place, load and each coordinate, is not used. It needs
 several times as many modes and stagnates at 13 % of the displacement towards incompressibility,
@@ -30,13 +31,15 @@ from avatar_core.errors import CoordinateError
 if TYPE_CHECKING:
     from avatar_core.fem.elasticity import Elasticity
 
+RESECTION = "resection"
 # Between nodes no farther apart, in the scales above, interpolation adds nothing to the error that
 # can be measured (`avatar study coordinates`).
-_SPACING = {"poisson": 2.4, "contrast": 1.9, "support": 3.1}
+_SPACING = {"poisson": 2.4, "contrast": 1.9, "support": 3.1, RESECTION: 0.2}
 _LIMITS = {
     "poisson": (0.0, 0.4999),
     "contrast": (0.01, 100.0),
     "support": (LEAST_STIFFNESS, MOST_STIFFNESS),
+    RESECTION: (0.0, 1.0),
 }
 
 
@@ -45,7 +48,8 @@ class Coordinate:
     """A parameter of the organ that may be chosen when the vademecum is used.
 
     name : "poisson" (Poisson's ratio), "contrast" (Young's modulus inside the tumour over that
-        outside) or "support.NAME" (stiffness per area of a support [N/m^3])
+        outside), "support.NAME" (stiffness per area of a support [N/m^3]) or "resection" (opened
+        part of a cut)
     low, high : its range
     n_nodes : at which the organ is solved, both ends included; 0: as many as the range needs
 
@@ -63,7 +67,8 @@ class Coordinate:
     def __post_init__(self) -> None:
         if self.kind not in _LIMITS or self.name == "support":
             raise CoordinateError(
-                f"coordinate '{self.name}' is unknown; there are poisson, contrast and support.NAME"
+                f"coordinate '{self.name}' is unknown; there are poisson, contrast, "
+                "support.NAME and resection"
             )
         least, most = _LIMITS[self.kind]
         if not least <= self.low < self.high <= most:
@@ -84,7 +89,7 @@ class Coordinate:
 
     @property
     def kind(self) -> str:
-        """What it is a coordinate of: "poisson", "contrast" or "support"."""
+        """Kind of parameter: "poisson", "contrast", "support" or "resection"."""
         return "support" if self.name.startswith(SUPPORT) else self.name
 
     @classmethod
@@ -135,9 +140,13 @@ class Coordinate:
         return np.maximum(0.0, 1.0 - np.abs(np.arange(self.n_nodes) - place))
 
     def _scaled(self, value: float) -> float:
+        if self.name == RESECTION:
+            return value
         return -math.log1p(-2.0 * value) if self.name == "poisson" else math.log(value)
 
     def _unscaled(self, scaled: float) -> float:
+        if self.name == RESECTION:
+            return scaled
         return 0.5 * -math.expm1(-scaled) if self.name == "poisson" else math.exp(scaled)
 
 
@@ -163,14 +172,17 @@ def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]
         if name not in names:
             raise CoordinateError(
                 f"this vademecum has no coordinate '{name}' but {', '.join(names) or 'none'}; "
-                f"build it with {option_of(name)}=LOW:HIGH"
+                f"build it with {option_of(name)}"
             )
 
 
 def option_of(name: str) -> str:
-    """Of the command line, that makes a coordinate."""
+    """Option of the command line that makes a coordinate."""
+    if name == RESECTION:
+        return "--resection FILE"
     is_support = name.startswith(SUPPORT)
-    return f"--support {name.removeprefix(SUPPORT)}" if is_support else f"--coordinate {name}"
+    kind = f"--support {name.removeprefix(SUPPORT)}" if is_support else f"--coordinate {name}"
+    return f"{kind}=LOW:HIGH"
 
 
 def fixed_support(name: str, young: float) -> CoordinateError:
@@ -190,4 +202,6 @@ def problem_at(elasticity: Elasticity, values: Mapping[str, float]) -> Elasticit
     """The elastic problem at values of the coordinates; others keep their values."""
     poisson = values.get("poisson", elasticity.material.poisson_ratio)
     material = replace(elasticity.material, poisson_ratio=poisson)
-    return elasticity.at(material, values.get("contrast"), stiffness_of(values))
+    return elasticity.at(
+        material, values.get("contrast"), stiffness_of(values), values.get(RESECTION)
+    )

@@ -179,8 +179,13 @@ def moved_supports(vademecum: Vademecum, shift: float) -> LoadBasis:
     shift : prior root mean square of a shift [m]; a turn moves the rim of a support as far
     """
     mesh, supports = vademecum.mesh, vademecum.supports
-    elasticity = Elasticity(mesh, vademecum.material, vademecum.regions.clamped, supports=supports)
-    n_material = len(elasticity.factors) - len(supports)
+    elasticity = Elasticity(
+        mesh,
+        vademecum.material,
+        vademecum.regions.clamped,
+        supports=supports,
+        resection=vademecum.resection,
+    )
     loads, spreads = [], []
     for k, support in enumerate(supports):
         corners = mesh.vertices[mesh.boundary_faces[support.faces]]
@@ -192,7 +197,7 @@ def moved_supports(vademecum: Vademecum, shift: float) -> LoadBasis:
             for field in (np.broadcast_to(axis, arms.shape), np.cross(axis, arms)):
                 moved = np.zeros((elasticity.n_nodes, 3))
                 moved[nodes] = field
-                force = elasticity.apply_term(n_material + k, moved.reshape(-1, 1))
+                force = elasticity.apply_term(elasticity.n_material + k, moved.reshape(-1, 1))
                 loads.append(support.stiffness * force[:, 0])
             spreads += [shift / np.sqrt(3.0), shift / reach / np.sqrt(3.0)]
     solved = elasticity.at_vertices(elasticity.solve(np.stack(loads, axis=1)))

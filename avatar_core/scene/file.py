@@ -40,7 +40,7 @@ from avatar_core.scene.yaml_lines import (
 # Fields of a Scene by the key that groups them in YAML; the other keys have no group.
 SECTIONS = {
     "organ": ("vademecum",),
-    "material": ("young_modulus", "poisson_ratio", "supports"),
+    "material": ("young_modulus", "poisson_ratio", "supports", "resection"),
     "outputs": ("cloud", "cloud_divisor", "modes"),
 }
 SHIPPED = "scenes"  # folder of those that come with the project

@@ -16,7 +16,7 @@ from avatar_core.common.supports import LEAST_STIFFNESS, MOST_STIFFNESS, SUPPORT
 from avatar_core.contact.effects import Effect, Grasp, Tilt
 from avatar_core.errors import CoordinateError, SceneError
 from avatar_core.geometry.tip import MAX_TOOLS, Tip
-from avatar_core.reduction.coordinates import require_known
+from avatar_core.reduction.coordinates import RESECTION, require_known
 from avatar_core.vademecum.accuracy import Cloud
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ class Scene:
     vademecum : file in the library's folder; "" for the one that is loaded
     young_modulus, poisson_ratio, modes : None for those of the vademecum
     supports : stiffnesses per area that are not those of the vademecum
+    resection : opened part of a cut; None for that of the vademecum
     cloud : vertices that are sent
     effects : each at most once, in any order; a tool with a jaw brings grasp along
 
@@ -99,6 +100,7 @@ class Scene:
     young_modulus: float | None = quantity("Pa", 1.0, 1e8, "of the organ", None)
     poisson_ratio: float | None = quantity("-", 0.0, 0.4999, "of the organ", None)
     supports: tuple[SupportStiffness, ...] = ()
+    resection: float | None = quantity("-", 0.0, 1.0, "opened part of the organ's cut", None)
     tools: tuple[Tool, ...] = (Tool(),)
     cloud: Cloud = "surface"
     cloud_divisor: int = quantity("-", 1, 1000, "the cloud is sent every so many steps", 1)
@@ -156,7 +158,11 @@ class Scene:
 
         The contrast is that of the effect ``tumour``.
         """
-        chosen = {"young": self.young_modulus, "poisson": self.poisson_ratio}
+        chosen = {
+            "young": self.young_modulus,
+            "poisson": self.poisson_ratio,
+            RESECTION: self.resection,
+        }
         given = {name: value for name, value in chosen.items() if value is not None}
         return given | {SUPPORT + one.name: one.stiffness for one in self.supports}
 
@@ -172,6 +178,8 @@ class Scene:
             effect.require(vademecum)
         if self.poisson_ratio is not None:
             _require_coordinate(vademecum, "material.poisson_ratio", "poisson", self.poisson_ratio)
+        if self.resection is not None:
+            _require_coordinate(vademecum, "material.resection", RESECTION, self.resection)
         for one in self.supports:
             _require_coordinate(
                 vademecum, f"material.supports.{one.name}", SUPPORT + one.name, one.stiffness

@@ -21,6 +21,7 @@ NAMES = (
     "atlas-size",
     "pgd",
     "coordinates",
+    "resection",
     "certainty",
     "accuracy-time",
     "passivity",

@@ -80,7 +80,7 @@ class Held:
             if name not in names:
                 raise CoordinateError(
                     f"this vademecum has no '{name}' but {', '.join(names)}; build it with "
-                    f"{option_of(name)}=LOW:HIGH"
+                    f"{option_of(name)}"
                 )
         young = given.get("young", Fixed(self.own["young"]))
         if young.cdf(0.0) > 0.0:

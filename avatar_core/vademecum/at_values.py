@@ -11,8 +11,10 @@ import numpy as np
 from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import CoordinateError
 from avatar_core.fem.elasticity import Material, factors_at
+from avatar_core.fem.resection import opened_to
 from avatar_core.fem.supports import with_stiffness
 from avatar_core.reduction.coordinates import (
+    RESECTION,
     Coordinate,
     fixed_support,
     node_weights,
@@ -64,13 +66,17 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     at_reference = with_stiffness(supports, {s.name: softer * s.stiffness for s in supports})
     here = {"poisson": material.poisson_ratio, "contrast": vademecum.contrast or 1.0, **given}
     here |= {SUPPORT + support.name: support.stiffness for support in at_reference}
+    here.setdefault(RESECTION, vademecum.resection.opened if vademecum.resection else 0.0)
     point = {c.name: float(here[c.name]) for c in coordinates}
     _require_in_range(coordinates, point, softer)
     weights = node_weights(coordinates, point)
     material = replace(material, poisson_ratio=point.get("poisson", material.poisson_ratio))
     contrast = point.get("contrast", vademecum.contrast)
     reference = replace(material, young_modulus=parametric.young_modulus)
-    root = stiffness_root(parametric, factors_at(reference, contrast, at_reference))
+    resection = opened_to(vademecum.resection, point.get(RESECTION))
+    # the tie softens with the organ: it stands for tissue, and u stays proportional to 1 / E
+    factors = factors_at(reference, contrast, at_reference, resection)
+    root = stiffness_root(parametric, factors)
     far, trailing, body = galerkin_field(parametric, root)
     field = vademecum.field
     regional_load = regional_load_of_basis(
@@ -84,6 +90,7 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
         material=reference,
         contrast=contrast,
         supports=supports,
+        resection=resection,
         far=SeparatedField(far.space.astype(np.float32), far.load.astype(np.float32)),
         trailing=trailing.astype(np.float32),
         body=body,
@@ -114,7 +121,9 @@ def own_compliance_at(vademecum: Vademecum, values: Mapping[str, float]) -> np.n
         vademecum.material, young_modulus=parametric.young_modulus, poisson_ratio=poisson
     )
     supports = with_stiffness(vademecum.supports, stiffness_of(values))
-    factors = factors_at(material, values.get("contrast", vademecum.contrast), supports)
+    resection = opened_to(vademecum.resection, values.get(RESECTION))
+    contrast = values.get("contrast", vademecum.contrast)
+    factors = factors_at(material, contrast, supports, resection)
     load = galerkin_load(parametric, stiffness_root(parametric, factors))
     weights = node_weights(parametric.coordinates, values)
     return _own_compliance(load, combined(parametric.contact_near[:, own], weights))

@@ -20,6 +20,7 @@ from avatar_core.errors import ConvergenceError, LoadError
 from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.fem.patch_on_plane import missed_between
+from avatar_core.fem.resection import Resection
 from avatar_core.fem.supports import Support
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.reduction.block_field import BlockField, Blocks
@@ -119,7 +120,7 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "6.0"
+SCHEMA_VERSION = "6.1"
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,7 @@ class Vademecum:
         are those of one choice of their values (:func:`avatar_core.vademecum.at_values.at_values`)
     contrast : Young's modulus inside the tumour over that outside; None without a tumour
     supports : springs that hold the organ, beside the clamp of ``regions``
+    resection : how far the cut of the mesh is opened; None without a cut
     large : LargeDeformation or None, the load's magnitude as a coordinate
     body : BodyResponse or None, mass and weight as the far modes see them
     display : Display or None, a finer surface, and structures inside; None for the boundary of the
@@ -163,6 +165,7 @@ class Vademecum:
     parametric: ParametricResponse | None = None
     contrast: float | None = None
     supports: tuple[Support, ...] = ()
+    resection: Resection | None = None
     large: LargeDeformation | None = None
     body: BodyResponse | None = None
     display: Display | None = None

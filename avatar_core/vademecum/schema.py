@@ -88,6 +88,14 @@ _DISPLAY: Shapes = {
     "display/first_face": "i: parts",
 }
 _SUPPORTS: Shapes = {"supports/faces": "b: supports faces"}
+_RESECTION: Shapes = {
+    "mesh/pairs": "i: pairs 2",
+    "resection/direction": "f: 3",
+    "resection/fronts": "f: fronts",
+    "resection/opened": "f:",
+    "resection/stiffness": "f:",
+    "resection/halfway": "f:",
+}
 BODY_KEYS = tuple(_BODY)
 PARAMETRIC_KEYS = tuple(_PARAMETRIC)
 PARAMETRIC_BODY_KEYS = tuple(_PARAMETRIC_BODY)
@@ -96,9 +104,20 @@ TUMOUR_KEYS = tuple(_TUMOUR)
 OUTLINE_KEYS = tuple(_OUTLINE)
 DISPLAY_KEYS = tuple(_DISPLAY)
 SUPPORT_KEYS = tuple(_SUPPORTS)
+RESECTION_KEYS = tuple(_RESECTION)
 
 # Each is present or absent as a whole; its first key decides.
-_PARTS = (_PARAMETRIC, _BODY, _PARAMETRIC_BODY, _LARGE, _TUMOUR, _OUTLINE, _DISPLAY, _SUPPORTS)
+_PARTS = (
+    _PARAMETRIC,
+    _BODY,
+    _PARAMETRIC_BODY,
+    _LARGE,
+    _TUMOUR,
+    _OUTLINE,
+    _DISPLAY,
+    _SUPPORTS,
+    _RESECTION,
+)
 
 
 def shapes_of(held: Container[str]) -> dict[str, str]:
@@ -149,7 +168,16 @@ def require_sound(arrays: Arrays) -> None:
 def _require_mesh(arrays: Arrays, sizes: Mapping[str, int]) -> None:
     _require_lengths(arrays, "mesh/vertices")
     require_indices("mesh/tets", arrays["mesh/tets"], sizes["vertices"])
-    mesh = TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"])
+    vertices, pairs = arrays["mesh/vertices"], arrays.get("mesh/pairs")
+    if pairs is not None:
+        require_indices("mesh/pairs", pairs, sizes["vertices"])
+        first, second = pairs.T
+        alone = len(np.unique(pairs)) == pairs.size > 0
+        if not (alone and np.array_equal(vertices[first], vertices[second])):
+            raise StorageError("'mesh/pairs' do not lie at one place each; build the file again")
+    mesh = TetMesh(vertices, arrays["mesh/tets"], pairs)
+    if pairs is not None and len(mesh.cut_faces[0]) == 0:
+        raise StorageError("'mesh/pairs' are no cut; build the file again")
     if len(mesh.boundary_faces) != sizes["faces"]:
         raise StorageError("'regions' are not those of the mesh; build the file again")
 

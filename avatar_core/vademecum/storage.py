@@ -1,6 +1,6 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 6.0), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 6.1), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
 ``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve; those of the parts
@@ -39,7 +39,11 @@ to display
     display/first_face (n_parts + 1,), with the JSON attribute ``parts``, their names
 
 one on supports supports/faces (n_supports, n_faces) over the boundary faces, with the JSON
-attribute ``supports``, their names and stiffnesses [N/m^3];
+attribute ``supports``, their names and stiffnesses [N/m^3]; one that is cut
+
+    mesh/pairs (n_pairs, 2), vertices of both sides at one place
+    resection/direction (3,), fronts (n_strips + 1,) [m], opened, stiffness and halfway
+    [N/m^3];
 
 one with large deformation the JSON attribute
 ``large`` (material, certificate) and, for k = 2, 3,
@@ -68,10 +72,11 @@ from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.fem.elasticity import Element, Material
 from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.fem.resection import Resection
 from avatar_core.fem.supports import Support
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.reduction.block_field import BlockField, Blocks
-from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.reduction.coordinates import RESECTION, Coordinate
 from avatar_core.reduction.near_field import LocalBlocks, Mirror
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.accuracy import AccuracyCurve, Cloud
@@ -92,6 +97,7 @@ from avatar_core.vademecum.schema import (
     OUTLINE_KEYS,
     PARAMETRIC_BODY_KEYS,
     PARAMETRIC_KEYS,
+    RESECTION_KEYS,
     SUPPORT_KEYS,
     TUMOUR_KEYS,
     require_sound,
@@ -208,6 +214,7 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
     held += TUMOUR_KEYS[:1] * (v.tip_field.tumour is not None)
     held += OUTLINE_KEYS[:1] * (v.tip_field.outline is not None)
     held += DISPLAY_KEYS[:1] * bool(v.display)
+    held += RESECTION_KEYS[:1] * bool(v.resection)
     held += PARAMETRIC_BODY_KEYS[:1] * bool(v.parametric and v.parametric.body)
     for key in shapes_of(held):
         value: Any = v
@@ -266,7 +273,7 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
     supports = _supports(arrays, plain["supports"])
     return Vademecum(
         name=require_name(attributes["name"], "name"),
-        mesh=TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"]),
+        mesh=TetMesh(arrays["mesh/vertices"], arrays["mesh/tets"], arrays.get(RESECTION_KEYS[0])),
         regions=Regions(arrays["regions/clamped"], arrays["regions/accessible"]),
         material=of_plain(Material, plain["material"], "material"),
         element=of_plain(Element, attributes["element"], "element"),  # type: ignore[arg-type]
@@ -291,6 +298,7 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         parametric=_parametric(arrays, plain["coordinates"], mirror, supports),
         contrast=_contrast(plain["contrast"]),
         supports=supports,
+        resection=_resection(arrays),
         large=_large(arrays, plain["large"]),
         body=_body(arrays, BODY_KEYS),
         display=_display(arrays, plain["parts"]),
@@ -349,6 +357,15 @@ def _supports(arrays: dict[str, np.ndarray], stored: Any) -> tuple[Support, ...]
         Support(require_name(one.name, "supports"), some, one.stiffness)
         for one, some in zip(said, faces, strict=True)
     )
+
+
+def _resection(arrays: dict[str, np.ndarray]) -> Resection | None:
+    if RESECTION_KEYS[0] not in arrays:
+        return None
+    direction, fronts, opened, stiffness, halfway = (
+        arrays[key].astype(float).tolist() for key in RESECTION_KEYS[1:]
+    )
+    return Resection(tuple(direction), tuple(fronts), opened, stiffness, halfway)
 
 
 def _certificate(stored: Any, curve: Any) -> Certificate | None:
@@ -415,6 +432,8 @@ def _parametric(
     held = {SUPPORT + support.name for support in supports}
     if not {c.name for c in coordinates if c.kind == "support"} <= held:
         raise StorageError("'coordinates' do not fit 'supports'; build the file again")
+    if any(c.kind == RESECTION for c in coordinates) and RESECTION_KEYS[0] not in arrays:
+        raise StorageError("'coordinates' do not fit 'resection'; build the file again")
     return ParametricResponse(
         coordinates=coordinates,
         basis=SeparatedField(part["basis/space"], part["basis/load"]),

@@ -1,4 +1,4 @@
-"""Coarse phantoms over Poisson's ratio and the contrast of a tumour, and over a support."""
+"""Coarse phantoms over Poisson's ratio and a tumour's contrast, a support, and a resection."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from avatar_core.fem import patch_loads
+from avatar_core.geometry.cut_surface import CutSurface
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.rule import BuildRule
@@ -64,6 +65,22 @@ def organ_on_springs() -> Vademecum:
         n_vertices=450,
         rule=BuildRule(max_modes=60),
         supports=(SupportOption.parse("bare_area=1e5:1e9:3"),),
+        n_certified=8,
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(patch_loads, "MIDPOINTS_FROM", 1.0)
+        return build(phantom_liver(12e-3), options)
+
+
+@cached_on_disk
+def cut_organ() -> Vademecum:
+    """Cut beside a tumour from the front backwards, nine tenths of the way; loads at vertices."""
+    x, y, z = map(float, phantom_liver(12e-3).vertices.mean(axis=0))
+    options = OrganOptions(
+        n_vertices=450,
+        rule=BuildRule(max_modes=60),
+        resection=CutSurface((0.0, -1.0, 0.0), (x + 0.03, y, z), (1.0, 0.0, 0.0), part=0.9),
+        tumour=soft_tumour(),
         n_certified=8,
     )
     with pytest.MonkeyPatch.context() as patch:

@@ -10,6 +10,7 @@ from typing import Any, get_args
 from avatar_core.common.supports import ATTACHMENTS, MOST_STIFFNESS, SUPPORT
 from avatar_core.errors import CoordinateError, SceneError, one_line
 from avatar_core.geometry.tip import Shape, Tip
+from avatar_core.reduction.coordinates import RESECTION
 from avatar_core.uncertainty.distributions import (
     Distribution,
     distribution_file,
@@ -130,6 +131,13 @@ CONTACT = (
         range=(0.0, 100.0),
         read_only=False,
     ),
+    Parameter(
+        "material.resection",
+        0.0,
+        "opened part of the organ's cut, if it is a coordinate: 0 (whole) to 1 (opened)",
+        range=(0.0, 1.0),
+        read_only=False,
+    ),
     *(
         Parameter(
             f"support.{name}",
@@ -189,6 +197,7 @@ MATERIAL = {
     "material.young_modulus": "young",
     "material.poisson_ratio": "poisson",
     "material.contrast": "contrast",
+    "material.resection": RESECTION,
     **{SUPPORT + name: SUPPORT + name for name in ATTACHMENTS},
 }
 

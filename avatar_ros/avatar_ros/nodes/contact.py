@@ -394,7 +394,7 @@ class ContactNode(ManagedNode):
         if value == 0.0 or self._ranges is None or (name == "young" and name not in self._ranges):
             return ""
         if name not in self._ranges:
-            return f"the vademecum has no coordinate {name}; build it with {option_of(name)}=..."
+            return f"the vademecum has no coordinate {name}; build it with {option_of(name)}"
         others = {one for one in material if one != name}
         if (name == "young" and any(one.startswith(SUPPORT) for one in others)) or (
             name.startswith(SUPPORT) and "young" in others

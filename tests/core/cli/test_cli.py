@@ -94,6 +94,7 @@ def test_bad_surface(refused: Any, tmp_path: Path, content: str | None, remedy: 
         (["--support", "falciform", "--material", "neo-hookean"], "two vademecums"),
         (["--support", "falciform", "--contact-sites", "3"], "one linear material"),
         (["--contact-sites", "2"], "at least 3"),
+        (["--coordinate", "resection=0:1"], "--resection FILE"),
         (["--contact-sites", "3", "--material", "neo-hookean"], "one linear material"),
     ],
 )
@@ -101,6 +102,30 @@ def test_bad_option(refused: Any, tmp_path: Path, options: list[str], remedy: st
     source = phantom_file(tmp_path)
     small = [] if "--vertices" in options else ["--vertices", "800"]
     refused([source, *small, *options], remedy)
+
+
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [
+        (None, "cannot read the resection"),
+        ({"point": [1.0, 0.0, 0.0]}, "give a surface through the organ"),
+        ({"open_along": [1.0, 0.0, 0.0]}, "opens along its own normal"),
+        # across the way from the clamp, behind and above, to the front
+        (
+            {"normal": [0.0, -1.0, 1.0], "open_along": [1.0, 0.0, 0.0]},
+            "nothing holds the first part",
+        ),
+    ],
+    ids=["no file", "elsewhere", "along the normal", "loose"],
+)
+def test_bad_resection(
+    refused: Any, tmp_path: Path, change: dict[str, list[float]] | None, remedy: str
+) -> None:
+    plane, file = tmp_path / "plane.json", phantom_file(tmp_path)
+    sound = {"point": [0.0, 0.0, 0.0], "normal": [1.0, 0.0, 0.0], "open_along": [0.0, -1.0, 0.0]}
+    if change is not None:
+        plane.write_text(json.dumps(sound | change))
+    refused([file, "--vertices", "800", "--resection", plane], remedy)
 
 
 @pytest.mark.parametrize(

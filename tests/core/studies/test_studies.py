@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from avatar_core.cli import main as cli
 from avatar_core.errors import SurfaceError
+from avatar_core.fem.norms import relative_l2
+from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
@@ -35,6 +37,7 @@ from avatar_core.studies import (
     meshes,
     passivity,
     pgd,
+    resection,
     samples,
 )
 from avatar_core.studies.response import carried, relative_errors, trilinear
@@ -423,3 +426,18 @@ def test_the_command_prints_and_writes(
     assert "paper" in shown.splitlines()[0]
     assert shown.splitlines()[1].split() == ["rate", "1", "0.5"]
     assert {file.name for file in (tmp_path / "new").iterdir()} == {"samples.json", "samples.png"}
+
+
+def test_before_it_is_opened_a_resected_liver_answers_like_the_whole() -> None:
+    organ, whole = resection.resected(phantom_liver(12e-3), 450)
+    n, radius = 3 * len(whole.elasticity.mesh.vertices), organ.loads.patch_radius
+    mass = whole.elasticity.mesh.lumped_mass
+    np.testing.assert_array_equal(organ.loads.centers, whole.loads.centers)
+    np.testing.assert_array_equal(organ.loads.corners, whole.loads.corners)
+    found, exact = (
+        one.elasticity.at_vertices(
+            one.elasticity.solve(patch_loads(one.elasticity, one.loads.centers[::20], radius))
+        )[:n]
+        for one in (organ, whole)
+    )
+    assert relative_l2(found, exact, mass).max() < 0.01

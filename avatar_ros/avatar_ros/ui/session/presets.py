@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from avatar_core.common.supports import ATTACHMENTS, SUPPORT
 from avatar_core.contact.effects import Tumour
+from avatar_core.reduction.coordinates import RESECTION
 from avatar_core.scene.model import Scene
 from avatar_ros.ui.view.organ import Organ
 
@@ -14,12 +15,14 @@ SLIDERS = {
     "young": ("E [kPa]", 1e3),
     "poisson": ("nu [-]", 1.0),
     "contrast": ("Tumour / E [-]", 1.0),
+    RESECTION: ("Resection [-]", 1.0),
 }
 
 HINTS = {
     "young": "Young's modulus",
     "poisson": "Poisson's ratio",
     "contrast": "Young's modulus in the tumour over that around it",
+    RESECTION: "Opened part of the cut: 0 whole, 1 opened as far as planned",
 }
 for _name in ATTACHMENTS:
     _words = _name.replace("_", " ").capitalize()

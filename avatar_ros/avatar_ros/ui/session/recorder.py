@@ -10,7 +10,7 @@ import numpy as np
 
 from avatar_core.contact.effects import Tumour
 from avatar_core.contact.layout import default_effects
-from avatar_core.reduction.coordinates import stiffness_of
+from avatar_core.reduction.coordinates import RESECTION, stiffness_of
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene, SupportStiffness, Tool
 from avatar_core.scene.recording import Clouds, Periods, Recording, save_recording
@@ -54,6 +54,7 @@ def scene_in_force(
         supports=tuple(supports.values()),
         young_modulus=material.get("young", scene.young_modulus),
         poisson_ratio=material.get("poisson", scene.poisson_ratio),
+        resection=material.get(RESECTION, scene.resection),
     )
 
 

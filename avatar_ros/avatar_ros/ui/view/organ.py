@@ -12,6 +12,7 @@ import numpy as np
 from avatar_core.common.supports import SUPPORT
 from avatar_core.contact.tool_path import middle_of_access, starts_apart
 from avatar_core.geometry.tip import Tip
+from avatar_core.reduction.coordinates import RESECTION
 from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum, VademecumInfo
 from avatar_ros.loop.settings import MATERIAL
@@ -60,6 +61,7 @@ class Organ:
         held = ranges(v)
         here = {"young": young, "poisson": v.material.poisson_ratio, "contrast": v.contrast or 1.0}
         here |= {SUPPORT + support.name: support.stiffness for support in v.supports}
+        here |= {RESECTION: v.resection.opened} if v.resection else {}
         least, most = held.pop("young", (0.0, math.inf))
         low_young, high_young = (float(np.clip(end, least, most)) for end in YOUNG_RANGE)
         held = {"young": (min(low_young, young), max(high_young, young)), **held}
