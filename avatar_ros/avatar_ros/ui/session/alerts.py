@@ -65,5 +65,5 @@ def _of_period(shown: ShownPeriod) -> list[str]:
     if shown.missing:
         return [f"No force: {shown.missing}"]
     if shown.status == ContactState.STATUS_EXTRAPOLATED:
-        return ["Extrapolated: pressed beyond what was computed; the force is a guess"]
+        return ["Extrapolated: beyond what was computed; the force is a guess"]
     return []
