@@ -22,6 +22,7 @@ from avatar_ros.ui.view.organ import Organ
 from PIL import Image
 
 from avatar_core.errors import StorageError
+from avatar_core.geometry.cut_surface import CutSurface
 from avatar_core.geometry.surface_files import parse
 from tests.ros.helpers.page import Noted
 
@@ -254,6 +255,33 @@ def test_the_deformed_surface_is_written_in_mm_and_lps(
     exact = 1e3 * now.points[np.unique(now.organ.faces)] * [-1.0, -1.0, 1.0]
     np.testing.assert_allclose(corners.min(axis=0), exact.min(axis=0), atol=1e-3)
     np.testing.assert_allclose(corners.max(axis=0), exact.max(axis=0), atol=1e-3)
+
+
+@pytest.mark.parametrize(("side", "opens"), [("R", [0, -1, 0]), ("A", [0, 0, -1])])
+def test_the_plane_of_the_cut_is_written_as_a_resection(
+    plan: Plan,
+    now: PlanNow,
+    page: Noted,
+    tmp_path: Path,
+    side: str,
+    opens: list[int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where it was seen: a quarter of the organ's width from that side."""
+    monkeypatch.setattr(plan, "_now", lambda: replace(now, look=("cut open", side, 0.25)))
+    plan.resect()
+    (path,) = tmp_path.glob("resection-*.json")
+    surface = CutSurface.read(path)
+    height = surface.heights(now.organ.vertices)
+    assert height.max() / np.ptp(height) == pytest.approx(0.25, abs=1e-3)
+    assert surface.open_along == tuple(opens)
+    assert page.of("say")[-1].startswith(path.name)
+
+
+def test_without_a_cut_no_plane_is_written(plan: Plan, page: Noted, tmp_path: Path) -> None:
+    plan.resect()
+    assert "no plane cuts the organ" in page.of("say")[-1]
+    assert not list(tmp_path.glob("resection-*"))
 
 
 def test_a_pdf_has_a_page_for_the_organ_and_one_for_each_state(cube: Organ) -> None:

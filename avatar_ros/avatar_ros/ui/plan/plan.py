@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -21,8 +22,10 @@ from avatar_ros.ui.plan.bookmarks import Bookmark, Bookmarks
 from avatar_ros.ui.plan.report import report
 from avatar_ros.ui.session.alerts import alerts_of_organ
 from avatar_ros.ui.view.camera import pose_of, turn_camera
+from avatar_ros.ui.view.cut_handle import cut_heights
 from avatar_ros.ui.view.organ import Organ
-from avatar_ros.ui.view.orientation import Pose
+from avatar_ros.ui.view.orientation import AXES, Pose
+from avatar_ros.ui.view.view import CUT
 
 
 def _html(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> bytes:
@@ -180,6 +183,29 @@ class Plan:
             return ", ".join(file.name for file in written)
 
         self._try(write, "")
+
+    def resect(self) -> None:
+        """Write the plane that cuts the organ open, for ``avatar vademecum --resection``."""
+        now = self._now()
+        how, side, part = now.look if now else ("", "A", 0.0)
+        if now is None or how != CUT:
+            self._say("no plane cuts the organ: choose 'cut open' under Organ, and put it there")
+            return
+        path = _new_file(self._folder, "resection", now.organ, ".json")
+        normal = np.array(AXES[side])
+        first, last = cut_heights(now.organ, normal)
+        backwards, down = np.array(AXES["P"]), np.array(AXES["I"])
+        plane = {
+            "point": [round(float(x), 5) for x in (first + part * (last - first)) * normal],
+            "normal": [float(x) for x in normal],
+            "open_along": [float(x) for x in (down if normal @ backwards else backwards)],
+        }
+
+        def write() -> None:
+            with replaced(path) as file:
+                file.write_text(json.dumps(plane) + "\n")
+
+        self._try(write, f"{path.name}: for avatar vademecum SURFACE --resection {path.name}")
 
     def _try(self, do: Callable[[], str | None], good: str) -> None:
         try:

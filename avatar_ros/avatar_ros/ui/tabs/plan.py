@@ -31,6 +31,9 @@ class PlanTab:
         gui.add_button("Export deformed surfaces").on_click(
             lambda _: plan.export(self._format.value)
         )
+        gui.add_button(
+            "Write the cut as a resection", hint="a plane, for a new vademecum"
+        ).on_click(lambda _: plan.resect())
         gui.add_markdown("Surfaces are in mm and LPS, as 3D Slicer takes them.")
 
     def _on_kept(self, event: Any) -> None:

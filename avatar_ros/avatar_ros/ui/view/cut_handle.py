@@ -17,6 +17,12 @@ _SIZE = 0.25  # of the arrow, over the organ's
 _MOVED = 1e-3  # part from which the handle is put elsewhere
 
 
+def cut_heights(organ: Organ, normal: np.ndarray) -> tuple[float, float]:
+    """Where a plane of a normal cuts away nothing of an organ, and all of it [m]."""
+    heights = organ.vertices @ normal
+    return float(heights.max()), float(heights.min())
+
+
 class CutHandle:
     """One handle; ``on_cut`` gets the part of the organ's width that lies beyond the plane."""
 
@@ -29,8 +35,7 @@ class CutHandle:
 
     def show(self, organ: Organ, normal: np.ndarray, part: float) -> Plane:
         """Put the handle where a part is cut away from the side of a normal; the plane there."""
-        heights = organ.vertices @ normal
-        self._heights, self._normal = (float(heights.max()), float(heights.min())), normal
+        self._heights, self._normal = cut_heights(organ, normal), normal
         first, last = self._heights
         height = first + part * (last - first)
         place = organ.centre + (height - float(organ.centre @ normal)) * normal

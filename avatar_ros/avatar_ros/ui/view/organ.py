@@ -15,6 +15,7 @@ from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.coordinates import RESECTION
 from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum, VademecumInfo
+from avatar_core.vademecum.resected import margins, part_volumes
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.prepare.scenes import usable_material
 from avatar_ros.ui.view.measuring import hit, is_within
@@ -131,4 +132,16 @@ class Organ:
             f"<b>{escape(self.name)}</b>, {info.volume * 1e6:.0f} ml, "
             f"E {info.young_modulus / 1e3:.4g} kPa, nu {info.poisson_ratio:.3g}. "
             + (errors if np.isfinite(info.l2_mean) else "Errors: not measured.")
+            + self._parts()
         )
+
+    def _parts(self) -> str:
+        """Volumes of what a resection leaves, and its distance from structures at rest."""
+        if self.vademecum.resection is None:
+            return ""
+        first, second = part_volumes(self.vademecum)
+        share = second / (first + second)
+        text = f" The cut leaves {1e6 * first:.0f} and {1e6 * second:.0f} ml ({share:.0%})."
+        for name, margin in margins(self.vademecum).items():
+            text += f" {escape(name)}: {1e3 * margin:.0f} mm from it at rest."
+        return text
