@@ -173,14 +173,19 @@ class _Topics:
 
     def take(self, connection: Any, received: int, content: bytes) -> None:
         kind, take = self._readers[connection.topic]
-        try:
-            message = self._store.deserialize_cdr(content, kind)
-        except Exception:  # whatever the library raises for what is no such message
-            message = None
+        message = self._read(content, kind)
+        if message is None and kind == types.STATE:
+            message = self._read(content + b"\0", kind)  # of before its last field, ``held``
         if message is None or not 0 <= received < 1 << 63:
             self._failed[connection.topic] = self._failed.get(connection.topic, 0) + 1
         else:
             take(received, message)
+
+    def _read(self, content: bytes, kind: str) -> Any:
+        try:
+            return self._store.deserialize_cdr(content, kind)
+        except Exception:  # whatever the library raises for what is no such message
+            return None
 
     def bag(self, path: Path, notes: Sequence[str]) -> Bag:
         wrenches = {

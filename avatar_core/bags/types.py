@@ -33,6 +33,7 @@ string vademecum_id
 avatar_ros/Contact[] contacts
 float64 force_error
 float64 force_share
+bool held
 """,
     INFO: """
 std_msgs/Header header

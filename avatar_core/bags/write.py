@@ -136,4 +136,5 @@ class _Messages:
             contacts,
             float(periods.error[k, tool]),
             float(periods.sent_fraction[k, tool]),
+            False,  # jaws are not recorded
         )

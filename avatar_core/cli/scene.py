@@ -85,7 +85,11 @@ def _organ(one: Scene, given: Path | None) -> str:
 def _material(one: Scene) -> str:
     chosen = [
         f"{name} {value:g}{unit}"
-        for name, value, unit in (("E", one.young_modulus, " Pa"), ("nu", one.poisson_ratio, ""))
+        for name, value, unit in (
+            ("E", one.young_modulus, " Pa"),
+            ("nu", one.poisson_ratio, ""),
+            ("resection", one.resection, ""),
+        )
         if value is not None
     ]
     chosen += [f"support {s.name} {s.stiffness:g} N/m^3" for s in one.supports]

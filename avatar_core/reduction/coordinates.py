@@ -168,11 +168,12 @@ def node_weights(coordinates: Sequence[Coordinate], values: Mapping[str, float])
 def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]) -> None:
     """Raise CoordinateError if a value is given for an unknown coordinate."""
     names = [coordinate.name for coordinate in coordinates]
+    others = f" but {', '.join(names)}" if names else ""
     for name in values:
         if name not in names:
             raise CoordinateError(
-                f"this vademecum has no coordinate '{name}' but {', '.join(names) or 'none'}; "
-                f"build it with {option_of(name)}"
+                f"this vademecum has no coordinate '{name}'{others}; build it with "
+                f"{option_of(name)}"
             )
 
 

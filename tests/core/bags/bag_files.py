@@ -107,6 +107,7 @@ class Cell:
             contacts[: 2 * any(self.force[k])],
             0.1,
             share,
+            False,
         )
 
 

@@ -36,6 +36,8 @@ from tests.core.bags import bag_files
 from tests.core.bags.bag_files import (
     PERIOD,
     POSE,
+    STATE,
+    STORE,
     Cell,
     Message,
     info,
@@ -124,6 +126,23 @@ def test_the_computed_forces_are_compared_where_states_are_recorded(
     np.testing.assert_array_equal(path.recording.periods.force[:, 0], weak.force)
     assert found.difference(path.recording) <= SAME
     np.testing.assert_array_equal(path.recording.periods.sent_fraction[:, 0], weak.share)
+
+
+def test_states_of_before_jaws_are_read(
+    organ: Vademecum, cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They end before ``held``."""
+    whole = STORE.serialize_cdr
+
+    def shorter(message: Any, kind: str) -> Any:
+        content = whole(message, kind)
+        return content[:-1] if kind == STATE else content
+
+    monkeypatch.setattr(STORE, "serialize_cdr", shorter)
+    bag = write_rosbag(tmp_path / "bag", cell.messages(states=True))
+    monkeypatch.undo()
+    path, found = replayed(bag, organ)
+    assert path.answers == "states" and found.difference(path.recording) <= SAME
 
 
 def test_forces_that_a_limit_altered_are_not_compared(organ: Vademecum, tmp_path: Path) -> None:
