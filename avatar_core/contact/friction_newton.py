@@ -169,7 +169,7 @@ def _linearise(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def _linearise_held(model, data, t):  # type: ignore[no-untyped-def]
-    """The same of a tool that holds tissue: g + K sum_s C_ts g_s = K (y - u) but for its own."""
+    """Rows and residual of a tool that holds tissue: dg_t + K sum C_ts dg_s = K (y - u), s != t."""
     friction, k = data.friction, data.grasp.stiffness[t]
     u0, u1, u2 = patch_displacement(model, data, t)
     y, square = friction.offset[t], 0.0

@@ -12,16 +12,15 @@ from avatar_core.common.jit import inlined
 from avatar_core.common.splines import cell_at, in_cell, on_grid
 from avatar_core.contact.effects.tilt import sample_tilt
 from avatar_core.contact.organ_response import gather
+from avatar_core.contact.status import BARRED as BARRED
+from avatar_core.contact.status import ENTERED as ENTERED
+from avatar_core.contact.status import OUTSIDE as OUTSIDE
 from avatar_core.contact.status import Status
 from avatar_core.geometry.tip import MAX_DEPTH
 
 OK, INVALID_POSE = int(Status.OK), int(Status.INVALID_POSE)  # numba takes plain numbers
 NOT_CONVERGED, OUT_OF_RANGE = int(Status.NOT_CONVERGED), int(Status.OUT_OF_RANGE)
 EXTRAPOLATED = int(Status.EXTRAPOLATED)
-
-# A tip that did not enter through the surface is barred until it is outside again: a contact that
-# began at depth would release energy that no tool has put in.
-OUTSIDE, ENTERED, BARRED = range(3)
 
 ENTRY_DEPTH = 5e-3  # [m] a centre deeper than this did not enter through the surface
 LEAP = 50e-3  # [m] in a period; a tip that is farther from its last pose makes a new contact

@@ -270,6 +270,18 @@ def modal_load(model, data, t):  # type: ignore[no-untyped-def]
 
 
 @fast
+def modes_at_nodes(model, data, t, amplitude, values):  # type: ignore[no-untyped-def]
+    """sum_k Y_k(s_j) q_k at the load positions of a tip."""
+    for i in range(data.n_nodes[t]):
+        load = model.load[data.nodes[t, i]]
+        for d in range(3):
+            value = 0.0
+            for k in range(amplitude.shape[0]):
+                value += load[d, k] * amplitude[k]
+            values[i, d] = value
+
+
+@fast
 def near_column(model, data, t):  # type: ignore[no-untyped-def]
     """Near displacement at the nodes of a tip under its own unit normal force.
 

@@ -39,6 +39,7 @@ from avatar_core.contact.effects.several_tools import (
 )
 from avatar_core.contact.effects.viscoelasticity import held_load, near_free_displacement
 from avatar_core.contact.friction_solver import target_derivative
+from avatar_core.contact.organ_response import modes_at_nodes
 
 SUPERPOSITION = kind(
     "Superposition",
@@ -54,18 +55,6 @@ SUPERPOSITION = kind(
     hessian=array("3 3"),  # of phi
     normal_gradient=array("3 3"),  # dn_i / dp_d
 )
-
-
-@fast
-def modes_at_nodes(model, data, t, amplitude, values):  # type: ignore[no-untyped-def]
-    """sum_k Y_k(s_j) q_k at the load positions of a tip."""
-    for i in range(data.n_nodes[t]):
-        load = model.load[data.nodes[t, i]]
-        for d in range(3):
-            value = 0.0
-            for k in range(amplitude.shape[0]):
-                value += load[d, k] * amplitude[k]
-            values[i, d] = value
 
 
 @fast

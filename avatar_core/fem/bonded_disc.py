@@ -22,7 +22,7 @@ _BATCH = 60  # loads solved at once
 
 @dataclass(frozen=True, eq=False)
 class BondedDisc:
-    """What a rigid translation of a disc takes, and does.
+    """Stiffness of a disc against rigid translations, and the organ's displacement by them.
 
     stiffness : ndarray, shape (3, 3) [N/m], force on the organ by displacement of the disc
     displacement : ndarray, shape (n_vertices, 3, 3) [-], of each vertex by each translation

@@ -20,6 +20,7 @@ that no tool has put in.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -29,9 +30,10 @@ from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast, inlined
 from avatar_core.common.splines import cell_at, in_cell, on_grid, value_in_cell
 from avatar_core.contact.effects.base import Effect, Ground
-from avatar_core.contact.organ_response import gather
-from avatar_core.contact.status import Status
+from avatar_core.contact.organ_response import gather, modes_at_nodes
+from avatar_core.contact.status import BARRED, OUTSIDE, Status
 from avatar_core.errors import SceneError
+from avatar_core.geometry.tip import Tip
 from avatar_core.tips.profile import STIFFNESS, TAKEN
 
 OK, INVALID_POSE = int(Status.OK), int(Status.INVALID_POSE)  # numba takes plain numbers
@@ -72,7 +74,7 @@ class Grasp(Effect):
     superposed: ClassVar[bool] = True
 
     @staticmethod
-    def require_jaw(tips: Any) -> None:
+    def require_jaw(tips: Sequence[Tip]) -> None:
         """Raise SceneError if no tip has a jaw, or a jaw has no tip of its own."""
         if all(tip.grasp is None for tip in tips):
             raise SceneError(
@@ -120,8 +122,9 @@ def work_jaw(model, data, t):  # type: ignore[no-untyped-def]
         if valid and _find_point(model, data, t):
             grasp.held[t] = grasp.fresh[t] = True
             grasp.begun[t] = False
-            data.passage[t] = 0  # as if it came from outside
+            data.passage[t] = OUTSIDE  # as if it came from there
             data.force[t] = data.law.elastic[t] = 0.0
+            data.friction.push[t] = 0.0
             for d in range(3):
                 grasp.start[t, d] = grasp.now[t, d] = tip[d]
     return False
@@ -131,20 +134,18 @@ def work_jaw(model, data, t):  # type: ignore[no-untyped-def]
 def _find_point(model, data, t):  # type: ignore[no-untyped-def]
     """The material point X with X + u(X) under the tool, into ``place``; whether it can be held."""
     place, tip, slope = data.grasp.place[t], data.tip[t], data.slope[t]
+    displacement = data.superposition.displacement
     for d in range(3):
         place[d] = tip[d]
     for _ in range(_STEPS):
         if not on_grid(model.distance.shape, model.origin, model.spacing[0], place):
             return False
         gather(model, data, t, cell_at(model.origin, model.spacing[0], place))
+        modes_at_nodes(model, data, t, data.superposition.total, displacement)
         for d in range(3):
-            moved = 0.0
+            place[d] = tip[d]
             for i in range(data.n_nodes[t]):
-                load, u = model.load[data.nodes[t, i], d], 0.0
-                for k in range(data.superposition.total.shape[0]):
-                    u += load[k] * data.superposition.total[k]
-                moved += data.weight[t, i, 0] * u
-            place[d] = tip[d] - moved
+                place[d] -= data.weight[t, i, 0] * displacement[i, d]
     if not on_grid(model.distance.shape, model.origin, model.spacing[0], place):
         return False
     cell = cell_at(model.origin, model.spacing[0], place)
@@ -164,7 +165,7 @@ def _find_point(model, data, t):  # type: ignore[no-untyped-def]
 def let_go(data, t):  # type: ignore[no-untyped-def]
     """Hold nothing, and touch nothing before the tool has been outside."""
     data.grasp.held[t] = data.grasp.fresh[t] = data.active[t] = False
-    data.passage[t] = 2  # barred
+    data.passage[t] = BARRED
     data.force[t] = 0.0
     data.friction.push[t] = 0.0
 

@@ -34,6 +34,7 @@ JAW = (
     ),
 )
 _LONGEST = 4096  # of a message that is read [bytes]
+_MOST_NAMES = 64  # of joints that are passed over
 
 
 def chosen_jaw(value: dict[str, Any]) -> tuple[float, float]:
@@ -60,25 +61,27 @@ class JointReader:
     def read(self, raw: bytes) -> float:
         """The position, NaN if there is none. Real-time safe.
 
-        CDR aligns numbers to their size behind the four bytes of the encoding: stamp, frame,
-        names, positions.
+        CDR has, behind the four bytes of the encoding, stamp, frame, names and positions.
         """
         if raw[:2] != self._encoding or len(raw) > _LONGEST:
             return math.nan
         try:
-            at = _after_text(raw, 12)
-            at = (at + 3) & ~3
+            at = _aligned(_after_text(raw, 12), 4)
             (n_names,) = struct.unpack_from("=I", raw, at)
             at += 4
-            for _ in range(min(n_names, 64)):
-                at = _after_text(raw, (at + 3) & ~3)
-            at = (at + 3) & ~3
+            for _ in range(min(n_names, _MOST_NAMES)):
+                at = _aligned(_after_text(raw, at), 4)
             (n,) = struct.unpack_from("=I", raw, at)
-            at = ((at + 4 - 4 + 7) & ~7) + 4
+            at = _aligned(at + 4, 8)
             (position,) = struct.unpack_from("=d", raw, at) if n else (math.nan,)
         except struct.error:
             return math.nan
         return float(position)
+
+
+def _aligned(at: int, size: int) -> int:
+    """The next offset where a number of a size may begin, counted behind the encoding."""
+    return ((at - 4 + size - 1) & -size) + 4
 
 
 def _after_text(raw: bytes, at: int) -> int:

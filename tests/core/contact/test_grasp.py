@@ -49,6 +49,16 @@ def test_a_jaw_that_closes_pulls_nothing_and_then_like_a_spring() -> None:
     assert forces[0] @ pull[0] < 0.0  # back to where it was taken
 
 
+def test_a_jaw_that_closes_while_it_presses_lets_the_pressure_go() -> None:
+    """Going on from it, a disc stiffer than the tip would give back more than was put in."""
+    data = model_of(liver(), (jaw_of(),), effects=(Grasp(),)).data()
+    for depth in (-1e-3, 1e-3, 3e-3):
+        step(data.model, data, middle().tip(depth)[None], None, OPEN)
+    assert np.linalg.norm(data.out.force[0]) > 0.3
+    step(data.model, data, middle().tip(3e-3)[None], None, SHUT)
+    assert data.holds(0) and np.linalg.norm(data.out.force[0]) < 1e-9
+
+
 def test_the_stiffness_is_that_of_the_organ_and_of_a_bonded_disc() -> None:
     """1 / (2 E* a) along the normal, (2 - nu) / (8 G a) along the surface, in series with C - c."""
     v, spot = liver(), middle()
