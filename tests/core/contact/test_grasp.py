@@ -168,7 +168,7 @@ def test_a_jaw_beyond_reach_or_closed_before_holds_nothing() -> None:
 
 
 def test_tissue_that_hangs_is_taken_where_it_hangs() -> None:
-    """Closed on the sagged surface, it pulls nothing; on the surface at rest, it misses."""
+    """Closed on the sagged surface, it takes the point that has come there, and pulls nothing."""
     effects = (Grasp(), SelfWeight(gravity=9.81))
     data, _ = holding(middle(), effects=effects)
     cloud = data.out.cloud
@@ -182,6 +182,8 @@ def test_tissue_that_hangs_is_taken_where_it_hangs() -> None:
     step(data.model, data, at, None, SHUT)
     assert data.holds(0)
     assert np.linalg.norm(data.out.force[0]) < 1e-9
+    taken = data.state.point[0] - middle().center
+    assert np.linalg.norm(taken) < 0.3 * np.linalg.norm(sag)
     step(data.model, data, at + np.array([[0.0, 2e-3, 0.0]]))
     assert data.out.force[0, 1] < -0.1
 
