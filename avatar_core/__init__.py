@@ -13,7 +13,8 @@
 All lengths are in metres, forces in newtons. What users can cause and cure raises
 :class:`AvatarError` with one line that names cause and remedy.
 
-``msg_docs/architecture.md`` has the rooms, in the order in which data flows and imports may run.
+``msg_docs/background/architecture.md`` has the rooms, in the order in which data flows and imports
+may run.
 """
 
 from __future__ import annotations

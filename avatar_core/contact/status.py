@@ -1,7 +1,7 @@
 """Status codes of a tool, from the step or from the loop around it: the one list.
 
-avatar_ros/msg/ContactState.msg, msg_docs/contact_state.md and avatar_ros.loop.statuses are compared
-with it by tests/ros/loop/test_statuses.py.
+avatar_ros/msg/ContactState.msg, msg_docs/interfaces/contact_state.md and avatar_ros.loop.statuses
+are compared with it by tests/ros/loop/test_statuses.py.
 """
 
 from __future__ import annotations

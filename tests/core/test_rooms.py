@@ -12,7 +12,7 @@ import pytest
 
 from tests.helpers.paths import ROOT
 
-PAGE = ROOT / "msg_docs" / "architecture.md"
+PAGE = ROOT / "msg_docs" / "background" / "architecture.md"
 CORE, NODES = ROOT / "avatar_core", ROOT / "avatar_ros" / "avatar_ros"
 
 ORDER = {

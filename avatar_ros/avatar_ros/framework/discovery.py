@@ -1,7 +1,7 @@
 """Who can reach a node, and over which transport: this machine only, unless the user opens it.
 
 Nothing in this project authenticates anybody. To let other machines take part, export
-ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET; see msg_docs/security.md.
+ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET; see msg_docs/guides/security.md.
 
 A node that must keep time does not use shared memory. With shared memory, Fast DDS checks whether
 the port of a joining process is alive (``Port::healthy_check``), sometimes sleeps for a third of a

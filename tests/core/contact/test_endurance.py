@@ -24,7 +24,7 @@ from tests.helpers.tool_motion import AWAY, follow
 
 MINUTE = 60_000  # periods
 PR_SET_THP_DISABLE = 41
-STATES = ROOT / "msg_docs" / "contact_state.md"
+STATES = ROOT / "msg_docs" / "interfaces" / "contact_state.md"
 SCENES: dict[str, tuple[tuple[Effect, ...], int]] = {
     "bare": ((), 1),
     "friction, viscoelastic, two tools": (

@@ -37,7 +37,7 @@ def test_the_slope_is_that_of_the_depth(tip: Tip) -> None:
 
 
 def test_the_page_has_every_shape_with_what_it_needs() -> None:
-    page = (ROOT / "msg_docs" / "parameters.md").read_text()
+    page = (ROOT / "msg_docs" / "interfaces" / "parameters.md").read_text()
     rows = re.findall(
         r"^\| `(\w+)` \| ((?:`\w+`(?:, )?)+) \|", page.split("## Tips")[1], re.MULTILINE
     )

@@ -15,7 +15,7 @@ from avatar_core.scene.file import SECTIONS, parse_scene
 from avatar_core.scene.model import Scene, SupportStiffness, Tool
 from tests.helpers.paths import ROOT
 
-PAGE = (ROOT / "msg_docs" / "scenes.md").read_text()
+PAGE = (ROOT / "msg_docs" / "interfaces" / "scene_file.md").read_text()
 WORDS = {"the vademecum's", "none", "all"}  # of a default that is None
 
 

@@ -10,7 +10,7 @@ from rclpy.node import NodeNameNonExistentError
 
 from tests.helpers.paths import ROOT
 
-PAGES = ROOT / "msg_docs"
+PAGES = ROOT / "msg_docs" / "interfaces"
 # Every managed node has these; the index says so in one sentence.
 COMMON_TOPICS = {"parameter_events", "rosout", "transition_event"}
 COMMON_SERVICES = re.compile(

@@ -83,7 +83,7 @@ def test_a_driver_feels_the_organ_by_its_file(
     name: str,
     hears: str,
 ) -> None:
-    """Started by the lines of msg_docs/devices.md; poses at 500 Hz, as crtk's clients send them.
+    """Started by the lines of msg_docs/guides/devices.md, with poses at 500 Hz as crtk's clients.
 
     It feels nothing before it says that it is enabled and homed, and nothing any more when it is
     paused or in fault.

@@ -1,0 +1,60 @@
+"""The README and the pages of msg_docs: links that lead somewhere, headings in order."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.paths import ROOT
+
+README, DOCS = ROOT / "README.md", ROOT / "msg_docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+
+
+def prose(page: Path) -> str:
+    """A page without its blocks of code."""
+    return re.sub(r"^[ ]*```.*?^[ ]*```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
+def headings(page: Path) -> list[tuple[int, str]]:
+    """Level and text of each heading."""
+    return [(len(a), b) for a, b in re.findall(r"^(#+) (.+)$", prose(page), re.MULTILINE)]
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives to the headings of a page."""
+    kept = (re.sub(r"[^\w\- ]", "", text).strip() for _, text in headings(page))
+    return {text.lower().replace(" ", "-") for text in kept}
+
+
+def links(page: Path) -> list[tuple[Path, str]]:
+    """File and anchor of each link inside the repository."""
+    found = re.findall(r"\]\((?!https?:)([^)#\s]*)#?([^)\s]*)\)", prose(page))
+    return [((page.parent / path).resolve() if path else page, anchor) for path, anchor in found]
+
+
+@pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: page.name)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for target, anchor in links(page):
+        assert target.exists(), target
+        assert not anchor or anchor in anchors(target), (target, anchor)
+
+
+@pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: page.name)
+def test_headings_descend_one_level_at_a_time(page: Path) -> None:
+    levels = [level for level, _ in headings(page)]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(after - before <= 1 for before, after in pairwise(levels))
+
+
+def test_every_page_can_be_reached_from_the_readme() -> None:
+    reached, ahead = set(), [README]
+    while ahead:
+        page = ahead.pop()
+        if page.suffix == ".md" and page not in reached:
+            reached.add(page)
+            ahead += [target for target, _ in links(page)]
+    assert not set(PAGES) - reached
